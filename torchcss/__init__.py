@@ -1,0 +1,1 @@
+"""torchcss: articulated tracking from one camera that keeps every explanation."""

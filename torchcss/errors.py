@@ -1,0 +1,72 @@
+"""Typed errors for bad input, and the shape check that raises them.
+
+Every error of this package that a user can cause derives from `TorchcssError`; its message is one
+line that says what was expected, what was found, and what to do. The command line prints that line
+and exits with status 2; a library user catches the class.
+
+Numerical trouble is not an error: it is data (see `torchcss.types.Status`).
+"""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+
+class TorchcssError(Exception):
+    """Base of all errors that bad input causes."""
+
+
+class ShapeError(TorchcssError, ValueError):
+    """A tensor has the wrong shape, dtype or device."""
+
+
+class BodyError(TorchcssError, ValueError):
+    """A body or robot description cannot be used: unknown name, bad URDF, duplicate joint."""
+
+
+class CameraError(TorchcssError, ValueError):
+    """A camera file or camera value is missing, malformed or belongs to another image size."""
+
+
+class VideoError(TorchcssError, ValueError):
+    """A video or image folder is missing, empty, truncated or not a video."""
+
+
+class KeypointError(TorchcssError, ValueError):
+    """A keypoint file is missing, malformed, of unknown layout or has nobody in it."""
+
+
+class TrackFileError(TorchcssError, ValueError):
+    """A track file is missing, malformed or of another schema version."""
+
+
+class OutputError(TorchcssError, OSError):
+    """The output folder cannot be written, or the disk is full."""
+
+
+class ConfigurationError(TorchcssError, ValueError):
+    """An option has a value that makes no sense, alone or together with another."""
+
+
+class MissingExtraError(TorchcssError, ImportError):
+    """An optional package is needed; the message says which extra installs it."""
+
+
+def check_shape(name: str, tensor: Tensor, *trailing: int | None) -> None:
+    """Check that `tensor` ends in the dimensions `trailing`; `None` stands for any size.
+
+    Args:
+        name: How the caller calls the tensor, for the message.
+        tensor: The tensor to check; any number of leading dimensions is accepted.
+        trailing: The sizes of the last dimensions.
+
+    Raises:
+        ShapeError: If the number or the size of the trailing dimensions differs.
+    """
+    got = tuple(tensor.shape)
+    tail = got[len(got) - len(trailing) :] if len(got) >= len(trailing) else None
+    if tail is None or any(
+        want is not None and have != want for have, want in zip(tail, trailing, strict=True)
+    ):
+        wanted = ", ".join("any" if want is None else str(want) for want in trailing)
+        raise ShapeError(f"{name}: expected a shape [..., {wanted}], got {list(got)}")

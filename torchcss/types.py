@@ -1,0 +1,141 @@
+"""Records and enums that the whole package shares.
+
+Axis letters used in shape annotations everywhere:
+
+| letter | axis |
+|---|---|
+| `*batch` | any leading dimensions (samples, modes, frames) |
+| `n` | state parameters |
+| `q` | joints of the kinematic tree (every one of one degree of freedom) |
+| `l` | links of the tree |
+| `p` | surface points |
+| `j` | named joint centres |
+| `k` | modes of a mixture |
+| `t` | frames |
+| `h w` | image rows and columns |
+
+Units are metres, radians, seconds, pixels (pixel centres at integers) and nats.
+"""
+
+from __future__ import annotations
+
+from enum import Enum, IntEnum
+from typing import NamedTuple, Protocol, runtime_checkable
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+class LocalModel(NamedTuple):
+    """A cost and its first two derivatives at a state; the quadratic model of eq. 11 and 12 [IJRR].
+
+    Attributes:
+        value: Cost in nats.
+        gradient: First derivative with respect to the state.
+        hessian: Second derivative, symmetric; it may be indefinite.
+    """
+
+    value: Float[Tensor, "*batch"]
+    gradient: Float[Tensor, "*batch n"]
+    hessian: Float[Tensor, "*batch n n"]
+
+
+class PointCost(NamedTuple):
+    """A cost per 3D point with its derivatives with respect to that point, world frame.
+
+    Attributes:
+        value: Cost of each point in nats.
+        gradient: First derivative, nats per metre.
+        hessian: Second derivative, symmetric, nats per square metre.
+    """
+
+    value: Float[Tensor, "*batch p"]
+    gradient: Float[Tensor, "*batch p 3"]
+    hessian: Float[Tensor, "*batch p 3 3"]
+
+
+class Bounds(NamedTuple):
+    """Box limits on the state, the constraints `C_bl x < 0` of section 3.2.3 [IJRR].
+
+    Attributes:
+        lower: Least admissible value; `-inf` where there is none.
+        upper: Greatest admissible value; `inf` where there is none.
+    """
+
+    lower: Float[Tensor, " n"]
+    upper: Float[Tensor, " n"]
+
+    def project(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
+        """Return the nearest admissible state."""
+        return x.clamp(self.lower.to(x), self.upper.to(x))
+
+
+class Curvature(Enum):
+    """Which second derivative `BodyModel.lift` returns."""
+
+    EXACT = "exact"
+    """Closed form, with the second-order kinematics."""
+    GAUSS_NEWTON = "gauss-newton"
+    """Without the second-order kinematics, eq. 9 of [RR]."""
+    AUTOGRAD = "autograd"
+    """Double backward through the kinematics: slow, the reference for the other two."""
+
+
+class Status(IntEnum):
+    """Why the optimiser stopped on one item."""
+
+    RUNNING = 0
+    CONVERGED = 1
+    SMALL_STEP = 2
+    STEP_LIMIT = 3
+    NON_FINITE = 4
+
+    @property
+    def message(self) -> str:
+        """What happened and what to try."""
+        return {
+            Status.RUNNING: "still running",
+            Status.CONVERGED: "the projected gradient is below the tolerance",
+            Status.SMALL_STEP: "no step within the numerical resolution lowers the cost; "
+            "use float64 if the gradient matters",
+            Status.STEP_LIMIT: "the step limit was reached; raise max_steps",
+            Status.NON_FINITE: "the cost is not finite at the start; check the input",
+        }[self]
+
+
+class Modes(NamedTuple):
+    """What the optimiser returns for every start.
+
+    Attributes:
+        mean: The states reached.
+        covariance: Inverse Hessian on the free variables (design decision 9).
+        cost: Cost at `mean`, nats.
+        active: True where a variable ended at a bound that holds it.
+        status: A `Status` per item.
+        num_steps: Iterations taken per item.
+    """
+
+    mean: Float[Tensor, "*batch n"]
+    covariance: Float[Tensor, "*batch n n"]
+    cost: Float[Tensor, "*batch"]
+    active: Int[Tensor, "*batch n"]
+    status: Int[Tensor, "*batch"]
+    num_steps: Int[Tensor, "*batch"]
+
+
+@runtime_checkable
+class CostFunction(Protocol):
+    """Anything that the optimiser and the tracker can search: the negative log posterior, eq. 3.
+
+    A cost whose items differ (each sample compared with its own parent mode, say) also has a
+    method `take(items)` that returns the cost restricted to those items of the leading batch
+    dimension; the optimiser calls it when it drops finished items.
+    """
+
+    def value(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+        """Cost in nats; a pure function of `x`."""
+        ...
+
+    def local_model(self, x: Float[Tensor, "*batch n"]) -> LocalModel:
+        """Cost, gradient and Hessian at `x`, image matches held fixed."""
+        ...
