@@ -1,1 +1,10 @@
-"""torchcss: articulated tracking from one camera that keeps every explanation."""
+"""torchcss: articulated tracking from one camera that keeps every explanation.
+
+Give it a video of an articulated body, a camera and a rough start; it returns, per frame, a mixture
+of poses with covariances and weights (covariance scaled sampling, Sminchisescu and Triggs, IJRR
+2003). Start with `load_body`, `track_video` and `load_track`.
+"""
+
+from torchcss.body.model import BodyModel, load_body
+
+__all__ = ["BodyModel", "load_body"]

@@ -1,0 +1,542 @@
+"""Reading and writing of frames: whole videos, damaged ones, folders."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import struct
+import subprocess
+import sys
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from torchcss.errors import ConfigurationError, OutputError, ShapeError, VideoError
+from torchcss.io.video import Frame, VideoReader, VideoWriter, natural_order, read_image
+
+
+def grey_level(index: int) -> int:
+    """The brightness that marks frame `index`."""
+    return 20 + 6 * index
+
+
+def film(
+    path: Path,
+    num_frames: int = 12,
+    size_wh: tuple[int, int] = (64, 48),
+    rate: Fraction | float = Fraction(30),
+) -> Path:
+    """Write a film whose frames are uniform grey, brighter from frame to frame."""
+    with VideoWriter(path, rate) as writer:
+        for index in range(num_frames):
+            image = np.full((size_wh[1], size_wh[0], 3), grey_level(index), np.uint8)
+            writer.write(image)
+    return path
+
+
+def noisy_film(path: Path, num_frames: int = 60, **options: str) -> Path:
+    """Write a film that cannot be compressed, so that it can be cut anywhere."""
+    source = np.random.default_rng(0)
+    with av.open(str(path), "w", options=options) as container:
+        stream = container.add_stream("libx264", rate=30)
+        stream.width = stream.height = 64
+        stream.pix_fmt = "yuv420p"
+        for _ in range(num_frames):
+            image = source.integers(0, 256, (64, 64, 3), dtype=np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode(None))
+    return path
+
+
+def cut(path: Path, fraction: float) -> Path:
+    """Write the beginning of a file under another name."""
+    data = path.read_bytes()
+    shorter = path.with_stem(f"{path.stem}_cut")
+    shorter.write_bytes(data[: int(fraction * len(data))])
+    return shorter
+
+
+def read_until_error(reader: VideoReader) -> tuple[list[Frame], VideoError | None]:
+    frames = []
+    try:
+        for frame in reader:
+            frames.append(frame)
+    except VideoError as error:
+        return frames, error
+    return frames, None
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mov", ".mkv"])
+def test_round_trip(tmp_path: Path, suffix: str) -> None:
+    path = film(tmp_path / f"a{suffix}")
+    reader = VideoReader(path)
+    assert (reader.info.width, reader.info.height) == (64, 48)
+    assert reader.info.frame_rate == 30
+    assert reader.info.num_frames == (None if suffix == ".mkv" else 12)
+    assert reader.count_frames() == 12
+    for _ in range(2):  # it can be read again
+        frames = list(reader)
+        assert [frame.index for frame in frames] == list(range(12))
+        np.testing.assert_allclose(
+            [frame.time_s for frame in frames], np.arange(12) / 30, atol=2e-3
+        )
+        for frame in frames:
+            assert frame.image.dtype == np.uint8
+            assert frame.image.shape == (48, 64, 3)
+            assert abs(frame.image.astype(float).mean() - grey_level(frame.index)) < 3
+    assert list(tmp_path.iterdir()) == [path]  # no temporary file is left
+
+
+@pytest.mark.parametrize("size_wh", [(63, 47), (64, 47), (63, 48), (1, 1), (2, 2)])
+def test_odd_sizes_are_padded_to_even_ones(tmp_path: Path, size_wh: tuple[int, int]) -> None:
+    path = film(tmp_path / "a.mp4", 3, size_wh)
+    info = VideoReader(path).info
+    assert (info.width, info.height) == tuple(side + side % 2 for side in size_wh)
+    assert len(list(VideoReader(path))) == 3
+
+
+@pytest.mark.parametrize("rate", [Fraction(30000, 1001), 25, 6, Fraction(1, 2), 29.97])
+def test_frame_rates(tmp_path: Path, rate: Fraction | float) -> None:
+    reader = VideoReader(film(tmp_path / "a.mp4", 4, rate=rate))
+    assert abs(reader.info.frame_rate - rate) < 1e-3
+    np.testing.assert_allclose(
+        [frame.time_s for frame in reader], np.arange(4) / float(rate), atol=1e-3
+    )
+
+
+def test_crf_trades_size_for_quality(tmp_path: Path) -> None:
+    source = np.random.default_rng(1)
+    image = source.integers(0, 256, (64, 64, 3), dtype=np.uint8)
+    sizes = []
+    for crf in (10, 40):
+        with VideoWriter(tmp_path / f"{crf}.mp4", 30, crf=crf) as writer:
+            writer.write(image)
+        sizes.append((tmp_path / f"{crf}.mp4").stat().st_size)
+    assert sizes[0] > 1.5 * sizes[1]
+
+
+@pytest.mark.parametrize(
+    ("start", "stop", "stride"),
+    [(0, None, 1), (3, None, 1), (0, 5, 1), (2, 9, 3), (0, 100, 4), (11, None, 2), (4, 5, 1)],
+)
+def test_selection_keeps_the_index_in_the_file(
+    tmp_path: Path, start: int, stop: int | None, stride: int
+) -> None:
+    path = film(tmp_path / "a.mp4")
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for index in range(12):
+        level = np.full((8, 10, 3), grey_level(index), np.uint8)
+        Image.fromarray(level).save(folder / f"{index}.png")
+    expected = list(range(12))[start:stop:stride]
+    for source in (path, folder):
+        with VideoReader(source, start=start, stop=stop, stride=stride) as reader:
+            assert reader.num_selected == len(expected)
+            frames = list(reader)
+        assert [frame.index for frame in frames] == expected
+        for frame in frames:
+            assert abs(frame.image.astype(float).mean() - grey_level(frame.index)) < 3
+            assert frame.time_s == pytest.approx(frame.index / 30, abs=2e-3)
+
+
+def test_close_ends_an_iteration(tmp_path: Path) -> None:
+    with VideoReader(film(tmp_path / "a.mp4")) as reader:
+        frames = iter(reader)
+        next(frames)
+    assert list(frames) == []
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"stride": 0}, "stride"),
+        ({"stride": -1}, "stride"),
+        ({"start": -1}, "start"),
+        ({"start": 12}, "beyond the end"),
+        ({"start": 500}, "12 frames"),
+        ({"start": 4, "stop": 4}, "stop"),
+    ],
+)
+def test_bad_selections(tmp_path: Path, options: dict[str, int], words: str) -> None:
+    path = film(tmp_path / "a.mp4")
+    with pytest.raises(VideoError, match=words):
+        VideoReader(path, **options)
+
+
+def test_start_beyond_the_end_of_a_container_that_does_not_count(tmp_path: Path) -> None:
+    reader = VideoReader(film(tmp_path / "a.mkv"), start=50)
+    assert reader.num_selected is None
+    with pytest.raises(VideoError, match="start 50 is beyond the end: the video has 12 frames"):
+        list(reader)
+
+
+# Rotation.
+
+
+@pytest.mark.parametrize("quarter_turns", [0, 1, 2, 3])
+def test_rotation_metadata_is_applied(tmp_path: Path, quarter_turns: int) -> None:
+    # A bright corner, top left as coded; the display matrix of the track header turns it.
+    path = tmp_path / "a.mp4"
+    image = np.zeros((32, 64, 3), np.uint8)
+    image[:16, :16] = 255
+    with VideoWriter(path, 30) as writer:
+        for _ in range(3):
+            writer.write(image)
+    data = bytearray(path.read_bytes())
+    header = data.rindex(b"tkhd") + 4
+    matrix = header + 40  # version 0: after the times, identity, layer, group and volume
+    cosine, sine = [(1, 0), (0, 1), (-1, 0), (0, -1)][quarter_turns]  # clockwise
+    one = 1 << 16
+    data[matrix : matrix + 36] = struct.pack(
+        ">9i", cosine * one, sine * one, 0, -sine * one, cosine * one, 0, 0, 0, 1 << 30
+    )
+    path.write_bytes(bytes(data))
+    reader = VideoReader(path)
+    expected = np.rot90(image, -quarter_turns)
+    assert (reader.info.height, reader.info.width) == expected.shape[:2]
+    for frame in reader:
+        assert frame.image.flags["C_CONTIGUOUS"]
+        assert np.abs(frame.image.astype(int) - expected).mean() < 4
+
+
+# Damage.
+
+
+def test_missing_empty_and_foreign_files(tmp_path: Path) -> None:
+    with pytest.raises(VideoError, match="no such file"):
+        VideoReader(tmp_path / "none.mp4")
+    empty = tmp_path / "empty.mp4"
+    empty.touch()
+    with pytest.raises(VideoError, match="empty"):
+        VideoReader(empty)
+    for name, content in {
+        "text.mp4": b"hello world\n" * 100,
+        "text.txt": b"hello world\n" * 100,
+        "noise.mp4": np.random.default_rng(0).bytes(10000),
+        "noise.yuv": np.random.default_rng(0).bytes(100000),
+        "playlist.m3u8": b"#EXTM3U\n#EXTINF:1,\nhttp://localhost/a.ts\n",
+        "list.ffconcat": b"ffconcat version 1.0\nfile a.mp4\n",
+        "image.png": b"not an image",
+    }.items():
+        path = tmp_path / name
+        path.write_bytes(content)
+        with pytest.raises(VideoError, match="not a") as caught:
+            VideoReader(path)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(VideoError):
+        VideoReader("a\0b")
+    with pytest.raises(VideoError, match="device"):
+        VideoReader("/dev/null")
+
+
+def test_sound_without_pictures(tmp_path: Path) -> None:
+    path = tmp_path / "sound.mkv"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("pcm_s16le", rate=8000)
+        sound = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), layout="mono")
+        sound.sample_rate = 8000
+        container.mux(stream.encode(sound))
+        container.mux(stream.encode(None))
+    with pytest.raises(VideoError, match="no pictures"):
+        VideoReader(path)
+
+
+def test_truncated_with_index_at_the_front_yields_what_is_whole(tmp_path: Path) -> None:
+    path = cut(noisy_film(tmp_path / "a.mp4", movflags="faststart"), 0.6)
+    frames, error = read_until_error(VideoReader(path))
+    count = len(frames)
+    assert 25 < count < 45
+    assert [frame.index for frame in frames] == list(range(count))
+    assert error is not None
+    assert f"{count} of 60 frames could be read" in str(error)
+    assert f"stop {count}" in str(error)
+    assert VideoReader(path).count_frames() == count
+    # What the message proposes works, also with a start behind.
+    frames, error = read_until_error(VideoReader(path, stop=count))
+    assert (len(frames), error) == (count, None)
+    whole = [frame.image for frame in VideoReader(tmp_path / "a.mp4", stop=count)]
+    assert all(
+        np.array_equal(frame.image, image) for frame, image in zip(frames, whole, strict=True)
+    )
+
+
+def test_truncated_avi(tmp_path: Path) -> None:
+    path = cut(noisy_film(tmp_path / "a.avi"), 0.5)
+    frames, error = read_until_error(VideoReader(path))
+    assert 20 < len(frames) < 40
+    assert f"{len(frames)} of 60 frames" in str(error)
+
+
+def test_truncated_before_the_index_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(VideoError, match="not a video"):
+        VideoReader(cut(noisy_film(tmp_path / "a.mp4"), 0.6))
+
+
+def test_first_frame_undecodable(tmp_path: Path) -> None:
+    path = noisy_film(tmp_path / "a.mp4", movflags="faststart")
+    data = path.read_bytes()
+    path.write_bytes(data[: data.index(b"mdat") + 8])
+    with pytest.raises(VideoError):
+        VideoReader(path)
+
+
+@pytest.fixture(scope="module")
+def good_files(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
+    folder = tmp_path_factory.mktemp("good")
+    return [
+        noisy_film(folder / "a.mp4", 8, movflags="faststart").read_bytes(),
+        noisy_film(folder / "a.mkv", 8).read_bytes(),
+        film(folder / "b.mp4", 4).read_bytes(),
+    ]
+
+
+@settings(
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(data=st.data())
+def test_only_video_errors_come_from_bad_bytes(
+    good_files: list[bytes], tmp_path: Path, data: st.DataObject
+) -> None:
+    kind = data.draw(st.sampled_from(["random", "cut", "changed"]))
+    content = bytearray(data.draw(st.sampled_from(good_files)))
+    if kind == "random":
+        content = bytearray(data.draw(st.binary(min_size=1, max_size=400)))
+    elif kind == "cut":
+        del content[data.draw(st.integers(1, len(content))) :]
+    else:
+        for _ in range(data.draw(st.integers(1, 20))):
+            content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path = tmp_path / data.draw(st.sampled_from(["a.mp4", "a.mkv", "a.png", "a.txt"]))
+    path.write_bytes(content)
+    try:
+        reader = VideoReader(path)
+    except VideoError as raised:
+        error: VideoError | None = raised
+    else:
+        _, error = read_until_error(reader)
+    if error is not None:
+        assert "\n" not in str(error)
+        assert str(path) in str(error)
+
+
+# Folders of images.
+
+
+def test_folder_is_sorted_naturally(tmp_path: Path) -> None:
+    for index in range(12):
+        level = np.full((6, 8, 3), grey_level(index), np.uint8)
+        Image.fromarray(level).save(tmp_path / f"frame{index}.png")
+    (tmp_path / "notes.txt").write_text("not an image")
+    (tmp_path / ".hidden.png").write_text("not an image")
+    reader = VideoReader(tmp_path, image_frame_rate=10)
+    assert reader.info == (10, 8, 6, 12)
+    assert [int(frame.image[0, 0, 0]) for frame in reader] == [grey_level(i) for i in range(12)]
+    assert [frame.time_s for frame in reader] == pytest.approx(np.arange(12) / 10)
+
+
+def test_natural_order() -> None:
+    names = ["10.png", "2.PNG", "a10", "a2", "b", "²", "1"]  # a superscript is no digit
+    assert sorted(names, key=natural_order) == ["1", "2.PNG", "10.png", "a2", "a10", "b", "²"]
+
+
+def test_kinds_of_images(tmp_path: Path) -> None:
+    ramp = np.arange(256, dtype=np.uint16).reshape(16, 16)
+    Image.fromarray((ramp * 257).astype(np.uint16)).save(tmp_path / "grey16.png")
+    np.testing.assert_array_equal(read_image(tmp_path / "grey16.png")[..., 1], ramp)
+    Image.fromarray(ramp.astype(np.uint8)).save(tmp_path / "grey8.png")
+    np.testing.assert_array_equal(read_image(tmp_path / "grey8.png")[..., 2], ramp)
+    colour = np.full((4, 5, 4), 200, np.uint8)
+    colour[:, :2, 3] = 0
+    colour[:, 2:, 3] = 255
+    Image.fromarray(colour).save(tmp_path / "alpha.png")
+    image = read_image(tmp_path / "alpha.png")
+    assert image[0, 0].tolist() == [0, 0, 0]
+    assert image[0, 4].tolist() == [200, 200, 200]
+    Image.fromarray(colour[..., :3]).convert("P").save(tmp_path / "palette.png")
+    assert read_image(tmp_path / "palette.png").shape == (4, 5, 3)
+    Image.fromarray(colour[..., :3]).convert("CMYK").save(tmp_path / "ink.jpg")
+    assert read_image(tmp_path / "ink.jpg").shape == (4, 5, 3)
+    # A telephone's rotation: orientation 6 is shown turned clockwise.
+    tags = Image.Exif()
+    tags[0x0112] = 6
+    Image.fromarray(colour[..., :3]).save(tmp_path / "turned.jpg", exif=tags)
+    assert read_image(tmp_path / "turned.jpg").shape == (5, 4, 3)
+    Image.fromarray(ramp.astype(np.float32)).save(tmp_path / "real.tiff")
+    with pytest.raises(VideoError, match="floating-point"):
+        read_image(tmp_path / "real.tiff")
+
+
+def test_one_image_is_a_video_of_one_frame(tmp_path: Path) -> None:
+    Image.new("RGB", (7, 5)).save(tmp_path / "a.png")
+    assert [frame.image.shape for frame in VideoReader(tmp_path / "a.png")] == [(5, 7, 3)]
+
+
+def test_bad_folders(tmp_path: Path) -> None:
+    with pytest.raises(VideoError, match="no images"):
+        VideoReader(tmp_path)
+    Image.new("RGB", (8, 6)).save(tmp_path / "0.png")
+    Image.new("RGB", (9, 6)).save(tmp_path / "1.png")
+    frames, error = read_until_error(VideoReader(tmp_path))
+    assert len(frames) == 1
+    assert "9 x 6" in str(error)
+    assert "8 x 6" in str(error)
+    with pytest.raises(VideoError, match="beyond the end"):
+        VideoReader(tmp_path, start=2)
+    (tmp_path / "1.png").write_bytes((tmp_path / "0.png").read_bytes()[:40])
+    frames, error = read_until_error(VideoReader(tmp_path))
+    assert len(frames) == 1
+    assert "1.png" in str(error)
+    with pytest.raises(VideoError, match="per second"):
+        VideoReader(tmp_path, image_frame_rate=0)
+
+
+# Writing.
+
+
+def test_interrupted_writer_keeps_what_was_written(tmp_path: Path) -> None:
+    path = tmp_path / "a.mp4"
+    image = np.zeros((16, 16, 3), np.uint8)
+
+    def run() -> None:
+        with VideoWriter(path, 30) as writer:
+            for index in range(100):
+                if index == 7:
+                    raise KeyboardInterrupt
+                writer.write(image)
+
+    with pytest.raises(KeyboardInterrupt):
+        run()
+    assert len(list(VideoReader(path))) == 7
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_killed_process_leaves_the_old_file_and_a_playable_partial_one(tmp_path: Path) -> None:
+    path = film(tmp_path / "a.mp4", 5)
+    good = path.read_bytes()
+    programme = (
+        "import sys, os, signal, numpy as np\n"
+        "from torchcss.io.video import VideoWriter\n"
+        "writer = VideoWriter(sys.argv[1], 10)\n"
+        "source = np.random.default_rng(0)\n"
+        "for _ in range(100): writer.write(source.integers(0, 256, (64, 64, 3), dtype=np.uint8))\n"
+        "os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    repository = Path(__file__).resolve().parents[2]
+    killed = subprocess.run(
+        [sys.executable, "-c", programme, str(path)], cwd=repository, check=False
+    )
+    assert killed.returncode == -signal.SIGKILL
+    assert path.read_bytes() == good
+    (partial,) = (entry for entry in tmp_path.iterdir() if entry != path)
+    frames, _ = read_until_error(VideoReader(partial))
+    assert len(frames) > 10
+
+
+@pytest.mark.parametrize("old", [False, True])
+def test_full_disk(tmp_path: Path, old: bool) -> None:
+    # A limit on the size of files stands in for the full disk: the same path through FFmpeg.
+    path = tmp_path / "a.mp4"
+    if old:
+        film(path, 3)
+    programme = (
+        "import sys, resource, signal, numpy as np\n"
+        "from torchcss.errors import OutputError\n"
+        "from torchcss.io.video import VideoWriter\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (200000, 200000))\n"
+        "source = np.random.default_rng(0)\n"
+        "try:\n"
+        "    with VideoWriter(sys.argv[1], 10) as writer:\n"
+        "        for _ in range(300):\n"
+        "            writer.write(source.integers(0, 256, (64, 64, 3), dtype=np.uint8))\n"
+        "except OutputError as error:\n"
+        "    print(error)\n"
+    )
+    repository = Path(__file__).resolve().parents[2]
+    done = subprocess.run(
+        [sys.executable, "-c", programme, str(path)],
+        cwd=repository, check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    assert "larger than this system allows" in done.stdout
+    assert list(tmp_path.iterdir()) == [path]
+    frames, _ = read_until_error(VideoReader(path))
+    assert len(frames) == 3 if old else len(frames) > 5
+
+
+def test_writer_without_frames_leaves_nothing(tmp_path: Path) -> None:
+    with VideoWriter(tmp_path / "a.mp4", 30):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_unwritable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    image = np.zeros((16, 16, 3), np.uint8)
+    with pytest.raises(OutputError), VideoWriter(tmp_path / "none" / "a.mp4", 30) as writer:
+        writer.write(image)
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError), VideoWriter(tmp_path / "file" / "a.mp4", 30) as writer:
+        writer.write(image)
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(os, "replace", refuse)
+    with pytest.raises(OutputError, match="read-only"), VideoWriter(tmp_path / "a.mp4", 30) as w:
+        w.write(image)
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["file"]
+
+
+def test_bad_frames_and_options(tmp_path: Path) -> None:
+    with VideoWriter(tmp_path / "a.mp4", 30) as writer:
+        writer.write(np.zeros((16, 16, 3), np.uint8))
+        for image in (
+            np.zeros((16, 18, 3), np.uint8),
+            np.zeros((16, 16), np.uint8),
+            np.zeros((16, 16, 3)),
+            np.zeros((0, 16, 3), np.uint8),
+        ):
+            with pytest.raises(ShapeError):
+                writer.write(image)
+    with pytest.raises(ConfigurationError, match="mp4"):
+        VideoWriter(tmp_path / "a.xyz", 30)
+    with pytest.raises(ConfigurationError, match="crf"):
+        VideoWriter(tmp_path / "a.mp4", 30, crf=52)
+    for rate in (0, -1, float("nan"), float("inf")):
+        with pytest.raises(ConfigurationError, match="per second"):
+            VideoWriter(tmp_path / "a.mp4", rate)
+
+
+# Files of others.
+
+
+@pytest.mark.parametrize(
+    ("name", "size_wh", "num_frames", "rate"),
+    [
+        ("balance_beam_4cam/cam01.mp4", (1080, 1920), 100, 60),
+        ("handheld_board/cam_0.mp4", (1280, 720), 57, 6),
+        ("walk_sit_mono/cam0.mp4", (720, 720), 187, 20),
+        ("rendered_turn/video.mp4", (640, 480), 103, 30),
+    ],
+)
+def test_real_videos(
+    shared_data: Path, name: str, size_wh: tuple[int, int], num_frames: int, rate: int
+) -> None:
+    reader = VideoReader(shared_data / name, start=num_frames - 3)
+    assert reader.info == (rate, *size_wh, num_frames)
+    assert reader.count_frames() == num_frames
+    assert [frame.index for frame in reader] == list(range(num_frames - 3, num_frames))
+
+
+def test_real_folder_shows_what_the_video_shows(shared_data: Path) -> None:
+    beam = shared_data / "balance_beam_4cam"
+    (whole,) = VideoReader(beam / "cam01.mp4", start=7, stop=8)
+    (half,) = VideoReader(beam / "frames_half" / "cam01", start=7, stop=8)
+    shrunk = np.asarray(Image.fromarray(whole.image).resize((540, 960), Image.Resampling.BOX))
+    assert np.abs(shrunk.astype(float) - half.image).mean() < 4

@@ -1,0 +1,406 @@
+"""BodyModel: tree, flesh and state layout in one object; the map from x to 3D of eq. 1 [IJRR].
+
+A state x is a vector of named parameters. It drives the joints through a linear tie `q = q0 + E x`
+(left-right symmetry, mimic joints). `pose(x)` gives link poses and joint centres, `surface(pose)`
+the mesh nodes, and `lift` turns derivatives at 3D points into gradient and exact Hessian in x (see
+`torchcss.body.lift`). `torchcss.load_body` makes one by name or from a URDF file.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from torchcss.body.catalog import BODY_NAMES, BodySpecification, MarkerSpecification, specification
+from torchcss.body.kinematics import KinematicTree, TreePose
+from torchcss.body.lift import lift_to_joints
+from torchcss.body.surface import SurfaceSample, angular_grid, surface_points
+from torchcss.errors import BodyError, check_shape
+from torchcss.types import Bounds, Curvature, LocalModel, PointCost
+
+
+class BodyPose(NamedTuple):
+    """A posed body, world frame.
+
+    Attributes:
+        x: The state.
+        tree: Link poses and joint twists.
+        joints: Positions of the named joint centres, metres.
+    """
+
+    x: Float[Tensor, "*batch n"]
+    tree: TreePose
+    joints: Float[Tensor, "*batch j 3"]
+
+
+class BodyModel(nn.Module):
+    """An articulated body with flesh, in the type and on the device of its buffers.
+
+    Args:
+        body: Rows of the catalogue, or a specification made from a URDF.
+        rings: Latitudes of the mesh of every part.
+        meridians: Longitudes of the mesh of every part.
+
+    Attributes:
+        name: Name of the body.
+        state_names: Names of the parameters, the order of x.
+        joint_names: Names of the joint centres, the order of `BodyPose.joints`.
+        part_names: Names of the parts of flesh.
+        lengths: Lengths that the body was built with, metres.
+        base_rotation: Orientation of the root link in the world (design decision 11).
+        base_translation: Origin of the root link in the world, metres.
+    """
+
+    tie: Tensor
+    offset: Tensor
+    lower: Tensor
+    upper: Tensor
+    marker_link: Tensor
+    marker_offset: Tensor
+    part_link: Tensor
+    part_rotation: Tensor
+    part_translation: Tensor
+    part_shape: Tensor
+    eta: Tensor
+    omega: Tensor
+    sticky_mean: Tensor
+    sticky_deviation: Tensor
+    base_rotation: Tensor
+    base_translation: Tensor
+
+    def __init__(self, body: BodySpecification, *, rings: int = 8, meridians: int = 12) -> None:
+        super().__init__()
+        self.name = body.name
+        self.lengths = dict(body.lengths)
+        self.tree = KinematicTree(body.joints)
+        self.neighbours = body.neighbours
+        self._lay_out_state(body)
+        real = torch.float64
+        self.joint_names = tuple(marker.name for marker in body.markers)
+        self.part_names = tuple(part.name for part in body.parts)
+        link_of = self.tree.link_index
+
+        def register(name: str, value: Tensor) -> None:
+            self.register_buffer(name, value)
+
+        register("marker_link", torch.tensor([link_of(m.link) for m in body.markers]).long())
+        offsets = torch.tensor([m.translation for m in body.markers], dtype=real)
+        register("marker_offset", offsets.reshape(-1, 3))
+        register("part_link", torch.tensor([link_of(p.link) for p in body.parts]).long())
+        rotations = torch.tensor([p.rotation for p in body.parts], dtype=real)
+        register("part_rotation", rotations.reshape(-1, 3, 3))
+        centres = torch.tensor([p.translation for p in body.parts], dtype=real)
+        register("part_translation", centres.reshape(-1, 3))
+        shapes = torch.tensor([p.shape for p in body.parts], dtype=real)
+        register("part_shape", shapes.reshape(-1, 9))
+        eta, omega = angular_grid(rings, meridians, dtype=real)
+        register("eta", eta)
+        register("omega", omega)
+        register("base_rotation", torch.eye(3, dtype=real))
+        register("base_translation", torch.zeros(3, dtype=real))
+
+    def _lay_out_state(self, body: BodySpecification) -> None:
+        mimics = {j.name: j.mimic for j in body.joints if j.mimic is not None}
+        names: list[str] = []
+        rows: list[tuple[int, float, float]] = []
+        for joint in self.tree.joint_names:
+            driver, factor, offset = joint, 1.0, 0.0
+            if joint in body.ties:
+                driver, factor = body.ties[joint]
+            elif joint in mimics:
+                driver, factor, offset = mimics[joint]
+                if driver not in self.tree.joint_names or driver in mimics:
+                    raise BodyError(
+                        f"joint {joint!r} mimics {driver!r}, which does not move freely"
+                    )
+            if driver not in names:
+                names.append(driver)
+            rows.append((names.index(driver), factor, offset))
+        self.state_names = tuple(names)
+        size = len(names)
+        tie = torch.zeros(len(rows), size, dtype=torch.float64)
+        lower = torch.full((size,), -math.inf, dtype=torch.float64)
+        upper = torch.full((size,), math.inf, dtype=torch.float64)
+        for row, (column, factor, offset) in enumerate(rows):
+            tie[row, column] = factor
+            ends = [(float(b[row]) - offset) / factor for b in (self.tree.lower, self.tree.upper)]
+            lower[column] = max(lower[column], min(ends))
+            upper[column] = min(upper[column], max(ends))
+        self.register_buffer("tie", tie)
+        self.register_buffer("offset", torch.tensor([r[2] for r in rows], dtype=torch.float64))
+        self.register_buffer("lower", lower)
+        self.register_buffer("upper", upper)
+        rest = [body.sticky.get(name, (0.0, math.inf)) for name in names]
+        self.register_buffer("sticky_mean", torch.tensor([r[0] for r in rest], dtype=torch.float64))
+        deviation = torch.tensor([r[1] for r in rest], dtype=torch.float64)
+        self.register_buffer("sticky_deviation", deviation)
+
+    @property
+    def num_parameters(self) -> int:
+        """Number of state parameters n."""
+        return len(self.state_names)
+
+    @property
+    def num_parts(self) -> int:
+        """Number of superquadric parts."""
+        return len(self.part_names)
+
+    @property
+    def bounds(self) -> Bounds:
+        """Joint limits on the state."""
+        return Bounds(self.lower, self.upper)
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Type of the buffers; states must have it too."""
+        return self.tie.dtype
+
+    @property
+    def rest(self) -> Float[Tensor, " n"]:
+        """The rest pose: zero, moved inside the limits."""
+        return self.bounds.project(torch.zeros_like(self.lower))
+
+    def joint_index(self, name: str) -> int:
+        """Position of a joint centre on axis `j`.
+
+        Raises:
+            BodyError: If the body has no such joint centre.
+        """
+        if name not in self.joint_names:
+            raise BodyError(f"{self.name} has no joint {name!r}; it has {list(self.joint_names)}")
+        return self.joint_names.index(name)
+
+    def state_index(self, name: str) -> int:
+        """Position of a state parameter on axis `n`.
+
+        Raises:
+            BodyError: If the body has no such parameter.
+        """
+        if name not in self.state_names:
+            raise BodyError(f"{self.name} has no parameter {name!r}; it has {self.state_names}")
+        return self.state_names.index(name)
+
+    def with_base(
+        self, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]
+    ) -> BodyModel:
+        """The same body hung on another base transform; everything else is shared.
+
+        Args:
+            rotation: Orientation of the root link's frame in the world.
+            translation: Its origin in the world, metres.
+        """
+        other = copy.copy(self)
+        other._buffers = dict(self._buffers)
+        other._buffers["base_rotation"] = rotation.to(self.tie)
+        other._buffers["base_translation"] = translation.to(self.tie)
+        return other
+
+    def pose(self, x: Float[Tensor, "*batch n"]) -> BodyPose:
+        """Pose the body: the map A of eq. 1 [IJRR].
+
+        Args:
+            x: State, radians and metres.
+
+        Returns:
+            Link poses, twists and joint centres in the world.
+        """
+        check_shape("x", x, self.num_parameters)
+        tree = self.tree(x @ self.tie.T + self.offset, self.base_rotation, self.base_translation)
+        return BodyPose(x, tree, self.points_on_links(tree, self.marker_link, self.marker_offset))
+
+    def points_on_links(
+        self, tree: TreePose, link: Int[Tensor, " p"], offset: Float[Tensor, "p 3"]
+    ) -> Float[Tensor, "*batch p 3"]:
+        """World positions of points that are fixed in links.
+
+        Args:
+            tree: Link poses.
+            link: Link of each point.
+            offset: Position in that link's frame, metres.
+        """
+        turned = (tree.rotation[..., link, :, :] * offset[:, None, :]).sum(-1)
+        return turned + tree.translation[..., link, :]
+
+    def part_poses(
+        self, pose: BodyPose
+    ) -> tuple[Float[Tensor, "*batch parts 3 3"], Float[Tensor, "*batch parts 3"]]:
+        """World orientation and centre of every part of flesh."""
+        rotation = pose.tree.rotation[..., self.part_link, :, :]
+        centre = (rotation * self.part_translation[:, None, :]).sum(-1)
+        return rotation @ self.part_rotation, centre + pose.tree.translation[..., self.part_link, :]
+
+    def mesh(self, rings: int | None = None, meridians: int | None = None) -> SurfaceSample:
+        """Nodes and normals of all parts in their own frames, `[parts rings meridians 3]`.
+
+        Args:
+            rings: Latitudes; the model's own by default.
+            meridians: Longitudes; the model's own by default.
+        """
+        eta, omega = self.eta, self.omega
+        if rings is not None or meridians is not None:
+            eta, omega = angular_grid(
+                rings or eta.shape[0],
+                meridians or eta.shape[1],
+                dtype=self.dtype,
+                device=eta.device,
+            )
+        shape = self.part_shape[:, None, None, :]
+        full = (self.num_parts, *eta.shape)
+        return surface_points(shape, eta.expand(full), omega.expand(full))
+
+    def surface(self, pose: BodyPose) -> SurfaceSample:
+        """World positions and unit outward normals of the mesh nodes.
+
+        Args:
+            pose: A posed body.
+
+        Returns:
+            Points and normals of shape `[*batch p 3]`, part by part, ring by ring.
+        """
+        mesh = self.mesh()
+        rotation, centre = self.part_poses(pose)
+        turn = rotation.transpose(-1, -2)
+        points = mesh.points.flatten(1, 2) @ turn + centre[..., None, :]
+        normals = mesh.normals.flatten(1, 2) @ turn
+        return SurfaceSample(points.flatten(-3, -2), normals.flatten(-3, -2))
+
+    def lift(
+        self,
+        pose: BodyPose,
+        points: Float[Tensor, "*batch p 3"],
+        point_link: Int[Tensor, " p"],
+        cost: PointCost,
+        *,
+        curvature: Curvature = Curvature.EXACT,
+    ) -> LocalModel:
+        """Sum a cost over 3D points and differentiate it with respect to the state.
+
+        Args:
+            pose: The posed body at which the cost was evaluated.
+            points: World positions of the points, metres.
+            point_link: The link that carries each point.
+            cost: Value, gradient and Hessian of each point's cost in its position.
+            curvature: Which Hessian; see `Curvature`.
+
+        Returns:
+            Value, gradient and Hessian in x.
+        """
+        if curvature is Curvature.AUTOGRAD:
+            return self._lift_by_autograd(pose, points, point_link, cost)
+        joints = lift_to_joints(
+            pose.tree,
+            self.tree.ancestors,
+            self.tree.joint_ancestors,
+            points,
+            point_link,
+            cost,
+            second_order_kinematics=curvature is Curvature.EXACT,
+        )
+        return LocalModel(
+            joints.value, joints.gradient @ self.tie, self.tie.T @ joints.hessian @ self.tie
+        )
+
+    def _lift_by_autograd(
+        self, pose: BodyPose, points: Tensor, point_link: Tensor, cost: PointCost
+    ) -> LocalModel:
+        """The same by double backward through the kinematics: the reference and the fallback."""
+        rotation, translation = pose.tree.rotation.detach(), pose.tree.translation.detach()
+        local = points.detach() - translation[..., point_link, :]
+        local = (rotation[..., point_link, :, :] * local[..., :, None]).sum(-2)
+        with torch.enable_grad():
+            x = pose.x.detach().requires_grad_()
+            tree = self.tree(
+                x @ self.tie.T + self.offset, self.base_rotation, self.base_translation
+            )
+            moved = (tree.rotation[..., point_link, :, :] * local[..., None, :]).sum(-1)
+            moved = moved + tree.translation[..., point_link, :]
+            step = moved - points.detach()
+            bowl = (step[..., None, :] @ cost.hessian.detach() @ step[..., :, None]).flatten(-3)
+            value = cost.value.detach().sum(-1) + (cost.gradient.detach() * step).sum((-1, -2))
+            value = value + 0.5 * bowl.sum(-1)
+            return differentiate_twice(value, x)
+
+
+def differentiate_twice(value: Float[Tensor, "*batch"], x: Float[Tensor, "*batch n"]) -> LocalModel:
+    """Gradient and Hessian of a batch of scalars by double backward, one row at a time.
+
+    Args:
+        value: Scalars that depend on `x`, item by item.
+        x: The leaf to differentiate with respect to.
+    """
+    (gradient,) = torch.autograd.grad(value.sum(), x, create_graph=True)
+    rows = [
+        torch.autograd.grad(gradient[..., i].sum(), x, retain_graph=True, allow_unused=True)[0]
+        if gradient.requires_grad
+        else None
+        for i in range(x.shape[-1])
+    ]
+    hessian = torch.stack([torch.zeros_like(x) if row is None else row for row in rows], dim=-2)
+    return LocalModel(value.detach(), gradient.detach(), hessian.detach())
+
+
+def load_body(
+    name_or_path: str | Path,
+    *,
+    dtype: torch.dtype = torch.float64,
+    device: torch.device | str = "cpu",
+    lengths: Mapping[str, float] | None = None,
+    scale: float = 1.0,
+    free_proportions: bool = False,
+    free_root: bool | None = None,
+    rings: int = 8,
+    meridians: int = 12,
+) -> BodyModel:
+    """Make a body: one that ships, or the kinematics of a URDF file.
+
+    Args:
+        name_or_path: "arm7", "arm8", "body30", "body32", "body34", or the path of a URDF.
+        dtype: Floating type.
+        device: Where its tensors live.
+        lengths: Lengths that differ from the standard humanoid's, metres.
+        scale: Overall scale of the standard humanoid (stature 1.75 m).
+        free_proportions: Make the lengths parameters too (for fitting).
+        free_root: Six root parameters or none; by default bodies have them and arms do not.
+        rings: Latitudes of the mesh of each part.
+        meridians: Longitudes of the mesh of each part.
+
+    Raises:
+        BodyError: If there is no such body, or the URDF cannot be used.
+    """
+    if str(name_or_path) in BODY_NAMES:
+        body = specification(
+            str(name_or_path),
+            lengths=lengths,
+            scale=scale,
+            free_proportions=free_proportions,
+            free_root=free_root,
+        )
+    elif Path(name_or_path).suffix.lower() in (".urdf", ".xml") or Path(name_or_path).exists():
+        body = _urdf_specification(Path(name_or_path))
+    else:
+        raise BodyError(
+            f"no body {str(name_or_path)!r}; expected one of {', '.join(BODY_NAMES)} or the path of "
+            "a URDF file"
+        )
+    return BodyModel(body, rings=rings, meridians=meridians).to(dtype=dtype, device=device)
+
+
+def _urdf_specification(path: Path) -> BodySpecification:
+    tree = KinematicTree.from_urdf(path)
+    return BodySpecification(
+        name=path.stem,
+        joints=tree.specifications,
+        parts=(),
+        markers=tuple(MarkerSpecification(name=link, link=link) for link in tree.link_names),
+        ties={},
+        sticky={},
+        neighbours=(),
+        lengths={},
+    )

@@ -1,0 +1,64 @@
+"""Parameter stabilisers: long-tailed "sticky" priors on hard-to-see parameters (section 3.2.2 [IJRR]).
+
+Each such parameter has a rest value mu and a deviation sigma; its cost is
+`1/2 rho(((x - mu) / sigma)^2)` with a Lorentzian of unit curvature at rest. Near rest it is the
+Gaussian `N(mu, sigma^2)`; beyond `sqrt(nu)` deviations its pull fades, so a strong observation can
+unstick the parameter and turn the prior off.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchcss.robust import Lorentzian
+from torchcss.types import LocalModel
+
+
+def long_tailed(
+    x: Float[Tensor, "*batch n"],
+    centre: Float[Tensor, "*#batch n"],
+    deviation: Float[Tensor, " n"],
+    nu: float,
+) -> LocalModel:
+    """Sum over parameters of the Lorentzian prior about `centre`, with its derivatives.
+
+    Args:
+        x: States.
+        centre: Where the prior pulls to.
+        deviation: Standard deviation at the centre; infinite for parameters without a prior.
+        nu: Height of the tails, nats: the pull fades beyond `sqrt(nu)` deviations.
+    """
+    z = (x - centre) / deviation
+    rho, first, second = Lorentzian(nu=nu, sigma=nu**0.5)(z.square())
+    curvature = (first + 2 * second * z.square()) / deviation.square()
+    return LocalModel(0.5 * rho.sum(-1), first * z / deviation, torch.diag_embed(curvature))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stabiliser:
+    """The sticky prior of a body's hard-to-see parameters.
+
+    Attributes:
+        nu: Height of the tails, nats; the prior lets go at `sqrt(nu)` deviations.
+    """
+
+    nu: float = 9.0
+
+    def local_model(
+        self,
+        x: Float[Tensor, "*batch n"],
+        mean: Float[Tensor, " n"],
+        deviation: Float[Tensor, " n"],
+    ) -> LocalModel:
+        """Cost, gradient and (diagonal) Hessian.
+
+        Args:
+            x: States.
+            mean: Rest values, `BodyModel.sticky_mean`.
+            deviation: Standard deviations, `BodyModel.sticky_deviation`; infinite where free.
+        """
+        return long_tailed(x, mean, deviation, self.nu)

@@ -1,0 +1,246 @@
+"""What the camera sees of a posed body: occluding contours and self-occlusion (section 3.1 [IJRR]).
+
+The occluding contour of a part is where its normals are perpendicular to the line of sight. On the
+part's mesh it crosses every ring (a closed curve around the part) twice, once each way, and every
+meridian (pole to pole) once; the crossings are found by linear interpolation of `n . (c - p)`
+between neighbouring nodes and are the contour nodes, a fixed number per part. Rings serve limbs seen
+from the side, meridians limbs that point at the camera.
+
+A node is occluded where another part crosses its line of sight in front of it. Parts are taken as
+tapered ellipsoids here; the transition is a ramp some millimetres wide, so that the cost has no
+jump where a limb passes in front of another. A node whose outside touches a neighbouring part (the
+end of the upper arm inside the forearm) lies on no image contour and is left out.
+
+Call `contour_nodes`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from torchcss.body.model import BodyModel, BodyPose
+from torchcss.body.surface import surface_points
+
+
+class ContourNodes(NamedTuple):
+    """Nodes of the occluding contours of all parts, world frame.
+
+    Attributes:
+        points: Positions, metres.
+        normals: Unit outward normals; they are also the contour's normals in the image.
+        exists: False where the ring or meridian has no contour: wholly back-facing or front-facing.
+        visible: 1 where nothing is in front, 0 where another part is, between on the ramp.
+    """
+
+    points: Float[Tensor, "*batch p 3"]
+    normals: Float[Tensor, "*batch p 3"]
+    exists: Bool[Tensor, "*batch p"]
+    visible: Float[Tensor, "*batch p"]
+
+
+class ContourPredictor(nn.Module):
+    """Finds the contour nodes of a body for any number of poses at once.
+
+    Args:
+        body: The body whose parts are predicted.
+        rings: Closed curves per part, each with two nodes.
+        meridians: Pole-to-pole curves per part, each with one node.
+        ramp: Width of the transition between visible and occluded, metres.
+        clearance: How far outside the surface a node must be free of neighbouring parts, metres.
+
+    Attributes:
+        node_part: The part of each node.
+        node_link: The link of each node.
+    """
+
+    node_part: Tensor
+    node_link: Tensor
+    ring_points: Tensor
+    ring_normals: Tensor
+    meridian_points: Tensor
+    meridian_normals: Tensor
+    touching: Tensor
+
+    _RING_STEPS = 16
+    _MERIDIAN_STEPS = 12
+
+    def __init__(
+        self,
+        body: BodyModel,
+        *,
+        rings: int = 7,
+        meridians: int = 6,
+        ramp: float = 0.010,
+        clearance: float = 0.010,
+    ) -> None:
+        super().__init__()
+        self.ramp, self.clearance = ramp, clearance
+        real, device = torch.float64, body.tie.device
+        shape = body.part_shape.to(real)[:, None, None, :]
+        heights = (torch.arange(rings, dtype=real, device=device) + 0.5) * (1.9 / rings) - 0.95
+        around = torch.arange(self._RING_STEPS + 1, dtype=real, device=device)
+        eta, omega = torch.meshgrid(
+            heights.asin(), around * (2 * torch.pi / self._RING_STEPS) - torch.pi, indexing="ij"
+        )
+        full = (body.num_parts, *eta.shape)
+        ring = surface_points(shape, eta.expand(full), omega.expand(full))
+        pole = torch.linspace(-1, 1, self._MERIDIAN_STEPS + 1, dtype=real, device=device)
+        sides = torch.arange(meridians, dtype=real, device=device)
+        omega, eta = torch.meshgrid(
+            sides * (2 * torch.pi / meridians) + 0.1, pole * torch.pi / 2, indexing="ij"
+        )
+        full = (body.num_parts, *eta.shape)
+        meridian = surface_points(shape, eta.expand(full), omega.expand(full))
+        per_part = 2 * rings + meridians
+        parts = torch.arange(body.num_parts, device=device)
+        touching = torch.eye(body.num_parts, dtype=torch.bool, device=device)
+        for first, second in body.neighbours:
+            i, j = body.part_names.index(first), body.part_names.index(second)
+            touching[i, j] = touching[j, i] = True
+        touching &= ~torch.eye(body.num_parts, dtype=torch.bool, device=device)
+        for name, value in (
+            ("node_part", parts.repeat_interleave(per_part)),
+            ("node_link", body.part_link.repeat_interleave(per_part)),
+            ("ring_points", ring.points.to(body.dtype)),
+            ("ring_normals", ring.normals.to(body.dtype)),
+            ("meridian_points", meridian.points.to(body.dtype)),
+            ("meridian_normals", meridian.normals.to(body.dtype)),
+            ("touching", touching),
+        ):
+            self.register_buffer(name, value, persistent=False)
+
+    @property
+    def num_nodes(self) -> int:
+        """Number of contour nodes."""
+        return len(self.node_part)
+
+    def forward(
+        self, body: BodyModel, pose: BodyPose, centre_world: Float[Tensor, "3"]
+    ) -> ContourNodes:
+        """Predict the occluding contours.
+
+        Args:
+            body: The body that this predictor was made for (its base may have moved).
+            pose: Any number of posed bodies.
+            centre_world: The camera's centre, metres.
+
+        Returns:
+            Nodes in the order of `node_part`.
+        """
+        rotation, centre = body.part_poses(pose)
+        eye = ((centre_world - centre)[..., None, :] @ rotation)[..., 0, :]
+        ring = _ring_crossings(self.ring_points, self.ring_normals, eye)
+        meridian = _meridian_crossings(self.meridian_points, self.meridian_normals, eye)
+        points, normals, exists = (
+            torch.cat(pair, dim=eye.dim() - 1) for pair in zip(ring, meridian, strict=True)
+        )
+        normals = normals / normals.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+        turn = rotation.transpose(-1, -2)
+        points = (points @ turn + centre[..., None, :]).flatten(-3, -2)
+        normals = (normals @ turn).flatten(-3, -2)
+        exists = exists.flatten(-2)
+        visible, free = self._occlusion(body, rotation, centre, eye, points, normals)
+        return ContourNodes(points, normals, exists & free, visible)
+
+    def _occlusion(
+        self,
+        body: BodyModel,
+        rotation: Tensor,
+        centre: Tensor,
+        eye: Tensor,
+        points: Tensor,
+        normals: Tensor,
+    ) -> tuple[Float[Tensor, "*batch p"], Bool[Tensor, "*batch p"]]:
+        """Visibility of the nodes, and whether their outside is free of neighbouring parts."""
+        tested = points + self.clearance * normals
+        visible = torch.ones_like(points[..., 0])
+        free = torch.ones_like(visible, dtype=torch.bool)
+        shape = body.part_shape
+        distance = eye.norm(dim=-1)
+        for part in range(body.num_parts):
+            # Everything in the frame of the occluding part, in units of its semi-axes.
+            a = shape[part, :3]
+            origin = (eye[..., part, :] / a)[..., None, :]
+            local = (tested - centre[..., part, None, :]) @ (rotation[..., part, :, :] / a)
+            ray = local - origin
+            ox, oy, oz = origin.unbind(-1)
+            rx, ry, rz = ray.unbind(-1)
+            # Height of closest approach decides the taper of the cross-section.
+            square = rx * rx + ry * ry + rz * rz
+            nearest = -(ox * rx + oy * ry + oz * rz) / square
+            height = (oz + nearest * rz).clamp(-1, 1)
+            fx = 1 / (1 + shape[part, 5] * height)
+            fy = 1 / (1 + shape[part, 6] * height)
+            ox, oy, rx, ry = ox * fx, oy * fy, rx * fx, ry * fy
+            square = rx * rx + ry * ry + rz * rz
+            along = -(ox * rx + oy * ry + oz * rz)
+            miss = (ox * ox + oy * oy + oz * oz) - along * along / square
+            thickness = a[:2].mean()
+            # How deep the ray passes inside, and how far in front of the node it enters, metres.
+            inside = 0.5 * (1 - miss) * thickness
+            entry = (along - (square * (1 - miss).clamp(min=0)).sqrt()) / square
+            front = (1 - entry) * distance[..., part, None]
+            covered = (inside / self.ramp).clamp(0, 1) * (front / self.ramp).clamp(0, 1)
+            own = self.node_part == part
+            visible = visible * (1 - torch.where(own, 0.0, covered))
+            close = (front > -4 * thickness) & (inside > 0)
+            free = free & ~(close & self.touching[part, self.node_part])
+        return visible, free
+
+
+def _ring_crossings(
+    points: Float[Tensor, "parts rings steps 3"],
+    normals: Float[Tensor, "parts rings steps 3"],
+    eye: Float[Tensor, "*batch parts 3"],
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Both crossings of every ring: `[*batch parts 2*rings ...]`."""
+    parts, rings, steps, _ = points.shape
+    facing = _facing(points, normals, eye)
+    before, after = facing[..., :-1], facing[..., 1:]
+    found = []
+    index = torch.arange(parts * rings, device=points.device).reshape(parts, rings)
+    for crossing in ((before < 0) & (after >= 0), (before >= 0) & (after < 0)):
+        exists, step = crossing.max(dim=-1)
+        found.append(
+            (*_interpolate(points, normals, facing, index * steps + step, step), exists)
+        )
+    return tuple(torch.cat(pair, dim=eye.dim() - 1) for pair in zip(*found, strict=True))  # type: ignore[return-value]
+
+
+def _meridian_crossings(
+    points: Float[Tensor, "parts meridians steps 3"],
+    normals: Float[Tensor, "parts meridians steps 3"],
+    eye: Float[Tensor, "*batch parts 3"],
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The crossing of every meridian: `[*batch parts meridians ...]`."""
+    parts, meridians, steps, _ = points.shape
+    facing = _facing(points, normals, eye)
+    crossing = (facing[..., :-1] < 0) != (facing[..., 1:] < 0)
+    exists, step = crossing.max(dim=-1)
+    index = torch.arange(parts * meridians, device=points.device).reshape(parts, meridians)
+    return (*_interpolate(points, normals, facing, index * steps + step, step), exists)
+
+
+def _facing(points: Tensor, normals: Tensor, eye: Tensor) -> Float[Tensor, "*batch parts c steps"]:
+    """`n . (c - p)` at every node; positive where it faces the camera."""
+    flat = normals.flatten(1, 2)
+    towards = (eye[..., None, :] @ flat.transpose(-1, -2))[..., 0, :]
+    offset = (flat * points.flatten(1, 2)).sum(-1)
+    return (towards - offset).unflatten(-1, points.shape[1:3])
+
+
+def _interpolate(
+    points: Tensor, normals: Tensor, facing: Tensor, flat: Int[Tensor, "*batch parts c"], step: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Point and normal where `facing` changes sign between `step` and the next node."""
+    here = facing.gather(-1, step[..., None])[..., 0]
+    there = facing.gather(-1, step[..., None] + 1)[..., 0]
+    change = here - there
+    t = torch.where(change != 0, here / torch.where(change != 0, change, 1), 0.5).clamp(0, 1)
+    table = torch.cat([points, normals], dim=-1).flatten(0, 2)
+    mixed = table[flat] * (1 - t[..., None]) + table[flat + 1] * t[..., None]
+    return mixed[..., :3], mixed[..., 3:]

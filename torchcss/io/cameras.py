@@ -1,0 +1,278 @@
+"""Cameras from calibration files: `cameras.json` and Pose2Sim's `Calib.toml`.
+
+`cameras.json` holds `{"units": "metre, pixel", "cameras": {name: {...}}}`; each camera has `K`
+(3 x 3, pixels), `image_size_wh`, optionally `distortion` (k1 k2 p1 p2 k3), the world-to-camera `R`
+and `t`, and `video`, the name of the file that it took. Pose2Sim's file has one table per camera
+with `name`, `size`, `matrix`, `distortions`, `rotation` (Rodrigues vector) and `translation`, metres.
+
+Units are metres inside (design, decision 12). Where the extrinsics are in another unit, or absent,
+the camera is used in its own frame, x right, y down, z forward: one view needs no more than the
+intrinsics, and a made-up scale would be worse. `LoadedCamera.units_note` says so.
+
+By default: `read_camera(path, video=video_path)`, then `check_image_size(camera, width, height)`.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from torchcss.errors import CameraError
+from torchcss.io.safe_load import load_json, one_line, real_numbers, shortened
+from torchcss.vision.camera import Camera
+
+_METRES = frozenset({"m", "metre", "metres", "meter", "meters"})
+
+
+class LoadedCamera(NamedTuple):
+    """A camera and what its file said about it.
+
+    Attributes:
+        camera: The camera; in its own frame unless `metric`.
+        metric: Whether the world frame is the file's, in metres.
+        units_note: Why the camera is in its own frame, for the user; None if `metric`.
+        video: Name of the video file that the camera took, where the calibration says it.
+    """
+
+    camera: Camera
+    metric: bool
+    units_note: str | None
+    video: str | None
+
+
+class _Entry(NamedTuple):
+    """One camera of a file, whatever the format; `None` for what the file does not have."""
+
+    K: Any
+    image_size_wh: Any
+    distortion: Any
+    rotation: Any
+    translation: Any
+    units: str | None
+    video: str | None = None
+    fisheye: bool = False
+
+
+def read_camera(
+    path: str | os.PathLike[str],
+    *,
+    camera_name: str | None = None,
+    video: str | os.PathLike[str] | None = None,
+) -> LoadedCamera:
+    """Read one camera of a calibration file.
+
+    Args:
+        path: A `.json` or Pose2Sim `.toml` file.
+        camera_name: Which camera. None: the one of `video`, or the only one.
+        video: The video to be tracked; the camera whose `video`, or else whose name, is the name of
+            this file is taken.
+
+    Returns:
+        The camera, in float64.
+
+    Raises:
+        CameraError: If the file is missing or malformed, or which camera is meant is not clear.
+    """
+    path = Path(path)
+    entries = _read_pose2sim(path) if path.suffix.lower() == ".toml" else _read_json(path)
+    name = _choose(path, entries, camera_name, None if video is None else Path(video))
+    entry = entries[name]
+    where = f"{path}: camera {name!r}"
+    if entry.fisheye:
+        raise CameraError(
+            f"{where}: a fisheye lens is not supported; undistort the video first and give the "
+            "camera of the undistorted images"
+        )
+    for key, value in (("K (matrix)", entry.K), ("image_size_wh (size)", entry.image_size_wh)):
+        if value is None:
+            raise CameraError(f"{where}: {key} is missing")
+    intrinsics = real_numbers(entry.K, f"{where}: K", CameraError)
+    size = real_numbers(entry.image_size_wh, f"{where}: image size", CameraError)
+    if size.shape != (2,) or not (np.isfinite(size) & (size == np.round(size))).all():
+        raise CameraError(
+            f"{where}: image size: expected whole numbers [width, height], "
+            f"found {shortened(entry.image_size_wh)}"
+        )
+    optional = {
+        argument: None if value is None else real_numbers(value, f"{where}: {key}", CameraError)
+        for argument, key, value in (
+            ("distortion", "distortion", entry.distortion),
+            ("R_camera_world", "rotation", entry.rotation),
+            ("t_camera_world", "translation", entry.translation),
+        )
+    }
+    rotation = optional["R_camera_world"]
+    if rotation is not None and rotation.shape == (3,):
+        optional["R_camera_world"] = rotation_matrix(rotation, where)
+    try:
+        camera = Camera(intrinsics, (int(size[0]), int(size[1])), name=name, **optional)
+    except CameraError as error:
+        raise CameraError(f"{path}: camera {error}") from error
+    note = _own_frame_note(name, entry)
+    if note is not None:
+        camera = camera.in_own_frame()
+    return LoadedCamera(camera, note is None, note, entry.video)
+
+
+def check_image_size(camera: Camera, width: int, height: int) -> None:
+    """Make sure that a camera belongs to images of this size.
+
+    Args:
+        camera: The camera.
+        width: Columns of the images.
+        height: Rows of the images.
+
+    Raises:
+        CameraError: If the sizes differ; where only the scale does, with the way to rescale.
+    """
+    expected_width, expected_height = camera.image_size_wh
+    if (width, height) == (expected_width, expected_height):
+        return
+    message = (
+        f"camera {camera.name!r} belongs to images of {expected_width} x {expected_height} pixels, "
+        f"these have {width} x {height}"
+    )
+    # Half a pixel of rounding in either side is what resizing to whole pixels leaves.
+    if abs(width * expected_height - height * expected_width) <= max(
+        expected_width, expected_height
+    ):
+        raise CameraError(
+            f"{message}: the same shape at another scale; if the images were only resized, "
+            f"scale the calibration: camera.resized({width}, {height})"
+        )
+    if (height, width) == (expected_width, expected_height):
+        raise CameraError(
+            f"{message}: turned by a right angle; calibrate the video as it is shown upright"
+        )
+    raise CameraError(
+        f"{message}: another shape, so they were cropped or come from another camera; "
+        "use the calibration of this video"
+    )
+
+
+def _own_frame_note(name: str, entry: _Entry) -> str | None:
+    """Say why the file's world frame cannot be used, or None if it can."""
+    if entry.rotation is None or entry.translation is None:
+        why = "has no extrinsics"
+    elif entry.units is None:
+        why = "has extrinsics of unknown unit"
+    else:
+        unit = entry.units.split(",")[0].strip()
+        if unit.lower() in _METRES:
+            return None
+        why = f"has its extrinsics in the unit {unit!r}"
+    return f"camera {name!r} {why}: tracking in the camera's own frame (x right, y down, z forward)"
+
+
+def _choose(
+    path: Path, entries: Mapping[str, Any], camera_name: str | None, video: Path | None
+) -> str:
+    names = ", ".join(entries)
+    if not entries:
+        raise CameraError(f"{path}: no cameras in the file")
+    if camera_name is not None:
+        if camera_name not in entries:
+            raise CameraError(f"{path}: no camera {camera_name!r}; the file has {names}")
+        return camera_name
+    if len(entries) == 1:
+        return next(iter(entries))
+    if video is None:
+        raise CameraError(f"{path}: several cameras, {names}: say which (--camera-name)")
+    exact = [name for name, entry in entries.items() if entry.video == video.name]
+    alike = [name for name in entries if _letters(name) == _letters(video.stem)]
+    for found in (exact, alike):
+        if len(found) == 1:
+            return found[0]
+    raise CameraError(
+        f"{path}: no single camera of {video.name}; say which of {names} it is (--camera-name)"
+    )
+
+
+def _letters(name: str) -> str:
+    """A name without case and separators: `cam_01` is `cam01`."""
+    return re.sub(r"[^a-z0-9]", "", name.lower())
+
+
+def _read_json(path: Path) -> dict[str, _Entry]:
+    content = load_json(path, CameraError)
+    cameras = content.get("cameras") if isinstance(content, dict) else None
+    if not isinstance(cameras, dict):
+        raise CameraError(
+            f"{path}: expected an object 'cameras' with a camera under each name, "
+            f"found {shortened(content)}"
+        )
+    units = content.get("units")
+    entries = {}
+    for name, values in cameras.items():
+        if not isinstance(values, dict):
+            raise CameraError(
+                f"{path}: camera {name!r}: expected an object, found {shortened(values)}"
+            )
+        video = values.get("video")
+        entries[name] = _Entry(
+            K=values.get("K"),
+            image_size_wh=values.get("image_size_wh"),
+            distortion=values.get("distortion"),
+            rotation=values.get("R"),
+            translation=values.get("t"),
+            units=units if isinstance(units, str) else None,
+            video=video if isinstance(video, str) else None,
+        )
+    return entries
+
+
+def _read_pose2sim(path: Path) -> dict[str, _Entry]:
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise CameraError(f"{path}: there is no such file; check the path") from error
+    except (OSError, ValueError, RecursionError) as error:
+        raise CameraError(f"{path}: cannot be read as TOML: {one_line(error)}") from error
+    entries = {}
+    for table, values in content.items():
+        if not isinstance(values, dict) or table == "metadata":
+            continue
+        name = values.get("name", table)
+        if not isinstance(name, str) or name in entries:
+            raise CameraError(
+                f"{path}: table {table!r}: expected a name of its own, found {shortened(name)}"
+            )
+        entries[name] = _Entry(
+            K=values.get("matrix"),
+            image_size_wh=values.get("size"),
+            distortion=values.get("distortions"),
+            rotation=values.get("rotation"),
+            translation=values.get("translation"),
+            units="metre",
+            fisheye=bool(values.get("fisheye", False)),
+        )
+    return entries
+
+
+def rotation_matrix(vector: np.ndarray, where: str = "rotation") -> np.ndarray:
+    """Return the rotation about `vector` by its length in radians (Rodrigues' formula).
+
+    Args:
+        vector: Axis times angle, `[3]`.
+        where: The place in the file, for the message.
+
+    Raises:
+        CameraError: If it has another shape or is not finite.
+    """
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise CameraError(
+            f"{where}: expected a rotation vector of 3 numbers, found {shortened(vector.tolist())}"
+        )
+    x, y, z = vector
+    angle = float(np.linalg.norm(vector))
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    # sin(a) / a and (1 - cos(a)) / a^2, both regular at zero.
+    first = np.sinc(angle / np.pi)
+    second = 0.5 * np.sinc(0.5 * angle / np.pi) ** 2
+    return np.eye(3) + first * cross + second * (cross @ cross)

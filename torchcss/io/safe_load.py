@@ -1,0 +1,103 @@
+"""Reading files that somebody else wrote, JSON and NumPy archives, with one error.
+
+Nothing in such a file is executed (NumPy's pickled objects are refused) and whatever is wrong with
+it ends in the error class that the caller names, in one line.
+
+Call `load_json` and `load_arrays`; `real_numbers` turns a piece of JSON into an array.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchcss.errors import TorchcssError
+
+
+def load_json(path: Path, error_class: type[TorchcssError]) -> Any:
+    """Return the content of a JSON file.
+
+    Raises:
+        error_class: If the file is missing, empty, unreadable or not JSON.
+    """
+    data = _read_bytes(path, error_class)
+    try:
+        return json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise error_class(f"{path}: not a JSON file: {one_line(error)}") from error
+
+
+def load_arrays(path: Path, error_class: type[TorchcssError]) -> Mapping[str, np.ndarray]:
+    """Return all arrays of an NPZ file, in memory.
+
+    Raises:
+        error_class: If the file is missing, damaged, no NPZ file, or holds pickled objects.
+    """
+    if not _read_bytes(path, error_class, 4).startswith(b"PK"):
+        raise error_class(f"{path}: not an NPZ file; expected what numpy.savez writes")
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except Exception as error:  # zipfile, zlib and NumPy raise a dozen kinds for damaged archives
+        reason = (
+            "it holds pickled objects, which could run a programme; save plain arrays"
+            if "pickle" in str(error)
+            else f"{one_line(error)}; get a complete copy"
+        )
+        raise error_class(f"{path}: cannot be read as an NPZ file: {reason}") from error
+
+
+def real_numbers(value: object, where: str, error_class: type[TorchcssError]) -> np.ndarray:
+    """Return nested lists of numbers as a float64 array.
+
+    Args:
+        value: What JSON or TOML gave.
+        where: The place in the file, for the message.
+        error_class: What to raise.
+
+    Raises:
+        error_class: If it is ragged or holds anything but numbers.
+    """
+    try:
+        array = np.asarray(value)
+        # Numbers beyond 64 bit make an object array, which is still one of numbers.
+        if array.dtype.kind not in "iufO" or any(
+            not isinstance(entry, (int, float)) or isinstance(entry, bool)
+            for entry in (array.flat if array.dtype.kind == "O" else ())
+        ):
+            raise ValueError("not numbers")
+        return array.astype(np.float64)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise error_class(f"{where}: expected numbers, found {shortened(value)}") from error
+
+
+def one_line(error: BaseException) -> str:
+    """What an exception says, in one short line."""
+    return " ".join(str(error).split())[:120] or type(error).__name__
+
+
+def shortened(value: object) -> str:
+    """A piece of a file for a message, in one short line."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _read_bytes(path: Path, error_class: type[TorchcssError], size: int = -1) -> bytes:
+    try:
+        if path.is_dir():
+            raise error_class(f"{path}: expected a file, found a folder")
+        with path.open("rb") as stream:
+            data = stream.read(size)
+    except FileNotFoundError as error:
+        raise error_class(f"{path}: there is no such file; check the path") from error
+    except (OSError, ValueError) as error:  # ValueError: a null character in the name
+        if isinstance(error, error_class):
+            raise
+        raise error_class(f"{str(path)!r}: cannot be read: {one_line(error)}") from error
+    if not data:
+        raise error_class(f"{path}: the file is empty")
+    return data

@@ -1,0 +1,519 @@
+"""Frames in and frames out: any video that FFmpeg (PyAV) opens, a folder of images, H.264 output.
+
+A video is a sequence of `Frame(index, time_s, image)`; `index` counts from the first frame of the
+file, whatever `start`, `stop` and `stride` select: keypoints and references keep their place.
+Frames are found by decoding from the beginning, never by seeking: seeking is exact in few
+containers only. Rotation that a telephone writes into the file is applied, as every player does.
+
+A damaged video is read up to the damage. The frames before it are yielded, then a `VideoError` says
+how many there were; whoever consumed them keeps what was computed.
+
+By default: `for frame in VideoReader(path)` and `with VideoWriter(path, frame_rate) as writer`.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Generator, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple, Self
+
+import av
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image, ImageOps
+
+from torchcss.errors import ConfigurationError, ShapeError, VideoError
+from torchcss.io.atomic import output_error, temporary_name
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
+"""What counts as a frame in a folder of images."""
+
+# Demuxers that make pictures out of text or of anything at all: no video comes in them.
+_NOT_VIDEOS = frozenset({"tty", "ansi", "bin", "xbin", "adf", "idf", "rawvideo", "subviewer"})
+
+_SECONDS_BETWEEN_KEY_FRAMES = 1
+
+
+class VideoInfo(NamedTuple):
+    """What is known of a video before it is read.
+
+    Attributes:
+        frame_rate: Mean frames per second.
+        width: Image columns, after rotation.
+        height: Image rows, after rotation.
+        num_frames: What the container says, or None where it does not say;
+            `VideoReader.count_frames` then counts.
+    """
+
+    frame_rate: Fraction
+    width: int
+    height: int
+    num_frames: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One image of a video.
+
+    Attributes:
+        index: Place in the file, from 0, whatever part of the file is read.
+        time_s: Seconds since the file's first frame.
+        image: Red, green, blue.
+    """
+
+    index: int
+    time_s: float
+    image: UInt8[np.ndarray, "h w 3"]
+
+
+class VideoReader:
+    """A video file or a folder of images, as a sequence of frames that can be read again and again.
+
+    Args:
+        path: A video in any container that FFmpeg reads, one image, or a folder of images that are
+            taken in the natural order of their names (`2.png` before `10.png`).
+        start: First frame.
+        stop: The frame before which reading ends; None or beyond the end: to the last.
+        stride: Every how many frames one is taken.
+        image_frame_rate: Frames per second of images, which do not say it themselves.
+
+    Raises:
+        VideoError: If nothing can be read, no frame is selected, or the stride is not positive.
+    """
+
+    info: VideoInfo
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        start: int = 0,
+        stop: int | None = None,
+        stride: int = 1,
+        image_frame_rate: float | Fraction = 30,
+    ) -> None:
+        self.path = Path(path)
+        self._start, self._stop, self._stride = start, stop, stride
+        self._image_frame_rate = Fraction(image_frame_rate).limit_denominator(1001)
+        if stride < 1:
+            raise VideoError(f"{self.path}: stride must be at least 1, got {stride}")
+        if start < 0:
+            raise VideoError(f"{self.path}: start must be at least 0, got {start}")
+        if stop is not None and stop <= start:
+            raise VideoError(
+                f"{self.path}: stop must be greater than start, got start {start}, stop {stop}"
+            )
+        if self._image_frame_rate <= 0:
+            raise VideoError(
+                f"{self.path}: frames per second must be positive, got {image_frame_rate}"
+            )
+        self._iterators: list[Generator[Frame]] = []
+        self._images = self._find_images()
+        self.info = self._probe_container() if self._images is None else self._probe_images()
+        if self.info.num_frames is not None and start >= self.info.num_frames:
+            raise self._beyond_the_end(self.info.num_frames)
+
+    @property
+    def num_selected(self) -> int | None:
+        """How many frames an iteration yields, or None where the container does not tell."""
+        num_frames = self.info.num_frames
+        if num_frames is None:
+            return None
+        stop = num_frames if self._stop is None else min(self._stop, num_frames)
+        return len(range(self._start, stop, self._stride))
+
+    def count_frames(self) -> int:
+        """Count the frames without decoding them; those before the damage, if there is any."""
+        if self._images is not None:
+            return len(self._images)
+        count = 0
+        # What cannot be demuxed ends the count, as it ends the reading.
+        with suppress(av.FFmpegError, OSError), self._open() as container:
+            for packet in container.demux(video=0):
+                if packet.is_corrupt:
+                    break
+                count += bool(packet.size) and not packet.is_discard
+        return count
+
+    def __iter__(self) -> Iterator[Frame]:
+        frames = self._read_container() if self._images is None else self._read_images()
+        self._iterators.append(frames)
+        return frames
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End every iteration that is under way and close its file."""
+        while self._iterators:
+            self._iterators.pop().close()
+
+    def _beyond_the_end(self, num_frames: int) -> VideoError:
+        return VideoError(
+            f"{self.path}: start {self._start} is beyond the end: "
+            f"the video has {num_frames} frames, the last is {num_frames - 1}"
+        )
+
+    # Containers.
+
+    def _open(self) -> av.container.InputContainer:
+        # Only this file: playlists that name other files or addresses are refused.
+        return av.open(f"file:{self.path}", container_options={"protocol_whitelist": "file"})
+
+    def _not_a_video(self, reason: object) -> VideoError:
+        return VideoError(
+            f"{self.path}: not a video that can be read ({_reason(reason)}); expected a complete "
+            "video file or a folder of images"
+        )
+
+    def _probe_container(self) -> VideoInfo:
+        try:
+            with self._open() as container:
+                if _NOT_VIDEOS.intersection(container.format.name.split(",")):
+                    raise self._not_a_video("it holds text or raw bytes")
+                if not container.streams.video:
+                    raise self._not_a_video("it holds no pictures")
+                stream = container.streams.video[0]
+                rate = stream.average_rate or stream.guessed_rate or stream.base_rate
+                num_frames = stream.frames or None
+                first = next(iter(_decode(container)), None)
+                if first is None:
+                    raise self._not_a_video("its first frame cannot be decoded")
+                height, width = _upright(first).shape[:2]
+        except VideoError:
+            raise
+        except (av.FFmpegError, OSError, ValueError, _Damage) as error:
+            raise self._not_a_video(error) from error
+        return VideoInfo(rate or Fraction(25), width, height, num_frames)
+
+    def _read_container(self) -> Generator[Frame]:
+        num_read = 0
+        origin: float | None = None
+        damage: str | None = None
+        try:
+            with self._open() as container:
+                for picture in _decode(container):
+                    index, num_read = num_read, num_read + 1
+                    if origin is None and picture.time is not None:
+                        origin = picture.time
+                    if self._stop is not None and index >= self._stop:
+                        return
+                    if index < self._start or (index - self._start) % self._stride:
+                        continue
+                    image = _upright(picture)
+                    if image.shape[:2] != (self.info.height, self.info.width):
+                        raise VideoError(
+                            f"{self.path}: frame {index} has {image.shape[1]} x {image.shape[0]} "
+                            f"pixels, the first has {self.info.width} x {self.info.height}; "
+                            "all frames must have one size"
+                        )
+                    yield Frame(index, self._time(picture, index, origin), image)
+                container_name = container.format.name
+        except VideoError:
+            raise
+        except (av.FFmpegError, OSError, ValueError, _Damage) as error:
+            damage, container_name = _reason(error), ""
+        if self._stop is not None and num_read >= self._stop:
+            return
+        promised = self.info.num_frames
+        # An MP4 may hide frames by its edit list, so there a smaller count alone is no damage.
+        if (
+            damage is None
+            and promised is not None
+            and num_read < promised
+            and "mp4" not in container_name
+        ):
+            damage = "the file ends early"
+        if damage is not None:
+            of = "" if promised is None else f" of {promised}"
+            raise VideoError(
+                f"{self.path}: {num_read}{of} frames could be read ({damage}); "
+                f"get a complete copy, or use these with stop {num_read}"
+            )
+        if num_read <= self._start:
+            raise self._beyond_the_end(num_read)
+
+    def _time(self, picture: av.VideoFrame, index: int, origin: float | None) -> float:
+        if picture.time is None or origin is None:
+            return float(index / self.info.frame_rate)
+        return float(picture.time - origin)
+
+    # Images.
+
+    def _find_images(self) -> list[Path] | None:
+        try:
+            if self.path.is_dir():
+                images = [
+                    entry
+                    for entry in self.path.iterdir()
+                    if entry.suffix.lower() in IMAGE_SUFFIXES
+                    and not entry.name.startswith(".")
+                    and entry.is_file()
+                ]
+                if not images:
+                    raise VideoError(
+                        f"{self.path}: no images in this folder; expected files that end in "
+                        + ", ".join(IMAGE_SUFFIXES)
+                    )
+                return sorted(images, key=lambda entry: natural_order(entry.name))
+            if not self.path.exists():
+                raise VideoError(
+                    f"{self.path}: there is no such file or folder; check the path of the video"
+                )
+            if not self.path.is_file():
+                raise VideoError(f"{self.path}: expected a file or a folder, found a device")
+            if self.path.stat().st_size == 0:
+                raise VideoError(f"{self.path}: the file is empty; get a complete copy")
+        except VideoError:
+            raise
+        except (OSError, ValueError) as error:  # ValueError: a null character in the name
+            raise VideoError(f"{str(self.path)!r}: cannot be read: {_reason(error)}") from error
+        return [self.path] if self.path.suffix.lower() in IMAGE_SUFFIXES else None
+
+    def _probe_images(self) -> VideoInfo:
+        assert self._images is not None
+        height, width = read_image(self._images[0]).shape[:2]
+        return VideoInfo(self._image_frame_rate, width, height, len(self._images))
+
+    def _read_images(self) -> Generator[Frame]:
+        assert self._images is not None
+        for index in range(len(self._images))[self._start : self._stop : self._stride]:
+            image = read_image(self._images[index])
+            if image.shape[:2] != (self.info.height, self.info.width):
+                raise VideoError(
+                    f"{self._images[index]}: has {image.shape[1]} x {image.shape[0]} pixels, "
+                    f"{self._images[0].name} has {self.info.width} x {self.info.height}; "
+                    "all images of a folder must have one size"
+                )
+            yield Frame(index, float(index / self.info.frame_rate), image)
+
+
+class VideoWriter:
+    """An H.264 video (yuv420p, so that every player shows it), written frame by frame.
+
+    The file has a temporary name until `close`, which an exception inside the `with` block calls
+    too: an interrupted run leaves a shorter film, never a broken one in place of a good one. The
+    size is that of the first frame, the last row or column repeated where H.264 needs an even number.
+
+    Args:
+        path: The file, whose suffix says the container: `.mp4`, `.mov` or `.mkv`.
+        frame_rate: Frames per second.
+        crf: Constant rate factor of x264: 0 without loss, 51 worst; 18 to 24 are usual.
+
+    Raises:
+        ConfigurationError: If the suffix, the rate or the factor makes no sense.
+        OutputError: If the file cannot be written, from any method.
+    """
+
+    def __init__(
+        self, path: str | os.PathLike[str], frame_rate: Fraction | float, *, crf: int = 20
+    ) -> None:
+        self.path = Path(path)
+        if self.path.suffix.lower() not in (".mp4", ".mov", ".mkv"):
+            raise ConfigurationError(
+                f"{self.path}: expected a name that ends in .mp4, .mov or .mkv"
+            )
+        if not 0 <= crf <= 51:
+            raise ConfigurationError(f"crf must lie between 0 and 51, got {crf}")
+        if not 0 < frame_rate < 1e6:
+            raise ConfigurationError(f"frames per second must be positive, got {frame_rate}")
+        self.num_frames = 0
+        self._rate = Fraction(frame_rate).limit_denominator(65535)
+        self._crf = crf
+        self._partial = temporary_name(self.path)
+        self._size_hw: tuple[int, int] | None = None
+        self._container: Any = None
+        self._stream: Any = None
+
+    def write(self, image: UInt8[np.ndarray, "h w 3"]) -> None:
+        """Append one frame, red, green, blue.
+
+        Raises:
+            ShapeError: If it is not an 8-bit colour image of the first frame's size.
+            OutputError: If the disk does not take it.
+        """
+        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not image.size:
+            raise ShapeError(
+                f"image: expected uint8 [height, width, 3], got {image.dtype} {list(image.shape)}"
+            )
+        height, width = image.shape[:2]
+        if self._size_hw not in (None, (height, width)):
+            raise ShapeError(
+                f"image: expected the first frame's size {list(self._size_hw or ())}, "
+                f"got {[height, width]}"
+            )
+        image = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+        try:
+            if self._size_hw is None:
+                self._size_hw = (height, width)
+                self._open(image.shape[1], image.shape[0])
+            picture = av.VideoFrame.from_ndarray(image, format="rgb24")
+            picture.pts = self.num_frames
+            self._container.mux(self._stream.encode(picture))
+        except (av.FFmpegError, OSError) as error:
+            raise output_error(self.path, _as_os_error(error)) from error
+        self.num_frames += 1
+
+    def _open(self, width: int, height: int) -> None:
+        # Written in fragments, so that even a killed process leaves a playable partial file, and
+        # turned into an ordinary MP4 when it is closed.
+        options = {"flush_packets": "1"}
+        if self.path.suffix.lower() != ".mkv":
+            options["movflags"] = "hybrid_fragmented"
+        self._container = av.open(f"file:{self._partial}", "w", options=options)
+        stream = self._container.add_stream("libx264", rate=self._rate)
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        stream.time_base = stream.codec_context.time_base = 1 / self._rate
+        stream.gop_size = max(1, round(_SECONDS_BETWEEN_KEY_FRAMES * self._rate))
+        stream.options = {"crf": str(self._crf), "preset": "veryfast"}
+        self._stream = stream
+
+    def close(self) -> None:
+        """Finish the film and give it its name; without any frame nothing is left behind.
+
+        Raises:
+            OutputError: If the disk is full. What was written is then kept under the final name
+                if no older file has it.
+        """
+        container, self._container = self._container, None
+        if container is None:
+            return
+        try:
+            try:
+                if self.num_frames:
+                    container.mux(self._stream.encode(None))
+            finally:
+                container.close()
+            if self.num_frames:
+                os.replace(self._partial, self.path)
+        except (av.FFmpegError, OSError) as error:
+            if self.num_frames and not self.path.exists():
+                with suppress(OSError):
+                    os.replace(self._partial, self.path)
+            raise output_error(self.path, _as_os_error(error)) from error
+        finally:
+            with suppress(OSError):
+                self._partial.unlink(missing_ok=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if kind is None:
+            self.close()
+            return
+        # The first error is the one to report; a full disk will refuse the closing too.
+        with suppress(OSError):
+            self.close()
+
+
+def read_image(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "h w 3"]:
+    """Read one image as 8-bit red, green, blue, turned upright.
+
+    16-bit grey is scaled to 8 bit; transparent images are laid over black.
+
+    Args:
+        path: An image that Pillow reads.
+
+    Returns:
+        The image `[height, width, 3]`.
+
+    Raises:
+        VideoError: If the file is missing, damaged or no image.
+    """
+    try:
+        with Image.open(path) as opened:
+            picture = ImageOps.exif_transpose(opened)
+            if picture.mode == "F":
+                raise VideoError(
+                    f"{path}: floating-point images have no fixed range; expected 8 or 16 bit"
+                )
+            if picture.mode.startswith("I"):
+                values = np.asarray(picture)
+                grey = (values.astype(np.int64).clip(0, 65535) >> 8).astype(np.uint8)
+                return np.repeat(grey[:, :, None], 3, axis=2)
+            if "A" in picture.getbands() or "transparency" in picture.info:
+                picture = picture.convert("RGBA")
+                black = Image.new("RGBA", picture.size, (0, 0, 0, 255))
+                picture = Image.alpha_composite(black, picture)
+            return np.array(picture.convert("RGB"))
+    except VideoError:
+        raise
+    except Exception as error:  # Pillow's decoders raise whatever their format's damage leads to
+        raise VideoError(
+            f"{path}: not an image that can be read ({_reason(error)}); get a complete copy"
+        ) from error
+
+
+def natural_order(name: str) -> tuple[tuple[int, int | str], ...]:
+    """Return a sorting key in which numbers inside names count as numbers: 2 before 10."""
+    # `[0-9]` and not `\d`: the latter takes signs such as superscripts that `int` refuses.
+    parts = re.split(r"([0-9]+)", name)
+    return tuple(
+        (0, int(part)) if number else (1, part.lower())
+        for number, part in ((index % 2, part) for index, part in enumerate(parts))
+        if part
+    )
+
+
+class _Damage(Exception):
+    """The container goes on, but not with whole frames."""
+
+
+def _decode(container: av.container.InputContainer) -> Iterator[av.VideoFrame]:
+    """Yield the frames of the first video stream; raise at the first damage, after those before."""
+    stream = container.streams.video[0]
+    damage: Exception | None = None
+    packets = container.demux(stream)
+    while damage is None:
+        try:
+            packet = next(packets, None)
+            if packet is None:
+                return
+            if packet.is_corrupt:
+                damage = _Damage("the file is cut off or damaged")
+                break
+            pictures = packet.decode()
+        except (av.FFmpegError, OSError) as error:
+            damage = error
+            break
+        yield from pictures
+    # Frames that the decoder holds back to reorder them are whole.
+    pictures = []
+    with suppress(av.FFmpegError, OSError):
+        pictures = stream.codec_context.decode(None)
+    yield from (picture for picture in pictures if not picture.is_corrupt)
+    raise damage
+
+
+def _upright(picture: av.VideoFrame) -> UInt8[np.ndarray, "h w 3"]:
+    """Return the picture as a player shows it."""
+    image = picture.to_ndarray(format="rgb24")
+    quarter_turns = round(picture.rotation / 90)
+    return np.ascontiguousarray(np.rot90(image, quarter_turns)) if quarter_turns else image
+
+
+def _reason(error: object) -> str:
+    """One short line of what a library said."""
+    said = getattr(error, "strerror", None) or error
+    return " ".join(str(said).split())[:120] or type(error).__name__
+
+
+def _as_os_error(error: Exception) -> OSError:
+    if isinstance(error, OSError):
+        return error
+    return OSError(getattr(error, "errno", 0) or 0, _reason(error))

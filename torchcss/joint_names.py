@@ -1,0 +1,175 @@
+"""Joint names: the catalogue's own, and what every other program calls the same places.
+
+The package speaks H-Anim (ISO/IEC 19774) names, completed by a few landmarks that detectors give
+and H-Anim does not name as joints (nose, eyes, ears, toes, heels, fingertips). `JOINT_NAMES` lists
+them all; `ALIASES` says, for the fixed orders in which detectors and data sets store joints, which
+of ours each column is; `canonical_joint_name` recognises a free spelling.
+
+A column that is no place of ours (small toe, knuckle, inner eye, mid-spine) is `None`: a joint
+that lies some centimetres off is worse than a missing one. Two namings need care:
+
+* `vt1` is the base of the neck, what OpenPose calls Neck: the midpoint of the shoulders.
+* `skullbase` is the upper neck; `skull_tip` the top of the head.
+
+By default call `canonical_joint_name` for files with names and `ALIASES` for files without.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+_PAIRED = (
+    "hip", "knee", "ankle", "midtarsal", "toe", "heel",
+    "eye", "ear", "shoulder", "elbow", "wrist", "hand_tip",
+)  # fmt: skip
+_SINGLE = ("HumanoidRoot", "vl5", "vt1", "skullbase", "skull_tip", "nose")
+
+JOINT_NAMES: Final[tuple[str, ...]] = (
+    "HumanoidRoot",
+    "l_hip", "r_hip", "l_knee", "r_knee", "l_ankle", "r_ankle",
+    "l_midtarsal", "r_midtarsal", "l_toe", "r_toe", "l_heel", "r_heel",
+    "vl5", "vt1", "skullbase", "skull_tip",
+    "nose", "l_eye", "r_eye", "l_ear", "r_ear",
+    "l_shoulder", "r_shoulder", "l_elbow", "r_elbow", "l_wrist", "r_wrist",
+    "l_hand_tip", "r_hand_tip",
+)  # fmt: skip
+"""Every joint and landmark that the bodies of this package name."""
+
+ALIASES: Final[dict[str, tuple[str | None, ...]]] = {
+    # OpenPose's default: 1 Neck, 8 MidHip, 19 to 24 the feet (big toe, small toe, heel).
+    "BODY_25": (
+        "nose", "vt1",
+        "r_shoulder", "r_elbow", "r_wrist", "l_shoulder", "l_elbow", "l_wrist",
+        "HumanoidRoot", "r_hip", "r_knee", "r_ankle", "l_hip", "l_knee", "l_ankle",
+        "r_eye", "l_eye", "r_ear", "l_ear",
+        "l_toe", None, "l_heel", "r_toe", None, "r_heel",
+    ),
+    # OpenPose's experimental model: COCO's order, upper neck and head top, then the feet.
+    "BODY_25B": (
+        "nose", "l_eye", "r_eye", "l_ear", "r_ear",
+        "l_shoulder", "r_shoulder", "l_elbow", "r_elbow", "l_wrist", "r_wrist",
+        "l_hip", "r_hip", "l_knee", "r_knee", "l_ankle", "r_ankle",
+        "skullbase", "skull_tip",
+        "l_toe", None, "l_heel", "r_toe", None, "r_heel",
+    ),
+    "COCO-17": (
+        "nose", "l_eye", "r_eye", "l_ear", "r_ear",
+        "l_shoulder", "r_shoulder", "l_elbow", "r_elbow", "l_wrist", "r_wrist",
+        "l_hip", "r_hip", "l_knee", "r_knee", "l_ankle", "r_ankle",
+    ),
+    "COCO-18": (
+        "nose", "vt1",
+        "r_shoulder", "r_elbow", "r_wrist", "l_shoulder", "l_elbow", "l_wrist",
+        "r_hip", "r_knee", "r_ankle", "l_hip", "l_knee", "l_ankle",
+        "r_eye", "l_eye", "r_ear", "l_ear",
+    ),
+    # The eyes' inner and outer corners, the mouth and the knuckles are no joints of ours.
+    "MediaPipe-33": (
+        "nose", None, "l_eye", None, None, "r_eye", None, "l_ear", "r_ear", None, None,
+        "l_shoulder", "r_shoulder", "l_elbow", "r_elbow", "l_wrist", "r_wrist",
+        None, None, None, None, None, None,
+        "l_hip", "r_hip", "l_knee", "r_knee", "l_ankle", "r_ankle",
+        "l_heel", "r_heel", "l_toe", "r_toe",
+    ),
+    # 7 is the middle of the spine and 9 lies between nose and neck: neither is a place of ours.
+    "H36M-17": (
+        "HumanoidRoot", "r_hip", "r_knee", "r_ankle", "l_hip", "l_knee", "l_ankle",
+        None, "vt1", None, "skull_tip",
+        "l_shoulder", "l_elbow", "l_wrist", "r_shoulder", "r_elbow", "r_wrist",
+    ),
+    # 'foot' is the ball of the foot, 'hand' the knuckles, 'head' the joint under the skull.
+    "SMPL-24": (
+        "HumanoidRoot", "l_hip", "r_hip", "vl5", "l_knee", "r_knee", None, "l_ankle", "r_ankle",
+        None, "l_midtarsal", "r_midtarsal", "vt1", None, None, "skullbase",
+        "l_shoulder", "r_shoulder", "l_elbow", "r_elbow", "l_wrist", "r_wrist", None, None,
+    ),
+    "H-Anim": JOINT_NAMES,
+}  # fmt: skip
+"""Layout name to the catalogue's name of every column, `None` for a place that has none."""
+
+# What else the places are called, written without side, case and separators.
+_PLACES: Final[dict[str, str]] = {
+    **{name.replace("_", "").lower(): name for name in (*_PAIRED, *_SINGLE)},
+    "bigtoe": "toe",
+    "footindex": "toe",
+    "foot": "midtarsal",
+    "forefoot": "midtarsal",
+    "ballfoot": "midtarsal",
+    "balloffoot": "midtarsal",
+    "fingertip": "hand_tip",
+    "middletip": "hand_tip",
+    "middlefinger4": "hand_tip",
+    "middlefingertip": "hand_tip",
+    "hip": "hip",
+    "pelvis": "HumanoidRoot",
+    "root": "HumanoidRoot",
+    "midhip": "HumanoidRoot",
+    "hipcenter": "HumanoidRoot",
+    "lumbar": "vl5",
+    "spine1": "vl5",
+    "neck": "vt1",
+    "neckbase": "vt1",
+    "thorax": "vt1",
+    "upperneck": "skullbase",
+    "head": "skull_tip",
+    "headtop": "skull_tip",
+    "tophead": "skull_tip",
+    "skulltip": "skull_tip",
+}
+_SIDES: Final[dict[str, str]] = {"l": "l_", "left": "l_", "r": "r_", "right": "r_"}
+
+
+def canonical_joint_name(name: str) -> str | None:
+    """Return the catalogue's name for a freely spelt joint.
+
+    Case, separators and the place of the side do not matter: `LShoulder`, `left_shoulder`,
+    `L.Shoulder`, `shoulder_l` and `l_shoulder` are one. `Head` alone is the top of the head
+    (a detector's meaning); `Hip` alone is the middle of the hips.
+
+    Args:
+        name: A joint name of any program.
+
+    Returns:
+        A member of `JOINT_NAMES`, or `None` if the place is none of the catalogue's.
+    """
+    # Words: at every change from lower to upper case, before the last capital of a run of them
+    # (LBigToe is L Big Toe), and at everything that is neither letter nor digit.
+    spaced = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", name)
+    words = [word for word in re.split(r"[^a-z0-9]+", spaced.lower()) if word]
+    side = ""
+    for end in (0, -1):
+        if len(words) > 1 and words[end] in _SIDES:
+            side = _SIDES[words.pop(end)]
+            break
+    place = "".join(words)
+    if not side:
+        # lshoulder, leftshoulder: the side is glued to the word.
+        for prefix in ("left", "right", "l", "r"):
+            if place.startswith(prefix) and _PLACES.get(place.removeprefix(prefix)) in _PAIRED:
+                side, place = _SIDES[prefix], place.removeprefix(prefix)
+                break
+    if not side and place == "hip":
+        return "HumanoidRoot"
+    known = _PLACES.get(place)
+    if known is None or (known in _PAIRED) != bool(side):
+        return None
+    return side + known
+
+
+def layout_of_names(names: tuple[str, ...]) -> tuple[str | None, ...]:
+    """Return the catalogue's name of every column of a file that names its columns.
+
+    Where two columns are the same place, the first has it and the others stay unknown.
+
+    Args:
+        names: The file's own joint names.
+
+    Returns:
+        A catalogue name or `None` for every column.
+    """
+    found: list[str | None] = []
+    for name in names:
+        canonical = canonical_joint_name(name)
+        found.append(None if canonical in found else canonical)
+    return tuple(found)

@@ -1,0 +1,205 @@
+"""Robust error potentials, section 3.1.1 [IJRR].
+
+A residual r enters the cost as e = 1/2 rho(s), where s = r W r^T >= 0 is its squared weighted
+length. Every potential satisfies
+
+    rho(0) = 0,    rho'(0) = nu / sigma^2,    rho increasing,
+
+so that all of them agree on small residuals: a central peak of scale sigma against a spread of
+outliers nu. They differ in what a large residual costs.
+
+| potential | rho(s), with z = s / sigma^2 | saturates at |
+|---|---|---|
+| `Quadratic` | nu z (Gaussian errors) | never |
+| `Lorentzian` | nu log(1 + z) | never, but only logarithmically |
+| `Leclerc` | nu (1 - exp(-z)) | nu |
+| `Truncated` | min(rho_inner(s), rho_inner(threshold)) | rho_inner(threshold) |
+
+By default: `Lorentzian` for correspondences, which pull from afar; `Leclerc`, or either one
+`Truncated` at the edge of a search window, where a missing match must cost as much as the worst.
+
+The derivatives are with respect to s. Those of the cost e with respect to the residual are, with
+v = W r, the gradient rho' v and the Hessian rho' W + 2 rho'' v v^T (eq. 9 [RR]).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchcss.errors import ConfigurationError
+
+
+class RobustValue(NamedTuple):
+    """A potential and its derivatives with respect to the squared weighted error s.
+
+    Attributes:
+        rho: The potential; a cost in nats is half of it.
+        first: First derivative, never negative.
+        second: Second derivative, never positive.
+    """
+
+    rho: Float[Tensor, "*batch"]
+    first: Float[Tensor, "*batch"]
+    second: Float[Tensor, "*batch"]
+
+
+@runtime_checkable
+class RobustPotential(Protocol):
+    """An increasing function of the squared weighted error with its first two derivatives."""
+
+    @property
+    def nu(self) -> float:
+        """Spread of the outliers; the unit in which costs are normalised, eq. 5 [IJRR]."""
+        ...
+
+    @property
+    def sigma(self) -> float:
+        """Scale of the central peak, in the unit of the weighted residual."""
+        ...
+
+    @property
+    def saturation(self) -> float:
+        """Least upper bound of the potential; inf where there is none."""
+        ...
+
+    def __call__(self, s: Float[Tensor, "*batch"]) -> RobustValue:
+        """Evaluate at squared weighted errors, none negative."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Scaled:
+    """The two parameters that every potential has, checked.
+
+    Attributes:
+        nu: Spread of the outliers, positive.
+        sigma: Scale of the central peak in the unit of the weighted residual, positive.
+    """
+
+    nu: float = 1.0
+    sigma: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name, value in (("nu", self.nu), ("sigma", self.sigma)):
+            if not (math.isfinite(value) and value > 0.0):
+                raise ConfigurationError(
+                    f"{type(self).__name__}: {name} must be positive and finite, got {value}"
+                )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Quadratic(_Scaled):
+    """The Gaussian error model, rho = nu s / sigma^2: no outliers expected.
+
+    Attributes:
+        nu: Spread of the outliers, here a mere factor.
+        sigma: Scale of the central peak in the unit of the weighted residual.
+    """
+
+    @property
+    def saturation(self) -> float:
+        """Inf: any residual can be outdone."""
+        return math.inf
+
+    def __call__(self, s: Float[Tensor, "*batch"]) -> RobustValue:
+        """Evaluate at squared weighted errors."""
+        slope = self.nu / self.sigma**2
+        return RobustValue(slope * s, torch.full_like(s, slope), torch.zeros_like(s))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lorentzian(_Scaled):
+    """The Lorentzian potential of section 3.1.1 [IJRR], rho = nu log(1 + s / sigma^2).
+
+    Attributes:
+        nu: Spread of the outliers.
+        sigma: Scale of the central peak in the unit of the weighted residual.
+    """
+
+    @property
+    def saturation(self) -> float:
+        """Inf: the logarithm grows for ever."""
+        return math.inf
+
+    def __call__(self, s: Float[Tensor, "*batch"]) -> RobustValue:
+        """Evaluate at squared weighted errors."""
+        variance = self.sigma**2
+        inverse = (s + variance).reciprocal()
+        first = self.nu * inverse
+        return RobustValue(self.nu * torch.log1p(s / variance), first, -first * inverse)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Leclerc(_Scaled):
+    """The Leclerc potential of section 3.1.1 [IJRR], rho = nu (1 - exp(-s / sigma^2)).
+
+    Attributes:
+        nu: Spread of the outliers; also the cost of a residual without bound.
+        sigma: Scale of the central peak in the unit of the weighted residual.
+    """
+
+    @property
+    def saturation(self) -> float:
+        """The spread of the outliers nu."""
+        return self.nu
+
+    def __call__(self, s: Float[Tensor, "*batch"]) -> RobustValue:
+        """Evaluate at squared weighted errors."""
+        variance = self.sigma**2
+        z = s / variance
+        first = (self.nu / variance) * torch.exp(-z)
+        return RobustValue(-self.nu * torch.expm1(-z), first, -first / variance)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Truncated:
+    """Another potential up to a threshold, and constant from there on.
+
+    The value is continuous; the derivatives jump to zero at the threshold.
+
+    Attributes:
+        inner: The potential below the threshold.
+        threshold: The squared weighted error at which the cost stops rising, e.g. that of a
+            residual as long as a search window.
+    """
+
+    inner: Quadratic | Lorentzian | Leclerc
+    threshold: float
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.threshold) and self.threshold > 0.0):
+            raise ConfigurationError(
+                f"Truncated: threshold must be positive and finite, got {self.threshold}"
+            )
+
+    @property
+    def nu(self) -> float:
+        """Spread of the outliers of the inner potential."""
+        return self.inner.nu
+
+    @property
+    def sigma(self) -> float:
+        """Scale of the central peak of the inner potential."""
+        return self.inner.sigma
+
+    @cached_property
+    def saturation(self) -> float:
+        """The inner potential at the threshold."""
+        return float(self.inner(torch.tensor(self.threshold, dtype=torch.float64)).rho)
+
+    def __call__(self, s: Float[Tensor, "*batch"]) -> RobustValue:
+        """Evaluate at squared weighted errors."""
+        below = s < self.threshold
+        inner = self.inner(s.clamp(max=self.threshold))
+        return RobustValue(
+            inner.rho,
+            torch.where(below, inner.first, 0.0),
+            torch.where(below, inner.second, 0.0),
+        )

@@ -1,0 +1,594 @@
+"""Perspective camera with lens distortion, and its exact first and second derivatives.
+
+The map `P` of section 2 [IJRR], from a point of the world to a pixel:
+
+    x_cam  = R_camera_world x_world + t_camera_world      OpenCV axes: x right, y down, z forward
+    (a, b) = (x_cam, y_cam) / z_cam                       normalised coordinates
+    r2     = a^2 + b^2
+    q      = 1 + k1 r2 + k2 r2^2 + k3 r2^3
+    a'     = a q + 2 p1 a b + p2 (r2 + 2 a^2)             Brown's lens distortion in OpenCV's
+    b'     = b q + p1 (r2 + 2 b^2) + 2 p2 a b             order [k1, k2, p1, p2, k3]
+    (u, v) = (fx a' + cx, fy b' + cy)                     pixel (0, 0) is a pixel's centre
+
+The distortion is the gradient of a scalar function of (a, b), so its second derivatives have only
+four distinct entries. With the sparse derivatives of the perspective division the Hessian of u and
+v costs a few multiplications per point in the camera's frame, and one rotation to the world's.
+
+A term of the cost is a scalar function of the image point. `pull_back` carries its gradient g and
+Hessian H to the 3D point, J being the Jacobian of (u, v):
+
+    gradient = J^T g
+    hessian  = J^T H J + g_u d2u + g_v d2v                (Gauss-Newton keeps the first part only)
+
+A point is *valid* where the model means anything: farther than the near plane, and within the
+radius up to which the distortion polynomial grows. High-order terms of real calibrations fold the
+image back on itself outside the region that was calibrated. An invalid point gets a fixed place
+outside the image and zero derivatives, so that every number stays finite and a term can give it a
+constant cost.
+
+By default: `Camera(K, image_size_wh, ...)` from a calibration, `Camera.pinhole(...)` from a guess;
+`project` where the point is enough, `project_with_derivatives` and `pull_back` inside a term.
+
+A new camera holds its numbers in float64 on the CPU; it computes in its argument's dtype and on
+its argument's device.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple, Self
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from torchcss.errors import CameraError, check_shape
+from torchcss.types import PointCost
+
+_GRAZING_RADIUS = 1.0e4
+"""Normalised radius (0.006 degrees from the image plane) beyond which powers overflow float32."""
+
+_ORTHONORMALITY_TOLERANCE = 1.0e-4
+"""Largest eigenvalue of `R R^T - I` that is taken for rounding in a calibration file."""
+
+_UNDISTORTION_STEPS = 50
+"""Most Newton steps of the undistortion; a handful is enough away from the radius limit."""
+
+
+class Projection(NamedTuple):
+    """Image points.
+
+    Attributes:
+        uv: Pixel coordinates; outside the image where `valid` is False.
+        depth: Distance along the optical axis in metres; negative behind the camera.
+        valid: False where the camera cannot see the direction, whatever the size of its image.
+    """
+
+    uv: Float[Tensor, "*batch p 2"]
+    depth: Float[Tensor, "*batch p"]
+    valid: Bool[Tensor, "*batch p"]
+
+
+class ProjectionModel(NamedTuple):
+    """Image points with their derivatives with respect to the 3D points in the world frame.
+
+    Attributes:
+        uv: Pixel coordinates; outside the image where `valid` is False.
+        jacobian: First derivatives of `uv`, pixels per metre; zero where `valid` is False.
+        hessian: Second derivatives of `uv`, pixels per square metre; zero where `valid` is False.
+        depth: Distance along the optical axis in metres; negative behind the camera.
+        valid: False where the camera cannot see the direction, whatever the size of its image.
+    """
+
+    uv: Float[Tensor, "*batch p 2"]
+    jacobian: Float[Tensor, "*batch p 2 3"]
+    hessian: Float[Tensor, "*batch p 2 3 3"]
+    depth: Float[Tensor, "*batch p"]
+    valid: Bool[Tensor, "*batch p"]
+
+
+class Camera(nn.Module):
+    """A calibrated camera.
+
+    Args:
+        K: Intrinsics `[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]` in pixels.
+        image_size_wh: Width and height of the image that `K` belongs to.
+        distortion: `k1, k2, p1, p2, k3` in OpenCV's order, or the first four. None: no distortion.
+        R_camera_world: Rotation from world to camera axes. None: identity.
+        t_camera_world: The world's origin in the camera's frame, metres. None: zero.
+        name: How messages and files call the camera.
+        near: Points nearer than this depth (metres) are invalid.
+
+    Raises:
+        CameraError: If a value is not finite, `K` is not of the form above, the rotation is not
+            one, or the image is empty.
+    """
+
+    K: Float[Tensor, "3 3"]
+    distortion: Float[Tensor, " 5"]
+    R_camera_world: Float[Tensor, "3 3"]
+    t_camera_world: Float[Tensor, " 3"]
+    maximum_radius: Float[Tensor, ""]
+
+    def __init__(
+        self,
+        K: Tensor | np.ndarray | Sequence[Sequence[float]],
+        image_size_wh: Sequence[int],
+        *,
+        distortion: Tensor | np.ndarray | Sequence[float] | None = None,
+        R_camera_world: Tensor | np.ndarray | Sequence[Sequence[float]] | None = None,
+        t_camera_world: Tensor | np.ndarray | Sequence[float] | None = None,
+        name: str = "camera",
+        near: float = 0.05,
+    ) -> None:
+        super().__init__()
+        width, height = _checked_image_size(name, image_size_wh)
+        if not (math.isfinite(near) and near > 0.0):
+            raise CameraError(f"{name}: near must be a positive number of metres, got {near}")
+        coefficients = _finite_tensor(
+            name, "distortion", [0.0] * 5 if distortion is None else distortion
+        )
+        if coefficients.ndim == 1 and coefficients.numel() == 4:
+            coefficients = torch.cat([coefficients, coefficients.new_zeros(1)])
+        if coefficients.shape != (5,):
+            raise CameraError(
+                f"{name}: distortion must be k1, k2, p1, p2 and optionally k3, got shape "
+                f"{list(coefficients.shape)}; for another lens model undistort the video first"
+            )
+        rotation = _finite_tensor(
+            name, "R_camera_world", torch.eye(3) if R_camera_world is None else R_camera_world, 3, 3
+        )
+        translation = _finite_tensor(
+            name, "t_camera_world", [0.0] * 3 if t_camera_world is None else t_camera_world, 3
+        )
+        self.image_size_wh: tuple[int, int] = (width, height)
+        self.name: str = name
+        self.near: float = float(near)
+        self.register_buffer("K", _checked_intrinsics(name, K))
+        self.register_buffer("distortion", coefficients)
+        self.register_buffer("R_camera_world", _nearest_rotation(name, rotation))
+        self.register_buffer("t_camera_world", translation)
+        self.register_buffer("maximum_radius", _monotonic_radius(coefficients))
+
+    @classmethod
+    def pinhole(
+        cls,
+        width: int,
+        height: int,
+        *,
+        focal_px: float | None = None,
+        field_of_view_degrees: float | None = None,
+        name: str = "pinhole",
+    ) -> Self:
+        """Make a camera without distortion that looks through the middle of the image.
+
+        Args:
+            width: Width of the image in pixels.
+            height: Height of the image in pixels.
+            focal_px: Focal length in pixels; this or the next, not both.
+            field_of_view_degrees: Angle between the left and the right border of the image.
+            name: How messages and files call the camera.
+
+        Raises:
+            CameraError: If not exactly one of the focal length and the field of view is given, or
+                it is out of range.
+        """
+        if (focal_px is None) == (field_of_view_degrees is None):
+            raise CameraError(f"{name}: give either focal_px or field_of_view_degrees")
+        if field_of_view_degrees is not None:
+            if not 0.0 < field_of_view_degrees < 180.0:
+                raise CameraError(
+                    f"{name}: field_of_view_degrees must lie between 0 and 180, "
+                    f"got {field_of_view_degrees}"
+                )
+            focal_px = 0.5 * width / math.tan(math.radians(0.5 * field_of_view_degrees))
+        K = [
+            [focal_px, 0.0, 0.5 * (width - 1)],
+            [0.0, focal_px, 0.5 * (height - 1)],
+            [0.0, 0.0, 1.0],
+        ]
+        return cls(K, (width, height), name=name)
+
+    def extra_repr(self) -> str:
+        """Name, image size and focal lengths, for `repr`."""
+        width, height = self.image_size_wh
+        focal_u, focal_v = torch.diagonal(self.K)[:2].tolist()
+        return f"{self.name}, {width} x {height}, focal {focal_u:.1f} {focal_v:.1f} px"
+
+    @property
+    def centre_world(self) -> Float[Tensor, " 3"]:
+        """The centre of projection in the world frame, metres."""
+        return -self.R_camera_world.mT @ self.t_camera_world
+
+    # From the world to the image.
+
+    def to_camera_frame(self, points_world: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Return the points in the camera's frame, `R x + t`, metres."""
+        check_shape("points_world", points_world, 3)
+        rotation, translation = (
+            self.R_camera_world.to(points_world),
+            self.t_camera_world.to(points_world),
+        )
+        return points_world @ rotation.mT + translation
+
+    def project(self, points_world: Float[Tensor, "*batch p 3"]) -> Projection:
+        """Project points; autograd differentiates it as often as needed.
+
+        Args:
+            points_world: World frame, metres.
+
+        Raises:
+            ShapeError: If the last dimension is not 3.
+        """
+        a, b, _, depth, valid = self._normalise(points_world)
+        distorted_a, distorted_b = _distort(a, b, self.distortion.to(a))
+        return Projection(self._to_pixels(distorted_a, distorted_b, valid), depth, valid)
+
+    def project_with_derivatives(
+        self, points_world: Float[Tensor, "*batch p 3"]
+    ) -> ProjectionModel:
+        """Project points, with closed-form derivatives with respect to the points.
+
+        Args:
+            points_world: World frame, metres.
+
+        Raises:
+            ShapeError: If the last dimension is not 3.
+        """
+        a, b, inverse_depth, depth, valid = self._normalise(points_world)
+        distortion = self.distortion.to(a)
+        distorted_a, distorted_b = _distort(a, b, distortion)
+        d_aa, d_ab, d_bb = _distortion_jacobian(a, b, distortion)
+        d_aaa, d_aab, d_abb, d_bbb = _distortion_hessian(a, b, distortion)
+
+        # In the camera's frame, with w = 1 / z: da = w (1, 0, -a) and db = w (0, 1, -b).
+        scale = torch.where(valid, inverse_depth, 0.0)
+        rows, curvatures = [], []
+        focal_u, focal_v = self.K[0, 0].to(a), self.K[1, 1].to(a)
+        for focal, f_a, f_b, f_aa, f_ab, f_bb in (
+            (focal_u, d_aa, d_ab, d_aaa, d_aab, d_abb),
+            (focal_v, d_ab, d_bb, d_aab, d_abb, d_bbb),
+        ):
+            first, second = focal * scale, focal * scale * inverse_depth
+            along_a, along_b = a * f_aa + b * f_ab, a * f_ab + b * f_bb
+            along = a * f_a + b * f_b
+            rows += [first * f_a, first * f_b, -first * along]
+            curvatures += [
+                second * f_aa,
+                second * f_ab,
+                second * f_bb,
+                -second * (along_a + f_a),
+                -second * (along_b + f_b),
+                second * (a * along_a + b * along_b + 2.0 * along),
+            ]
+        rotation = self.R_camera_world.to(a)
+        shape = a.shape
+        jacobian = torch.stack(rows, dim=-1).reshape(-1, 3) @ rotation
+        hessian = torch.stack(curvatures, dim=-1).reshape(-1, 6) @ _congruence(rotation)
+        return ProjectionModel(
+            uv=self._to_pixels(distorted_a, distorted_b, valid),
+            jacobian=jacobian.reshape(*shape, 2, 3),
+            hessian=hessian.reshape(*shape, 2, 3, 3),
+            depth=depth,
+            valid=valid,
+        )
+
+    def inside_image(self, uv: Float[Tensor, "*batch 2"]) -> Bool[Tensor, "*batch"]:
+        """Tell which image points lie on a pixel; a pixel reaches half its side each way."""
+        check_shape("uv", uv, 2)
+        width, height = self.image_size_wh
+        u, v = uv.unbind(-1)
+        return (u >= -0.5) & (u < width - 0.5) & (v >= -0.5) & (v < height - 0.5)
+
+    # From the image to the world.
+
+    def undistort(
+        self, uv: Float[Tensor, "*batch 2"]
+    ) -> tuple[Float[Tensor, "*batch 2"], Bool[Tensor, "*batch"]]:
+        """Find the normalised coordinates (a, b) whose image is `uv`.
+
+        Newton's method, the step halved per point until the residual falls; where the distortion
+        is monotonic it can be inverted and this converges to rounding.
+
+        Args:
+            uv: Pixel coordinates.
+
+        Returns:
+            The normalised coordinates, and whether the distortion model reaches the pixel at all;
+            where it does not, the coordinates are the nearest found within the monotonic region.
+
+        Raises:
+            ShapeError: If the last dimension is not 2.
+        """
+        check_shape("uv", uv, 2)
+        K, distortion = self.K.to(uv), self.distortion.to(uv)
+        focal = torch.diagonal(K)[:2]
+        target = (uv - K[:2, 2]) / focal
+        limit = self.maximum_radius.to(uv).clamp(max=_GRAZING_RADIUS)
+
+        def residual_of(point: Tensor) -> tuple[Tensor, Tensor]:
+            distorted = _distort(point[..., 0], point[..., 1], distortion)
+            residual = torch.stack(distorted, dim=-1) - target
+            return residual, residual.square().sum(dim=-1)
+
+        point = _within_radius(target, 0.9 * limit)
+        residual, error = residual_of(point)
+        damping = torch.ones_like(error)
+        tolerance = (4.0 * torch.finfo(uv.dtype).eps) ** 2 * (1.0 + target.square().sum(dim=-1))
+        for _ in range(_UNDISTORTION_STEPS):
+            if not (error > tolerance).any():
+                break
+            d_aa, d_ab, d_bb = _distortion_jacobian(point[..., 0], point[..., 1], distortion)
+            determinant = d_aa * d_bb - d_ab * d_ab
+            determinant = torch.where(determinant > 0.0, determinant, 1.0)
+            e_a, e_b = residual.unbind(-1)
+            step = torch.stack([d_bb * e_a - d_ab * e_b, d_aa * e_b - d_ab * e_a], dim=-1)
+            step = step / determinant[..., None]
+            trial = _within_radius(point - damping[..., None] * step, limit)
+            trial_residual, trial_error = residual_of(trial)
+            better = trial_error < error
+            point = torch.where(better[..., None], trial, point)
+            residual = torch.where(better[..., None], trial_residual, residual)
+            error = torch.where(better, trial_error, error)
+            damping = torch.where(better, (2.0 * damping).clamp(max=1.0), 0.5 * damping)
+        # One part in 1e5 of the focal length, far below a calibration's error and above rounding.
+        reached = error.sqrt() < 1.0e-5 * (1.0 + torch.linalg.vector_norm(target, dim=-1))
+        return point, reached
+
+    def rays(self, uv: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
+        """Return unit directions, in the world frame, from `centre_world` through image points.
+
+        A pixel that the distortion does not reach (see `undistort`) gets the nearest direction.
+
+        Args:
+            uv: Pixel coordinates.
+
+        Raises:
+            ShapeError: If the last dimension is not 2.
+        """
+        normalised, _ = self.undistort(uv)
+        direction = torch.cat([normalised, torch.ones_like(normalised[..., :1])], dim=-1)
+        direction = direction / torch.linalg.vector_norm(direction, dim=-1, keepdim=True)
+        return direction @ self.R_camera_world.to(uv)
+
+    def unproject(
+        self, uv: Float[Tensor, "*batch 2"], depth: Float[Tensor, "*batch"]
+    ) -> Float[Tensor, "*batch 3"]:
+        """Return the world points at image points and depths along the optical axis (metres).
+
+        Args:
+            uv: Pixel coordinates.
+            depth: Distance along the optical axis, as `project` returns it.
+
+        Raises:
+            ShapeError: If the last dimension of `uv` is not 2.
+        """
+        normalised, _ = self.undistort(uv)
+        direction = torch.cat([normalised, torch.ones_like(normalised[..., :1])], dim=-1)
+        point = direction * depth[..., None] - self.t_camera_world.to(uv)
+        return point @ self.R_camera_world.to(uv)
+
+    # Cameras made from this one.
+
+    def resized(self, width: int, height: int) -> Camera:
+        """Return the camera of the same image resampled to `width` x `height` pixels.
+
+        The corners of the image stay its corners: `c' = s (c + 1/2) - 1/2`, which is how
+        `interpolate` with `align_corners=False`, OpenCV and ffmpeg resize.
+
+        Raises:
+            CameraError: If the new image is empty.
+        """
+        width, height = _checked_image_size(self.name, (width, height))
+        scale = self.K.new_tensor([width, height]) / self.K.new_tensor(self.image_size_wh)
+        K = self.K.clone()
+        K[:2, :2] = torch.diag(scale * torch.diagonal(self.K)[:2])
+        K[:2, 2] = scale * (self.K[:2, 2] + 0.5) - 0.5
+        return self._like(K, (width, height), self.R_camera_world, self.t_camera_world)
+
+    def scaled(self, factor: float) -> Camera:
+        """Return the camera of the image scaled by `factor`, its size rounded to whole pixels.
+
+        Raises:
+            CameraError: If the factor is not positive.
+        """
+        if not (math.isfinite(factor) and factor > 0.0):
+            raise CameraError(f"{self.name}: the scale factor must be positive, got {factor}")
+        width, height = (max(1, round(side * factor)) for side in self.image_size_wh)
+        return self.resized(width, height)
+
+    def in_own_frame(self) -> Camera:
+        """Return the camera at the origin of the world, its axes those of the world."""
+        rotation = torch.eye(3, dtype=self.K.dtype, device=self.K.device)
+        return self._like(self.K, self.image_size_wh, rotation, self.K.new_zeros(3))
+
+    def _like(
+        self, K: Tensor, image_size_wh: tuple[int, int], rotation: Tensor, translation: Tensor
+    ) -> Camera:
+        camera = Camera(
+            K,
+            image_size_wh,
+            distortion=self.distortion,
+            R_camera_world=rotation,
+            t_camera_world=translation,
+            name=self.name,
+            near=self.near,
+        )
+        return camera.to(device=self.K.device, dtype=self.K.dtype)
+
+    def _normalise(
+        self, points_world: Float[Tensor, "*batch p 3"]
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Return a, b, 1 / depth (zero, zero and one where invalid), depth and valid."""
+        x, y, depth = self.to_camera_frame(points_world).unbind(-1)
+        limit = self.maximum_radius.to(depth).clamp(max=_GRAZING_RADIUS)
+        valid = (depth > self.near) & (x * x + y * y < (limit * depth).square())
+        # Both sides of the division are made harmless before it, so no derivative is NaN either.
+        inverse_depth = torch.where(valid, depth, 1.0).reciprocal()
+        a = torch.where(valid, x, 0.0) * inverse_depth
+        b = torch.where(valid, y, 0.0) * inverse_depth
+        return a, b, inverse_depth, depth, valid
+
+    def _to_pixels(self, a: Tensor, b: Tensor, valid: Tensor) -> Float[Tensor, "*batch p 2"]:
+        K = self.K.to(a)
+        width, height = self.image_size_wh
+        u = torch.where(valid, K[0, 0] * a + K[0, 2], -float(width))
+        v = torch.where(valid, K[1, 1] * b + K[1, 2], -float(height))
+        return torch.stack([u, v], dim=-1)
+
+
+def pull_back(
+    model: ProjectionModel,
+    value: Float[Tensor, "*batch p"],
+    gradient_uv: Float[Tensor, "*batch p 2"],
+    hessian_uv: Float[Tensor, "*batch p 2 2"],
+    *,
+    gauss_newton: bool = False,
+) -> PointCost:
+    """Carry a cost of image points, with its derivatives, to the 3D points that they are images of.
+
+    Args:
+        model: The projection with its derivatives.
+        value: Cost of each point in nats; returned as it is.
+        gradient_uv: Derivative of the cost with respect to `uv`, nats per pixel.
+        hessian_uv: Second derivative, symmetric, nats per square pixel.
+        gauss_newton: Drop the curvature of the projection, as eq. 9 of [RR] does.
+
+    Returns:
+        The same cost as a function of the 3D point; its derivatives are zero at invalid points.
+    """
+    g_u, g_v = gradient_uv[..., 0, None], gradient_uv[..., 1, None]
+    gradient = g_u * model.jacobian[..., 0, :] + g_v * model.jacobian[..., 1, :]
+    hessian = model.jacobian.mT @ (hessian_uv @ model.jacobian)
+    if not gauss_newton:
+        hessian = hessian + g_u[..., None] * model.hessian[..., 0, :, :]
+        hessian = hessian + g_v[..., None] * model.hessian[..., 1, :, :]
+    return PointCost(value, gradient, hessian)
+
+
+def _radial_factors(
+    a: Tensor, b: Tensor, distortion: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return r2, q(r2) and its first and second derivative with respect to r2."""
+    k1, k2, _, _, k3 = distortion.unbind()
+    r2 = a * a + b * b
+    q = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    first = k1 + r2 * (2.0 * k2 + r2 * (3.0 * k3))
+    second = 2.0 * k2 + 6.0 * k3 * r2
+    return r2, q, first, second
+
+
+def _distort(a: Tensor, b: Tensor, distortion: Tensor) -> tuple[Tensor, Tensor]:
+    """Apply the lens distortion to normalised coordinates."""
+    _, _, p1, p2, _ = distortion.unbind()
+    r2, q, _, _ = _radial_factors(a, b, distortion)
+    return (
+        a * q + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a),
+        b * q + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b,
+    )
+
+
+def _distortion_jacobian(a: Tensor, b: Tensor, distortion: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the entries aa, ab, bb of the distortion's Jacobian, which is symmetric."""
+    _, _, p1, p2, _ = distortion.unbind()
+    _, q, q1, _ = _radial_factors(a, b, distortion)
+    return (
+        q + 2.0 * (a * a * q1 + p1 * b + 3.0 * p2 * a),
+        2.0 * (a * b * q1 + p1 * a + p2 * b),
+        q + 2.0 * (b * b * q1 + 3.0 * p1 * b + p2 * a),
+    )
+
+
+def _distortion_hessian(
+    a: Tensor, b: Tensor, distortion: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the entries aaa, aab, abb, bbb of the distortion's symmetric second derivative."""
+    _, _, p1, p2, _ = distortion.unbind()
+    _, _, q1, q2 = _radial_factors(a, b, distortion)
+    return (
+        6.0 * (a * q1 + p2) + 4.0 * a * a * a * q2,
+        2.0 * (b * q1 + p1) + 4.0 * a * a * b * q2,
+        2.0 * (a * q1 + p2) + 4.0 * a * b * b * q2,
+        6.0 * (b * q1 + p1) + 4.0 * b * b * b * q2,
+    )
+
+
+def _congruence(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "6 9"]:
+    """Return the matrix that maps (xx, xy, yy, xz, yz, zz) of S to the nine entries of R^T S R."""
+    rows = []
+    for i, j in ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2)):
+        outer = torch.outer(rotation[i], rotation[j])
+        rows.append((outer if i == j else outer + outer.mT).flatten())
+    return torch.stack(rows)
+
+
+def _within_radius(point: Float[Tensor, "*batch 2"], limit: Tensor) -> Float[Tensor, "*batch 2"]:
+    """Pull points that lie beyond a radius back onto it."""
+    radius = torch.linalg.vector_norm(point, dim=-1, keepdim=True)
+    outside = radius > limit
+    return torch.where(outside, point * (limit / torch.where(outside, radius, 1.0)), point)
+
+
+def _monotonic_radius(distortion: Float[Tensor, " 5"]) -> Float[Tensor, ""]:
+    """Return the radius where the radial distortion stops growing, inf where it never does.
+
+    The derivative of r q(r^2) is 1 + 3 k1 s + 5 k2 s^2 + 7 k3 s^3 with s = r^2. The tangential
+    terms, small in any real lens, are left out.
+    """
+    k1, k2, _, _, k3 = distortion.tolist()
+    roots = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])
+    real = roots.real[np.abs(roots.imag) <= 1.0e-9 * np.abs(roots)]
+    positive = real[real > 0.0]
+    return distortion.new_tensor(math.sqrt(positive.min()) if positive.size else math.inf)
+
+
+def _checked_image_size(name: str, image_size_wh: Sequence[int]) -> tuple[int, int]:
+    sides = tuple(image_size_wh)
+    if len(sides) != 2 or any(int(side) != side or side < 1 for side in sides):
+        raise CameraError(
+            f"{name}: image_size_wh must be a width and a height in whole pixels, got {list(sides)}"
+        )
+    return int(sides[0]), int(sides[1])
+
+
+def _finite_tensor(name: str, what: str, value: object, *shape: int) -> Tensor:
+    """Copy a value into a float64 tensor on the CPU and check it."""
+    array = value.detach().cpu().numpy() if isinstance(value, Tensor) else value
+    try:
+        tensor = torch.from_numpy(np.array(array, dtype=np.float64))
+    except (TypeError, ValueError) as error:
+        raise CameraError(f"{name}: {what} must be numbers, got {value!r}") from error
+    if shape and tensor.shape != shape:
+        raise CameraError(f"{name}: {what} must have shape {list(shape)}, got {list(tensor.shape)}")
+    if not torch.isfinite(tensor).all():
+        raise CameraError(f"{name}: {what} must be finite, got {tensor.tolist()}")
+    return tensor
+
+
+def _checked_intrinsics(name: str, value: object) -> Float[Tensor, "3 3"]:
+    K = _finite_tensor(name, "K", value, 3, 3)
+    if not (K[0, 0] > 0.0 and K[1, 1] > 0.0):
+        raise CameraError(
+            f"{name}: the focal lengths K[0, 0] and K[1, 1] must be positive, "
+            f"got {float(K[0, 0]):g} and {float(K[1, 1]):g}"
+        )
+    rest = torch.stack([K[0, 1], K[1, 0], K[2, 0], K[2, 1], K[2, 2] - 1.0])
+    if (rest.abs() > 1.0e-9 * K[0, 0]).any():
+        raise CameraError(
+            f"{name}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] (no skew), got {K.tolist()}"
+        )
+    return K
+
+
+def _nearest_rotation(name: str, matrix: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
+    u, singular_values, vt = torch.linalg.svd(matrix)
+    error = float((singular_values.square() - 1.0).abs().max())
+    determinant = float(torch.linalg.det(matrix))
+    if error > _ORTHONORMALITY_TOLERANCE or determinant < 0.0:
+        raise CameraError(
+            f"{name}: R_camera_world must be a rotation, but R R^T differs from the identity by "
+            f"{error:.2g} and the determinant is {determinant:.4g}; check the order of its entries"
+        )
+    return u @ vt
