@@ -32,6 +32,14 @@ class VideoError(TorchcssError, ValueError):
     """A video or image folder is missing, empty, truncated or not a video."""
 
 
+class FrameError(TorchcssError, ValueError):
+    """The pixels of a frame cannot be used: not finite, or not grey levels in 0..1."""
+
+
+class FlowFileError(TorchcssError, ValueError):
+    """A `.flo` file is missing, truncated or not a flow file."""
+
+
 class KeypointError(TorchcssError, ValueError):
     """A keypoint file is missing, malformed, of unknown layout or has nobody in it."""
 

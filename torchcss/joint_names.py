@@ -9,7 +9,8 @@ A column that is no place of ours (small toe, knuckle, inner eye, mid-spine) is 
 that lies some centimetres off is worse than a missing one. Two namings need care:
 
 * `vt1` is the base of the neck, what OpenPose calls Neck: the midpoint of the shoulders.
-* `skullbase` is the upper neck; `skull_tip` the top of the head.
+* `vc7` is the lowest neck vertebra, 5 to 7 cm above the shoulder line, what BODY_25B calls upper
+  neck; `skullbase` is where the head turns on the neck; `skull_tip` is the top of the head.
 
 By default call `canonical_joint_name` for files with names and `ALIASES` for files without.
 """
@@ -23,13 +24,13 @@ _PAIRED = (
     "hip", "knee", "ankle", "midtarsal", "toe", "heel",
     "eye", "ear", "shoulder", "elbow", "wrist", "hand_tip",
 )  # fmt: skip
-_SINGLE = ("HumanoidRoot", "vl5", "vt1", "skullbase", "skull_tip", "nose")
+_SINGLE = ("HumanoidRoot", "vl5", "vt1", "vc7", "skullbase", "skull_tip", "nose")
 
 JOINT_NAMES: Final[tuple[str, ...]] = (
     "HumanoidRoot",
     "l_hip", "r_hip", "l_knee", "r_knee", "l_ankle", "r_ankle",
     "l_midtarsal", "r_midtarsal", "l_toe", "r_toe", "l_heel", "r_heel",
-    "vl5", "vt1", "skullbase", "skull_tip",
+    "vl5", "vt1", "vc7", "skullbase", "skull_tip",
     "nose", "l_eye", "r_eye", "l_ear", "r_ear",
     "l_shoulder", "r_shoulder", "l_elbow", "r_elbow", "l_wrist", "r_wrist",
     "l_hand_tip", "r_hand_tip",
@@ -50,7 +51,7 @@ ALIASES: Final[dict[str, tuple[str | None, ...]]] = {
         "nose", "l_eye", "r_eye", "l_ear", "r_ear",
         "l_shoulder", "r_shoulder", "l_elbow", "r_elbow", "l_wrist", "r_wrist",
         "l_hip", "r_hip", "l_knee", "r_knee", "l_ankle", "r_ankle",
-        "skullbase", "skull_tip",
+        "vc7", "skull_tip",
         "l_toe", None, "l_heel", "r_toe", None, "r_heel",
     ),
     "COCO-17": (
@@ -111,7 +112,7 @@ _PLACES: Final[dict[str, str]] = {
     "neck": "vt1",
     "neckbase": "vt1",
     "thorax": "vt1",
-    "upperneck": "skullbase",
+    "upperneck": "vc7",
     "head": "skull_tip",
     "headtop": "skull_tip",
     "tophead": "skull_tip",

@@ -66,6 +66,68 @@ reach, unlike the sideways, forward or hanging arm of the usual orders."""
 
 _DEGREE = math.pi / 180
 
+STABILISERS: dict[str, tuple[float, float]] = {
+    "lumbar_flexion": (0, 15),
+    "lumbar_bending": (0, 12),
+    "lumbar_twist": (0, 15),
+    "neck_flexion": (0, 20),
+    "neck_bending": (0, 15),
+    "neck_twist": (0, 25),
+    "clavicle_elevation": (0, 10),
+    "clavicle_protraction": (0, 10),
+    "shoulder_swing": (-10, 70),
+    "shoulder_raising": (10, 50),
+    "shoulder_twist": (0, 45),
+    "elbow_flexion": (30, 45),
+    "forearm_twist": (0, 40),
+    "wrist_flexion": (0, 20),
+    "wrist_deviation": (0, 15),
+    "hip_flexion": (15, 40),
+    "hip_abduction": (5, 18),
+    "hip_twist": (0, 20),
+    "knee_flexion": (20, 40),
+    "ankle_flexion": (0, 15),
+}
+"""Rest value and deviation, degrees, of the sticky priors of section 3.2.2 [IJRR]; narrow for the
+joints that are hard to see, wide for the rest. The papers give no numbers; these are a third to a
+half of each joint's range, about a relaxed upright stance."""
+
+
+MOTION_RATES: dict[str, float] = {
+    "root_x": 0.7,
+    "root_y": 0.5,
+    "root_z": 0.7,
+    "root_yaw": 1.5,
+    "root_pitch": 0.8,
+    "root_roll": 0.8,
+    "lumbar_flexion": 1.0,
+    "lumbar_bending": 1.0,
+    "lumbar_twist": 1.0,
+    "neck_flexion": 1.0,
+    "neck_bending": 1.0,
+    "neck_twist": 1.5,
+    "clavicle_elevation": 0.7,
+    "clavicle_protraction": 0.7,
+    "shoulder_swing": 3.0,
+    "shoulder_raising": 2.5,
+    "shoulder_twist": 2.5,
+    "elbow_flexion": 3.5,
+    "forearm_twist": 3.0,
+    "wrist_flexion": 2.5,
+    "wrist_deviation": 1.5,
+    "hip_flexion": 2.5,
+    "hip_abduction": 1.5,
+    "hip_twist": 1.5,
+    "knee_flexion": 3.0,
+    "ankle_flexion": 2.0,
+}
+"""Standard deviation of the speed of each parameter in everyday motion, metres or radians per
+second: the scale of the diffusion dynamics (section 4.2 [IJRR]). Brisk, not athletic; the tails of
+the temporal prior leave room for more."""
+
+DEFAULT_RATE = 2.0
+"""Speed assumed for a parameter that `MOTION_RATES` does not list, such as a robot's joint."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class PartSpecification:
@@ -169,6 +231,9 @@ class _Builder:
                 upper=limits[1] * scale,
             )
         )
+        rest = STABILISERS.get(name.removeprefix("l_").removeprefix("r_"))
+        if rest is not None:
+            self.sticky[name] = (rest[0] * _DEGREE, rest[1] * _DEGREE)
         return f"{name}_link"
 
     def stretch(self, length: str, parent: str, direction: Vector, prefix: str = "") -> str:
@@ -233,11 +298,9 @@ def _arm(
         link = build.joint(
             p + "clavicle_elevation", link, (0, 0, 0), _side((0, 0, 1), sign), (-10, 40)
         )
-        build.sticky[p + "clavicle_elevation"] = (0.0, 10 * _DEGREE)
     if "protraction" in clavicle:
         axis = _side((0, -1, 0), sign)
         link = build.joint(p + "clavicle_protraction", link, (0, 0, 0), axis, (-25, 30))
-        build.sticky[p + "clavicle_protraction"] = (0.0, 10 * _DEGREE)
     half = size["shoulder_width"] / 2
     drop = 0.015 if chest else 0.0
     if chest or clavicle:
@@ -273,7 +336,6 @@ def _arm(
     length = size["forearm"]
     if hand:
         link = build.joint(p + "forearm_twist", link, (0, 0, 0), _side((0, 1, 0), sign), (-80, 80))
-        build.sticky[p + "forearm_twist"] = (0.0, 40 * _DEGREE)
     build.part(p + "forearm", link, (0, -0.5 * length, 0), _DOWN, (0.040, 0.042, 0.57 * length),
                taper=(-0.25, -0.25))  # fmt: skip
     link = build.stretch("forearm", link, (0, -1, 0), p)
@@ -281,8 +343,6 @@ def _arm(
     if hand:
         link = build.joint(p + "wrist_flexion", link, (0, 0, 0), _side((0, 0, -1), sign), (-70, 80))
         link = build.joint(p + "wrist_deviation", link, (0, 0, 0), (1, 0, 0), (-30, 20))
-        for angle in ("wrist_flexion", "wrist_deviation"):
-            build.sticky[p + angle] = (0.0, 20 * _DEGREE)
     build.marker(p + "wrist", link)
     length = size["hand"]
     build.part(p + "hand", link, (0, -0.48 * length, 0), _DOWN, (0.020, 0.040, 0.54 * length))
@@ -299,7 +359,6 @@ def _leg(build: _Builder, side: str, parent: str, sign: float) -> None:
     link = build.joint(p + "hip_flexion", link, offset, (-1, 0, 0), (-30, 120))
     link = build.joint(p + "hip_abduction", link, (0, 0, 0), _side((0, 0, 1), sign), (-30, 45))
     link = build.joint(p + "hip_twist", link, (0, 0, 0), _side((0, 1, 0), sign), (-45, 45))
-    build.sticky[p + "hip_twist"] = (0.0, 25 * _DEGREE)
     build.marker(p + "hip", link)
     length = size["thigh"]
     build.part(p + "thigh", link, (0, -0.47 * length, 0), _DOWN, (0.075, 0.082, 0.55 * length),
@@ -312,7 +371,6 @@ def _leg(build: _Builder, side: str, parent: str, sign: float) -> None:
                taper=(-0.33, -0.33))  # fmt: skip
     link = build.stretch("shank", link, (0, -1, 0), p)
     link = build.joint(p + "ankle_flexion", link, (0, -length, 0), (1, 0, 0), (-20, 50))
-    build.sticky[p + "ankle_flexion"] = (0.0, 20 * _DEGREE)
     build.marker(p + "ankle", link)
     length = size["foot"]
     build.part(
@@ -399,8 +457,6 @@ def _torso(build: _Builder, name: str, root: str) -> None:
     link = build.joint("lumbar_flexion", root, (0, 0.12, -0.03), (1, 0, 0), (-25, 80))
     link = build.joint("lumbar_bending", link, (0, 0, 0), (0, 0, 1), (-35, 35))
     link = build.joint("lumbar_twist", link, (0, 0, 0), (0, 1, 0), (-45, 45))
-    for angle in ("flexion", "bending", "twist"):
-        build.sticky[f"lumbar_{angle}"] = (0.0, 15 * _DEGREE)
     build.marker("vl5", link)
     trunk = size["trunk"]
     build.part("chest", link, (0, 0.40 * trunk, 0.025), _UP, (0.150, 0.105, 0.475 * trunk),
@@ -422,8 +478,6 @@ def _torso(build: _Builder, name: str, root: str) -> None:
     link = build.joint("neck_flexion", link, (0, top + size["neck"], 0.02), (1, 0, 0), (-45, 45))
     link = build.joint("neck_bending", link, (0, 0, 0), (0, 0, 1), (-45, 45))
     link = build.joint("neck_twist", link, (0, 0, 0), (0, 1, 0), (-60, 60))
-    for angle in ("flexion", "bending", "twist"):
-        build.sticky[f"neck_{angle}"] = (0.0, 20 * _DEGREE)
     head = size["head"]
     build.marker("vc7", link)
     build.part("neck", link, (0, 0.15 * head, 0.0), _UP, (0.055, 0.058, 0.085))

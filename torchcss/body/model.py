@@ -18,7 +18,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from torchcss.body.catalog import BODY_NAMES, BodySpecification, MarkerSpecification, specification
+from torchcss.body.catalog import (
+    BODY_NAMES,
+    DEFAULT_RATE,
+    MOTION_RATES,
+    BodySpecification,
+    MarkerSpecification,
+    specification,
+)
 from torchcss.body.kinematics import KinematicTree, TreePose
 from torchcss.body.lift import lift_to_joints
 from torchcss.body.surface import SurfaceSample, angular_grid, surface_points
@@ -72,6 +79,7 @@ class BodyModel(nn.Module):
     omega: Tensor
     sticky_mean: Tensor
     sticky_deviation: Tensor
+    motion_rate: Tensor
     base_rotation: Tensor
     base_translation: Tensor
 
@@ -141,6 +149,9 @@ class BodyModel(nn.Module):
         self.register_buffer("sticky_mean", torch.tensor([r[0] for r in rest], dtype=torch.float64))
         deviation = torch.tensor([r[1] for r in rest], dtype=torch.float64)
         self.register_buffer("sticky_deviation", deviation)
+        bare = [name.removeprefix("l_").removeprefix("r_") for name in names]
+        rates = [MOTION_RATES.get(name, DEFAULT_RATE) for name in bare]
+        self.register_buffer("motion_rate", torch.tensor(rates, dtype=torch.float64))
 
     @property
     def num_parameters(self) -> int:

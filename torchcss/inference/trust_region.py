@@ -14,10 +14,10 @@ show the way down (at a saddle), the step goes along the direction of negative c
 inverse iterations with the last factor give; there are no eigenvectors inside the iterations.
 
 Hard bounds are handled by an active set. A variable at a bound whose gradient points outwards is
-fixed; the step is computed on the free ones; whatever would cross a bound is put on it and the
-others are solved again. The candidate is accepted on the true cost, with the decrease predicted for
-the step that was actually taken. Each iteration evaluates `cost.local_model` once, at the
-candidate: its value decides on acceptance and its derivatives are kept if it is accepted.
+fixed; the step is computed on the free ones; whatever would cross a bound is pinned to it (or let
+go again) and the others are solved again. The candidate is accepted on the true cost, with the
+decrease predicted for the step that was actually taken. Each iteration evaluates `cost.local_model`
+once, at the candidate: its value decides on acceptance, its derivatives are kept if accepted.
 
 No item of a batch influences another: radius, damping, acceptance and `Status` are per item, and
 `minimise` drops items as they finish (and restricts the cost by `cost.take(items)` if it has that).
@@ -25,7 +25,7 @@ No item of a batch influences another: radius, damping, acceptance and `Status` 
 An item stops as
 
 * `CONVERGED` when the undamped Newton step, on a positive definite model, promises less than
-  `tolerance` nats: half the squared Newton decrement, which does not depend on the units of the state;
+  `tolerance` nats: half the squared Newton decrement, in which the units of the state cancel;
 * `SMALL_STEP` when only a damped step is left and it promises less than that, or when the promise
   is below the rounding of the cost. A cost that jumps (its matches are found fresh at each state)
   ends here, its radius shrunk by the rejections;
@@ -88,6 +88,8 @@ class TrustRegionInfo(NamedTuple):
 
 _LEAST_RATIO = 1e-4
 """Share of the predicted decrease below which a step is not worth taking."""
+_PINNING_ROUNDS = 12
+"""Solves that may be spent on finding which bounds a step ends at."""
 _GOOD_ERROR = 0.25
 """Relative error of the predicted decrease at which the radius stays as it is (measured: see
 `_next_radius`)."""
@@ -287,7 +289,9 @@ class TrustRegionNewton:
         step, damping = _damped_step(
             hessian, gradient, weight, state.radius, state.damping, floor, self.factorisations
         )
-        step = _step_in_box(hessian, gradient, weight, damping, free, state.x, step, bounds)
+        step = _step_in_box(
+            hessian, gradient, weight, damping, free, state.x, step, bounds, 0.1 * self.tolerance
+        )
         curved = (hessian @ step[..., None])[..., 0]
         predicted = -(step * (gradient + 0.5 * curved)).sum(-1)
         idle = running & (predicted < self.tolerance)
@@ -431,26 +435,44 @@ def _step_in_box(
     x: Float[Tensor, "b n"],
     step: Float[Tensor, "b n"],
     bounds: Bounds,
+    negligible: float,
 ) -> Float[Tensor, "b n"]:
-    """Put what would leave the box on its bound and solve for the other variables again.
+    """Solve the damped quadratic inside the box, for the items whose step leaves it.
 
-    Every round fixes at least one more variable of an item; the matrices stay definite, being
-    principal parts of definite ones.
+    Free variables that cross a bound are pinned to it and the others solved again, until none
+    crosses; a pinned variable is let go again if that lowers the model by more than `negligible`
+    nats (without this, a step can be pinned to nothing at a point that is not stationary). The
+    matrices are principal parts of definite ones. An item not settled in time takes a projected
+    gradient step so short that the model is sure to fall; its damping, changed in place, says so.
     """
-    crossing = free & ((x + step < bounds.lower) | (x + step > bounds.upper))
-    todo = torch.nonzero(crossing.any(-1))[:, 0]
-    while len(todo):
-        h, position = hessian[todo], x[todo]
-        still_free = free[todo] & ~crossing[todo]
-        fixed = torch.where(still_free, 0.0, bounds.project(position + step[todo]) - position)
-        force = torch.where(still_free, gradient[todo] + (h @ fixed[..., None])[..., 0], 0.0)
-        factor, ok = damped_cholesky(mask_free(h, still_free), damping[todo, None] * weight)
-        # Only steepest descent comes without a factor; it is cut at the box as it is.
-        moved = torch.where(ok[:, None], fixed - cholesky_apply(factor, force), step[todo])
+    below, above = free & (x + step < bounds.lower), free & (x + step > bounds.upper)
+    pin = above.to(x) - below.to(x)  # 1 at the upper bound, -1 at the lower
+    todo = torch.nonzero((pin != 0).any(-1))[:, 0]
+    for _ in range(_PINNING_ROUNDS):
+        if not len(todo):
+            break
+        h, g, position, side = hessian[todo], gradient[todo], x[todo], pin[todo]
+        gap = torch.where(side > 0, bounds.upper - position, bounds.lower - position)
+        pinned = torch.where(side != 0, gap, 0.0)
+        loose = free[todo] & (side == 0)
+        force = torch.where(loose, g + (h @ pinned[..., None])[..., 0], 0.0)
+        ridge = damping[todo, None] * weight
+        factor, ok = damped_cholesky(mask_free(h, loose), ridge)
+        moved = torch.where(ok[:, None], pinned - cholesky_apply(factor, force), 0.0)
+        slope = g + (h @ moved[..., None])[..., 0] + ridge * moved
+        diagonal = h.diagonal(dim1=-2, dim2=-1) + ridge
+        gain = slope.square() / (2 * torch.where(diagonal > 0, diagonal, 1.0))
+        released = (side * slope > 0) & (gain > negligible)
         target = position + moved
-        out = still_free & ok[:, None] & ((target < bounds.lower) | (target > bounds.upper))
-        step[todo], free[todo], crossing[todo] = moved, still_free, out
-        todo = todo[out.any(-1)]
+        below, above = loose & (target < bounds.lower), loose & (target > bounds.upper)
+        step[todo] = moved
+        pin[todo] = torch.where(released, 0.0, side) + above.to(x) - below.to(x)
+        todo = todo[(released | below | above).any(-1) | ~ok]
+    if len(todo):
+        # A bound on the largest eigenvalue in the metric W, row by row.
+        rows = (hessian[todo].abs() / (weight[:, None] * weight).sqrt()).sum(-1).amax(-1)
+        damping[todo] += rows
+        step[todo] = -gradient[todo] / weight / damping[todo, None]
     return bounds.project(x + step) - x
 
 

@@ -3,7 +3,8 @@
 `cameras.json` holds `{"units": "metre, pixel", "cameras": {name: {...}}}`; each camera has `K`
 (3 x 3, pixels), `image_size_wh`, optionally `distortion` (k1 k2 p1 p2 k3), the world-to-camera `R`
 and `t`, and `video`, the name of the file that it took. Pose2Sim's file has one table per camera
-with `name`, `size`, `matrix`, `distortions`, `rotation` (Rodrigues vector) and `translation`, metres.
+with `name`, `size`, `matrix`, `distortions`, `rotation` (Rodrigues vector) and `translation` in
+metres.
 
 Units are metres inside (design, decision 12). Where the extrinsics are in another unit, or absent,
 the camera is used in its own frame, x right, y down, z forward: one view needs no more than the
@@ -99,19 +100,25 @@ def read_camera(
             f"{where}: image size: expected whole numbers [width, height], "
             f"found {shortened(entry.image_size_wh)}"
         )
-    optional = {
-        argument: None if value is None else real_numbers(value, f"{where}: {key}", CameraError)
-        for argument, key, value in (
-            ("distortion", "distortion", entry.distortion),
-            ("R_camera_world", "rotation", entry.rotation),
-            ("t_camera_world", "translation", entry.translation),
+    distortion, rotation, translation = (
+        None if value is None else real_numbers(value, f"{where}: {key}", CameraError)
+        for key, value in (
+            ("distortion", entry.distortion),
+            ("rotation", entry.rotation),
+            ("translation", entry.translation),
         )
-    }
-    rotation = optional["R_camera_world"]
+    )
     if rotation is not None and rotation.shape == (3,):
-        optional["R_camera_world"] = rotation_matrix(rotation, where)
+        rotation = rotation_matrix(rotation, where)
     try:
-        camera = Camera(intrinsics, (int(size[0]), int(size[1])), name=name, **optional)
+        camera = Camera(
+            intrinsics,
+            (int(size[0]), int(size[1])),
+            distortion=distortion,
+            R_camera_world=rotation,
+            t_camera_world=translation,
+            name=name,
+        )
     except CameraError as error:
         raise CameraError(f"{path}: camera {error}") from error
     note = _own_frame_note(name, entry)

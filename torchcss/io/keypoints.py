@@ -128,6 +128,7 @@ def read_keypoints(
             f"which has {len(people.frames)} frames"
         )
     report = list(people.report)
+    _check_names(path, people)
     _check_numbers(path, people, report)
     _check_somebody(path, people, first_frame)
     _to_pixels(path, people, image_size_wh, normalised, report)
@@ -224,8 +225,8 @@ def _read_coco(
     frames = [_stack(path, detections.get(image, [])) for image in order]
     _check_counts(path, frames)
     report = ["format: COCO, " + note]
-    confidence = np.concatenate([frame[..., 2].ravel() for frame in frames] or [np.zeros(0)])
-    if confidence.size and np.isin(confidence, (0, 1, 2)).all() and (confidence == 2).any():
+    confidence = np.concatenate([np.zeros(0), *(frame[..., 2].ravel() for frame in frames)])
+    if np.isin(confidence, (0, 1, 2)).all() and (confidence == 2).any():
         # Annotations: 0 not labelled, 1 labelled but hidden, 2 seen.
         frames = [frame * (1.0, 1.0, 0.5) for frame in frames]
         report.append("visibility 0, 1, 2 of the annotations taken as confidence 0, 0.5, 1")
@@ -252,8 +253,9 @@ def _coco_order(
     # Without the list of images, frames in which nobody was seen are absent: the number counts.
     places: dict[int, object] = {}
     for image in found:
-        digits = re.findall(r"[0-9]+", Path(image).stem) if isinstance(image, str) else [image]
-        place = int(digits[-1]) if digits and len(str(digits[-1])) < 10 else -1
+        text = Path(image).stem if isinstance(image, str) else str(image)
+        digits = re.findall(r"[0-9]+", text)
+        place = int(digits[-1]) if digits and len(digits[-1]) < 10 and text[0] != "-" else -1
         if place < 0 or place in places:
             raise KeypointError(
                 f"{path}: image_id {shortened(image)} is not a frame number of its own; "
@@ -269,7 +271,7 @@ def _coco_order(
         )
     if total > 1_000_000:
         raise KeypointError(f"{path}: image {last} is not a frame number; number the frames from 0")
-    order = [places.get(index + origin) for index in range(total)]
+    order: list[object] = [places.get(index + origin) for index in range(total)]
     return order, f"image {origin} is the first frame"
 
 
@@ -299,7 +301,8 @@ def _read_arrays(path: Path) -> _People:
     shape = keypoints.shape[:2]
     if 0 in shape:
         raise KeypointError(f"{path}: keypoints: expected frames and joints, got {list(shape)}")
-    confidence = arrays.get("confidence", np.isfinite(keypoints).all(axis=2).astype(np.float64))
+    finite = np.isfinite(keypoints[..., 0]) & np.isfinite(keypoints[..., 1])
+    confidence = arrays.get("confidence", finite.astype(np.float64))
     if confidence.shape != shape or confidence.dtype.kind not in "biuf":
         raise KeypointError(
             f"{path}: confidence: expected numbers {list(shape)}, "
@@ -310,7 +313,7 @@ def _read_arrays(path: Path) -> _People:
         raise KeypointError(
             f"{path}: joint_names: expected {shape[1]} names, got {names.dtype} {list(names.shape)}"
         )
-    triples = np.concatenate([keypoints, confidence[..., None]], axis=2, dtype=np.float64)
+    triples = np.dstack([keypoints, confidence]).astype(np.float64)
     report = ["format: NPZ"]
     if "confidence" not in arrays:
         report.append("no confidence in the file: 1 for every joint that is a number")
@@ -359,9 +362,7 @@ def _read_clicked(
                 raise KeypointError(
                     f"{where}: expected [u, v] or [u, v, confidence], found {shortened(place)}"
                 )
-            triples[frame, names.index(name)] = (
-                [*numbers[:2], *(numbers[2:] or [1.0])] if (numbers.shape == (2,)) else numbers
-            )
+            triples[frame, names.index(name)] = [*numbers, 1.0][:3]
     unknown = [name for name in names if canonical_joint_name(name) is None]
     if unknown:
         raise KeypointError(
@@ -406,19 +407,32 @@ def _check_counts(path: Path, frames: list[np.ndarray]) -> None:
 # What is checked and decided.
 
 
+def _check_names(path: Path, people: _People) -> None:
+    num_joints = max((frame.shape[1] for frame in people.frames), default=0)
+    if people.names is None or not num_joints:  # nobody in the whole file: another check says so
+        return
+    if len(people.names) != num_joints:
+        raise KeypointError(
+            f"{path}: {len(people.names)} joint names for {num_joints} joints; expected as many"
+        )
+    if len(set(people.names)) < num_joints:
+        raise KeypointError(f"{path}: the same joint name twice in {shortened(people.names)}")
+
+
 def _check_numbers(path: Path, people: _People, report: list[str]) -> None:
     """Refuse numbers that are not finite where they count; bring confidences into their range."""
     clipped = 0
     for index, frame in enumerate(people.frames):
         confidence = frame[..., 2]
-        finite = np.isfinite(frame[..., :2]).all(axis=-1)
+        finite = np.isfinite(frame[..., 0]) & np.isfinite(frame[..., 1])
         bad = np.isnan(confidence) | (~finite & (confidence != 0.0))
         if bad.any():
             joint = int(np.argwhere(bad)[0, -1])
             name = repr(people.names[joint]) if people.names else str(joint)
+            found = float(np.extract(bad, confidence)[0])
             raise KeypointError(
                 f"{path}: frame {index}: joint {name} is not a number though its confidence is "
-                f"{confidence[bad][0]:g}; expected confidence 0 where a joint is missing"
+                f"{found:g}; expected confidence 0 where a joint is missing"
             )
         if (confidence > 10.0).any():
             raise KeypointError(
@@ -496,7 +510,7 @@ def _check_places(path: Path, people: _People, image_size_wh: tuple[int, int]) -
     if (outside > _OUTSIDE * size.max()).any():
         u, v = points[outside.argmax()]
         raise KeypointError(
-            f"{path}: a joint at ({u:.0f}, {v:.0f}) is far outside the image of "
+            f"{path}: a joint at ({u:.5g}, {v:.5g}) is far outside the image of "
             f"{image_size_wh[0]} x {image_size_wh[1]} pixels; expected pixels of this video"
         )
     inside = float((outside <= 0.0).mean())
@@ -580,12 +594,6 @@ def _joint_names(
         known, own = ALIASES[layout], people.names or ()
         report.append(f"layout: {layout}, as asked for")
     elif people.names is not None and any(layout_of_names(people.names)):
-        if len(people.names) != num_joints:
-            raise KeypointError(
-                f"{path}: {len(people.names)} joint names for {num_joints} joints; expected as many"
-            )
-        if len(set(people.names)) < num_joints:
-            raise KeypointError(f"{path}: the same joint name twice in {shortened(people.names)}")
         known, own = layout_of_names(people.names), people.names
         report.append(f"layout: by {num_joints} names")
     elif people.names is None and num_joints in _LAYOUTS_BY_COUNT:

@@ -91,6 +91,16 @@ class OverlayStyle:
     faintest: float = 0.35
     resolution: int = 300_000
 
+    def __post_init__(self) -> None:
+        opacities = (self.fill, self.hidden, self.faintest)
+        if not all(0 <= opacity <= 1 for opacity in opacities):
+            raise ConfigurationError(f"opacities: expected from 0 to 1, got {opacities}")
+        if self.resolution < 1 or (self.line is not None and not self.line > 0):
+            raise ConfigurationError(
+                "overlay style: expected a positive line width and resolution, got "
+                f"{self.line} and {self.resolution}"
+            )
+
 
 class _Window(NamedTuple):
     """The part of the frame that a body can touch, and how coarsely it is rasterised."""

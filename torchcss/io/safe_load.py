@@ -40,7 +40,8 @@ def load_arrays(path: Path, error_class: type[TorchcssError]) -> Mapping[str, np
     if not _read_bytes(path, error_class, 4).startswith(b"PK"):
         raise error_class(f"{path}: not an NPZ file; expected what numpy.savez writes")
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        # The stream is ours: NumPy does not close its own where the archive turns out damaged.
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     except Exception as error:  # zipfile, zlib and NumPy raise a dozen kinds for damaged archives
         reason = (
@@ -63,16 +64,17 @@ def real_numbers(value: object, where: str, error_class: type[TorchcssError]) ->
         error_class: If it is ragged or holds anything but numbers.
     """
     try:
-        array = np.asarray(value)
-        # Numbers beyond 64 bit make an object array, which is still one of numbers.
-        if array.dtype.kind not in "iufO" or any(
-            not isinstance(entry, (int, float)) or isinstance(entry, bool)
-            for entry in (array.flat if array.dtype.kind == "O" else ())
-        ):
-            raise ValueError("not numbers")
-        return array.astype(np.float64)
-    except (ValueError, TypeError, OverflowError) as error:
-        raise error_class(f"{where}: expected numbers, found {shortened(value)}") from error
+        if _only_numbers(value):
+            return np.asarray(value, dtype=np.float64)
+    except (ValueError, TypeError, OverflowError, RecursionError):
+        pass  # ragged, beyond the range of float64, or nested without end
+    raise error_class(f"{where}: expected numbers, found {shortened(value)}")
+
+
+def _only_numbers(value: object) -> bool:
+    if isinstance(value, list):
+        return all(_only_numbers(entry) for entry in value)
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def one_line(error: BaseException) -> str:

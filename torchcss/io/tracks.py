@@ -360,7 +360,7 @@ def _array(
     """Return a float64 copy of checked shape."""
     source: Any = value
     if isinstance(source, Tensor):
-        source = source.detach().cpu()
+        source = source.detach().cpu().numpy()
     array = np.array(source, dtype=np.float64)
     if len(array.shape) != len(shape) or any(
         want not in (None, have) for want, have in zip(shape, array.shape, strict=True)

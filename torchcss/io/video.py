@@ -24,7 +24,9 @@ from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 import av
+import av.container
 import numpy as np
+from av.error import FFmpegError
 from jaxtyping import UInt8
 from PIL import Image, ImageOps
 
@@ -134,7 +136,7 @@ class VideoReader:
             return len(self._images)
         count = 0
         # What cannot be demuxed ends the count, as it ends the reading.
-        with suppress(av.FFmpegError, OSError), self._open() as container:
+        with suppress(FFmpegError, OSError), self._open() as container:
             for packet in container.demux(video=0):
                 if packet.is_corrupt:
                     break
@@ -191,7 +193,7 @@ class VideoReader:
                 height, width = _upright(first).shape[:2]
         except VideoError:
             raise
-        except (av.FFmpegError, OSError, ValueError, _Damage) as error:
+        except (FFmpegError, OSError, ValueError, _Damage) as error:
             raise self._not_a_video(error) from error
         return VideoInfo(rate or Fraction(25), width, height, num_frames)
 
@@ -220,7 +222,7 @@ class VideoReader:
                 container_name = container.format.name
         except VideoError:
             raise
-        except (av.FFmpegError, OSError, ValueError, _Damage) as error:
+        except (FFmpegError, OSError, ValueError, _Damage) as error:
             damage, container_name = _reason(error), ""
         if self._stop is not None and num_read >= self._stop:
             return
@@ -302,7 +304,8 @@ class VideoWriter:
 
     The file has a temporary name until `close`, which an exception inside the `with` block calls
     too: an interrupted run leaves a shorter film, never a broken one in place of a good one. The
-    size is that of the first frame, the last row or column repeated where H.264 needs an even number.
+    size is that of the first frame; where that is odd, which H.264 cannot do, the last row or
+    column is repeated.
 
     Args:
         path: The file, whose suffix says the container: `.mp4`, `.mov` or `.mkv`.
@@ -359,7 +362,7 @@ class VideoWriter:
             picture = av.VideoFrame.from_ndarray(image, format="rgb24")
             picture.pts = self.num_frames
             self._container.mux(self._stream.encode(picture))
-        except (av.FFmpegError, OSError) as error:
+        except (FFmpegError, OSError) as error:
             raise output_error(self.path, _as_os_error(error)) from error
         self.num_frames += 1
 
@@ -395,7 +398,7 @@ class VideoWriter:
                 container.close()
             if self.num_frames:
                 os.replace(self._partial, self.path)
-        except (av.FFmpegError, OSError) as error:
+        except (FFmpegError, OSError) as error:
             if self.num_frames and not self.path.exists():
                 with suppress(OSError):
                     os.replace(self._partial, self.path)
@@ -477,6 +480,9 @@ class _Damage(Exception):
 def _decode(container: av.container.InputContainer) -> Iterator[av.VideoFrame]:
     """Yield the frames of the first video stream; raise at the first damage, after those before."""
     stream = container.streams.video[0]
+    decoder = stream.codec_context
+    if decoder is None:
+        raise _Damage("its codec is unknown")
     damage: Exception | None = None
     packets = container.demux(stream)
     while damage is None:
@@ -488,14 +494,14 @@ def _decode(container: av.container.InputContainer) -> Iterator[av.VideoFrame]:
                 damage = _Damage("the file is cut off or damaged")
                 break
             pictures = packet.decode()
-        except (av.FFmpegError, OSError) as error:
+        except (FFmpegError, OSError) as error:
             damage = error
             break
         yield from pictures
     # Frames that the decoder holds back to reorder them are whole.
     pictures = []
-    with suppress(av.FFmpegError, OSError):
-        pictures = stream.codec_context.decode(None)
+    with suppress(FFmpegError, OSError):
+        pictures = decoder.decode(None)
     yield from (picture for picture in pictures if not picture.is_corrupt)
     raise damage
 

@@ -1,0 +1,171 @@
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchcss.errors import ShapeError
+from torchcss.inference.mixture import (
+    GaussianMixture,
+    bhattacharyya,
+    distinct_modes,
+    draw_components,
+    match_to_prior,
+)
+
+
+def random_mixture(
+    k: int, n: int, *, generator: torch.Generator, size: float = 1.0
+) -> GaussianMixture:
+    def draw(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    root = draw(k, n, n)
+    covariance = size * (root @ root.mT + 0.1 * torch.eye(n).double())
+    return GaussianMixture(5 * size**0.5 * draw(k, n), covariance, draw(k)).normalise()
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    k=st.integers(1, 6),
+    size=st.sampled_from([1e-12, 1.0, 1e12]),
+    offset=st.floats(-1e5, 1e5),
+    seed=st.integers(0, 2**31),
+)
+def test_weights_sum_to_one(k, size, offset, seed):
+    mixture = random_mixture(k, 3, generator=torch.Generator().manual_seed(seed), size=size)
+    shifted = mixture._replace(log_weight=mixture.log_weight + offset)
+    for result in (shifted.normalise(), shifted.prune(2), match_to_prior(shifted, mixture).mixture):
+        assert float(result.log_weight.exp().sum()) == pytest.approx(1)
+    assert shifted.prune(2).log_weight.tolist() == sorted(
+        shifted.prune(2).log_weight.tolist(), reverse=True
+    )
+
+
+def test_weights_far_below_the_smallest_number_keep_their_order():
+    weight = torch.tensor([-1e6, -1e6 - 3.0, -torch.inf])
+    mixture = GaussianMixture(torch.zeros(3, 2), torch.eye(2).expand(3, 2, 2), weight)
+    torch.testing.assert_close(mixture.weight[0] / mixture.weight[1], torch.tensor(math.exp(3)))
+    nothing = mixture._replace(log_weight=torch.full((3,), -torch.inf))
+    torch.testing.assert_close(nothing.weight, torch.full((3,), 1 / 3))
+
+
+@pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
+def test_log_density_is_that_of_torch(batch, generator):
+    mixture = random_mixture(4, 3, generator=generator)
+    x = 5 * torch.randn(*batch, 3, generator=generator, dtype=torch.float64)
+    components = torch.distributions.MultivariateNormal(mixture.mean, mixture.covariance)
+    twin = torch.distributions.MixtureSameFamily(
+        torch.distributions.Categorical(logits=mixture.log_weight), components
+    )
+    torch.testing.assert_close(mixture.log_density(x), twin.log_prob(x))
+
+
+def test_sample_moments(generator):
+    mixture, num = random_mixture(3, 2, generator=generator), 20000
+    x, component = mixture.sample(num, generator=generator)
+    mean, covariance = mixture.moments()
+    deviation = covariance.diagonal().sqrt()
+    assert bool(((x.mean(0) - mean).abs() < 5 * deviation / num**0.5).all())
+    # Four standard errors; the kurtosis of a mixture this wide is below 6.
+    product = (x - mean)[:, :, None] * (x - mean)[:, None, :]
+    error = product.std(0) / num**0.5
+    assert bool(((product.mean(0) - covariance).abs() < 5 * error).all())
+    share = torch.bincount(component, minlength=3) / num
+    assert bool(((share - mixture.weight).abs() < 5 * 0.5 / num**0.5).all())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_singular_mixture(dtype, generator):
+    covariance = torch.diag(torch.tensor([1.0, 0.0], dtype=dtype)).expand(2, 2, 2)
+    mixture = GaussianMixture(
+        torch.tensor([[0.0, 1.0], [0.0, 2.0]], dtype=dtype), covariance, torch.zeros(2).to(dtype)
+    )
+    x, component = mixture.sample(100, generator=generator)
+    assert torch.equal(x[:, 1], mixture.mean[component, 1])
+    assert bool(bhattacharyya(mixture, mixture).diagonal().isfinite().all())
+    assert not bool(mixture.log_density(x).isnan().any())
+    assert match_to_prior(mixture, mixture).parent.tolist() == [0, 1]
+
+
+def test_stratified_components_get_their_share(generator):
+    weight = torch.tensor([0.5, 0.3, 0.2, 0.0]).log()
+    drawn = draw_components(weight, 100, generator=generator, stratified=True)
+    counts = torch.bincount(drawn, minlength=4)
+    assert bool(((counts - torch.tensor([50, 30, 20, 0])).abs() <= 1).all())
+    assert int(draw_components(weight, 1000, generator=generator).max()) < 3
+    assert draw_components(weight, 0, generator=generator).shape == (0,)
+
+
+def planted(generator: torch.Generator, copies: int = 40):
+    """Known modes, each found many times with a small error, in random order."""
+    truth = random_mixture(5, 4, generator=generator)
+    truth = truth._replace(mean=50 * truth.mean)
+    which = torch.arange(5).repeat(copies)[torch.randperm(5 * copies, generator=generator)]
+    error = 0.01 * torch.randn(len(which), 4, generator=generator, dtype=torch.float64)
+    cost = which + 1e-4 * torch.rand(len(which), generator=generator, dtype=torch.float64)
+    return truth, truth.mean[which] + error, truth.covariance[which], cost, which
+
+
+@pytest.mark.parametrize("distance", [0.3, 1.0, 3.0])
+def test_known_modes_are_recovered_whatever_the_threshold(distance, generator):
+    _, mean, covariance, cost, which = planted(generator)
+    kept = distinct_modes(mean, covariance, cost, distance=distance)
+    assert which[kept].tolist() == [0, 1, 2, 3, 4]
+    best = [float(cost[which == i].min()) for i in range(5)]
+    assert cost[kept].tolist() == best
+
+
+def test_order_of_candidates_is_irrelevant(generator):
+    _, mean, covariance, cost, _ = planted(generator)
+    order = torch.randperm(len(mean), generator=generator)
+    kept = distinct_modes(mean, covariance, cost)
+    again = distinct_modes(mean[order], covariance[order], cost[order])
+    assert torch.equal(order[again], kept)
+
+
+def test_only_finite_candidates_are_modes(generator):
+    _, mean, covariance, _, _ = planted(generator)
+    cost = torch.full((len(mean),), torch.inf).double()
+    assert len(distinct_modes(mean, covariance, cost)) == 0
+    cost[3] = 1.0
+    assert distinct_modes(mean, covariance, cost).tolist() == [3]
+
+
+def test_bhattacharyya_as_printed_and_standard(generator):
+    a, b = (random_mixture(k, 3, generator=generator) for k in (2, 4))
+    printed, standard = bhattacharyya(a, b), bhattacharyya(a, b, standard=True)
+    for i in range(2):
+        for j in range(4):
+            total = a.covariance[i] + b.covariance[j]
+            d = a.mean[i] - b.mean[j]
+            squared = d @ torch.linalg.solve(total / 2, d)
+            root = (a.covariance[i].det() * b.covariance[j].det()).sqrt()
+            expected = squared + 0.5 * (total.det() / root).log()
+            torch.testing.assert_close(printed[i, j], expected)
+            expected = squared / 8 + 0.5 * ((total / 2).det() / root).log()
+            torch.testing.assert_close(standard[i, j], expected)
+    torch.testing.assert_close(
+        bhattacharyya(a, a, standard=True).diagonal(), torch.zeros(2).double(), rtol=0, atol=1e-9
+    )
+    with pytest.raises(ShapeError, match="3 and 2 parameters"):
+        bhattacharyya(a, random_mixture(1, 2, generator=generator))
+
+
+def test_matching_multiplies_and_uses_a_prior_mode_once():
+    def mixture(mean, weight):
+        mean = torch.tensor(mean).double()[:, None]
+        return GaussianMixture(
+            mean, torch.ones(len(mean), 1, 1).double(), torch.tensor(weight).double().log()
+        )
+
+    prior = mixture([0.0, 10.0, 99.0], [0.6, 0.3, 0.1])
+    posterior = mixture([0.1, 9.0, 0.2, 50.0], [0.4, 0.3, 0.2, 0.1])
+    got = match_to_prior(posterior, prior)
+    # The third is closest to a component already used; the fourth finds none.
+    assert got.parent.tolist() == [0, 1, 2, -1]
+    weight = torch.tensor([0.4 * 0.6, 0.3 * 0.3, 0.2 * 0.1, 0.1 * 0.1]).double()
+    torch.testing.assert_close(got.mixture.weight, weight / weight.sum())
+    empty = prior._replace(log_weight=torch.tensor([0.0, -torch.inf, -torch.inf]).double())
+    assert match_to_prior(posterior, empty).parent.tolist() == [0, -1, -1, -1]

@@ -1,0 +1,194 @@
+import io
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchcss.errors import ConfigurationError, ShapeError
+from torchcss.inference.dynamics import ConstantVelocity, Diffusion
+from torchcss.inference.mixture import GaussianMixture
+from torchcss.inference.proposals import CovarianceScaled, EigenDirectionGrid, Samples
+from torchcss.inference.tracker import Tracker
+from torchcss.types import LocalModel, Status
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import problems
+
+BOUNDS = problems.box(2, -6, 6)
+CSS = Tracker(proposal=CovarianceScaled(covariance_scale=8), num_samples=40, num_modes=3)
+
+
+def single(mean=(2.0, 1.0), variance=(1.0, 0.25)) -> GaussianMixture:
+    covariance = torch.diag(torch.tensor(variance).double())
+    return GaussianMixture(torch.tensor([mean]).double(), covariance[None], torch.zeros(1).double())
+
+
+def test_both_wells_are_found_and_followed(generator):
+    state = CSS.init(single(), generator=generator)
+    wells = [problems.DoubleWell(slope=0.5 + 0.02 * t) for t in range(5)]
+    for well, (now, info) in zip(wells, CSS.track(state, wells, BOUNDS), strict=True):
+        state = now
+        found = state.mixture.mean[state.mixture.mean[:, 0].argsort()]
+        torch.testing.assert_close(found, well.minima, rtol=0, atol=0.02)
+        assert int(info.num_distinct) == 2
+        assert int(info.status_counts.sum()) == int(info.num_samples) == 40
+        assert float(state.mixture.log_weight.exp().sum()) == pytest.approx(1)
+        # Equal minima share the posterior.
+        assert float(info.effective_sample_size) == pytest.approx(2, abs=0.01)
+    assert int(state.frame) == 5
+    assert sorted(info.parent.tolist()) == [0, 1]
+    assert sorted(info.origin.tolist()) == [0, 1]
+
+
+def test_weights_are_those_of_the_costs(generator):
+    well = problems.DoubleWell(tilt=0.4)
+    state, info = CSS.step(CSS.init(single(), generator=generator), well, BOUNDS)
+    # One prior mode: its weight is one, and the posterior that of the likelihood.
+    expected = (-info.cost).softmax(0)
+    torch.testing.assert_close(state.mixture.weight, expected)
+    assert info.parent.tolist() == [0, -1]
+    evidence = Tracker(proposal=CSS.proposal, num_samples=40, num_modes=3, laplace_evidence=True)
+    state, info = evidence.step(evidence.init(single(), generator=generator), well, BOUNDS)
+    expected = (-info.cost + 0.5 * state.mixture.covariance.logdet()).softmax(0)
+    torch.testing.assert_close(state.mixture.weight, expected)
+
+
+def test_saved_and_restored_runs_continue_exactly(generator):
+    wells = [problems.DoubleWell(tilt=0.1 * t) for t in range(6)]
+    tracker = Tracker(
+        proposal=CSS.proposal,
+        num_samples=20,
+        num_modes=3,
+        dynamics=ConstantVelocity(deviation=0.01),
+    )
+    state = tracker.init(single(), generator=generator)
+    whole = [s for s, _ in tracker.track(state, wells, BOUNDS)][-1]
+    half = [s for s, _ in tracker.track(state, wells[:3], BOUNDS)][-1]
+    file = io.BytesIO()
+    torch.save([half.mixture._asdict(), half.velocity, half.generator_state, half.frame], file)
+    file.seek(0)
+    mixture, *rest = torch.load(file)
+    resumed = type(half)(GaussianMixture(**mixture), *rest)
+    end = [s for s, _ in tracker.track(resumed, wells[3:], BOUNDS)][-1]
+    for a, b in zip((*whole.mixture, *whole[1:]), (*end.mixture, *end[1:]), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_a_step_is_a_pure_function_of_the_state(generator):
+    state = CSS.init(single(), generator=generator)
+    a, _ = CSS.step(state, problems.DoubleWell(), BOUNDS)
+    b, _ = CSS.step(state, problems.DoubleWell(), BOUNDS)
+    assert torch.equal(a.mixture.mean, b.mixture.mean)
+    assert torch.equal(generator.get_state(), state.generator_state)
+
+
+class Shuffled:
+    """A proposal whose samples come in another order."""
+
+    def sample(self, mixture, num, bounds, *, generator):
+        x, parent = CSS.proposal.sample(mixture, num, bounds, generator=generator)
+        order = torch.randperm(len(x), generator=torch.Generator().manual_seed(5))
+        return Samples(x[order], parent[order])
+
+
+def test_the_order_of_the_samples_is_irrelevant(generator):
+    other = Tracker(proposal=Shuffled(), num_samples=40, num_modes=3)
+    well = problems.DoubleWell(tilt=0.3)
+    state = CSS.init(single(), generator=generator)
+    a, b = (t.step(state, well, BOUNDS)[0].mixture for t in (CSS, other))
+    torch.testing.assert_close(a.mean, b.mean, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(a.log_weight, b.log_weight, rtol=1e-6, atol=1e-6)
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    variance=st.sampled_from([0.0, 1e-14, 1.0, 1e14]),
+    num_modes=st.integers(1, 3),
+    single_precision=st.booleans(),
+    seed=st.integers(0, 2**31),
+)
+def test_awkward_covariances(variance, num_modes, single_precision, seed):
+    dtype = torch.float32 if single_precision else torch.float64
+    mixture = single(variance=(variance, 0.5 * variance))
+    mixture = GaussianMixture(*(x.to(dtype) for x in mixture))
+    tracker = Tracker(proposal=CSS.proposal, num_samples=15, num_modes=num_modes)
+    state = tracker.init(mixture, generator=torch.Generator().manual_seed(seed))
+    for state, info in tracker.track(state, [problems.DoubleWell(tilt=0.2)] * 3, BOUNDS):  # noqa: B020
+        assert 1 <= len(state.mixture.mean) <= num_modes
+        assert all(bool(x.isfinite().all()) for x in state.mixture)
+        assert state.mixture.mean.dtype == dtype
+        assert float(state.mixture.weight.sum()) == pytest.approx(1, abs=1e-5)
+        assert float(info.cost.min()) < 1
+
+
+def test_all_samples_in_one_minimum(generator):
+    bowl = problems.Bowl(4 * torch.eye(2).double(), torch.tensor([0.5, 0.0]).double())
+    state, info = CSS.step(CSS.init(single(), generator=generator), bowl, BOUNDS)
+    assert state.mixture.mean.shape == (1, 2)
+    assert float(state.mixture.log_weight) == 0
+    assert int(info.num_distinct) == 1
+    assert info.parent.tolist() == [0]
+
+
+class Nowhere(problems.DoubleWell):
+    def local_model(self, x):
+        return LocalModel(*(torch.full_like(v, torch.nan) for v in super().local_model(x)))
+
+
+def test_no_sample_with_a_finite_cost_carries_the_prior_over(generator):
+    tracker = Tracker(
+        proposal=CSS.proposal, num_samples=10, num_modes=3, dynamics=Diffusion(deviation=0.5)
+    )
+    start = tracker.init(single(), generator=generator)
+    state, info = tracker.step(start, Nowhere(), BOUNDS)
+    assert torch.equal(state.mixture.mean, start.mixture.mean)
+    assert bool((state.mixture.covariance - start.mixture.covariance).diagonal(0, 1, 2).gt(0).all())
+    assert int(info.status_counts[Status.NON_FINITE]) == 10
+    assert int(info.num_distinct) == 0
+    assert info.cost.tolist() == [torch.inf]
+    state, info = tracker.step(state, problems.DoubleWell(), BOUNDS)
+    assert float(info.cost.min()) < 0.01
+
+
+def test_weights_do_not_underflow(generator):
+    """The lesser mode lies 40 nats a frame behind, far below the smallest number after 100."""
+    tracker = Tracker(proposal=EigenDirectionGrid(), num_samples=20, num_modes=2)
+    well = problems.DoubleWell(barrier=100, tilt=10.0)
+    both = GaussianMixture(
+        well.minima, 0.01 * torch.eye(2).double().expand(2, 2, 2), torch.zeros(2).double()
+    )
+    state = tracker.init(both, generator=generator)
+    *_, (state, _) = tracker.track(state, [well] * 100, BOUNDS)
+    assert len(state.mixture.mean) == 2
+    assert -5000 < float(state.mixture.log_weight[1]) < -3000
+
+
+def test_a_cost_made_from_the_samples_parents(generator):
+    seen = []
+
+    class Sticky(problems.ItemBowls):
+        pass
+
+    def make(parent, prior):
+        seen.append((parent, prior))
+        return Sticky(torch.ones(len(parent), 1).double(), prior.mean[parent])
+
+    state = CSS.init(single(), generator=generator)
+    state, _ = CSS.step(state, make, BOUNDS)
+    parent, prior = seen[0]
+    assert parent.shape == (40,)
+    assert torch.equal(prior.mean, single().mean)
+    torch.testing.assert_close(state.mixture.mean[:1], prior.mean, rtol=0, atol=0.2)
+
+
+def test_bad_input(generator):
+    with pytest.raises(ConfigurationError, match="num_samples"):
+        Tracker(proposal=CSS.proposal, num_samples=0, num_modes=1)
+    with pytest.raises(ShapeError, match=r"mixture.covariance.*\[..., 1, 2, 2\]"):
+        CSS.init(single()._replace(covariance=torch.eye(3)[None]), generator=generator)
+    state = CSS.init(single(), generator=generator)
+    with pytest.raises(ShapeError, match="bounds"):
+        CSS.step(state, problems.DoubleWell(), problems.box(3, -1, 1))

@@ -1,0 +1,288 @@
+"""Calibration files: which camera, in which unit, for which images."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from torchcss.errors import CameraError
+from torchcss.io.cameras import check_image_size, read_camera, rotation_matrix
+from torchcss.vision.camera import Camera
+
+K = [[800.0, 0.0, 319.5], [0.0, 810.0, 239.5], [0.0, 0.0, 1.0]]
+VECTOR = [0.3, -1.2, 0.7]
+R = Rotation.from_rotvec(VECTOR).as_matrix().tolist()
+
+
+def entry(**more: Any) -> dict[str, Any]:
+    values = {
+        "video": "a.mp4", "image_size_wh": [640, 480], "K": K,
+        "distortion": [0.1, -0.2, 0.001, 0.002, 0.05], "R": R, "t": [0.1, 0.2, 3.0],
+    }  # fmt: skip
+    values.update(more)
+    return {key: value for key, value in values.items() if value is not None}
+
+
+def write(path: Path, cameras: Any, units: str | None = "metre, pixel") -> Path:
+    content = {"cameras": cameras} | ({} if units is None else {"units": units})
+    path.write_text(json.dumps(content))
+    return path
+
+
+POSE2SIM = """
+[cam_01]
+name = "cam_01"
+size = [ 640.0, 480.0,]
+matrix = [ [ 800.0, 0.0, 319.5,], [ 0.0, 810.0, 239.5,], [ 0.0, 0.0, 1.0,],]
+distortions = [ 0.1, -0.2, 0.001, 0.002,]
+rotation = [ 0.3, -1.2, 0.7,]
+translation = [ 0.1, 0.2, 3.0,]
+fisheye = false
+
+[cam_02]
+name = "cam_02"
+size = [ 1280.0, 720.0,]
+matrix = [ [ 900.0, 0.0, 640.0,], [ 0.0, 900.0, 360.0,], [ 0.0, 0.0, 1.0,],]
+distortions = [ 0.0, 0.0, 0.0, 0.0, 0.0,]
+rotation = [ 0.0, 0.0, 0.0,]
+translation = [ 0.0, 0.0, 0.0,]
+fisheye = true
+
+[metadata]
+adjusted = false
+error = 0.0
+"""
+
+
+def test_json_camera(tmp_path: Path) -> None:
+    loaded = read_camera(write(tmp_path / "a.json", {"one": entry()}))
+    camera = loaded.camera
+    assert (loaded.metric, loaded.units_note, loaded.video) == (True, None, "a.mp4")
+    assert camera.name == "one"
+    assert tuple(camera.image_size_wh) == (640, 480)
+    torch.testing.assert_close(camera.K, torch.tensor(K, dtype=camera.K.dtype))
+    torch.testing.assert_close(
+        camera.R_camera_world, torch.tensor(R, dtype=camera.R_camera_world.dtype)
+    )
+    assert camera.t_camera_world.tolist() == pytest.approx([0.1, 0.2, 3.0])
+    assert camera.distortion.tolist() == pytest.approx([0.1, -0.2, 0.001, 0.002, 0.05])
+
+
+def test_distortion_may_be_absent_or_short(tmp_path: Path) -> None:
+    camera = read_camera(write(tmp_path / "a.json", {"one": entry(distortion=None)})).camera
+    assert camera.distortion.tolist() == [0.0] * 5
+    camera = read_camera(write(tmp_path / "a.json", {"one": entry(distortion=[1, 0, 0, 0])})).camera
+    assert camera.distortion.tolist() == [1.0, 0, 0, 0, 0]
+
+
+@pytest.mark.parametrize("units", ["metre, pixel", "meters", "m", " Metres , px"])
+def test_metres(tmp_path: Path, units: str) -> None:
+    assert read_camera(write(tmp_path / "a.json", {"one": entry()}, units)).metric
+
+
+@pytest.mark.parametrize(
+    ("units", "more", "words"),
+    [
+        ("board square, pixel", {}, "'board square'"),
+        ("mm", {}, "'mm'"),
+        (None, {}, "unknown unit"),
+        ("metre", {"R": None}, "no extrinsics"),
+        ("metre", {"t": None}, "no extrinsics"),
+    ],
+)
+def test_own_frame_where_the_world_is_not_metric(
+    tmp_path: Path, units: str | None, more: dict[str, Any], words: str
+) -> None:
+    loaded = read_camera(write(tmp_path / "a.json", {"one": entry(**more)}, units))
+    assert not loaded.metric
+    assert loaded.units_note is not None
+    assert words in loaded.units_note
+    assert "own frame" in loaded.units_note
+    torch.testing.assert_close(loaded.camera.R_camera_world, torch.eye(3).to(loaded.camera.K))
+    assert not loaded.camera.t_camera_world.any()
+    torch.testing.assert_close(loaded.camera.K, torch.tensor(K, dtype=loaded.camera.K.dtype))
+
+
+def test_choice_of_the_camera(tmp_path: Path) -> None:
+    cameras = {
+        "left": entry(video="a.mp4"),
+        "right": entry(video="b.mp4"),
+        "cam_03": entry(video=None),
+    }
+    path = write(tmp_path / "a.json", cameras)
+    assert read_camera(path, video="somewhere/b.mp4").camera.name == "right"
+    assert read_camera(path, video="somewhere/cam03.mov").camera.name == "cam_03"
+    assert read_camera(path, video="a.mp4", camera_name="right").camera.name == "right"
+    with pytest.raises(CameraError, match=r"several cameras, left, right, cam_03"):
+        read_camera(path)
+    with pytest.raises(CameraError, match=r"c\.mp4.*left, right, cam_03"):
+        read_camera(path, video="c.mp4")
+    with pytest.raises(CameraError, match=r"no camera 'up'.*left, right, cam_03"):
+        read_camera(path, camera_name="up")
+    twice = write(tmp_path / "b.json", {"left": entry(), "right": entry()})
+    with pytest.raises(CameraError, match="no single camera"):
+        read_camera(twice, video="a.mp4")
+    single = write(tmp_path / "c.json", {"only": entry()})
+    assert read_camera(single, video="other.mp4").camera.name == "only"
+    with pytest.raises(CameraError, match="no camera"):
+        read_camera(single, camera_name="other")
+
+
+def test_pose2sim(tmp_path: Path) -> None:
+    path = tmp_path / "Calib.toml"
+    path.write_text(POSE2SIM)
+    loaded = read_camera(path, video="cam01.mp4")
+    expected = Camera(
+        K, (640, 480), distortion=[0.1, -0.2, 0.001, 0.002, 0.0],
+        R_camera_world=R, t_camera_world=[0.1, 0.2, 3.0],
+    )  # fmt: skip
+    assert (loaded.metric, loaded.camera.name) == (True, "cam_01")
+    points = torch.randn(7, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(loaded.camera.project(points).uv, expected.project(points).uv)
+    with pytest.raises(CameraError, match=r"cam_02.*fisheye"):
+        read_camera(path, camera_name="cam_02")
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.floats(-10, 10), min_size=3, max_size=3))
+def test_rotation_vector_against_scipy(vector: list[float]) -> None:
+    expected = Rotation.from_rotvec(vector).as_matrix()
+    np.testing.assert_allclose(rotation_matrix(np.array(vector)), expected, atol=1e-12)
+
+
+def test_image_size() -> None:
+    camera = Camera(K, (1080, 1920), name="cam")
+    check_image_size(camera, 1080, 1920)
+    with pytest.raises(CameraError, match=r"1080 x 1920.*540 x 960.*resized\(540, 960\)"):
+        check_image_size(camera, 540, 960)
+    with pytest.raises(CameraError, match="another scale"):
+        check_image_size(camera, 360, 641)
+    with pytest.raises(CameraError, match=r"1080 x 1920.*1920 x 1080.*right angle"):
+        check_image_size(camera, 1920, 1080)
+    with pytest.raises(CameraError, match=r"1080 x 1920.*1088 x 1920.*another shape"):
+        check_image_size(camera, 1088, 1920)
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ({"K": None}, "K"),
+        ({"K": [[1, 0], [0, 1]]}, "K"),
+        ({"K": "a"}, "K"),
+        ({"K": [[1, 0, 0], [0, 1]]}, "K"),
+        ({"K": [[float("nan"), 0, 0], [0, 1, 0], [0, 0, 1]]}, "K"),
+        ({"K": [[-5, 0, 0], [0, 1, 0], [0, 0, 1]]}, "."),
+        ({"image_size_wh": None}, "image_size_wh"),
+        ({"image_size_wh": [640]}, "image size"),
+        ({"image_size_wh": [640.5, 480]}, "whole"),
+        ({"image_size_wh": [0, 480]}, "."),
+        ({"image_size_wh": [float("inf"), 480]}, "image size"),
+        ({"distortion": [0.0] * 8}, "distortion"),
+        ({"distortion": [float("nan")] * 5}, "distortion"),
+        ({"R": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "."),
+        ({"R": [[2, 0, 0], [0, 1, 0], [0, 0, 1]]}, "."),
+        ({"R": [[1, 0], [0, 1]]}, "."),
+        ({"R": [float("nan"), 0, 0]}, "rotation"),
+        ({"t": [1, 2]}, "t"),
+        ({"t": [1, 2, float("nan")]}, "t"),
+        ({"t": [1, 2, True]}, "translation: expected numbers"),
+    ],
+)  # fmt: skip
+def test_bad_values(tmp_path: Path, more: dict[str, Any], words: str) -> None:
+    path = write(tmp_path / "a.json", {"one": entry(**more)})
+    with pytest.raises(CameraError, match=words) as caught:
+        read_camera(path)
+    message = str(caught.value)
+    assert str(path) in message
+    assert "one" in message
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", "3", '{"cameras": 3}', '{"cameras": {}}',
+                                     '{"cameras": {"a": 3}}'])  # fmt: skip
+def test_bad_json(tmp_path: Path, content: str) -> None:
+    (tmp_path / "a.json").write_text(content)
+    with pytest.raises(CameraError, match=r"a.json"):
+        read_camera(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize(
+    "content", ["", "a = [", "[metadata]\nerror = 1.0", "[a]\nname = 3", "\xff", '[a]\nname="b"',
+                '[a]\nname="c"\n[b]\nname="c"', "a = " + "[" * 5000]
+)  # fmt: skip
+def test_bad_toml(tmp_path: Path, content: str) -> None:
+    (tmp_path / "a.toml").write_bytes(content.encode("latin-1"))
+    with pytest.raises(CameraError, match=r"a.toml"):
+        read_camera(tmp_path / "a.toml")
+
+
+def test_missing(tmp_path: Path) -> None:
+    for name in ("a.json", "a.toml"):
+        with pytest.raises(CameraError, match="no such file"):
+            read_camera(tmp_path / name)
+        (tmp_path / "folder" / name).mkdir(parents=True)
+        with pytest.raises(CameraError):
+            read_camera(tmp_path / "folder" / name)
+
+
+@settings(
+    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(data=st.data())
+def test_only_camera_errors_come_from_bad_bytes(tmp_path: Path, data: st.DataObject) -> None:
+    good = write(tmp_path / "good.json", {"one": entry()}).read_bytes()
+    content = bytearray(data.draw(st.sampled_from([good, POSE2SIM.encode()])))
+    for _ in range(data.draw(st.integers(0, 8))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    del content[data.draw(st.integers(0, len(content))) :]
+    path = tmp_path / data.draw(st.sampled_from(["a.json", "a.toml"]))
+    path.write_bytes(content)
+    message = ""
+    try:
+        loaded = read_camera(path, video="cam01.mp4")
+    except CameraError as error:
+        message = str(error)
+    else:
+        assert loaded.camera.K.isfinite().all()
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("video", "metric"),
+    [
+        ("balance_beam_4cam/cam01.mp4", True),
+        ("balance_beam_4cam/cam03.mp4", True),
+        ("handheld_board/cam_2.mp4", True),
+        ("rendered_turn/video.mp4", True),
+        ("arm_pointing/cam0.mp4", False),
+        ("walk_sit_mono/cam0.mp4", False),
+    ],
+)
+def test_real_calibrations(shared_data: Path, video: str, metric: bool) -> None:
+    path = shared_data / video
+    loaded = read_camera(path.parent / "cameras.json", video=path)
+    assert loaded.video == path.name
+    assert loaded.metric is metric
+    assert ("board square" in (loaded.units_note or "")) is not metric
+    values = json.loads((path.parent / "cameras.json").read_text())["cameras"][loaded.camera.name]
+    check_image_size(loaded.camera, *values["image_size_wh"])
+    if metric:
+        torch.testing.assert_close(
+            loaded.camera.centre_world,
+            torch.tensor(values["centre_world"], dtype=torch.float64),
+            atol=1e-6,
+            rtol=0.0,
+        )
+
+
+def test_real_calibration_needs_a_name(shared_data: Path) -> None:
+    with pytest.raises(CameraError, match="cam01, static_cam01, cam03, static_cam03"):
+        read_camera(shared_data / "balance_beam_4cam" / "cameras.json")

@@ -1,0 +1,78 @@
+"""The one place that knows what every program calls a joint."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from torchcss.joint_names import ALIASES, JOINT_NAMES, canonical_joint_name, layout_of_names
+
+
+def test_tables_hold_catalogue_names_once() -> None:
+    assert len(set(JOINT_NAMES)) == len(JOINT_NAMES)
+    for names in ALIASES.values():
+        known = [name for name in names if name is not None]
+        assert set(known) <= set(JOINT_NAMES)
+        assert len(set(known)) == len(known)
+
+
+@pytest.mark.parametrize(
+    ("layout", "size"),
+    [
+        ("BODY_25", 25), ("BODY_25B", 25), ("COCO-17", 17), ("COCO-18", 18),
+        ("MediaPipe-33", 33), ("H36M-17", 17), ("SMPL-24", 24), ("H-Anim", len(JOINT_NAMES)),
+    ],
+)  # fmt: skip
+def test_sizes_and_symmetry(layout: str, size: int) -> None:
+    names = ALIASES[layout]
+    assert len(names) == size
+    left = {name[2:] for name in names if name and name.startswith("l_")}
+    right = {name[2:] for name in names if name and name.startswith("r_")}
+    assert left == right
+
+
+def test_body_25_gives_coco_by_openpose_table() -> None:
+    # The list that the field uses to turn one into the other.
+    order = [0, 16, 15, 18, 17, 5, 2, 6, 3, 7, 4, 12, 9, 13, 10, 14, 11]
+    assert tuple(ALIASES["BODY_25"][index] for index in order) == ALIASES["COCO-17"]
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("LShoulder", "l_shoulder"), ("left_shoulder", "l_shoulder"), ("l_shoulder", "l_shoulder"),
+        ("L.Shoulder", "l_shoulder"), ("shoulder_l", "l_shoulder"), ("lshoulder", "l_shoulder"),
+        ("leftShoulder", "l_shoulder"), ("Left Shoulder", "l_shoulder"), ("REar", "r_ear"),
+        ("RIGHT_ANKLE", "r_ankle"), ("heel_right", "r_heel"), ("RBigToe", "r_toe"),
+        ("right_foot_index", "r_toe"), ("left_foot", "l_midtarsal"), ("leye", "l_eye"),
+        ("Head", "skull_tip"), ("HeadTop", "skull_tip"), ("UpperNeck", "vc7"),
+        ("skullbase", "skullbase"),
+        ("Neck", "vt1"), ("thorax", "vt1"), ("MidHip", "HumanoidRoot"), ("Hip", "HumanoidRoot"),
+        ("pelvis", "HumanoidRoot"), ("RHip", "r_hip"), ("nose", "nose"),
+        ("LSmallToe", None), ("left_hand", None), ("shoulder", None), ("LNeck", None),
+        ("left_eye_inner", None), ("", None), ("left", None), ("tail", None),
+    ],
+)  # fmt: skip
+def test_free_spellings(name: str, expected: str | None) -> None:
+    assert canonical_joint_name(name) == expected
+
+
+def test_catalogue_names_are_fixed_points() -> None:
+    assert layout_of_names(JOINT_NAMES) == JOINT_NAMES
+
+
+def test_second_of_the_same_place_stays_unknown() -> None:
+    assert layout_of_names(("LWrist", "left_wrist", "tail")) == ("l_wrist", None, None)
+
+
+@given(st.text(max_size=30))
+def test_any_text_is_a_name_or_none(name: str) -> None:
+    assert canonical_joint_name(name) in (None, *JOINT_NAMES)
+
+
+def test_names_of_the_real_file(shared_data) -> None:
+    with np.load(shared_data / "balance_beam_4cam" / "keypoints2d_cam01.npz") as archive:
+        names = tuple(str(name) for name in archive["joint_names"])
+    assert layout_of_names(names) == ALIASES["BODY_25B"]

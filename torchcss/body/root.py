@@ -1,0 +1,93 @@
+"""The six root parameters and the base transform they hang on (design decision 11).
+
+The root is three prismatic joints and yaw, pitch, roll (rotations about y, x, z, in that order) on
+a base transform. The base is set when tracking starts and moved when the pitch nears a right angle,
+so that the angles never lock; means and covariances are mapped along. Call `move_base` for that.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchcss.body.model import BodyModel
+
+ROOT_NAMES = ("root_x", "root_y", "root_z", "root_yaw", "root_pitch", "root_roll")
+
+
+def root_rotation(angles: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation matrix of yaw, pitch and roll (radians)."""
+    a, b, c = angles.unbind(-1)
+    zero, one = torch.zeros_like(a), torch.ones_like(a)
+
+    def matrix(*entries: Tensor) -> Tensor:
+        return torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
+
+    yaw = matrix(a.cos(), zero, a.sin(), zero, one, zero, -a.sin(), zero, a.cos())
+    pitch = matrix(one, zero, zero, zero, b.cos(), -b.sin(), zero, b.sin(), b.cos())
+    roll = matrix(c.cos(), -c.sin(), zero, c.sin(), c.cos(), zero, zero, zero, one)
+    return yaw @ pitch @ roll
+
+
+def root_angles(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
+    """Yaw, pitch and roll of a rotation; pitch lies in [-pi/2, pi/2]."""
+    yaw = torch.atan2(rotation[..., 0, 2], rotation[..., 2, 2])
+    pitch = torch.asin((-rotation[..., 1, 2]).clamp(-1, 1))
+    roll = torch.atan2(rotation[..., 1, 0], rotation[..., 1, 1])
+    return torch.stack([yaw, pitch, roll], dim=-1)
+
+
+def has_root(body: BodyModel) -> bool:
+    """Whether the body has the six root parameters."""
+    return set(ROOT_NAMES) <= set(body.state_names)
+
+
+def root_pose(
+    body: BodyModel, x: Float[Tensor, "*batch n"]
+) -> tuple[Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch 3"]]:
+    """World pose of the root link."""
+    index = [body.state_index(name) for name in ROOT_NAMES]
+    root = x[..., index]
+    rotation = body.base_rotation @ root_rotation(root[..., 3:])
+    return rotation, root[..., :3] @ body.base_rotation.T + body.base_translation
+
+
+def move_base(
+    body: BodyModel,
+    rotation: Float[Tensor, "3 3"],
+    translation: Float[Tensor, "3"],
+    x: Float[Tensor, "*batch n"],
+    covariance: Float[Tensor, "*batch n n"] | None = None,
+) -> tuple[BodyModel, Float[Tensor, "*batch n"], Float[Tensor, "*batch n n"] | None]:
+    """Hang the body on another base without moving it.
+
+    Args:
+        body: A body with root parameters.
+        rotation: Orientation of the new base in the world.
+        translation: Its origin in the world, metres.
+        x: States on the old base.
+        covariance: Their covariances.
+
+    Returns:
+        The body on the new base, and the states and covariances in its parameters.
+    """
+    index = [body.state_index(name) for name in ROOT_NAMES]
+    turn = rotation.T @ body.base_rotation
+    shift = (body.base_translation - translation) @ rotation
+
+    def mapped(root: Tensor) -> Tensor:
+        angles = root_angles(turn @ root_rotation(root[..., 3:]))
+        return torch.cat([root[..., :3] @ turn.T + shift, angles], dim=-1)
+
+    moved = x.clone()
+    moved[..., index] = mapped(x[..., index])
+    if covariance is not None:
+        flat = x[..., index].reshape(-1, 6)
+        jacobian = torch.stack([torch.func.jacfwd(mapped)(root) for root in flat])
+        full = torch.eye(x.shape[-1]).to(x).repeat(len(flat), 1, 1)
+        rows = torch.tensor(index, device=x.device)
+        full[:, rows[:, None], rows] = jacobian
+        full = full.reshape(*x.shape[:-1], x.shape[-1], x.shape[-1])
+        covariance = full @ covariance @ full.mT
+    return body.with_base(rotation, translation), moved, covariance

@@ -1,0 +1,238 @@
+"""Gaussian mixtures over the state: what the tracker believes, section 3.3 of [IJRR].
+
+A posterior is a set of separate modes with means, covariances and weights,
+
+    p(x) = sum_i pi_i N(x; mu_i, Sigma_i).
+
+Weights are kept as logarithms: the product over frames of Fig. 6, step 5, would underflow.
+Covariances may be singular, huge or tiny (see `torchcss.linalg`).
+
+What to call: `GaussianMixture.prune` to keep the best modes, `distinct_modes` to discard modes
+found before (step 2.3), `match_to_prior` for step 5.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchcss.errors import ShapeError
+from torchcss.linalg import covariance_factor, log_determinant, symmetric_part, whitener
+
+
+class GaussianMixture(NamedTuple):
+    """A weighted set of Gaussian modes.
+
+    Attributes:
+        mean: Mode centres.
+        covariance: Positive semi-definite.
+        log_weight: Logarithms of the weights; `-inf` marks an empty place.
+    """
+
+    mean: Float[Tensor, "k n"]
+    covariance: Float[Tensor, "k n n"]
+    log_weight: Float[Tensor, " k"]
+
+    @property
+    def weight(self) -> Float[Tensor, " k"]:
+        """Weights that sum to one."""
+        return self.normalise().log_weight.exp()
+
+    def normalise(self) -> GaussianMixture:
+        """Scale the weights to sum to one; equal weights if every one is zero."""
+        total = self.log_weight.logsumexp(0)
+        equal = torch.full_like(self.log_weight, -math.log(max(len(self.log_weight), 1)))
+        shifted = self.log_weight - torch.where(total.isfinite(), total, 0.0)
+        return self._replace(log_weight=torch.where(total.isfinite(), shifted, equal))
+
+    def take(self, modes: Int[Tensor, " m"]) -> GaussianMixture:
+        """Keep some modes, in the order given, with the weights that they have."""
+        return GaussianMixture(self.mean[modes], self.covariance[modes], self.log_weight[modes])
+
+    def prune(self, num_modes: int) -> GaussianMixture:
+        """Keep the modes of greatest weight, the best first, and normalise (Fig. 6, step 4)."""
+        order = self.log_weight.argsort(descending=True, stable=True)
+        return self.take(order[:num_modes]).normalise()
+
+    def component_log_density(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch k"]:
+        """Log-density of every component, without its weight."""
+        n = self.mean.shape[-1]
+        whitened = (whitener(self.covariance) @ (x[..., None, :] - self.mean)[..., None])[..., 0]
+        normaliser = n * math.log(2 * math.pi) + log_determinant(self.covariance)
+        return -0.5 * (whitened.square().sum(-1) + normaliser)
+
+    def log_density(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+        """Log-density of the mixture, its weights normalised."""
+        return (self.component_log_density(x) + self.normalise().log_weight).logsumexp(-1)
+
+    def sample(self, num: int, *, generator: torch.Generator) -> MixtureSamples:
+        """Draw independent samples."""
+        component = draw_components(self.log_weight, num, generator=generator)
+        noise = standard_normal((num, self.mean.shape[-1]), self.mean, generator=generator)
+        factor = covariance_factor(self.covariance)[component]
+        return MixtureSamples(self.mean[component] + (factor @ noise[..., None])[..., 0], component)
+
+    def moments(self) -> tuple[Float[Tensor, " n"], Float[Tensor, "n n"]]:
+        """Mean and covariance of the whole mixture."""
+        weight = self.weight
+        mean = weight @ self.mean
+        apart = self.mean - mean
+        spread = self.covariance + apart[:, :, None] * apart[:, None, :]
+        return mean, symmetric_part((weight[:, None, None] * spread).sum(0))
+
+
+class MixtureSamples(NamedTuple):
+    """Samples of a mixture.
+
+    Attributes:
+        x: The samples.
+        component: The component that each came from.
+    """
+
+    x: Float[Tensor, "s n"]
+    component: Int[Tensor, " s"]
+
+
+class Matches(NamedTuple):
+    """Posterior modes matched with prior ones, Fig. 6 step 5.
+
+    Attributes:
+        mixture: The posterior with the weights of its matches multiplied in, normalised.
+        parent: The prior component of each mode; -1 where none was left.
+    """
+
+    mixture: GaussianMixture
+    parent: Int[Tensor, " k"]
+
+
+def standard_normal(
+    shape: tuple[int, ...], like: Tensor, *, generator: torch.Generator
+) -> Float[Tensor, "..."]:
+    """Draw standard normal numbers on the generator's device, returned like another tensor."""
+    noise = torch.randn(shape, generator=generator, device=generator.device, dtype=like.dtype)
+    return noise.to(like.device)
+
+
+def draw_components(
+    log_weight: Float[Tensor, " k"],
+    num: int,
+    *,
+    generator: torch.Generator,
+    stratified: bool = False,
+) -> Int[Tensor, " s"]:
+    """Choose components with the probability of their weight.
+
+    Args:
+        log_weight: Unnormalised; all `-inf` means equal weights.
+        num: How many to choose.
+        generator: Source of randomness.
+        stratified: Choose at equal steps of the cumulated weight from one random offset: the same
+            expectation, and every component gets its share to within one sample.
+    """
+    top = log_weight.max()
+    weight = (log_weight - torch.where(top.isfinite(), top, 0.0)).to(torch.float64).exp()
+    weight = torch.where(top.isfinite(), weight, torch.ones_like(weight))
+    cumulated = weight.cumsum(0)
+    uniform = torch.rand(
+        1 if stratified else num,
+        generator=generator,
+        device=generator.device,
+        dtype=torch.float64,
+    ).to(log_weight.device)
+    if stratified:
+        uniform = (torch.arange(num, device=log_weight.device) + uniform) / max(num, 1)
+    chosen = torch.searchsorted(cumulated, uniform * cumulated[-1], right=True)
+    # Rounding must not run past the last component that has a weight.
+    return chosen.clamp(max=int(torch.nonzero(weight)[-1, 0]))
+
+
+def distinct_modes(
+    mean: Float[Tensor, "s n"],
+    covariance: Float[Tensor, "s n n"],
+    cost: Float[Tensor, " s"],
+    *,
+    distance: float = 1.0,
+) -> Int[Tensor, " m"]:
+    """Discard modes that have been found before, Fig. 6 step 2.3.
+
+    The paper gives no threshold (design decision 6). Here a mode is a duplicate of one of lower
+    cost if its Mahalanobis distance under that mode's own covariance is at most `distance`: two
+    descents into one minimum end some thousandths of a standard deviation apart, and minima closer
+    than one standard deviation are one mode for every purpose of a mixture.
+
+    Args:
+        mean: Candidates, in any order.
+        covariance: Their covariances.
+        cost: Their costs, nats. A candidate whose cost is not finite is discarded.
+        distance: Threshold in standard deviations.
+
+    Returns:
+        Indices of the modes kept, by ascending cost.
+    """
+    order = cost.argsort(stable=True)
+    order = order[cost[order].isfinite()]
+    kept = []
+    while len(order):
+        best, order = order[0], order[1:]
+        kept.append(best)
+        whitened = (mean[order] - mean[best]) @ whitener(covariance[best]).mT
+        order = order[whitened.square().sum(-1) > distance**2]
+    return torch.stack(kept) if kept else order
+
+
+def bhattacharyya(
+    first: GaussianMixture, second: GaussianMixture, *, standard: bool = False
+) -> Float[Tensor, "k m"]:
+    """Bhattacharyya distance between the components of two mixtures.
+
+    Args:
+        first: Rows of the result.
+        second: Columns of the result.
+        standard: False for the distance as it is printed in Fig. 6 [IJRR],
+            `d^T S^-1 d + log(|A + B| / sqrt(|A| |B|)) / 2` with `S = (A + B) / 2`; True for that of
+            the literature, `d^T S^-1 d / 8 + log(|S| / sqrt(|A| |B|)) / 2` (design decision 4).
+    """
+    n = first.mean.shape[-1]
+    if second.mean.shape[-1] != n:
+        raise ShapeError(
+            f"bhattacharyya: expected mixtures over the same state, got {n} and "
+            f"{second.mean.shape[-1]} parameters; map one onto the other first"
+        )
+    between = 0.5 * (first.covariance[:, None] + second.covariance[None, :])
+    apart = first.mean[:, None] - second.mean[None, :]
+    squared = (whitener(between) @ apart[..., None])[..., 0].square().sum(-1)
+    own = log_determinant(first.covariance)[:, None] + log_determinant(second.covariance)[None, :]
+    overlap = 0.5 * (log_determinant(between) - 0.5 * own)
+    if standard:
+        return squared / 8 + overlap
+    return squared + overlap + 0.5 * n * math.log(2)
+
+
+def match_to_prior(
+    posterior: GaussianMixture, prior: GaussianMixture, *, standard: bool = False
+) -> Matches:
+    """Multiply each mode's weight by that of the closest prior component, Fig. 6 step 5 and 6.
+
+    The modes choose in their order, and a prior component is used once. A mode for which no
+    component is left is new; it takes the least weight of the prior, so that it is not favoured
+    over any mode that has a past. (With a single prior component that is a factor of one: all the
+    modes are its children.) Prior components of weight zero are not there.
+    """
+    prior = prior.normalise()
+    present = torch.nonzero(prior.log_weight > -torch.inf)[:, 0]
+    prior = prior.take(present)
+    distance = bhattacharyya(posterior, prior, standard=standard)
+    parent = torch.full_like(posterior.log_weight, -1, dtype=torch.long)
+    factor = prior.log_weight.min().repeat(len(parent))
+    unused = torch.ones_like(present, dtype=torch.bool)
+    for mode in range(min(len(parent), len(present))):
+        choices = torch.nonzero(unused)[:, 0]
+        closest = choices[distance[mode, choices].argmin()]
+        parent[mode], factor[mode] = present[closest], prior.log_weight[closest]
+        unused[closest] = False
+    weighted = posterior._replace(log_weight=posterior.log_weight + factor)
+    return Matches(weighted.normalise(), parent)

@@ -1,0 +1,555 @@
+"""From frames to a trajectory: the one loop that the command line, scripts and notebooks share.
+
+`track_frames` turns any sequence of images into tracked frames: features, cost, one step of the
+tracker, and the base transform moved where the root's angles come near their lock. `track_video`
+wraps it for files: it reads video, camera and keypoints, finds the first pose, and writes
+`track.npz`, `summary.json` and `overlay.mp4` as it goes, so that a stopped run keeps what it has.
+"""
+
+from __future__ import annotations
+
+import math
+import platform
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+from tqdm import tqdm
+
+from torchcss.body.model import BodyModel
+from torchcss.body.root import ROOT_NAMES, has_root, move_base, root_pose
+from torchcss.cost.joints import JointObservation, JointTerm
+from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.cost.visibility import ContourPredictor
+from torchcss.errors import ConfigurationError, KeypointError
+from torchcss.inference.mixture import GaussianMixture
+from torchcss.inference.tracker import Tracker, TrackerInfo, TrackerState
+from torchcss.initialise import default_sigma, initialise_from_joints
+from torchcss.io.cameras import check_image_size, read_camera
+from torchcss.io.keypoints import Keypoints, read_keypoints
+from torchcss.io.overlay import ProjectedPart, draw_overlay
+from torchcss.io.tracks import TrackWriter, prepare_output_folder, write_summary
+from torchcss.io.video import VideoReader, VideoWriter
+from torchcss.presets import make_tracker
+from torchcss.synthetic import grid_faces
+from torchcss.types import Status
+from torchcss.vision.camera import Camera
+from torchcss.vision.features import FeatureExtractor
+
+TERMS = ("contour", "joints", "stabiliser", "temporal")
+"""Terms and priors that `track_video` can switch."""
+
+_PITCH_LIMIT = math.radians(55)
+"""The base follows the body once the root's pitch exceeds this: well before the lock at 90 degrees."""
+
+_SAVE_EVERY_S = 10.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """How to track; everything here is in `summary.json`.
+
+    Attributes:
+        body: Body to track: arm7, arm8, body30, body32 or body34.
+        preset: Tracker, a name in `presets.PRESETS`.
+        samples: Samples per frame; the preset's number by default.
+        modes: Modes kept; the preset's number by default.
+        keypoints_use: "all": keypoints are observations in every frame; "first": they only
+            give the first pose, as in the papers.
+        terms: Terms and priors of the cost.
+        working_size: Longer side, in pixels, at which features are computed; larger images are
+            reduced to it.
+        contour_weight: Temperature of the contour term, see `CostChoice`.
+        seed: Seed of all random numbers; the same seed gives the same track.
+        device: Where to compute.
+        dtype: "float64" or "float32".
+        overlay: Write `overlay.mp4`.
+    """
+
+    body: str = "body34"
+    preset: str = "css"
+    samples: int | None = None
+    modes: int | None = None
+    keypoints_use: Literal["first", "all"] = "all"
+    terms: tuple[str, ...] = TERMS
+    working_size: int = 640
+    contour_weight: float = 150.0
+    seed: int = 0
+    device: str = "cpu"
+    dtype: Literal["float64", "float32"] = "float64"
+    overlay: bool = True
+
+    def __post_init__(self) -> None:
+        unknown = sorted(set(self.terms) - set(TERMS))
+        if unknown:
+            raise ConfigurationError(f"unknown terms {unknown}; there are {', '.join(TERMS)}")
+        for name in ("samples", "modes", "working_size"):
+            number = getattr(self, name)
+            if number is not None and number < 1:
+                raise ConfigurationError(f"{name} must be at least 1, got {number}")
+        try:
+            torch.empty(0, device=self.device)
+        except RuntimeError as error:
+            raise ConfigurationError(
+                f"device {self.device!r} is not available here; use cpu"
+            ) from error
+
+    @property
+    def torch_dtype(self) -> torch.dtype:
+        """The floating type."""
+        return torch.float32 if self.dtype == "float32" else torch.float64
+
+
+class TrackedFrame(NamedTuple):
+    """One frame's result.
+
+    Attributes:
+        index: Index in the video.
+        time_s: Seconds since its start.
+        image: The frame.
+        body: The body on this frame's base.
+        state: The tracker's state, best mode first.
+        info: What the step did.
+        joints_world: Joint centres of the modes, metres.
+        terms: Cost of the best mode by term, nats.
+        seconds: Wall time of the frame by stage.
+    """
+
+    index: int
+    time_s: float
+    image: UInt8[np.ndarray, "h w 3"]
+    body: BodyModel
+    state: TrackerState
+    info: TrackerInfo
+    joints_world: Float[Tensor, "k j 3"]
+    terms: dict[str, float]
+    seconds: dict[str, float]
+
+
+class Picture(NamedTuple):
+    """One image of a sequence."""
+
+    index: int
+    time_s: float
+    image: UInt8[np.ndarray, "h w 3"]
+
+
+Observe = Callable[[int], JointObservation | None]
+"""Keypoints of a frame by its index, in pixels of the working image; None if there are none."""
+
+
+def track_frames(
+    frames: Iterable[Picture],
+    *,
+    body: BodyModel,
+    mixture: GaussianMixture,
+    camera: Camera,
+    extractor: FeatureExtractor,
+    tracker: Tracker,
+    choice: CostChoice,
+    observe: Observe,
+    frame_interval: float,
+    generator: torch.Generator,
+) -> Iterator[TrackedFrame]:
+    """Track a body through a sequence of images.
+
+    Args:
+        frames: The images, in order.
+        body: The body on its base.
+        mixture: Where it may be in the first frame.
+        camera: Camera of the full-size images.
+        extractor: Makes the features, at its working size.
+        tracker: Search, optimiser, numbers of samples and modes.
+        choice: Terms and weights of the cost; pixels are those of the working image.
+        observe: Keypoints by frame.
+        frame_interval: Seconds between frames, which scales the expected motion.
+        generator: Source of the samples.
+
+    Yields:
+        A `TrackedFrame` for every frame.
+    """
+    working = extractor.working_camera(camera).to(dtype=body.dtype, device=body.tie.device)
+    predictor = ContourPredictor(body) if choice.contour is not None else None
+    deviation = body.motion_rate * frame_interval
+    state = tracker.init(mixture, generator=generator)
+    for frame in frames:
+        clock = time.perf_counter()
+        features = extractor(frame.image)
+        edge_field = (features.edge_energy * features.edge_direction).to(body.tie)
+        featured = time.perf_counter()
+
+        def cost_of(
+            parent: Tensor,
+            prior: GaussianMixture,
+            body: BodyModel = body,
+            edge_field: Tensor = edge_field,
+            index: int = frame.index,
+        ) -> TrackingCost:
+            return TrackingCost(
+                body=body,
+                camera=working,
+                choice=choice,
+                predictor=predictor,
+                edge_field=edge_field,
+                observation=observe(index),
+                parent=prior.mean[parent],
+                deviation=deviation,
+            )
+
+        prior = state.mixture
+        state, info = tracker.step(state, cost_of, body.bounds)
+        searched = time.perf_counter()
+        mean = state.mixture.mean
+        terms = cost_of(info.origin[:1], prior).terms(mean[:1])
+        yield TrackedFrame(
+            frame.index,
+            frame.time_s,
+            frame.image,
+            body,
+            state,
+            info,
+            body.pose(mean).joints,
+            {name: float(value[0]) for name, value in terms.items()},
+            {"features": featured - clock, "search": searched - featured},
+        )
+        body, state = follow_with_base(body, state)
+
+
+def follow_with_base(body: BodyModel, state: TrackerState) -> tuple[BodyModel, TrackerState]:
+    """Move the base under the best mode if the root's pitch nears its lock (design decision 11)."""
+    if not has_root(body):
+        return body, state
+    best = state.mixture.mean[0]
+    angles = best[[body.state_index(name) for name in ROOT_NAMES[3:]]]
+    if float(angles[1].abs()) < _PITCH_LIMIT and float(angles.abs().max()) < math.radians(270):
+        return body, state
+    mixture = state.mixture
+    body, mean, covariance = move_base(
+        body, *root_pose(body, best), mixture.mean, mixture.covariance
+    )
+    assert covariance is not None
+    moved = mixture._replace(mean=mean, covariance=covariance)
+    return body, state._replace(mixture=moved, velocity=torch.zeros_like(state.velocity))
+
+
+def scale_keypoints(
+    keypoints: Float[Tensor, "*t j 2"], full: tuple[int, int], working: tuple[int, int]
+) -> Float[Tensor, "*t j 2"]:
+    """Pixels of the full image to pixels of the working image (centres at integers)."""
+    factor = keypoints.new_tensor([working[0] / full[0], working[1] / full[1]])
+    return (keypoints + 0.5) * factor - 0.5
+
+
+def draw_modes(
+    frame: TrackedFrame, camera: Camera, *, rings: int = 16, meridians: int = 20
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Draw the best mode as a shaded body and the others as outlines over the frame.
+
+    Args:
+        frame: A tracked frame.
+        camera: Camera of the full-size image.
+        rings: Latitudes of the drawn mesh.
+        meridians: Longitudes of the drawn mesh.
+    """
+    body, mixture = frame.body, frame.state.mixture
+    mesh = body.mesh(rings, meridians)
+    faces = grid_faces(rings, meridians).to(body.tie.device)
+    rotation, centre = body.part_poses(body.pose(mixture.mean))
+    local = mesh.points.flatten(1, 2)
+    points = local @ rotation.transpose(-1, -2) + centre[..., None, :]
+    modes = []
+    for mode in points:
+        parts = []
+        for part, vertices in enumerate(mode):
+            uv, depth, valid = camera.project(vertices)
+            parts.append(ProjectedPart(uv, depth, valid, faces, part))
+        modes.append(parts)
+    text = (
+        f"frame {frame.index}   {len(modes)} modes   cost {float(frame.info.cost[0]):.1f}"
+    )
+    picture = draw_overlay(
+        torch.from_numpy(np.ascontiguousarray(frame.image)), modes, weights=mixture.weight, text=text
+    )
+    return picture.numpy()
+
+
+@dataclass(kw_only=True)
+class Recorder:
+    """Writes a run as it goes: track, summary and overlay.
+
+    Attributes:
+        folder: The output folder.
+        settings: What is run.
+        camera: Camera of the full-size images, for the overlay.
+        frame_rate: Frames per second of the overlay.
+        notes: Lines for the user, also in the summary.
+        extra: Further entries of the summary.
+    """
+
+    folder: Path
+    settings: Settings
+    camera: Camera
+    frame_rate: float
+    notes: list[str] = field(default_factory=list)
+    extra: dict[str, Any] = field(default_factory=dict)
+
+    def run(self, frames: Iterator[TrackedFrame], body: BodyModel, total: int | None) -> dict:
+        """Track to the end, or to an interruption, which is recorded and raised again.
+
+        Args:
+            frames: What `track_frames` yields.
+            body: The body, for the names in the file.
+            total: Number of frames, for the progress bar.
+
+        Returns:
+            The summary.
+        """
+        writer = TrackWriter(
+            self.folder / "track.npz", state_names=body.state_names, joint_names=body.joint_names
+        )
+        totals: dict[str, float] = {}
+        terms: dict[str, float] = {}
+        counts = {"samples": 0, "iterations": 0, "distinct": 0}
+        statuses = torch.zeros(len(Status), dtype=torch.long)
+        ended, saved, began = "interrupted", time.perf_counter(), time.perf_counter()
+        with ExitStack() as stack:
+            film = None
+            if self.settings.overlay:
+                film = stack.enter_context(
+                    VideoWriter(self.folder / "overlay.mp4", self.frame_rate)
+                )
+            bar = stack.enter_context(tqdm(frames, total=total, unit="frame", dynamic_ncols=True))
+            try:
+                for frame in bar:
+                    self._append(writer, frame)
+                    drawn = time.perf_counter()
+                    if film is not None:
+                        film.write(draw_modes(frame, self.camera))
+                    seconds = {**frame.seconds, "overlay": time.perf_counter() - drawn}
+                    for into, values in ((totals, seconds), (terms, frame.terms)):
+                        for name, value in values.items():
+                            into[name] = into.get(name, 0.0) + value
+                    counts["samples"] += int(frame.info.num_samples)
+                    counts["iterations"] += int(frame.info.num_steps.sum())
+                    counts["distinct"] += int(frame.info.num_distinct)
+                    statuses += frame.info.status_counts.cpu()
+                    bar.set_postfix(
+                        cost=f"{float(frame.info.cost[0]):.1f}",
+                        modes=len(frame.state.mixture.mean),
+                    )
+                    if time.perf_counter() - saved > _SAVE_EVERY_S:
+                        writer.save()
+                        saved = time.perf_counter()
+                ended = "complete"
+            finally:
+                if len(writer):
+                    writer.save()
+                    summary = self._summary(
+                        ended, len(writer), time.perf_counter() - began, totals, terms, counts,
+                        statuses,
+                    )  # fmt: skip
+                    write_summary(self.folder, summary)
+        return summary if len(writer) else {}
+
+    def _append(self, writer: TrackWriter, frame: TrackedFrame) -> None:
+        base = np.eye(4)
+        base[:3, :3] = frame.body.base_rotation.cpu().numpy()
+        base[:3, 3] = frame.body.base_translation.cpu().numpy()
+        mixture = frame.state.mixture
+        writer.append(
+            frame=frame.index,
+            time_s=frame.time_s,
+            state=mixture.mean,
+            covariance=mixture.covariance,
+            log_weight=mixture.log_weight,
+            cost=frame.info.cost,
+            parent=frame.info.parent if len(writer) else torch.full_like(frame.info.parent, -1),
+            joints_world=frame.joints_world,
+            base_transform=base,
+        )
+
+    def _summary(
+        self,
+        ended: str,
+        num_frames: int,
+        wall: float,
+        seconds: dict[str, float],
+        terms: dict[str, float],
+        counts: dict[str, int],
+        statuses: Tensor,
+    ) -> dict[str, Any]:
+        return {
+            "ended": ended,
+            "settings": asdict(self.settings),
+            "versions": {
+                "python": platform.python_version(),
+                **{name: version(name) for name in ("torchcss", "torch", "kornia", "numpy")},
+            },
+            "num_frames": num_frames,
+            "seconds_per_frame": wall / num_frames,
+            "seconds_per_frame_by_stage": {k: v / num_frames for k, v in seconds.items()},
+            "samples_per_frame": counts["samples"] / num_frames,
+            "iterations_per_sample": counts["iterations"] / max(counts["samples"], 1),
+            "distinct_modes_per_frame": counts["distinct"] / num_frames,
+            "optimiser_status": {s.name.lower(): int(statuses[s]) for s in Status},
+            "best_mode_cost_by_term": {k: v / num_frames for k, v in terms.items()},
+            "notes": self.notes,
+            **self.extra,
+        }
+
+
+def make_choice(settings: Settings, sigma: float) -> CostChoice:
+    """The cost that the settings ask for.
+
+    Args:
+        settings: Which terms.
+        sigma: Keypoint noise in pixels of the working image.
+    """
+    default = CostChoice()
+    has = settings.terms.__contains__
+    return CostChoice(
+        contour=default.contour if has("contour") else None,
+        joints=JointTerm(sigma=sigma) if has("joints") else None,
+        stabiliser=default.stabiliser if has("stabiliser") else None,
+        temporal=default.temporal if has("temporal") else None,
+        contour_weight=settings.contour_weight,
+    )
+
+
+def track_video(
+    video: Path,
+    *,
+    camera: Path,
+    keypoints: Path,
+    out: Path,
+    settings: Settings | None = None,
+    camera_name: str | None = None,
+    start: int = 0,
+    stop: int | None = None,
+    stride: int = 1,
+    layout: str | None = None,
+    normalised: bool = False,
+) -> dict[str, Any]:
+    """Track a body through a video file.
+
+    Args:
+        video: A video, or a folder of images.
+        camera: Calibration file, see `torchcss.io.cameras`.
+        keypoints: 2D joints, see `torchcss.io.keypoints`.
+        out: Folder for `track.npz`, `summary.json` and `overlay.mp4`.
+        settings: How to track.
+        camera_name: Which camera of the file; by default the one of this video.
+        start: First frame.
+        stop: Frame before which to end.
+        stride: Every how many frames to track.
+        layout: Layout of a keypoint file that does not name its joints.
+        normalised: Whether keypoints are fractions of the image.
+
+    Returns:
+        The summary.
+
+    Raises:
+        TorchcssError: With one line that says what was wrong, for any bad input.
+    """
+    settings = settings or Settings()
+    out = Path(out)
+    prepare_output_folder(out)
+    reader = VideoReader(video, start=start, stop=stop, stride=stride)
+    width, height = reader.info.width, reader.info.height
+    loaded = read_camera(camera, camera_name=camera_name, video=video)
+    check_image_size(loaded.camera, width, height)
+    num_frames = reader.info.num_frames or reader.count_frames()
+    marks = read_keypoints(
+        keypoints,
+        image_size_wh=(width, height),
+        num_frames=num_frames,
+        layout=layout,
+        normalised=normalised,
+        first_frame=start,
+    )
+    notes = [note for note in (loaded.units_note, *marks.report) if note]
+    generator = torch.Generator().manual_seed(settings.seed)
+    dtype, device = settings.torch_dtype, settings.device
+    eye = loaded.camera.to(dtype=dtype, device=device)
+    sigma = _sigma(marks)
+    first = initialise_from_joints(
+        settings.body,
+        eye,
+        marks.keypoints[start],
+        marks.confidence[start],
+        marks.joint_names,
+        generator=generator,
+        joints=JointTerm(sigma=sigma),
+        dtype=dtype,
+        device=device,
+    )
+    notes += first.report
+    for note in notes:
+        tqdm.write(note)
+
+    extractor = FeatureExtractor(working_size=settings.working_size).to(dtype=dtype, device=device)
+    working = extractor.working_shape(width, height)
+    scaled = scale_keypoints(marks.keypoints, (width, height), working).to(dtype).to(device)
+    confidence = marks.confidence.to(dtype).to(device)
+
+    def observe(index: int) -> JointObservation | None:
+        if settings.keypoints_use == "first" and index != start:
+            return None
+        return JointObservation(
+            first.body.joint_names, scaled[index], confidence[index], marks.joint_names
+        )
+
+    interval = stride / float(reader.info.frame_rate)
+    tracker = make_tracker(
+        settings.preset,
+        settings.body,
+        num_samples=settings.samples,
+        num_modes=settings.modes,
+        motion=tuple((first.body.motion_rate * interval).tolist()),
+    )
+    recorder = Recorder(
+        folder=out,
+        settings=settings,
+        camera=eye,
+        frame_rate=1 / interval,
+        notes=notes,
+        extra={
+            "video": str(video),
+            "camera": loaded.camera.name,
+            "world_is_metric": loaded.metric,
+            "body_lengths_m": first.body.lengths,
+        },
+    )
+    tracked = track_frames(
+        (Picture(frame.index, frame.time_s, frame.image) for frame in reader),
+        body=first.body,
+        mixture=first.mixture,
+        camera=loaded.camera,
+        extractor=extractor,
+        tracker=tracker,
+        choice=make_choice(settings, sigma * working[0] / width),
+        observe=observe,
+        frame_interval=interval,
+        generator=generator,
+    )
+    return recorder.run(tracked, first.body, reader.num_selected)
+
+
+def _sigma(marks: Keypoints) -> float:
+    """Keypoint noise, from the person's typical size over the whole sequence."""
+    sizes = [
+        default_sigma(points[seen > 0])
+        for points, seen in zip(marks.keypoints, marks.confidence, strict=True)
+        if int((seen > 0).sum()) >= 2
+    ]
+    if not sizes:
+        raise KeypointError("no frame has two keypoints; nothing can be tracked from them")
+    return float(np.median(sizes))
