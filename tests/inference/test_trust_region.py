@@ -180,6 +180,20 @@ def test_as_low_as_lbfgs(generator):
         assert polished.fun > float(value) - 1e-4
 
 
+@pytest.mark.parametrize("tolerance", [1e-6, 1e-3])
+def test_curved_valleys_are_followed_out(tolerance, generator):
+    """Short damped steps along a valley are not taken for an end, whatever the tolerance."""
+    cost = problems.Rosenbrock(steepness=1e5)
+    x0 = torch.tensor([-1.0, 1.0]).double() + 0.1 * randn(10, 2, generator=generator)
+    newton = TrustRegionNewton(tolerance=tolerance, max_steps=1000)
+    modes = newton.minimise(cost, x0, problems.unbounded(2))
+    assert bool((modes.status == Status.CONVERGED).all())
+    _, gradient, hessian = cost.local_model(modes.mean)
+    assert bool((torch.linalg.eigvalsh(hessian) > 0).all())
+    newton_step = torch.linalg.solve(hessian, gradient)
+    assert float(0.5 * (gradient * newton_step).sum(-1).max()) < 1.01 * tolerance
+
+
 def test_limbs_reach_the_truth_or_a_known_alternative(generator):
     cost = limbs(generator)
     x0 = cost.truth + 0.1 * randn(20, 14, generator=generator)

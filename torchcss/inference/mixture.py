@@ -160,9 +160,9 @@ def distinct_modes(
     """Discard modes that have been found before, Fig. 6 step 2.3.
 
     The paper gives no threshold (design decision 6). Here a mode is a duplicate of one of lower
-    cost if its Mahalanobis distance under that mode's own covariance is at most `distance`: two
-    descents into one minimum end some thousandths of a standard deviation apart, and minima closer
-    than one standard deviation are one mode for every purpose of a mixture.
+    cost if its Mahalanobis distance under that mode's own covariance is at most `distance`: minima
+    closer than one standard deviation are one mode for every purpose of a mixture. Descents must
+    have converged for this; ends of curved valleys that were not followed out look distinct.
 
     Args:
         mean: Candidates, in any order.

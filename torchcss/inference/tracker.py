@@ -93,7 +93,7 @@ class Tracker:
         proposal: Where the samples go.
         num_samples: Samples per frame, the modes themselves included.
         num_modes: Modes kept, `K`; the papers use 3 for an arm and 7 for a body.
-        optimiser: How samples descend. The default tolerance is coarser than the optimiser's own.
+        optimiser: How samples descend.
         dynamics: What happens between frames; the papers' driftless diffusion by default.
         duplicate_distance: See `distinct_modes`.
         laplace_evidence: Weigh a mode by its Laplace evidence, likelihood times
@@ -105,7 +105,7 @@ class Tracker:
     proposal: Proposal
     num_samples: int
     num_modes: int
-    optimiser: TrustRegionNewton = field(default_factory=lambda: TrustRegionNewton(tolerance=1e-3))
+    optimiser: TrustRegionNewton = field(default_factory=TrustRegionNewton)
     dynamics: Dynamics = field(default_factory=Diffusion)
     duplicate_distance: float = 1.0
     laplace_evidence: bool = False

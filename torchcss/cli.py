@@ -1,0 +1,178 @@
+"""The `torchcss` command: thin, every verb is a call that a user could write in Python.
+
+| verb | does |
+|---|---|
+| `torchcss demo` | renders a sequence, tracks it and prints the error against the truth |
+| `torchcss track VIDEO` | tracks a body through a video |
+
+Bad input ends with one line on standard error and exit status 2; Ctrl-C with status 130. What was
+tracked until then is on disk.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from torchcss.demo import run_demo
+from torchcss.errors import OutputError, TorchcssError
+from torchcss.pipeline import TERMS, Settings, track_video
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demo:
+    """Track an arm that moves in depth before clutter, and compare with the truth."""
+
+    out: Path = Path("out/demo")
+    """Folder for track.npz, summary.json, overlay.mp4 and the rendered input."""
+    seed: int = 0
+    """Seed of the rendering and of the tracker."""
+    frames: int = 50
+    """Number of frames, 25 per second."""
+    samples: int | None = None
+    """Samples per frame; the preset's number by default."""
+    device: str = "cpu"
+    """Where to compute."""
+    dtype: Literal["float64", "float32"] = "float64"
+    """Floating type."""
+
+    def run(self) -> None:
+        """Run the verb."""
+        settings = Settings(
+            body="arm8",
+            samples=self.samples,
+            keypoints_use="first",
+            seed=self.seed,
+            device=self.device,
+            dtype=self.dtype,
+        )
+        summary = run_demo(self.out, settings=settings, num_frames=self.frames)
+        print(
+            f"{summary['num_frames']} frames, {summary['seconds_per_frame']:.2f} s each\n"
+            f"mean error of the best mode   {summary['mpjpe_mm']:6.1f} mm\n"
+            f"mean error, best of the modes {summary['mpjpe_best_of_modes_mm']:6.1f} mm\n"
+            f"look at {self.out / 'overlay.mp4'}"
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Track:
+    """Track a body through a video, and write track.npz, summary.json and overlay.mp4."""
+
+    video: Annotated[Path, tyro.conf.Positional]
+    """A video in any container, or a folder of images."""
+    camera: Path
+    """Calibration: cameras.json, or a Pose2Sim .toml."""
+    keypoints: Path
+    """2D joints: OpenPose folder, COCO or AlphaPose JSON, NPZ, or clicked joints as JSON."""
+    out: Path = Path("out/track")
+    """Output folder."""
+    camera_name: str | None = None
+    """Camera in the file; by default the one whose video this is."""
+    body: str = "body34"
+    """arm7, arm8, body30, body32 or body34."""
+    keypoints_use: Literal["first", "all"] = "all"
+    """Keypoints as an observation in every frame, or only to start, as the papers do."""
+    layout: str | None = None
+    """Layout of a keypoint file that does not name its joints, e.g. BODY_25."""
+    normalised: bool = False
+    """Keypoints are fractions of the image instead of pixels."""
+    start: int = 0
+    """First frame."""
+    stop: int | None = None
+    """Frame before which to end."""
+    stride: int = 1
+    """Track every so many frames."""
+    working_size: int = 640
+    """Longer image side, in pixels, on which features are computed."""
+    preset: str = "css"
+    """Tracker, see torchcss.presets."""
+    samples: int | None = None
+    """Samples per frame; the preset's number by default."""
+    modes: int | None = None
+    """Modes kept; the preset's number by default."""
+    terms: tuple[str, ...] = TERMS
+    """Terms and priors of the cost."""
+    contour_weight: float = Settings.contour_weight
+    """Temperature of the contour term, nats."""
+    overlay: bool = True
+    """Write overlay.mp4."""
+    seed: int = 0
+    """Seed of all random numbers."""
+    device: str = "cpu"
+    """Where to compute."""
+    dtype: Literal["float64", "float32"] = "float64"
+    """Floating type."""
+
+    def run(self) -> None:
+        """Run the verb."""
+        settings = Settings(
+            body=self.body,
+            preset=self.preset,
+            samples=self.samples,
+            modes=self.modes,
+            keypoints_use=self.keypoints_use,
+            terms=self.terms,
+            working_size=self.working_size,
+            contour_weight=self.contour_weight,
+            seed=self.seed,
+            device=self.device,
+            dtype=self.dtype,
+            overlay=self.overlay,
+        )
+        summary = track_video(
+            self.video,
+            camera=self.camera,
+            keypoints=self.keypoints,
+            out=self.out,
+            settings=settings,
+            camera_name=self.camera_name,
+            start=self.start,
+            stop=self.stop,
+            stride=self.stride,
+            layout=self.layout,
+            normalised=self.normalised,
+        )
+        print(
+            f"{summary['num_frames']} frames, {summary['seconds_per_frame']:.2f} s each; "
+            f"track, summary and overlay are in {self.out}"
+        )
+
+
+Verb = (
+    Annotated[Demo, tyro.conf.subcommand("demo")]
+    | Annotated[Track, tyro.conf.subcommand("track")]
+)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        arguments: What follows `torchcss`; the process's own arguments by default.
+
+    Returns:
+        The exit status.
+    """
+    verb = tyro.cli(Verb, prog="torchcss", args=arguments, description=__doc__)  # type: ignore[arg-type]
+    try:
+        verb.run()
+    except TorchcssError as error:
+        print(f"torchcss: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        # A disk that fills up or goes away in mid-write.
+        print(f"torchcss: {OutputError(str(error))}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("torchcss: interrupted; the frames tracked so far are on disk", file=sys.stderr)
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
