@@ -5,20 +5,19 @@
 The joint term of body34 is evaluated with gradient and exact Hessian for many samples in four ways:
 
 * closed form: what the optimiser calls, `TrackingCost.local_model`;
-* value alone: the same without derivatives, the price of a trial step;
-* lifted by autograd: `Curvature.AUTOGRAD`, closed-form points, double backward through the tree;
+* value alone, without derivatives: the price of a trial step;
+* lifted by autograd: `Curvature.AUTOGRAD`, double backward through the tree alone;
 * plain autograd: state, pose, projection, robust cost, and a double backward through all of it, row
   by row, as anybody would write it first. The headline is the closed form against this one.
 
-Two rows of the full cost (contour, joints and stabiliser) follow, which need no autograd twin. Each
-repeat times every way once, one after the other; ratios are taken within a repeat, so that a busy
-machine slows both sides. Peak memory is that of a process of its own per way. Nothing is asserted.
+Two rows of the full cost (contour, joints and stabiliser) follow. Each repeat times every way, one
+after the other; ratios are taken within a repeat, so that a busy machine slows both sides. Memory
+is the peak of a process of its own per way. Nothing is asserted.
 """
 
 from __future__ import annotations
 
 import json
-import platform
 import resource
 import subprocess
 import sys
@@ -41,10 +40,12 @@ from torchcss.io.tracks import prepare_output_folder, write_summary
 from torchcss.joint_names import ALIASES
 from torchcss.types import Curvature, LocalModel
 from torchcss.vision.camera import Camera
-from torchcss.vision.features import FeatureExtractor
 
 CLOSED, LIFTED, PLAIN = "joints_closed_form", "joints_lifted_by_autograd", "joints_plain_autograd"
+WAYS = ("joints_value", CLOSED, LIFTED, PLAIN, "full_value", "full_local_model")
 WIDTH, HEIGHT = 640, 480
+AT_LEAST_S = 0.3
+"""A way that is faster is called again, and the mean time taken."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,17 +55,15 @@ class Config:
     samples: int = 2000
     """States per evaluation."""
     repeats: int = 7
-    """Interleaved repeats; the first, which warms up, is not counted when there are more."""
+    """Interleaved repeats, after one call of each way that compares the results."""
     dtype: Literal["float32", "float64"] = "float64"
     """Floating type."""
-    body: str = "body34"
-    """Body to pose."""
-    autograd_chunk: int = CHUNK
-    """Samples that the autograd ways take at a time; the package takes its own."""
-    at_least_s: float = 0.3
-    """A way that is faster than this is called again and its mean time taken."""
+    plain_chunk: int = CHUNK
+    """Samples that plain autograd takes at a time; the package takes its own number."""
+    threads: int | None = None
+    """Threads of torch; its own choice by default."""
     seed: int = 0
-    """Seed of poses, keypoints and picture."""
+    """Seed of poses, keypoints and edges."""
     out: Path | None = None
     """JSON file to write."""
     memory_of: str | None = None
@@ -77,7 +76,7 @@ def make_ways(config: Config) -> tuple[dict[str, Callable[[Tensor], Any]], Tenso
     dtype = getattr(torch, config.dtype)
     # The camera looks along z with y down; the body stands upright 3.5 m before it, facing it.
     flip = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
-    body = load_body(config.body, dtype=dtype).with_base(flip, torch.tensor([0.0, 0.0, 3.5]))
+    body = load_body("body34", dtype=dtype).with_base(flip, torch.tensor([0.0, 0.0, 3.5]))
     camera = Camera.pinhole(WIDTH, HEIGHT, focal_px=600.0).to(dtype)
     noise = torch.randn(config.samples, body.num_parameters, generator=generator, dtype=dtype)
     x = body.bounds.project(body.rest + 0.2 * noise)
@@ -91,65 +90,49 @@ def make_ways(config: Config) -> tuple[dict[str, Callable[[Tensor], Any]], Tenso
     choice = CostChoice(contour=None, joints=term, stabiliser=None, temporal=None)
     joints = TrackingCost(body=body, camera=camera, choice=choice, observation=observation)
     autograd = replace(joints, choice=replace(choice, curvature=Curvature.AUTOGRAD))
-    features = FeatureExtractor().to(dtype)(torch.rand(HEIGHT, WIDTH, generator=generator))
-    full = replace(
-        joints,
-        choice=CostChoice(temporal=None),
-        predictor=ContourPredictor(body),
-        edge_field=(features.edge_energy * features.edge_direction).to(dtype),
-    )
+    # Noise for edges: the search along the normals takes the same time whatever it finds.
+    edge_field = 0.7 * torch.rand(2, HEIGHT, WIDTH, generator=generator, dtype=dtype)
+    everything, predictor = CostChoice(temporal=None), ContourPredictor(body)
+    full = replace(joints, choice=everything, predictor=predictor, edge_field=edge_field)
 
     def plain(x: Tensor) -> LocalModel:
-        x = x.detach().requires_grad_()
-        uv_and_more = camera.project(body.pose(x).joints[:, observation.index])
-        return differentiate_twice(term.value(uv_and_more, observation).sum(-1), x)
+        parts = []
+        for part in x.split(config.plain_chunk):
+            part = part.detach().requires_grad_()
+            projection = camera.project(body.pose(part).joints[:, observation.index])
+            parts.append(differentiate_twice(term.value(projection, observation).sum(-1), part))
+        return LocalModel(*(torch.cat(items) for items in zip(*parts, strict=True)))
 
-    def in_chunks(evaluate: Callable[[Tensor], LocalModel]) -> Callable[[Tensor], LocalModel]:
-        def whole(x: Tensor) -> LocalModel:
-            parts = [evaluate(part) for part in x.split(config.autograd_chunk)]
-            return LocalModel(*(torch.cat(items) for items in zip(*parts, strict=True)))
-
-        return whole
-
-    ways = {
-        "joints_value": joints.value,
-        CLOSED: joints.local_model,
-        LIFTED: in_chunks(autograd.local_model),
-        PLAIN: in_chunks(plain),
-        "full_value": full.value,
-        "full_local_model": full.local_model,
-    }
-    return ways, x
+    evaluations = joints.value, joints.local_model, autograd.local_model, plain
+    evaluations += full.value, full.local_model
+    return dict(zip(WAYS, evaluations, strict=True)), x
 
 
-def seconds_of(way: Callable[[Tensor], Any], x: Tensor, at_least_s: float) -> float:
+def seconds_of(way: Callable[[Tensor], Any], x: Tensor) -> float:
     """Mean time of one call."""
     calls, start = 0, time.perf_counter()
-    while calls == 0 or time.perf_counter() - start < at_least_s:
+    while calls == 0 or time.perf_counter() - start < AT_LEAST_S:
         way(x)
         calls += 1
     return (time.perf_counter() - start) / calls
 
 
-def peak_mib() -> float:
-    """Largest memory that this process has held, MiB."""
+def measure_memory(config: Config, name: str) -> dict[str, float]:
+    """Peak memory of this process with one way, and how much a few samples would need less."""
     unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
-
-
-def measure_memory(config: Config) -> dict[str, float]:
-    """Peak memory of one way, and how much of it the evaluation added to the loaded libraries."""
     ways, x = make_ways(config)
-    ways[config.memory_of or CLOSED](x[:8])
-    before = peak_mib()
-    ways[config.memory_of or CLOSED](x)
-    return {"peak_mib": peak_mib(), "added_mib": peak_mib() - before}
+    peaks = []
+    for states in (x[:8], x):
+        ways[name](states)
+        peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20)
+    return {"peak_mib": peaks[1], "added_mib": peaks[1] - peaks[0]}
 
 
 def memory_in_own_process(config: Config, name: str) -> dict[str, float]:
-    options = [f"--{key}={getattr(config, key)}" for key in ("samples", "dtype", "body", "seed")]
-    options += [f"--autograd-chunk={config.autograd_chunk}", f"--memory-of={name}"]
-    command = [sys.executable, str(Path(__file__).resolve()), *options]
+    """The same of a new process."""
+    keys = ("samples", "dtype", "plain_chunk", "threads", "seed")
+    options = [f"--{key.replace('_', '-')}={getattr(config, key)}" for key in keys]
+    command = [sys.executable, __file__, *options, f"--memory-of={name}"]
     return json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout)
 
 
@@ -159,68 +142,69 @@ def difference(one: Tensor, other: Tensor) -> float:
     return float(((one - other).abs().amax(-1) / other.abs().amax(-1)).max())
 
 
-def quartiles(values: Any) -> dict[str, float]:
-    low, median, high = np.percentile(values, [25, 50, 75])
-    return {"median": float(median), "lower_quartile": float(low), "upper_quartile": float(high)}
+def quartiles(values: list[float]) -> dict[str, float]:
+    """The middle and the spread."""
+    names = ("lower_quartile", "median", "upper_quartile")
+    return dict(zip(names, np.percentile(values, [25, 50, 75]).tolist(), strict=True))
 
 
 def main(config: Config) -> dict[str, Any]:
     """Measure, print, write; return what is written."""
+    if config.threads is not None:
+        torch.set_num_threads(config.threads)
     if config.memory_of is not None:
-        memory = measure_memory(config)
+        memory = measure_memory(config, config.memory_of)
         print(json.dumps(memory))
         return memory
-    # First the memory: on Linux a process starts with the peak of the one that started it.
-    ways, x = make_ways(replace(config, samples=1))
-    memory = {name: memory_in_own_process(config, name) for name in ways}
+    # First of all the memory: on Linux a process starts with the peak of the one that starts it.
+    memory = {name: memory_in_own_process(config, name) for name in WAYS}
     ways, x = make_ways(config)
     closed = ways[CLOSED](x)
-    agreement = {}
-    for name in (LIFTED, PLAIN):
-        other = ways[name](x)
-        agreement[name] = {
-            "gradient": difference(closed.gradient, other.gradient),
-            "hessian": difference(closed.hessian, other.hessian),
-        }
-    times: dict[str, list[float]] = {name: [] for name in ways}
-    for _ in range(config.repeats):
-        for name, way in ways.items():
-            times[name].append(seconds_of(way, x, config.at_least_s))
-    counted = slice(1, None) if config.repeats > 1 else slice(None)
-    seconds = {name: np.array(values)[counted] for name, values in times.items()}
-    ratios = {name: quartiles(seconds[name] / seconds[CLOSED]) for name in (LIFTED, PLAIN)}
-    report = {
-        "metrics": {
-            "seconds": {name: quartiles(values) for name, values in seconds.items()},
-            "times_closed_form": ratios,
-            "memory": memory,
-            "relative_difference": agreement,
+    pairs = {name: list(zip(closed, ways[name](x), strict=True)) for name in (LIFTED, PLAIN)}
+    agreement = {
+        name: {"gradient": difference(*gradients), "hessian": difference(*hessians)}
+        for name, (_, gradients, hessians) in pairs.items()
+    }
+    rounds = [{name: seconds_of(ways[name], x) for name in WAYS} for _ in range(config.repeats)]
+    metrics = {
+        "seconds": {name: quartiles([t[name] for t in rounds]) for name in WAYS},
+        "times_closed_form": {
+            name: quartiles([t[name] / t[CLOSED] for t in rounds]) for name in agreement
         },
-        "unit": {"seconds": "s per call", "times_closed_form": "1", "memory": "MiB",
-                 "relative_difference": "1"},
-        "direction": {"seconds": "lower", "times_closed_form": "higher", "memory": "lower",
-                      "relative_difference": "lower"},
+        "memory": memory,
+        "relative_difference": agreement,
+    }
+    report = {
+        "metrics": metrics,
+        "unit": dict(zip(metrics, ("s per call", "1", "MiB", "1"), strict=True)),
+        "direction": dict(zip(metrics, ("lower", "higher", "lower", "lower"), strict=True)),
         "config": config,
         "threads": torch.get_num_threads(),
         "torch": torch.__version__,
-        "machine": platform.machine(),
-    }  # fmt: skip
-    print(f"{config.samples} samples of {config.body}, {config.dtype}, "
-          f"{report['threads']} threads, {len(seconds[CLOSED])} repeats")  # fmt: skip
-    print(f"{'':>26} {'ms, median':>11} {'quartiles':>17} {'peak MiB':>9} {'added':>7}")
-    for name, row in report["metrics"]["seconds"].items():
-        low, median, high = (1e3 * row[k] for k in ("lower_quartile", "median", "upper_quartile"))
-        peak, added = memory[name].values()
-        print(f"{name:>26} {median:11.1f} {low:8.1f}-{high:8.1f} {peak:9.0f} {added:7.0f}")
-    for name, ratio in ratios.items():
-        print(f"{name}: {ratio['median']:.1f} times the closed form's time "
-              f"({ratio['lower_quartile']:.1f}-{ratio['upper_quartile']:.1f}); largest relative "
-              f"difference {agreement[name]['gradient']:.1e} (gradient), "
-              f"{agreement[name]['hessian']:.1e} (Hessian)")  # fmt: skip
+    }
+    print_table(report)
     if config.out is not None:
         prepare_output_folder(config.out.parent)
         write_summary(config.out, report)
     return report
+
+
+def print_table(report: dict[str, Any]) -> None:
+    """The report for people."""
+    config, metrics = report["config"], report["metrics"]
+    print(f"{config.samples} samples, {config.dtype}, {report['threads']} threads")
+    print(f"{'ms':>26} {'quartile':>9} {'median':>9} {'quartile':>9} {'peak MiB':>9} {'added':>6}")
+    for name, row in metrics["seconds"].items():
+        times = "".join(f" {1e3 * value:9.1f}" for value in row.values())
+        peak, added = metrics["memory"][name].values()
+        print(f"{name:>26}{times} {peak:9.0f} {added:6.0f}")
+    for name, ratio in metrics["times_closed_form"].items():
+        low, median, high = ratio.values()
+        gradient, hessian = metrics["relative_difference"][name].values()
+        print(
+            f"{name}: {median:.1f} times the closed form ({low:.1f} to {high:.1f}); largest "
+            f"relative difference {gradient:.1e} (gradient), {hessian:.1e} (Hessian)"
+        )
 
 
 if __name__ == "__main__":

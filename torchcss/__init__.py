@@ -6,5 +6,17 @@ of poses with covariances and weights (covariance scaled sampling, Sminchisescu 
 """
 
 from torchcss.body.model import BodyModel, load_body
+from torchcss.io.tracks import Track, load_track
+from torchcss.pipeline import Settings, track_frames, track_video
+from torchcss.vision.camera import Camera
 
-__all__ = ["BodyModel", "load_body"]
+__all__ = [
+    "BodyModel",
+    "Camera",
+    "Settings",
+    "Track",
+    "load_body",
+    "load_track",
+    "track_frames",
+    "track_video",
+]

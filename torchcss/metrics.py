@@ -192,7 +192,7 @@ def procrustes_align(
         ShapeError: If the shapes do not fit, or a tracked position is not finite.
     """
     tracked, reference = _pair(tracked_m, reference_m)
-    known = np.isfinite(reference).all(-1)[..., None]
+    known = np.isfinite(reference).all(axis=-1, keepdims=True)
     count = known.sum(axis=-2, keepdims=True)
 
     def centred(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -256,9 +256,10 @@ def best_of_modes(
     if present is not None:
         mean = np.where(np.asarray(present, dtype=bool), mean, np.nan)
     chosen = np.where(np.isnan(mean), np.inf, mean).argmin(axis=-1)
-    measured = np.isfinite(mean).any(axis=-1)
-    best = np.take_along_axis(errors, chosen[..., None, None], axis=-2)[..., 0, :]
-    return np.where(measured[..., None], best, np.nan), np.where(measured, chosen, -1)
+    best = np.take_along_axis(errors, chosen[..., None, None], axis=-2)
+    measured = np.isfinite(mean).any(axis=-1, keepdims=True)
+    mode = np.where(measured, chosen[..., None], -1)
+    return np.where(measured, best[..., 0, :], np.nan), mode[..., 0]
 
 
 def frames_lost(
@@ -317,15 +318,18 @@ def track_errors(
     tracked, reference = tracked[..., index, :], reference[..., index, :]
     if not np.isfinite(reference).all(-1).any():
         raise ShapeError("the reference has no known position of the joints to compare: all is NaN")
-    kinds = (
-        absolute_errors_mm(tracked, reference), aligned, procrustes_errors_mm(tracked, reference)
-    )  # fmt: skip
-    return TrackErrors(
-        tuple(chosen),
-        *(JointErrors(errors[:, 0]) for errors in kinds),
-        *(JointErrors(best_of_modes(errors, present)[0]) for errors in kinds),
-        frames_lost(aligned[:, 0]),
-    )
+    kinds = {
+        "absolute": absolute_errors_mm(tracked, reference),
+        "root_aligned": aligned,
+        "procrustes": procrustes_errors_mm(tracked, reference),
+    }
+    of_kind = {kind: JointErrors(errors[:, 0]) for kind, errors in kinds.items()}
+    of_kind |= {
+        f"{kind}_best_of_modes": JointErrors(best_of_modes(errors, present)[0])
+        for kind, errors in kinds.items()
+    }
+    lost = frames_lost(of_kind["root_aligned"].errors_mm)
+    return TrackErrors(joint_names=tuple(chosen), lost=lost, **of_kind)
 
 
 def _pair(tracked_m: ArrayLike, reference_m: ArrayLike) -> tuple[np.ndarray, np.ndarray]:

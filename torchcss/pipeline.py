@@ -97,7 +97,7 @@ class Settings:
                 raise ConfigurationError(f"{name} must be at least 1, got {number}")
         try:
             torch.empty(0, device=self.device)
-        except RuntimeError as error:
+        except (RuntimeError, AssertionError) as error:  # the latter without CUDA
             raise ConfigurationError(
                 f"device {self.device!r} is not available here; use cpu"
             ) from error

@@ -26,6 +26,7 @@ class Preset:
         samples_body: Samples per frame for a body.
         modes_arm: Modes kept for an arm.
         modes_body: Modes kept for a body.
+        memory: See `Tracker`.
     """
 
     what: str
@@ -34,14 +35,16 @@ class Preset:
     samples_body: int
     modes_arm: int = 3
     modes_body: int = 7
+    memory: float = 1.0
 
 
 PRESETS: dict[str, Preset] = {
     "css": Preset(
         what="covariance scaled sampling, [IJRR] Fig. 6 with s = 8",
         proposal=CovarianceScaled(covariance_scale=8.0, max_deviation=1.0),
-        samples_arm=60,
+        samples_arm=40,
         samples_body=60,
+        memory=0.5,
     ),
     "single": Preset(
         what="one robust mode with joint limits, no search ([IJRR] section 6)",
@@ -82,6 +85,7 @@ def make_tracker(
         proposal=row.proposal,
         num_samples=num_samples or (row.samples_arm if arm else row.samples_body),
         num_modes=num_modes or (row.modes_arm if arm else row.modes_body),
-        optimiser=TrustRegionNewton(max_steps=40, tolerance=1e-2),
+        optimiser=TrustRegionNewton(max_steps=20, tolerance=1e-2),
+        memory=row.memory,
         dynamics=Diffusion(deviation=motion),
     )

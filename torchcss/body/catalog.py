@@ -191,7 +191,7 @@ class BodySpecification:
 
 _DOWN = ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0))
 _UP = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
-_FORWARD = ((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+_FORWARD = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 """Rotations (rows) that lay a part's z axis along -Y, +Y and +Z of its link."""
 
 
@@ -304,11 +304,10 @@ def _arm(
     half = size["shoulder_width"] / 2
     drop = 0.015 if chest else 0.0
     if chest or clavicle:
-        along = ((0.0, 0.0, sign), (0.0, 1.0, 0.0), (-sign, 0.0, 0.0))
-        rows = tuple(zip(*along, strict=True))
+        along = ((0.0, 0.0, -sign), (0.0, 1.0, 0.0), (sign, 0.0, 0.0))
         build.part(
-            p + "clavicle", link, (sign * half, drop - 0.025, -0.015), rows, (0.05, 0.05, 0.10)
-        )  # type: ignore[arg-type]
+            p + "clavicle", link, (sign * half, drop - 0.025, -0.015), along, (0.05, 0.05, 0.10)
+        )
         if chest:
             build.neighbours += [(p + "clavicle", chest), (p + "clavicle", "neck")]
         build.neighbours.append((p + "clavicle", p + "upper_arm"))
@@ -413,8 +412,8 @@ def specification(
     if unknown:
         raise BodyError(f"unknown lengths {sorted(unknown)}; known are {', '.join(LENGTHS)}")
     size = {**LENGTHS, **(lengths or {})}
-    if not all(value > 0 for value in (*size.values(), scale)):
-        raise BodyError("lengths and scale must be positive")
+    if not all(0 < value < math.inf for value in (*size.values(), scale)):
+        raise BodyError("lengths and scale must be positive and finite")
     build = _Builder(size, free_proportions)
     is_arm = name.startswith("arm")
     link = build.joint("world", None)
@@ -527,7 +526,7 @@ def _scaled(body: BodySpecification, scale: float) -> BodySpecification:
                     part.shape[7] / scale,
                     part.shape[8],
                 ),
-            )  # fmt: skip
+            )
             for part in body.parts
         ),
         markers=tuple(replace(m, translation=times(m.translation)) for m in body.markers),

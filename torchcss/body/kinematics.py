@@ -22,10 +22,10 @@ from typing import NamedTuple
 import numpy as np
 import pytorch_kinematics as pk
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 
-from torchcss.errors import BodyError, check_shape
+from torchcss.errors import BodyError, ShapeError, check_shape
 from torchcss.types import Bounds
 
 _MOVING = ("revolute", "prismatic")
@@ -128,7 +128,8 @@ class KinematicTree(nn.Module):
         links = torch.tensor([self.link_names.index(joint.link) for joint in moving]).long()
         axes = torch.tensor([joint.axis for joint in moving], dtype=torch.float64).reshape(-1, 3)
         self.register_buffer("axes", axes / axes.norm(dim=-1, keepdim=True))
-        self.register_buffer("is_revolute", torch.tensor([j.kind == "revolute" for j in moving]))
+        revolute = [joint.kind == "revolute" for joint in moving]
+        self.register_buffer("is_revolute", torch.tensor(revolute, dtype=torch.bool))
         self.register_buffer("lower", torch.tensor([j.lower for j in moving], dtype=torch.float64))
         self.register_buffer("upper", torch.tensor([j.upper for j in moving], dtype=torch.float64))
         self.register_buffer("joint_link", links)
@@ -183,7 +184,7 @@ class KinematicTree(nn.Module):
         # The analytical backward of pytorch-kinematics treats the poses as constants in a second
         # derivative; plain autograd through its forward pass does not.
         transforms = chain.forward_kinematics_tensor(
-            q.reshape(-1, self.num_joints), analytical_grad=False
+            q.reshape(batch.numel(), self.num_joints), analytical_grad=False
         )
         transforms = transforms.movedim(0, 1).reshape(*batch, len(self.link_names), 4, 4)
         return transforms[..., :3, :3], transforms[..., :3, 3]
@@ -219,7 +220,7 @@ class KinematicTree(nn.Module):
 
     def _chain(self, q: Tensor) -> pk.Chain:
         if q.dtype != self.axes.dtype:
-            raise BodyError(
+            raise ShapeError(
                 f"the state is {q.dtype} and the body {self.axes.dtype}: convert one, "
                 "for example with body.to(x.dtype)"
             )
@@ -230,7 +231,7 @@ class KinematicTree(nn.Module):
 
 
 def _check_specifications(joints: Sequence[JointSpecification]) -> None:
-    names = [joint.name for joint in joints]
+    names = [joint.name for joint in joints if joint.parent is not None]
     links = [joint.link for joint in joints]
     for what, values in (("joint", names), ("link", links)):
         duplicates = sorted({value for value in values if values.count(value) > 1})
@@ -251,8 +252,11 @@ def _check_specifications(joints: Sequence[JointSpecification]) -> None:
                 f"joint {joint.name!r} is of type {joint.kind!r}; supported are revolute, "
                 "continuous, prismatic and fixed (split others into joints of one axis)"
             )
-        if joint.kind != "fixed" and not float(np.linalg.norm(joint.axis)) > 0:
-            raise BodyError(f"joint {joint.name!r} has a zero axis")
+        numbers = np.concatenate([np.ravel(joint.rotation), joint.translation, joint.axis])
+        if not np.isfinite(numbers).all() or (joint.kind != "fixed" and not np.any(joint.axis)):
+            raise BodyError(
+                f"joint {joint.name!r}: origin and axis must be finite and the axis not zero"
+            )
         if not joint.lower <= joint.upper:
             raise BodyError(f"joint {joint.name!r}: lower limit {joint.lower} > {joint.upper}")
         seen.add(joint.link)
@@ -289,7 +293,7 @@ def _build_frames(joints: Sequence[JointSpecification]) -> pk.Frame:
 def _read_urdf(data: bytes, name: str) -> list[JointSpecification]:
     try:
         xml = ElementTree.fromstring(data)
-    except ElementTree.ParseError as error:
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise BodyError(f"{name}: not a URDF, the XML does not parse ({error})") from error
     if xml.tag != "robot" or xml.find("link") is None:
         raise BodyError(f"{name}: not a URDF, expected <robot> with links, found <{xml.tag}>")
@@ -303,22 +307,27 @@ def _read_urdf(data: bytes, name: str) -> list[JointSpecification]:
                 f"{', '.join(_URDF_TYPES)} (split others into joints of one axis)"
             )
     children = [_child(element, "child", name) for element in elements.values()]
+    parents = [_child(element, "parent", name) for element in elements.values()]
     links = [link.get("name", "") for link in xml.findall("link")]
-    unknown = {*children, *(_child(e, "parent", name) for e in elements.values())} - set(links)
+    unknown = {*children, *parents} - set(links)
     if unknown:
         raise BodyError(f"{name}: joints name links that do not exist: {sorted(unknown)}")
     if len(set(children)) != len(children) or len(set(links)) != len(links):
         raise BodyError(f"{name}: a link occurs twice, or hangs on two joints")
-    if len(set(links) - set(children)) != 1:
-        raise BodyError(
-            f"{name}: expected exactly one root link, found {sorted(set(links) - set(children))}"
-        )
+    reached = [link for link in links if link not in children]
+    if len(reached) != 1:
+        raise BodyError(f"{name}: expected exactly one root link, found {sorted(reached)}")
+    for link in reached:  # grows while it is walked: breadth first
+        reached += [below for below, above in zip(children, parents, strict=True) if above == link]
+    if len(reached) != len(links):
+        raise BodyError(f"{name}: the links {sorted(set(links) - set(reached))} form a loop")
     if not elements:
         return [JointSpecification(name="root", link=links[0], parent=None)]
     try:
-        chain = pk.build_chain_from_urdf(data)
+        chain = pk.build_chain_from_urdf(ElementTree.tostring(_kinematics_only(xml)))
     except Exception as error:  # the parser raises many kinds, all of them mean a bad file
-        raise BodyError(f"{name}: pytorch-kinematics cannot read this URDF ({error})") from error
+        reason = " ".join(str(error).split())
+        raise BodyError(f"{name}: pytorch-kinematics cannot read this URDF ({reason})") from error
 
     specifications: list[JointSpecification] = []
 
@@ -329,6 +338,9 @@ def _read_urdf(data: bytes, name: str) -> list[JointSpecification]:
         for offset in (link_offset, joint_offset):
             if offset is not None:
                 matrix = matrix @ offset.get_matrix()[0].double()
+        axis = tuple(frame.joint.axis.double().tolist())
+        if element is not None and element.find("axis") is None:
+            axis = (1.0, 0.0, 0.0)  # the URDF's default; pytorch-kinematics takes z
         lower, upper = _limits(element, name)
         specifications.append(
             JointSpecification(
@@ -338,10 +350,10 @@ def _read_urdf(data: bytes, name: str) -> list[JointSpecification]:
                 kind=frame.joint.joint_type,
                 translation=tuple(matrix[:3, 3].tolist()),
                 rotation=tuple(tuple(row) for row in matrix[:3, :3].tolist()),
-                axis=tuple(frame.joint.axis.double().tolist()),
+                axis=axis,
                 lower=lower,
                 upper=upper,
-                mimic=_mimic(element),
+                mimic=_mimic(element, name),
             )
         )
         for child in frame.children:
@@ -349,6 +361,19 @@ def _read_urdf(data: bytes, name: str) -> list[JointSpecification]:
 
     visit(chain._root, None)
     return specifications
+
+
+def _kinematics_only(xml: ElementTree.Element) -> ElementTree.Element:
+    """The robot without meshes, inertias and limits, which the parser would only stumble over."""
+    robot = ElementTree.Element("robot", name="robot")
+    for link in xml.findall("link"):
+        ElementTree.SubElement(robot, "link", name=link.get("name", ""))
+    for joint in xml.findall("joint"):
+        bare = ElementTree.SubElement(robot, "joint", dict(joint.attrib))
+        # Files often give fixed joints the axis 0 0 0.
+        wanted = ("parent", "child", "origin", "axis")[: 3 if joint.get("type") == "fixed" else 4]
+        bare.extend(part for part in joint if part.tag in wanted)
+    return robot
 
 
 def _child(element: ElementTree.Element, tag: str, name: str) -> str:
@@ -370,12 +395,18 @@ def _limits(element: ElementTree.Element | None, name: str) -> tuple[float, floa
         raise BodyError(f"{name}: joint {element.get('name')!r}: {error}") from error
 
 
-def _mimic(element: ElementTree.Element | None) -> tuple[str, float, float] | None:
+def _mimic(element: ElementTree.Element | None, name: str) -> tuple[str, float, float] | None:
     mimic = None if element is None else element.find("mimic")
-    if mimic is None:
+    if element is None or mimic is None:
         return None
-    return (
-        mimic.get("joint", ""),
-        float(mimic.get("multiplier", 1.0)),
-        float(mimic.get("offset", 0.0)),
-    )
+    try:
+        multiplier = float(mimic.get("multiplier", 1.0))
+        offset = float(mimic.get("offset", 0.0))
+    except ValueError as error:
+        raise BodyError(f"{name}: joint {element.get('name')!r}: {error}") from error
+    if not (math.isfinite(multiplier) and math.isfinite(offset) and multiplier != 0):
+        raise BodyError(
+            f"{name}: joint {element.get('name')!r} mimics with multiplier {multiplier} and offset "
+            f"{offset}; expected finite numbers and a multiplier that is not zero"
+        )
+    return mimic.get("joint", ""), multiplier, offset

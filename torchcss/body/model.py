@@ -29,7 +29,7 @@ from torchcss.body.catalog import (
 from torchcss.body.kinematics import KinematicTree, TreePose
 from torchcss.body.lift import lift_to_joints
 from torchcss.body.surface import SurfaceSample, angular_grid, surface_points
-from torchcss.errors import BodyError, check_shape
+from torchcss.errors import BodyError, ShapeError, check_shape
 from torchcss.types import Bounds, Curvature, LocalModel, PointCost
 
 
@@ -141,6 +141,11 @@ class BodyModel(nn.Module):
             ends = [(float(b[row]) - offset) / factor for b in (self.tree.lower, self.tree.upper)]
             lower[column] = max(lower[column], min(ends))
             upper[column] = min(upper[column], max(ends))
+            if lower[column] > upper[column]:
+                raise BodyError(
+                    f"parameter {names[column]!r} moves several joints whose limits exclude each "
+                    "other: widen the limits or free a joint"
+                )
         self.register_buffer("tie", tie)
         self.register_buffer("offset", torch.tensor([r[2] for r in rows], dtype=torch.float64))
         self.register_buffer("lower", lower)
@@ -207,8 +212,10 @@ class BodyModel(nn.Module):
             rotation: Orientation of the root link's frame in the world.
             translation: Its origin in the world, metres.
         """
-        other = copy.copy(self)
-        other._buffers = dict(self._buffers)
+        other, tree = copy.copy(self), copy.copy(self.tree)
+        # Own tables of tensors, so that converting one body leaves the other as it is.
+        other._buffers, tree._buffers = dict(self._buffers), dict(self.tree._buffers)
+        other._modules = {**self._modules, "tree": tree}
         other._buffers["base_rotation"] = rotation.to(self.tie)
         other._buffers["base_translation"] = translation.to(self.tie)
         return other
@@ -221,8 +228,16 @@ class BodyModel(nn.Module):
 
         Returns:
             Link poses, twists and joint centres in the world.
+
+        Raises:
+            ShapeError: If the state has another size or type than the body.
         """
         check_shape("x", x, self.num_parameters)
+        if x.dtype != self.dtype:
+            raise ShapeError(
+                f"x: the state is {x.dtype} and the body {self.dtype}; convert one, for example "
+                "with body.to(x.dtype)"
+            )
         tree = self.tree(x @ self.tie.T + self.offset, self.base_rotation, self.base_translation)
         return BodyPose(x, tree, self.points_on_links(tree, self.marker_link, self.marker_offset))
 
@@ -397,8 +412,8 @@ def load_body(
         body = _urdf_specification(Path(name_or_path))
     else:
         raise BodyError(
-            f"no body {str(name_or_path)!r}; expected one of {', '.join(BODY_NAMES)} or the path of "
-            "a URDF file"
+            f"no body {str(name_or_path)!r}; expected one of {', '.join(BODY_NAMES)} or the path "
+            "of a URDF file"
         )
     return BodyModel(body, rings=rings, meridians=meridians).to(dtype=dtype, device=device)
 

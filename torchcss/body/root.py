@@ -31,7 +31,11 @@ def root_rotation(angles: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 
 
 
 def root_angles(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
-    """Yaw, pitch and roll of a rotation; pitch lies in [-pi/2, pi/2]."""
+    """Yaw, pitch and roll of a rotation; pitch lies in [-pi/2, pi/2].
+
+    At a pitch of a right angle only the sum or difference of yaw and roll is determined: the angles
+    returned still give the rotation, but their derivatives are not finite.
+    """
     yaw = torch.atan2(rotation[..., 0, 2], rotation[..., 2, 2])
     pitch = torch.asin((-rotation[..., 1, 2]).clamp(-1, 1))
     roll = torch.atan2(rotation[..., 1, 0], rotation[..., 1, 1])
@@ -67,7 +71,8 @@ def move_base(
         rotation: Orientation of the new base in the world.
         translation: Its origin in the world, metres.
         x: States on the old base.
-        covariance: Their covariances.
+        covariance: Their covariances. On the new base no item may have a pitch of exactly a right
+            angle, where its covariance is not finite; choose a base near the body.
 
     Returns:
         The body on the new base, and the states and covariances in its parameters.
@@ -83,11 +88,11 @@ def move_base(
     moved = x.clone()
     moved[..., index] = mapped(x[..., index])
     if covariance is not None:
-        flat = x[..., index].reshape(-1, 6)
-        jacobian = torch.stack([torch.func.jacfwd(mapped)(root) for root in flat])
-        full = torch.eye(x.shape[-1]).to(x).repeat(len(flat), 1, 1)
+        root, size = x[..., index], x.shape[-1]
+        # The derivative in a step that all items share is that of every item in its own.
+        jacobian = torch.func.jacfwd(lambda step: mapped(root + step))(root.new_zeros(6))
+        full = torch.eye(size).to(x).repeat(*x.shape[:-1], 1, 1)
         rows = torch.tensor(index, device=x.device)
-        full[:, rows[:, None], rows] = jacobian
-        full = full.reshape(*x.shape[:-1], x.shape[-1], x.shape[-1])
+        full[..., rows[:, None], rows] = jacobian
         covariance = full @ covariance @ full.mT
     return body.with_base(rotation, translation), moved, covariance

@@ -19,11 +19,15 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.surface import surface_points
+
+
+_GRAZING = 0.15
+"""Sine of the angle by which a curve must turn through the line of sight to count fully."""
 
 
 class ContourNodes(NamedTuple):
@@ -32,13 +36,14 @@ class ContourNodes(NamedTuple):
     Attributes:
         points: Positions, metres.
         normals: Unit outward normals; they are also the contour's normals in the image.
-        exists: False where the ring or meridian has no contour: wholly back-facing or front-facing.
+        exists: 0 where the ring or meridian has no contour (wholly back-facing or front-facing) or
+            runs inside a neighbouring part; 1 on a clear contour, between where one fades.
         visible: 1 where nothing is in front, 0 where another part is, between on the ramp.
     """
 
     points: Float[Tensor, "*batch p 3"]
     normals: Float[Tensor, "*batch p 3"]
-    exists: Bool[Tensor, "*batch p"]
+    exists: Float[Tensor, "*batch p"]
     visible: Float[Tensor, "*batch p"]
 
 
@@ -47,8 +52,9 @@ class ContourPredictor(nn.Module):
 
     Args:
         body: The body whose parts are predicted.
-        rings: Closed curves per part, each with two nodes.
-        meridians: Pole-to-pole curves per part, each with one node.
+        rings: Closed curves per part, each with two nodes; by default 7, and more for a body of few
+            parts, so that its contour is as finely sampled as a large one's.
+        meridians: Pole-to-pole curves per part, each with one node; by default nearly as many.
         ramp: Width of the transition between visible and occluded, metres.
         clearance: How far outside the surface a node must be free of neighbouring parts, metres.
 
@@ -72,13 +78,15 @@ class ContourPredictor(nn.Module):
         self,
         body: BodyModel,
         *,
-        rings: int = 7,
-        meridians: int = 6,
+        rings: int | None = None,
+        meridians: int | None = None,
         ramp: float = 0.010,
         clearance: float = 0.010,
     ) -> None:
         super().__init__()
         self.ramp, self.clearance = ramp, clearance
+        rings = rings or max(7, min(18, 126 // max(body.num_parts, 1)))
+        meridians = meridians or rings - 1
         real, device = torch.float64, body.tie.device
         shape = body.part_shape.to(real)[:, None, None, :]
         heights = (torch.arange(rings, dtype=real, device=device) + 0.5) * (1.9 / rings) - 0.95
@@ -144,7 +152,7 @@ class ContourPredictor(nn.Module):
         normals = (normals @ turn).flatten(-3, -2)
         exists = exists.flatten(-2)
         visible, free = self._occlusion(body, rotation, centre, eye, points, normals)
-        return ContourNodes(points, normals, exists & free, visible)
+        return ContourNodes(points, normals, exists * free, visible)
 
     def _occlusion(
         self,
@@ -154,11 +162,11 @@ class ContourPredictor(nn.Module):
         eye: Tensor,
         points: Tensor,
         normals: Tensor,
-    ) -> tuple[Float[Tensor, "*batch p"], Bool[Tensor, "*batch p"]]:
+    ) -> tuple[Float[Tensor, "*batch p"], Float[Tensor, "*batch p"]]:
         """Visibility of the nodes, and whether their outside is free of neighbouring parts."""
         tested = points + self.clearance * normals
         visible = torch.ones_like(points[..., 0])
-        free = torch.ones_like(visible, dtype=torch.bool)
+        free = torch.ones_like(visible)
         shape = body.part_shape
         distance = eye.norm(dim=-1)
         for part in range(body.num_parts):
@@ -187,8 +195,9 @@ class ContourPredictor(nn.Module):
             covered = (inside / self.ramp).clamp(0, 1) * (front / self.ramp).clamp(0, 1)
             own = self.node_part == part
             visible = visible * (1 - torch.where(own, 0.0, covered))
-            close = (front > -4 * thickness) & (inside > 0)
-            free = free & ~(close & self.touching[part, self.node_part])
+            # A neighbour just behind the node hides the step in depth that makes an image edge.
+            close = (inside / self.ramp).clamp(0, 1) * (4 + front / thickness).clamp(0, 1)
+            free = free * (1 - torch.where(self.touching[part, self.node_part], close, 0.0))
         return visible, free
 
 
@@ -200,13 +209,14 @@ def _ring_crossings(
     """Both crossings of every ring: `[*batch parts 2*rings ...]`."""
     parts, rings, steps, _ = points.shape
     facing = _facing(points, normals, eye)
+    clear = _clearness(facing, eye)
     before, after = facing[..., :-1], facing[..., 1:]
     found = []
     index = torch.arange(parts * rings, device=points.device).reshape(parts, rings)
     for crossing in ((before < 0) & (after >= 0), (before >= 0) & (after < 0)):
         exists, step = crossing.max(dim=-1)
         found.append(
-            (*_interpolate(points, normals, facing, index * steps + step, step), exists)
+            (*_interpolate(points, normals, facing, index * steps + step, step), exists * clear)
         )
     return tuple(torch.cat(pair, dim=eye.dim() - 1) for pair in zip(*found, strict=True))  # type: ignore[return-value]
 
@@ -222,7 +232,18 @@ def _meridian_crossings(
     crossing = (facing[..., :-1] < 0) != (facing[..., 1:] < 0)
     exists, step = crossing.max(dim=-1)
     index = torch.arange(parts * meridians, device=points.device).reshape(parts, meridians)
+    exists = exists * _clearness(facing, eye)
     return (*_interpolate(points, normals, facing, index * steps + step, step), exists)
+
+
+def _clearness(facing: Tensor, eye: Tensor) -> Float[Tensor, "*batch parts c"]:
+    """1 where a curve turns well to both sides of the line of sight; 0 where it only grazes it.
+
+    A contour is born where a curve touches the line of sight, with both crossings in one place.
+    """
+    distance = eye.norm(dim=-1)[..., None]
+    turned = torch.minimum(facing.amax(-1), -facing.amin(-1))
+    return (turned / (_GRAZING * distance)).clamp(0, 1)
 
 
 def _facing(points: Tensor, normals: Tensor, eye: Tensor) -> Float[Tensor, "*batch parts c steps"]:

@@ -98,6 +98,9 @@ class Tracker:
         duplicate_distance: See `distinct_modes`.
         laplace_evidence: Weigh a mode by its Laplace evidence, likelihood times
             `sqrt(det Sigma)`, instead of the likelihood at the mode alone (design decision 5).
+        memory: Power of the prior's weights in step 5. One is Fig. 6; it treats frames as independent
+            evidence, so with a sharp likelihood a mode that led for some frames can never be
+            overtaken. Image errors persist from frame to frame, which a power below one allows for.
         standard_bhattacharyya: Match modes by the distance of the literature instead of the one
             printed (design decision 4).
     """
@@ -109,6 +112,7 @@ class Tracker:
     dynamics: Dynamics = field(default_factory=Diffusion)
     duplicate_distance: float = 1.0
     laplace_evidence: bool = False
+    memory: float = 1.0
     standard_bhattacharyya: bool = False
 
     def __post_init__(self) -> None:
@@ -117,6 +121,8 @@ class Tracker:
                 raise ConfigurationError(
                     f"Tracker.{name}: expected a positive number, got {getattr(self, name)}"
                 )
+        if not 0 <= self.memory <= 1:
+            raise ConfigurationError(f"Tracker.memory: expected 0 to 1, got {self.memory}")
 
     def init(self, mixture: GaussianMixture, *, generator: torch.Generator) -> TrackerState:
         """Start from a mixture.
@@ -201,7 +207,8 @@ class Tracker:
             pruned, kept = unpruned.take(order).normalise(), distinct[order]
 
             # 5, 6: multiply in the weights of the closest prior modes, and normalise.
-            matches = match_to_prior(pruned, prior, standard=self.standard_bhattacharyya)
+            tempered = prior._replace(log_weight=self.memory * prior.normalise().log_weight)
+            matches = match_to_prior(pruned, tempered, standard=self.standard_bhattacharyya)
             best_first = matches.mixture.log_weight.argsort(descending=True, stable=True)
             mixture, parent = matches.mixture.take(best_first), matches.parent[best_first]
             kept = kept[best_first]

@@ -1,0 +1,375 @@
+"""The tree: poses and twists against hand-written kinematics, URDF files, and their errors."""
+
+from __future__ import annotations
+
+import math
+import sys
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import pytest
+import pytorch_kinematics as pk
+import torch
+from torch import Tensor
+
+from torchcss.body.catalog import BODY_NAMES
+from torchcss.body.kinematics import JointSpecification, KinematicTree
+from torchcss.body.model import BodyModel, load_body
+from torchcss.errors import BodyError, ShapeError
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from reference import kinematics as reference
+
+ROBOTS = {"panda": 9, "iiwa7": 7, "ur5": 6, "anymal_b": 12, "poppy_torso": 13}
+"""Moving joints of the robots in the shared data."""
+
+
+def by_hand(tree: KinematicTree, q: Tensor) -> tuple[Tensor, Tensor]:
+    values = dict(zip(tree.joint_names, q.unbind(-1), strict=True))
+    poses = reference.forward_kinematics(tree.specifications, values)
+    batch = q.shape[:-1]
+    turns = [poses[name][0].expand(*batch, 3, 3) for name in tree.link_names]
+    origins = [poses[name][1].expand(*batch, 3) for name in tree.link_names]
+    return torch.stack(turns, dim=-3), torch.stack(origins, dim=-2)
+
+
+def awkward_tree() -> KinematicTree:
+    """Branches, oblique axes that are not unit, turned offsets, fixed joints in between."""
+    turn = torch.linalg.matrix_exp(reference.skew(torch.tensor([0.3, 1.0, -2.0]).double()))
+    rotation = tuple(tuple(row) for row in turn.tolist())
+    return KinematicTree(
+        [
+            JointSpecification(name="root", link="base", parent=None),
+            JointSpecification(
+                name="a", link="A", parent="base", kind="revolute", axis=(1.0, 2.0, -3.0),
+                translation=(0.1, 0.2, 0.3), rotation=rotation,
+            ),
+            JointSpecification(
+                name="slide", link="B", parent="A", kind="prismatic", axis=(0.0, 5.0, 1.0),
+                rotation=rotation, translation=(0.0, 0.0, 1.0),
+            ),
+            JointSpecification(name="weld", link="W", parent="B", translation=(0.5, 0.0, 0.0)),
+            JointSpecification(
+                name="c", link="C", parent="W", kind="revolute", axis=(0.0, 0.0, 1e-3)
+            ),
+            JointSpecification(
+                name="d", link="D", parent="base", kind="revolute", axis=(0.0, -1.0, 0.0)
+            ),
+            JointSpecification(
+                name="e", link="E", parent="A", kind="prismatic", translation=(1.0, 0.0, 0.0)
+            ),
+        ]
+    )  # fmt: skip
+
+
+def trees() -> list:
+    bodies = [load_body(name, free_proportions=True).tree for name in BODY_NAMES]
+    names = [*BODY_NAMES, "awkward"]
+    return [
+        pytest.param(tree, id=n) for tree, n in zip([*bodies, awkward_tree()], names, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("tree", trees())
+def test_poses_are_those_of_rodrigues(tree: KinematicTree, generator: torch.Generator) -> None:
+    q = 3 * torch.randn(4, tree.num_joints, generator=generator, dtype=torch.float64)
+    rotation, translation = tree.link_poses(q)
+    expected_rotation, expected_translation = by_hand(tree, q)
+    torch.testing.assert_close(rotation, expected_rotation, rtol=0, atol=1e-13)
+    torch.testing.assert_close(translation, expected_translation, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("tree", trees())
+def test_twists_move_points_as_autograd_says(
+    tree: KinematicTree, generator: torch.Generator
+) -> None:
+    q = torch.randn(tree.num_joints, generator=generator, dtype=torch.float64)
+    offset = torch.randn(len(tree.link_names), 3, generator=generator, dtype=torch.float64)
+    base = torch.linalg.matrix_exp(reference.skew(torch.tensor([1.0, -0.2, 0.7]).double()))
+    shift = torch.tensor([0.3, -2.0, 1.0], dtype=torch.float64)
+
+    def points(q: Tensor) -> Tensor:
+        turn, origin = by_hand(tree, q)
+        return ((turn @ offset[..., None])[..., 0] + origin) @ base.T + shift
+
+    jacobian = torch.autograd.functional.jacobian(points, q)
+    pose = tree(q, base, shift)
+    p = points(q)
+    arm = torch.linalg.cross(pose.omega[:, None, :].expand(-1, len(p), -1), p.expand(len(q), -1, 3))
+    velocity = (arm + pose.velocity[:, None, :]) * tree.ancestors[..., None]
+    torch.testing.assert_close(velocity.permute(1, 2, 0), jacobian, rtol=0, atol=1e-12)
+    moved = jacobian.abs().amax(dim=1).T > 1e-12
+    assert (moved <= tree.ancestors).all()
+    below = tree.ancestors[:, tree.joint_link]
+    assert torch.equal(tree.joint_ancestors, below)
+    assert tree.joint_ancestors.diagonal().all()
+
+
+def test_second_derivatives_are_those_of_finite_differences(generator: torch.Generator) -> None:
+    """The trap of pytorch-kinematics' default backward: see section 0 of the field notes."""
+    tree = load_body("arm8").tree
+    q = torch.randn(tree.num_joints, generator=generator, dtype=torch.float64)
+    weight = torch.randn(len(tree.link_names), 3, generator=generator, dtype=torch.float64)
+
+    def gradient(q: Tensor, create_graph: bool = False) -> Tensor:
+        q = q if q.requires_grad else q.detach().requires_grad_()
+        value = (weight * tree.link_poses(q)[1]).sum().square()
+        return torch.autograd.grad(value, q, create_graph=create_graph)[0]
+
+    leaf = q.clone().requires_grad_()
+    rows = gradient(leaf, create_graph=True)
+    hessian = torch.stack(
+        [torch.autograd.grad(row, leaf, retain_graph=True)[0] for row in rows]
+    )
+    step = 1e-6
+    shifts = step * torch.eye(len(q), dtype=torch.float64)
+    differences = torch.stack([(gradient(q + s) - gradient(q - s)) / (2 * step) for s in shifts])
+    torch.testing.assert_close(hessian, differences, rtol=1e-7, atol=1e-7)
+
+
+@pytest.mark.parametrize("batch", [(), (5,), (2, 3), (0,)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_leading_shapes_and_types(batch: tuple[int, ...], dtype: torch.dtype) -> None:
+    tree = awkward_tree().to(dtype)
+    pose = tree(torch.zeros(*batch, tree.num_joints, dtype=dtype))
+    links, joints = len(tree.link_names), tree.num_joints
+    assert pose.rotation.shape == (*batch, links, 3, 3)
+    assert pose.translation.shape == (*batch, links, 3)
+    assert pose.omega.shape == pose.velocity.shape == (*batch, joints, 3)
+    assert all(part.dtype == dtype for part in pose)
+
+
+def test_wrong_states_are_refused() -> None:
+    tree = awkward_tree()
+    with pytest.raises(ShapeError, match="expected a shape"):
+        tree(torch.zeros(3, dtype=torch.float64))
+    with pytest.raises(ShapeError, match=r"float32.*float64.*convert"):
+        tree(torch.zeros(tree.num_joints, dtype=torch.float32))
+    with pytest.raises(BodyError, match="no link 'nose'"):
+        tree.link_index("nose")
+
+
+# URDF files.
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_robots_load_and_agree_with_pytorch_kinematics(
+    name: str, shared_data: Path, generator: torch.Generator
+) -> None:
+    path = shared_data / "robot_models" / f"{name}.urdf"
+    body = load_body(path)
+    tree = body.tree
+    assert tree.num_joints == ROBOTS[name]
+    theirs = pk.build_chain_from_urdf(path.read_bytes()).to(dtype=torch.float64)
+    assert list(tree.joint_names) == theirs.get_joint_parameter_names()
+    q = torch.randn(6, tree.num_joints, generator=generator, dtype=torch.float64)
+    expected = theirs.forward_kinematics(q)
+    rotation, translation = tree.link_poses(q)
+    assert set(tree.link_names) == set(expected)
+    for link, pose in expected.items():
+        matrix = pose.get_matrix()
+        index = tree.link_index(link)
+        # Their numbers have passed through float32 and are not orthonormal; ours are.
+        torch.testing.assert_close(rotation[:, index], matrix[:, :3, :3], rtol=0, atol=3e-7)
+        torch.testing.assert_close(translation[:, index], matrix[:, :3, 3], rtol=0, atol=3e-7)
+    identity = torch.eye(3, dtype=torch.float64).expand_as(rotation)
+    torch.testing.assert_close(rotation @ rotation.mT, identity, rtol=0, atol=1e-13)
+    torch.testing.assert_close(translation, by_hand(tree, q)[1], rtol=0, atol=3e-7)
+    joints = {joint.get("name"): joint for joint in ElementTree.parse(path).getroot().findall("joint")}
+    for row, joint in enumerate(tree.joint_names):
+        limit = joints[joint].find("limit")
+        if limit is None or joints[joint].get("type") == "continuous":
+            expected_limits = (-math.inf, math.inf)
+        else:
+            expected_limits = (float(limit.get("lower", 0)), float(limit.get("upper", 0)))
+        assert (float(tree.lower[row]), float(tree.upper[row])) == expected_limits
+    assert torch.isfinite(body.rest).all()
+    assert body.pose(body.rest).joints.shape == (len(tree.link_names), 3)
+
+
+def test_mimic_fingers_of_panda_share_a_parameter(shared_data: Path) -> None:
+    body = load_body(shared_data / "robot_models" / "panda.urdf")
+    assert body.tree.num_joints == 9
+    assert body.num_parameters == 8
+    assert "panda_finger_joint2" not in body.state_names
+    x = torch.zeros(8, dtype=torch.float64)
+    x[body.state_index("panda_finger_joint1")] = 0.03
+    joints = body.pose(x).joints
+    rest = body.pose(torch.zeros_like(x)).joints
+    for finger in ("panda_leftfinger", "panda_rightfinger"):
+        moved = joints[body.joint_index(finger)] - rest[body.joint_index(finger)]
+        assert float(moved.norm()) == pytest.approx(0.03)
+
+
+LINKS = "<link name='a'/><link name='b'/>"
+
+
+def joint(
+    inside: str = "", *, name: str = "j", kind: str = "revolute", parent: str = "a", child: str = "b"
+) -> str:
+    return (
+        f"<joint name='{name}' type='{kind}'><parent link='{parent}'/><child link='{child}'/>"
+        f"{inside}</joint>"
+    )
+
+
+def robot(inside: str) -> str:
+    return f"<robot name='r'>{inside}</robot>"
+
+
+def load(folder: Path, text: str) -> BodyModel:
+    path = folder / "robot.urdf"
+    path.write_text(text)
+    return load_body(path)
+
+
+THREE = LINKS + "<link name='c'/>" + joint("<limit lower='-1' upper='2'/>")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        pytest.param("", "XML does not parse", id="empty file"),
+        pytest.param("hello, world", "XML does not parse", id="not XML"),
+        pytest.param("\x00\x01\x02", "XML does not parse", id="binary"),
+        pytest.param("<?xml version='1.0' encoding='latin-17'?><robot/>", "parse", id="encoding"),
+        pytest.param("<mujoco><worldbody/></mujoco>", "found <mujoco>", id="MJCF"),
+        pytest.param(robot(""), "expected <robot> with links", id="no links"),
+        pytest.param(robot(LINKS + joint(kind="floating")), "'floating'; supported", id="floating"),
+        pytest.param(robot(LINKS + joint(kind="planar")), "'planar'; supported", id="planar"),
+        pytest.param(robot(THREE + joint(child="c")), "same name", id="duplicate joint"),
+        pytest.param(robot(LINKS + LINKS + joint()), "a link occurs twice", id="duplicate link"),
+        pytest.param(robot(LINKS), r"one root link, found \['a', 'b'\]", id="two roots"),
+        pytest.param(
+            robot(LINKS + joint() + joint(name="k", parent="b", child="a")),
+            r"one root link, found \[\]", id="no root",
+        ),
+        pytest.param(
+            robot(
+                THREE + "<link name='d'/>" + joint(name="k", parent="c", child="d")
+                + joint(name="l", parent="d", child="c")
+            ),
+            r"\['c', 'd'\] form a loop", id="loop beside a tree",
+        ),
+        pytest.param(robot(LINKS + joint(child="z")), r"not exist: \['z'\]", id="unknown link"),
+        pytest.param(
+            robot(LINKS + "<joint name='j' type='fixed'><child link='b'/></joint>"),
+            "no <parent", id="no parent",
+        ),
+        pytest.param(robot(LINKS + joint("<axis xyz='0 0 0'/>")), "axis not zero", id="zero axis"),
+        pytest.param(robot(LINKS + joint("<axis xyz='0 1'/>")), "vector length", id="short axis"),
+        pytest.param(robot(LINKS + joint("<axis xyz='x y z'/>")), "'x'", id="axis not a number"),
+        pytest.param(robot(LINKS + joint("<axis xyz='inf 0 1'/>")), "finite", id="infinite axis"),
+        pytest.param(robot(LINKS + joint("<origin xyz='nan 0 0'/>")), "finite", id="origin NaN"),
+        pytest.param(robot(LINKS + joint("<origin rpy='1 2'/>")), "vector length", id="origin"),
+        pytest.param(robot(LINKS + joint("<limit lower='low'/>")), "'low'", id="limit"),
+        pytest.param(robot(LINKS + joint("<limit lower='nan'/>")), "lower limit", id="limit NaN"),
+        pytest.param(
+            robot(LINKS + joint("<limit lower='1' upper='0'/>")), "lower limit 1", id="no range"
+        ),
+        pytest.param(
+            robot(THREE + joint("<mimic joint='z'/>", name="k", child="c")), "'z'", id="mimics none"
+        ),
+        pytest.param(
+            robot(THREE + joint("<mimic joint='k'/>", name="k", child="c")), "'k'", id="mimics self"
+        ),
+        pytest.param(
+            robot(THREE + joint("<mimic joint='j' multiplier='0'/>", name="k", child="c")),
+            "multiplier 0", id="mimics nothing",
+        ),
+        pytest.param(
+            robot(THREE + joint("<mimic joint='j' offset='far'/>", name="k", child="c")),
+            "'far'", id="mimic offset",
+        ),
+        pytest.param(
+            robot(
+                THREE
+                + joint("<mimic joint='j'/><limit lower='5' upper='6'/>", name="k", child="c")
+            ),
+            "exclude each other", id="limits exclude each other",
+        ),
+    ],
+)  # fmt: skip
+def test_bad_files_are_refused_in_one_line(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(BodyError, match=message) as caught:
+        load(tmp_path, text)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(BodyError, match="No such file"):
+        load_body(tmp_path / "nowhere.urdf")
+    with pytest.raises(BodyError, match=r"no body .*arm7"):
+        load_body("arm9")
+    with pytest.raises(BodyError, match="cannot read the URDF"):
+        load_body(tmp_path)
+
+
+def test_mjcf_of_the_shared_data_is_refused(shared_data: Path) -> None:
+    with pytest.raises(BodyError, match="found <mujoco>"):
+        load_body(shared_data / "robot_models" / "humanoid_gym.xml")
+
+
+def test_what_urdf_leaves_out(tmp_path: Path, capfd: pytest.CaptureFixture) -> None:
+    """Axis x, no limits, no inertias; meshes, colours and foreign tags do not matter."""
+    odd = "<visual><geometry><mesh/></geometry></visual><inertial/>"
+    text = robot(f"<link name='a'>{odd}</link><link name='b'/><gazebo/>" + joint("<weird/>"))
+    body = load(tmp_path, "<?xml version='1.0' encoding='utf-8'?>" + text)
+    assert body.tree.axes.tolist() == [[1.0, 0.0, 0.0]]
+    assert body.bounds.lower.tolist() == [-math.inf]
+    assert body.bounds.upper.tolist() == [math.inf]
+    assert body.rest.tolist() == [0.0]
+    assert capfd.readouterr() == ("", "")
+
+
+def test_limits_without_effort_and_of_continuous_joints(tmp_path: Path) -> None:
+    limit = "<limit lower='-1' upper='0.5'/>"
+    body = load(tmp_path, robot(LINKS + joint(limit)))
+    assert (float(body.lower), float(body.upper)) == (-1.0, 0.5)
+    body = load(tmp_path, robot(LINKS + joint(limit, kind="continuous")))
+    assert (float(body.lower), float(body.upper)) == (-math.inf, math.inf)
+    body = load(tmp_path, robot(LINKS + joint("<limit lower='0.2' upper='0.5'/>")))
+    assert float(body.rest) == 0.2
+
+
+def test_mimic_joint_narrows_the_limits_and_keeps_its_offset(tmp_path: Path) -> None:
+    follower = "<mimic joint='j' multiplier='-2' offset='0.5'/><limit lower='-1' upper='2'/>"
+    body = load(tmp_path, robot(THREE + joint(follower, name="k", child="c")))
+    assert body.state_names == ("j",)
+    assert (float(body.lower), float(body.upper)) == (-0.75, 0.75)
+    q = torch.tensor([0.3], dtype=torch.float64) @ body.tie.T + body.offset
+    torch.testing.assert_close(q, torch.tensor([0.3, -0.1], dtype=torch.float64))
+
+
+def test_robots_without_moving_joints_stand_still(tmp_path: Path) -> None:
+    for text in (robot("<link name='a'/>"), robot(LINKS + joint(kind="fixed"))):
+        body = load(tmp_path, text)
+        assert body.num_parameters == 0
+        pose = body.pose(torch.zeros(4, 0, dtype=torch.float64))
+        assert pose.joints.shape == (4, len(body.joint_names), 3)
+        assert not pose.joints.any()
+
+
+def test_a_joint_may_be_called_root(tmp_path: Path) -> None:
+    assert load(tmp_path, robot(LINKS + joint(name="root"))).state_names == ("root",)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"name": "a"}, "joint names must be unique; repeated: a"),
+        ({"link": "A"}, "link names must be unique; repeated: A"),
+        ({"parent": None}, "exactly one root"),
+        ({"parent": "Z"}, "must form one tree"),
+        ({"kind": "ball"}, "type 'ball'"),
+        ({"axis": (0.0, 0.0, 0.0)}, "not zero"),
+        ({"lower": 2.0, "upper": 1.0}, "lower limit"),
+        ({"translation": (math.inf, 0.0, 0.0)}, "finite"),
+    ],
+)
+def test_bad_specifications_are_refused(change: dict, message: str) -> None:
+    root = JointSpecification(name="root", link="base", parent=None)
+    first = JointSpecification(name="a", link="A", parent="base", kind="revolute")
+    second = {"name": "b", "link": "B", "parent": "A", "kind": "revolute", **change}
+    with pytest.raises(BodyError, match=message):
+        KinematicTree([root, first, JointSpecification(**second)])

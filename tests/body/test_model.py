@@ -1,0 +1,186 @@
+"""State layout, ties, bases, meshes and the ways to make a body."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchcss.body.catalog import BODY_NAMES
+from torchcss.body.model import BodyModel, differentiate_twice, load_body
+from torchcss.errors import BodyError, ShapeError
+
+
+def random_states(body: BodyModel, *batch: int, generator: torch.Generator) -> Tensor:
+    size = (*batch, body.num_parameters)
+    return body.bounds.project(torch.randn(size, generator=generator, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("name", BODY_NAMES)
+def test_layout(name: str) -> None:
+    body = load_body(name)
+    n = body.num_parameters
+    assert n == int(name.removeprefix("body").removeprefix("arm"))
+    assert len(set(body.state_names)) == n
+    for buffer in (body.lower, body.upper, body.sticky_mean, body.sticky_deviation):
+        assert buffer.shape == (n,)
+    assert torch.equal(body.tie, torch.eye(n, dtype=torch.float64))
+    assert not body.offset.any()
+    assert ((body.lower <= body.rest) & (body.rest <= body.upper)).all()
+    assert (body.lower < body.upper).all()
+    assert (body.sticky_deviation > 0).all()
+    assert (body.motion_rate > 0).all()
+    inside = (body.lower <= body.sticky_mean) & (body.sticky_mean <= body.upper)
+    assert inside[body.sticky_deviation.isfinite()].all()
+    for index, joint in enumerate(body.joint_names):
+        assert body.joint_index(joint) == index
+    for index, parameter in enumerate(body.state_names):
+        assert body.state_index(parameter) == index
+
+
+def test_unknown_names_are_refused() -> None:
+    body = load_body("arm7")
+    with pytest.raises(BodyError, match="no joint 'tail'"):
+        body.joint_index("tail")
+    with pytest.raises(BodyError, match="no parameter 'wag'"):
+        body.state_index("wag")
+
+
+def test_wrong_states_are_refused() -> None:
+    body = load_body("arm7")
+    with pytest.raises(ShapeError, match=r"expected a shape \[\.\.\., 7\], got \[8\]"):
+        body.pose(torch.zeros(8, dtype=torch.float64))
+    for dtype in (torch.float32, torch.long):
+        with pytest.raises(ShapeError, match="convert one") as caught:
+            body.pose(torch.zeros(7, dtype=dtype))
+        assert "\n" not in str(caught.value)
+
+
+def test_ties_move_both_sides(generator: torch.Generator) -> None:
+    body = load_body("body34", free_proportions=True)
+    assert body.num_parameters == 34 + 9
+    assert body.tree.num_joints == 34 + 9 + 6
+    x = body.rest.clone()
+    x[body.state_index("upper_arm_length")] += 0.02
+    before, after = body.pose(body.rest).joints, body.pose(x).joints
+    for side in ("l", "r"):
+        index = [body.joint_index(f"{side}_{name}") for name in ("shoulder", "elbow", "wrist")]
+        moved = (after - before)[index].norm(dim=-1)
+        torch.testing.assert_close(moved, torch.tensor([0.0, 0.02, 0.02], dtype=torch.float64))
+
+
+def test_free_proportions_reach_what_lengths_set() -> None:
+    """A prismatic parameter stands for the difference from the length built in."""
+    lengths = {"forearm": 0.255, "thigh": 0.45, "shoulder_width": 0.16}
+    built = load_body("body32", lengths=lengths)
+    free = load_body("body32", free_proportions=True)
+    x = torch.zeros(free.num_parameters, dtype=torch.float64)
+    for name, length in lengths.items():
+        x[free.state_index(f"{name}_length")] = length - free.lengths[name]
+    torch.testing.assert_close(
+        free.pose(x).joints, built.pose(torch.zeros(32, dtype=torch.float64)).joints
+    )
+
+
+@pytest.mark.parametrize("batch", [(), (5,), (2, 3), (0,)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_leading_shapes_and_types(
+    batch: tuple[int, ...], dtype: torch.dtype, generator: torch.Generator
+) -> None:
+    double = load_body("body30")
+    body = load_body("body30", dtype=dtype)
+    assert body.dtype == dtype
+    x = random_states(double, *batch, generator=generator)
+    pose = body.pose(x.to(dtype))
+    assert pose.joints.shape == (*batch, len(body.joint_names), 3)
+    surface = body.surface(pose)
+    assert surface.points.shape == (*batch, body.num_parts * 8 * 12, 3)
+    assert surface.points.dtype == surface.normals.dtype == pose.joints.dtype == dtype
+    tolerance = 1e-12 if dtype == torch.float64 else 1e-5
+    torch.testing.assert_close(
+        pose.joints.double(), double.pose(x).joints, rtol=0, atol=tolerance
+    )
+    rotation, centre = body.part_poses(pose)
+    assert rotation.shape == (*batch, body.num_parts, 3, 3)
+    assert centre.shape == (*batch, body.num_parts, 3)
+
+
+def test_surface_is_the_posed_mesh(generator: torch.Generator) -> None:
+    body = load_body("arm8", rings=4, meridians=6)
+    pose = body.pose(random_states(body, generator=generator))
+    surface, mesh = body.surface(pose), body.mesh()
+    assert mesh.points.shape == (4, 4, 6, 3)
+    link_turn, link_origin = pose.tree.rotation, pose.tree.translation
+    for part in range(4):
+        link = int(body.part_link[part])
+        local = mesh.points[part] @ body.part_rotation[part].T + body.part_translation[part]
+        world = local @ link_turn[link].T + link_origin[link]
+        got = surface.points.unflatten(0, (4, 24))[part]
+        torch.testing.assert_close(got, world.reshape(24, 3))
+        normal = mesh.normals[part] @ body.part_rotation[part].T @ link_turn[link].T
+        got = surface.normals.unflatten(0, (4, 24))[part]
+        torch.testing.assert_close(got, normal.reshape(24, 3))
+    torch.testing.assert_close(
+        surface.normals.norm(dim=-1), torch.ones(96, dtype=torch.float64)
+    )
+    assert body.mesh(3).points.shape == (4, 3, 6, 3)
+    assert body.mesh(3, 5).points.shape == (4, 3, 5, 3)
+
+
+def test_another_base_moves_the_whole_body(generator: torch.Generator) -> None:
+    body = load_body("body34")
+    x = random_states(body, 2, generator=generator)
+    turn = torch.linalg.matrix_exp(
+        torch.tensor([[0.0, -0.4, 0.3], [0.4, 0.0, -0.8], [-0.3, 0.8, 0.0]]).double()
+    )
+    shift = torch.tensor([1.0, 2.0, -3.0], dtype=torch.float64)
+    other = body.with_base(turn, shift)
+    torch.testing.assert_close(other.pose(x).joints, body.pose(x).joints @ turn.T + shift)
+    assert torch.equal(body.base_rotation, torch.eye(3, dtype=torch.float64))
+
+
+def test_converting_a_rebased_body_leaves_the_first_alone() -> None:
+    body = load_body("arm7")
+    other = body.with_base(body.base_rotation, body.base_translation).to(torch.float32)
+    assert other.dtype == other.tree.axes.dtype == torch.float32
+    assert body.dtype == body.tree.axes.dtype == torch.float64
+    body.pose(body.rest)
+    other.pose(other.rest)
+
+
+def test_bodies_can_be_copied_and_pickled(generator: torch.Generator) -> None:
+    body = load_body("arm8")
+    x = random_states(body, generator=generator)
+    expected = body.pose(x).joints
+    for other in (copy.deepcopy(body), pickle.loads(pickle.dumps(body))):
+        assert torch.equal(other.pose(x).joints, expected)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"name_or_path": "body33"}, "no body 'body33'"),
+        ({"name_or_path": "body30", "lengths": {"tail": 1.0}}, r"unknown lengths \['tail'\]"),
+        ({"name_or_path": "body30", "lengths": {"head": 0.0}}, "must be positive"),
+        ({"name_or_path": "body30", "scale": -1.0}, "must be positive"),
+        ({"name_or_path": "body30", "scale": float("nan")}, "must be positive"),
+        ({"name_or_path": "body30", "scale": float("inf")}, "must be positive"),
+    ],
+)
+def test_bad_requests_are_refused(arguments: dict, message: str) -> None:
+    with pytest.raises(BodyError, match=message):
+        load_body(**arguments)
+
+
+def test_differentiate_twice_of_functions_that_do_not_bend() -> None:
+    x = torch.randn(4, 3, dtype=torch.float64, requires_grad=True)
+    linear = differentiate_twice((2 * x).sum(-1), x)
+    torch.testing.assert_close(linear.gradient, torch.full((4, 3), 2.0, dtype=torch.float64))
+    assert not linear.hessian.any()
+    partly = differentiate_twice(x[:, 0].square() + x[:, 1], x)
+    expected = torch.zeros(3, 3, dtype=torch.float64)
+    expected[0, 0] = 2.0
+    torch.testing.assert_close(partly.hessian, expected.expand(4, 3, 3))

@@ -1,0 +1,202 @@
+"""The evaluation script on made-up tracks and on a real reference."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from torchcss.errors import ConfigurationError, ShapeError, TrackFileError
+from torchcss.io.tracks import TrackWriter
+from torchcss.metrics import LIMB_JOINTS
+
+SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "evaluate_track.py"
+
+
+@pytest.fixture(scope="module")
+def script() -> ModuleType:
+    specification = importlib.util.spec_from_file_location("evaluate_track", SCRIPT)
+    assert specification is not None
+    assert specification.loader is not None
+    module = importlib.util.module_from_spec(specification)
+    sys.modules["evaluate_track"] = module
+    specification.loader.exec_module(module)
+    return module
+
+
+def write_track(
+    folder: Path,
+    joints: np.ndarray,
+    names: tuple[str, ...],
+    *,
+    frames: list[int] | None = None,
+    modes: list[int] | None = None,
+) -> Path:
+    """A track whose modes are at `joints [T K J 3]`; `modes[i]` of them exist in frame i."""
+    folder.mkdir(exist_ok=True)
+    writer = TrackWriter(folder / "track.npz", state_names=("a", "b"), joint_names=names)
+    for row in range(len(joints)):
+        k = joints.shape[1] if modes is None else modes[row]
+        writer.append(
+            frame=row if frames is None else frames[row],
+            time_s=row / 25,
+            state=np.zeros((k, 2)),
+            covariance=np.tile(np.eye(2), (k, 1, 1)),
+            log_weight=np.log(np.arange(k, 0, -1) / (k * (k + 1) / 2)),
+            cost=np.arange(k),
+            parent=np.full(k, -1),
+            joints_world=joints[row, :k],
+        )
+    writer.save()
+    return folder
+
+
+def write_reference(path: Path, joints: np.ndarray, names: list[str], **more: object) -> Path:
+    arrays = {"joints": joints, "joint_names": np.array(names), **more}
+    np.savez(path, **{name: np.asarray(array) for name, array in arrays.items()})
+    return path
+
+
+@pytest.fixture
+def joints() -> np.ndarray:
+    return np.random.default_rng(0).normal(scale=0.4, size=(10, len(LIMB_JOINTS), 3))
+
+
+def detector_name(name: str) -> str:
+    return name[0].upper() + name[2:].capitalize()
+
+
+def test_frames_names_and_modes_are_matched(
+    script: ModuleType, joints: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = [detector_name(name) for name in LIMB_JOINTS]  # l_wrist -> LWrist
+    order = np.random.default_rng(1).permutation(len(names))
+    holes = joints.copy()
+    holes[4, LIMB_JOINTS.index("l_wrist")] = np.nan
+    reference = write_reference(
+        tmp_path / "reference.npz", holes[:, order], [names[i] for i in order], units="m"
+    )
+    frames = [2, 4, 6, 9]
+    tracked = np.stack([joints[frames] + 0.1, joints[frames] + [0.03, 0, 0.04]], axis=1)
+    tracked[3, 0] += 5 * joints[9]
+    track = write_track(tmp_path / "run", tracked, LIMB_JOINTS, frames=frames, modes=[2, 2, 2, 1])
+    out = tmp_path / "table" / "errors.json"
+    report = script.main(script.Config(track=track, reference=reference, out=out))
+    written = json.loads(out.read_text())
+    assert written["num_frames"] == written["num_frames_measured"] == 4
+    assert written["num_modes"] == 2
+    assert written["frames"] == frames
+    assert written["mpjpe_mm"] == report["mpjpe_mm"]
+    per_frame = written["per_frame_mm"]
+    assert per_frame["mpjpe"][:3] == pytest.approx([1000 * 0.03**0.5] * 3)
+    # The mode that only pads the last frame is at the origin: nobody may choose it.
+    assert per_frame["mpjpe_best_of_modes"][:3] == pytest.approx([50.0] * 3)
+    assert per_frame["mpjpe_best_of_modes"][3] == pytest.approx(per_frame["mpjpe"][3])
+    assert per_frame["root_aligned_mpjpe"][:3] == pytest.approx([0.0] * 3, abs=1e-9)
+    assert per_frame["pa_mpjpe"] == pytest.approx([0.0] * 4, abs=1e-9)  # the last is scaled only
+    assert written["frames_lost"] == [9]
+    assert written["num_frames_lost"] == 1
+    assert set(written["per_joint_mm"]["pa_mpjpe"]) == set(LIMB_JOINTS)
+    assert "left out" not in (table := capsys.readouterr().out)
+    assert "l_wrist" in table
+    assert "1 of 4 measured frames lost" in table
+    assert "world frame" in table
+
+
+def test_joints_array_and_root_can_be_chosen(
+    script: ModuleType, joints: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arm = ("l_shoulder", "l_elbow", "l_wrist")
+    index = [LIMB_JOINTS.index(name) for name in arm]
+    reference = write_reference(
+        tmp_path / "r.npz", joints + 1, list(LIMB_JOINTS), joints_smooth=joints
+    )
+    track = write_track(tmp_path / "run", joints[:, None, index] + 0.01, arm)
+    config = script.Config(
+        track=track / "track.npz",
+        reference=reference,
+        reference_array="joints_smooth",
+        root="LShoulder",
+        joints=("left_wrist", "l_elbow", "nose"),
+    )
+    report = script.main(config)
+    assert report["joint_names"] == ("l_wrist", "l_elbow")
+    assert report["joints_left_out"] == ["nose"]
+    assert report["mpjpe_mm"] == pytest.approx(10 * 3**0.5)
+    assert report["root_aligned_mpjpe_mm"] == pytest.approx(0.0, abs=1e-9)
+    assert "left out, not in both: nose" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"joints": ("nose",)}, ConfigurationError, "no common joints"),
+        ({"root": "nose"}, ConfigurationError, "--root"),
+        ({"reference_array": "joint"}, TrackFileError, "--reference-array"),
+        ({"reference_array": "joint_names"}, TrackFileError, "expected shape"),
+        ({"reference_array": "nothing"}, ShapeError, "all is NaN"),
+        ({"reference_array": "short"}, ConfigurationError, "has 5 frames"),
+        ({"reference": Path("absent.npz")}, TrackFileError, "no such file"),
+        ({"track": Path("absent")}, TrackFileError, "no such file"),
+        ({"out": Path()}, ConfigurationError, "found a folder"),
+    ],
+)
+def test_bad_input_is_a_typed_error(
+    script: ModuleType,
+    joints: np.ndarray,
+    tmp_path: Path,
+    change: dict[str, object],
+    error: type[Exception],
+    message: str,
+) -> None:
+    reference = write_reference(
+        tmp_path / "r.npz",
+        joints,
+        list(LIMB_JOINTS),
+        nothing=np.full_like(joints, np.nan),
+        short=joints[:5],
+    )
+    track = write_track(tmp_path / "run", joints[:, None], LIMB_JOINTS)
+    options = {"track": track, "reference": reference, **change}
+    with pytest.raises(error, match=message) as caught:
+        script.main(script.Config(**options))
+    assert "\n" not in str(caught.value)
+
+
+def test_other_units_are_refused(script: ModuleType, joints: np.ndarray, tmp_path: Path) -> None:
+    reference = write_reference(tmp_path / "r.npz", joints, list(LIMB_JOINTS), units="mm")
+    track = write_track(tmp_path / "run", joints[:, None], LIMB_JOINTS)
+    with pytest.raises(TrackFileError, match="expected metres"):
+        script.main(script.Config(track=track, reference=reference))
+
+
+def test_command_line(joints: np.ndarray, tmp_path: Path) -> None:
+    track = write_track(tmp_path / "run", joints[:, None], LIMB_JOINTS)
+    reference = write_reference(tmp_path / "r.npz", joints, list(LIMB_JOINTS))
+    command = [sys.executable, str(SCRIPT), str(track), str(reference), "--joints"]
+    run = subprocess.run([*command, "l_wrist", "l_knee", "r_ankle"], capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    assert "r_ankle" in run.stdout
+    run = subprocess.run([*command, "nose"], capture_output=True, text=True)
+    assert run.returncode == 2
+    assert run.stderr.startswith("error: no common joints")
+
+
+def test_real_reference(script: ModuleType, shared_data: Path, tmp_path: Path) -> None:
+    """A track that is the smoothed reference is a few millimetres from the raw one."""
+    path = shared_data / "balance_beam_4cam" / "reference3d.npz"
+    with np.load(path) as arrays:
+        smooth = arrays["joints_smooth"]
+        names = tuple(str(name) for name in arrays["joint_names"])
+    track = write_track(tmp_path / "run", smooth[:, None], names)
+    report = script.main(script.Config(track=track, reference=path))
+    assert len(report["joint_names"]) == 12
+    assert report["num_frames"] == report["num_frames_measured"] == 100
+    assert report["num_frames_lost"] == 0
+    assert 0 < report["pa_mpjpe_mm"] < report["mpjpe_mm"] < 30
