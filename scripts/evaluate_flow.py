@@ -85,8 +85,8 @@ def main(config: Config) -> None:
         for name, method in methods.items():
             runs = [timed(method, pair) for _ in range(1 if config.small else config.repeats)]
             result, seconds = min(runs, key=lambda run: run[1])
-            flow = result.flow if isinstance(result, OpticalFlow) else result
             row = {"pair": pair.name, "method": name, "seconds": seconds}
+            flow = result.flow if isinstance(result, OpticalFlow) else result
             row |= errors(flow, pair, widened(boundary, config.near))
             if isinstance(result, OpticalFlow):
                 row |= boundary_score(result, boundary, config.tolerance)

@@ -45,8 +45,7 @@ def test_small_mode_agrees_with_autograd(
     for row in metrics["seconds"].values():
         assert 0 < row["lower_quartile"] <= row["median"] <= row["upper_quartile"]
     assert set(metrics["times_closed_form"]) == set(metrics["relative_difference"])
-    for row in metrics["relative_difference"].values():
-        assert max(row.values()) < tolerance
+    assert max(metrics["relative_difference"].values()) < tolerance
     assert "times the closed form" in capsys.readouterr().out
 
 

@@ -194,7 +194,7 @@ def test_subpixel_translation(
     result = robust_flow(first, second, configuration)
     error = end_point_error(result.flow, torch.tensor(motion).view(2, 1, 1))
     assert error[8:-8, 8:-8].mean() < 0.05
-    assert error[8:-8, 8:-8].max() < 0.12
+    assert error[8:-8, 8:-8].max() < 0.15
     assert result.smoothness_outlier[8:-8, 8:-8].mean() < 0.01
 
 

@@ -20,6 +20,7 @@ fitted model, and hidden nodes cost slightly more.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -46,9 +47,14 @@ class EdgeAssignments(NamedTuple):
     weight: Float[Tensor, "*batch p s"]
 
 
+_TINY = 1e-12
 _SHARP_ENOUGH = 0.05
 """Relative curvature, per square pixel, from which a maximum has its full weight: that of a Gaussian
 ridge of 4.5 pixels, twice as wide as the detector's own edges."""
+
+
+_FADE = 0.25
+"""Share of the window over which an assignment that enters it comes to count in the sum of 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,24 +106,30 @@ class ContourTerm:
             edge_field: Contrast-normalised gradient, of length at most one (edge energy times
                 direction).
         """
-        count = 2 * round(self.window / self.step) + 1
-        offsets = torch.linspace(-self.window, self.window, count, dtype=uv.dtype, device=uv.device)
-        line = uv[..., None, :] + offsets[:, None] * normal_uv[..., None, :]
+        # Single precision is enough to find what the derivatives hold fixed, and twice as fast.
+        start, along = uv.detach().float(), normal_uv.detach().float()
+        # Two samples beyond the window, so that a maximum on its very edge is found too.
+        reach = math.ceil(self.window / self.step) + 1
+        steps = torch.arange(-reach, reach + 1, dtype=start.dtype, device=uv.device)
+        line = start[..., None, :] + (self.step * steps)[:, None] * along[..., None, :]
         field, inside = sample_bilinear(edge_field, line.flatten(-3, -2))
-        field = (field * inside[..., None]).unflatten(-2, line.shape[-3:-1])
-        response = (field * normal_uv[..., None, :]).sum(-1).abs()
+        shape = line.shape[-3:-1]
+        field_u, field_v = (component.unflatten(-1, shape) for component in field.unbind(-1))
+        response = (field_u * along[..., :1] + field_v * along[..., 1:]).abs()
+        response = response * inside.unflatten(-1, shape)
         middle, left, right = response[..., 1:-1], response[..., :-2], response[..., 2:]
-        curve = 2 * middle - left - right
         peak = (middle > left) & (middle >= right)
-        safe = torch.where(peak, curve, 1.0)
-        shift = torch.where(peak, 0.5 * (right - left) / safe, 0.0)
+        curve = (2 * middle - left - right).clamp(min=_TINY)
+        shift = 0.5 * (right - left) / curve * peak
         height = middle + 0.25 * (right - left) * shift
         # A maximum is born as an inflection, with no curvature: the weight starts at zero there.
-        relative = curve / (self.step**2 * height.clamp(min=1e-3))
-        sharpness = torch.where(peak, (relative / _SHARP_ENOUGH).clamp(max=1), 0.0)
-        weight = height * sharpness
-        distance = offsets[1:-1] + shift * self.step
-        return EdgeAssignments(distance, weight / weight.sum(-1, keepdim=True).clamp(min=1))
+        sharpness = curve / height.clamp(min=1e-3) / (self.step**2 * _SHARP_ENOUGH)
+        weight = height * sharpness.clamp(max=1) * peak
+        distance = self.step * (steps[1:-1] + shift)
+        # Weights share 1, but one that enters the window takes its share from the others by degrees.
+        share = weight * ((self.window - distance.abs()) / (_FADE * self.window)).clamp(0, 1)
+        weight = weight / share.sum(-1, keepdim=True).clamp(min=1)
+        return EdgeAssignments(distance.to(uv), weight.to(uv))
 
     def _wells(
         self, assignments: EdgeAssignments

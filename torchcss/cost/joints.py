@@ -69,8 +69,7 @@ class JointObservation:
         ]
         device = keypoints.device
         columns = torch.tensor([column for _, column in pairs], dtype=torch.long, device=device)
-        spread = [SPREAD.get(keypoint_names[c].split("_", 1)[-1], SPREAD.get(keypoint_names[c], 1.0))
-                  for _, c in pairs]  # fmt: skip
+        spread = [_spread(keypoint_names[column]) for _, column in pairs]
         self.index: Int[Tensor, " m"] = torch.tensor(
             [joint for joint, _ in pairs], dtype=torch.long, device=device
         )
@@ -79,6 +78,10 @@ class JointObservation:
         self.target: Float[Tensor, "m 2"] = torch.where(known[:, None], target, 0.0)
         weight = torch.where(known, confidence.clamp(0, 1), 0.0)
         self.weight: Float[Tensor, " m"] = weight / keypoints.new_tensor(spread).square()
+
+
+def _spread(name: str) -> float:
+    return SPREAD.get(name, SPREAD.get(name.split("_", 1)[-1], 1.0))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,9 +1,9 @@
-"""Parameter stabilisers: long-tailed "sticky" priors on hard-to-see parameters (section 3.2.2 [IJRR]).
+"""Parameter stabilisers: long-tailed "sticky" priors on hard-to-see parameters.
 
-Each such parameter has a rest value mu and a deviation sigma; its cost is
-`1/2 rho(((x - mu) / sigma)^2)` with a Lorentzian of unit curvature at rest. Near rest it is the
-Gaussian `N(mu, sigma^2)`; beyond `sqrt(nu)` deviations its pull fades, so a strong observation can
-unstick the parameter and turn the prior off.
+These are the priors of section 3.2.2 [IJRR]. Each such parameter has a rest value mu and a deviation
+sigma; its cost is `1/2 rho(((x - mu) / sigma)^2)` with a Lorentzian of unit curvature at rest. Near
+rest it is the Gaussian `N(mu, sigma^2)`; beyond `sqrt(nu)` deviations its pull fades, so a strong
+observation can unstick the parameter and turn the prior off.
 """
 
 from __future__ import annotations
@@ -32,7 +32,9 @@ def long_tailed(
         deviation: Standard deviation at the centre; infinite for parameters without a prior.
         nu: Height of the tails, nats: the pull fades beyond `sqrt(nu)` deviations.
     """
-    z = (x - centre) / deviation
+    # The square of a larger number would overflow; the pull is nil there anyway.
+    limit = 0.5 * torch.finfo(x.dtype).max ** 0.5
+    z = ((x - centre) / deviation).clamp(-limit, limit)
     rho, first, second = Lorentzian(nu=nu, sigma=nu**0.5)(z.square())
     curvature = (first + 2 * second * z.square()) / deviation.square()
     return LocalModel(0.5 * rho.sum(-1), first * z / deviation, torch.diag_embed(curvature))

@@ -26,6 +26,7 @@ from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.surface import surface_points
 
 
+_TINY = 1e-12
 _GRAZING = 0.15
 """Sine of the angle by which a curve must turn through the line of sight to count fully."""
 
@@ -69,6 +70,7 @@ class ContourPredictor(nn.Module):
     ring_normals: Tensor
     meridian_points: Tensor
     meridian_normals: Tensor
+    other: Tensor
     touching: Tensor
 
     _RING_STEPS = 16
@@ -110,14 +112,16 @@ class ContourPredictor(nn.Module):
             i, j = body.part_names.index(first), body.part_names.index(second)
             touching[i, j] = touching[j, i] = True
         touching &= ~torch.eye(body.num_parts, dtype=torch.bool, device=device)
+        node_part = parts.repeat_interleave(per_part)
         for name, value in (
-            ("node_part", parts.repeat_interleave(per_part)),
+            ("node_part", node_part),
             ("node_link", body.part_link.repeat_interleave(per_part)),
             ("ring_points", ring.points.to(body.dtype)),
             ("ring_normals", ring.normals.to(body.dtype)),
             ("meridian_points", meridian.points.to(body.dtype)),
             ("meridian_normals", meridian.normals.to(body.dtype)),
-            ("touching", touching),
+            ("other", 1 - torch.eye(body.num_parts, device=device)[node_part]),
+            ("touching", touching[node_part].float()),
         ):
             self.register_buffer(name, value, persistent=False)
 
@@ -151,54 +155,51 @@ class ContourPredictor(nn.Module):
         points = (points @ turn + centre[..., None, :]).flatten(-3, -2)
         normals = (normals @ turn).flatten(-3, -2)
         exists = exists.flatten(-2)
-        visible, free = self._occlusion(body, rotation, centre, eye, points, normals)
+        rays = points + self.clearance * normals - centre_world
+        visible, free = self._occlusion(body, rotation, eye, rays)
         return ContourNodes(points, normals, exists * free, visible)
 
     def _occlusion(
         self,
         body: BodyModel,
-        rotation: Tensor,
-        centre: Tensor,
-        eye: Tensor,
-        points: Tensor,
-        normals: Tensor,
+        rotation: Float[Tensor, "*batch parts 3 3"],
+        eye: Float[Tensor, "*batch parts 3"],
+        rays: Float[Tensor, "*batch p 3"],
     ) -> tuple[Float[Tensor, "*batch p"], Float[Tensor, "*batch p"]]:
-        """Visibility of the nodes, and whether their outside is free of neighbouring parts."""
-        tested = points + self.clearance * normals
-        visible = torch.ones_like(points[..., 0])
-        free = torch.ones_like(visible)
-        shape = body.part_shape
-        distance = eye.norm(dim=-1)
-        for part in range(body.num_parts):
-            # Everything in the frame of the occluding part, in units of its semi-axes.
-            a = shape[part, :3]
-            origin = (eye[..., part, :] / a)[..., None, :]
-            local = (tested - centre[..., part, None, :]) @ (rotation[..., part, :, :] / a)
-            ray = local - origin
-            ox, oy, oz = origin.unbind(-1)
-            rx, ry, rz = ray.unbind(-1)
-            # Height of closest approach decides the taper of the cross-section.
-            square = rx * rx + ry * ry + rz * rz
-            nearest = -(ox * rx + oy * ry + oz * rz) / square
-            height = (oz + nearest * rz).clamp(-1, 1)
-            fx = 1 / (1 + shape[part, 5] * height)
-            fy = 1 / (1 + shape[part, 6] * height)
-            ox, oy, rx, ry = ox * fx, oy * fy, rx * fx, ry * fy
-            square = rx * rx + ry * ry + rz * rz
-            along = -(ox * rx + oy * ry + oz * rz)
-            miss = (ox * ox + oy * oy + oz * oz) - along * along / square
-            thickness = a[:2].mean()
-            # How deep the ray passes inside, and how far in front of the node it enters, metres.
-            inside = 0.5 * (1 - miss) * thickness
-            entry = (along - (square * (1 - miss).clamp(min=0)).sqrt()) / square
-            front = (1 - entry) * distance[..., part, None]
-            covered = (inside / self.ramp).clamp(0, 1) * (front / self.ramp).clamp(0, 1)
-            own = self.node_part == part
-            visible = visible * (1 - torch.where(own, 0.0, covered))
-            # A neighbour just behind the node hides the step in depth that makes an image edge.
-            close = (inside / self.ramp).clamp(0, 1) * (4 + front / thickness).clamp(0, 1)
-            free = free * (1 - torch.where(self.touching[part, self.node_part], close, 0.0))
-        return visible, free
+        """Visibility of the nodes, and whether their outside is free of neighbouring parts.
+
+        Args:
+            body: The body.
+            rotation: Orientations of the parts.
+            eye: The camera's centre in the frames of the parts.
+            rays: From the camera's centre to the tested points, world axes.
+        """
+        # All pairs of node and part at once, in the part's frame and in units of its semi-axes.
+        # Single precision: the closest approach is found as a vector, without cancellation.
+        shape = body.part_shape.float()
+        scale = 1 / shape[:, :3]
+        axes = (rotation.float() * scale[:, None, :]).movedim(-3, -1)
+        rays = rays.float()
+        rx, ry, rz = (rays @ axes[..., i, :] for i in range(3))
+        ox, oy, oz = (eye.float() * scale)[..., None, :, :].unbind(-1)
+        # Height of closest approach decides the taper of the cross-section.
+        nearest = -(ox * rx + oy * ry + oz * rz) / (rx * rx + ry * ry + rz * rz).clamp(min=_TINY)
+        height = (oz + nearest * rz).clamp(-1, 1)
+        fx, fy = 1 / (1 + shape[:, 5] * height), 1 / (1 + shape[:, 6] * height)
+        ox, oy, rx, ry = ox * fx, oy * fy, rx * fx, ry * fy
+        square = (rx * rx + ry * ry + rz * rz).clamp(min=_TINY)
+        nearest = -(ox * rx + oy * ry + oz * rz) / square
+        px, py, pz = ox + nearest * rx, oy + nearest * ry, oz + nearest * rz
+        depth = 1 - (px * px + py * py + pz * pz)
+        thickness = shape[:, :2].mean(-1)
+        # How deep the ray passes inside, and how far in front of the node it enters, metres.
+        crossed = (depth * (0.5 / self.ramp * thickness)).clamp(0, 1)
+        entry = nearest - (depth.clamp(min=0) / square).sqrt()
+        front = (1 - entry) * eye.float().norm(dim=-1)[..., None, :]
+        covered = crossed * (front / self.ramp).clamp(0, 1) * self.other
+        # A neighbour just behind the node hides the step in depth that makes an image edge.
+        close = crossed * (4 + front / thickness).clamp(0, 1) * self.touching
+        return (1 - covered).prod(-1).to(eye), (1 - close).prod(-1).to(eye)
 
 
 def _ring_crossings(

@@ -14,8 +14,9 @@ The sign deserves a word: with W = 1 - k S_p the text wants k = 1 to exclude eve
 boundaries as its valleys. `MotionBoundaries` holds both, under names that cannot be mistaken.
 
 Only the smoothness term enters. The data term's outliers are occluded strips beside a boundary,
-but also glints and aliasing: on the Middlebury pairs, adding them lowered precision and left
-recall as it was (measured; alone they reach three quarters of the F score).
+but also glints and aliasing: on the two Middlebury pairs of the tests, adding them lowered the
+precision and left the recall as it was; alone they reach an F score of 0.62 and 0.76, where the
+smoothness term reaches 0.88 and 0.90.
 
 By default: `motion_boundaries(flow)`. `flow_discontinuities` marks the boundaries of a known flow.
 """

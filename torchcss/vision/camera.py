@@ -460,8 +460,12 @@ def pull_back(
         The same cost as a function of the 3D point; its derivatives are zero at invalid points.
     """
     g_u, g_v = gradient_uv[..., 0, None], gradient_uv[..., 1, None]
-    gradient = g_u * model.jacobian[..., 0, :] + g_v * model.jacobian[..., 1, :]
-    hessian = model.jacobian.mT @ (hessian_uv @ model.jacobian)
+    along_u, along_v = model.jacobian.unbind(-2)
+    gradient = g_u * along_u + g_v * along_v
+    # Sums of outer products: on a CPU far faster than batches of 2 x 3 matrix products.
+    h_uu, h_uv, h_vv = (hessian_uv[..., i, j, None] for i, j in ((0, 0), (0, 1), (1, 1)))
+    hessian = along_u[..., :, None] * (h_uu * along_u + h_uv * along_v)[..., None, :]
+    hessian = hessian + along_v[..., :, None] * (h_uv * along_u + h_vv * along_v)[..., None, :]
     if not gauss_newton:
         hessian = hessian + g_u[..., None] * model.hessian[..., 0, :, :]
         hessian = hessian + g_v[..., None] * model.hessian[..., 1, :, :]

@@ -95,7 +95,7 @@ class FlowConfiguration:
     smoothness_outlier_scale: float = 0.25
     texture: float = 0.9
     pyramid_factor: float = 0.7
-    smallest_side: int = 8
+    smallest_side: int = 6
     sigma_factors: tuple[float, ...] = (100.0, 10.0, 1.0)
     num_warps: int = 6
     num_reweightings: int = 2

@@ -1,0 +1,193 @@
+"""The keypoint term: derivatives per point against autograd, missing and unseen joints."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchcss.cost.joints import OUTLIER_LENGTHS, SPREAD, JointObservation, JointTerm
+from torchcss.types import PointCost
+from torchcss.vision.camera import Camera
+
+NAMES = ("l_shoulder", "r_wrist", "nose", "skull_tip", "l_hip", "vt1")
+TERM = JointTerm(sigma=3.0, nu=4.0)
+
+
+def make_camera(distortion: list[float] | None = None) -> Camera:
+    rotation = torch.linalg.matrix_exp(
+        torch.tensor([[0.0, -0.4, 0.3], [0.4, 0.0, -0.8], [-0.3, 0.8, 0.0]], dtype=torch.float64)
+    )
+    return Camera(
+        [[900.0, 0.0, 317.0], [0.0, 880.0, 243.0], [0.0, 0.0, 1.0]],
+        (640, 480),
+        distortion=distortion,
+        R_camera_world=rotation,
+        t_camera_world=[0.1, -0.2, 3.0],
+    )
+
+
+def observe(
+    camera: Camera, points: Tensor, generator: torch.Generator, *, noise: float = 10.0
+) -> JointObservation:
+    keypoints = camera.project(points).uv
+    keypoints = keypoints + noise * torch.randn(
+        keypoints.shape, generator=generator, dtype=torch.float64
+    )
+    confidence = torch.rand(len(NAMES), generator=generator, dtype=torch.float64)
+    return JointObservation(NAMES, keypoints, confidence, NAMES)
+
+
+def random_points(*batch: int, generator: torch.Generator) -> Tensor:
+    shape = (*batch, len(NAMES), 3)
+    return 0.5 * torch.randn(shape, generator=generator, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("distortion", [None, [-0.33, 0.046, -0.0043, 0.0041, 0.067]])
+@pytest.mark.parametrize("noise", [0.0, 2.0, 300.0])
+@pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
+def test_derivatives_per_point_are_those_of_autograd(
+    distortion: list[float] | None,
+    noise: float,
+    batch: tuple[int, ...],
+    generator: torch.Generator,
+) -> None:
+    camera = make_camera(distortion)
+    points = random_points(*batch, generator=generator)
+    first = points.reshape(-1, len(NAMES), 3)[0]
+    observation = observe(camera, first, generator, noise=noise)
+    got = TERM.point_cost(points, camera, observation)
+    leaf = points.clone().requires_grad_()
+    value = TERM.value(camera.project(leaf), observation)
+    (gradient,) = torch.autograd.grad(value.sum(), leaf, create_graph=True)
+    rows = [
+        torch.autograd.grad(gradient[..., a].sum(), leaf, retain_graph=True)[0] for a in range(3)
+    ]
+    expected = PointCost(value.detach(), gradient.detach(), torch.stack(rows, dim=-2))
+    scale = float(expected.hessian.abs().max())
+    torch.testing.assert_close(got.value, expected.value)
+    torch.testing.assert_close(got.gradient, expected.gradient, rtol=1e-9, atol=1e-9 * scale)
+    torch.testing.assert_close(got.hessian, expected.hessian, rtol=1e-9, atol=1e-10 * scale)
+
+
+def test_gauss_newton_leaves_out_the_curvature_of_the_projection(
+    generator: torch.Generator,
+) -> None:
+    camera = make_camera()
+    points = random_points(generator=generator)
+    observation = observe(camera, points, generator, noise=40.0)
+    model = camera.project_with_derivatives(points)
+    error = (model.uv - observation.target).requires_grad_()
+    rho = TERM.potential(observation.weight * error.square().sum(-1)).rho
+    (slope,) = torch.autograd.grad(0.5 * rho.sum(), error, create_graph=True)
+    rows = [torch.autograd.grad(slope[:, a].sum(), error, retain_graph=True)[0] for a in range(2)]
+    bowl = torch.stack(rows, dim=-2)
+    got = TERM.point_cost(points, camera, observation, gauss_newton=True)
+    torch.testing.assert_close(got.hessian, model.jacobian.mT @ bowl @ model.jacobian)
+
+
+def test_the_potential_is_that_of_its_docstring() -> None:
+    """Unit curvature in sigmas at zero, and `nu log` growth far out."""
+    near = TERM.potential(torch.tensor(1e-8, dtype=torch.float64))
+    assert float(near.first) == pytest.approx(1 / TERM.sigma**2)
+    s = torch.tensor([1e8, 4e8], dtype=torch.float64)
+    rise = 0.5 * TERM.potential(s).rho.diff()
+    assert float(rise) == pytest.approx(TERM.nu * math.log(2.0), rel=1e-5)
+
+
+def test_weights_follow_confidence_and_spread() -> None:
+    keypoints = torch.zeros(len(NAMES), 2, dtype=torch.float64)
+    confidence = torch.tensor([1.0, 0.5, 1.0, 1.0, 2.0, 1.0], dtype=torch.float64)
+    observation = JointObservation(NAMES, keypoints, confidence, NAMES)
+    spread = [SPREAD["shoulder"], 1.0, SPREAD["nose"], SPREAD["skull_tip"], SPREAD["hip"], 1.3]
+    expected = torch.tensor([1.0, 0.5, 1.0, 1.0, 1.0, 1.0]) / torch.tensor(spread).square()
+    torch.testing.assert_close(observation.weight, expected.double())
+
+
+def test_keypoints_are_matched_by_name() -> None:
+    keypoints = torch.arange(8, dtype=torch.float64).reshape(4, 2)
+    order = ("nose", "tail", "l_hip", "r_wrist")
+    observation = JointObservation(NAMES, keypoints, torch.ones(4).double(), order)
+    assert observation.index.tolist() == [2, 4, 1]
+    assert observation.target.tolist() == [[0.0, 1.0], [4.0, 5.0], [6.0, 7.0]]
+    none = JointObservation(("a",), keypoints, torch.ones(4).double(), order)
+    assert none.index.shape == (0,)
+    camera = make_camera()
+    cost = TERM.point_cost(torch.zeros(2, 0, 3, dtype=torch.float64), camera, none)
+    assert cost.value.shape == (2, 0)
+    assert cost.hessian.shape == (2, 0, 3, 3)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, 1e30])
+def test_missing_keypoints_cost_nothing_whatever_they_hold(
+    bad: float, generator: torch.Generator
+) -> None:
+    camera = make_camera()
+    points = random_points(3, generator=generator)
+    keypoints = camera.project(points[0]).uv
+    keypoints[1] = bad
+    confidence = torch.ones(len(NAMES), dtype=torch.float64)
+    confidence[1] = 0.0
+    observation = JointObservation(NAMES, keypoints, confidence, NAMES)
+    cost = TERM.point_cost(points, camera, observation)
+    for part in cost:
+        assert torch.isfinite(part).all()
+        assert not part[:, 1].any()
+    assert cost.value[1:, 0].all()
+
+
+@pytest.mark.parametrize(
+    "confidence", [math.nan, -1.0, 0.0], ids=["NaN", "negative", "zero"]
+)
+def test_confidences_that_are_none(confidence: float, generator: torch.Generator) -> None:
+    keypoints = torch.zeros(len(NAMES), 2, dtype=torch.float64)
+    all_of_them = torch.full((len(NAMES),), confidence, dtype=torch.float64)
+    observation = JointObservation(NAMES, keypoints, all_of_them, NAMES)
+    assert not observation.weight.any()
+
+
+def test_a_joint_behind_the_camera_costs_a_constant(generator: torch.Generator) -> None:
+    camera = make_camera()
+    points = random_points(generator=generator)
+    observation = observe(camera, points, generator)
+    behind = points.clone()
+    behind[1] = (torch.tensor([0.1, 0.2, -2.0]) - camera.t_camera_world) @ camera.R_camera_world
+    cost = TERM.point_cost(behind, camera, observation)
+    far = observation.weight[1] * (OUTLIER_LENGTHS * TERM.sigma) ** 2
+    torch.testing.assert_close(cost.value[1], 0.5 * TERM.potential(far).rho)
+    assert not cost.gradient[1].any()
+    assert not cost.hessian[1].any()
+    assert float(cost.value[1]) > 0
+    torch.testing.assert_close(TERM.value(camera.project(behind), observation), cost.value)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_types(dtype: torch.dtype, generator: torch.Generator) -> None:
+    camera = make_camera()
+    points = random_points(4, generator=generator)
+    double = observe(camera, points[0], generator)
+    expected = TERM.point_cost(points, camera, double)
+    keypoints = camera.project(points[0]).uv
+    single = JointObservation(NAMES, keypoints.to(dtype), torch.ones(len(NAMES)).to(dtype), NAMES)
+    single.target, single.weight = double.target.to(dtype), double.weight.to(dtype)
+    got = TERM.point_cost(points.to(dtype), camera, single)
+    for ours, theirs in zip(got, expected, strict=True):
+        assert ours.dtype == dtype
+        scale = float(theirs.abs().max())
+        torch.testing.assert_close(ours.double(), theirs, rtol=0, atol=1e-4 * scale)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_far_keypoints_and_points_stay_finite(dtype: torch.dtype) -> None:
+    camera = make_camera()
+    points = torch.tensor(
+        [[0.0, 0.0, 0.0], [1e6, 0.0, 0.0], [1e15, 1e15, 1e15], [0.0, 1e3, 1e-3], [0.0, 0, 5], [1, 1, 1]],
+        dtype=dtype,
+    )  # fmt: skip
+    for far in (1e4, 1e9, 1e15):
+        keypoints = torch.full((len(NAMES), 2), far, dtype=dtype)
+        observation = JointObservation(NAMES, keypoints, torch.ones(len(NAMES), dtype=dtype), NAMES)
+        for part in TERM.point_cost(points, camera, observation):
+            assert torch.isfinite(part).all()
