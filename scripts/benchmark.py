@@ -64,7 +64,7 @@ class Config:
     out: Path | None = None
     """JSON file to write."""
     memory_of: str | None = None
-    """Measure only the memory of this way, print it and stop; the script calls itself with it."""
+    """Measure only the memory of this way; the script calls itself with it."""
 
 
 def make_ways(config: Config) -> tuple[dict[str, Callable[[Tensor], Any]], Tensor]:
@@ -82,8 +82,7 @@ def make_ways(config: Config) -> tuple[dict[str, Callable[[Tensor], Any]], Tenso
     uv = camera.project(joints).uv
     uv = uv + 3.0 * torch.randn(uv.shape, generator=generator, dtype=dtype)
     observation = JointObservation(body.joint_names, uv, torch.ones_like(uv[:, 0]), names)
-    term = JointTerm()
-    choice = CostChoice(contour=None, joints=term, stabiliser=None, temporal=None)
+    choice = CostChoice(contour=None, joints=(term := JointTerm()), stabiliser=None, temporal=None)
     cost = TrackingCost(body=body, camera=camera, choice=choice, observation=observation)
     autograd = replace(cost, choice=replace(choice, curvature=Curvature.AUTOGRAD))
     # Noise for edges: the search along the normals takes the same time whatever it finds.

@@ -95,11 +95,8 @@ def main(config: Config) -> None:
             cells = ("-" if value is None else f"{value:.3f}" for value in values)
             print(f"{name:<20}" + "".join(f"{cell:>11}" for cell in cells))
     if config.out:
-        setting = {
-            **{key: getattr(config, key) for key in ("jump", "near", "tolerance", "small")},
-            "torch": torch.__version__,
-            "threads": torch.get_num_threads(),
-        }
+        setting = {key: getattr(config, key) for key in ("jump", "near", "tolerance", "small")}
+        setting |= {"torch": torch.__version__, "threads": torch.get_num_threads()}
         config.out.write_text(json.dumps({"setting": setting, "rows": rows}, indent=1) + "\n")
 
 

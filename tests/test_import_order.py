@@ -57,7 +57,9 @@ def imported_modules(source: str, package: list[str]) -> set[str]:
             above = package[: len(package) - node.level + 1] if node.level else []
             base = ".".join([*above, *([node.module] if node.module else [])])
             # `from torchcss import x` may mean the module torchcss.x.
-            found |= {f"{base}.{alias.name}" if base == "torchcss" else base for alias in node.names}
+            found |= {
+                f"{base}.{alias.name}" if base == "torchcss" else base for alias in node.names
+            }
     return found
 
 

@@ -144,8 +144,7 @@ class Track:
 
 
 Verb = (
-    Annotated[Demo, tyro.conf.subcommand("demo")]
-    | Annotated[Track, tyro.conf.subcommand("track")]
+    Annotated[Demo, tyro.conf.subcommand("demo")] | Annotated[Track, tyro.conf.subcommand("track")]
 )
 
 

@@ -15,8 +15,8 @@ import torch
 from torchcss.cost.joints import JointObservation, JointTerm
 from torchcss.initialise import initialise_from_joints
 from torchcss.io.tracks import load_track, prepare_output_folder, write_summary
-from torchcss.io.video import VideoWriter
-from torchcss.pipeline import Picture, Recorder, Settings, make_choice, track_frames
+from torchcss.io.video import Frame, VideoWriter
+from torchcss.pipeline import Recorder, Settings, make_choice, track_frames
 from torchcss.presets import make_tracker
 from torchcss.synthetic import arm_sequence
 from torchcss.vision.features import FeatureExtractor
@@ -77,7 +77,7 @@ def run_demo(
     )  # fmt: skip
     interval = 1 / sequence.frame_rate
     tracked = track_frames(
-        (Picture(i, i * interval, image) for i, image in enumerate(sequence.frames)),
+        (Frame(i, i * interval, image) for i, image in enumerate(sequence.frames)),
         body=first.body,
         mixture=first.mixture,
         camera=camera_there,

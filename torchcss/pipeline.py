@@ -37,7 +37,7 @@ from torchcss.io.cameras import check_image_size, read_camera
 from torchcss.io.keypoints import Keypoints, read_keypoints
 from torchcss.io.overlay import ProjectedPart, draw_overlay
 from torchcss.io.tracks import TrackWriter, prepare_output_folder, write_summary
-from torchcss.io.video import VideoReader, VideoWriter
+from torchcss.io.video import Frame, VideoReader, VideoWriter
 from torchcss.presets import make_tracker
 from torchcss.synthetic import grid_faces
 from torchcss.types import Status
@@ -48,7 +48,7 @@ TERMS = ("contour", "joints", "stabiliser", "temporal")
 """Terms and priors that `track_video` can switch."""
 
 _PITCH_LIMIT = math.radians(55)
-"""The base follows the body once the root's pitch exceeds this: well before the lock at 90 degrees."""
+"""The base follows the body once the root's pitch exceeds this, well before the lock at 90 degrees."""
 
 _SAVE_EVERY_S = 10.0
 
@@ -112,9 +112,7 @@ class TrackedFrame(NamedTuple):
     """One frame's result.
 
     Attributes:
-        index: Index in the video.
-        time_s: Seconds since its start.
-        image: The frame.
+        frame: The image and its place in the video.
         body: The body on this frame's base.
         state: The tracker's state, best mode first.
         info: What the step did.
@@ -123,9 +121,7 @@ class TrackedFrame(NamedTuple):
         seconds: Wall time of the frame by stage.
     """
 
-    index: int
-    time_s: float
-    image: UInt8[np.ndarray, "h w 3"]
+    frame: Frame
     body: BodyModel
     state: TrackerState
     info: TrackerInfo
@@ -134,20 +130,12 @@ class TrackedFrame(NamedTuple):
     seconds: dict[str, float]
 
 
-class Picture(NamedTuple):
-    """One image of a sequence."""
-
-    index: int
-    time_s: float
-    image: UInt8[np.ndarray, "h w 3"]
-
-
 Observe = Callable[[int], JointObservation | None]
 """Keypoints of a frame by its index, in pixels of the working image; None if there are none."""
 
 
 def track_frames(
-    frames: Iterable[Picture],
+    frames: Iterable[Frame],
     *,
     body: BodyModel,
     mixture: GaussianMixture,
@@ -210,9 +198,7 @@ def track_frames(
         mean = state.mixture.mean
         terms = cost_of(info.origin[:1], prior).terms(mean[:1])
         yield TrackedFrame(
-            frame.index,
-            frame.time_s,
-            frame.image,
+            frame,
             body,
             state,
             info,
@@ -249,17 +235,17 @@ def scale_keypoints(
 
 
 def draw_modes(
-    frame: TrackedFrame, camera: Camera, *, rings: int = 16, meridians: int = 20
+    tracked: TrackedFrame, camera: Camera, *, rings: int = 16, meridians: int = 20
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Draw the best mode as a shaded body and the others as outlines over the frame.
 
     Args:
-        frame: A tracked frame.
+        tracked: A tracked frame.
         camera: Camera of the full-size image.
         rings: Latitudes of the drawn mesh.
         meridians: Longitudes of the drawn mesh.
     """
-    body, mixture = frame.body, frame.state.mixture
+    body, mixture = tracked.body, tracked.state.mixture
     mesh = body.mesh(rings, meridians)
     faces = grid_faces(rings, meridians).to(body.tie.device)
     rotation, centre = body.part_poses(body.pose(mixture.mean))
@@ -273,10 +259,13 @@ def draw_modes(
             parts.append(ProjectedPart(uv, depth, valid, faces, part))
         modes.append(parts)
     text = (
-        f"frame {frame.index}   {len(modes)} modes   cost {float(frame.info.cost[0]):.1f}"
+        f"frame {tracked.frame.index}   {len(modes)} modes   cost {float(tracked.info.cost[0]):.1f}"
     )
     picture = draw_overlay(
-        torch.from_numpy(np.ascontiguousarray(frame.image)), modes, weights=mixture.weight, text=text
+        torch.from_numpy(np.ascontiguousarray(tracked.frame.image)),
+        modes,
+        weights=mixture.weight,
+        text=text,
     )
     return picture.numpy()
 
@@ -320,6 +309,7 @@ class Recorder:
         counts = {"samples": 0, "iterations": 0, "distinct": 0}
         statuses = torch.zeros(len(Status), dtype=torch.long)
         ended, saved, began = "interrupted", time.perf_counter(), time.perf_counter()
+        summary: dict[str, Any] = {}
         with ExitStack() as stack:
             film = None
             if self.settings.overlay:
@@ -357,7 +347,7 @@ class Recorder:
                         statuses,
                     )  # fmt: skip
                     write_summary(self.folder, summary)
-        return summary if len(writer) else {}
+        return summary
 
     def _append(self, writer: TrackWriter, frame: TrackedFrame) -> None:
         base = np.eye(4)
@@ -365,8 +355,8 @@ class Recorder:
         base[:3, 3] = frame.body.base_translation.cpu().numpy()
         mixture = frame.state.mixture
         writer.append(
-            frame=frame.index,
-            time_s=frame.time_s,
+            frame=frame.frame.index,
+            time_s=frame.frame.time_s,
             state=mixture.mean,
             covariance=mixture.covariance,
             log_weight=mixture.log_weight,
@@ -529,7 +519,7 @@ def track_video(
         },
     )
     tracked = track_frames(
-        (Picture(frame.index, frame.time_s, frame.image) for frame in reader),
+        reader,
         body=first.body,
         mixture=first.mixture,
         camera=loaded.camera,

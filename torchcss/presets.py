@@ -1,7 +1,7 @@
 """The trackers of the papers by name, as one table of choices.
 
-`make_tracker(name, body_name)` builds one. The number of modes is the papers': 3 for an arm, 7 for a
-body. More trackers (the baselines) join the table with their samplers.
+`make_tracker(name, body_name)` builds one. The number of modes is the papers': 3 for an arm, 7 for
+a body. More trackers (the baselines) join the table with their samplers.
 """
 
 from __future__ import annotations

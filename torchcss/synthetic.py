@@ -145,9 +145,7 @@ def grid_faces(rings: int, meridians: int) -> Tensor:
         rings: Latitudes.
         meridians: Longitudes.
     """
-    ring, step = torch.meshgrid(
-        torch.arange(rings - 1), torch.arange(meridians), indexing="ij"
-    )
+    ring, step = torch.meshgrid(torch.arange(rings - 1), torch.arange(meridians), indexing="ij")
     here = ring * meridians + step
     beside = ring * meridians + (step + 1) % meridians
     quads = torch.stack([here, beside, here + meridians, beside + meridians], dim=-1).reshape(-1, 4)

@@ -95,7 +95,8 @@ def test_shoulder_angles_do_not_lock_inside_the_limits(name: str) -> None:
     x[:, raising] = body.lower[raising] + steps * (body.upper - body.lower)[raising]
     omega = body.pose(x).tree.omega
     rows = [
-        body.tree.joint_names.index(f"r_shoulder_{angle}") for angle in ("swing", "raising", "twist")
+        body.tree.joint_names.index(f"r_shoulder_{angle}")
+        for angle in ("swing", "raising", "twist")
     ]
     volume = torch.linalg.det(omega[:, rows]).abs()
     assert float(volume.min()) > math.sin(math.radians(9.9))
@@ -145,9 +146,7 @@ def test_proportions_stay_within_their_interval_of_the_standard() -> None:
         ends = body.lengths[length] + torch.stack([body.lower[row], body.upper[row]])
         expected = LENGTHS[length] * (1 + PROPORTION_RANGE * torch.tensor([-1.0, 1.0]).double())
         torch.testing.assert_close(ends, expected)
-        assert float(body.sticky_mean[row]) == pytest.approx(
-            LENGTHS[length] - body.lengths[length]
-        )
+        assert float(body.sticky_mean[row]) == pytest.approx(LENGTHS[length] - body.lengths[length])
 
 
 def test_roots_are_free_or_not_as_asked() -> None:

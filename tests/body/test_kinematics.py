@@ -118,9 +118,7 @@ def test_second_derivatives_are_those_of_finite_differences(generator: torch.Gen
 
     leaf = q.clone().requires_grad_()
     rows = gradient(leaf, create_graph=True)
-    hessian = torch.stack(
-        [torch.autograd.grad(row, leaf, retain_graph=True)[0] for row in rows]
-    )
+    hessian = torch.stack([torch.autograd.grad(row, leaf, retain_graph=True)[0] for row in rows])
     step = 1e-6
     shifts = step * torch.eye(len(q), dtype=torch.float64)
     differences = torch.stack([(gradient(q + s) - gradient(q - s)) / (2 * step) for s in shifts])
@@ -175,7 +173,9 @@ def test_robots_load_and_agree_with_pytorch_kinematics(
     identity = torch.eye(3, dtype=torch.float64).expand_as(rotation)
     torch.testing.assert_close(rotation @ rotation.mT, identity, rtol=0, atol=1e-13)
     torch.testing.assert_close(translation, by_hand(tree, q)[1], rtol=0, atol=3e-7)
-    joints = {joint.get("name"): joint for joint in ElementTree.parse(path).getroot().findall("joint")}
+    joints = {
+        joint.get("name"): joint for joint in ElementTree.parse(path).getroot().findall("joint")
+    }
     for row, joint in enumerate(tree.joint_names):
         limit = joints[joint].find("limit")
         if limit is None or joints[joint].get("type") == "continuous":
@@ -205,7 +205,12 @@ LINKS = "<link name='a'/><link name='b'/>"
 
 
 def joint(
-    inside: str = "", *, name: str = "j", kind: str = "revolute", parent: str = "a", child: str = "b"
+    inside: str = "",
+    *,
+    name: str = "j",
+    kind: str = "revolute",
+    parent: str = "a",
+    child: str = "b",
 ) -> str:
     return (
         f"<joint name='{name}' type='{kind}'><parent link='{parent}'/><child link='{child}'/>"

@@ -100,9 +100,7 @@ def test_leading_shapes_and_types(
     assert surface.points.shape == (*batch, body.num_parts * 8 * 12, 3)
     assert surface.points.dtype == surface.normals.dtype == pose.joints.dtype == dtype
     tolerance = 1e-12 if dtype == torch.float64 else 1e-5
-    torch.testing.assert_close(
-        pose.joints.double(), double.pose(x).joints, rtol=0, atol=tolerance
-    )
+    torch.testing.assert_close(pose.joints.double(), double.pose(x).joints, rtol=0, atol=tolerance)
     rotation, centre = body.part_poses(pose)
     assert rotation.shape == (*batch, body.num_parts, 3, 3)
     assert centre.shape == (*batch, body.num_parts, 3)
@@ -123,9 +121,7 @@ def test_surface_is_the_posed_mesh(generator: torch.Generator) -> None:
         normal = mesh.normals[part] @ body.part_rotation[part].T @ link_turn[link].T
         got = surface.normals.unflatten(0, (4, 24))[part]
         torch.testing.assert_close(got, normal.reshape(24, 3))
-    torch.testing.assert_close(
-        surface.normals.norm(dim=-1), torch.ones(96, dtype=torch.float64)
-    )
+    torch.testing.assert_close(surface.normals.norm(dim=-1), torch.ones(96, dtype=torch.float64))
     assert body.mesh(3).points.shape == (4, 3, 6, 3)
     assert body.mesh(3, 5).points.shape == (4, 3, 5, 3)
 

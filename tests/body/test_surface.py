@@ -59,7 +59,10 @@ def test_normals_are_the_cross_product_of_the_tangents(generator: torch.Generato
     points, normals = surface_points(shapes, eta, omega)
     along, around = (
         torch.stack(
-            [torch.autograd.grad(points[:, a].sum(), angle, retain_graph=True)[0] for a in range(3)],
+            [
+                torch.autograd.grad(points[:, a].sum(), angle, retain_graph=True)[0]
+                for a in range(3)
+            ],
             dim=-1,
         )
         for angle in (eta, omega)
@@ -184,9 +187,7 @@ def test_angular_grid() -> None:
     torch.testing.assert_close(heights, -heights.flip(0))
     assert float(heights[-1]) < 1
     assert torch.equal(eta, eta[:, :1].expand(6, 8))
-    torch.testing.assert_close(
-        omega[0].diff(), torch.full((7,), math.pi / 4, dtype=torch.float64)
-    )
+    torch.testing.assert_close(omega[0].diff(), torch.full((7,), math.pi / 4, dtype=torch.float64))
     assert float(omega[0, 0]) == pytest.approx(-math.pi)
     assert angular_grid(2, 3, dtype=torch.float32)[0].dtype == torch.float32
 

@@ -138,9 +138,7 @@ def test_missing_keypoints_cost_nothing_whatever_they_hold(
     assert cost.value[1:, 0].all()
 
 
-@pytest.mark.parametrize(
-    "confidence", [math.nan, -1.0, 0.0], ids=["NaN", "negative", "zero"]
-)
+@pytest.mark.parametrize("confidence", [math.nan, -1.0, 0.0], ids=["NaN", "negative", "zero"])
 def test_confidences_that_are_none(confidence: float, generator: torch.Generator) -> None:
     keypoints = torch.zeros(len(NAMES), 2, dtype=torch.float64)
     all_of_them = torch.full((len(NAMES),), confidence, dtype=torch.float64)

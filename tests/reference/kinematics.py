@@ -37,7 +37,9 @@ def forward_kinematics(
             turn, origin = torch.eye(3).to(like), torch.zeros(3).to(like)
         else:
             turn, origin = poses[joint.parent]
-        origin = origin + (turn @ torch.tensor(joint.translation, dtype=like.dtype)[:, None])[..., 0]
+        origin = (
+            origin + (turn @ torch.tensor(joint.translation, dtype=like.dtype)[:, None])[..., 0]
+        )
         turn = turn @ torch.tensor(joint.rotation, dtype=like.dtype)
         axis = torch.tensor(joint.axis, dtype=like.dtype)
         axis = axis / axis.norm()

@@ -1,1 +1,1 @@
-"""The articulated body: tree, flesh and derivatives; it knows nothing of images."""
+"""The articulated body; knows nothing of images."""

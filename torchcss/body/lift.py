@@ -100,7 +100,12 @@ def lift_to_joints(
     gradient = (omega * torque).sum(-1) + (velocity * force).sum(-1)
 
     def times(matrix: Tensor, vector: Tensor) -> Tensor:
-        return (matrix * vector[..., None, :]).sum(-1)
+        a, b, c = vector.unbind(-1)
+        return (
+            matrix[..., 0] * a[..., None]
+            + matrix[..., 1] * b[..., None]
+            + (matrix[..., 2] * c[..., None])
+        )
 
     reaction_w = times(k_ww, omega) + times(k_wv, velocity)
     reaction_v = times(k_wv.transpose(-1, -2), omega) + times(k_vv, velocity)

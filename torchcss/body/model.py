@@ -147,6 +147,8 @@ class BodyModel(nn.Module):
                     "other: widen the limits or free a joint"
                 )
         self.register_buffer("tie", tie)
+        # Without ties the state is the joints, and the lift can skip two products with E.
+        self.is_untied = tie.shape[0] == size and bool((tie == torch.eye(size)).all())
         self.register_buffer("offset", torch.tensor([r[2] for r in rows], dtype=torch.float64))
         self.register_buffer("lower", lower)
         self.register_buffer("upper", upper)
@@ -329,6 +331,8 @@ class BodyModel(nn.Module):
             cost,
             second_order_kinematics=curvature is Curvature.EXACT,
         )
+        if self.is_untied:
+            return joints
         return LocalModel(
             joints.value, joints.gradient @ self.tie, self.tie.T @ joints.hessian @ self.tie
         )

@@ -1,1 +1,1 @@
-"""Where body meets image: one term or prior a file, summed in `torchcss.cost.total`."""
+"""Where body meets image: one term a file."""

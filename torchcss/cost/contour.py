@@ -108,8 +108,8 @@ class ContourTerm:
         """
         # Single precision is enough to find what the derivatives hold fixed, and twice as fast.
         start, along = uv.detach().float(), normal_uv.detach().float()
-        # Two samples beyond the window, so that a maximum on its very edge is found too.
-        reach = math.ceil(self.window / self.step) + 1
+        # Samples beyond the window, so that a maximum on its very edge is found too.
+        reach = math.ceil(self.window / self.step) + 2
         steps = torch.arange(-reach, reach + 1, dtype=start.dtype, device=uv.device)
         line = start[..., None, :] + (self.step * steps)[:, None] * along[..., None, :]
         field, inside = sample_bilinear(edge_field, line.flatten(-3, -2))
@@ -117,23 +117,27 @@ class ContourTerm:
         field_u, field_v = (component.unflatten(-1, shape) for component in field.unbind(-1))
         response = (field_u * along[..., :1] + field_v * along[..., 1:]).abs()
         response = response * inside.unflatten(-1, shape)
-        middle, left, right = response[..., 1:-1], response[..., :-2], response[..., 2:]
+        count = response.shape[-1] - 4
+        before, left, middle, right, after = (response[..., i : i + count] for i in range(5))
         peak = (middle > left) & (middle >= right)
         curve = (2 * middle - left - right).clamp(min=_TINY)
         shift = 0.5 * (right - left) / curve * peak
         height = middle + 0.25 * (right - left) * shift
-        # A maximum is born as an inflection, with no curvature: the weight starts at zero there.
-        sharpness = curve / height.clamp(min=1e-3) / (self.step**2 * _SHARP_ENOUGH)
-        weight = height * sharpness.clamp(max=1) * peak
-        distance = self.step * (steps[1:-1] + shift)
+        # How far the response falls to either side, 1.5 samples from the maximum. A maximum is born
+        # on a slope, where it does not fall to one side: the weight starts at zero there.
+        fall = torch.minimum(
+            middle - torch.lerp(left, before, 0.5 - shift),
+            middle - torch.lerp(right, after, 0.5 + shift),
+        )
+        sharpness = fall / height.clamp(min=1e-3) * (2 / (1.5 * self.step) ** 2 / _SHARP_ENOUGH)
+        weight = height * sharpness.clamp(0, 1) * peak
+        distance = self.step * (steps[2:-2] + shift)
         # Weights share 1, but one that enters the window takes its share from the others by degrees.
         share = weight * ((self.window - distance.abs()) / (_FADE * self.window)).clamp(0, 1)
         weight = weight / share.sum(-1, keepdim=True).clamp(min=1)
         return EdgeAssignments(distance.to(uv), weight.to(uv))
 
-    def _wells(
-        self, assignments: EdgeAssignments
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def _wells(self, assignments: EdgeAssignments) -> tuple[Tensor, Tensor, Tensor]:
         """Depth of the wells, and first and second derivative of the cost in the distance moved."""
         distance, weight = assignments
         squared = distance.square()
@@ -175,7 +179,13 @@ class ContourTerm:
         return pull_back(model, value, gradient, hessian, gauss_newton=gauss_newton)
 
     def _image_normal(self, model: ProjectionModel, nodes: ContourNodes) -> Tensor:
-        normal = (model.jacobian * nodes.normals[..., None, :]).sum(-1)
+        """Unit normal m of the contour in the image, for which `J^T m` is parallel to n."""
+        along = (model.jacobian * nodes.normals[..., None, :]).sum(-1)
+        row_u, row_v = model.jacobian.unbind(-2)
+        uu, vv = row_u.square().sum(-1), row_v.square().sum(-1)
+        uv = (row_u * row_v).sum(-1)
+        (u, v) = along.unbind(-1)
+        normal = torch.stack([vv * u - uv * v, uu * v - uv * u], dim=-1)
         length = normal.norm(dim=-1, keepdim=True)
         safe = torch.where(length > 0, length, 1.0)
         along = torch.zeros_like(normal)

@@ -87,7 +87,9 @@ class TrackingCost:
 
     def value(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
         """Cost in nats, visibility and assignments found fresh at x."""
-        return self._chunked(lambda x, part: (sum(part._values(x).values()),), x)[0]
+        return self._chunked(
+            lambda x, part: (torch.stack(list(part._values(x).values())).sum(0),), x
+        )[0]
 
     def terms(self, x: Float[Tensor, "*batch n"]) -> dict[str, Float[Tensor, "*batch"]]:
         """Cost of every term and prior by name, nats."""
@@ -165,7 +167,9 @@ class TrackingCost:
             links.append(self.body.marker_link[observation.index])
             costs.append(PointCost(*(self.choice.joint_weight * part for part in cost)))
         size = x.shape[-1]
-        total = LocalModel(x.new_zeros(len(x)), torch.zeros_like(x), x.new_zeros(len(x), size, size))
+        total = LocalModel(
+            x.new_zeros(len(x)), torch.zeros_like(x), x.new_zeros(len(x), size, size)
+        )
         if points:
             cost = PointCost(*(torch.cat(parts, dim=1) for parts in zip(*costs, strict=True)))
             total = self.body.lift(
@@ -190,7 +194,7 @@ class TrackingCost:
             priors["temporal"] = self.choice.temporal.local_model(x, self.parent, self.deviation)
         return priors
 
-    def _contour_nodes(self, pose: BodyPose):  # noqa: ANN202 (ContourNodes)
+    def _contour_nodes(self, pose: BodyPose):
         assert self.predictor is not None
         return self.predictor(self.body, pose, self.camera.centre_world)
 

@@ -25,7 +25,6 @@ from torch import Tensor, nn
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.surface import surface_points
 
-
 _TINY = 1e-12
 _GRAZING = 0.15
 """Sine of the angle by which a curve must turn through the line of sight to count fully."""
@@ -256,7 +255,11 @@ def _facing(points: Tensor, normals: Tensor, eye: Tensor) -> Float[Tensor, "*bat
 
 
 def _interpolate(
-    points: Tensor, normals: Tensor, facing: Tensor, flat: Int[Tensor, "*batch parts c"], step: Tensor
+    points: Tensor,
+    normals: Tensor,
+    facing: Tensor,
+    flat: Int[Tensor, "*batch parts c"],
+    step: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Point and normal where `facing` changes sign between `step` and the next node."""
     here = facing.gather(-1, step[..., None])[..., 0]

@@ -1,0 +1,1 @@
+"""Search over any cost with value, gradient and Hessian; knows no bodies and no images."""

@@ -1,0 +1,1 @@
+"""Files: video, keypoints, cameras, tracks, overlays."""
