@@ -115,11 +115,11 @@ def initialise_from_joints(
     free = _hang_before_camera(free, camera, observation)
     fits = fit(free, _starts(free, num_starts, generator))
     best = fits.mean[int(fits.cost.nan_to_num(math.inf).argmin())]
-    lengths = dict(free.lengths)
-    for proportion in PROPORTIONS:
-        column = f"{proportion}_length"
-        if column in free.state_names:
-            lengths[proportion] += float(best[free.state_index(column)])
+    lengths = {
+        name: free.lengths[name] + float(best[free.state_index(f"{name}_length")])
+        for name in PROPORTIONS
+        if f"{name}_length" in free.state_names
+    }
     body = load_body(name, dtype=dtype, device=device, lengths=lengths, free_root=True)
     body = body.with_base(free.base_rotation, free.base_translation)
     body, starts, _ = move_base(body, *root_pose(free, best), _columns(free, body, fits.mean))

@@ -247,7 +247,7 @@ def draw_modes(
     """
     body, mixture = tracked.body, tracked.state.mixture
     mesh = body.mesh(rings, meridians)
-    faces = grid_faces(rings, meridians).to(body.tie.device)
+    faces = grid_faces(rings, meridians)
     rotation, centre = body.part_poses(body.pose(mixture.mean))
     local = mesh.points.flatten(1, 2)
     points = local @ rotation.transpose(-1, -2) + centre[..., None, :]
@@ -255,7 +255,7 @@ def draw_modes(
     for mode in points:
         parts = []
         for part, vertices in enumerate(mode):
-            uv, depth, valid = camera.project(vertices)
+            uv, depth, valid = (tensor.cpu() for tensor in camera.project(vertices))
             parts.append(ProjectedPart(uv, depth, valid, faces, part))
         modes.append(parts)
     text = (

@@ -1,10 +1,11 @@
 """Contour term: image edges along the normals of the predicted occluding contour, eq. 8 [IJRR].
 
-For each visible contour node the image is searched along the node's projected normal, up to a window
-on either side. All local maxima of the edge response are kept as assignments; the response along
-the normal m is `|G . m|` with G the contrast-normalised gradient of unit range, so one number holds
-edge strength and agreement in orientation. Each assignment e, at signed distance d_e, has a weight
-`w_e` in [0, 1] (response, sharpness of the maximum; together at most 1), and the node costs
+For each visible contour node the image is searched along the node's projected normal, up to a
+window on either side. All local maxima of the edge response are kept as assignments; the response
+along the normal m is `|G . m|` with G the contrast-normalised gradient of unit range, so one number
+holds edge strength and agreement in orientation. Each assignment e, at signed distance d_e, has a
+weight `w_e` in [0, 1] (response, sharpness of the maximum; together at most 1, save for those about
+to leave the window), and the node costs
 
     U - sum_e w_e (U - 1/2 rho(d_e^2)),    U = 1/2 rho(window^2)
 
@@ -13,9 +14,9 @@ edge changes nothing, and one that appears on a slope starts with weight zero: t
 continuous. Only the distance along the normal counts (the aperture problem), `W_e = w_e m m^T`.
 Derivatives hold nodes, normals and assignments fixed.
 
-Rings without a contour cost `nu_bf`, existing nodes that are hidden `nu_occ = k nu_bf` (eq. 5). Both
-lie between a good fit and a bad one, U: as [IJRR] advises, their level is the error per node of a
-fitted model, and hidden nodes cost slightly more.
+Rings without a contour cost `nu_bf`, existing nodes that are hidden `nu_occ = k nu_bf` (eq. 5).
+Both lie between a good fit and a bad one, U: as [IJRR] advises, their level is the error per node
+of a fitted model, and hidden nodes cost slightly more.
 """
 
 from __future__ import annotations
@@ -49,9 +50,8 @@ class EdgeAssignments(NamedTuple):
 
 _TINY = 1e-12
 _SHARP_ENOUGH = 0.05
-"""Relative curvature, per square pixel, from which a maximum has its full weight: that of a Gaussian
-ridge of 4.5 pixels, twice as wide as the detector's own edges."""
-
+"""Relative curvature, per square pixel, from which a maximum has its full weight: that of a
+Gaussian ridge of 4.5 pixels, twice as wide as the detector's own edges."""
 
 _FADE = 0.25
 """Share of the window over which an assignment that enters it comes to count in the sum of 1."""
@@ -132,7 +132,7 @@ class ContourTerm:
         sharpness = fall / height.clamp(min=1e-3) * (2 / (1.5 * self.step) ** 2 / _SHARP_ENOUGH)
         weight = height * sharpness.clamp(0, 1) * peak
         distance = self.step * (steps[2:-2] + shift)
-        # Weights share 1, but one that enters the window takes its share from the others by degrees.
+        # Weights share 1; one that enters the window takes its share from the others by degrees.
         share = weight * ((self.window - distance.abs()) / (_FADE * self.window)).clamp(0, 1)
         weight = weight / share.sum(-1, keepdim=True).clamp(min=1)
         return EdgeAssignments(distance.to(uv), weight.to(uv))
@@ -184,7 +184,7 @@ class ContourTerm:
         row_u, row_v = model.jacobian.unbind(-2)
         uu, vv = row_u.square().sum(-1), row_v.square().sum(-1)
         uv = (row_u * row_v).sum(-1)
-        (u, v) = along.unbind(-1)
+        u, v = along.unbind(-1)
         normal = torch.stack([vv * u - uv * v, uu * v - uv * u], dim=-1)
         length = normal.norm(dim=-1, keepdim=True)
         safe = torch.where(length > 0, length, 1.0)

@@ -1,9 +1,9 @@
 """Parameter stabilisers: long-tailed "sticky" priors on hard-to-see parameters.
 
-These are the priors of section 3.2.2 [IJRR]. Each such parameter has a rest value mu and a deviation
-sigma; its cost is `1/2 rho(((x - mu) / sigma)^2)` with a Lorentzian of unit curvature at rest. Near
-rest it is the Gaussian `N(mu, sigma^2)`; beyond `sqrt(nu)` deviations its pull fades, so a strong
-observation can unstick the parameter and turn the prior off.
+These are the priors of section 3.2.2 [IJRR]. Each such parameter has a rest value mu and a
+deviation sigma; its cost is `1/2 rho(((x - mu) / sigma)^2)` with a Lorentzian of unit curvature at
+rest. Near rest it is the Gaussian `N(mu, sigma^2)`; beyond `sqrt(nu)` deviations its pull fades, so
+a strong observation can unstick the parameter and turn the prior off.
 """
 
 from __future__ import annotations

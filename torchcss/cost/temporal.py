@@ -1,8 +1,9 @@
 """Temporal prior: each sample near the mode that it descends from.
 
-This is `p(x_t | R_{t-1})` of eq. 10 [IJRR]. The papers start each search from it but leave it out of the cost; in directions that no image term sees, modes then drift. Here the
-driftless diffusion about the parent mode may join the cost, long-tailed so that a fast motion is
-unlikely and not impossible. It is evaluated per sample against its own parent.
+This is `p(x_t | R_{t-1})` of eq. 10 [IJRR]. The papers start each search from it but leave it out
+of the cost; in directions that no image term sees, modes then drift. Here the driftless diffusion
+about the parent mode may join the cost, long-tailed so that a fast motion is unlikely and not
+impossible. It is evaluated per sample against its own parent.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ temperature: the nats that a term contributes per nu of mean cost per node (desi
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -24,7 +24,7 @@ from torchcss.cost.contour import ContourTerm
 from torchcss.cost.joints import JointObservation, JointTerm
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.temporal import TemporalPrior
-from torchcss.cost.visibility import ContourPredictor
+from torchcss.cost.visibility import ContourNodes, ContourPredictor
 from torchcss.types import Curvature, LocalModel, PointCost
 from torchcss.vision.camera import Camera
 
@@ -46,10 +46,10 @@ class CostChoice:
         curvature: Which Hessian the optimiser gets.
     """
 
-    contour: ContourTerm | None = ContourTerm()
-    joints: JointTerm | None = JointTerm()
-    stabiliser: Stabiliser | None = Stabiliser()
-    temporal: TemporalPrior | None = TemporalPrior()
+    contour: ContourTerm | None = field(default_factory=ContourTerm)
+    joints: JointTerm | None = field(default_factory=JointTerm)
+    stabiliser: Stabiliser | None = field(default_factory=Stabiliser)
+    temporal: TemporalPrior | None = field(default_factory=TemporalPrior)
     contour_weight: float = 150.0
     joint_weight: float = 1.0
     curvature: Curvature = Curvature.EXACT
@@ -194,7 +194,7 @@ class TrackingCost:
             priors["temporal"] = self.choice.temporal.local_model(x, self.parent, self.deviation)
         return priors
 
-    def _contour_nodes(self, pose: BodyPose):
+    def _contour_nodes(self, pose: BodyPose) -> ContourNodes:
         assert self.predictor is not None
         return self.predictor(self.body, pose, self.camera.centre_world)
 

@@ -3,15 +3,15 @@
 The occluding contour of a part is where its normals are perpendicular to the line of sight. On the
 part's mesh it crosses every ring (a closed curve around the part) twice, once each way, and every
 meridian (pole to pole) once; the crossings are found by linear interpolation of `n . (c - p)`
-between neighbouring nodes and are the contour nodes, a fixed number per part. Rings serve limbs seen
-from the side, meridians limbs that point at the camera.
+between neighbouring nodes and are the contour nodes, a fixed number per part. Rings serve limbs
+seen from the side, meridians limbs that point at the camera.
 
 A node is occluded where another part crosses its line of sight in front of it. Parts are taken as
 tapered ellipsoids here; the transition is a ramp some millimetres wide, so that the cost has no
 jump where a limb passes in front of another. A node whose outside touches a neighbouring part (the
 end of the upper arm inside the forearm) lies on no image contour and is left out.
 
-Call `contour_nodes`.
+Make a `ContourPredictor` for a body once, and call it with poses.
 """
 
 from __future__ import annotations
@@ -26,6 +26,9 @@ from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.surface import surface_points
 
 _TINY = 1e-12
+_FAR = 1e6
+"""Metres beyond which squares could overflow in single precision; nothing is seen there."""
+
 _GRAZING = 0.15
 """Sine of the angle by which a curve must turn through the line of sight to count fully."""
 
@@ -178,9 +181,9 @@ class ContourPredictor(nn.Module):
         shape = body.part_shape.float()
         scale = 1 / shape[:, :3]
         axes = (rotation.float() * scale[:, None, :]).movedim(-3, -1)
-        rays = rays.float()
+        rays, eye_single = rays.float().clamp(-_FAR, _FAR), eye.float().clamp(-_FAR, _FAR)
         rx, ry, rz = (rays @ axes[..., i, :] for i in range(3))
-        ox, oy, oz = (eye.float() * scale)[..., None, :, :].unbind(-1)
+        ox, oy, oz = (eye_single * scale)[..., None, :, :].unbind(-1)
         # Height of closest approach decides the taper of the cross-section.
         nearest = -(ox * rx + oy * ry + oz * rz) / (rx * rx + ry * ry + rz * rz).clamp(min=_TINY)
         height = (oz + nearest * rz).clamp(-1, 1)
@@ -191,10 +194,11 @@ class ContourPredictor(nn.Module):
         px, py, pz = ox + nearest * rx, oy + nearest * ry, oz + nearest * rz
         depth = 1 - (px * px + py * py + pz * pz)
         thickness = shape[:, :2].mean(-1)
-        # How deep the ray passes inside, and how far in front of the node it enters, metres.
-        crossed = (depth * (0.5 / self.ramp * thickness)).clamp(0, 1)
+        # How deep the ray passes inside, and how far in front of the node it enters, metres; parts
+        # behind the camera hide nothing.
+        crossed = (depth * (0.5 / self.ramp * thickness)).clamp(0, 1) * (nearest > 0)
         entry = nearest - (depth.clamp(min=0) / square).sqrt()
-        front = (1 - entry) * eye.float().norm(dim=-1)[..., None, :]
+        front = (1 - entry) * eye_single.norm(dim=-1)[..., None, :]
         covered = crossed * (front / self.ramp).clamp(0, 1) * self.other
         # A neighbour just behind the node hides the step in depth that makes an image edge.
         close = crossed * (4 + front / thickness).clamp(0, 1) * self.touching
