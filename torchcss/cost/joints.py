@@ -94,7 +94,7 @@ class JointTerm:
     """
 
     sigma: float = 3.0
-    nu: float = 4.0
+    nu: float = 8.0
 
     @property
     def potential(self) -> RobustPotential:

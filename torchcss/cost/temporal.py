@@ -25,7 +25,7 @@ class TemporalPrior:
         nu: Height of the tails, nats.
     """
 
-    nu: float = 9.0
+    nu: float = 4.0
 
     def local_model(
         self,

@@ -32,6 +32,10 @@ CHUNK = 256
 """Samples evaluated at a time: small enough for the caches, large enough to hide call overhead."""
 
 
+COARSE_SCALE = 6.0
+"""How much wider the keypoints' scale is in the coarse cost: a missed limb is then no outlier."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class CostChoice:
     """Which terms and priors make up the cost, and how they weigh.
@@ -84,6 +88,17 @@ class TrackingCost:
         if self.parent is None or self.parent.dim() == 1:
             return self
         return replace(self, parent=self.parent[items])
+
+    def coarse(self) -> TrackingCost | None:
+        """The keypoints alone with a wide scale: what finds a limb that moved too fast for edges.
+
+        None in frames without keypoints.
+        """
+        if not self._uses_joints:
+            return None
+        assert self.choice.joints is not None
+        wide = replace(self.choice.joints, sigma=COARSE_SCALE * self.choice.joints.sigma)
+        return replace(self, choice=replace(self.choice, contour=None, joints=wide))
 
     def value(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
         """Cost in nats, visibility and assignments found fresh at x."""

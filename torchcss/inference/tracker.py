@@ -101,6 +101,9 @@ class Tracker:
         memory: Power of the prior's weights in step 5. One is Fig. 6; it treats frames as independent
             evidence, so with a sharp likelihood a mode that led for some frames can never be
             overtaken. Image errors persist from frame to frame, which a power below one allows for.
+        coarse_every: If the cost has a method `coarse()` that returns a smoother cost (or None),
+            every so many samples descend on that first, so that what moved farther than the cost's
+            own basin reaches is found again; 0 for never.
         standard_bhattacharyya: Match modes by the distance of the literature instead of the one
             printed (design decision 4).
     """
@@ -113,6 +116,7 @@ class Tracker:
     duplicate_distance: float = 1.0
     laplace_evidence: bool = False
     memory: float = 1.0
+    coarse_every: int = 3
     standard_bhattacharyya: bool = False
 
     def __post_init__(self) -> None:
@@ -184,6 +188,13 @@ class Tracker:
         samples = self.proposal.sample(prior, self.num_samples, bounds, generator=generator)
         if not isinstance(cost, CostFunction):
             cost = cost(samples.parent, prior)
+
+        # Before 2.3, if the cost has a smoother self, every so many samples descend on that first.
+        if self.coarse_every and (coarse := getattr(cost, "coarse", lambda: None)()) is not None:
+            some = torch.arange(0, len(samples.x), self.coarse_every, device=samples.x.device)
+            part = coarse.take(some) if hasattr(coarse, "take") else coarse
+            rough = self.optimiser.minimise(part, samples.x[some], bounds, scale=scale)
+            samples = samples._replace(x=samples.x.index_copy(0, some, rough.mean))
 
         # 2.3: descend from every sample, and discard minima found before.
         modes = self.optimiser.minimise(
