@@ -16,10 +16,9 @@ from torchcss.cost.joints import JointObservation, JointTerm
 from torchcss.initialise import initialise_from_joints
 from torchcss.io.tracks import load_track, prepare_output_folder, write_summary
 from torchcss.io.video import Frame, VideoWriter
-from torchcss.pipeline import Recorder, Settings, make_choice, track_frames
+from torchcss.pipeline import Recorder, Settings, make_choice, make_extractor, track_frames
 from torchcss.presets import make_tracker
 from torchcss.synthetic import arm_sequence
-from torchcss.vision.features import FeatureExtractor
 
 KEYPOINT_NOISE_PX = 1.5
 
@@ -81,9 +80,7 @@ def run_demo(
         body=first.body,
         mixture=first.mixture,
         camera=camera_there,
-        extractor=FeatureExtractor(working_size=settings.working_size).to(
-            dtype=dtype, device=device
-        ),
+        extractor=make_extractor(settings),
         tracker=make_tracker(
             settings.preset,
             "arm8",

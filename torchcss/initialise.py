@@ -154,7 +154,7 @@ def default_sigma(keypoints: Float[Tensor, "j 2"]) -> float:
 def _hang_before_camera(
     body: BodyModel, camera: Camera, observation: JointObservation
 ) -> BodyModel:
-    """Base: upright in the image, facing the camera, at the depth that the limbs' lengths suggest."""
+    """Base: upright in the image, facing the camera, as far as the limbs' lengths suggest."""
     seen = observation.weight > 0
     index, target = observation.index[seen], observation.target[seen]
     rest = body.pose(body.rest).joints[index]

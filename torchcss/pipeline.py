@@ -26,9 +26,10 @@ from tqdm import tqdm
 
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, has_root, move_base, root_pose
+from torchcss.cost.flow import FlowTargets, FlowTerm, InteriorNodes, flow_targets
 from torchcss.cost.joints import JointObservation, JointTerm
 from torchcss.cost.total import CostChoice, TrackingCost
-from torchcss.cost.visibility import ContourPredictor
+from torchcss.cost.visibility import ContourPredictor, visible_nodes
 from torchcss.errors import ConfigurationError, KeypointError
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.tracker import Tracker, TrackerInfo, TrackerState
@@ -43,12 +44,16 @@ from torchcss.synthetic import grid_faces
 from torchcss.types import Status
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor
+from torchcss.vision.flow import TRACKING
 
 TERMS = ("contour", "joints", "stabiliser", "temporal")
-"""Terms and priors that `track_video` can switch."""
+"""Terms and priors of the cost by default."""
+
+ALL_TERMS = (*TERMS, "flow")
+"""Terms and priors that can be chosen."""
 
 _PITCH_LIMIT = math.radians(55)
-"""The base follows the body once the root's pitch exceeds this, well before the lock at 90 degrees."""
+"""The base follows once the root's pitch exceeds this, well before it locks at 90 degrees."""
 
 _SAVE_EVERY_S = 10.0
 
@@ -88,9 +93,9 @@ class Settings:
     overlay: bool = True
 
     def __post_init__(self) -> None:
-        unknown = sorted(set(self.terms) - set(TERMS))
+        unknown = sorted(set(self.terms) - set(ALL_TERMS))
         if unknown:
-            raise ConfigurationError(f"unknown terms {unknown}; there are {', '.join(TERMS)}")
+            raise ConfigurationError(f"unknown terms {unknown}; there are {', '.join(ALL_TERMS)}")
         for name in ("samples", "modes", "working_size"):
             number = getattr(self, name)
             if number is not None and number < 1:
@@ -166,12 +171,29 @@ def track_frames(
     """
     working = extractor.working_camera(camera).to(dtype=body.dtype, device=body.tie.device)
     predictor = ContourPredictor(body) if choice.contour is not None else None
+    interior = InteriorNodes(body) if choice.flow is not None else None
+    last_image = None
     deviation = body.motion_rate * frame_interval
     state = tracker.init(mixture, generator=generator)
     for frame in frames:
         clock = time.perf_counter()
-        features = extractor(frame.image)
-        edge_field = (features.edge_energy * features.edge_direction).to(body.tie)
+        features = extractor(frame.image, last_image)
+        last_image = frame.image if choice.flow is not None else None
+        edge_field = features.edge_field().to(body.tie)
+        targets = None
+        if interior is not None and features.flow is not None:
+            mean = state.mixture.mean
+            before = body.pose(mean)
+            points = interior(body, before).points
+            targets = flow_targets(
+                interior,
+                body,
+                mean,
+                working,
+                features.flow.to(body.tie),
+                None if features.flow_outlier is None else features.flow_outlier.to(body.tie),
+                visible_nodes(body, before, working.centre_world, points, interior.node_part),
+            )
         featured = time.perf_counter()
 
         def cost_of(
@@ -180,6 +202,7 @@ def track_frames(
             body: BodyModel = body,
             edge_field: Tensor = edge_field,
             index: int = frame.index,
+            targets: FlowTargets | None = targets,
         ) -> TrackingCost:
             return TrackingCost(
                 body=body,
@@ -187,6 +210,8 @@ def track_frames(
                 choice=choice,
                 predictor=predictor,
                 edge_field=edge_field,
+                interior=interior,
+                targets=None if targets is None else targets.take(parent),
                 observation=observe(index),
                 parent=prior.mean[parent],
                 deviation=deviation,
@@ -396,6 +421,13 @@ class Recorder:
         }
 
 
+def make_extractor(settings: Settings) -> FeatureExtractor:
+    """The features that the settings ask for, in their type and on their device."""
+    flow = TRACKING if "flow" in settings.terms else None
+    extractor = FeatureExtractor(working_size=settings.working_size, flow=flow)
+    return extractor.to(dtype=settings.torch_dtype, device=settings.device)
+
+
 def make_choice(settings: Settings, sigma: float) -> CostChoice:
     """The cost that the settings ask for.
 
@@ -407,6 +439,7 @@ def make_choice(settings: Settings, sigma: float) -> CostChoice:
     has = settings.terms.__contains__
     return CostChoice(
         contour=default.contour if has("contour") else None,
+        flow=FlowTerm() if has("flow") else None,
         joints=JointTerm(sigma=sigma) if has("joints") else None,
         stabiliser=default.stabiliser if has("stabiliser") else None,
         temporal=default.temporal if has("temporal") else None,
@@ -485,7 +518,7 @@ def track_video(
     for note in notes:
         tqdm.write(note)
 
-    extractor = FeatureExtractor(working_size=settings.working_size).to(dtype=dtype, device=device)
+    extractor = make_extractor(settings)
     working = extractor.working_shape(width, height)
     scaled = scale_keypoints(marks.keypoints, (width, height), working).to(dtype).to(device)
     confidence = marks.confidence.to(dtype).to(device)

@@ -89,17 +89,13 @@ def test_a_ball_has_the_contour_of_its_cone() -> None:
     assert int(own.sum()) > 20
     away = nodes.points[own] - centre[0]
     height = -radius * radius / distance
-    torch.testing.assert_close(
-        away[:, 2], torch.full_like(away[:, 2], height), rtol=0, atol=3e-3
-    )
+    torch.testing.assert_close(away[:, 2], torch.full_like(away[:, 2], height), rtol=0, atol=3e-3)
     torch.testing.assert_close(
         away.norm(dim=-1), torch.full_like(away[:, 2], radius), rtol=0, atol=2.5e-3
     )
 
 
-@pytest.mark.parametrize(
-    ("name", "poses", "least_hidden"), [("arm7", 12, 10), ("body34", 4, 40)]
-)
+@pytest.mark.parametrize(("name", "poses", "least_hidden"), [("arm7", 12, 3), ("body34", 4, 40)])
 def test_occlusion_agrees_with_marched_rays(
     name: str, poses: int, least_hidden: int, generator: torch.Generator
 ) -> None:
@@ -110,9 +106,9 @@ def test_occlusion_agrees_with_marched_rays(
     body = before_camera(name)
     predictor = ContourPredictor(body)
     x = poses_about_rest(body, poses, generator=generator)
-    if name == "arm7":  # bent arms that reach across the line of sight
-        x[:, body.state_index("r_elbow_flexion")] = torch.linspace(1.2, 2.5, poses).double()
-        x[:, body.state_index("r_shoulder_swing")] = torch.linspace(-2.2, -1.2, poses).double()
+    if name == "arm7":  # any arm at all
+        fraction = torch.rand(poses, 7, generator=generator, dtype=torch.float64)
+        x = body.lower + fraction * (body.upper - body.lower)
     else:
         x[:, body.state_index("root_yaw")] = torch.linspace(0.0, 2.5, poses).double()
     agreeing = clear = hidden = 0
@@ -183,34 +179,42 @@ def test_an_arm_that_points_at_the_camera_has_a_contour_from_its_meridians() -> 
     assert int((side.exists[upper & ~from_meridians] > 0.5).sum()) >= num_rings
 
 
-def test_a_limb_in_front_hides_the_one_behind() -> None:
+def test_an_arm_is_hidden_behind_the_body_and_not_before_it() -> None:
     body = before_camera("body34")
     predictor = ContourPredictor(body)
-    x = body.rest.clone()
-    x[body.state_index("root_yaw")] = math.pi / 2  # seen from one side
-    nodes = predictor(body, body.pose(x), EYE)
-    visible = {}
-    for side in ("l", "r"):
-        part = predictor.node_part == body.part_names.index(f"{side}_thigh")
-        part &= nodes.exists > 0.5
-        visible[side] = float(nodes.visible[part].mean())
-    assert min(visible.values()) < 0.2
-    assert max(visible.values()) > 0.6
+    for yaw in (math.pi / 2, -math.pi / 2):  # seen from either side
+        x = body.rest.clone()
+        x[body.state_index("root_yaw")] = yaw
+        pose = body.pose(x)
+        nodes = predictor(body, pose, EYE)
+        seen = {}
+        for side in ("l", "r"):
+            part = predictor.node_part == body.part_names.index(f"{side}_forearm")
+            part &= nodes.exists > 0.5
+            depth = pose.joints[body.joint_index(f"{side}_elbow"), 2]
+            seen[float(depth)] = float(nodes.visible[part].mean())
+        assert seen[min(seen)] > 0.95
+        assert seen[max(seen)] < 0.3
 
 
 def test_visibility_fades_without_jumps() -> None:
-    """A hand that moves before the body: no node flips in a small step."""
+    """A forearm sweeps before the body, a millimetre a step: no node behind it flips."""
     body = before_camera("body34")
     predictor = ContourPredictor(body)
-    steps = torch.linspace(0, 1, 401, dtype=torch.float64)[:, None]
-    x = body.rest + steps * torch.zeros(34, dtype=torch.float64)
+    num = 801
+    x = body.rest.repeat(num, 1)
     x[:, body.state_index("l_elbow_flexion")] = math.radians(90)
-    x[:, body.state_index("l_shoulder_twist")] = torch.linspace(-1.5, 1.5, 401).double()
+    x[:, body.state_index("l_shoulder_twist")] = torch.linspace(-1.5, 1.5, num).double()
     nodes = predictor(body, body.pose(x), EYE)
-    jump = nodes.visible.diff(dim=0).abs()
-    assert float(jump.max()) < 0.5
-    assert float(nodes.exists.diff(dim=0).abs().max()) < 0.5
-    assert float((nodes.visible.amax(0) - nodes.visible.amin(0)).max()) > 0.9
+    still = [body.part_names.index(name) for name in ("pelvis", "chest", "r_forearm", "neck")]
+    behind = torch.isin(predictor.node_part, torch.tensor(still))
+    visible = nodes.visible[:, behind]
+    assert float((visible.amax(0) - visible.amin(0)).max()) > 0.9
+    assert float(visible.diff(dim=0).abs().max()) < 0.3
+    # Where a contour fades in or out it does so by degrees.
+    moved = nodes.points.diff(dim=0).norm(dim=-1)
+    jump = nodes.exists.diff(dim=0).abs()
+    assert float(jump[moved < 0.005].max()) < 0.3
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -238,10 +242,9 @@ def test_parts_behind_the_camera_hide_nothing() -> None:
     for side in ("l", "r"):
         x[body.state_index(f"{side}_elbow_flexion")] = math.radians(90)
     pose = body.pose(x)
-    rotation, centre = body.part_poses(pose)
-    chest, head = (body.part_names.index(name) for name in ("chest", "head"))
-    forward = UPRIGHT @ torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    eye = centre[chest] + 0.22 * forward
+    _, centre = body.part_poses(pose)
+    chest = body.part_names.index("chest")
+    eye = centre[chest] + torch.tensor([0.0, 0.0, -0.22], dtype=torch.float64)
     nodes = predictor(body, pose, eye)
     part = predictor.node_part == body.part_names.index("l_hand")
     targets = nodes.points + predictor.clearance * nodes.normals
@@ -249,4 +252,3 @@ def test_parts_behind_the_camera_hide_nothing() -> None:
     seen = part & (nodes.exists > 0.5) & ~truth
     assert int(seen.sum()) > 10
     assert float(nodes.visible[seen].mean()) > 0.9
-    assert rotation.shape[0] == body.num_parts > head

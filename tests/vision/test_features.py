@@ -7,9 +7,12 @@ import pytest
 import torch
 
 from torchcss.errors import ConfigurationError, ShapeError
+from torchcss.vision.boundaries import motion_boundaries
 from torchcss.vision.camera import Camera
 from torchcss.vision.edges import EdgeConfiguration, edge_features
-from torchcss.vision.features import FeatureExtractor
+from torchcss.vision.features import FeatureExtractor, FrameFeatures
+from torchcss.vision.flow import TRACKING, robust_flow
+from torchcss.vision.foreground import foreground_weight
 
 
 @pytest.fixture
@@ -132,3 +135,141 @@ def test_sizes_that_differ_are_refused(picture: torch.Tensor) -> None:
     for bad in (0, -3, 2.5):
         with pytest.raises(ConfigurationError, match="working_size"):
             FeatureExtractor(working_size=bad)
+
+
+def texture(generator: torch.Generator, height: int = 60, width: int = 80) -> torch.Tensor:
+    """A finely textured grey picture in 0..1."""
+    noise = torch.rand(1, 1, height // 3 + 2, width // 3 + 2, generator=generator)
+    fine = torch.nn.functional.interpolate(noise, size=(height, width), mode="bicubic")
+    return fine[0, 0].clamp(0.0, 1.0)
+
+
+def moving_square(
+    generator: torch.Generator, shift: int = 3
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Two frames in which a textured square moves to the right, and where it was."""
+    ground, square = texture(generator), texture(generator, 30, 30)
+    before, after, mask = ground.clone(), ground.clone(), torch.zeros(60, 80)
+    before[15:45, 20:50] = square
+    after[15:45, 20 + shift : 50 + shift] = square
+    mask[15:45, 20:50] = 1.0
+    return before, after, mask
+
+
+def assert_unusable(features: FrameFeatures) -> None:
+    assert features.flow is not None
+    assert features.flow_outlier is not None
+    assert features.motion_boundary is not None
+    assert not features.flow.any()
+    assert (features.flow_outlier == 1.0).all()
+    assert (features.motion_boundary == 1.0).all()
+
+
+def test_features_of_motion(generator: torch.Generator) -> None:
+    before, after, mask = moving_square(generator)
+    extractor = FeatureExtractor(flow=TRACKING)
+    assert extractor(after).flow is None
+    features = extractor(after, before)
+    assert features.flow is not None
+    assert features.flow_outlier is not None
+    assert features.motion_boundary is not None
+    expected = robust_flow(before, after, TRACKING)
+    assert torch.equal(features.flow, expected.flow)
+    assert torch.equal(features.motion_boundary, motion_boundaries(expected).potential)
+    assert (features.flow_outlier >= expected.data_outlier - 1e-6).all()
+    assert (features.flow_outlier >= expected.smoothness_outlier - 1e-6).all()
+    inside = torch.nn.functional.avg_pool2d(mask[None], 9, stride=1, padding=4)[0] == 1.0
+    middle = features.flow[:, inside].median(dim=-1).values
+    torch.testing.assert_close(middle, torch.tensor([3.0, 0.0]), rtol=0.0, atol=0.1)
+    assert float(features.flow_outlier[inside].mean()) < 0.1
+    # The potential is low on the boundary of the square, and near one far from it.
+    assert float(features.motion_boundary[25:35, 19:21].mean()) < 0.5
+    assert float(features.motion_boundary[inside].mean()) > 0.9
+
+
+def test_edge_fields_emphasise_what_moves(generator: torch.Generator) -> None:
+    before, after, mask = moving_square(generator)
+    features = FeatureExtractor(flow=TRACKING)(after, before, mask)
+    assert features.motion_boundary is not None
+    plain = features.edge_energy * features.edge_direction
+    weight = foreground_weight(mask)
+    for k in (0.0, 0.3, 1.0):
+        expected = plain * (1.0 - k * features.motion_boundary) * weight
+        torch.testing.assert_close(features.edge_field(boundary_emphasis=k), expected)
+    torch.testing.assert_close(features.edge_field(), features.edge_field(boundary_emphasis=0.3))
+    still = features._replace(motion_boundary=None, mask=None)
+    torch.testing.assert_close(still.edge_field(), plain)
+    assert float(features.edge_field().norm(dim=0).max()) < 1.0
+    for bad in (-0.1, 1.1, float("nan")):
+        with pytest.raises(ConfigurationError, match="boundary_emphasis"):
+            features.edge_field(boundary_emphasis=bad)
+
+
+def test_a_repeated_frame_does_not_move(generator: torch.Generator) -> None:
+    frame = texture(generator)
+    features = FeatureExtractor(flow=TRACKING)(frame, frame)
+    assert features.flow is not None
+    assert features.flow_outlier is not None
+    assert float(features.flow.abs().max()) < 1e-3
+    assert float(features.flow_outlier.max()) < 1e-3
+
+
+def test_a_dropped_frame_is_a_larger_motion(generator: torch.Generator) -> None:
+    before, after, _ = moving_square(generator, shift=6)
+    features = FeatureExtractor(flow=TRACKING)(after, before)
+    assert features.flow is not None
+    torch.testing.assert_close(
+        features.flow[0, 25:35, 30:40].median(), torch.tensor(6.0), atol=0.3, rtol=0
+    )
+
+
+def test_motion_across_a_cut_is_unusable(generator: torch.Generator) -> None:
+    extractor = FeatureExtractor(flow=TRACKING)
+    one, other = texture(generator, 90, 120), texture(generator, 90, 120)
+    assert_unusable(extractor(one, other))
+    assert_unusable(extractor(one, 1.0 - one))
+
+
+@pytest.mark.parametrize("level", [0.0, 0.3, 1.0])
+def test_motion_of_a_frame_of_one_colour_is_unusable(
+    level: float, generator: torch.Generator
+) -> None:
+    extractor = FeatureExtractor(flow=TRACKING)
+    flat, frame = torch.full((60, 80), level), texture(generator)
+    for current, previous in ((flat, frame), (frame, flat), (flat, flat), (flat, 1.0 - flat)):
+        features = extractor(current, previous)
+        assert_unusable(features)
+        assert features.edge_field().isfinite().all()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (33, 1), (2, 2), (7, 5), (23, 31)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_motion_of_thin_small_and_saturated_frames(
+    size: tuple[int, int], dtype: torch.dtype, generator: torch.Generator
+) -> None:
+    extractor = FeatureExtractor(flow=TRACKING, working_size=24).to(dtype)
+    frames = torch.randint(0, 256, (2, *size, 4), generator=generator, dtype=torch.uint8)
+    saturated = torch.where(frames > 128, 255, 0).to(torch.uint8)
+    for before, after in (frames, saturated, (frames[0], saturated[1])):
+        features = extractor(after, before, mask=after[..., 0] > 100)
+        assert features.flow is not None
+        assert features.flow.shape == (2, *features.grey.shape)
+        for part in (*features, features.edge_field()):
+            assert part is not None
+            assert part.dtype == dtype
+            assert part.isfinite().all()
+        for part in (features.flow_outlier, features.motion_boundary, features.mask):
+            assert part is not None
+            assert 0.0 <= float(part.min()) <= float(part.max()) <= 1.0
+
+
+def test_motion_between_pictures_of_all_kinds(picture: torch.Tensor) -> None:
+    extractor = FeatureExtractor(flow=TRACKING)
+    shifted = picture.roll(2, dims=1)
+    expected = extractor(shifted, picture)
+    assert expected.flow is not None
+    sixteen = picture.numpy().astype(np.uint16) * 257
+    with_alpha = torch.cat([picture, picture[..., :1]], dim=-1)
+    for previous in (sixteen, with_alpha, picture.float() / 255.0, extractor(picture).grey):
+        features = extractor(shifted, previous)
+        torch.testing.assert_close(features.flow, expected.flow, rtol=0.0, atol=1e-2)

@@ -21,10 +21,11 @@ from torch import Tensor
 
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.cost.contour import ContourTerm
+from torchcss.cost.flow import FlowTargets, FlowTerm, InteriorNodes
 from torchcss.cost.joints import JointObservation, JointTerm
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.temporal import TemporalPrior
-from torchcss.cost.visibility import ContourNodes, ContourPredictor
+from torchcss.cost.visibility import ContourNodes, ContourPredictor, visible_nodes
 from torchcss.types import Curvature, LocalModel, PointCost
 from torchcss.vision.camera import Camera
 
@@ -42,19 +43,23 @@ class CostChoice:
 
     Attributes:
         contour: The edge term, or None.
+        flow: The flow term, or None; it is silent in frames without flow.
         joints: The keypoint term, or None; it is silent in frames without keypoints.
         stabiliser: The sticky prior, or None.
         temporal: The temporal prior, or None.
         contour_weight: Nats per nu of the contour's mean cost per node.
+        flow_weight: Nats per nu of the flow's mean cost per node.
         joint_weight: Factor on the joints' cost, whose nu is in nats already.
         curvature: Which Hessian the optimiser gets.
     """
 
     contour: ContourTerm | None = field(default_factory=ContourTerm)
+    flow: FlowTerm | None = None
     joints: JointTerm | None = field(default_factory=JointTerm)
     stabiliser: Stabiliser | None = field(default_factory=Stabiliser)
     temporal: TemporalPrior | None = field(default_factory=TemporalPrior)
     contour_weight: float = 150.0
+    flow_weight: float = 50.0
     joint_weight: float = 1.0
     curvature: Curvature = Curvature.EXACT
 
@@ -69,6 +74,8 @@ class TrackingCost:
         choice: Terms and weights.
         predictor: Contour predictor of the body; None switches the contour term off.
         edge_field: Edge energy times gradient direction; None switches the contour term off.
+        interior: Interior nodes of the body, for the flow term; None switches it off.
+        targets: Where the flow carried the nodes of each sample's parent mode, `[b p 2]`.
         observation: Keypoints of the frame, in that image's pixels; None if there are none.
         parent: State of each sample's parent mode, `[b n]` or `[n]`; None: no temporal prior.
         deviation: Expected motion per frame of every parameter, for the temporal prior.
@@ -79,15 +86,20 @@ class TrackingCost:
     choice: CostChoice
     predictor: ContourPredictor | None = None
     edge_field: Float[Tensor, "2 h w"] | None = None
+    interior: InteriorNodes | None = None
+    targets: FlowTargets | None = None
     observation: JointObservation | None = None
     parent: Float[Tensor, "*b n"] | None = None
     deviation: Float[Tensor, " n"] | None = None
 
     def take(self, items: Int[Tensor, " b"]) -> TrackingCost:
         """The cost restricted to some samples: each keeps its own parent."""
-        if self.parent is None or self.parent.dim() == 1:
-            return self
-        return replace(self, parent=self.parent[items])
+        cost = self
+        if cost.parent is not None and cost.parent.dim() > 1:
+            cost = replace(cost, parent=cost.parent[items])
+        if cost.targets is not None and cost.targets.uv.dim() > 2:
+            cost = replace(cost, targets=cost.targets.take(items))
+        return cost
 
     def coarse(self) -> TrackingCost | None:
         """The keypoints alone with a wide scale: what finds a limb that moved too fast for edges.
@@ -98,7 +110,7 @@ class TrackingCost:
             return None
         assert self.choice.joints is not None
         wide = replace(self.choice.joints, sigma=COARSE_SCALE * self.choice.joints.sigma)
-        return replace(self, choice=replace(self.choice, contour=None, joints=wide))
+        return replace(self, choice=replace(self.choice, contour=None, flow=None, joints=wide))
 
     def value(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
         """Cost in nats, visibility and assignments found fresh at x."""
@@ -139,6 +151,10 @@ class TrackingCost:
         return None not in (self.choice.contour, self.predictor, self.edge_field)
 
     @property
+    def _uses_flow(self) -> bool:
+        return None not in (self.choice.flow, self.interior, self.targets)
+
+    @property
     def _uses_joints(self) -> bool:
         return self.choice.joints is not None and self.observation is not None
 
@@ -151,6 +167,11 @@ class TrackingCost:
             assert self.edge_field is not None
             cost = term.value(nodes, self.camera, self.edge_field)
             values["contour"] = self._contour_scale * cost.sum(-1)
+        if self._uses_flow:
+            term = self.choice.flow
+            assert term is not None
+            cost = term.value(*self._interior_nodes(pose), self.camera, self._targets)
+            values["flow"] = self._flow_scale * cost.sum(-1)
         if self._uses_joints:
             assert self.choice.joints is not None
             assert self.observation is not None
@@ -172,6 +193,14 @@ class TrackingCost:
             points.append(nodes.points)
             links.append(self.predictor.node_link)
             costs.append(PointCost(*(self._contour_scale * part for part in cost)))
+        if self._uses_flow:
+            term, interior = self.choice.flow, self._interior_nodes(pose)
+            assert term is not None
+            assert self.interior is not None
+            cost = term.point_cost(*interior, self.camera, self._targets, gauss_newton=gauss_newton)
+            points.append(interior[0])
+            links.append(self.interior.node_link)
+            costs.append(PointCost(*(self._flow_scale * part for part in cost)))
         if self._uses_joints:
             term, observation = self.choice.joints, self.observation
             assert term is not None
@@ -212,6 +241,24 @@ class TrackingCost:
     def _contour_nodes(self, pose: BodyPose) -> ContourNodes:
         assert self.predictor is not None
         return self.predictor(self.body, pose, self.camera.centre_world)
+
+    def _interior_nodes(self, pose: BodyPose) -> tuple[Tensor, Tensor, Tensor]:
+        """Points, normals and visibility of the interior nodes."""
+        assert self.interior is not None
+        points, normals = self.interior(self.body, pose)
+        centre, part = self.camera.centre_world, self.interior.node_part
+        return points, normals, visible_nodes(self.body, pose, centre, points, part)
+
+    @property
+    def _targets(self) -> FlowTargets:
+        assert self.targets is not None
+        return self.targets
+
+    @property
+    def _flow_scale(self) -> float:
+        assert self.choice.flow is not None
+        assert self.interior is not None
+        return self.choice.flow_weight / (self.interior.num_nodes * self.choice.flow.nu)
 
     @property
     def _contour_scale(self) -> float:

@@ -158,51 +158,89 @@ class ContourPredictor(nn.Module):
         normals = (normals @ turn).flatten(-3, -2)
         exists = exists.flatten(-2)
         rays = points + self.clearance * normals - centre_world
-        visible, free = self._occlusion(body, rotation, eye, rays)
+        visible, free = line_of_sight(
+            body, rotation, eye, rays, other=self.other, touching=self.touching, ramp=self.ramp
+        )
         return ContourNodes(points, normals, exists * free, visible)
 
-    def _occlusion(
-        self,
-        body: BodyModel,
-        rotation: Float[Tensor, "*batch parts 3 3"],
-        eye: Float[Tensor, "*batch parts 3"],
-        rays: Float[Tensor, "*batch p 3"],
-    ) -> tuple[Float[Tensor, "*batch p"], Float[Tensor, "*batch p"]]:
-        """Visibility of the nodes, and whether their outside is free of neighbouring parts.
 
-        Args:
-            body: The body.
-            rotation: Orientations of the parts.
-            eye: The camera's centre in the frames of the parts.
-            rays: From the camera's centre to the tested points, world axes.
-        """
-        # All pairs of node and part at once, in the part's frame and in units of its semi-axes.
-        # Single precision: the closest approach is found as a vector, without cancellation.
-        shape = body.part_shape.float()
-        scale = 1 / shape[:, :3]
-        axes = (rotation.float() * scale[:, None, :]).movedim(-3, -1)
-        rays, eye_single = rays.float().clamp(-_FAR, _FAR), eye.float().clamp(-_FAR, _FAR)
-        rx, ry, rz = (rays @ axes[..., i, :] for i in range(3))
-        ox, oy, oz = (eye_single * scale)[..., None, :, :].unbind(-1)
-        # Height of closest approach decides the taper of the cross-section.
-        nearest = -(ox * rx + oy * ry + oz * rz) / (rx * rx + ry * ry + rz * rz).clamp(min=_TINY)
-        height = (oz + nearest * rz).clamp(-1, 1)
-        fx, fy = 1 / (1 + shape[:, 5] * height), 1 / (1 + shape[:, 6] * height)
-        ox, oy, rx, ry = ox * fx, oy * fy, rx * fx, ry * fy
-        square = (rx * rx + ry * ry + rz * rz).clamp(min=_TINY)
-        nearest = -(ox * rx + oy * ry + oz * rz) / square
-        px, py, pz = ox + nearest * rx, oy + nearest * ry, oz + nearest * rz
-        depth = 1 - (px * px + py * py + pz * pz)
-        thickness = shape[:, :2].mean(-1)
-        # How deep the ray passes inside, and how far in front of the node it enters, metres; parts
-        # behind the camera hide nothing.
-        crossed = (depth * (0.5 / self.ramp * thickness)).clamp(0, 1) * (nearest > 0)
-        entry = nearest - (depth.clamp(min=0) / square).sqrt()
-        front = (1 - entry) * eye_single.norm(dim=-1)[..., None, :]
-        covered = crossed * (front / self.ramp).clamp(0, 1) * self.other
-        # A neighbour just behind the node hides the step in depth that makes an image edge.
-        close = crossed * (4 + front / thickness).clamp(0, 1) * self.touching
-        return (1 - covered).prod(-1).to(eye), (1 - close).prod(-1).to(eye)
+def line_of_sight(
+    body: BodyModel,
+    rotation: Float[Tensor, "*batch parts 3 3"],
+    eye: Float[Tensor, "*batch parts 3"],
+    rays: Float[Tensor, "*batch p 3"],
+    *,
+    other: Float[Tensor, "p parts"],
+    touching: Float[Tensor, "p parts"] | None = None,
+    ramp: float = 0.010,
+) -> tuple[Float[Tensor, "*batch p"], Float[Tensor, "*batch p"]]:
+    """Visibility of points past all parts, and whether neighbouring parts leave them free.
+
+    Args:
+        body: The body.
+        rotation: World orientations of the parts.
+        eye: The camera's centre in the frames of the parts, metres.
+        rays: From the camera's centre to the points, world axes, metres.
+        other: 0 where a part cannot hide a point (its own), else 1.
+        touching: 1 where a part is a neighbour of the point's own; None: nothing is.
+        ramp: Width of the transition between visible and hidden, metres.
+
+    Returns:
+        1 where nothing is in front of the point, 0 where a part is; and 1 where no neighbouring
+        part is close behind.
+    """
+    # All pairs of node and part at once, in the part's frame and in units of its semi-axes.
+    # Single precision: the closest approach is found as a vector, without cancellation.
+    shape = body.part_shape.float()
+    scale = 1 / shape[:, :3]
+    axes = (rotation.float() * scale[:, None, :]).movedim(-3, -1)
+    rays, eye_single = rays.float().clamp(-_FAR, _FAR), eye.float().clamp(-_FAR, _FAR)
+    rx, ry, rz = (rays @ axes[..., i, :] for i in range(3))
+    ox, oy, oz = (eye_single * scale)[..., None, :, :].unbind(-1)
+    # Height of closest approach decides the taper of the cross-section.
+    nearest = -(ox * rx + oy * ry + oz * rz) / (rx * rx + ry * ry + rz * rz).clamp(min=_TINY)
+    height = (oz + nearest * rz).clamp(-1, 1)
+    fx, fy = 1 / (1 + shape[:, 5] * height), 1 / (1 + shape[:, 6] * height)
+    ox, oy, rx, ry = ox * fx, oy * fy, rx * fx, ry * fy
+    square = (rx * rx + ry * ry + rz * rz).clamp(min=_TINY)
+    nearest = -(ox * rx + oy * ry + oz * rz) / square
+    px, py, pz = ox + nearest * rx, oy + nearest * ry, oz + nearest * rz
+    depth = 1 - (px * px + py * py + pz * pz)
+    thickness = shape[:, :2].mean(-1)
+    # How deep the ray passes inside, and how far in front of the node it enters, metres; parts
+    # behind the camera hide nothing.
+    crossed = (depth * (0.5 / ramp * thickness)).clamp(0, 1) * (nearest > 0)
+    entry = nearest - (depth.clamp(min=0) / square).sqrt()
+    front = (1 - entry) * eye_single.norm(dim=-1)[..., None, :]
+    covered = crossed * (front / ramp).clamp(0, 1) * other
+    visible = (1 - covered).prod(-1).to(eye)
+    if touching is None:
+        return visible, torch.ones_like(visible)
+    # A neighbour just behind the node hides the step in depth that makes an image edge.
+    close = crossed * (4 + front / thickness).clamp(0, 1) * touching
+    return visible, (1 - close).prod(-1).to(eye)
+
+
+def visible_nodes(
+    body: BodyModel,
+    pose: BodyPose,
+    centre_world: Float[Tensor, "3"],
+    points: Float[Tensor, "*batch p 3"],
+    node_part: Int[Tensor, " p"],
+) -> Float[Tensor, "*batch p"]:
+    """Visibility of surface nodes past the other parts: 1 where seen, 0 where hidden.
+
+    Args:
+        body: The body.
+        pose: Its poses.
+        centre_world: The camera's centre, metres.
+        points: Nodes, world frame, metres.
+        node_part: The part of each node.
+    """
+    rotation, centre = body.part_poses(pose)
+    eye = ((centre_world - centre)[..., None, :] @ rotation)[..., 0, :]
+    other = 1 - torch.eye(body.num_parts, device=points.device)[node_part]
+    return line_of_sight(body, rotation, eye, points - centre_world, other=other)[0]
 
 
 def _ring_crossings(
@@ -236,7 +274,11 @@ def _meridian_crossings(
     crossing = (facing[..., :-1] < 0) != (facing[..., 1:] < 0)
     exists, step = crossing.max(dim=-1)
     index = torch.arange(parts * meridians, device=points.device).reshape(parts, meridians)
-    exists = exists * _clearness(facing, eye)
+    # Towards which side the curve turns on either side of the crossing: this also fades a contour
+    # that leaves over a pole, before another crossing takes its place.
+    later = torch.arange(steps, device=points.device) > step[..., None]
+    turned = torch.where(facing.gather(-1, step[..., None]) < 0, facing, -facing)
+    exists = exists * _clearness(torch.where(later, turned.clamp(min=0), turned.clamp(max=0)), eye)
     return (*_interpolate(points, normals, facing, index * steps + step, step), exists)
 
 

@@ -1,0 +1,478 @@
+"""Interpenetration: repulsive potentials between parts of flesh, section 3.2.4 [IJRR].
+
+Every part B repels the surface nodes of every other part A that it may collide with:
+
+    f_pa = weight * sum_(A, B) 1/N sum_(N nodes of A) phi(u),    u = f |f|^(p-1)
+
+with the inside-outside function f of B, negative inside. The paper's `phi(u) = exp(-u)` decays
+outside the surface; here its tangent at `u = c` is taken off,
+
+    phi(u) = exp(-u) - exp(-c) (1 + c - u)    for u < c, else 0,
+
+so that value and gradient vanish where the potential ends and far parts can be left out without a
+jump (at c = 6 this takes 0.02 from the 1 at the surface).
+
+The inside-outside function is `f = sharpness (R^2 - 1)`, where `R^2 = F^e1` with the superquadric's
+F (see `torchcss.body.surface`): 0 at the centre, 1 on the surface, and growing as the square of the
+distance from the centre along every ray, whatever the exponents. It has the sign and the zeros of
+`surface.implicit`, but its slope does not depend on the exponents, and it is bounded inside by
+`-sharpness`, so that the potential never exceeds `exp(sharpness^p)`, however deep. With p = 1 the
+push is strong from just outside the surface to deep inside and fades only at the very centre; any
+p > 1 makes f |f|^(p-1) flat at the surface, so that nodes are not pushed all the way out.
+
+Pairs that touch in every pose (`BodyModel.neighbours`) are left out, and so are pairs between which
+no revolute joint lies: they cannot move against each other, other than by their lengths.
+
+The cost of a pair depends on where the nodes are in B's frame, `y = R_B^T (p - c_B)`. Joints above
+both parts do not matter. The others form a chain that starts at B, climbs to the link where the
+branches meet and descends to A; seen from B, a joint of B's own branch acts with the opposite sign,
+and the order along the chain takes the place of that along the tree. With signed twists `t_j =
+s_j (omega_j, v_j)` about the centre of B, and the sums over the nodes of the pair that
+`torchcss.body.lift` forms for each joint (wrench, stiffness K and moment P),
+
+    gradient_j  = t_j . (tau, f)
+    hessian_ij = t_i^T W t_j  for i before j or j itself,  W = K + [[P - tr(P) I, -[f]x], [0, 0]],
+
+exact, the cross terms between the two branches included. The work over nodes does not depend on the
+number of joints, and only pairs that are near each other are looked at.
+
+Make `InterpenetrationPairs(body)` once and call `Interpenetration().local_model(body, pose, pairs)`
+on a few hundred poses at a time.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from torchcss.body.model import BodyModel, BodyPose
+from torchcss.body.surface import surface_points
+from torchcss.errors import ConfigurationError
+from torchcss.types import Curvature, LocalModel
+
+END = 6.0
+"""The `c` above: the potential ends where that of the paper has fallen to `exp(-c)`."""
+
+_MOST_TAPER = 0.95
+_OVERHANG = 0.5
+"""How far a taper goes on beyond the ends of its part, in semi-axes, before it levels off."""
+
+
+class NearNodes(NamedTuple):
+    """The nodes of a batch of poses that may feel a potential.
+
+    Attributes:
+        item: Pose of every near pair (the batch is flattened).
+        pair: Which ordered pair of `InterpenetrationPairs` it is.
+        rotation: Orientation of its part B in the world.
+        centre: Centre of its part B, metres.
+        owner: Near pair of every node.
+        points: Position of every node in the frame of B, metres.
+    """
+
+    item: Int[Tensor, " m"]
+    pair: Int[Tensor, " m"]
+    rotation: Float[Tensor, "m 3 3"]
+    centre: Float[Tensor, "m 3"]
+    owner: Int[Tensor, " p"]
+    points: Float[Tensor, "p 3"]
+
+    def select(
+        self, keep: Bool[Tensor, " p"], *along: Float[Tensor, "p *rest"]
+    ) -> tuple[NearNodes, list[Float[Tensor, "k *rest"]]]:
+        """Some of the nodes, the pairs that they belong to, and the same rows of `along`."""
+        index = keep.nonzero()[:, 0]
+        pairs, owner = torch.unique_consecutive(self.owner[index], return_inverse=True)
+        chosen = NearNodes(
+            self.item[pairs],
+            self.pair[pairs],
+            self.rotation[pairs],
+            self.centre[pairs],
+            owner,
+            self.points[index],
+        )
+        return chosen, [part[index] for part in along]
+
+
+class InterpenetrationPairs(nn.Module):
+    """Which parts may collide, the nodes that are tested, and the joints between them.
+
+    A bend of part B is neglected (no body that ships has one; its nodes as part A do have it), and
+    exponents above 1 count as 1, the ellipsoid.
+
+    Args:
+        body: The body; its base may move afterwards, its shape may not.
+        rings: Latitudes of nodes per part; the two poles come on top.
+        meridians: Longitudes of nodes per part.
+
+    Attributes:
+        first: Part A of every ordered pair, whose nodes are tested.
+        second: Part B, whose potential they feel.
+        chain: Joints between B and A in the order in which they are met from B, `[pairs length]`.
+        sign: -1 for joints that move B, +1 for joints that move A, 0 for padding.
+        nodes: Nodes of every part in the part's frame, metres, `[parts nodes 3]`.
+        shape: The first seven shape numbers of every part.
+        overhang: Where the taper of a part levels off beyond its ends, in semi-axes.
+    """
+
+    first: Tensor
+    second: Tensor
+    chain: Tensor
+    sign: Tensor
+    nodes: Tensor
+    shape: Tensor
+    overhang: Tensor
+
+    def __init__(self, body: BodyModel, *, rings: int = 4, meridians: int = 6) -> None:
+        super().__init__()
+        pairs = _pairs(body)
+        length = max((len(joints) for _, _, joints, _ in pairs), default=0)
+        chain = torch.zeros(len(pairs), length, dtype=torch.long)
+        sign = torch.zeros(len(pairs), length, dtype=body.dtype)
+        for row, (_, _, joints, signs) in enumerate(pairs):
+            chain[row, : len(joints)] = torch.tensor(joints)
+            sign[row, : len(joints)] = torch.tensor(signs).to(sign)
+        shape = body.part_shape[:, :7].clone()
+        shape[:, 3:5] = shape[:, 3:5].clamp(max=1.0)
+        shape[:, 5:7] = shape[:, 5:7].clamp(-_MOST_TAPER, _MOST_TAPER)
+        taper = shape[:, 5:7].abs().amax(-1).clamp(min=0.1)
+        for name, value in (
+            ("first", torch.tensor([pair[0] for pair in pairs], dtype=torch.long)),
+            ("second", torch.tensor([pair[1] for pair in pairs], dtype=torch.long)),
+            ("chain", chain),
+            ("sign", sign),
+            ("nodes", _nodes(body, rings, meridians)),
+            ("shape", shape),
+            # Short enough that the section stays positive.
+            ("overhang", ((1 - taper) / (2 * taper)).clamp(max=_OVERHANG)),
+        ):
+            self.register_buffer(name, value.to(body.tie.device), persistent=False)
+
+    @property
+    def num_pairs(self) -> int:
+        """Number of ordered pairs."""
+        return len(self.first)
+
+    def near(self, body: BodyModel, pose: BodyPose, reach: float) -> NearNodes:
+        """Find the nodes that may lie in the potential of another part.
+
+        Boxes around the parts are tested for separation along the axes of both, then the nodes of
+        the pairs that are left against the box of B.
+
+        Args:
+            body: The body.
+            pose: Any number of posed bodies.
+            reach: The R at which the potential of a part ends.
+        """
+        parts = len(self.nodes)
+        rotation, centre = body.part_poses(pose)
+        items = pose.x.shape[:-1].numel()
+        rotation, centre = rotation.reshape(items, parts, 3, 3), centre.reshape(items, parts, 3)
+        widest = 1 + self.shape[:, 5:7].abs() * (1 + self.overhang[:, None])
+        outer = reach * torch.cat([self.shape[:, :2] * widest, self.shape[:, 2:3]], dim=-1)
+        inner = self.nodes.abs().amax(dim=1)
+        axes = rotation.transpose(-1, -2).flatten(1, 2)  # three rows for every part
+        own = (rotation * centre[..., None]).sum(-2).flatten(1)
+        distance = (axes @ centre.transpose(-1, -2) - own[..., None]).abs()
+        cosines = (axes @ axes.transpose(-1, -2)).abs()
+
+        own_axes = torch.eye(parts).to(axes).repeat_interleave(3, dim=0)
+
+        def overlap(half: Tensor, other: Tensor) -> Tensor:
+            """Whether boxes overlap along the axes of the part in the row."""
+            spread = cosines @ (own_axes * other.flatten()[:, None])
+            gap = distance - half.flatten()[:, None] - spread
+            first, second, third = (gap <= 0).unflatten(1, (parts, 3)).unbind(2)
+            return first & second & third
+
+        close = overlap(outer, inner) & overlap(inner, outer).transpose(-1, -2)
+        item, pair = close[:, self.second, self.first].nonzero(as_tuple=True)
+        a, b = self.first[pair], self.second[pair]
+        frame, origin = rotation[item, b], centre[item, b]
+        # In units of the box of B, so that the test is against 1.
+        scale = 1 / outer[b][:, None, :]
+        turn = rotation[item, a].transpose(-1, -2) @ frame * scale
+        shift = (centre[item, a] - origin)[:, None, :] @ frame * scale
+        scaled = torch.baddbmm(shift, self.nodes[a], turn)
+        owner, node = (scaled.abs().amax(-1) < 1).nonzero(as_tuple=True)
+        return NearNodes(item, pair, frame, origin, owner, scaled[owner, node] * outer[b[owner]])
+
+    def radial_square(
+        self, near: NearNodes
+    ) -> tuple[Float[Tensor, " p"], Float[Tensor, "p 3"], Float[Tensor, "p 3 3"]]:
+        """`R^2` of nodes with its first and second derivatives in their position in B's frame.
+
+        With the squares a, b, c of the straightened, scaled coordinates, `R^2 = M_e1(M_e2(a, b),
+        c)` where `M_e(a, b) = (a^(1/e) + b^(1/e))^e`. As M is homogeneous of degree one, its second
+        derivatives follow from the first ones, and nothing is singular where a coordinate vanishes.
+        """
+        part = self.second[near.pair][near.owner]
+        a1, a2, a3, e1, e2, tx, ty = self.shape[part].unbind(-1)
+        x, y, z = near.points.unbind(-1)
+        # The taper of the section at height u3 goes on beyond the ends for a while and levels off,
+        # twice differentiable; lx, ly and cx, cy are its derivatives in z, relative to it.
+        h, u3 = self.overhang[part], z / a3
+        past = (u3.abs() - 1).clamp(min=0)
+        level = (past.square() + h.square()).rsqrt()
+        height = u3.clamp(-1, 1) + u3.sign() * h * past * level
+        rise = (h * level) ** 3 / a3
+        turn = -3 * u3.sign() * past * level.square() * rise / a3
+        fx, fy = 1 + tx * height, 1 + ty * height
+        lx, ly, cx, cy = tx * rise / fx, ty * rise / fy, tx * turn / fx, ty * turn / fy
+        i, j, k = 1 / (a1 * fx), 1 / (a2 * fy), 1 / a3
+        u1, u2 = x * i, y * j
+        a, b, c = u1.square(), u2.square(), u3.square()
+        n, n1, n2 = _combine(a, b, e2)
+        value, m, m3 = _combine(n, c, e1)
+        # Derivatives in u: of n, then of R^2.
+        safe = torch.where(n > 0, n, 1)
+        cross = 4 * (1 / e2 - 1) * n1 * n2 / safe
+        bend = 4 * (1 / e1 - 1) * m * m3 / torch.where(value > 0, value, 1)
+        d1, d2, along = n1 * u1, n2 * u2, bend * c / safe
+        g1, g2, g3 = 2 * m * d1, 2 * m * d2, 2 * m3 * u3
+        h11 = m * (2 * n1 + cross * b) + along * d1.square()
+        h22 = m * (2 * n2 + cross * a) + along * d2.square()
+        h12 = along * d1 * d2 - m * cross * u1 * u2
+        h13, h23, h33 = -bend * u3 * d1, -bend * u3 * d2, 2 * m3 + bend * n
+        # From u to the position; the taper makes u1 and u2 depend on z.
+        w1, w2 = -u1 * lx, -u2 * ly
+        s1, s2 = h11 * w1 + h12 * w2 + h13 * k, h12 * w1 + h22 * w2 + h23 * k
+        s3 = h13 * w1 + h23 * w2 + h33 * k
+        hxz, hyz = i * (s1 - g1 * lx), j * (s2 - g2 * ly)
+        hzz = s1 * w1 + s2 * w2 + s3 * k
+        hzz = hzz + g1 * u1 * (2 * lx * lx - cx) + g2 * u2 * (2 * ly * ly - cy)
+        hxx, hxy, hyy = h11 * i * i, h12 * i * j, h22 * j * j
+        gradient = torch.stack([g1 * i, g2 * j, g1 * w1 + g2 * w2 + g3 * k], dim=-1)
+        hessian = torch.stack([hxx, hxy, hxz, hxy, hyy, hyz, hxz, hyz, hzz], dim=-1)
+        return value, gradient, hessian.unflatten(-1, (3, 3))
+
+    def lift(
+        self,
+        body: BodyModel,
+        pose: BodyPose,
+        near: NearNodes,
+        value: Float[Tensor, " p"],
+        gradient: Float[Tensor, "p 3"],
+        hessian: Float[Tensor, "p 3 3"],
+        *,
+        curvature: Curvature = Curvature.EXACT,
+    ) -> LocalModel:
+        """Sum a cost over nodes and differentiate it with respect to the state.
+
+        Args:
+            body: The body.
+            pose: The posed bodies.
+            near: Their nodes.
+            value: Cost of every node.
+            gradient: Its derivative in the node's position in B's frame.
+            hessian: Its second derivative.
+            curvature: Gauss-Newton leaves the second-order kinematics out; anything else is exact.
+        """
+        batch, joints = pose.x.shape[:-1], len(body.tree.joint_names)
+        wrench, inertia = self._sums(near, gradient, hessian, curvature)
+        # Twists of the chain about the centre of B, in B's frame.
+        chain, sign = self.chain[near.pair], self.sign[near.pair][..., None]
+        row = near.item[:, None] * joints + chain
+        omega = sign * pose.tree.omega.reshape(-1, 3)[row]
+        velocity = sign * pose.tree.velocity.reshape(-1, 3)[row]
+        velocity = velocity + torch.linalg.cross(omega, near.centre[:, None, :], dim=-1)
+        twist = torch.cat([omega @ near.rotation, velocity @ near.rotation], dim=-1)
+        slope = (twist @ wrench[..., None])[..., 0]
+        upper = (twist @ inertia @ twist.transpose(-1, -2)).triu()
+
+        def collect(index: Tensor, values: Tensor, *size: int) -> Tensor:
+            total = values.new_zeros(math.prod((*batch, *size)))
+            return total.index_add(0, index.flatten(), values.flatten()).reshape((*batch, *size))
+
+        total = collect(near.item[near.owner], value)
+        first = collect(row, slope, joints)
+        second = collect(row[:, :, None] * joints + chain[:, None, :], upper, joints, joints)
+        second = second + second.transpose(-1, -2)
+        second = second - 0.5 * torch.diag_embed(second.diagonal(dim1=-2, dim2=-1))
+        if body.is_untied:
+            return LocalModel(total, first, second)
+        return LocalModel(total, first @ body.tie, body.tie.T @ second @ body.tie)
+
+    def _sums(
+        self, near: NearNodes, gradient: Tensor, hessian: Tensor, curvature: Curvature
+    ) -> tuple[Float[Tensor, "m 6"], Float[Tensor, "m 6 6"]]:
+        """Wrench and W of every near pair, see the module."""
+        # Components as whole tensors: on a CPU this is many times faster than 3 x 3 products.
+        x, y, z = near.points.unbind(-1)
+        fx, fy, fz = gradient.unbind(-1)
+        (axx, axy, axz), (_, ayy, ayz), (_, _, azz) = (row.unbind(-1) for row in hessian.unbind(-2))
+        # mixed = [y]x A and angular = [y]x A [y]x^T.
+        mixed = (
+            y * axz - z * axy, y * ayz - z * ayy, y * azz - z * ayz,
+            z * axx - x * axz, z * axy - x * ayz, z * axz - x * azz,
+            x * axy - y * axx, x * ayy - y * axy, x * ayz - y * axz,
+        )  # fmt: skip
+        bxy = z * mixed[0] - x * mixed[2]
+        bxz, byz = x * mixed[1] - y * mixed[0], x * mixed[4] - y * mixed[3]
+        angular = (
+            y * mixed[2] - z * mixed[1], bxy, bxz,
+            bxy, z * mixed[3] - x * mixed[5], byz,
+            bxz, byz, x * mixed[7] - y * mixed[6],
+        )  # fmt: skip
+        moment = (x * fx, x * fy, x * fz, y * fx, y * fy, y * fz, z * fx, z * fy, z * fz)
+        linear = (axx, axy, axz, axy, ayy, ayz, axz, ayz, azz)
+        rows = torch.stack([fx, fy, fz, *angular, *mixed, *linear, *moment], dim=-1)
+        sums = rows.new_zeros(len(near.item), rows.shape[-1]).index_add(0, near.owner, rows)
+        force = sums[:, :3]
+        k_ww, k_wv, k_vv, moment = sums[:, 3:].unflatten(-1, (4, 3, 3)).unbind(1)
+        torque = (moment - moment.transpose(-1, -2))[:, (1, 2, 0), (2, 0, 1)]
+        w_ww, w_wv = k_ww, k_wv
+        if curvature is not Curvature.GAUSS_NEWTON:
+            trace = moment.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
+            w_ww = w_ww + moment - torch.diag_embed(trace.expand_as(force))
+            a, b, c = force.unbind(-1)
+            zero = torch.zeros_like(a)
+            skew = torch.stack([zero, -c, b, c, zero, -a, -b, a, zero], dim=-1)
+            w_wv = w_wv - skew.unflatten(-1, (3, 3))
+        top = torch.cat([w_ww, w_wv], dim=-1)
+        bottom = torch.cat([k_wv.transpose(-1, -2), k_vv], dim=-1)
+        return torch.cat([torque, force], dim=-1), torch.cat([top, bottom], dim=-2)
+
+
+def _pairs(body: BodyModel) -> list[tuple[int, int, list[int], list[int]]]:
+    """Part A, part B, the joints from B to A and their signs, for all pairs that may collide."""
+    tree, links = body.tree, body.part_link.tolist()
+    above, revolute = tree.ancestors.cpu(), tree.is_revolute.cpu()
+    depth = tree.joint_ancestors.sum(0).tolist()
+    touching = {frozenset(pair) for pair in body.neighbours}
+    found = []
+    for a, name_a in enumerate(body.part_names):
+        for b, name_b in enumerate(body.part_names):
+            moves_a, moves_b = above[:, links[a]], above[:, links[b]]
+            between = moves_a ^ moves_b
+            if {name_a, name_b} in touching or not bool((between & revolute).any()):
+                continue
+            up = sorted((moves_b & between).nonzero()[:, 0].tolist(), key=lambda j: -depth[j])
+            down = sorted((moves_a & between).nonzero()[:, 0].tolist(), key=lambda j: depth[j])
+            found.append((a, b, up + down, [-1] * len(up) + [1] * len(down)))
+    return found
+
+
+def _nodes(body: BodyModel, rings: int, meridians: int) -> Float[Tensor, "parts nodes 3"]:
+    """Rings of nodes, equally spaced along the axis, and the two poles of every part."""
+    mesh = body.mesh(rings, meridians).points.flatten(1, 2)
+    end = mesh.new_tensor([-torch.pi / 2, torch.pi / 2]).expand(body.num_parts, 2)
+    poles = surface_points(body.part_shape[:, None, :], end, torch.zeros_like(end)).points
+    return torch.cat([mesh, poles], dim=1)
+
+
+def _combine(a: Tensor, b: Tensor, exponent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """`(a^(1/e) + b^(1/e))^e` for a, b >= 0 and 0 < e <= 1, and its derivatives in a and in b."""
+    most, least = torch.maximum(a, b), torch.minimum(a, b)
+    ratio = least / torch.where(most > 0, most, 1)
+    power = ratio ** (1 / exponent - 1)
+    total = 1 + ratio * power
+    of_most = total ** (exponent - 1)
+    of_least = power * of_most
+    larger = a >= b
+    first, second = torch.where(larger, of_most, of_least), torch.where(larger, of_least, of_most)
+    return most * total * of_most, first, second
+
+
+@dataclass(frozen=True, kw_only=True)
+class Interpenetration:
+    """The repulsive potential between parts of flesh.
+
+    Attributes:
+        weight: Nats that a part costs whose nodes all lie on the surface of another one. The
+            papers give no number.
+        p: Exponent of [IJRR]: 1, or at least 2 (between them the second derivative is infinite at
+            the surface).
+        sharpness: Scale of the inside-outside function: the potential falls to `1/e` about
+            `1/(2 sharpness)` of a part's radius outside its surface.
+    """
+
+    weight: float = 5.0
+    p: float = 1.0
+    sharpness: float = 3.0
+
+    def __post_init__(self) -> None:
+        if not (self.p == 1 or 2 <= self.p < math.inf):
+            raise ConfigurationError(
+                f"Interpenetration.p: expected 1 or at least 2, got {self.p}; leave it out for 1"
+            )
+        if not (0 < self.weight < math.inf and self.sharpness > 0 and self.sharpness**self.p <= 20):
+            raise ConfigurationError(
+                "Interpenetration: expected a positive weight and a positive sharpness with "
+                f"sharpness^p at most 20, got {self.weight}, {self.sharpness} and p = {self.p}; "
+                "leave them out for the defaults"
+            )
+
+    @property
+    def reach(self) -> float:
+        """The R at which the potential ends."""
+        return (1 + END ** (1 / self.p) / self.sharpness) ** 0.5
+
+    def value(
+        self, body: BodyModel, pose: BodyPose, pairs: InterpenetrationPairs
+    ) -> Float[Tensor, "*batch"]:
+        """Cost in nats.
+
+        Args:
+            body: The body.
+            pose: Any number of posed bodies.
+            pairs: The tables of that body.
+        """
+        near = pairs.near(body, pose, self.reach)
+        value, _, _ = self._potential(pairs.radial_square(near)[0], pairs)
+        batch = pose.x.shape[:-1]
+        total = value.new_zeros(batch.numel())
+        return total.index_add(0, near.item[near.owner], value).reshape(batch)
+
+    def local_model(
+        self,
+        body: BodyModel,
+        pose: BodyPose,
+        pairs: InterpenetrationPairs,
+        *,
+        curvature: Curvature = Curvature.EXACT,
+    ) -> LocalModel:
+        """Cost, gradient and Hessian in x.
+
+        Args:
+            body: The body.
+            pose: Any number of posed bodies.
+            pairs: The tables of that body.
+            curvature: Gauss-Newton leaves the second-order kinematics out; anything else is exact.
+        """
+        near = pairs.near(body, pose, self.reach)
+        square, slope, bowl = pairs.radial_square(near)
+        near, (square, slope, bowl) = near.select(square < self.reach**2, square, slope, bowl)
+        value, first, second = self._potential(square, pairs)
+        outer = slope[:, :, None] * slope[:, None, :]
+        return pairs.lift(
+            body,
+            pose,
+            near,
+            value,
+            first[:, None] * slope,
+            first[:, None, None] * bowl + second[:, None, None] * outer,
+            curvature=curvature,
+        )
+
+    def _potential(
+        self, square: Float[Tensor, " p"], pairs: InterpenetrationPairs
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Cost of nodes and its first and second derivatives in `R^2`."""
+        scale, end = self.weight / pairs.nodes.shape[1], END ** (1 / self.p)
+        f = (self.sharpness * (square - 1)).clamp(max=end)
+        power = f.abs() ** (self.p - 1)
+        u, du = f * power, self.p * self.sharpness * power
+        paper, last = torch.exp(-u), math.exp(-END)
+        first, second = (last - paper) * du, paper * du.square()
+        if self.p > 1:
+            ddu = self.p * (self.p - 1) * f.sign() * f.abs() ** (self.p - 2)
+            second = second + (last - paper) * ddu * self.sharpness**2
+        value = paper - last * (1 + END - u)
+        inside = f < end
+        return tuple(torch.where(inside, scale * part, 0.0) for part in (value, first, second))  # type: ignore[return-value]
