@@ -85,8 +85,10 @@ def test_imports_point_down(path: Path) -> None:
             continue
         entry = entry_of(module)
         # `torchcss.load_body`, say, is a name of the package's page and not a module.
-        is_module = (PACKAGE / entry).is_dir() or (PACKAGE / f"{entry}.py").is_file()
-        assert entry and is_module, f"{path.name}: imports the package's own page ({module})"
+        is_module = bool(entry) and (
+            (PACKAGE / entry).is_dir() or (PACKAGE / f"{entry}.py").is_file()
+        )
+        assert is_module, f"{path.name}: imports the package's own page ({module})"
         assert rank(entry) <= rank(own), f"{own} imports {module}, which is above it"
         if own in STRANGERS and entry in STRANGERS:
             assert own == entry, f"{own} and {entry} must not know of each other"

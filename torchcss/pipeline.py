@@ -27,6 +27,7 @@ from tqdm import tqdm
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, has_root, move_base, root_pose
 from torchcss.cost.flow import FlowTargets, FlowTerm, InteriorNodes, flow_targets
+from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
 from torchcss.cost.joints import JointObservation, JointTerm
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.cost.visibility import ContourPredictor, visible_nodes
@@ -49,7 +50,7 @@ from torchcss.vision.flow import TRACKING
 TERMS = ("contour", "joints", "stabiliser", "temporal")
 """Terms and priors of the cost by default."""
 
-ALL_TERMS = (*TERMS, "flow")
+ALL_TERMS = (*TERMS, "flow", "interpenetration")
 """Terms and priors that can be chosen."""
 
 _PITCH_LIMIT = math.radians(55)
@@ -172,6 +173,7 @@ def track_frames(
     working = extractor.working_camera(camera).to(dtype=body.dtype, device=body.tie.device)
     predictor = ContourPredictor(body) if choice.contour is not None else None
     interior = InteriorNodes(body) if choice.flow is not None else None
+    pairs = InterpenetrationPairs(body) if choice.interpenetration is not None else None
     last_image = None
     deviation = body.motion_rate * frame_interval
     state = tracker.init(mixture, generator=generator)
@@ -211,6 +213,7 @@ def track_frames(
                 predictor=predictor,
                 edge_field=edge_field,
                 interior=interior,
+                pairs=pairs,
                 targets=None if targets is None else targets.take(parent),
                 observation=observe(index),
                 parent=prior.mean[parent],
@@ -443,6 +446,7 @@ def make_choice(settings: Settings, sigma: float) -> CostChoice:
         joints=JointTerm(sigma=sigma) if has("joints") else None,
         stabiliser=default.stabiliser if has("stabiliser") else None,
         temporal=default.temporal if has("temporal") else None,
+        interpenetration=Interpenetration() if has("interpenetration") else None,
         contour_weight=settings.contour_weight,
     )
 

@@ -1,4 +1,4 @@
-"""Twins of the kinematics and the lift, as a textbook writes them: one joint, one point at a time."""
+"""Twins of kinematics and lift, as a textbook writes them: one joint, one point at a time."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ def is_hidden(
 
 
 def neighbourhood(targets: Tensor, centre_world: Tensor, distance: float) -> Tensor:
-    """The targets moved by `distance` in ten directions, `[10 p 3]`: across the ray and along it."""
+    """The targets moved by `distance` in ten directions, `[10 p 3]`: across the ray, along it."""
     ray = targets - centre_world
     ray = ray / ray.norm(dim=-1, keepdim=True)
     helper = torch.zeros_like(ray)

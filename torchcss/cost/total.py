@@ -22,6 +22,7 @@ from torch import Tensor
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.flow import FlowTargets, FlowTerm, InteriorNodes
+from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
 from torchcss.cost.joints import JointObservation, JointTerm
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.temporal import TemporalPrior
@@ -47,6 +48,7 @@ class CostChoice:
         joints: The keypoint term, or None; it is silent in frames without keypoints.
         stabiliser: The sticky prior, or None.
         temporal: The temporal prior, or None.
+        interpenetration: The repulsion between parts, or None.
         contour_weight: Nats per nu of the contour's mean cost per node.
         flow_weight: Nats per nu of the flow's mean cost per node.
         joint_weight: Factor on the joints' cost, whose nu is in nats already.
@@ -58,6 +60,7 @@ class CostChoice:
     joints: JointTerm | None = field(default_factory=JointTerm)
     stabiliser: Stabiliser | None = field(default_factory=Stabiliser)
     temporal: TemporalPrior | None = field(default_factory=TemporalPrior)
+    interpenetration: Interpenetration | None = None
     contour_weight: float = 150.0
     flow_weight: float = 50.0
     joint_weight: float = 1.0
@@ -77,6 +80,7 @@ class TrackingCost:
         interior: Interior nodes of the body, for the flow term; None switches it off.
         targets: Where the flow carried the nodes of each sample's parent mode, `[b p 2]`.
         observation: Keypoints of the frame, in that image's pixels; None if there are none.
+        pairs: Pairs of parts that may collide; None switches the repulsion off.
         parent: State of each sample's parent mode, `[b n]` or `[n]`; None: no temporal prior.
         deviation: Expected motion per frame of every parameter, for the temporal prior.
     """
@@ -89,6 +93,7 @@ class TrackingCost:
     interior: InteriorNodes | None = None
     targets: FlowTargets | None = None
     observation: JointObservation | None = None
+    pairs: InterpenetrationPairs | None = None
     parent: Float[Tensor, "*b n"] | None = None
     deviation: Float[Tensor, " n"] | None = None
 
@@ -142,7 +147,7 @@ class TrackingCost:
             items = items[: len(flat)]
             results.append(evaluate(flat[items], self.take(items)))
         return tuple(
-            torch.cat(parts).reshape(*x.shape[:-1], *parts[0].shape[1:])
+            torch.cat(parts).reshape((*x.shape[:-1], *parts[0].shape[1:]))
             for parts in zip(*results, strict=True)
         )
 
@@ -160,7 +165,7 @@ class TrackingCost:
 
     def _values(self, x: Tensor) -> dict[str, Tensor]:
         pose = self.body.pose(x)
-        values = {name: model.value for name, model in self._priors(x).items()}
+        values = {name: model.value for name, model in self._priors(x, pose).items()}
         if self._uses_contour:
             term, nodes = self.choice.contour, self._contour_nodes(pose)
             assert term is not None
@@ -223,11 +228,11 @@ class TrackingCost:
                 cost,
                 curvature=self.choice.curvature,
             )
-        for prior in self._priors(x).values():
+        for prior in self._priors(x, pose).values():
             total = LocalModel(*(a + b for a, b in zip(total, prior, strict=True)))
         return total
 
-    def _priors(self, x: Tensor) -> dict[str, LocalModel]:
+    def _priors(self, x: Tensor, pose: BodyPose) -> dict[str, LocalModel]:
         body, priors = self.body, {}
         if self.choice.stabiliser is not None:
             priors["stabiliser"] = self.choice.stabiliser.local_model(
@@ -236,6 +241,10 @@ class TrackingCost:
         if self.choice.temporal is not None and self.parent is not None:
             assert self.deviation is not None
             priors["temporal"] = self.choice.temporal.local_model(x, self.parent, self.deviation)
+        if self.choice.interpenetration is not None and self.pairs is not None:
+            priors["interpenetration"] = self.choice.interpenetration.local_model(
+                body, pose, self.pairs, curvature=self.choice.curvature
+            )
         return priors
 
     def _contour_nodes(self, pose: BodyPose) -> ContourNodes:
@@ -258,10 +267,12 @@ class TrackingCost:
     def _flow_scale(self) -> float:
         assert self.choice.flow is not None
         assert self.interior is not None
-        return self.choice.flow_weight / (self.interior.num_nodes * self.choice.flow.nu)
+        num_nodes = max(self.interior.num_nodes, 1)
+        return self.choice.flow_weight / (num_nodes * self.choice.flow.nu)
 
     @property
     def _contour_scale(self) -> float:
         assert self.choice.contour is not None
         assert self.predictor is not None
-        return self.choice.contour_weight / (self.predictor.num_nodes * self.choice.contour.nu)
+        num_nodes = max(self.predictor.num_nodes, 1)  # none on a robot without flesh
+        return self.choice.contour_weight / (num_nodes * self.choice.contour.nu)

@@ -100,7 +100,7 @@ class Tracker:
             `sqrt(det Sigma)`, instead of the likelihood at the mode alone (design decision 5).
         memory: Power of the prior's weights in step 5. One is Fig. 6, which takes frames as
             independent evidence; with a sharp likelihood a mode that led for some frames can then
-            never be overtaken. Image errors persist over frames, which a power below one allows for.
+            never be overtaken. Errors persist over frames, which a power below one allows for.
         coarse_every: If the cost has a method `coarse()` that returns a smoother cost (or None),
             every so many samples descend on that first, so that what moved farther than the cost's
             own basin reaches is found again; 0 for never.

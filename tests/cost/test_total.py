@@ -1,0 +1,346 @@
+"""The whole cost: sums, chunks, items, curvatures, and no NaN from any state."""
+
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from torchcss.body.model import BodyModel, differentiate_twice, load_body
+from torchcss.cost import total
+from torchcss.cost.joints import JointObservation, JointTerm
+from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.cost.visibility import ContourPredictor
+from torchcss.types import CostFunction, Curvature, LocalModel
+from torchcss.vision.camera import Camera
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from reference.contour import cost_of_fixed_matches
+
+WIDTH, HEIGHT = 160, 120
+JOINTS_ONLY = CostChoice(contour=None, stabiliser=None, temporal=None)
+CONTOUR_ONLY = CostChoice(joints=None, stabiliser=None, temporal=None)
+NOTHING = CostChoice(contour=None, joints=None, stabiliser=None, temporal=None)
+EVERYTHING = CostChoice(joints=JointTerm(sigma=2.0))
+
+
+def random_states(body: BodyModel, *batch: int, generator: torch.Generator) -> Tensor:
+    size = (*batch, body.num_parameters)
+    noise = torch.randn(size, generator=generator, dtype=torch.float64)
+    return body.bounds.project(body.sticky_mean + 0.3 * noise)
+
+
+def make_cost(
+    name: str = "arm8",
+    choice: CostChoice = EVERYTHING,
+    *,
+    dtype: torch.dtype = torch.float64,
+    own_parents: int | None = None,
+) -> TrackingCost:
+    """A body upright before a camera with distortion, keypoints, and a rough picture of edges."""
+    generator = torch.Generator().manual_seed(1)
+    body = load_body(name)
+    base = torch.diag(torch.tensor([1.0, -1.0, -1.0])).double()
+    depth = 3.5 if name.startswith("body") else 1.8
+    body = body.with_base(base, torch.tensor([0.1, -0.1, depth]).double())
+    camera = Camera(
+        [[150.0, 0.0, 80.0], [0.0, 150.0, 60.0], [0.0, 0.0, 1.0]],
+        (WIDTH, HEIGHT),
+        distortion=[-0.1, 0.02, 0.001, -0.002, 0.0],
+    )
+    truth = random_states(body, generator=generator)
+    keypoints = camera.project(body.pose(truth).joints).uv
+    keypoints = keypoints + 3 * torch.randn(
+        keypoints.shape, generator=generator, dtype=torch.float64
+    )
+    confidence = torch.rand(len(keypoints), generator=generator, dtype=torch.float64)
+    keypoints[0], confidence[0] = math.nan, 0.0
+    small = torch.randn(1, 2, HEIGHT // 6, WIDTH // 6, generator=generator, dtype=torch.float64)
+    field = torch.nn.functional.interpolate(small, (HEIGHT, WIDTH), mode="bicubic")[0]
+    field = 0.9 * field / (0.5 + field.norm(dim=0)).clamp(min=1.0)
+    parents = random_states(
+        body, *(() if own_parents is None else (own_parents,)), generator=generator
+    )
+    body = body.to(dtype)
+    return TrackingCost(
+        body=body,
+        camera=camera.to(dtype),
+        choice=choice,
+        predictor=ContourPredictor(body),
+        edge_field=field.to(dtype),
+        observation=JointObservation(
+            body.joint_names, keypoints.to(dtype), confidence.to(dtype), body.joint_names
+        ),
+        parent=parents.to(dtype),
+        deviation=body.motion_rate / 25,
+    )
+
+
+def assert_same(got: LocalModel, expected: LocalModel, tolerance: float) -> None:
+    for ours, theirs in zip(got, expected, strict=True):
+        scale = max(float(theirs.abs().max()), 1e-30) if theirs.numel() else 1.0
+        torch.testing.assert_close(ours, theirs, rtol=0, atol=tolerance * scale)
+
+
+@pytest.mark.parametrize("choice", [EVERYTHING, JOINTS_ONLY, CONTOUR_ONLY, NOTHING])
+@pytest.mark.parametrize("name", ["arm8", "body34"])
+def test_value_is_that_of_the_model_and_the_sum_of_terms(
+    name: str, choice: CostChoice, generator: torch.Generator
+) -> None:
+    cost = make_cost(name, choice)
+    assert isinstance(cost, CostFunction)
+    x = random_states(cost.body, 6, generator=generator)
+    value, model, terms = cost.value(x), cost.local_model(x), cost.terms(x)
+    torch.testing.assert_close(value, model.value, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(value, torch.stack(list(terms.values())).sum(dim=0))
+    names = {
+        "contour": choice.contour,
+        "joints": choice.joints,
+        "stabiliser": choice.stabiliser,
+        "temporal": choice.temporal,
+    }
+    expected = {name for name, term in names.items() if term is not None}
+    assert set(terms) == (expected or {"none"})
+    assert torch.isfinite(model.hessian).all()
+    if choice is NOTHING:
+        assert not value.any()
+        assert not model.gradient.any()
+        assert not model.hessian.any()
+
+
+@pytest.mark.parametrize("batch", [(), (5,), (2, 3), (0,), (2, 0)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_leading_shapes_and_types(
+    batch: tuple[int, ...], dtype: torch.dtype, generator: torch.Generator
+) -> None:
+    double, cost = make_cost(), make_cost(dtype=dtype)
+    n = cost.body.num_parameters
+    x = random_states(double.body, *batch, generator=generator)
+    model = cost.local_model(x.to(dtype))
+    assert model.value.shape == cost.value(x.to(dtype)).shape == batch
+    assert model.gradient.shape == (*batch, n)
+    assert model.hessian.shape == (*batch, n, n)
+    assert all(part.dtype == dtype for part in model)
+    terms = cost.terms(x.to(dtype))
+    assert all(term.shape == batch for term in terms.values())
+    if x.numel():
+        expected = double.value(x)
+        torch.testing.assert_close(model.value.double(), expected, rtol=2e-2, atol=0.5)
+
+
+def test_chunks_are_invisible(monkeypatch: pytest.MonkeyPatch, generator: torch.Generator) -> None:
+    """To 1e-12 for the joints; the search for edges is in single precision."""
+    for choice, tolerance in ((JOINTS_ONLY, 1e-12), (EVERYTHING, 1e-6)):
+        cost = make_cost(choice=choice, own_parents=11)
+        x = random_states(cost.body, 11, generator=generator)
+        whole, value = cost.local_model(x), cost.value(x)
+        for chunk in (1, 4, 11):
+            monkeypatch.setattr(total, "CHUNK", chunk)
+            assert_same(cost.local_model(x), whole, tolerance)
+            torch.testing.assert_close(cost.value(x), value, rtol=tolerance, atol=tolerance)
+        monkeypatch.undo()
+
+
+def test_each_item_keeps_its_own_parent(generator: torch.Generator) -> None:
+    cost = make_cost(own_parents=7)
+    x = random_states(cost.body, 7, generator=generator)
+    items = torch.tensor([5, 0, 3])
+    assert_same(
+        cost.take(items).local_model(x[items]),
+        LocalModel(*(part[items] for part in cost.local_model(x))),
+        1e-6,
+    )
+    assert cost.parent is not None
+    for item in range(7):
+        alone = replace(cost, parent=cost.parent[item])
+        torch.testing.assert_close(alone.value(x[item]), cost.value(x)[item], rtol=1e-6, atol=1e-6)
+    shared = replace(cost, parent=cost.parent[0])
+    assert shared.take(items).parent is shared.parent
+    without = replace(cost, parent=None)
+    assert without.take(items).parent is None
+    assert "temporal" not in without.terms(x)
+
+
+def test_items_of_a_batch_do_not_meet(generator: torch.Generator) -> None:
+    cost = make_cost("body34")
+    x = random_states(cost.body, 4, generator=generator)
+    spoilt = x.clone()
+    spoilt[1] = math.nan
+    whole, other = cost.local_model(x), cost.local_model(spoilt)
+    kept = torch.tensor([0, 2, 3])
+    for ours, theirs in zip(whole, other, strict=True):
+        torch.testing.assert_close(ours[kept], theirs[kept], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["arm8", "body34"])
+def test_without_image_search_the_model_is_that_of_autograd(
+    name: str, generator: torch.Generator
+) -> None:
+    cost = make_cost(name, replace(EVERYTHING, contour=None))
+    x = random_states(cost.body, 3, generator=generator).requires_grad_()
+    expected = differentiate_twice(cost.value(x), x)
+    assert_same(cost.local_model(x.detach()), expected, 1e-10)
+
+
+@pytest.mark.parametrize("name", ["arm8", "body34"])
+def test_contours_are_differentiated_with_visibility_and_matches_held_fixed(
+    name: str, generator: torch.Generator
+) -> None:
+    cost = make_cost(name, CONTOUR_ONLY)
+    body, term, predictor = cost.body, cost.choice.contour, cost.predictor
+    assert term is not None
+    assert predictor is not None
+    assert cost.edge_field is not None
+    x = random_states(body, 2, generator=generator)
+    pose = body.pose(x)
+    nodes = predictor(body, pose, cost.camera.centre_world)
+    model = cost.camera.project_with_derivatives(nodes.points)
+    normal = term._image_normal(model, nodes)
+    found = term.search(model.uv, normal, cost.edge_field)
+    link = predictor.node_link
+    away = nodes.points - pose.tree.translation[..., link, :]
+    local = (pose.tree.rotation[..., link, :, :] * away[..., :, None]).sum(-2)
+    leaf = x.clone().requires_grad_()
+    tree = body.pose(leaf).tree
+    points = (tree.rotation[..., link, :, :] * local[..., None, :]).sum(-1)
+    points = points + tree.translation[..., link, :]
+    value = cost_of_fixed_matches(term, nodes, cost.camera, found, model.uv, normal, points)
+    scale = cost.choice.contour_weight / (predictor.num_nodes * term.nu)
+    expected = differentiate_twice(scale * value.sum(-1), leaf)
+    assert expected.gradient.any()
+    assert_same(cost.local_model(x), expected, 1e-9)
+
+
+@pytest.mark.parametrize("choice", [JOINTS_ONLY, CONTOUR_ONLY, EVERYTHING])
+@pytest.mark.parametrize("name", ["arm8", "body34"])
+def test_autograd_curvature_is_the_exact_one(
+    name: str, choice: CostChoice, generator: torch.Generator
+) -> None:
+    exact = make_cost(name, choice)
+    autograd = replace(exact, choice=replace(choice, curvature=Curvature.AUTOGRAD))
+    newton = replace(exact, choice=replace(choice, curvature=Curvature.GAUSS_NEWTON))
+    x = random_states(exact.body, 3, generator=generator)
+    model = exact.local_model(x)
+    assert_same(autograd.local_model(x), model, 1e-9)
+    approximate = newton.local_model(x)
+    torch.testing.assert_close(approximate.value, model.value)
+    torch.testing.assert_close(approximate.gradient, model.gradient)
+    assert not torch.allclose(approximate.hessian, model.hessian)
+
+
+def test_weights_scale_their_terms(generator: torch.Generator) -> None:
+    cost = make_cost()
+    heavy = replace(cost, choice=replace(EVERYTHING, contour_weight=300.0, joint_weight=3.0))
+    x = random_states(cost.body, 4, generator=generator)
+    light, terms = cost.terms(x), heavy.terms(x)
+    torch.testing.assert_close(terms["contour"], 2 * light["contour"])
+    torch.testing.assert_close(terms["joints"], 3 * light["joints"])
+    torch.testing.assert_close(terms["temporal"], light["temporal"])
+
+
+def test_terms_are_silent_without_their_data(generator: torch.Generator) -> None:
+    cost = make_cost()
+    x = random_states(cost.body, 2, generator=generator)
+    assert set(replace(cost, observation=None).terms(x)) == {"contour", "stabiliser", "temporal"}
+    assert set(replace(cost, edge_field=None).terms(x)) == {"joints", "stabiliser", "temporal"}
+    assert set(replace(cost, predictor=None).terms(x)) == {"joints", "stabiliser", "temporal"}
+    bare = replace(cost, observation=None, edge_field=None, parent=None)
+    assert set(bare.terms(x)) == {"stabiliser"}
+    assert torch.isfinite(bare.local_model(x).hessian).all()
+
+
+def test_the_coarse_cost_is_the_keypoints_with_a_wide_scale(generator: torch.Generator) -> None:
+    cost = make_cost()
+    x = random_states(cost.body, 3, generator=generator)
+    coarse = cost.coarse()
+    assert coarse is not None
+    assert set(coarse.terms(x)) == {"joints", "stabiliser", "temporal"}
+    assert (coarse.terms(x)["joints"] <= cost.terms(x)["joints"]).all()
+    assert replace(cost, observation=None).coarse() is None
+    assert replace(cost, choice=replace(EVERYTHING, joints=None)).coarse() is None
+
+
+def test_a_body_without_flesh_has_no_contour(tmp_path: Path) -> None:
+    path = tmp_path / "robot.urdf"
+    path.write_text(
+        "<robot name='r'><link name='a'/><link name='b'/><joint name='j' type='continuous'>"
+        "<parent link='a'/><child link='b'/></joint></robot>"
+    )
+    body = load_body(path)
+    cost = replace(make_cost(), body=body, observation=None, parent=None, deviation=None)
+    cost = replace(cost, predictor=ContourPredictor(body))
+    x = torch.zeros(3, 1, dtype=torch.float64)
+    assert not cost.value(x).any()
+    assert not cost.local_model(x).hessian.any()
+
+
+# No NaN ever leaves.
+
+COSTS = {
+    (name, dtype): make_cost(name, dtype=dtype)
+    for name in ("arm8", "body30")
+    for dtype in (torch.float32, torch.float64)
+}
+
+
+def assert_no_nan(cost: TrackingCost, x: Tensor) -> None:
+    value, model = cost.value(x), cost.local_model(x)
+    for part in (value, *model):
+        assert torch.isfinite(part).all()
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    name=st.sampled_from(["arm8", "body30"]),
+    dtype=st.sampled_from([torch.float32, torch.float64]),
+    size=st.sampled_from([1e-30, 1e-3, 1.0, 10.0, 1e3, 1e6, 1e12]),
+    seed=st.integers(0, 2**20),
+    few=st.booleans(),
+)
+def test_no_state_gives_nan(
+    name: str, dtype: torch.dtype, size: float, seed: int, few: bool
+) -> None:
+    """Far away, behind the camera, wound up a million times, or exactly at zero."""
+    cost = COSTS[name, dtype]
+    generator = torch.Generator().manual_seed(seed)
+    x = size * torch.randn(3, cost.body.num_parameters, generator=generator, dtype=torch.float64)
+    if few:
+        x = x * (torch.rand(x.shape, generator=generator) < 0.1)
+    assert_no_nan(cost, x.to(dtype))
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    place=st.tuples(*[st.floats(-6, 6) for _ in range(3)]),
+    dtype=st.sampled_from([torch.float32, torch.float64]),
+    yaw=st.floats(-7, 7),
+)
+def test_no_place_around_the_camera_gives_nan(
+    place: tuple[float, float, float], dtype: torch.dtype, yaw: float
+) -> None:
+    cost = COSTS["body30", dtype]
+    body = cost.body.with_base(cost.body.base_rotation, torch.tensor(place).to(dtype))
+    x = cost.body.rest.clone()
+    x[body.state_index("root_yaw")] = yaw
+    assert_no_nan(replace(cost, body=body), x)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_huge_distances_give_no_nan(dtype: torch.dtype) -> None:
+    cost = COSTS["body30", dtype]
+    for far in (1e9, 1e15, 1e18) + ((1e30,) if dtype == torch.float64 else ()):
+        for column in range(3):
+            for sign in (1.0, -1.0):
+                x = cost.body.rest.clone()
+                x[column] = sign * far
+                assert_no_nan(cost, x)
+        x = cost.body.rest.clone()
+        x[:3] = far
+        assert_no_nan(cost, x)
