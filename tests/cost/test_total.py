@@ -135,6 +135,14 @@ def test_leading_shapes_and_types(
         torch.testing.assert_close(model.value.double(), expected, rtol=2e-2, atol=0.5)
 
 
+def test_the_camera_may_be_more_precise_than_the_body(generator: torch.Generator) -> None:
+    cost, double = make_cost(dtype=torch.float32), make_cost()
+    x = random_states(double.body, 3, generator=generator).float()
+    mixed = replace(cost, camera=double.camera)
+    assert mixed.value(x).dtype == torch.float32
+    assert_same(mixed.local_model(x), cost.local_model(x), 1e-3)
+
+
 def test_chunks_are_invisible(monkeypatch: pytest.MonkeyPatch, generator: torch.Generator) -> None:
     """To 1e-12 for the joints; the search for edges is in single precision."""
     for choice, tolerance in ((JOINTS_ONLY, 1e-12), (EVERYTHING, 1e-6)):

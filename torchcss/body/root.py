@@ -91,7 +91,7 @@ def move_base(
         root, size = x[..., index], x.shape[-1]
         # The derivative in a step that all items share is that of every item in its own.
         jacobian = torch.func.jacfwd(lambda step: mapped(root + step))(root.new_zeros(6))
-        full = torch.eye(size).to(x).repeat(*x.shape[:-1], 1, 1)
+        full = torch.eye(size, dtype=x.dtype, device=x.device).repeat(*x.shape[:-1], 1, 1)
         rows = torch.tensor(index, device=x.device)
         full[..., rows[:, None], rows] = jacobian
         covariance = full @ covariance @ full.mT

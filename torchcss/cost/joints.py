@@ -126,7 +126,9 @@ class JointTerm:
         value = 0.5 * torch.where(model.valid, rho, self._unseen(observation))
         gradient = (first * weight)[..., None] * error
         outer = error[..., :, None] * error[..., None, :]
-        hessian = (first * weight)[..., None, None] * torch.eye(2).to(error)
+        hessian = (first * weight)[..., None, None] * torch.eye(
+            2, dtype=error.dtype, device=error.device
+        )
         hessian = hessian + (2 * second * weight.square())[..., None, None] * outer
         return pull_back(model, value, gradient, hessian, gauss_newton=gauss_newton)
 

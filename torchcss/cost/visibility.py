@@ -146,6 +146,7 @@ class ContourPredictor(nn.Module):
             Nodes in the order of `node_part`.
         """
         rotation, centre = body.part_poses(pose)
+        centre_world = centre_world.to(centre)
         eye = ((centre_world - centre)[..., None, :] @ rotation)[..., 0, :]
         ring = _ring_crossings(self.ring_points, self.ring_normals, eye)
         meridian = _meridian_crossings(self.meridian_points, self.meridian_normals, eye)
@@ -238,6 +239,7 @@ def visible_nodes(
         node_part: The part of each node.
     """
     rotation, centre = body.part_poses(pose)
+    centre_world = centre_world.to(centre)
     eye = ((centre_world - centre)[..., None, :] @ rotation)[..., 0, :]
     other = 1 - torch.eye(body.num_parts, device=points.device)[node_part]
     return line_of_sight(body, rotation, eye, points - centre_world, other=other)[0]
