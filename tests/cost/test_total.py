@@ -308,7 +308,7 @@ def assert_no_nan(cost: TrackingCost, x: Tensor) -> None:
 @given(
     name=st.sampled_from(["arm8", "body30"]),
     dtype=st.sampled_from([torch.float32, torch.float64]),
-    size=st.sampled_from([1e-30, 1e-3, 1.0, 10.0, 1e3, 1e6, 1e12]),
+    size=st.sampled_from([1e-30, 1e-3, 1.0, 10.0, 1e3, 1e4, 1e5, 1e6, 1e12, 1e18]),
     seed=st.integers(0, 2**20),
     few=st.booleans(),
 )

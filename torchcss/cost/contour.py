@@ -180,8 +180,11 @@ class ContourTerm:
 
     def _image_normal(self, model: ProjectionModel, nodes: ContourNodes) -> Tensor:
         """Unit normal m of the contour in the image, for which `J^T m` is parallel to n."""
-        along = (model.jacobian * nodes.normals[..., None, :]).sum(-1)
-        row_u, row_v = model.jacobian.unbind(-2)
+        # Only the direction counts; at grazing rays the squares would overflow.
+        largest = model.jacobian.abs().amax(dim=(-2, -1), keepdim=True)
+        jacobian = model.jacobian / largest.clamp(min=_TINY)
+        along = (jacobian * nodes.normals[..., None, :]).sum(-1)
+        row_u, row_v = jacobian.unbind(-2)
         uu, vv = row_u.square().sum(-1), row_v.square().sum(-1)
         uv = (row_u * row_v).sum(-1)
         u, v = along.unbind(-1)

@@ -38,6 +38,7 @@ SPREAD = {
 hips and face on the surface, not at the joint (measured in the data's READMEs: 10 px against 6)."""
 
 OUTLIER_LENGTHS = 10.0
+_FAR_PX = 1e8
 
 
 class JointObservation:
@@ -80,6 +81,11 @@ class JointObservation:
         self.weight: Float[Tensor, " m"] = weight / keypoints.new_tensor(spread).square()
 
 
+def _error(uv: Float[Tensor, "*batch m 2"], observation: JointObservation) -> Tensor:
+    """Distance in the image; beyond all images it is cut off, lest its square overflow."""
+    return (uv - observation.target).clamp(-_FAR_PX, _FAR_PX)
+
+
 def _spread(name: str) -> float:
     return SPREAD.get(name, SPREAD.get(name.split("_", 1)[-1], 1.0))
 
@@ -105,7 +111,7 @@ class JointTerm:
         self, projection: Projection, observation: JointObservation
     ) -> Float[Tensor, "*batch m"]:
         """Cost of every correspondence, nats."""
-        error = observation.target - projection.uv
+        error = _error(projection.uv, observation)
         squared = observation.weight * error.square().sum(-1)
         rho = self.potential(squared).rho
         return 0.5 * torch.where(projection.valid, rho, self._unseen(observation))
@@ -120,7 +126,7 @@ class JointTerm:
     ) -> PointCost:
         """The same with first and second derivatives in the joint centres' positions."""
         model = camera.project_with_derivatives(points_world)
-        error = model.uv - observation.target
+        error = _error(model.uv, observation)
         weight = observation.weight
         rho, first, second = self.potential(weight * error.square().sum(-1))
         value = 0.5 * torch.where(model.valid, rho, self._unseen(observation))
