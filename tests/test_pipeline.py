@@ -18,7 +18,7 @@ from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.tracker import Tracker, TrackerState
 from torchcss.io import tracks
 from torchcss.io.video import VideoWriter
-from torchcss.pipeline import Settings, follow_with_base, scale_keypoints, track_video
+from torchcss.pipeline import ALL_TERMS, Settings, follow_with_base, scale_keypoints, track_video
 from torchcss.synthetic import arm_sequence
 
 FRAMES = 4
@@ -88,7 +88,17 @@ def test_writes_what_the_design_says(clip: Path, tmp_path: Path):
     assert (np.diff(weights, axis=1) <= 0).all()
     on_disk = tracks.read_summary(tmp_path)
     assert on_disk["ended"] == summary["ended"] == "complete"
-    for key in ("settings", "versions", "seconds_per_frame", "best_mode_cost_by_term"):
+    assert (on_disk["samples"], on_disk["modes"], on_disk["body"]) == (6, 2, "arm7")
+    assert on_disk["samples_optimised"] == 6 * FRAMES
+    for key in (
+        "preset",
+        "seed",
+        "iterations",
+        "settings",
+        "versions",
+        "seconds_per_frame",
+        "best_mode_cost_by_term",
+    ):
         assert key in on_disk
     assert (track.parent[0] == -1).all()
 
@@ -101,6 +111,12 @@ def test_same_seed_same_track(clip: Path, tmp_path: Path):
     np.testing.assert_array_equal(a.state, b.state)
     np.testing.assert_array_equal(a.covariance, b.covariance)
     assert not np.array_equal(a.state, c.state)
+
+
+def test_all_terms_track(clip: Path, tmp_path: Path):
+    summary = run(clip, tmp_path, terms=ALL_TERMS)
+    assert {"contour", "flow", "interpenetration"} <= set(summary["best_mode_cost_by_term"])
+    assert np.isfinite(torchcss.load_track(tmp_path).joints_world).all()
 
 
 def test_float32_tracks_too(clip: Path, tmp_path: Path):

@@ -75,19 +75,20 @@ def run_demo(
         body.joint_names,
     )  # fmt: skip
     interval = 1 / sequence.frame_rate
+    tracker = make_tracker(
+        settings.preset,
+        "arm8",
+        num_samples=settings.samples,
+        num_modes=settings.modes,
+        motion=tuple((body.motion_rate * interval).tolist()),
+    )
     tracked = track_frames(
         (Frame(i, i * interval, image) for i, image in enumerate(sequence.frames)),
         body=first.body,
         mixture=first.mixture,
         camera=camera_there,
         extractor=make_extractor(settings),
-        tracker=make_tracker(
-            settings.preset,
-            "arm8",
-            num_samples=settings.samples,
-            num_modes=settings.modes,
-            motion=tuple((body.motion_rate * interval).tolist()),
-        ),
+        tracker=tracker,
         choice=make_choice(settings, KEYPOINT_NOISE_PX),
         observe=lambda index: marks if index == 0 else None,
         frame_interval=interval,
@@ -96,6 +97,7 @@ def run_demo(
     recorder = Recorder(
         folder=out,
         settings=settings,
+        tracker=tracker,
         camera=camera_there,
         frame_rate=sequence.frame_rate,
         notes=list(first.report),

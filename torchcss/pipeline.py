@@ -305,6 +305,7 @@ class Recorder:
     Attributes:
         folder: The output folder.
         settings: What is run.
+        tracker: The tracker that the settings made, for its numbers.
         camera: Camera of the full-size images, for the overlay.
         frame_rate: Frames per second of the overlay.
         notes: Lines for the user, also in the summary.
@@ -313,6 +314,7 @@ class Recorder:
 
     folder: Path
     settings: Settings
+    tracker: Tracker
     camera: Camera
     frame_rate: float
     notes: list[str] = field(default_factory=list)
@@ -406,6 +408,11 @@ class Recorder:
     ) -> dict[str, Any]:
         return {
             "ended": ended,
+            "body": self.settings.body,
+            "preset": self.settings.preset,
+            "seed": self.settings.seed,
+            "samples": self.tracker.num_samples,
+            "modes": self.tracker.num_modes,
             "settings": asdict(self.settings),
             "versions": {
                 "python": platform.python_version(),
@@ -414,7 +421,8 @@ class Recorder:
             "num_frames": num_frames,
             "seconds_per_frame": wall / num_frames,
             "seconds_per_frame_by_stage": {k: v / num_frames for k, v in seconds.items()},
-            "samples_per_frame": counts["samples"] / num_frames,
+            "samples_optimised": counts["samples"],
+            "iterations": counts["iterations"],
             "iterations_per_sample": counts["iterations"] / max(counts["samples"], 1),
             "distinct_modes_per_frame": counts["distinct"] / num_frames,
             "optimiser_status": {s.name.lower(): int(statuses[s]) for s in Status},
@@ -545,6 +553,7 @@ def track_video(
     recorder = Recorder(
         folder=out,
         settings=settings,
+        tracker=tracker,
         camera=eye,
         frame_rate=1 / interval,
         notes=notes,
