@@ -56,7 +56,9 @@ ALL_TERMS = (*TERMS, "flow", "interpenetration")
 _PITCH_LIMIT = math.radians(55)
 """The base follows once the root's pitch exceeds this, well before it locks at 90 degrees."""
 
-_SAVE_EVERY_S = 10.0
+_SAVE_SHARE = 0.05
+"""Share of the time that may go into saving the track as it grows: a full disk then leaves nearly
+all of it, since a save replaces the last good file only when it is complete."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -338,7 +340,8 @@ class Recorder:
         terms: dict[str, float] = {}
         counts = {"samples": 0, "iterations": 0, "distinct": 0}
         statuses = torch.zeros(len(Status), dtype=torch.long)
-        ended, saved, began = "interrupted", time.perf_counter(), time.perf_counter()
+        ended, began = "interrupted", time.perf_counter()
+        saved, took = began, 0.0
         summary: dict[str, Any] = {}
         with ExitStack() as stack:
             film = None
@@ -365,9 +368,11 @@ class Recorder:
                         cost=f"{float(frame.info.cost[0]):.1f}",
                         modes=len(frame.state.mixture.mean),
                     )
-                    if time.perf_counter() - saved > _SAVE_EVERY_S:
+                    start = time.perf_counter()
+                    if _SAVE_SHARE * (start - saved) >= took:
                         writer.save()
                         saved = time.perf_counter()
+                        took = saved - start
                 ended = "complete"
             finally:
                 if len(writer):
