@@ -13,14 +13,14 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "torchcss"
 
 LAYERS = (
-    {"types", "errors", "joint_names"},
+    {"types", "errors", "joint_names", "stopwatch"},
     {"linalg", "robust"},
     {"raster"},
     {"body"},
     {"vision"},
     {"inference"},
     {"cost"},
-    {"presets", "initialise", "synthetic", "metrics"},
+    {"presets", "initialise", "reprojection", "synthetic", "metrics"},
     {"io"},
     {"pipeline"},
     {"demo", "cli"},

@@ -35,6 +35,8 @@ class Demo:
     """Number of frames, 25 per second."""
     samples: int | None = None
     """Samples per frame; the preset's number by default."""
+    terms: tuple[str, ...] = TERMS
+    """Terms and priors of the cost."""
     device: str = "cpu"
     """Where to compute."""
     dtype: Literal["float64", "float32"] = "float64"
@@ -46,6 +48,7 @@ class Demo:
             body="arm8",
             samples=self.samples,
             keypoints_use="first",
+            terms=self.terms,
             seed=self.seed,
             device=self.device,
             dtype=self.dtype,
@@ -99,6 +102,10 @@ class Track:
     """Terms and priors of the cost."""
     contour_weight: float = Settings.contour_weight
     """Temperature of the contour term, nats."""
+    boundary_emphasis: float = Settings.boundary_emphasis
+    """k of the motion-boundary weights W = 1 - k S_p, for the term motion_boundaries."""
+    masks: Path | None = None
+    """Foreground of every frame: a video or a folder of images of the video's size."""
     overlay: bool = True
     """Write overlay.mp4."""
     seed: int = 0
@@ -119,6 +126,7 @@ class Track:
             terms=self.terms,
             working_size=self.working_size,
             contour_weight=self.contour_weight,
+            boundary_emphasis=self.boundary_emphasis,
             seed=self.seed,
             device=self.device,
             dtype=self.dtype,
@@ -136,6 +144,7 @@ class Track:
             stride=self.stride,
             layout=self.layout,
             normalised=self.normalised,
+            masks=self.masks,
         )
         print(
             f"{summary['num_frames']} frames, {summary['seconds_per_frame']:.2f} s each; "

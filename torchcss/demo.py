@@ -16,7 +16,14 @@ from torchcss.cost.joints import JointObservation, JointTerm
 from torchcss.initialise import initialise_from_joints
 from torchcss.io.tracks import load_track, prepare_output_folder, write_summary
 from torchcss.io.video import Frame, VideoWriter
-from torchcss.pipeline import Recorder, Settings, make_choice, make_extractor, track_frames
+from torchcss.pipeline import (
+    Recorder,
+    Settings,
+    boundary_emphasis,
+    make_choice,
+    make_extractor,
+    track_frames,
+)
 from torchcss.presets import make_tracker
 from torchcss.synthetic import arm_sequence
 
@@ -93,6 +100,7 @@ def run_demo(
         observe=lambda index: marks if index == 0 else None,
         frame_interval=interval,
         generator=generator,
+        boundary_emphasis=boundary_emphasis(settings),
     )
     recorder = Recorder(
         folder=out,

@@ -26,12 +26,14 @@ from tqdm import tqdm
 
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, has_root, move_base, root_pose
+from torchcss.cost.edge_energy import EdgeEnergyField, EdgeEnergyTerm, edge_energy_field
 from torchcss.cost.flow import FlowTargets, FlowTerm, InteriorNodes, flow_targets
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
 from torchcss.cost.joints import JointObservation, JointTerm
+from torchcss.cost.temporal import MixturePrior
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.cost.visibility import ContourPredictor, visible_nodes
-from torchcss.errors import ConfigurationError, KeypointError
+from torchcss.errors import ConfigurationError, KeypointError, VideoError
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.tracker import Tracker, TrackerInfo, TrackerState
 from torchcss.initialise import default_sigma, initialise_from_joints
@@ -41,6 +43,7 @@ from torchcss.io.overlay import ProjectedPart, draw_overlay
 from torchcss.io.tracks import TrackWriter, prepare_output_folder, write_summary
 from torchcss.io.video import Frame, VideoReader, VideoWriter
 from torchcss.presets import make_tracker
+from torchcss.stopwatch import Stopwatch
 from torchcss.synthetic import grid_faces
 from torchcss.types import Status
 from torchcss.vision.camera import Camera
@@ -50,8 +53,12 @@ from torchcss.vision.flow import TRACKING
 TERMS = ("contour", "joints", "stabiliser", "temporal")
 """Terms and priors of the cost by default."""
 
-ALL_TERMS = (*TERMS, "flow", "interpenetration")
-"""Terms and priors that can be chosen."""
+ALL_TERMS = (
+    *("contour", "motion_boundaries", "edge_energy", "flow", "joints"),
+    *("stabiliser", "anthropometric", "interpenetration", "temporal", "temporal_mixture"),
+)
+"""Terms and priors that can be chosen; see `torchcss.cost.total`. `motion_boundaries` weighs the
+edges of `contour` and `edge_energy` by the motion boundaries, `W = 1 - k S_p`."""
 
 _PITCH_LIMIT = math.radians(55)
 """The base follows once the root's pitch exceeds this, well before it locks at 90 degrees."""
@@ -76,6 +83,7 @@ class Settings:
         working_size: Longer side, in pixels, at which features are computed; larger images are
             reduced to it.
         contour_weight: Temperature of the contour term, see `CostChoice`.
+        boundary_emphasis: k of `W = 1 - k S_p`, for the term `motion_boundaries`.
         seed: Seed of all random numbers; the same seed gives the same track.
         device: Where to compute.
         dtype: "float64" or "float32".
@@ -90,6 +98,7 @@ class Settings:
     terms: tuple[str, ...] = TERMS
     working_size: int = 640
     contour_weight: float = 150.0
+    boundary_emphasis: float = 0.3
     seed: int = 0
     device: str = "cpu"
     dtype: Literal["float64", "float32"] = "float64"
@@ -127,6 +136,8 @@ class TrackedFrame(NamedTuple):
         joints_world: Joint centres of the modes, metres.
         terms: Cost of the best mode by term, nats.
         seconds: Wall time of the frame by stage.
+        term_seconds: Wall time of the search by what was evaluated; the rest of it is the
+            optimiser's own.
     """
 
     frame: Frame
@@ -136,6 +147,7 @@ class TrackedFrame(NamedTuple):
     joints_world: Float[Tensor, "k j 3"]
     terms: dict[str, float]
     seconds: dict[str, float]
+    term_seconds: dict[str, float]
 
 
 Observe = Callable[[int], JointObservation | None]
@@ -154,6 +166,8 @@ def track_frames(
     observe: Observe,
     frame_interval: float,
     generator: torch.Generator,
+    boundary_emphasis: float = 0.0,
+    masks: Iterable[np.ndarray | Tensor] | None = None,
 ) -> Iterator[TrackedFrame]:
     """Track a body through a sequence of images.
 
@@ -168,22 +182,32 @@ def track_frames(
         observe: Keypoints by frame.
         frame_interval: Seconds between frames, which scales the expected motion.
         generator: Source of the samples.
+        boundary_emphasis: Weight of motion boundaries, see `FrameFeatures.edge_field`.
+        masks: Foreground of each of the images, of their size, as `FeatureExtractor` takes it;
+            None: not known.
 
     Yields:
         A `TrackedFrame` for every frame.
     """
     working = extractor.working_camera(camera).to(dtype=body.dtype, device=body.tie.device)
-    predictor = ContourPredictor(body) if choice.contour is not None else None
+    edges = choice.contour is not None or choice.edge_energy is not None
+    predictor = ContourPredictor(body) if edges else None
     interior = InteriorNodes(body) if choice.flow is not None else None
     pairs = InterpenetrationPairs(body) if choice.interpenetration is not None else None
-    last_image = None
+    last_image, foregrounds = None, None if masks is None else iter(masks)
     deviation = body.motion_rate * frame_interval
     state = tracker.init(mixture, generator=generator)
     for frame in frames:
         clock = time.perf_counter()
-        features = extractor(frame.image, last_image)
-        last_image = frame.image if choice.flow is not None else None
-        edge_field = features.edge_field().to(body.tie)
+        mask = None
+        if foregrounds is not None and (mask := next(foregrounds, None)) is None:
+            raise VideoError(f"the masks end before frame {frame.index}; give one for every frame")
+        features = extractor(frame.image, last_image, mask)
+        last_image = frame.image
+        edge_field = features.edge_field(boundary_emphasis=boundary_emphasis).to(body.tie)
+        energy = None
+        if choice.edge_energy is not None:
+            energy = edge_energy_field(edge_field)
         targets = None
         if interior is not None and features.flow is not None:
             mean = state.mixture.mean
@@ -199,14 +223,17 @@ def track_frames(
                 visible_nodes(body, before, working.centre_world, points, interior.node_part),
             )
         featured = time.perf_counter()
+        stopwatch = Stopwatch()
 
         def cost_of(
             parent: Tensor,
             prior: GaussianMixture,
             body: BodyModel = body,
             edge_field: Tensor = edge_field,
+            energy: EdgeEnergyField | None = energy,
             index: int = frame.index,
             targets: FlowTargets | None = targets,
+            stopwatch: Stopwatch = stopwatch,
         ) -> TrackingCost:
             return TrackingCost(
                 body=body,
@@ -214,17 +241,22 @@ def track_frames(
                 choice=choice,
                 predictor=predictor,
                 edge_field=edge_field,
+                energy=energy,
                 interior=interior,
                 pairs=pairs,
                 targets=None if targets is None else targets.take(parent),
                 observation=observe(index),
                 parent=prior.mean[parent],
                 deviation=deviation,
+                previous=None
+                if choice.temporal_mixture is None
+                else choice.temporal_mixture.density(prior),
+                stopwatch=stopwatch,
             )
 
         prior = state.mixture
         state, info = tracker.step(state, cost_of, body.bounds)
-        searched = time.perf_counter()
+        searched, term_seconds = time.perf_counter(), dict(stopwatch.seconds)
         mean = state.mixture.mean
         terms = cost_of(info.origin[:1], prior).terms(mean[:1])
         yield TrackedFrame(
@@ -235,6 +267,7 @@ def track_frames(
             body.pose(mean).joints,
             {name: float(value[0]) for name, value in terms.items()},
             {"features": featured - clock, "search": searched - featured},
+            term_seconds,
         )
         body, state = follow_with_base(body, state)
 
@@ -338,6 +371,7 @@ class Recorder:
         )
         totals: dict[str, float] = {}
         terms: dict[str, float] = {}
+        term_seconds: dict[str, float] = {}
         counts = {"samples": 0, "iterations": 0, "distinct": 0}
         statuses = torch.zeros(len(Status), dtype=torch.long)
         ended, began = "interrupted", time.perf_counter()
@@ -357,7 +391,11 @@ class Recorder:
                     if film is not None:
                         film.write(draw_modes(frame, self.camera))
                     seconds = {**frame.seconds, "overlay": time.perf_counter() - drawn}
-                    for into, values in ((totals, seconds), (terms, frame.terms)):
+                    for into, values in (
+                        (totals, seconds),
+                        (terms, frame.terms),
+                        (term_seconds, frame.term_seconds),
+                    ):
                         for name, value in values.items():
                             into[name] = into.get(name, 0.0) + value
                     counts["samples"] += int(frame.info.num_samples)
@@ -378,8 +416,8 @@ class Recorder:
                 if len(writer):
                     writer.save()
                     summary = self._summary(
-                        ended, len(writer), time.perf_counter() - began, totals, terms, counts,
-                        statuses,
+                        ended, len(writer), time.perf_counter() - began, totals, terms,
+                        term_seconds, counts, statuses,
                     )  # fmt: skip
                     write_summary(self.folder, summary)
         return summary
@@ -408,6 +446,7 @@ class Recorder:
         wall: float,
         seconds: dict[str, float],
         terms: dict[str, float],
+        term_seconds: dict[str, float],
         counts: dict[str, int],
         statuses: Tensor,
     ) -> dict[str, Any]:
@@ -432,16 +471,34 @@ class Recorder:
             "distinct_modes_per_frame": counts["distinct"] / num_frames,
             "optimiser_status": {s.name.lower(): int(statuses[s]) for s in Status},
             "best_mode_cost_by_term": {k: v / num_frames for k, v in terms.items()},
+            "share_of_cost_by_term": _shares(terms),
+            "share_of_search_time_by_term": _shares(
+                {
+                    **term_seconds,
+                    "optimiser": seconds.get("search", 0.0) - sum(term_seconds.values()),
+                }
+            ),
             "notes": self.notes,
             **self.extra,
         }
 
 
+def _shares(values: dict[str, float]) -> dict[str, float]:
+    whole = sum(values.values())
+    return {name: value / whole if whole else 0.0 for name, value in values.items()}
+
+
 def make_extractor(settings: Settings) -> FeatureExtractor:
     """The features that the settings ask for, in their type and on their device."""
-    flow = TRACKING if "flow" in settings.terms else None
+    moving = {"flow", "motion_boundaries"} & set(settings.terms)
+    flow = TRACKING if moving else None
     extractor = FeatureExtractor(working_size=settings.working_size, flow=flow)
     return extractor.to(dtype=settings.torch_dtype, device=settings.device)
+
+
+def boundary_emphasis(settings: Settings) -> float:
+    """Emphasis k of the motion-boundary weights, zero if the settings do not ask for them."""
+    return settings.boundary_emphasis if "motion_boundaries" in settings.terms else 0.0
 
 
 def make_choice(settings: Settings, sigma: float) -> CostChoice:
@@ -455,10 +512,13 @@ def make_choice(settings: Settings, sigma: float) -> CostChoice:
     has = settings.terms.__contains__
     return CostChoice(
         contour=default.contour if has("contour") else None,
+        edge_energy=EdgeEnergyTerm() if has("edge_energy") else None,
         flow=FlowTerm() if has("flow") else None,
         joints=JointTerm(sigma=sigma) if has("joints") else None,
         stabiliser=default.stabiliser if has("stabiliser") else None,
+        anthropometric=default.anthropometric if has("anthropometric") else None,
         temporal=default.temporal if has("temporal") else None,
+        temporal_mixture=MixturePrior() if has("temporal_mixture") else None,
         interpenetration=Interpenetration() if has("interpenetration") else None,
         contour_weight=settings.contour_weight,
     )
@@ -477,6 +537,7 @@ def track_video(
     stride: int = 1,
     layout: str | None = None,
     normalised: bool = False,
+    masks: Path | None = None,
 ) -> dict[str, Any]:
     """Track a body through a video file.
 
@@ -492,6 +553,8 @@ def track_video(
         stride: Every how many frames to track.
         layout: Layout of a keypoint file that does not name its joints.
         normalised: Whether keypoints are fractions of the image.
+        masks: Foreground of every frame, white or in shades of belief: a video or a folder of
+            images, of the size and number of the video's frames.
 
     Returns:
         The summary.
@@ -502,8 +565,18 @@ def track_video(
     settings = settings or Settings()
     out = Path(out)
     prepare_output_folder(out)
-    reader = VideoReader(video, start=start, stop=stop, stride=stride)
+    part = {"start": start, "stop": stop, "stride": stride}
+    reader = VideoReader(video, **part)
     width, height = reader.info.width, reader.info.height
+    foreground = None if masks is None else VideoReader(masks, **part)
+    if foreground is not None and (foreground.info.width, foreground.info.height) != (
+        width,
+        height,
+    ):
+        raise VideoError(
+            f"{masks}: masks must have the video's size {width} x {height}, these have "
+            f"{foreground.info.width} x {foreground.info.height}"
+        )
     loaded = read_camera(camera, camera_name=camera_name, video=video)
     check_image_size(loaded.camera, width, height)
     num_frames = reader.info.num_frames or reader.count_frames()
@@ -580,6 +653,8 @@ def track_video(
         observe=observe,
         frame_interval=interval,
         generator=generator,
+        boundary_emphasis=boundary_emphasis(settings),
+        masks=None if foreground is None else (mask.image for mask in foreground),
     )
     return recorder.run(tracked, first.body, reader.num_selected)
 

@@ -3,18 +3,24 @@
 This is `p(x_t | R_{t-1})` of eq. 10 [IJRR]. The papers start each search from it but leave it out
 of the cost; in directions that no image term sees, modes then drift. Here the driftless diffusion
 about the parent mode may join the cost, long-tailed so that a fast motion is unlikely and not
-impossible. It is evaluated per sample against its own parent.
+impossible. `TemporalPrior`, the default, is evaluated per sample against its own parent;
+`MixturePrior` is the density of the whole previous mixture, correlations and all.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.cost.stabiliser import long_tailed
+from torchcss.inference.mixture import GaussianMixture
 from torchcss.types import LocalModel
+
+_LEAST_VARIANCE = 1e-12
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,3 +47,70 @@ class TemporalPrior:
             deviation: Expected motion per frame; infinite where nothing is known.
         """
         return long_tailed(x, parent, deviation, self.nu)
+
+
+class MixtureDensity(NamedTuple):
+    """The previous mixture, one frame ahead, ready to be evaluated many times.
+
+    Attributes:
+        mean: Means of the modes.
+        precision: Inverse covariances, motion included.
+        log_amplitude: Logarithm of each mode's density at its mean; that of the highest is zero.
+    """
+
+    mean: Float[Tensor, "k n"]
+    precision: Float[Tensor, "k n n"]
+    log_amplitude: Float[Tensor, " k"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MixturePrior:
+    """The whole of `p(x_t | R_{t-1})`: the modes of the previous frame, widened by the motion.
+
+        f(x) = -log( e^-nu + sum_k a_k exp(-1/2 (x - mu_k)^T P_k (x - mu_k)) )
+
+    with `a_k` the density of mode k at its mean, relative to the highest. A sample may move from
+    one mode to another for what their weights differ by; far from all of them the cost is nu and
+    there is no pull, so that a fast motion is unlikely and not impossible.
+
+    Attributes:
+        nu: Height of the tails, nats.
+    """
+
+    nu: float = 12.0
+
+    def density(self, predicted: GaussianMixture) -> MixtureDensity:
+        """Prepare the prior of a frame.
+
+        Args:
+            predicted: The previous posterior, one frame ahead (`Dynamics.predict`).
+        """
+        size = predicted.mean.shape[-1]
+        identity = torch.eye(size).to(predicted.covariance)
+        # A variance of zero (a frozen parameter) is as good as a very small one.
+        variance = predicted.covariance.diagonal(dim1=-2, dim2=-1).amax(-1)[:, None, None]
+        least = torch.finfo(identity.dtype).eps * variance.clamp(min=_LEAST_VARIANCE)
+        root = torch.linalg.cholesky_ex(predicted.covariance + least * identity)[0]
+        height = predicted.log_weight - root.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        return MixtureDensity(predicted.mean, torch.cholesky_inverse(root), height - height.max())
+
+    def local_model(self, x: Float[Tensor, "*batch n"], density: MixtureDensity) -> LocalModel:
+        """Cost, gradient and Hessian.
+
+        Args:
+            x: States.
+            density: What `density` made.
+        """
+        # The square of a larger number would overflow; the share of a mode is nil there anyway.
+        limit = 1e-4 * (torch.finfo(x.dtype).max / float(density.precision.amax())) ** 0.5
+        offset = (x[..., None, :] - density.mean).clamp(-limit, limit)
+        pull = (density.precision @ offset[..., None])[..., 0]
+        exponent = density.log_amplitude - 0.5 * (offset * pull).sum(-1)
+        tail = exponent.new_full((*exponent.shape[:-1], 1), -self.nu)
+        everything = torch.cat([exponent, tail], dim=-1)
+        share = everything.softmax(-1)[..., :-1]
+        gradient = (share[..., None] * pull).sum(-2)
+        hessian = (share[..., None, None] * density.precision).sum(-3)
+        hessian = hessian - (share[..., None] * pull).transpose(-1, -2) @ pull
+        hessian = hessian + gradient[..., :, None] * gradient[..., None, :]
+        return LocalModel(-everything.logsumexp(-1), gradient, hessian)

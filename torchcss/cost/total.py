@@ -1,6 +1,6 @@
 """TrackingCost: the negative log posterior of one frame, eq. 3 to 7, 11 and 12 [IJRR].
 
-    f(x) = sum_terms  weight_t / (N_t nu_t) sum_i e_i(x)  +  f_s(x) + f_temporal(x)
+    f(x) = sum_terms  weight_t / (N_t nu_t) sum_i e_i(x)  +  sum_priors f_p(x)
 
 Every term sees posed points, never x; its derivatives at the points are collected and lifted once.
 `value` and `local_model` find visibility and edge assignments fresh at x; the derivatives hold them
@@ -8,31 +8,49 @@ fixed. Large batches are worked off in chunks, so memory does not grow with the 
 
 The factor 1/(N nu) of eq. 5 alone would make the posterior far too flat; `weight_t` sets its
 temperature: the nats that a term contributes per nu of mean cost per node (design decision 8).
+
+| name | term or prior | section of [IJRR] |
+|---|---|---|
+| `contour` | edges along the normals of occluding contours | 3.1.2, eq. 8 |
+| `edge_energy` | the edge energy itself at the same nodes | 3.1 |
+| `flow` | displacement of interior nodes against the optical flow | 3.1.2, eq. 9 |
+| `joints` | 2D joint correspondences | 5 |
+| `anthropometric` | lengths of the limbs, where they are free | 3.2.1 |
+| `stabiliser` | long-tailed priors on what is hard to see | 3.2.2 |
+| `interpenetration` | repulsion between parts | 3.2.4 |
+| `temporal` | near the sample's parent mode | 4.2, eq. 10 |
+| `temporal_mixture` | near any mode of the previous frame | 4.2, eq. 10 |
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchcss.body.model import BodyModel, BodyPose
+from torchcss.cost.anthropometric import Anthropometric, proportion_columns
 from torchcss.cost.contour import ContourTerm
+from torchcss.cost.edge_energy import EdgeEnergyField, EdgeEnergyTerm
 from torchcss.cost.flow import FlowTargets, FlowTerm, InteriorNodes
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
 from torchcss.cost.joints import JointObservation, JointTerm
 from torchcss.cost.stabiliser import Stabiliser
-from torchcss.cost.temporal import TemporalPrior
-from torchcss.cost.visibility import ContourNodes, ContourPredictor, visible_nodes
+from torchcss.cost.temporal import MixtureDensity, MixturePrior, TemporalPrior
+from torchcss.cost.visibility import ContourPredictor, visible_nodes
+from torchcss.stopwatch import Stopwatch
 from torchcss.types import Curvature, LocalModel, PointCost
 from torchcss.vision.camera import Camera
 
 CHUNK = 256
 """Samples evaluated at a time: small enough for the caches, large enough to hide call overhead."""
-
 
 COARSE_SCALE = 6.0
 """How much wider the keypoints' scale is in the coarse cost: a missed limb is then no outlier."""
@@ -42,29 +60,51 @@ COARSE_SCALE = 6.0
 class CostChoice:
     """Which terms and priors make up the cost, and how they weigh.
 
+    A term that lacks what it compares with (a frame without keypoints or flow, a body without free
+    lengths) is silent.
+
     Attributes:
         contour: The edge term, or None.
-        flow: The flow term, or None; it is silent in frames without flow.
-        joints: The keypoint term, or None; it is silent in frames without keypoints.
+        edge_energy: The direct edge-energy potential, or None.
+        flow: The flow term, or None.
+        joints: The keypoint term, or None.
         stabiliser: The sticky prior, or None.
-        temporal: The temporal prior, or None.
+        anthropometric: The prior on free lengths, or None; it takes the stabiliser's place there.
+        temporal: The prior about each sample's parent mode, or None.
+        temporal_mixture: The prior of the whole previous mixture, or None.
         interpenetration: The repulsion between parts, or None.
         contour_weight: Nats per nu of the contour's mean cost per node.
+        edge_energy_weight: Nats per nu of the edge energy's mean cost per node.
         flow_weight: Nats per nu of the flow's mean cost per node.
         joint_weight: Factor on the joints' cost, whose nu is in nats already.
         curvature: Which Hessian the optimiser gets.
     """
 
     contour: ContourTerm | None = field(default_factory=ContourTerm)
+    edge_energy: EdgeEnergyTerm | None = None
     flow: FlowTerm | None = None
     joints: JointTerm | None = field(default_factory=JointTerm)
     stabiliser: Stabiliser | None = field(default_factory=Stabiliser)
+    anthropometric: Anthropometric | None = field(default_factory=Anthropometric)
     temporal: TemporalPrior | None = field(default_factory=TemporalPrior)
+    temporal_mixture: MixturePrior | None = None
     interpenetration: Interpenetration | None = None
     contour_weight: float = 150.0
+    edge_energy_weight: float = 150.0
     flow_weight: float = 50.0
     joint_weight: float = 1.0
     curvature: Curvature = Curvature.EXACT
+
+
+class _Observed(NamedTuple):
+    """One image term at one batch of poses: where its points are, and how to evaluate it there."""
+
+    name: str
+    points: Float[Tensor, "*batch p 3"]
+    link: Int[Tensor, " p"]
+    scale: float
+    value: Callable[[], Float[Tensor, "*batch p"]]
+    point_cost: Callable[..., PointCost]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,14 +115,17 @@ class TrackingCost:
         body: The body, hung on its base.
         camera: The camera of the image that the features were computed on.
         choice: Terms and weights.
-        predictor: Contour predictor of the body; None switches the contour term off.
+        predictor: Contour predictor of the body; None switches contour and edge energy off.
         edge_field: Edge energy times gradient direction; None switches the contour term off.
+        energy: The edge energy as a smooth function; None switches the edge-energy term off.
         interior: Interior nodes of the body, for the flow term; None switches it off.
         targets: Where the flow carried the nodes of each sample's parent mode, `[b p 2]`.
         observation: Keypoints of the frame, in that image's pixels; None if there are none.
         pairs: Pairs of parts that may collide; None switches the repulsion off.
-        parent: State of each sample's parent mode, `[b n]` or `[n]`; None: no temporal prior.
-        deviation: Expected motion per frame of every parameter, for the temporal prior.
+        parent: State of each sample's parent mode, `[b n]` or `[n]`; None: no prior about it.
+        deviation: Expected motion per frame of every parameter, for the prior about the parent.
+        previous: The previous mixture, one frame ahead; None: no prior about it.
+        stopwatch: Where the time of the evaluations is added up by term; None: not at all.
     """
 
     body: BodyModel
@@ -90,12 +133,15 @@ class TrackingCost:
     choice: CostChoice
     predictor: ContourPredictor | None = None
     edge_field: Float[Tensor, "2 h w"] | None = None
+    energy: EdgeEnergyField | None = None
     interior: InteriorNodes | None = None
     targets: FlowTargets | None = None
     observation: JointObservation | None = None
     pairs: InterpenetrationPairs | None = None
     parent: Float[Tensor, "*b n"] | None = None
     deviation: Float[Tensor, " n"] | None = None
+    previous: MixtureDensity | None = None
+    stopwatch: Stopwatch | None = None
 
     def take(self, items: Int[Tensor, " b"]) -> TrackingCost:
         """The cost restricted to some samples: each keeps its own parent."""
@@ -111,11 +157,25 @@ class TrackingCost:
 
         None in frames without keypoints.
         """
-        if not self._uses_joints:
+        joints = self.choice.joints
+        if joints is None or self.observation is None:
             return None
-        assert self.choice.joints is not None
-        wide = replace(self.choice.joints, sigma=COARSE_SCALE * self.choice.joints.sigma)
-        return replace(self, choice=replace(self.choice, contour=None, flow=None, joints=wide))
+        wide = replace(joints, sigma=COARSE_SCALE * joints.sigma)
+        return replace(self, choice=replace(self._without_images(), joints=wide))
+
+    def screening(self) -> TrackingCost:
+        """The edges alone, by which [RR] section 4.2 scores sampled hypotheses for speed."""
+        edges = replace(
+            self._without_images(),
+            contour=self.choice.contour,
+            edge_energy=self.choice.edge_energy,
+            stabiliser=None,
+            anthropometric=None,
+            temporal=None,
+            temporal_mixture=None,
+            interpenetration=None,
+        )
+        return replace(self, choice=edges)
 
     def value(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
         """Cost in nats, visibility and assignments found fresh at x."""
@@ -138,6 +198,9 @@ class TrackingCost:
         """Cost, gradient and Hessian, visibility and assignments found at x and held fixed."""
         return LocalModel(*self._chunked(lambda x, part: tuple(part._local_model(x)), x))
 
+    def _without_images(self) -> CostChoice:
+        return replace(self.choice, contour=None, edge_energy=None, flow=None, joints=None)
+
     def _chunked(
         self, evaluate: Callable[[Tensor, TrackingCost], tuple[Tensor, ...]], x: Tensor
     ) -> tuple[Tensor, ...]:
@@ -151,128 +214,134 @@ class TrackingCost:
             for parts in zip(*results, strict=True)
         )
 
-    @property
-    def _uses_contour(self) -> bool:
-        return None not in (self.choice.contour, self.predictor, self.edge_field)
-
-    @property
-    def _uses_flow(self) -> bool:
-        return None not in (self.choice.flow, self.interior, self.targets)
-
-    @property
-    def _uses_joints(self) -> bool:
-        return self.choice.joints is not None and self.observation is not None
+    def _timed(self, name: str) -> AbstractContextManager[Any]:
+        return nullcontext() if self.stopwatch is None else self.stopwatch(name)
 
     def _values(self, x: Tensor) -> dict[str, Tensor]:
-        pose = self.body.pose(x)
-        values = {name: model.value for name, model in self._priors(x, pose).items()}
-        if self._uses_contour:
-            term, nodes = self.choice.contour, self._contour_nodes(pose)
-            assert term is not None
-            assert self.edge_field is not None
-            cost = term.value(nodes, self.camera, self.edge_field)
-            values["contour"] = self._contour_scale * cost.sum(-1)
-        if self._uses_flow:
-            term = self.choice.flow
-            assert term is not None
-            cost = term.value(*self._interior_nodes(pose), self.camera, self._targets)
-            values["flow"] = self._flow_scale * cost.sum(-1)
-        if self._uses_joints:
-            assert self.choice.joints is not None
-            assert self.observation is not None
-            projection = self.camera.project(pose.joints[..., self.observation.index, :])
-            cost = self.choice.joints.value(projection, self.observation)
-            values["joints"] = self.choice.joint_weight * cost.sum(-1)
+        with self._timed("pose"):
+            pose = self.body.pose(x)
+        values = {}
+        for name, prior in self._priors(x, pose):
+            with self._timed(name):
+                values[name] = prior().value
+        for term in self._observed(pose):
+            with self._timed(term.name):
+                values[term.name] = term.scale * term.value().sum(-1)
         return values or {"none": x.new_zeros(x.shape[:-1])}
 
     def _local_model(self, x: Tensor) -> LocalModel:
-        pose = self.body.pose(x)
+        with self._timed("pose"):
+            pose = self.body.pose(x)
         gauss_newton = self.choice.curvature is Curvature.GAUSS_NEWTON
         points, links, costs = [], [], []
-        if self._uses_contour:
-            term, nodes = self.choice.contour, self._contour_nodes(pose)
-            assert term is not None
-            assert self.predictor is not None
-            assert self.edge_field is not None
-            cost = term.point_cost(nodes, self.camera, self.edge_field, gauss_newton=gauss_newton)
-            points.append(nodes.points)
-            links.append(self.predictor.node_link)
-            costs.append(PointCost(*(self._contour_scale * part for part in cost)))
-        if self._uses_flow:
-            term, interior = self.choice.flow, self._interior_nodes(pose)
-            assert term is not None
-            assert self.interior is not None
-            cost = term.point_cost(*interior, self.camera, self._targets, gauss_newton=gauss_newton)
-            points.append(interior[0])
-            links.append(self.interior.node_link)
-            costs.append(PointCost(*(self._flow_scale * part for part in cost)))
-        if self._uses_joints:
-            term, observation = self.choice.joints, self.observation
-            assert term is not None
-            assert observation is not None
-            joints = pose.joints[..., observation.index, :]
-            cost = term.point_cost(joints, self.camera, observation, gauss_newton=gauss_newton)
-            points.append(joints)
-            links.append(self.body.marker_link[observation.index])
-            costs.append(PointCost(*(self.choice.joint_weight * part for part in cost)))
+        for term in self._observed(pose):
+            with self._timed(term.name):
+                cost = term.point_cost(gauss_newton=gauss_newton)
+                points.append(term.points)
+                links.append(term.link)
+                costs.append(PointCost(*(term.scale * part for part in cost)))
         size = x.shape[-1]
         total = LocalModel(
             x.new_zeros(len(x)), torch.zeros_like(x), x.new_zeros(len(x), size, size)
         )
         if points:
-            cost = PointCost(*(torch.cat(parts, dim=1) for parts in zip(*costs, strict=True)))
-            total = self.body.lift(
-                pose,
-                torch.cat(points, dim=1),
-                torch.cat(links),
-                cost,
-                curvature=self.choice.curvature,
-            )
-        for prior in self._priors(x, pose).values():
-            total = LocalModel(*(a + b for a, b in zip(total, prior, strict=True)))
+            with self._timed("lift"):
+                cost = PointCost(*(torch.cat(parts, dim=1) for parts in zip(*costs, strict=True)))
+                total = self.body.lift(
+                    pose,
+                    torch.cat(points, dim=1),
+                    torch.cat(links),
+                    cost,
+                    curvature=self.choice.curvature,
+                )
+        for name, prior in self._priors(x, pose):
+            with self._timed(name):
+                total = LocalModel(*(a + b for a, b in zip(total, prior(), strict=True)))
         return total
 
-    def _priors(self, x: Tensor, pose: BodyPose) -> dict[str, LocalModel]:
-        body, priors = self.body, {}
-        if self.choice.stabiliser is not None:
-            priors["stabiliser"] = self.choice.stabiliser.local_model(
-                x, body.sticky_mean, body.sticky_deviation
+    def _observed(self, pose: BodyPose) -> Iterator[_Observed]:
+        """The image terms that have what they need, at a batch of poses."""
+        choice, body, camera, predictor = self.choice, self.body, self.camera, self.predictor
+        matches = choice.contour is not None and self.edge_field is not None
+        direct = choice.edge_energy is not None and self.energy is not None
+        if predictor is not None and (matches or direct):
+            with self._timed("visibility"):
+                nodes = predictor(body, pose, camera.centre_world)
+            # None on a robot without flesh.
+            num_nodes = max(predictor.num_nodes, 1)
+            for name, term, image, weight in (
+                ("contour", choice.contour, self.edge_field, choice.contour_weight),
+                ("edge_energy", choice.edge_energy, self.energy, choice.edge_energy_weight),
+            ):
+                if term is not None and image is not None:
+                    yield _Observed(
+                        name,
+                        nodes.points,
+                        predictor.node_link,
+                        weight / (num_nodes * term.nu),
+                        partial(term.value, nodes, camera, image),  # type: ignore[arg-type]
+                        partial(term.point_cost, nodes, camera, image),  # type: ignore[arg-type]
+                    )
+        if choice.flow is not None and self.interior is not None and self.targets is not None:
+            term, interior = choice.flow, self.interior
+            with self._timed("visibility"):
+                points, normals = interior(body, pose)
+                seen = visible_nodes(body, pose, camera.centre_world, points, interior.node_part)
+            arguments = (points, normals, seen, camera, self.targets)
+            yield _Observed(
+                "flow",
+                points,
+                interior.node_link,
+                choice.flow_weight / (max(interior.num_nodes, 1) * term.nu),
+                partial(term.value, *arguments),
+                partial(term.point_cost, *arguments),
             )
-        if self.choice.temporal is not None and self.parent is not None:
+        if choice.joints is not None and self.observation is not None:
+            term, observation = choice.joints, self.observation
+            joints = pose.joints[..., observation.index, :]
+            yield _Observed(
+                "joints",
+                joints,
+                body.marker_link[observation.index],
+                choice.joint_weight,
+                lambda: term.value(camera.project(joints), observation),
+                partial(term.point_cost, joints, camera, observation),
+            )
+
+    def _priors(self, x: Tensor, pose: BodyPose) -> Iterator[tuple[str, Callable[[], LocalModel]]]:
+        """The priors that have what they need, at a batch of states."""
+        choice, body = self.choice, self.body
+        lengths = list(proportion_columns(body).values())
+        if choice.stabiliser is not None:
+            deviation = body.sticky_deviation
+            if choice.anthropometric is not None and lengths:
+                deviation = deviation.clone()
+                deviation[lengths] = math.inf
+            yield (
+                "stabiliser",
+                partial(choice.stabiliser.local_model, x, body.sticky_mean, deviation),
+            )
+        if choice.anthropometric is not None and lengths:
+            yield "anthropometric", partial(choice.anthropometric.local_model, x, body)
+        if choice.temporal is not None and self.parent is not None:
             assert self.deviation is not None
-            priors["temporal"] = self.choice.temporal.local_model(x, self.parent, self.deviation)
-        if self.choice.interpenetration is not None and self.pairs is not None:
-            priors["interpenetration"] = self.choice.interpenetration.local_model(
-                body, pose, self.pairs, curvature=self.choice.curvature
+            yield (
+                "temporal",
+                partial(choice.temporal.local_model, x, self.parent, self.deviation),
             )
-        return priors
-
-    def _contour_nodes(self, pose: BodyPose) -> ContourNodes:
-        assert self.predictor is not None
-        return self.predictor(self.body, pose, self.camera.centre_world)
-
-    def _interior_nodes(self, pose: BodyPose) -> tuple[Tensor, Tensor, Tensor]:
-        """Points, normals and visibility of the interior nodes."""
-        assert self.interior is not None
-        points, normals = self.interior(self.body, pose)
-        centre, part = self.camera.centre_world, self.interior.node_part
-        return points, normals, visible_nodes(self.body, pose, centre, points, part)
-
-    @property
-    def _targets(self) -> FlowTargets:
-        assert self.targets is not None
-        return self.targets
-
-    @property
-    def _flow_scale(self) -> float:
-        assert self.choice.flow is not None
-        assert self.interior is not None
-        num_nodes = max(self.interior.num_nodes, 1)
-        return self.choice.flow_weight / (num_nodes * self.choice.flow.nu)
-
-    @property
-    def _contour_scale(self) -> float:
-        assert self.choice.contour is not None
-        assert self.predictor is not None
-        num_nodes = max(self.predictor.num_nodes, 1)  # none on a robot without flesh
-        return self.choice.contour_weight / (num_nodes * self.choice.contour.nu)
+        if choice.temporal_mixture is not None and self.previous is not None:
+            yield (
+                "temporal_mixture",
+                partial(choice.temporal_mixture.local_model, x, self.previous),
+            )
+        if choice.interpenetration is not None and self.pairs is not None:
+            yield (
+                "interpenetration",
+                partial(
+                    choice.interpenetration.local_model,
+                    body,
+                    pose,
+                    self.pairs,
+                    curvature=choice.curvature,
+                ),
+            )
