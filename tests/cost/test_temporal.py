@@ -1,4 +1,4 @@
-"""The prior about the parent mode: one parent for all, or one for each."""
+"""The priors about the parent mode (one for all, or one for each) and about the whole mixture."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from torchcss.body.model import differentiate_twice
-from torchcss.cost.temporal import TemporalPrior
+from torchcss.cost.temporal import MixturePrior, TemporalPrior
+from torchcss.inference.mixture import GaussianMixture
 
 
 @pytest.mark.parametrize("own", [True, False])
@@ -45,3 +46,48 @@ def test_far_from_the_parent(dtype: torch.dtype) -> None:
     for part in model:
         assert part.dtype == dtype
         assert torch.isfinite(part).all()
+
+
+def make_mixture(n: int, generator: torch.Generator) -> GaussianMixture:
+    root = torch.randn(3, n, n, generator=generator, dtype=torch.float64)
+    mean = torch.randn(3, n, generator=generator, dtype=torch.float64)
+    weight = torch.rand(3, generator=generator, dtype=torch.float64)
+    covariance = root @ root.mT + 0.1 * torch.eye(n, dtype=torch.float64)
+    return GaussianMixture(mean, covariance, weight.log().log_softmax(0))
+
+
+@pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
+def test_mixture_against_the_library_and_autograd(
+    batch: tuple[int, ...], generator: torch.Generator
+) -> None:
+    n, nu = 4, 5.0
+    mixture = make_mixture(n, generator)
+    leaf = (2 * torch.randn(*batch, n, generator=generator, dtype=torch.float64)).requires_grad_()
+    modes = torch.distributions.MultivariateNormal(mixture.mean, mixture.covariance)
+    height = modes.log_prob(mixture.mean) + mixture.log_weight
+    density = modes.log_prob(leaf[..., None, :]) + mixture.log_weight - height.max()
+    floor = density.new_full((*batch, 1), -nu)
+    expected = differentiate_twice(-torch.cat([density, floor], -1).logsumexp(-1), leaf)
+    prior = MixturePrior(nu=nu)
+    got = prior.local_model(leaf.detach(), prior.density(mixture))
+    assert got.value.shape == batch
+    for ours, theirs in zip(got, expected, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_far_from_every_mode(dtype: torch.dtype, generator: torch.Generator) -> None:
+    """No pull, the height of the tails; frozen parameters with no variance do no harm."""
+    mixture = make_mixture(3, generator)
+    frozen = mixture.covariance.clone()
+    frozen[:, 1], frozen[:, :, 1] = 0.0, 0.0
+    prior = MixturePrior(nu=6.0)
+    mixture = GaussianMixture(mixture.mean, frozen, mixture.log_weight)
+    density = prior.density(GaussianMixture(*(part.to(dtype) for part in mixture)))
+    for size in (1e3, 1e30):
+        model = prior.local_model(torch.full((2, 3), size, dtype=dtype), density)
+        for part in model:
+            assert part.dtype == dtype
+            assert torch.isfinite(part).all()
+        torch.testing.assert_close(model.value, torch.full((2,), 6.0, dtype=dtype))
+        assert not model.gradient.any()

@@ -15,9 +15,16 @@ from torch import Tensor
 
 from torchcss.body.model import BodyModel, differentiate_twice, load_body
 from torchcss.cost import total
+from torchcss.cost.anthropometric import proportion_columns
+from torchcss.cost.edge_energy import EdgeEnergyTerm, edge_energy_field
+from torchcss.cost.flow import FlowTerm, InteriorNodes, flow_targets
+from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
 from torchcss.cost.joints import JointObservation, JointTerm
+from torchcss.cost.temporal import MixturePrior
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.cost.visibility import ContourPredictor
+from torchcss.inference.mixture import GaussianMixture
+from torchcss.stopwatch import Stopwatch
 from torchcss.types import CostFunction, Curvature, LocalModel
 from torchcss.vision.camera import Camera
 
@@ -29,6 +36,17 @@ JOINTS_ONLY = CostChoice(contour=None, stabiliser=None, temporal=None)
 CONTOUR_ONLY = CostChoice(joints=None, stabiliser=None, temporal=None)
 NOTHING = CostChoice(contour=None, joints=None, stabiliser=None, temporal=None)
 EVERYTHING = CostChoice(joints=JointTerm(sigma=2.0))
+FULL = replace(
+    EVERYTHING,
+    edge_energy=EdgeEnergyTerm(),
+    flow=FlowTerm(),
+    temporal_mixture=MixturePrior(),
+    interpenetration=Interpenetration(),
+)
+FULL_NAMES = {
+    *("contour", "edge_energy", "flow", "joints"),
+    *("stabiliser", "temporal", "temporal_mixture", "interpenetration"),
+}
 
 
 def random_states(body: BodyModel, *batch: int, generator: torch.Generator) -> Tensor:
@@ -352,3 +370,127 @@ def test_huge_distances_give_no_nan(dtype: torch.dtype) -> None:
         x = cost.body.rest.clone()
         x[:3] = far
         assert_no_nan(cost, x)
+
+
+def make_full_cost(
+    name: str = "arm8", *, dtype: torch.dtype = torch.float64, own_parents: int | None = None
+) -> TrackingCost:
+    """The same with every term and prior, and what they compare with."""
+    cost = make_cost(name, FULL, dtype=dtype, own_parents=own_parents)
+    generator = torch.Generator().manual_seed(2)
+    body, parent = cost.body, cost.parent
+    assert parent is not None
+    assert cost.edge_field is not None
+    small = torch.randn(1, 2, 4, 5, generator=generator, dtype=torch.float64)
+    flow = 3 * torch.nn.functional.interpolate(small, (HEIGHT, WIDTH), mode="bicubic")[0]
+    interior = InteriorNodes(body)
+    targets = flow_targets(interior, body, parent, cost.camera, flow.to(dtype))
+    mean = random_states(load_body(name), 3, generator=generator).to(dtype)
+    spread = 0.1 + torch.rand(3, body.num_parameters, generator=generator, dtype=torch.float64)
+    previous = GaussianMixture(
+        mean,
+        torch.diag_embed(spread.to(dtype)),
+        torch.tensor([0.0, -1.0, -2.0]).to(dtype).log_softmax(0),
+    )
+    return replace(
+        cost,
+        energy=edge_energy_field(cost.edge_field),
+        interior=interior,
+        targets=targets,
+        pairs=InterpenetrationPairs(body),
+        previous=MixturePrior().density(previous),
+    )
+
+
+FULL_COSTS = {dtype: make_full_cost(dtype=dtype) for dtype in (torch.float32, torch.float64)}
+
+
+@pytest.mark.parametrize("name", ["arm8", "body34"])
+def test_every_term_together(name: str, generator: torch.Generator) -> None:
+    cost = make_full_cost(name, own_parents=5)
+    x = random_states(cost.body, 5, generator=generator)
+    terms, model = cost.terms(x), cost.local_model(x)
+    assert set(terms) == FULL_NAMES
+    torch.testing.assert_close(torch.stack(list(terms.values())).sum(0), model.value)
+    torch.testing.assert_close(cost.value(x), model.value)
+    items = torch.tensor([4, 1])
+    part = LocalModel(*(part[items] for part in model))
+    assert_same(cost.take(items).local_model(x[items]), part, 1e-6)
+
+
+@given(
+    scale=st.sampled_from([0.0, 1.0, 1e3, 1e8, 1e30, math.inf]),
+    shift=st.sampled_from([0.0, -3.5, 5.0, 1e6]),
+    seed=st.integers(0, 2**31),
+    kind=st.sampled_from(["noise", "black", "white", "one line"]),
+    dtype=st.sampled_from([torch.float32, torch.float64]),
+)
+@settings(max_examples=40, deadline=None)
+def test_no_nan_leaves_a_term(
+    scale: float, shift: float, seed: int, kind: str, dtype: torch.dtype
+) -> None:
+    """Bodies at bounds, behind the camera, out of the image; images without any edge."""
+    cost = FULL_COSTS[dtype]
+    generator = torch.Generator().manual_seed(seed)
+    body = cost.body
+    assert cost.edge_field is not None
+    noise = torch.randn(3, body.num_parameters, generator=generator, dtype=torch.float64)
+    wild = (scale * noise).nan_to_num(0.0, math.inf, -math.inf).to(dtype)
+    x = body.bounds.project(wild).clamp(-1e30, 1e30)
+    base = body.base_translation + torch.tensor([0.0, 0.0, shift]).to(dtype)
+    field = {
+        "noise": cost.edge_field,
+        "black": torch.zeros_like(cost.edge_field),
+        "white": torch.full_like(cost.edge_field, 0.7),
+        "one line": cost.edge_field * (torch.arange(WIDTH) == 80),
+    }[kind]
+    cost = replace(
+        cost,
+        body=body.with_base(body.base_rotation, base),
+        edge_field=field,
+        energy=edge_energy_field(field),
+    )
+    for name, value in cost.terms(x).items():
+        assert torch.isfinite(value).all(), name
+    for part in cost.local_model(x):
+        assert torch.isfinite(part).all()
+
+
+def test_screening_is_the_edges_alone(generator: torch.Generator) -> None:
+    """[RR] section 4.2."""
+    cost = make_full_cost()
+    x = random_states(cost.body, 3, generator=generator)
+    screened, whole = cost.screening().terms(x), cost.terms(x)
+    assert set(screened) == {"contour", "edge_energy"}
+    for name, value in screened.items():
+        torch.testing.assert_close(value, whole[name])
+
+
+def test_lengths_belong_to_the_anthropometric_prior(generator: torch.Generator) -> None:
+    """It takes the stabiliser's place there, which would otherwise count them twice."""
+    body = load_body("body34", free_proportions=True)
+    cost = replace(make_cost(choice=NOTHING), body=body, deviation=None, parent=None)
+    both = replace(cost, choice=CostChoice(contour=None, joints=None))
+    x = random_states(body, 4, generator=generator)
+    terms = both.terms(x)
+    assert set(terms) == {"stabiliser", "anthropometric"}
+    moved = x.clone()
+    columns = list(proportion_columns(body).values())
+    moved[:, columns] = body.bounds.project(moved + 0.01)[:, columns]
+    after = both.terms(moved)
+    torch.testing.assert_close(after["stabiliser"], terms["stabiliser"])
+    assert (after["anthropometric"] != terms["anthropometric"]).all()
+    without = replace(both, choice=CostChoice(contour=None, joints=None, anthropometric=None))
+    assert (without.terms(moved)["stabiliser"] != without.terms(x)["stabiliser"]).all()
+
+
+def test_the_stopwatch_knows_every_term(generator: torch.Generator) -> None:
+    stopwatch = Stopwatch()
+    cost = replace(make_full_cost(), stopwatch=stopwatch)
+    x = random_states(cost.body, 3, generator=generator)
+    cost.value(x)
+    assert set(stopwatch.seconds) == {*FULL_NAMES, "pose", "visibility"}
+    before = dict(stopwatch.seconds)
+    cost.local_model(x)
+    assert set(stopwatch.seconds) == {*before, "lift"}
+    assert all(stopwatch.seconds[name] > spent > 0 for name, spent in before.items())

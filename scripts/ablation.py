@@ -1,0 +1,178 @@
+"""Errors with the terms of the cost switched on one by one, as a table and as JSON.
+
+    python scripts/ablation.py --data DIR --out ablation.json
+
+The demo (seeds 0 to 2), and, with `--data`, the clips of DIR/balance_beam_4cam from either camera,
+with keypoints in all frames and in the first frame only. Every row tracks with the terms of the row
+before it and one more, or with one exchanged. A clip with reference is measured as
+`scripts/evaluate_track.py` does; the demo against its own truth.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from evaluate_track import Config as Evaluation
+from evaluate_track import main as evaluate
+
+from torchcss.demo import run_demo
+from torchcss.errors import ConfigurationError, TorchcssError
+from torchcss.io.tracks import prepare_output_folder, write_summary
+from torchcss.pipeline import Settings, track_video
+
+BASE = ("joints", "stabiliser", "temporal")
+EDGES = ("contour", *BASE)
+BOUNDARIES = ("motion_boundaries", *EDGES)
+FLOW = ("flow", *BOUNDARIES)
+BODY = ("interpenetration", *FLOW)
+ROWS = {
+    "joints and priors only": BASE,
+    "+ contour": EDGES,
+    "+ motion boundaries": BOUNDARIES,
+    "+ flow": FLOW,
+    "+ interpenetration": BODY,
+    "+ edge energy": ("edge_energy", *BODY),
+    "+ previous mixture": ("temporal_mixture", *BODY),
+    "contour + flow": ("flow", *EDGES),
+    "contour + interpenetration": ("interpenetration", *EDGES),
+    "edge energy for contour": ("edge_energy", *BASE),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """What is tracked, and with which rows of the table."""
+
+    data: Path | None = None
+    """Folder that holds balance_beam_4cam; without it only the demo runs."""
+    sequences: tuple[str, ...] = ("demo", "cam01:all", "cam03:all", "cam01:first", "cam03:first")
+    """"demo", or a camera of the clip and where keypoints are used."""
+    rows: tuple[str, ...] = tuple(ROWS)
+    """Rows of the table."""
+    seeds: int = 3
+    """Seeds of the demo."""
+    frames: int = 50
+    """Frames of the demo."""
+    clip_frames: int = 100
+    """Frames of the clips."""
+    small: bool = False
+    """Four frames of the demo with few samples, to see that it runs."""
+    out: Path | None = None
+    """JSON file to write."""
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Track, print and write the table; return what is written."""
+    if unknown := sorted(set(config.rows) - set(ROWS)):
+        raise ConfigurationError(f"no rows {unknown}; there are {', '.join(ROWS)}")
+    sequences = config.sequences
+    if config.small or config.data is None:
+        sequences = tuple(name for name in sequences if name == "demo")
+    print(f"{'mean over frames, mm':28}" + "".join(f"{name:>24}" for name in sequences))
+    print(f"{'':28}" + f"{'best   of K  lost  s/fr':>24}" * len(sequences))
+    rows: dict[str, dict[str, Any]] = {}
+    for name in config.rows:
+        print(f"{name:28}", end="", flush=True)
+        rows[name] = {}
+        for sequence in sequences:
+            cell = demo(config, ROWS[name]) if sequence == "demo" else clip(config, sequence, name)
+            rows[name][sequence] = cell
+            print(
+                f"{cell['best_mm']:9.1f}{cell['best_of_modes_mm']:7.1f}"
+                f"{cell['frames_lost']:4d}{cell['seconds_per_frame']:5.1f}",
+                end="",
+                flush=True,
+            )
+        print()
+        report = {
+            "unit": "mm",
+            "direction": "lower is better",
+            "note": "demo: absolute error, its frames lost are not counted; clips: root-aligned",
+            "terms": {name: ROWS[name] for name in rows},
+            "rows": rows,
+        }
+        if config.out is not None:
+            prepare_output_folder(config.out.parent)
+            write_summary(config.out, report)
+    return report
+
+
+def demo(config: Config, terms: tuple[str, ...]) -> dict[str, Any]:
+    """Mean over seeds of the demo's errors."""
+    runs = []
+    for seed in range(1 if config.small else config.seeds):
+        settings = Settings(
+            body="arm8",
+            keypoints_use="first",
+            terms=terms,
+            seed=seed,
+            samples=8 if config.small else None,
+            overlay=False,
+        )
+        with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stderr(io.StringIO()):
+            runs.append(
+                run_demo(
+                    Path(folder), settings=settings, num_frames=4 if config.small else config.frames
+                )
+            )
+    return {
+        "best_mm": float(np.mean([run["mpjpe_mm"] for run in runs])),
+        "best_of_modes_mm": float(np.mean([run["mpjpe_best_of_modes_mm"] for run in runs])),
+        "best_mm_by_seed": [run["mpjpe_mm"] for run in runs],
+        "frames_lost": 0,
+        **_shares(runs[0]),
+    }
+
+
+def clip(config: Config, sequence: str, row: str) -> dict[str, Any]:
+    """Errors on one view of the beam clip."""
+    camera, use = sequence.split(":")
+    assert config.data is not None
+    folder = config.data / "balance_beam_4cam"
+    settings = Settings(terms=ROWS[row], keypoints_use=use, overlay=False)  # type: ignore[arg-type]
+    silent = io.StringIO()
+    with (
+        tempfile.TemporaryDirectory() as out,
+        contextlib.redirect_stderr(silent),
+        contextlib.redirect_stdout(silent),
+    ):
+        summary = track_video(
+            folder / f"{camera}.mp4",
+            camera=folder / "cameras.json",
+            keypoints=folder / f"keypoints2d_{camera}.npz",
+            out=Path(out),
+            settings=settings,
+            stop=config.clip_frames,
+        )
+        errors = evaluate(Evaluation(track=Path(out), reference=folder / "reference3d.npz"))
+    lost = np.asarray(errors["frames_lost"])
+    return {
+        "best_mm": errors["root_aligned_mpjpe_mm"],
+        "best_of_modes_mm": errors["root_aligned_mpjpe_best_of_modes_mm"],
+        "procrustes_mm": errors["pa_mpjpe_mm"],
+        "procrustes_best_of_modes_mm": errors["pa_mpjpe_best_of_modes_mm"],
+        "frames_lost": errors["num_frames_lost"],
+        "first_frame_lost": int(lost[0]) if lost.size else None,
+        **_shares(summary),
+    }
+
+
+def _shares(summary: dict[str, Any]) -> dict[str, Any]:
+    names = ("seconds_per_frame", "share_of_cost_by_term", "share_of_search_time_by_term")
+    return {name: summary[name] for name in names}
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Config, description=__doc__))
+    except TorchcssError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
