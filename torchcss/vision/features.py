@@ -48,6 +48,11 @@ _CUT_SHARE = 0.3
 six videos: at most 0.07 between neighbouring frames and 0.18 at thirty frames' distance, at least
 0.39 across cuts."""
 
+_DISCONTINUITY_DOUBT = 0.5
+"""How far a pixel whose neighbours move otherwise is in doubt. A small, fast limb is all boundary:
+at 1, half of the hand's pixels on the demo's sequence count as outliers although their flow is
+right to a pixel."""
+
 _FLAT_RANGE = 1.0 / 255.0
 """Range of grey levels up to which a frame is of one colour."""
 
@@ -198,7 +203,8 @@ class FeatureExtractor(nn.Module):
             # Single precision is far finer than the flow's error, and twice as fast.
             flow = robust_flow(previous.float(), grey.float(), choice)
             if float(flow.data_outlier.mean()) < _CUT_SHARE:
-                held = (1.0 - flow.data_outlier) * (1.0 - flow.smoothness_outlier)
+                doubt = _DISCONTINUITY_DOUBT * flow.smoothness_outlier
+                held = (1.0 - flow.data_outlier) * (1.0 - doubt)
                 return features._replace(
                     flow=flow.flow.to(grey),
                     flow_outlier=(1.0 - held).to(grey),
