@@ -1,29 +1,47 @@
-"""What the camera sees of a posed body: occluding contours and self-occlusion (section 3.1 [IJRR]).
+"""What the camera sees of a posed body: facing, occluding contours, self-occlusion (3.1 [IJRR]).
 
-The occluding contour of a part is where its normals are perpendicular to the line of sight. On the
-part's mesh it crosses every ring (a closed curve around the part) twice, once each way, and every
-meridian (pole to pole) once; the crossings are found by linear interpolation of `n . (c - p)`
-between neighbouring nodes and are the contour nodes, a fixed number per part. Rings serve limbs
-seen from the side, meridians limbs that point at the camera.
+**Back-facing.** A surface node p faces a camera at c where `n . (c - p) > 0`, see `front_facing`.
 
-A node is occluded where another part crosses its line of sight in front of it. Parts are taken as
-tapered ellipsoids here; the transition is a ramp some millimetres wide, so that the cost has no
-jump where a limb passes in front of another. A node whose outside touches a neighbouring part (the
-end of the upper arm inside the forearm) lies on no image contour and is left out.
+**Occluding contours.** The occluding contour of a part is where its normals are perpendicular to
+the line of sight. On the part's mesh it crosses every ring (a closed curve around the part) and
+every meridian (pole to pole) at most twice, once from back to front and once from front to back;
+the crossings are found by linear interpolation of `n . (c - p)` between neighbouring nodes and are
+the contour nodes, a fixed number per part. Rings serve limbs seen from the side, meridians limbs
+that point at the camera. A crossing fades in where a curve begins to turn through the line of
+sight, so that the cost has no jump where a contour is born. (A curve of a strongly bent part may
+cross more often; the first crossing of either kind is taken.)
 
-Make a `ContourPredictor` for a body once, and call it with poses.
+**Self-occlusion.** A node is hidden where the stretch of its line of sight from the camera to the
+node enters another part. With R the part's radial function (`R^2 = F^e1`, F the inside-outside
+function of Barr with taper and bend undone; 1 on the surface, and twice as large twice as far
+out), the depth of the entry is the signed distance, to first order,
+
+    gap = min over the stretch of (R - 1) / |grad R|
+
+which is exact in sign for the true superquadric. A node's visibility is a ramp in the gap, some
+millimetres wide and one half where the line of sight touches the nearest part.
+
+A part does not hide itself but by facing away, which is exact unless it is bent.
+
+A contour node lies on no image contour where a neighbouring part is just behind it (the end of the
+upper arm over the forearm). This is the same test, a little outside the contour and with a stretch
+that goes on behind the node, over neighbouring parts only.
+
+Make a `ContourPredictor` for a body once, and call it with poses; `visible_nodes` serves any other
+nodes.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchcss.body.model import BodyModel, BodyPose
-from torchcss.body.surface import surface_points
+from torchcss.body.surface import SurfaceSample, surface_points
 
 _TINY = 1e-12
 _FAR = 1e6
@@ -31,6 +49,27 @@ _FAR = 1e6
 
 _GRAZING = 0.15
 """Sine of the angle by which a curve must turn through the line of sight to count fully."""
+
+_BEHIND = 3.5
+"""How far behind a contour a neighbouring part suppresses it, in mean radii of that part."""
+
+_PAIRS_AT_ONCE = 2**18
+"""Pairs of node and part tested together on a CPU: what keeps their temporaries in its caches."""
+
+_STEPS, _SAMPLED_STEPS, _SAMPLES = 3, 4, 12
+"""Steps to the nearest point of a plain part and of any other, and samples before the latter."""
+
+_MICRO = 1e-10
+"""Square of a step too short to tell the curvature from, square metres."""
+
+_LEAST_POWER, _MOST_SQUARE = 1e-30, 64.0
+"""Bounds on powers and on squared coordinates, so that single precision holds all products."""
+
+_ROUNDING = 1e-6
+"""Relative error of a squared distance in single precision, with a margin."""
+
+_LEAST_BEND = 1e-6
+"""Curvature, per metre, below which the axis counts as straight."""
 
 
 class ContourNodes(NamedTuple):
@@ -40,7 +79,7 @@ class ContourNodes(NamedTuple):
         points: Positions, metres.
         normals: Unit outward normals; they are also the contour's normals in the image.
         exists: 0 where the ring or meridian has no contour (wholly back-facing or front-facing) or
-            runs inside a neighbouring part; 1 on a clear contour, between where one fades.
+            runs in front of a neighbouring part; 1 on a clear contour, between where one fades.
         visible: 1 where nothing is in front, 0 where another part is, between on the ramp.
     """
 
@@ -57,21 +96,21 @@ class ContourPredictor(nn.Module):
         body: The body whose parts are predicted.
         rings: Closed curves per part, each with two nodes; by default 7, and more for a body of few
             parts, so that its contour is as finely sampled as a large one's.
-        meridians: Pole-to-pole curves per part, each with one node; by default nearly as many.
+        meridians: Pole-to-pole curves per part, each with two nodes, of which one exists unless the
+            part is seen from the side; by default about half as many.
         ramp: Width of the transition between visible and occluded, metres.
         clearance: How far outside the surface a node must be free of neighbouring parts, metres.
 
     Attributes:
+        num_rings: Rings per part; a part's nodes are those of its rings, then of its meridians.
         node_part: The part of each node.
         node_link: The link of each node.
     """
 
     node_part: Tensor
     node_link: Tensor
-    ring_points: Tensor
-    ring_normals: Tensor
-    meridian_points: Tensor
-    meridian_normals: Tensor
+    rings: Tensor
+    meridians: Tensor
     other: Tensor
     touching: Tensor
 
@@ -85,45 +124,39 @@ class ContourPredictor(nn.Module):
         rings: int | None = None,
         meridians: int | None = None,
         ramp: float = 0.010,
-        clearance: float = 0.010,
+        clearance: float = 0.005,
     ) -> None:
         super().__init__()
         self.ramp, self.clearance = ramp, clearance
-        rings = rings or max(7, min(18, 126 // max(body.num_parts, 1)))
-        meridians = meridians or rings - 1
+        self.num_rings = rings = rings or max(7, min(18, 126 // max(body.num_parts, 1)))
+        meridians = meridians or (rings + 1) // 2
         real, device = torch.float64, body.tie.device
-        shape = body.part_shape.to(real)[:, None, None, :]
         heights = (torch.arange(rings, dtype=real, device=device) + 0.5) * (1.9 / rings) - 0.95
         around = torch.arange(self._RING_STEPS + 1, dtype=real, device=device)
         eta, omega = torch.meshgrid(
             heights.asin(), around * (2 * torch.pi / self._RING_STEPS) - torch.pi, indexing="ij"
         )
-        full = (body.num_parts, *eta.shape)
-        ring = surface_points(shape, eta.expand(full), omega.expand(full))
+        ring_curves = _curves(body, eta, omega)
         pole = torch.linspace(-1, 1, self._MERIDIAN_STEPS + 1, dtype=real, device=device)
         sides = torch.arange(meridians, dtype=real, device=device)
         omega, eta = torch.meshgrid(
             sides * (2 * torch.pi / meridians) + 0.1, pole * torch.pi / 2, indexing="ij"
         )
-        full = (body.num_parts, *eta.shape)
-        meridian = surface_points(shape, eta.expand(full), omega.expand(full))
-        per_part = 2 * rings + meridians
-        parts = torch.arange(body.num_parts, device=device)
-        touching = torch.eye(body.num_parts, dtype=torch.bool, device=device)
+        meridian_curves = _curves(body, eta, omega)
+        per_part = 2 * (rings + meridians)
+        node_part = torch.arange(body.num_parts, device=device).repeat_interleave(per_part)
+        own = torch.eye(body.num_parts, device=device)
+        touching = torch.zeros_like(own)
         for first, second in body.neighbours:
             i, j = body.part_names.index(first), body.part_names.index(second)
-            touching[i, j] = touching[j, i] = True
-        touching &= ~torch.eye(body.num_parts, dtype=torch.bool, device=device)
-        node_part = parts.repeat_interleave(per_part)
+            touching[i, j] = touching[j, i] = 1.0
         for name, value in (
             ("node_part", node_part),
             ("node_link", body.part_link.repeat_interleave(per_part)),
-            ("ring_points", ring.points.to(body.dtype)),
-            ("ring_normals", ring.normals.to(body.dtype)),
-            ("meridian_points", meridian.points.to(body.dtype)),
-            ("meridian_normals", meridian.normals.to(body.dtype)),
-            ("other", 1 - torch.eye(body.num_parts, device=device)[node_part]),
-            ("touching", touching[node_part].float()),
+            ("rings", ring_curves),
+            ("meridians", meridian_curves),
+            ("other", (1 - own)[node_part]),
+            ("touching", (touching * (1 - own))[node_part]),
         ):
             self.register_buffer(name, value, persistent=False)
 
@@ -148,78 +181,48 @@ class ContourPredictor(nn.Module):
         rotation, centre = body.part_poses(pose)
         centre_world = centre_world.to(centre)
         eye = ((centre_world - centre)[..., None, :] @ rotation)[..., 0, :]
-        ring = _ring_crossings(self.ring_points, self.ring_normals, eye)
-        meridian = _meridian_crossings(self.meridian_points, self.meridian_normals, eye)
+        found = (
+            _crossings(self.rings, eye, closed=True),
+            _crossings(self.meridians, eye, closed=False),
+        )
         points, normals, exists = (
-            torch.cat(pair, dim=eye.dim() - 1) for pair in zip(ring, meridian, strict=True)
+            torch.cat(pair, dim=eye.dim() - 1) for pair in zip(*found, strict=True)
         )
         normals = normals / normals.norm(dim=-1, keepdim=True).clamp(min=1e-6)
         turn = rotation.transpose(-1, -2)
         points = (points @ turn + centre[..., None, :]).flatten(-3, -2)
         normals = (normals @ turn).flatten(-3, -2)
-        exists = exists.flatten(-2)
-        rays = points + self.clearance * normals - centre_world
         visible, free = line_of_sight(
-            body, rotation, eye, rays, other=self.other, touching=self.touching, ramp=self.ramp
+            body,
+            rotation,
+            eye,
+            points - centre_world,
+            other=self.other,
+            touching=self.touching,
+            outward=self.clearance * normals,
+            ramp=self.ramp,
         )
-        return ContourNodes(points, normals, exists * free, visible)
+        return ContourNodes(points, normals, exists.flatten(-2) * free, visible)
 
 
-def line_of_sight(
-    body: BodyModel,
-    rotation: Float[Tensor, "*batch parts 3 3"],
-    eye: Float[Tensor, "*batch parts 3"],
-    rays: Float[Tensor, "*batch p 3"],
-    *,
-    other: Float[Tensor, "p parts"],
-    touching: Float[Tensor, "p parts"] | None = None,
-    ramp: float = 0.010,
-) -> tuple[Float[Tensor, "*batch p"], Float[Tensor, "*batch p"]]:
-    """Visibility of points past all parts, and whether neighbouring parts leave them free.
+def front_facing(
+    points: Float[Tensor, "*batch p 3"],
+    normals: Float[Tensor, "*batch p 3"],
+    centre_world: Float[Tensor, "3"],
+) -> Float[Tensor, "*batch p"]:
+    """Whether surface nodes face the camera: 0 where they face away, 1 where clearly towards it.
+
+    The ramp between starts where the line of sight grazes the surface.
 
     Args:
-        body: The body.
-        rotation: World orientations of the parts.
-        eye: The camera's centre in the frames of the parts, metres.
-        rays: From the camera's centre to the points, world axes, metres.
-        other: 0 where a part cannot hide a point (its own), else 1.
-        touching: 1 where a part is a neighbour of the point's own; None: nothing is.
-        ramp: Width of the transition between visible and hidden, metres.
-
-    Returns:
-        1 where nothing is in front of the point, 0 where a part is; and 1 where no neighbouring
-        part is close behind.
+        points: Nodes, world frame, metres.
+        normals: Their unit outward normals.
+        centre_world: The camera's centre, metres.
     """
-    # All pairs of node and part at once, in the part's frame and in units of its semi-axes.
-    # Single precision: the closest approach is found as a vector, without cancellation.
-    shape = body.part_shape.float()
-    scale = 1 / shape[:, :3]
-    axes = (rotation.float() * scale[:, None, :]).movedim(-3, -1)
-    rays, eye_single = rays.float().clamp(-_FAR, _FAR), eye.float().clamp(-_FAR, _FAR)
-    rx, ry, rz = (rays @ axes[..., i, :] for i in range(3))
-    ox, oy, oz = (eye_single * scale)[..., None, :, :].unbind(-1)
-    # Height of closest approach decides the taper of the cross-section.
-    nearest = -(ox * rx + oy * ry + oz * rz) / (rx * rx + ry * ry + rz * rz).clamp(min=_TINY)
-    height = (oz + nearest * rz).clamp(-1, 1)
-    fx, fy = 1 / (1 + shape[:, 5] * height), 1 / (1 + shape[:, 6] * height)
-    ox, oy, rx, ry = ox * fx, oy * fy, rx * fx, ry * fy
-    square = (rx * rx + ry * ry + rz * rz).clamp(min=_TINY)
-    nearest = -(ox * rx + oy * ry + oz * rz) / square
-    px, py, pz = ox + nearest * rx, oy + nearest * ry, oz + nearest * rz
-    depth = 1 - (px * px + py * py + pz * pz)
-    thickness = shape[:, :2].mean(-1)
-    # How deep the ray passes inside, and how far in front of the node it enters, metres; parts
-    # behind the camera hide nothing.
-    crossed = (depth * (0.5 / ramp * thickness)).clamp(0, 1) * (nearest > 0)
-    entry = nearest - (depth.clamp(min=0) / square).sqrt()
-    front = (1 - entry) * eye_single.norm(dim=-1)[..., None, :]
-    covered = crossed * (front / ramp).clamp(0, 1) * other
-    visible = (1 - covered).prod(-1).to(eye)
-    if touching is None:
-        return visible, torch.ones_like(visible)
-    # A neighbour just behind the node hides the step in depth that makes an image edge.
-    close = crossed * (4 + front / thickness).clamp(0, 1) * touching
-    return visible, (1 - close).prod(-1).to(eye)
+    towards = centre_world.to(points) - points
+    distance = towards.norm(dim=-1)
+    along = (normals * towards).sum(-1)
+    return (along / (_GRAZING * torch.where(distance > 0, distance, 1.0))).clamp(0, 1)
 
 
 def visible_nodes(
@@ -230,6 +233,8 @@ def visible_nodes(
     node_part: Int[Tensor, " p"],
 ) -> Float[Tensor, "*batch p"]:
     """Visibility of surface nodes past the other parts: 1 where seen, 0 where hidden.
+
+    A node that faces away is hidden by its own part besides, see `front_facing`.
 
     Args:
         body: The body.
@@ -245,75 +250,414 @@ def visible_nodes(
     return line_of_sight(body, rotation, eye, points - centre_world, other=other)[0]
 
 
-def _ring_crossings(
-    points: Float[Tensor, "parts rings steps 3"],
-    normals: Float[Tensor, "parts rings steps 3"],
+def line_of_sight(
+    body: BodyModel,
+    rotation: Float[Tensor, "*batch parts 3 3"],
     eye: Float[Tensor, "*batch parts 3"],
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Both crossings of every ring: `[*batch parts 2*rings ...]`."""
-    parts, rings, steps, _ = points.shape
-    facing = _facing(points, normals, eye)
-    clear = _clearness(facing, eye)
-    before, after = facing[..., :-1], facing[..., 1:]
-    found = []
-    index = torch.arange(parts * rings, device=points.device).reshape(parts, rings)
-    for crossing in ((before < 0) & (after >= 0), (before >= 0) & (after < 0)):
-        exists, step = crossing.max(dim=-1)
-        found.append(
-            (*_interpolate(points, normals, facing, index * steps + step, step), exists * clear)
-        )
-    return tuple(torch.cat(pair, dim=eye.dim() - 1) for pair in zip(*found, strict=True))  # type: ignore[return-value]
+    rays: Float[Tensor, "*batch p 3"],
+    *,
+    other: Float[Tensor, "p parts"],
+    touching: Float[Tensor, "p parts"] | None = None,
+    outward: Float[Tensor, "*batch p 3"] | None = None,
+    ramp: float = 0.010,
+) -> tuple[Float[Tensor, "*batch p"], Float[Tensor, "*batch p"]]:
+    """Visibility of points past all parts, and whether neighbouring parts leave them free.
 
+    Single precision inside, whatever the type of the inputs.
 
-def _meridian_crossings(
-    points: Float[Tensor, "parts meridians steps 3"],
-    normals: Float[Tensor, "parts meridians steps 3"],
-    eye: Float[Tensor, "*batch parts 3"],
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The crossing of every meridian: `[*batch parts meridians ...]`."""
-    parts, meridians, steps, _ = points.shape
-    facing = _facing(points, normals, eye)
-    crossing = (facing[..., :-1] < 0) != (facing[..., 1:] < 0)
-    exists, step = crossing.max(dim=-1)
-    index = torch.arange(parts * meridians, device=points.device).reshape(parts, meridians)
-    # Towards which side the curve turns on either side of the crossing: this also fades a contour
-    # that leaves over a pole, before another crossing takes its place.
-    later = torch.arange(steps, device=points.device) > step[..., None]
-    turned = torch.where(facing.gather(-1, step[..., None]) < 0, facing, -facing)
-    exists = exists * _clearness(torch.where(later, turned.clamp(min=0), turned.clamp(max=0)), eye)
-    return (*_interpolate(points, normals, facing, index * steps + step, step), exists)
+    Args:
+        body: The body.
+        rotation: World orientations of the parts.
+        eye: The camera's centre in the frames of the parts, metres.
+        rays: From the camera's centre to the points, world axes, metres.
+        other: 0 where a part cannot hide a point (its own), else 1.
+        touching: 1 where a part is a neighbour of the point's own; None: nothing is.
+        outward: How far beside the points neighbouring parts are looked for, metres.
+        ramp: Width of the transition between visible and hidden, metres.
 
-
-def _clearness(facing: Tensor, eye: Tensor) -> Float[Tensor, "*batch parts c"]:
-    """1 where a curve turns well to both sides of the line of sight; 0 where it only grazes it.
-
-    A contour is born where a curve touches the line of sight, with both crossings in one place.
+    Returns:
+        1 where nothing is in front of the point, 0 where a part is; and 1 where no neighbouring
+        part is in front or close behind.
     """
-    distance = eye.norm(dim=-1)[..., None]
-    turned = torch.minimum(facing.amax(-1), -facing.amin(-1))
-    return (turned / (_GRAZING * distance)).clamp(0, 1)
+    others, behind = other > 0, torch.zeros_like(other, dtype=torch.float32)
+    num_nodes = rays.shape[-2]
+    parts = _tabulate(body.part_shape.float(), ramp)
+    if touching is not None:
+        beside = rays if outward is None else rays + outward
+        rays, others = torch.cat([rays, beside], dim=-2), torch.cat([others, touching > 0])
+        behind = torch.cat([behind, (_BEHIND * parts.thickness).expand_as(behind)])
+    passed = (0.5 + _sight_gaps(parts, rotation, eye, rays, others, behind) / ramp).clamp(0, 1)
+    visible, free = passed[..., :num_nodes].to(eye), passed[..., num_nodes:].to(eye)
+    return visible, torch.ones_like(visible) if touching is None else free
 
 
-def _facing(points: Tensor, normals: Tensor, eye: Tensor) -> Float[Tensor, "*batch parts c steps"]:
-    """`n . (c - p)` at every node; positive where it faces the camera."""
-    flat = normals.flatten(1, 2)
-    towards = (eye[..., None, :] @ flat.transpose(-1, -2))[..., 0, :]
-    offset = (flat * points.flatten(1, 2)).sum(-1)
-    return (towards - offset).unflatten(-1, points.shape[1:3])
+class _Shape(NamedTuple):
+    """Numbers of a part, as `_radial_square` takes them; one per line of sight, or a table's row.
+
+    Attributes:
+        ia, ib, ic: Reciprocal semi-axes.
+        around: Exponent `1/e2 - 1`.
+        section: Exponent `e2/e1 - 1`.
+        along: Exponent `1/e1 - 1`.
+        whole: Exponent `e1 - 1`.
+        taper_x, taper_y: As in `torchcss.body.surface`.
+        bend: Curvature of the axis, per metre.
+        c, s: Cosine and sine of the direction of the bend.
+    """
+
+    ia: Tensor
+    ib: Tensor
+    ic: Tensor
+    around: Tensor
+    section: Tensor
+    along: Tensor
+    whole: Tensor
+    taper_x: Tensor
+    taper_y: Tensor
+    bend: Tensor
+    c: Tensor
+    s: Tensor
 
 
-def _interpolate(
-    points: Tensor,
-    normals: Tensor,
-    facing: Tensor,
-    flat: Int[Tensor, "*batch parts c"],
-    step: Tensor,
+class _Parts(NamedTuple):
+    """Shapes of all parts.
+
+    Attributes:
+        table: The rows of `_Shape`, one column per part.
+        radius: Of the sphere outside which a part hides nothing, metres.
+        thickness: Mean radius of the middle cross-section, metres.
+        plain: Whether a part is round, straight and little tapered: a line of sight then has one
+            nearest point, which a few steps find.
+        bent: Whether any part is bent.
+    """
+
+    table: Float[Tensor, "c parts"]
+    radius: Float[Tensor, " parts"]
+    thickness: Float[Tensor, " parts"]
+    plain: Bool[Tensor, " parts"]
+    bent: bool
+
+
+def _tabulate(shape: Float[Tensor, "parts 9"], margin: float) -> _Parts:
+    axes, taper, (bend, direction) = shape[:, :3], shape[:, 5:7], shape[:, 7:].unbind(-1)
+    # From all but a box to a diamond; powers beyond these leave single precision.
+    exponents = shape[:, 3:5].clamp(0.1, 2.0)
+    e1, e2 = exponents.unbind(-1)
+    table = [*(1 / axes).unbind(-1), 1 / e2 - 1, e2 / e1 - 1, 1 / e1 - 1, e1 - 1]
+    table += [*taper.unbind(-1), bend, direction.cos(), direction.sin()]
+    widest = axes[:, :2] * (1 + taper.abs())
+    section = _farthest(widest[:, 0], widest[:, 1], e2)
+    is_bent = bend.abs() >= _LEAST_BEND
+    is_round = ((exponents > 0.65) & (exponents < 1.05)).all(-1)
+    # A bent axis ends no farther out than a straight one, but the section may stand off its end.
+    straight = _farthest(section, axes[:, 2], e1)
+    radius = torch.where(is_bent, section + axes[:, 2], straight) + margin
+    plain = is_round & ~is_bent & (taper.abs() < 0.35).all(-1)
+    return _Parts(torch.stack(table), radius, axes[:, :2].mean(-1), plain, bool(is_bent.any()))
+
+
+def _farthest(a: Tensor, b: Tensor, exponent: Tensor) -> Tensor:
+    """Largest distance of a superellipse with semi-axes a and b from its centre."""
+    power = 2 / (1 - exponent.clamp(max=0.98))
+    most, least = torch.maximum(a, b), torch.minimum(a, b)
+    return most * (1 + (least / most) ** power) ** (1 / power)
+
+
+def _sight_gaps(
+    parts: _Parts,
+    rotation: Float[Tensor, "*batch parts 3 3"],
+    eye: Float[Tensor, "*batch parts 3"],
+    rays: Float[Tensor, "*batch p 3"],
+    others: Bool[Tensor, "p parts"],
+    behind: Float[Tensor, "p parts"],
+) -> Float[Tensor, "*batch p"]:
+    """Signed distance of each line of sight to the nearest of the others, metres; inf if far off.
+
+    A line counts from the camera to `behind` the ray's end.
+    """
+    (nodes, num_parts), batch = others.shape, rays.shape[:-1]
+    if others.numel() == 0:
+        return eye.new_full(batch, torch.inf)
+    rotation = rotation.float().reshape(-1, num_parts, 3, 3)
+    eye = eye.float().clamp(-_FAR, _FAR).reshape(-1, num_parts, 3)
+    centre = -(rotation @ eye[..., None])[..., 0]
+    # World axes in the part's frame, one after the other, then the camera's centre.
+    frames = torch.cat([rotation.flatten(-2), eye], dim=-1)
+    rays = rays.float().clamp(-_FAR, _FAR).reshape(-1, nodes, 3)
+    gap = torch.full_like(rays[..., 0], torch.inf)
+    at_once = _PAIRS_AT_ONCE if rays.device.type == "cpu" else 2**6 * _PAIRS_AT_ONCE
+    poses = max(1, at_once // others.numel())
+    for plain in (True, False):
+        candidates = others & (parts.plain == plain)
+        if not bool(candidates.any()):
+            continue
+        reach = torch.where(candidates, parts.radius + behind, -torch.inf)
+        for first in range(0, len(rays), poses):
+            chunk = slice(first, first + poses)
+            near = _near_pairs(parts, centre[chunk], rays[chunk], reach)
+            found = _least_gap(parts, frames[chunk], rays[chunk], near, behind, plain=plain)
+            gap[chunk] = torch.minimum(gap[chunk], found)
+    return gap.reshape(batch)
+
+
+def _near_pairs(
+    parts: _Parts,
+    centre: Float[Tensor, "b parts 3"],
+    rays: Float[Tensor, "b p 3"],
+    reach: Float[Tensor, "p parts"],
+) -> Int[Tensor, " m"]:
+    """Flat index `[b p parts]` of the rays that meet a part's sphere before their end."""
+    length = rays.norm(dim=-1, keepdim=True)
+    depth = (rays / length.clamp(min=_TINY)) @ centre.transpose(-1, -2)
+    # Beyond the length of a tangent to the sphere; any ray where the camera is inside it.
+    tangent = (1 - _ROUNDING) * centre.square().sum(-1) - parts.radius.square()
+    tangent = torch.where(tangent > 0, tangent.clamp(min=0).sqrt(), -torch.inf)
+    near = (depth > tangent[:, None, :]) & (depth < length + reach)
+    return near.flatten().nonzero()[:, 0]
+
+
+def _least_gap(
+    parts: _Parts,
+    frames: Float[Tensor, "b parts 12"],
+    rays: Float[Tensor, "b p 3"],
+    near: Int[Tensor, " m"],
+    behind: Float[Tensor, "p parts"],
+    *,
+    plain: bool,
+) -> Float[Tensor, "b p"]:
+    """Signed distance of each line of sight to the nearest of the parts paired with it, metres."""
+    nodes, num_parts = behind.shape
+    ray = near // num_parts
+    part = near - ray * num_parts
+    pose = ray // nodes
+    length = rays.norm(dim=-1)
+    u, v, w = (rays / length.clamp(min=_TINY)[..., None]).flatten(0, 1).T.index_select(1, ray)
+    frame = frames.flatten(0, 1).T.index_select(1, pose * num_parts + part)
+    ux, uy, uz, vx, vy, vz, wx, wy, wz, ox, oy, oz = frame.unbind(0)
+    x, y, z = (u * a + v * b + w * c for a, b, c in ((ux, vx, wx), (uy, vy, wy), (uz, vz, wz)))
+    # Measured from the foot of the perpendicular from the part's centre, for precision.
+    start = ox * x + oy * y + oz * z
+    foot = (ox - start * x, oy - start * y, oz - start * z)
+    half = parts.radius.square()[part] - sum(a.square() for a in foot)
+    half = half.clamp(min=0).sqrt()
+    begin = torch.maximum(start, -half)
+    stop = start + length.flatten()[ray] + behind.flatten()[near - pose * behind.numel()]
+    end = torch.minimum(stop, half)
+    gap = _gap(
+        _Shape._make(parts.table.index_select(1, part).unbind(0)),
+        foot,
+        (x, y, z),
+        begin,
+        torch.maximum(begin, end),
+        plain=plain,
+        bent=parts.bent and not plain,
+    )
+    gap = torch.where(begin > end, torch.inf, gap)  # the part is behind the node or the camera
+    least = torch.full_like(length, torch.inf)
+    return least.flatten().scatter_reduce(0, ray, gap, "amin").view_as(length)
+
+
+_Triple = tuple[Tensor, Tensor, Tensor]
+
+
+def _gap(
+    shape: _Shape,
+    foot: _Triple,
+    along: _Triple,
+    begin: Float[Tensor, " m"],
+    end: Float[Tensor, " m"],
+    *,
+    plain: bool,
+    bent: bool,
+) -> Float[Tensor, " m"]:
+    """Signed distance between a stretch of a line and a part, to first order, metres.
+
+    Args:
+        shape: The part of each line.
+        foot: A point of the line in the part's frame, metres.
+        along: Its unit direction.
+        begin: Where the stretch begins, metres from the foot.
+        end: Where it ends.
+        plain: Whether the parts are, see `_Parts`.
+        bent: Whether any of the parts is bent.
+    """
+
+    def evaluate(s: Tensor) -> tuple[Tensor, _Triple]:
+        x, y, z = (a + s * b for a, b in zip(foot, along, strict=True))
+        return _radial_square(shape, x, y, z, bent=bent)
+
+    def slope(s: Tensor) -> Tensor:
+        _, (gx, gy, gz) = evaluate(s)
+        return gx * along[0] + gy * along[1] + gz * along[2]
+
+    if plain:
+        s, curvature = _ellipsoid_minimum(shape, foot, along, begin, end)
+    else:
+        s, curvature, begin, end = _sampled_minima(slope, begin, end)
+    last, before = s, slope(s)
+    s = torch.minimum(torch.maximum(s - before / curvature, begin), end)
+    for _ in range(1, _STEPS if plain else _SAMPLED_STEPS):
+        # Secant; after a step too short for one, the curvature assumed at first.
+        now, moved = slope(s), s - last
+        secant = ((now - before) * moved + _MICRO * curvature) / (moved.square() + _MICRO)
+        secant = torch.minimum(torch.maximum(secant, 0.3 * curvature), 10 * curvature)
+        last, before = s, now
+        s = torch.minimum(torch.maximum(s - now / secant, begin), end)
+    square, (gx, gy, gz) = evaluate(s)
+    radial = square.sqrt()
+    # grad R = grad(R^2) / 2 R
+    steepness = (gx.square() + gy.square() + gz.square()).sqrt().clamp(min=_TINY)
+    gap = (radial - 1) * radial / steepness
+    return gap if plain else gap.amin(0)
+
+
+def _ellipsoid_minimum(
+    shape: _Shape, foot: _Triple, along: _Triple, begin: Tensor, end: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Point and normal where `facing` changes sign between `step` and the next node."""
-    here = facing.gather(-1, step[..., None])[..., 0]
-    there = facing.gather(-1, step[..., None] + 1)[..., 0]
+    """Where a stretch of line is nearest to the tapered ellipsoid, and the curvature of R^2/2."""
+    curvature = s = torch.zeros_like(begin)
+    for _ in range(2):  # with the taper at the foot, then with that at the nearest point
+        height = ((foot[2] + s * along[2]) * shape.ic).clamp(-1, 1)
+        ix = shape.ia / (1 + shape.taper_x * height)
+        iy = shape.ib / (1 + shape.taper_y * height)
+        x, y, z = along[0] * ix, along[1] * iy, along[2] * shape.ic
+        curvature = (x * x + y * y + z * z).clamp(min=_TINY)
+        s = -(foot[0] * ix * x + foot[1] * iy * y + foot[2] * shape.ic * z) / curvature
+        s = torch.minimum(torch.maximum(s, begin), end)
+    return s, curvature
+
+
+def _sampled_minima(
+    slope: Callable[[Tensor], Tensor], begin: Tensor, end: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The first and the last minimum on a stretch: guess, curvature and bounds, each `[2 m]`.
+
+    There are no others: a line meets a bent part at most twice.
+    """
+    s = torch.lerp(begin, end, torch.linspace(0, 1, _SAMPLES, device=end.device)[:, None])
+    rise = slope(s)
+    # A minimum is where a fall meets a climb, or at an end. It lies between samples k - 1 and k.
+    falls, anything = rise < 0, torch.ones_like(rise[:1], dtype=torch.bool)
+    minimum = torch.cat([anything, falls]) & torch.cat([~falls, anything])
+    number = torch.arange(_SAMPLES + 1, device=end.device)[:, None]
+    first = _SAMPLES - (minimum * number.flip(0)).amax(0)
+    k = torch.stack([first, (minimum * number).amax(0)])
+    left, right = (k - 1).clamp(min=0), k.clamp(max=_SAMPLES - 1)
+    lower, upper = s.gather(0, left), s.gather(0, right)
+    fall, climb = -rise.gather(0, left).clamp(max=0), rise.gather(0, right).clamp(min=0)
+    change, width = (fall + climb).clamp(min=_TINY), upper - lower
+    return lower + width * fall / change, change / width.clamp(min=_TINY), lower, upper
+
+
+def _radial_square(
+    shape: _Shape, x: Tensor, y: Tensor, z: Tensor, *, bent: bool
+) -> tuple[Tensor, _Triple]:
+    """`R^2` at points of the part's frame, and half its gradient there.
+
+    With u, v, w the coordinates of the straightened point in units of the semi-axes,
+    `F = (|u|^(2/e2) + |v|^(2/e2))^(e2/e1) + |w|^(2/e1)` and `R^2 = F^e1`.
+    """
+    cosine = sine = stretch = x
+    if bent:
+        x, y, z, cosine, sine, stretch = _unbend(shape, x, y, z)
+    w = z * shape.ic
+    height = w.clamp(-1, 1)  # beyond the ends the taper is held
+    fx = (1 + shape.taper_x * height).clamp(min=1e-3)
+    fy = (1 + shape.taper_y * height).clamp(min=1e-3)
+    ix, iy = shape.ia / fx, shape.ib / fy
+    u, v = x * ix, y * iy
+    uu, vv, ww = (a.square().clamp(_TINY, _MOST_SQUARE) for a in (u, v, w))
+    # Weights of u, v and w in the gradient of F, but for the factor 2 / e1.
+    pu, pv, pw = uu**shape.around, vv**shape.around, ww**shape.along
+    of_u, of_v = pu * uu, pv * vv
+    section = (of_u + of_v).clamp(min=_LEAST_POWER)
+    outer = section**shape.section
+    total = (outer * section + pw * ww).clamp(min=_LEAST_POWER)
+    scale = total**shape.whole
+    outer = outer * scale
+    gx, gy = outer * pu * u * ix, outer * pv * v * iy
+    narrowing = (of_u * shape.taper_x / fx + of_v * shape.taper_y / fy) * (w == height)
+    gz = (scale * pw * w - outer * narrowing) * shape.ic
+    if bent:
+        along, across = shape.c * gx + shape.s * gy, shape.c * gy - shape.s * gx
+        gz = gz / stretch
+        along, gz = cosine * along + sine * gz, cosine * gz - sine * along
+        gx, gy = shape.c * along - shape.s * across, shape.s * along + shape.c * across
+    return total * scale, (gx, gy, gz)
+
+
+def _unbend(
+    shape: _Shape, x: Tensor, y: Tensor, z: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Straightened point, cosine and sine of the axis' turn there, and the stretch along it."""
+    towards, across = shape.c * x + shape.s * y, shape.c * y - shape.s * x
+    # In units of the radius of the bend, seen from its centre.
+    cosine, sine = 1 - shape.bend * towards, shape.bend * z
+    stretch = torch.hypot(cosine, sine).clamp(min=1e-3)
+    # (1 - stretch) / bend, without cancellation where the bend is slight.
+    towards = (2 * towards - shape.bend * (towards.square() + z.square())) / (1 + stretch)
+    curved = shape.bend.abs() >= _LEAST_BEND
+    angle = torch.atan2(sine, cosine)
+    z = torch.where(curved, angle / torch.where(curved, shape.bend, 1.0), z)
+    x, y = shape.c * towards - shape.s * across, shape.s * towards + shape.c * across
+    return x, y, z, cosine / stretch, sine / stretch, stretch
+
+
+def _curves(
+    body: BodyModel, eta: Float[Tensor, "c k"], omega: Float[Tensor, "c k"]
+) -> Float[Tensor, "parts c k 9"]:
+    """Nodes of curves on all parts: point, normal, and how far the next step's middle bulges."""
+    shape = body.part_shape.to(eta)[:, None, None, :]
+
+    def sample(eta: Tensor, omega: Tensor) -> SurfaceSample:
+        full = (body.num_parts, *eta.shape)
+        return surface_points(shape, eta.expand(full), omega.expand(full))
+
+    points, normals = sample(eta, omega)
+    middle = sample(*(0.5 * (angle[:, 1:] + angle[:, :-1]) for angle in (eta, omega))).points
+    bulge = middle - 0.5 * (points[..., 1:, :] + points[..., :-1, :])
+    bulge = torch.cat([bulge, torch.zeros_like(bulge[..., :1, :])], dim=-2)
+    return torch.cat([points, normals, bulge], dim=-1).to(body.dtype)
+
+
+def _crossings(
+    curves: Float[Tensor, "parts c k 9"], eye: Float[Tensor, "*batch parts 3"], *, closed: bool
+) -> _Triple:
+    """Where each curve turns from back to front, then where each turns from front to back.
+
+    Returns:
+        Points `[*batch parts 2*c 3]`, normals, and whether they exist `[*batch parts 2*c]`.
+    """
+    parts, count, size, _ = curves.shape
+    points, normals = curves[..., :3].flatten(1, 2), curves[..., 3:6].flatten(1, 2)
+    towards = torch.einsum("...pi,pki->...pk", eye, normals)
+    facing = (towards - (normals * points).sum(-1)).unflatten(-1, (count, size))
+    away = facing < 0
+    before, after = away[..., :-1], away[..., 1:]
+    exists, step = torch.cat([before & ~after, ~before & after], dim=-2).max(dim=-1)
+    # A contour is born where a curve grazes the line of sight, or at a pole. So it counts by how
+    # far the curve turns through: anywhere on a closed curve, on either side of an open one.
+    if closed:
+        turns = torch.minimum(facing.amax(-1), -facing.amin(-1))
+        turns = torch.cat([turns, turns], dim=-1)
+    else:
+        wanted = torch.cat([facing, -facing], dim=-2)  # positive after the crossing
+        later = torch.arange(size, device=eye.device) > step[..., None]
+        turns = torch.minimum(
+            torch.where(later, wanted, 0.0).amax(-1), -torch.where(later, 0.0, wanted).amin(-1)
+        )
+    clear = _GRAZING * eye.norm(dim=-1)[..., None]
+    exists = exists * (turns / clear).clamp(0, 1)
+    # Interpolated to where n . (c - p) is zero.
+    place = torch.arange(count, device=eye.device).repeat(2) * size + step
+    here, there = (facing.flatten(-2).gather(-1, index) for index in (place, place + 1))
     change = here - there
     t = torch.where(change != 0, here / torch.where(change != 0, change, 1), 0.5).clamp(0, 1)
-    table = torch.cat([points, normals], dim=-1).flatten(0, 2)
-    mixed = table[flat] * (1 - t[..., None]) + table[flat + 1] * t[..., None]
-    return mixed[..., :3], mixed[..., 3:]
+    t = t[..., None]
+    place = place + torch.arange(parts, device=eye.device)[:, None] * (count * size)
+    here, there = (
+        curves.flatten(0, 2).index_select(0, index.flatten()).unflatten(0, place.shape)
+        for index in (place, place + 1)
+    )
+    mixed = torch.lerp(here[..., :6], there[..., :6], t)
+    return mixed[..., :3] + 4 * t * (1 - t) * here[..., 6:], mixed[..., 3:], exists
