@@ -2,17 +2,19 @@
 
     python scripts/benchmark.py --out benchmark.json
 
-The joint term of body34 is evaluated with gradient and exact Hessian for many samples in four ways:
+Two costs of body34: the joint term alone, and the full cost, which is contour, flow, joints,
+interpenetration and stabiliser at 1008 nodes with their visibility. Each in several ways:
 
-* closed form: what the optimiser calls, `TrackingCost.local_model`;
-* value alone, without derivatives: the price of a trial step;
-* lifted by autograd: `Curvature.AUTOGRAD`, double backward through the tree alone;
-* plain autograd: state, pose, projection, robust cost, and a double backward through all of it, row
-  by row, as anybody would write it first. The headline is the closed form against this one.
+* `value`: without derivatives, the price of a trial step;
+* `closed`: with gradient and exact Hessian in closed form, what the optimiser calls;
+* `plain`: the same by double backward (`peers/autograd_cost.py`), timed on one chunk, of the size
+  that suits it best, and extrapolated.
 
-Two rows of the full cost (contour, joints and stabiliser) follow. Each repeat times every way, one
-after the other; ratios are taken within a repeat, so that a busy machine slows both sides. Memory
-is the peak of a process of its own per way. Nothing is asserted.
+Each repeat times every way in turn; ratios are taken within a repeat, so that a busy machine slows
+both sides. Memory is the peak of a process of its own. Then come the times of the full cost by
+term, and of the features of a frame with flow. Nothing is asserted.
+
+PROFILE
 """
 
 from __future__ import annotations
@@ -24,26 +26,31 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+import matplotlib.image
 import numpy as np
 import torch
 import tyro
+from peers.autograd_cost import autograd_model, made_up_costs, made_up_frames
 from torch import Tensor
 
-from torchcss.body.model import differentiate_twice, load_body
-from torchcss.cost.joints import JointObservation, JointTerm
-from torchcss.cost.total import CHUNK, CostChoice, TrackingCost
-from torchcss.cost.visibility import ContourPredictor
+from torchcss.cost.total import TrackingCost
 from torchcss.io.tracks import prepare_output_folder, write_summary
-from torchcss.joint_names import ALIASES
-from torchcss.types import Curvature, LocalModel
-from torchcss.vision.camera import Camera
+from torchcss.stopwatch import Stopwatch
+from torchcss.types import LocalModel
+from torchcss.vision.features import FeatureExtractor
+from torchcss.vision.flow import TRACKING
 
-CLOSED, LIFTED, PLAIN = "joints_closed_form", "joints_lifted_by_autograd", "joints_plain_autograd"
-WAYS = ("joints_value", CLOSED, LIFTED, PLAIN, "full_value", "full_local_model")
-WIDTH, HEIGHT = 640, 480
+COMPARED = {  # with which other way each is compared
+    "joints_plain": "joints_closed",
+    "full_closed": "full_value",
+    "full_plain": "full_closed",
+}
+Way = tuple[Callable[[Tensor], Any], Tensor]
+QUARTILES = {"lower_quartile": 0.25, "median": 0.5, "upper_quartile": 0.75}
 AT_LEAST_S = 0.3  # A way that is faster is called again, and the mean time taken.
 
 
@@ -53,12 +60,18 @@ class Config:
 
     samples: int = 2000
     """States per evaluation."""
-    repeats: int = 7
+    repeats: int = 5
     """Interleaved repeats, after one call of each way that compares the results."""
     dtype: Literal["float32", "float64"] = "float64"
     """Floating type."""
-    plain_chunk: int = CHUNK
-    """Samples that plain autograd takes at a time; the package takes its own number."""
+    plain_joints: int = 256
+    """Samples on which plain autograd of the joint term is timed."""
+    plain_full: int = 128
+    """Samples on which plain autograd of the full cost is timed."""
+    size_wh: tuple[int, int] = (640, 480)
+    """Size of the made-up frames."""
+    frames: tuple[Path, Path] | None = None
+    """Two frames of a video to extract features from, instead of the made-up ones."""
     threads: int | None = None
     """Threads of torch; its own choice by default."""
     out: Path | None = None
@@ -67,40 +80,17 @@ class Config:
     """Measure only the memory of this way; the script calls itself with it."""
 
 
-def make_ways(config: Config) -> tuple[dict[str, Callable[[Tensor], Any]], Tensor]:
-    """The ways to evaluate the cost, by name, and the states."""
-    generator = torch.Generator().manual_seed(0)
-    dtype = getattr(torch, config.dtype)
-    # The camera looks along z with y down; the body stands upright 3.5 m before it, facing it.
-    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
-    body = load_body("body34", dtype=dtype).with_base(flip, torch.tensor([0.0, 0.0, 3.5]))
-    camera = Camera.pinhole(WIDTH, HEIGHT, focal_px=600.0).to(dtype)
-    noise = torch.randn(config.samples, body.num_parameters, generator=generator, dtype=dtype)
-    x = body.bounds.project(body.rest + 0.2 * noise)
-    names = tuple(name for name in ALIASES["BODY_25B"] if name in body.joint_names)
-    joints = body.pose(body.rest).joints[[body.joint_index(name) for name in names]]
-    uv = camera.project(joints).uv
-    uv = uv + 3.0 * torch.randn(uv.shape, generator=generator, dtype=dtype)
-    observation = JointObservation(body.joint_names, uv, torch.ones_like(uv[:, 0]), names)
-    choice = CostChoice(contour=None, joints=(term := JointTerm()), stabiliser=None, temporal=None)
-    cost = TrackingCost(body=body, camera=camera, choice=choice, observation=observation)
-    autograd = replace(cost, choice=replace(choice, curvature=Curvature.AUTOGRAD))
-    # Noise for edges: the search along the normals takes the same time whatever it finds.
-    edge_field = 0.7 * torch.rand(2, HEIGHT, WIDTH, generator=generator, dtype=dtype)
-    everything, predictor = CostChoice(temporal=None), ContourPredictor(body)
-    full = replace(cost, choice=everything, predictor=predictor, edge_field=edge_field)
-
-    def plain(x: Tensor) -> LocalModel:
-        parts = []
-        for part in x.split(config.plain_chunk):
-            part = part.detach().requires_grad_()
-            projection = camera.project(body.pose(part).joints[:, observation.index])
-            parts.append(differentiate_twice(term.value(projection, observation).sum(-1), part))
-        return LocalModel(*(torch.cat(items) for items in zip(*parts, strict=True)))
-
-    evaluations = cost.value, cost.local_model, autograd.local_model, plain
-    evaluations += full.value, full.local_model
-    return dict(zip(WAYS, evaluations, strict=True)), x
+def make_ways(config: Config) -> tuple[dict[str, Way], TrackingCost]:
+    """The ways to evaluate the costs, by name, with the states to time them on; the full cost."""
+    alone, full, x = made_up_costs(config.samples, config.size_wh, getattr(torch, config.dtype))
+    return {
+        "joints_value": (alone.value, x),
+        "joints_closed": (alone.local_model, x),
+        "joints_plain": (partial(autograd_model, alone), x[: config.plain_joints]),
+        "full_value": (full.value, x),
+        "full_closed": (full.local_model, x),
+        "full_plain": (partial(autograd_model, full), x[: config.plain_full]),
+    }, full
 
 
 def seconds_of(way: Callable[[Tensor], Any], x: Tensor) -> float:
@@ -114,18 +104,18 @@ def seconds_of(way: Callable[[Tensor], Any], x: Tensor) -> float:
 
 def measure_memory(config: Config, name: str) -> dict[str, float]:
     """Peak memory of this process with one way, and how much a few samples would need less."""
-    unit = 1 if sys.platform == "darwin" else 1024
-    ways, x = make_ways(config)
+    unit = 2**20 if sys.platform == "darwin" else 2**10
+    evaluate, x = make_ways(config)[0][name]
     peaks = []
     for states in (x[:8], x):
-        ways[name](states)
-        peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20)
+        evaluate(states)
+        peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit)
     return {"peak_mib": peaks[1], "added_mib": peaks[1] - peaks[0]}
 
 
 def memory_in_own_process(config: Config, name: str) -> dict[str, float]:
     """The same of a new process."""
-    keys = ("samples", "dtype", "plain_chunk", "threads")
+    keys = ("samples", "dtype", "plain_joints", "plain_full", "threads")
     options = (f"--{key.replace('_', '-')}={getattr(config, key)}" for key in keys)
     command = [sys.executable, __file__, *options, f"--memory-of={name}"]
     return json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout)
@@ -139,8 +129,7 @@ def difference(closed: LocalModel, other: LocalModel) -> float:
 
 def quartiles(values: list[float]) -> dict[str, float]:
     """The middle and the spread."""
-    names = ("lower_quartile", "median", "upper_quartile")
-    return dict(zip(names, np.percentile(values, [25, 50, 75]).tolist(), strict=True))
+    return {name: float(np.quantile(values, q)) for name, q in QUARTILES.items()}
 
 
 def main(config: Config) -> dict[str, Any]:
@@ -150,29 +139,36 @@ def main(config: Config) -> dict[str, Any]:
     if config.memory_of is not None:
         print(json.dumps(memory := measure_memory(config, config.memory_of)))
         return memory
+    ways, full = make_ways(config)
     # First of all the memory: on Linux a process starts with the peak of the one that starts it.
-    memory = {name: memory_in_own_process(config, name) for name in WAYS}
-    ways, x = make_ways(config)
-    closed = ways[CLOSED](x)
-    agreement = {name: difference(closed, ways[name](x)) for name in (LIFTED, PLAIN)}
-    rounds = [{name: seconds_of(ways[name], x) for name in WAYS} for _ in range(config.repeats)]
+    memory = {name: memory_in_own_process(config, name) for name in ways}
+    agreement = {}
+    for name in ("joints_plain", "full_plain"):
+        evaluate, x = ways[name]
+        agreement[name] = difference(ways[COMPARED[name]][0](x), evaluate(x))
+    rounds = [
+        {name: seconds_of(*way) * config.samples / len(way[1]) for name, way in ways.items()}
+        for _ in range(config.repeats)
+    ]
+    watches = {"full_value": Stopwatch(), "full_closed": Stopwatch()}
+    replace(full, stopwatch=watches["full_value"]).value(ways["full_value"][1])
+    replace(full, stopwatch=watches["full_closed"]).local_model(ways["full_closed"][1])
+    pair: Any = made_up_frames(config.size_wh)
+    if config.frames is not None:
+        pair = [np.asarray(matplotlib.image.imread(path)) for path in config.frames]
+    extractor = FeatureExtractor(flow=TRACKING, working_size=640)
+    extract = [seconds_of(lambda frame: extractor(frame, pair[0]), pair[1]) for _ in rounds]
     metrics = {
-        "seconds": {name: quartiles([times[name] for times in rounds]) for name in WAYS},
-        "times_closed_form": {
-            name: quartiles([times[name] / times[CLOSED] for times in rounds])
-            for name in (LIFTED, PLAIN)
-        },
+        "seconds": {name: quartiles([times[name] for times in rounds]) for name in ways},
+        "ratio": {n: quartiles([t[n] / t[other] for t in rounds]) for n, other in COMPARED.items()},
         "memory": memory,
         "relative_difference": agreement,
+        "seconds_by_term": {name: watch.seconds for name, watch in watches.items()},
+        "seconds_of_features": quartiles(extract),
     }
-    report = {
-        "metrics": metrics,
-        "unit": dict(zip(metrics, ("s per call", "1", "MiB", "1"), strict=True)),
-        "direction": dict(zip(metrics, ("lower", "higher", "lower", "lower"), strict=True)),
-        "config": config,
-        "threads": torch.get_num_threads(),
-        "torch": torch.__version__,
-    }
+    units = ("s per call", "1", "MiB", "1", "s per call", "s per frame")
+    report = {"metrics": metrics, "unit": dict(zip(metrics, units, strict=True)), "config": config}
+    report |= {"threads": torch.get_num_threads(), "torch": torch.__version__}
     print_table(report)
     if config.out is not None:
         prepare_output_folder(config.out.parent)
@@ -184,15 +180,20 @@ def print_table(report: dict[str, Any]) -> None:
     """The report for people."""
     config, metrics = report["config"], report["metrics"]
     print(f"{config.samples} samples, {config.dtype}, {report['threads']} threads")
-    print(f"{'ms':>26} {'quartile':>9} {'median':>9} {'quartile':>9} {'peak MiB':>9} {'added':>6}")
+    print(f"{'ms':>15} {'quartile':>9} {'median':>9} {'quartile':>9} {'peak MiB':>9} {'added':>6}")
     for name, row in metrics["seconds"].items():
         times = "".join(f" {1e3 * value:9.1f}" for value in row.values())
         peak, added = metrics["memory"][name].values()
-        print(f"{name:>26}{times} {peak:9.0f} {added:6.0f}")
-    for name, ratio in metrics["times_closed_form"].items():
+        print(f"{name:>15}{times} {peak:9.0f} {added:6.0f}")
+    for name, ratio in metrics["ratio"].items():
         low, median, high = ratio.values()
-        print(f"{name}: {median:.1f} times the closed form ({low:.1f} to {high:.1f})")
-        print(f"    largest relative difference {metrics['relative_difference'][name]:.1e}")
+        apart = metrics["relative_difference"].get(name)
+        note = "" if apart is None else f"; relative difference {apart:.1e}"
+        print(f"{name} takes {median:.2f} times {COMPARED[name]} ({low:.2f} to {high:.2f}){note}")
+    for name, seconds in metrics["seconds_by_term"].items():
+        shares = ", ".join(f"{term} {1e3 * value:.0f}" for term, value in seconds.items())
+        print(f"{name} by term, ms: {shares}")
+    print(f"features of a frame: {metrics['seconds_of_features']['median']:.2f} s")
 
 
 if __name__ == "__main__":

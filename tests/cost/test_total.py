@@ -228,7 +228,7 @@ def test_contours_are_differentiated_with_visibility_and_matches_held_fixed(
     pose = body.pose(x)
     nodes = predictor(body, pose, cost.camera.centre_world)
     model = cost.camera.project_with_derivatives(nodes.points)
-    normal = term._image_normal(model, nodes)
+    normal = cost.camera.image_normals(model, nodes.normals)
     found = term.search(model.uv, normal, cost.edge_field)
     link = predictor.node_link
     away = nodes.points - pose.tree.translation[..., link, :]

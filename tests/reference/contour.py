@@ -25,7 +25,7 @@ def cost_of_fixed_matches(
         term: The term.
         nodes: Where the nodes were when the image was searched.
         camera: The camera.
-        assignments: The edges found, along `normal_uv` from `uv`.
+        assignments: The edges found, along `normal_uv` from `uv`; nodes of all batches in a row.
         uv: The nodes' images at the search.
         normal_uv: The search directions.
         points: Where the nodes are now; the argument to differentiate in.
@@ -33,11 +33,10 @@ def cost_of_fixed_matches(
     projection = camera.project(points)
     moved = ((projection.uv - uv) * normal_uv).sum(-1)
     cost = torch.full_like(moved, term.unmatched)
-    for slot in range(assignments.distance.shape[-1]):
-        distance, weight = assignments.distance[..., slot], assignments.weight[..., slot]
-        rho = term.potential((distance - moved).square()).rho
-        inside = (distance.abs() < term.window) & projection.valid
-        cost = cost - torch.where(inside, weight * (term.unmatched - 0.5 * rho), 0.0)
+    node, distance, weight = assignments
+    rho = term.potential((distance - moved.flatten()[node]).square()).rho
+    wells = weight * projection.valid.flatten()[node] * (term.unmatched - 0.5 * rho)
+    cost = cost - torch.zeros_like(cost).flatten().index_add(0, node, wells).reshape(cost.shape)
     absent = term.fitted_level * term.nu
     hidden = term.occlusion_factor * absent
     seen = nodes.visible * cost + (1 - nodes.visible) * hidden

@@ -11,10 +11,16 @@ from types import ModuleType
 import pytest
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "benchmark.py"
+WAYS = {
+    *("joints_value", "joints_closed", "joints_plain"),
+    *("full_value", "full_closed", "full_plain"),
+}
+TERMS = {"pose", "visibility", "contour", "flow", "joints", "interpenetration", "stabiliser"}
 
 
 @pytest.fixture
 def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(SCRIPT.parent)
     specification = importlib.util.spec_from_file_location("benchmark", SCRIPT)
     assert specification is not None
     assert specification.loader is not None
@@ -34,24 +40,47 @@ def test_small_mode_agrees_with_autograd(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    # A process per way takes seconds to load the libraries; the test below starts one.
-    monkeypatch.setattr(script, "memory_in_own_process", script.measure_memory)
+    # A process per way takes seconds to load the libraries; the last test starts one.
+    memory = {"peak_mib": 2.0, "added_mib": 1.0}
+    monkeypatch.setattr(script, "memory_in_own_process", lambda config, name: memory)
     out = tmp_path / "tables" / "benchmark.json"
-    script.main(script.Config(samples=20, repeats=2, plain_chunk=7, dtype=dtype, out=out))
+    config = script.Config(
+        samples=12,
+        repeats=1,
+        plain_joints=7,
+        plain_full=4,
+        size_wh=(160, 120),
+        dtype=dtype,
+        out=out,
+    )
+    script.main(config)
     report = json.loads(out.read_text())
     metrics = report["metrics"]
-    assert set(report["unit"]) == set(report["direction"]) == set(metrics)
-    assert set(metrics["seconds"]) == set(metrics["memory"]) == set(script.WAYS)
+    assert set(report["unit"]) == set(metrics)
+    assert set(metrics["seconds"]) == set(metrics["memory"]) == WAYS
     for row in metrics["seconds"].values():
         assert 0 < row["lower_quartile"] <= row["median"] <= row["upper_quartile"]
-    assert set(metrics["times_closed_form"]) == set(metrics["relative_difference"])
+    assert set(metrics["ratio"]) == set(script.COMPARED)
+    assert len(metrics["relative_difference"]) == 2
     assert max(metrics["relative_difference"].values()) < tolerance
-    assert "times the closed form" in capsys.readouterr().out
+    assert set(metrics["seconds_by_term"]["full_value"]) == TERMS
+    assert set(metrics["seconds_by_term"]["full_closed"]) == TERMS | {"lift"}
+    assert metrics["seconds_of_features"]["median"] > 0
+    text = capsys.readouterr().out
+    assert "full_plain takes" in text
+    assert "features of a frame" in text
+
+
+def test_the_full_cost_has_a_thousand_nodes(script: ModuleType) -> None:
+    ways, full = script.make_ways(script.Config(samples=1, size_wh=(160, 120)))
+    _, x = ways["full_value"]
+    assert full.predictor.num_nodes + full.interior.num_nodes >= 1000
+    assert set(full.terms(x)) == TERMS - {"pose", "visibility"}
 
 
 def test_memory_is_that_of_a_process_of_its_own(script: ModuleType) -> None:
     config = script.Config(samples=300, threads=1)
-    memory = script.memory_in_own_process(config, script.PLAIN)
+    memory = script.memory_in_own_process(config, "joints_closed")
     # What importing took may hide what the work adds, so that zero is an honest answer too.
     assert memory["peak_mib"] > memory["added_mib"] >= 0.0
     assert memory["peak_mib"] > 50.0

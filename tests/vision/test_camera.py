@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchcss.errors import CameraError, ShapeError
-from torchcss.vision.camera import Camera, pull_back
+from torchcss.vision.camera import Camera, ProjectionModel
 
 MILD = [-0.33, 0.046, -0.0043, 0.0041, 0.067]
 WILD = [-0.014, 1.419, -0.0035, -0.0036, -6.394]
@@ -30,6 +30,17 @@ def make_camera(distortion: list[float] | None = None, name: str = "test") -> Ca
         t_camera_world=[0.1, -0.2, 3.0],
         name=name,
     )
+
+
+def hessian_of(camera: Camera, model: ProjectionModel) -> Tensor:
+    """Second derivatives of u and v, `[*batch p 2 3 3]`: u and v pulled back as costs."""
+    zero = torch.zeros_like(model.a)
+    curvature = torch.zeros(*model.uv.shape, 2).to(model.uv)
+    pulled = [
+        camera.pull_back(model, zero, unit.expand_as(model.uv), curvature).hessian
+        for unit in torch.eye(2).to(model.uv)
+    ]
+    return torch.stack(pulled, dim=-3)
 
 
 def points_in_camera_frame(camera: Camera, points: list[list[float]] | Tensor) -> Tensor:
@@ -60,19 +71,20 @@ def test_derivatives_agree_with_autograd(
     points = torch.randn(*batch, 4, 3, dtype=torch.float64, generator=generator)
     model = camera.project_with_derivatives(points)
     assert model.uv.shape == (*batch, 4, 2)
-    assert model.hessian.shape == (*batch, 4, 2, 3, 3)
+    jacobians, hessians = camera.jacobian(model), hessian_of(camera, model)
+    assert hessians.shape == (*batch, 4, 2, 3, 3)
 
     def total(flat_point: Tensor) -> Tensor:
         return camera.project(flat_point[None]).uv[0]
 
     for index in np.ndindex(*batch, 4):
         jacobian = torch.autograd.functional.jacobian(total, points[index])
-        torch.testing.assert_close(model.jacobian[index], jacobian, rtol=1e-11, atol=1e-9)
+        torch.testing.assert_close(jacobians[index], jacobian, rtol=1e-11, atol=1e-9)
         for k in range(2):
             hessian = torch.autograd.functional.hessian(
                 lambda point, k=k: total(point)[k], points[index]
             )
-            torch.testing.assert_close(model.hessian[index][k], hessian, rtol=1e-10, atol=1e-8)
+            torch.testing.assert_close(hessians[index][k], hessian, rtol=1e-10, atol=1e-8)
 
 
 @pytest.mark.parametrize("distortion", [None, MILD, WILD])
@@ -86,26 +98,28 @@ def test_awkward_points_stay_finite_and_agree_with_autograd(
     model = camera.project_with_derivatives(points.detach())
     assert torch.equal(projection.valid, model.valid)
     assert model.valid[:5].tolist() == [True, True, False, False, False]
-    for tensor in model:
+    jacobian, hessian = camera.jacobian(model), hessian_of(camera, model)
+    for tensor in (*model, jacobian, hessian):
         assert torch.isfinite(tensor).all()
     outside = ~model.valid
-    assert (model.jacobian[outside] == 0.0).all()
-    assert (model.hessian[outside] == 0.0).all()
+    assert (jacobian[outside] == 0.0).all()
+    assert (hessian[outside] == 0.0).all()
     assert not camera.inside_image(model.uv[outside]).any()
     torch.testing.assert_close(model.uv, projection.uv.detach(), rtol=0.0, atol=0.0)
     for k in range(2):
         (gradient,) = torch.autograd.grad(projection.uv[:, k].sum(), points, create_graph=True)
-        torch.testing.assert_close(model.jacobian[:, k], gradient.detach(), rtol=1e-10, atol=1e-9)
+        torch.testing.assert_close(jacobian[:, k], gradient.detach(), rtol=1e-10, atol=1e-9)
         for i in range(3):
             (row,) = torch.autograd.grad(gradient[:, i].sum(), points, retain_graph=True)
-            torch.testing.assert_close(model.hessian[:, k, i], row, rtol=1e-9, atol=1e-7)
+            torch.testing.assert_close(hessian[:, k, i], row, rtol=1e-9, atol=1e-7)
 
 
 def test_awkward_points_stay_finite_in_float32() -> None:
     for distortion in (None, MILD, WILD):
         camera = make_camera(distortion)
         points = points_in_camera_frame(camera, AWKWARD).float()
-        for tensor in camera.project_with_derivatives(points):
+        model = camera.project_with_derivatives(points)
+        for tensor in (*model, camera.jacobian(model), hessian_of(camera, model)):
             assert torch.isfinite(tensor).all()
 
 
@@ -118,7 +132,12 @@ def test_float32_agrees_with_float64(generator: torch.Generator) -> None:
     )
     assert single.uv.dtype == torch.float32
     assert torch.equal(single.valid, double.valid)
-    for one, two in zip(single[:4], double[:4], strict=True):
+    for one, two in (
+        (single.uv, double.uv),
+        (single.depth, double.depth),
+        (camera.jacobian(single), camera.jacobian(double)),
+        (hessian_of(camera, single), hessian_of(camera, double)),
+    ):
         torch.testing.assert_close(one.double(), two, rtol=1e-4, atol=1e-4 * float(two.abs().max()))
     converted = make_camera(MILD).to(torch.float32)
     assert converted.K.dtype == torch.float32
@@ -138,14 +157,14 @@ def test_pull_back_is_the_chain_rule(gauss_newton: bool, generator: torch.Genera
     model = camera.project_with_derivatives(points)
     g = torch.stack([torch.autograd.functional.jacobian(cost, uv) for uv in model.uv])
     H = torch.stack([torch.autograd.functional.hessian(cost, uv) for uv in model.uv])
-    result = pull_back(model, cost(model.uv), g, H, gauss_newton=gauss_newton)
+    result = camera.pull_back(model, cost(model.uv), g, H, gauss_newton=gauss_newton)
     assert torch.equal(result.value, cost(model.uv))
     for index in range(6):
 
         def of_point(point: Tensor, index: int = index) -> Tensor:
             uv = camera.project(point[None]).uv[0]
             if gauss_newton:  # linearise the projection
-                linear = model.jacobian[index] @ (point - points[index])
+                linear = camera.jacobian(model)[index] @ (point - points[index])
                 uv = model.uv[index] + linear
             return cost(uv)
 

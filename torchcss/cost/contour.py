@@ -25,30 +25,36 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchcss.cost.visibility import ContourNodes
 from torchcss.robust import Lorentzian, RobustPotential
 from torchcss.types import PointCost
-from torchcss.vision.camera import Camera, ProjectionModel, pull_back
-from torchcss.vision.sampling import sample_bilinear
+from torchcss.vision.camera import Camera
+from torchcss.vision.sampling import inside_image, interpolate_bilinear
 
 
 class EdgeAssignments(NamedTuple):
-    """Edges found along the search line of every node, one slot per inner sample of the line.
+    """Edges found along the search lines of nodes; a node may have several, or none.
 
     Attributes:
+        node: The node of each edge.
         distance: Signed distance from the node along its outward normal, pixels.
-        weight: Weight of the assignment; zero in slots without a local maximum.
+        weight: Weight of the assignment; zero outside the window and where the maximum is flat.
     """
 
-    distance: Float[Tensor, "*batch p s"]
-    weight: Float[Tensor, "*batch p s"]
+    node: Int[Tensor, " e"]
+    distance: Float[Tensor, " e"]
+    weight: Float[Tensor, " e"]
 
 
 _TINY = 1e-12
+_LINES = 16384
+"""Lines searched at a time: few enough for the caches, enough to hide the overhead of calls."""
+
 _SHARP_ENOUGH = 0.05
 """Relative curvature, per square pixel, from which a maximum has its full weight: that of a
 Gaussian ridge of 4.5 pixels, twice as wide as the detector's own edges."""
@@ -102,63 +108,83 @@ class ContourTerm:
         """Search the image along the normals.
 
         Args:
-            uv: Projected nodes, pixels.
+            uv: Projected nodes, pixels; those of a batch are numbered in a row.
             normal_uv: Unit outward normals in the image.
             edge_field: Contrast-normalised gradient, of length at most one (edge energy times
                 direction).
         """
         # Single precision is enough to find what the derivatives hold fixed, and twice as fast.
-        start, along = uv.detach().float(), normal_uv.detach().float()
+        # Samples run along the first axis in memory, so that neighbours on a line are whole rows.
+        start, along = (v.detach().reshape(-1, 2).float().mT.contiguous() for v in (uv, normal_uv))
         # Samples beyond the window, so that a maximum on its very edge is found too.
         reach = math.ceil(self.window / self.step) + 2
-        steps = torch.arange(-reach, reach + 1, dtype=start.dtype, device=uv.device)
-        line = start[..., None, :] + (self.step * steps)[:, None] * along[..., None, :]
-        field, inside = sample_bilinear(edge_field, line.flatten(-3, -2))
-        shape = line.shape[-3:-1]
-        field_u, field_v = (component.unflatten(-1, shape) for component in field.unbind(-1))
-        response = (field_u * along[..., :1] + field_v * along[..., 1:]).abs()
-        response = response * inside.unflatten(-1, shape)
-        count = response.shape[-1] - 4
-        before, left, middle, right, after = (response[..., i : i + count] for i in range(5))
-        peak = (middle > left) & (middle >= right)
-        curve = (2 * middle - left - right).clamp(min=_TINY)
-        shift = 0.5 * (right - left) / curve * peak
+        steps = self.step * torch.arange(-reach, reach + 1, dtype=start.dtype, device=uv.device)
+        line = torch.addcmul(start[:, None], steps[:, None], along[:, None]).movedim(0, -1)
+        field_u, field_v = interpolate_bilinear(edge_field, line).unbind(-1)
+        response = torch.addcmul(field_u * along[0], field_v, along[1]).abs()
+        # The image is convex: only lines with an end outside leave it.
+        ends = line[:: len(steps) - 1]
+        leaving = (~inside_image(ends, *edge_field.shape[1:])).any(0).nonzero()[:, 0]
+        response[:, leaving] *= inside_image(line[:, leaving], *edge_field.shape[1:])
+
+        rises = response[1:] > response[:-1]
+        peak = _places(rises[1:-2] & ~rises[2:-1])
+        size, count = start.shape[1], len(steps) - 4
+        before, left, middle, right, after = (
+            response[i : i + count].flatten().index_select(0, peak) for i in range(5)
+        )
+        slot = peak // max(size, 1)
+        node = peak - slot * size
+        shift = 0.5 * (right - left) / (2 * middle - left - right).clamp(min=_TINY)
         height = middle + 0.25 * (right - left) * shift
         # How far the response falls to either side, 1.5 samples from the maximum. A maximum is born
         # on a slope, where it does not fall to one side: the weight starts at zero there.
-        fall = torch.minimum(
-            middle - torch.lerp(left, before, 0.5 - shift),
-            middle - torch.lerp(right, after, 0.5 + shift),
+        fall = middle - torch.maximum(
+            torch.lerp(left, before, 0.5 - shift), torch.lerp(right, after, 0.5 + shift)
         )
         sharpness = fall / height.clamp(min=1e-3) * (2 / (1.5 * self.step) ** 2 / _SHARP_ENOUGH)
-        weight = height * sharpness.clamp(0, 1) * peak
-        distance = self.step * (steps[2:-2] + shift)
+        distance = self.step * (slot + (2 - reach) + shift)
+        weight = height * sharpness.clamp(0, 1) * (distance.abs() < self.window)
         # Weights share 1; one that enters the window takes its share from the others by degrees.
-        share = weight * ((self.window - distance.abs()) / (_FADE * self.window)).clamp(0, 1)
-        weight = weight / share.sum(-1, keepdim=True).clamp(min=1)
-        return EdgeAssignments(distance.to(uv), weight.to(uv))
+        share = weight * ((self.window - distance.abs()) / (_FADE * self.window)).clamp(max=1)
+        total = share.new_zeros(size).index_add(0, node, share).clamp(min=1)
+        weight = weight / total.index_select(0, node)
+        return EdgeAssignments(node, distance.to(uv), weight.to(uv))
 
-    def _wells(self, assignments: EdgeAssignments) -> tuple[Tensor, Tensor, Tensor]:
-        """Depth of the wells, and first and second derivative of the cost in the distance moved."""
-        distance, weight = assignments
-        squared = distance.square()
-        rho, first, second = self.potential(squared)
-        near = squared < self.window**2
-        depth = (weight * (self.unmatched - 0.5 * rho).clamp(min=0)).sum(-1)
-        weight = torch.where(near, weight, 0.0)
-        # d/dt of 1/2 rho((d - t)^2) at t = 0, t the node's motion along its normal.
-        slope = -(weight * first * distance).sum(-1)
-        curvature = (weight * (first + 2 * second * squared)).sum(-1)
+    def _wells(
+        self,
+        uv: Float[Tensor, "p 2"],
+        normal_uv: Float[Tensor, "p 2"],
+        edge_field: Float[Tensor, "2 h w"],
+    ) -> tuple[Float[Tensor, " p"], Float[Tensor, " p"], Float[Tensor, " p"]]:
+        """Depth of the wells of nodes, and the cost's derivatives in the distance moved."""
+        # Both components of a pixel side by side: fewer misses of the cache.
+        edge_field = edge_field.float().movedim(0, -1).contiguous().movedim(-1, 0)
+        unmatched, blocks = self.unmatched, []
+        for start, along in zip(uv.split(_LINES), normal_uv.split(_LINES), strict=True):
+            node, distance, weight = self.search(start, along, edge_field)
+            squared = distance.square()
+            rho, first, second = self.potential(squared)
+            # d/dt of 1/2 rho((d - t)^2) at t = 0, t the node's motion along its normal.
+            rows = (
+                weight * (unmatched - 0.5 * rho).clamp(min=0),
+                -weight * first * distance,
+                weight * (first + 2 * second * squared),
+            )
+            none = weight.new_zeros(len(start))
+            blocks.append([none.index_add(0, node, row) for row in rows])
+        depth, slope, curvature = (torch.cat(parts) for parts in zip(*blocks, strict=True))
         return depth, slope, curvature
 
     def value(
         self, nodes: ContourNodes, camera: Camera, edge_field: Float[Tensor, "2 h w"]
     ) -> Float[Tensor, "*batch p"]:
         """Cost of every node, in units of nu."""
-        model = camera.project_with_derivatives(nodes.points)
-        normal = self._image_normal(model, nodes)
-        depth, _, _ = self._wells(self.search(model.uv, normal, edge_field))
-        return self._compose(nodes, model, depth)
+        seen, index = _seen(nodes)
+        model = camera.project_with_derivatives(seen.points)
+        normal = camera.image_normals(model, seen.normals)
+        depth, _, _ = self._wells(model.uv, normal, edge_field)
+        return self._compose(nodes, _spread(model.valid * depth, index, nodes))
 
     def point_cost(
         self,
@@ -169,36 +195,51 @@ class ContourTerm:
         gauss_newton: bool = False,
     ) -> PointCost:
         """The same with first and second derivatives in the nodes' positions."""
-        model = camera.project_with_derivatives(nodes.points)
-        normal = self._image_normal(model, nodes)
-        depth, slope, curvature = self._wells(self.search(model.uv, normal, edge_field))
-        weight = nodes.visible * nodes.exists * model.valid
-        gradient = (weight * slope)[..., None] * normal
-        hessian = (weight * curvature)[..., None, None] * normal[..., :, None]
-        hessian = hessian * normal[..., None, :]
-        value = self._compose(nodes, model, depth)
-        return pull_back(model, value, gradient, hessian, gauss_newton=gauss_newton)
+        seen, index = _seen(nodes)
+        model = camera.project_with_derivatives(seen.points)
+        normal = camera.image_normals(model, seen.normals)
+        depth, slope, curvature = self._wells(model.uv, normal, edge_field)
+        weight = seen.visible * seen.exists * model.valid
+        gradient = (weight * slope)[:, None] * normal
+        hessian = (weight * curvature)[:, None, None] * normal[:, :, None] * normal[:, None, :]
+        cost = camera.pull_back(
+            model, model.valid * depth, gradient, hessian, gauss_newton=gauss_newton
+        )
+        value, gradient, hessian = (_spread(part, index, nodes) for part in cost)
+        return PointCost(self._compose(nodes, value), gradient, hessian)
 
-    def _image_normal(self, model: ProjectionModel, nodes: ContourNodes) -> Tensor:
-        """Unit normal m of the contour in the image, for which `J^T m` is parallel to n."""
-        # Only the direction counts; at grazing rays the squares would overflow.
-        largest = model.jacobian.abs().amax(dim=(-2, -1), keepdim=True)
-        jacobian = model.jacobian / largest.clamp(min=_TINY)
-        along = (jacobian * nodes.normals[..., None, :]).sum(-1)
-        row_u, row_v = jacobian.unbind(-2)
-        uu, vv = row_u.square().sum(-1), row_v.square().sum(-1)
-        uv = (row_u * row_v).sum(-1)
-        u, v = along.unbind(-1)
-        normal = torch.stack([vv * u - uv * v, uu * v - uv * u], dim=-1)
-        length = normal.norm(dim=-1, keepdim=True)
-        safe = torch.where(length > 0, length, 1.0)
-        along = torch.zeros_like(normal)
-        along[..., 0] = 1.0
-        return torch.where(length > 0, normal / safe, along)
-
-    def _compose(self, nodes: ContourNodes, model: ProjectionModel, depth: Tensor) -> Tensor:
-        matched = self.unmatched - torch.where(model.valid, depth, 0.0)
+    def _compose(
+        self, nodes: ContourNodes, depth: Float[Tensor, "*batch p"]
+    ) -> Float[Tensor, "*batch p"]:
+        matched = self.unmatched - depth
         back_facing = self.fitted_level * self.nu
         occluded = self.occlusion_factor * back_facing
         seen = nodes.visible * matched + (1 - nodes.visible) * occluded
         return nodes.exists * seen + (1 - nodes.exists) * back_facing
+
+
+def _seen(nodes: ContourNodes) -> tuple[ContourNodes, Int[Tensor, " k"]]:
+    """The nodes that count at all, of the whole batch, and their places in it."""
+    index = _places(nodes.visible * nodes.exists > 0)
+    last = nodes.exists.dim() - 1
+    return ContourNodes(*(part.flatten(0, last).index_select(0, index) for part in nodes)), index
+
+
+def _places(mask: Bool[Tensor, "*shape"]) -> Int[Tensor, " k"]:
+    """Where a mask is true, counted through all of it."""
+    if mask.device.type == "cpu":
+        # Without a branch per element: six times faster than `nonzero`, here a fifth of the search.
+        return torch.from_numpy(np.flatnonzero(mask.numpy()))
+    return mask.flatten().nonzero()[:, 0]
+
+
+def _spread(
+    part: Float[Tensor, "k *rest"], index: Int[Tensor, " k"], nodes: ContourNodes
+) -> Float[Tensor, "*batch p *rest"]:
+    """What was worked out for the nodes that count, and zero for the others."""
+    components = part.movedim(0, -1)
+    shape, rest = nodes.exists.shape, components.shape[:-1]
+    whole = components.new_zeros(*rest, shape.numel()).index_copy(-1, index, components)
+    return whole.reshape(*rest, *shape).movedim(
+        tuple(range(len(rest))), tuple(range(-len(rest), 0))
+    )

@@ -40,7 +40,7 @@ from torchcss.cost.visibility import ContourNodes
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.robust import Lorentzian, RobustPotential
 from torchcss.types import PointCost
-from torchcss.vision.camera import Camera, pull_back
+from torchcss.vision.camera import Camera
 
 _MARGIN = 4
 """Zero coefficients around the image, pixels: beyond two the spline is zero for good."""
@@ -222,7 +222,7 @@ class EdgeEnergyTerm:
         hessian = (weight * second)[..., None, None] * slope[..., :, None] * slope[..., None, :]
         hessian = hessian - (weight * first)[..., None, None] * bend
         value = self._compose(nodes, rho)
-        return pull_back(model, value, gradient, hessian, gauss_newton=gauss_newton)
+        return camera.pull_back(model, value, gradient, hessian, gauss_newton=gauss_newton)
 
     def _compose(self, nodes: ContourNodes, rho: Tensor) -> Float[Tensor, "*batch p"]:
         back_facing = self.fitted_level * self.nu

@@ -38,14 +38,12 @@ from torch import Tensor, nn
 
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.surface import SurfaceSample, surface_points
+from torchcss.cost.visibility import front_facing
 from torchcss.errors import ConfigurationError, ShapeError, check_shape
 from torchcss.robust import Lorentzian, RobustPotential
 from torchcss.types import PointCost
-from torchcss.vision.camera import Camera, pull_back
+from torchcss.vision.camera import Camera
 from torchcss.vision.sampling import sample_bilinear
-
-_GRAZING = 0.15
-"""Sine of the angle between surface and line of sight from which a node counts fully."""
 
 _NEAR_RAMP = 0.1
 """Depth behind the camera's near plane over which a node comes to count, metres."""
@@ -172,7 +170,9 @@ def flow_targets(
     projection = camera.project(sample.points)
     channels = torch.cat([torch.where(known, flow, 0.0), trust[None]])
     values, inside = sample_bilinear(channels, projection.uv)
-    seen = _facing(sample, camera) * (inside & projection.valid)
+    seen = front_facing(sample.points, sample.normals, camera.centre_world) * (
+        inside & projection.valid
+    )
     weight = values[..., 2].clamp(0, 1) * seen
     if visible is not None:
         weight = weight * visible
@@ -223,7 +223,7 @@ class FlowTerm:
         """
         projection = camera.project(points_world)
         squared = targets.weight * (projection.uv - targets.uv).square().sum(-1)
-        facing = _facing(SurfaceSample(points_world, normals_world), camera)
+        facing = front_facing(points_world, normals_world, camera.centre_world)
         near = _in_front(projection.depth, projection.valid, camera)
         rho = self.potential(squared).rho
         return self._compose(rho, facing, visible, near, camera, targets)
@@ -252,16 +252,16 @@ class FlowTerm:
         error = model.uv - targets.uv
         weight = targets.weight
         rho, first, second = self.potential(weight * error.square().sum(-1))
-        facing = _facing(SurfaceSample(points_world, normals_world), camera)
+        facing = front_facing(points_world, normals_world, camera.centre_world)
         near = _in_front(model.depth, model.valid, camera)
         value = self._compose(rho, facing, visible, near, camera, targets)
         seen = facing * visible * near
         stiffness = seen * weight * first
         bend = (2 * seen * weight.square() * second)[..., None, None]
-        hessian = bend * error[..., :, None] * error[..., None, :]
-        hessian = hessian + torch.diag_embed(stiffness[..., None].expand_as(error))
+        hessian = error[..., :, None] * error[..., None, :] * bend
+        hessian.diagonal(dim1=-2, dim2=-1).add_(stiffness[..., None])
         gradient = stiffness[..., None] * error
-        return pull_back(model, value, gradient, hessian, gauss_newton=gauss_newton)
+        return camera.pull_back(model, value, gradient, hessian, gauss_newton=gauss_newton)
 
     def _compose(
         self,
@@ -279,15 +279,6 @@ class FlowTerm:
         unhidden = visible * (0.5 * rho + untold) + (1 - visible) * hidden
         in_front = facing * unhidden + (1 - facing) * back_facing
         return near * in_front + (1 - near) * (0.5 * far + untold)
-
-
-def _facing(sample: SurfaceSample, camera: Camera) -> Float[Tensor, "*batch p"]:
-    """1 where the surface faces the camera, 0 where it faces away, a ramp where it is grazed."""
-    towards = camera.centre_world.to(sample.points) - sample.points
-    distance = towards.norm(dim=-1)
-    along = (sample.normals * towards).sum(-1)
-    safe = torch.where(distance > 0, distance, 1.0)
-    return (along / (_GRAZING * safe)).clamp(0, 1)
 
 
 def _in_front(depth: Tensor, valid: Tensor, camera: Camera) -> Float[Tensor, "*batch p"]:

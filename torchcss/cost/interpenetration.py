@@ -198,9 +198,19 @@ class InterpenetrationPairs(nn.Module):
         scale = 1 / outer[b][:, None, :]
         turn = rotation[item, a].transpose(-1, -2) @ frame * scale
         shift = (centre[item, a] - origin)[:, None, :] @ frame * scale
-        scaled = torch.baddbmm(shift, self.nodes[a], turn)
-        owner, node = (scaled.abs().amax(-1) < 1).nonzero(as_tuple=True)
-        return NearNodes(item, pair, frame, origin, owner, scaled[owner, node] * outer[b[owner]])
+        # Component by component: on a CPU many times faster than small matrix products.
+        nodes = self.nodes.movedim(-1, 0).contiguous().index_select(1, a)
+        scaled = []
+        for axis in range(3):
+            along = shift[:, :, axis]
+            for own, factor in zip(nodes, turn[:, :, axis].unbind(1), strict=True):
+                along = torch.addcmul(along, own, factor[:, None])
+            scaled.append(along)
+        inside = (scaled[0].abs() < 1) & (scaled[1].abs() < 1) & (scaled[2].abs() < 1)
+        index = inside.flatten().nonzero()[:, 0]
+        owner = index // max(self.nodes.shape[1], 1)
+        points = torch.stack([part.flatten().index_select(0, index) for part in scaled]).mT
+        return NearNodes(item, pair, frame, origin, owner, points * outer[b[owner]])
 
     def radial_square(
         self, near: NearNodes
@@ -247,9 +257,9 @@ class InterpenetrationPairs(nn.Module):
         hzz = s1 * w1 + s2 * w2 + s3 * k
         hzz = hzz + g1 * u1 * (2 * lx * lx - cx) + g2 * u2 * (2 * ly * ly - cy)
         hxx, hxy, hyy = h11 * i * i, h12 * i * j, h22 * j * j
-        gradient = torch.stack([g1 * i, g2 * j, g1 * w1 + g2 * w2 + g3 * k], dim=-1)
-        hessian = torch.stack([hxx, hxy, hxz, hxy, hyy, hyz, hxz, hyz, hzz], dim=-1)
-        return value, gradient, hessian.unflatten(-1, (3, 3))
+        gradient = torch.stack([g1 * i, g2 * j, g1 * w1 + g2 * w2 + g3 * k])
+        hessian = torch.stack([hxx, hxy, hxz, hxy, hyy, hyz, hxz, hyz, hzz])
+        return value, gradient.mT, hessian.mT.unflatten(-1, (3, 3))
 
     def lift(
         self,

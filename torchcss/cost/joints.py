@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchcss.robust import Lorentzian, RobustPotential
 from torchcss.types import PointCost
-from torchcss.vision.camera import Camera, Projection, pull_back
+from torchcss.vision.camera import Camera, Projection
 
 SPREAD = {
     "hip": 2.0,
@@ -97,15 +97,17 @@ class JointTerm:
     Attributes:
         sigma: Scale of the keypoint noise of a wrist, pixels.
         nu: Level of the outliers, nats per joint: the cost grows as nu log(error / sigma).
+        potential_kind: The potential rho.
     """
 
     sigma: float = 3.0
     nu: float = 8.0
+    potential_kind: type = Lorentzian
 
     @property
     def potential(self) -> RobustPotential:
         """`rho` on the squared error in pixels; its curvature at zero is that of sigma."""
-        return Lorentzian(nu=self.nu, sigma=self.sigma * self.nu**0.5)
+        return self.potential_kind(nu=self.nu, sigma=self.sigma * self.nu**0.5)
 
     def value(
         self, projection: Projection, observation: JointObservation
@@ -136,7 +138,7 @@ class JointTerm:
             2, dtype=error.dtype, device=error.device
         )
         hessian = hessian + (2 * second * weight.square())[..., None, None] * outer
-        return pull_back(model, value, gradient, hessian, gauss_newton=gauss_newton)
+        return camera.pull_back(model, value, gradient, hessian, gauss_newton=gauss_newton)
 
     def _unseen(self, observation: JointObservation) -> Tensor:
         far = observation.weight * (OUTLIER_LENGTHS * self.sigma) ** 2

@@ -49,8 +49,12 @@ from torchcss.stopwatch import Stopwatch
 from torchcss.types import Curvature, LocalModel, PointCost
 from torchcss.vision.camera import Camera
 
-CHUNK = 256
-"""Samples evaluated at a time: small enough for the caches, large enough to hide call overhead."""
+CHUNK = 512
+"""Most samples evaluated at a time: enough to hide the overhead of calls."""
+
+CHUNK_NODES = 65_536
+"""Most nodes evaluated at a time. With arrays of more than these the allocator keeps handing memory
+back to the system, and fetching it again costs as much as half of the arithmetic (measured)."""
 
 COARSE_SCALE = 6.0
 """How much wider the keypoints' scale is in the coarse cost: a missed limb is then no outlier."""
@@ -75,7 +79,9 @@ class CostChoice:
         interpenetration: The repulsion between parts, or None.
         contour_weight: Nats per nu of the contour's mean cost per node.
         edge_energy_weight: Nats per nu of the edge energy's mean cost per node.
-        flow_weight: Nats per nu of the flow's mean cost per node.
+        flow_weight: Nats per nu of the flow's mean cost per node. At 50 it holds real limbs a
+            little better, but where the flow misses a fast hand, as on the demo, it holds that
+            back; at 20 the edges win.
         joint_weight: Factor on the joints' cost, whose nu is in nats already.
         curvature: Which Hessian the optimiser gets.
     """
@@ -91,7 +97,7 @@ class CostChoice:
     interpenetration: Interpenetration | None = None
     contour_weight: float = 150.0
     edge_energy_weight: float = 150.0
-    flow_weight: float = 50.0
+    flow_weight: float = 20.0
     joint_weight: float = 1.0
     curvature: Curvature = Curvature.EXACT
 
@@ -105,6 +111,14 @@ class _Observed(NamedTuple):
     scale: float
     value: Callable[[], Float[Tensor, "*batch p"]]
     point_cost: Callable[..., PointCost]
+
+
+class _Prior(NamedTuple):
+    """One prior at one batch of states, and how to evaluate it there."""
+
+    name: str
+    value: Callable[[], Float[Tensor, "*batch"]]
+    local_model: Callable[[], LocalModel]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,12 +215,22 @@ class TrackingCost:
     def _without_images(self) -> CostChoice:
         return replace(self.choice, contour=None, edge_energy=None, flow=None, joints=None)
 
+    @property
+    def _chunk(self) -> int:
+        """Samples to evaluate at a time."""
+        choice, nodes = self.choice, 1
+        if self.predictor is not None and (choice.contour or choice.edge_energy):
+            nodes += self.predictor.num_nodes
+        if self.interior is not None and choice.flow:
+            nodes += self.interior.num_nodes
+        return max(1, min(CHUNK, CHUNK_NODES // nodes))
+
     def _chunked(
         self, evaluate: Callable[[Tensor, TrackingCost], tuple[Tensor, ...]], x: Tensor
     ) -> tuple[Tensor, ...]:
         flat = x.reshape(-1, x.shape[-1])
         results = []
-        for items in torch.arange(max(len(flat), 1), device=x.device).split(CHUNK):
+        for items in torch.arange(max(len(flat), 1), device=x.device).split(self._chunk):
             items = items[: len(flat)]
             results.append(evaluate(flat[items], self.take(items)))
         return tuple(
@@ -221,9 +245,9 @@ class TrackingCost:
         with self._timed("pose"):
             pose = self.body.pose(x)
         values = {}
-        for name, prior in self._priors(x, pose):
-            with self._timed(name):
-                values[name] = prior().value
+        for prior in self._priors(x, pose):
+            with self._timed(prior.name):
+                values[prior.name] = prior.value()
         for term in self._observed(pose):
             with self._timed(term.name):
                 values[term.name] = term.scale * term.value().sum(-1)
@@ -254,9 +278,10 @@ class TrackingCost:
                     cost,
                     curvature=self.choice.curvature,
                 )
-        for name, prior in self._priors(x, pose):
-            with self._timed(name):
-                total = LocalModel(*(a + b for a, b in zip(total, prior(), strict=True)))
+        for prior in self._priors(x, pose):
+            with self._timed(prior.name):
+                model = prior.local_model()
+                total = LocalModel(*(a + b for a, b in zip(total, model, strict=True)))
         return total
 
     def _observed(self, pose: BodyPose) -> Iterator[_Observed]:
@@ -308,7 +333,7 @@ class TrackingCost:
                 partial(term.point_cost, joints, camera, observation),
             )
 
-    def _priors(self, x: Tensor, pose: BodyPose) -> Iterator[tuple[str, Callable[[], LocalModel]]]:
+    def _priors(self, x: Tensor, pose: BodyPose) -> Iterator[_Prior]:
         """The priors that have what they need, at a batch of states."""
         choice, body = self.choice, self.body
         lengths = list(proportion_columns(body).values())
@@ -317,31 +342,32 @@ class TrackingCost:
             if choice.anthropometric is not None and lengths:
                 deviation = deviation.clone()
                 deviation[lengths] = math.inf
-            yield (
+            yield _on_states(
                 "stabiliser",
                 partial(choice.stabiliser.local_model, x, body.sticky_mean, deviation),
             )
         if choice.anthropometric is not None and lengths:
-            yield "anthropometric", partial(choice.anthropometric.local_model, x, body)
+            yield _on_states("anthropometric", partial(choice.anthropometric.local_model, x, body))
         if choice.temporal is not None and self.parent is not None:
             assert self.deviation is not None
-            yield (
+            yield _on_states(
                 "temporal",
                 partial(choice.temporal.local_model, x, self.parent, self.deviation),
             )
         if choice.temporal_mixture is not None and self.previous is not None:
-            yield (
+            yield _on_states(
                 "temporal_mixture",
                 partial(choice.temporal_mixture.local_model, x, self.previous),
             )
         if choice.interpenetration is not None and self.pairs is not None:
-            yield (
+            term, arguments = choice.interpenetration, (body, pose, self.pairs)
+            yield _Prior(
                 "interpenetration",
-                partial(
-                    choice.interpenetration.local_model,
-                    body,
-                    pose,
-                    self.pairs,
-                    curvature=choice.curvature,
-                ),
+                partial(term.value, *arguments),
+                partial(term.local_model, *arguments, curvature=choice.curvature),
             )
+
+
+def _on_states(name: str, local_model: Callable[[], LocalModel]) -> _Prior:
+    """A prior whose derivatives cost next to nothing."""
+    return _Prior(name, lambda: local_model().value, local_model)

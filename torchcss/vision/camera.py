@@ -10,15 +10,21 @@ The map `P` of section 2 [IJRR], from a point of the world to a pixel:
     b'     = b q + p1 (r2 + 2 b^2) + 2 p2 a b             order [k1, k2, p1, p2, k3]
     (u, v) = (fx a' + cx, fy b' + cy)                     pixel (0, 0) is a pixel's centre
 
-The distortion is the gradient of a scalar function of (a, b), so its second derivatives have only
-four distinct entries. With the sparse derivatives of the perspective division the Hessian of u and
-v costs a few multiplications per point in the camera's frame, and one rotation to the world's.
-
 A term of the cost is a scalar function of the image point. `pull_back` carries its gradient g and
-Hessian H to the 3D point, J being the Jacobian of (u, v):
+Hessian H to the 3D point through the two maps in turn. The lens first: the distortion is the
+gradient of a scalar function of (a, b), so its first derivatives D are symmetric and its second
+derivatives have only four distinct entries. With F = diag(fx, fy) and e = F g,
 
-    gradient = J^T g
-    hessian  = J^T H J + g_u d2u + g_v d2v                (Gauss-Newton keeps the first part only)
+    gradient f' = D e
+    hessian  f'' = D F H F D + e_a d2a' + e_b d2b'        (Gauss-Newton keeps the first part only)
+
+Then the division: in the camera's frame da = (1, 0, -a) / z and db = (0, 1, -b) / z, so that
+
+    gradient = (f_a, f_b, -a f_a - b f_b) / z
+    hessian  = [f'' and the third row and column that follow from it and from f'] / z^2
+
+A few multiplications per point, and one rotation to the world's axes. The Jacobian of (u, v) and
+the Hessians of u and v are never formed.
 
 A point is *valid* where the model means anything: farther than the near plane, and within the
 radius up to which the distortion polynomial grows. High-order terms of real calibrations fold the
@@ -72,21 +78,29 @@ class Projection(NamedTuple):
 
 
 class ProjectionModel(NamedTuple):
-    """Image points with their derivatives with respect to the 3D points in the world frame.
+    """Image points with what `Camera.pull_back` needs to differentiate them.
 
     Attributes:
         uv: Pixel coordinates; outside the image where `valid` is False.
-        jacobian: First derivatives of `uv`, pixels per metre; zero where `valid` is False.
-        hessian: Second derivatives of `uv`, pixels per square metre; zero where `valid` is False.
         depth: Distance along the optical axis in metres; negative behind the camera.
         valid: False where the camera cannot see the direction, whatever the size of its image.
+        a: Normalised coordinate x / z; zero where `valid` is False.
+        b: Normalised coordinate y / z; zero where `valid` is False.
+        inverse_depth: 1 / z, per metre; zero where `valid` is False.
+        lens_aa: First derivative of the distorted a in a.
+        lens_ab: First derivative of the distorted a in b, and of the distorted b in a.
+        lens_bb: First derivative of the distorted b in b.
     """
 
     uv: Float[Tensor, "*batch p 2"]
-    jacobian: Float[Tensor, "*batch p 2 3"]
-    hessian: Float[Tensor, "*batch p 2 3 3"]
     depth: Float[Tensor, "*batch p"]
     valid: Bool[Tensor, "*batch p"]
+    a: Float[Tensor, "*batch p"]
+    b: Float[Tensor, "*batch p"]
+    inverse_depth: Float[Tensor, "*batch p"]
+    lens_aa: Float[Tensor, "*batch p"]
+    lens_ab: Float[Tensor, "*batch p"]
+    lens_bb: Float[Tensor, "*batch p"]
 
 
 class Camera(nn.Module):
@@ -207,11 +221,8 @@ class Camera(nn.Module):
     def to_camera_frame(self, points_world: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """Return the points in the camera's frame, `R x + t`, metres."""
         check_shape("points_world", points_world, 3)
-        rotation, translation = (
-            self.R_camera_world.to(points_world),
-            self.t_camera_world.to(points_world),
-        )
-        return points_world @ rotation.mT + translation
+        translation = self.t_camera_world.to(points_world)
+        return _turned(self.R_camera_world, points_world) + translation
 
     def project(self, points_world: Float[Tensor, "*batch p 3"]) -> Projection:
         """Project points; autograd differentiates it as often as needed.
@@ -223,13 +234,14 @@ class Camera(nn.Module):
             ShapeError: If the last dimension is not 3.
         """
         a, b, _, depth, valid = self._normalise(points_world)
-        distorted_a, distorted_b = _distort(a, b, self.distortion.to(a))
-        return Projection(self._to_pixels(distorted_a, distorted_b, valid), depth, valid)
+        distortion = self.distortion.to(a)
+        distorted = _distort(a, b, _radial_factors(a, b, distortion), distortion)
+        return Projection(self._to_pixels(*distorted, valid), depth, valid)
 
     def project_with_derivatives(
         self, points_world: Float[Tensor, "*batch p 3"]
     ) -> ProjectionModel:
-        """Project points, with closed-form derivatives with respect to the points.
+        """Project points, ready for `pull_back` to differentiate with respect to the points.
 
         Args:
             points_world: World frame, metres.
@@ -239,41 +251,128 @@ class Camera(nn.Module):
         """
         a, b, inverse_depth, depth, valid = self._normalise(points_world)
         distortion = self.distortion.to(a)
-        distorted_a, distorted_b = _distort(a, b, distortion)
-        d_aa, d_ab, d_bb = _distortion_jacobian(a, b, distortion)
-        d_aaa, d_aab, d_abb, d_bbb = _distortion_hessian(a, b, distortion)
-
-        # In the camera's frame, with w = 1 / z: da = w (1, 0, -a) and db = w (0, 1, -b).
-        scale = torch.where(valid, inverse_depth, 0.0)
-        rows, curvatures = [], []
-        focal_u, focal_v = self.K[0, 0].to(a), self.K[1, 1].to(a)
-        for focal, f_a, f_b, f_aa, f_ab, f_bb in (
-            (focal_u, d_aa, d_ab, d_aaa, d_aab, d_abb),
-            (focal_v, d_ab, d_bb, d_aab, d_abb, d_bbb),
-        ):
-            first, second = focal * scale, focal * scale * inverse_depth
-            along_a, along_b = a * f_aa + b * f_ab, a * f_ab + b * f_bb
-            along = a * f_a + b * f_b
-            rows += [first * f_a, first * f_b, -first * along]
-            curvatures += [
-                second * f_aa,
-                second * f_ab,
-                second * f_bb,
-                -second * (along_a + f_a),
-                -second * (along_b + f_b),
-                second * (a * along_a + b * along_b + 2.0 * along),
-            ]
-        rotation = self.R_camera_world.to(a)
-        shape = a.shape
-        jacobian = torch.stack(rows, dim=-1).reshape(-1, 3) @ rotation
-        hessian = torch.stack(curvatures, dim=-1).reshape(-1, 6) @ _congruence(rotation)
+        factors = _radial_factors(a, b, distortion)
+        distorted = _distort(a, b, factors, distortion)
         return ProjectionModel(
-            uv=self._to_pixels(distorted_a, distorted_b, valid),
-            jacobian=jacobian.reshape(*shape, 2, 3),
-            hessian=hessian.reshape(*shape, 2, 3, 3),
-            depth=depth,
-            valid=valid,
+            self._to_pixels(*distorted, valid),
+            depth,
+            valid,
+            a,
+            b,
+            torch.where(valid, inverse_depth, 0.0),
+            *_distortion_jacobian(a, b, factors, distortion),
         )
+
+    def pull_back(
+        self,
+        model: ProjectionModel,
+        value: Float[Tensor, "*batch p"],
+        gradient_uv: Float[Tensor, "*batch p 2"],
+        hessian_uv: Float[Tensor, "*batch p 2 2"],
+        *,
+        gauss_newton: bool = False,
+    ) -> PointCost:
+        """Carry a cost of image points with its derivatives to the points that they are images of.
+
+        Args:
+            model: The points' projection.
+            value: Cost of each point in nats; returned as it is.
+            gradient_uv: Derivative of the cost with respect to `uv`, nats per pixel.
+            hessian_uv: Second derivative, symmetric, nats per square pixel.
+            gauss_newton: Drop the curvature of the projection, as eq. 9 of [RR] does.
+
+        Returns:
+            The same cost as a function of the 3D point; its derivatives are zero at invalid points.
+        """
+        a, b, w = model.a, model.b, model.inverse_depth
+        aa, ab, bb = model.lens_aa, model.lens_ab, model.lens_bb
+        focal_u, focal_v = self._focal(a)
+        e_a, e_b = focal_u * gradient_uv[..., 0], focal_v * gradient_uv[..., 1]
+        h_aa, h_ab, h_bb = (
+            first * second * hessian_uv[..., i, j]
+            for i, j, first, second in (
+                (0, 0, focal_u, focal_u), (0, 1, focal_u, focal_v), (1, 1, focal_v, focal_v)
+            )
+        )  # fmt: skip
+        # Through the lens: derivatives in a and b.
+        f_a, f_b = e_a * aa + e_b * ab, e_a * ab + e_b * bb
+        along_a = h_aa * aa + h_ab * ab, h_ab * aa + h_bb * ab
+        along_b = h_aa * ab + h_ab * bb, h_ab * ab + h_bb * bb
+        f_aa, f_ab = aa * along_a[0] + ab * along_a[1], ab * along_a[0] + bb * along_a[1]
+        f_bb = ab * along_b[0] + bb * along_b[1]
+        if not gauss_newton:
+            distortion = self.distortion.to(a)
+            factors = _radial_factors(a, b, distortion)
+            aaa, aab, abb, bbb = _distortion_hessian(a, b, factors, distortion)
+            f_aa = f_aa + e_a * aaa + e_b * aab
+            f_ab = f_ab + e_a * aab + e_b * abb
+            f_bb = f_bb + e_a * abb + e_b * bbb
+        # Through the division: derivatives in the camera's frame.
+        x, y, z = a * f_aa + b * f_ab, a * f_ab + b * f_bb, a * f_a + b * f_b
+        zz = a * x + b * y
+        if not gauss_newton:
+            x, y, zz = x + f_a, y + f_b, zz + 2 * z
+        # Whole components, one after the other in memory: what the lift reads fastest.
+        gradient = torch.stack([w * f_a, w * f_b, -w * z]).movedim(0, -1)
+        rows = torch.stack([f_aa, f_ab, f_bb, -x, -y, zz]) * w.square()
+        hessian = _congruence(self.R_camera_world.to(a)).mT @ rows.flatten(1)
+        return PointCost(
+            value,
+            _turned(self.R_camera_world.mT, gradient),
+            hessian.reshape(3, 3, *a.shape).movedim((0, 1), (-2, -1)),
+        )
+
+    def image_normals(
+        self, model: ProjectionModel, normals_world: Float[Tensor, "*batch p 3"]
+    ) -> Float[Tensor, "*batch p 2"]:
+        """Unit normals m, in the image, of surfaces that are seen edge on.
+
+        With J the derivative of the image point, `J^T m` is parallel to the surface's normal n: a
+        motion along the surface does not move the image across itself. Where n is not quite
+        perpendicular to the line of sight this is the solution by least squares,
+        `m ~ (J J^T)^-1 J n`, and along u where there is none.
+
+        Args:
+            model: The points' projection.
+            normals_world: The surfaces' normals at the points.
+        """
+        a, b = model.a, model.b
+        aa, ab, bb = model.lens_aa, model.lens_ab, model.lens_bb
+        focal_u, focal_v = self._focal(a)
+        x, y, z = _turned(self.R_camera_world, normals_world).unbind(-1)
+        # J = F D [I, -(a b)^T] R / z. The inverses of J J^T's factors as adjugates, scaled lest
+        # products overflow: grazing rays have large coordinates and larger derivatives.
+        x, y = x - a * z, y - b * z
+        x, y = (1 + b * b) * x - a * b * y, (1 + a * a) * y - a * b * x
+        largest = torch.maximum(torch.maximum(aa.abs(), bb.abs()), ab.abs())
+        scale = torch.where(largest > 0, largest, 1.0).reciprocal()
+        aa, ab, bb = scale * aa, scale * ab, scale * bb
+        turn = (aa * bb - ab * ab).sign()
+        x, y = turn * (bb * x - ab * y), turn * (aa * y - ab * x)
+        x, y = x / focal_u, y / focal_v
+        length = torch.hypot(x, y)
+        some = length > 0
+        safe = torch.where(some, length, 1.0)
+        normal = torch.where(some, x / safe, 1.0), torch.where(some, y / safe, 0.0)
+        return torch.stack(normal).movedim(0, -1)
+
+    def jacobian(self, model: ProjectionModel) -> Float[Tensor, "*batch p 2 3"]:
+        """Derivatives of the image points with respect to the 3D points, pixels per metre.
+
+        Args:
+            model: The points' projection.
+        """
+        rows = []
+        for focal, f_a, f_b in zip(
+            self._focal(model.a),
+            (model.lens_aa, model.lens_ab),
+            (model.lens_ab, model.lens_bb),
+            strict=True,
+        ):
+            first = focal * model.inverse_depth
+            row = [first * f_a, first * f_b, -first * (model.a * f_a + model.b * f_b)]
+            rows.append(_turned(self.R_camera_world.mT, torch.stack(row).movedim(0, -1)))
+        return torch.stack(rows, dim=-2)
 
     def inside_image(self, uv: Float[Tensor, "*batch 2"]) -> Bool[Tensor, "*batch"]:
         """Tell which image points lie on a pixel; a pixel reaches half its side each way."""
@@ -309,7 +408,8 @@ class Camera(nn.Module):
         limit = self.maximum_radius.to(uv).clamp(max=_GRAZING_RADIUS)
 
         def residual_of(point: Tensor) -> tuple[Tensor, Tensor]:
-            distorted = _distort(point[..., 0], point[..., 1], distortion)
+            a, b = point.unbind(-1)
+            distorted = _distort(a, b, _radial_factors(a, b, distortion), distortion)
             residual = torch.stack(distorted, dim=-1) - target
             return residual, residual.square().sum(dim=-1)
 
@@ -320,7 +420,9 @@ class Camera(nn.Module):
         for _ in range(_UNDISTORTION_STEPS):
             if not (error > tolerance).any():
                 break
-            d_aa, d_ab, d_bb = _distortion_jacobian(point[..., 0], point[..., 1], distortion)
+            a, b = point.unbind(-1)
+            factors = _radial_factors(a, b, distortion)
+            d_aa, d_ab, d_bb = _distortion_jacobian(a, b, factors, distortion)
             determinant = d_aa * d_bb - d_ab * d_ab
             determinant = torch.where(determinant > 0.0, determinant, 1.0)
             e_a, e_b = residual.unbind(-1)
@@ -431,73 +533,52 @@ class Camera(nn.Module):
         b = torch.where(valid, y, 0.0) * inverse_depth
         return a, b, inverse_depth, depth, valid
 
+    def _focal(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        focal_u, focal_v = torch.diagonal(self.K)[:2].to(like).unbind()
+        return focal_u, focal_v
+
     def _to_pixels(self, a: Tensor, b: Tensor, valid: Tensor) -> Float[Tensor, "*batch p 2"]:
         K = self.K.to(a)
         width, height = self.image_size_wh
         u = torch.where(valid, K[0, 0] * a + K[0, 2], -float(width))
         v = torch.where(valid, K[1, 1] * b + K[1, 2], -float(height))
-        return torch.stack([u, v], dim=-1)
+        # Each coordinate one block in memory, as everything that is computed from points.
+        return torch.stack([u, v]).movedim(0, -1)
 
 
-def pull_back(
-    model: ProjectionModel,
-    value: Float[Tensor, "*batch p"],
-    gradient_uv: Float[Tensor, "*batch p 2"],
-    hessian_uv: Float[Tensor, "*batch p 2 2"],
-    *,
-    gauss_newton: bool = False,
-) -> PointCost:
-    """Carry a cost of image points, with its derivatives, to the 3D points that they are images of.
-
-    Args:
-        model: The projection with its derivatives.
-        value: Cost of each point in nats; returned as it is.
-        gradient_uv: Derivative of the cost with respect to `uv`, nats per pixel.
-        hessian_uv: Second derivative, symmetric, nats per square pixel.
-        gauss_newton: Drop the curvature of the projection, as eq. 9 of [RR] does.
-
-    Returns:
-        The same cost as a function of the 3D point; its derivatives are zero at invalid points.
-    """
-    g_u, g_v = gradient_uv[..., 0, None], gradient_uv[..., 1, None]
-    along_u, along_v = model.jacobian.unbind(-2)
-    gradient = g_u * along_u + g_v * along_v
-    # Sums of outer products: on a CPU far faster than batches of 2 x 3 matrix products.
-    h_uu, h_uv, h_vv = (hessian_uv[..., i, j, None] for i, j in ((0, 0), (0, 1), (1, 1)))
-    hessian = along_u[..., :, None] * (h_uu * along_u + h_uv * along_v)[..., None, :]
-    hessian = hessian + along_v[..., :, None] * (h_uv * along_u + h_vv * along_v)[..., None, :]
-    if not gauss_newton:
-        hessian = hessian + g_u[..., None] * model.hessian[..., 0, :, :]
-        hessian = hessian + g_v[..., None] * model.hessian[..., 1, :, :]
-    return PointCost(value, gradient, hessian)
+def _turned(rotation: Tensor, vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Turn vectors. In memory each component of the result is one block, fast to work on."""
+    components = vectors.movedim(-1, 0)
+    turned = rotation.to(vectors) @ components.reshape(3, vectors.shape[:-1].numel())
+    return turned.reshape(components.shape).movedim(0, -1)
 
 
-def _radial_factors(
-    a: Tensor, b: Tensor, distortion: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return r2, q(r2) and its first and second derivative with respect to r2."""
+def _radial_factors(a: Tensor, b: Tensor, distortion: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return r2, q(r2) and its first derivative with respect to r2."""
     k1, k2, _, _, k3 = distortion.unbind()
     r2 = a * a + b * b
     q = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    first = k1 + r2 * (2.0 * k2 + r2 * (3.0 * k3))
-    second = 2.0 * k2 + 6.0 * k3 * r2
-    return r2, q, first, second
+    return r2, q, k1 + r2 * (2.0 * k2 + r2 * (3.0 * k3))
 
 
-def _distort(a: Tensor, b: Tensor, distortion: Tensor) -> tuple[Tensor, Tensor]:
+def _distort(
+    a: Tensor, b: Tensor, factors: tuple[Tensor, Tensor, Tensor], distortion: Tensor
+) -> tuple[Tensor, Tensor]:
     """Apply the lens distortion to normalised coordinates."""
     _, _, p1, p2, _ = distortion.unbind()
-    r2, q, _, _ = _radial_factors(a, b, distortion)
+    r2, q, _ = factors
     return (
         a * q + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a),
         b * q + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b,
     )
 
 
-def _distortion_jacobian(a: Tensor, b: Tensor, distortion: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _distortion_jacobian(
+    a: Tensor, b: Tensor, factors: tuple[Tensor, Tensor, Tensor], distortion: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
     """Return the entries aa, ab, bb of the distortion's Jacobian, which is symmetric."""
     _, _, p1, p2, _ = distortion.unbind()
-    _, q, q1, _ = _radial_factors(a, b, distortion)
+    _, q, q1 = factors
     return (
         q + 2.0 * (a * a * q1 + p1 * b + 3.0 * p2 * a),
         2.0 * (a * b * q1 + p1 * a + p2 * b),
@@ -506,16 +587,18 @@ def _distortion_jacobian(a: Tensor, b: Tensor, distortion: Tensor) -> tuple[Tens
 
 
 def _distortion_hessian(
-    a: Tensor, b: Tensor, distortion: Tensor
+    a: Tensor, b: Tensor, factors: tuple[Tensor, Tensor, Tensor], distortion: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the entries aaa, aab, abb, bbb of the distortion's symmetric second derivative."""
-    _, _, p1, p2, _ = distortion.unbind()
-    _, _, q1, q2 = _radial_factors(a, b, distortion)
+    _, k2, p1, p2, k3 = distortion.unbind()
+    r2, _, q1 = factors
+    # Four times the second derivative of q(r2).
+    bend = 8.0 * k2 + 24.0 * k3 * r2
     return (
-        6.0 * (a * q1 + p2) + 4.0 * a * a * a * q2,
-        2.0 * (b * q1 + p1) + 4.0 * a * a * b * q2,
-        2.0 * (a * q1 + p2) + 4.0 * a * b * b * q2,
-        6.0 * (b * q1 + p1) + 4.0 * b * b * b * q2,
+        6.0 * (a * q1 + p2) + bend * a * a * a,
+        2.0 * (b * q1 + p1) + bend * a * a * b,
+        2.0 * (a * q1 + p2) + bend * a * b * b,
+        6.0 * (b * q1 + p1) + bend * b * b * b,
     )
 
 

@@ -38,6 +38,23 @@ def sample_bilinear(
     Raises:
         ShapeError: If `image` is not `[c, h, w]` with at least one pixel or `uv` not `[..., 2]`.
     """
+    return interpolate_bilinear(image, uv), inside_image(uv, *image.shape[1:])
+
+
+def interpolate_bilinear(
+    image: Float[Tensor, "c h w"], uv: Float[Tensor, "*batch p 2"]
+) -> Float[Tensor, "*batch p c"]:
+    """The same without the test for being inside.
+
+    It is fastest where the coordinates are two blocks in memory, all u and then all v.
+
+    Args:
+        image: Any number of channels; converted to the dtype of `uv`.
+        uv: Pixel coordinates.
+
+    Raises:
+        ShapeError: If `image` is not `[c, h, w]` with at least one pixel or `uv` not `[..., 2]`.
+    """
     height, width = _checked_size(image, uv)
     scale = uv.new_tensor([2.0 / width, 2.0 / height])
     grid = ((uv + 0.5) * scale - 1.0).reshape(1, 1, -1, 2)
@@ -45,8 +62,19 @@ def sample_bilinear(
     values = functional.grid_sample(
         image.to(uv)[None], grid, mode="bilinear", padding_mode="border", align_corners=False
     )
-    values = values[0, :, 0].mT.reshape(*uv.shape[:-1], image.shape[0])
-    return values, _inside(uv, height, width)
+    return values[0, :, 0].mT.reshape(*uv.shape[:-1], image.shape[0])
+
+
+def inside_image(uv: Float[Tensor, "*batch 2"], height: int, width: int) -> Bool[Tensor, "*batch"]:
+    """Tell which points lie on a pixel of an image.
+
+    Args:
+        uv: Pixel coordinates.
+        height: Rows of the image.
+        width: Columns of the image.
+    """
+    u, v = uv.unbind(-1)
+    return (u >= -0.5) & (u < width - 0.5) & (v >= -0.5) & (v < height - 0.5)
 
 
 def sample_bilinear_with_derivative(
@@ -85,7 +113,7 @@ def sample_bilinear_with_derivative(
     slope_v = torch.where((v >= 0.0) & (v <= height - 1.0), low - top, 0.0)
     shape = (*uv.shape[:-1], image.shape[0])
     derivative = torch.stack([slope_u.mT, slope_v.mT], dim=-1)
-    return values.mT.reshape(shape), derivative.reshape(*shape, 2), _inside(uv, height, width)
+    return values.mT.reshape(shape), derivative.reshape(*shape, 2), inside_image(uv, height, width)
 
 
 def gaussian_pyramid(
@@ -126,11 +154,6 @@ def _checked_size(image: Tensor, uv: Tensor | None = None) -> tuple[int, int]:
     if uv is not None:
         check_shape("uv", uv, 2)
     return image.shape[1], image.shape[2]
-
-
-def _inside(uv: Tensor, height: int, width: int) -> Bool[Tensor, "*batch p"]:
-    u, v = uv.unbind(-1)
-    return (u >= -0.5) & (u < width - 0.5) & (v >= -0.5) & (v < height - 0.5)
 
 
 def _cell(coordinate: Tensor, size: int) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,131 @@
+"""Pose and shape together: derivatives, and a thick body found from its picture."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from torchcss.body.model import load_body
+from torchcss.body.shape import (
+    ShapeParameters,
+    surface_angles,
+    with_shape,
+)
+from torchcss.body.surface import surface_points
+from torchcss.cost.contour import ContourTerm
+from torchcss.cost.joints import JointObservation, JointTerm
+from torchcss.cost.shaped import ShapedCost
+from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.cost.visibility import ContourPredictor
+from torchcss.inference.trust_region import TrustRegionNewton
+from torchcss.raster import Mesh, render_meshes
+from torchcss.synthetic import grid_faces
+from torchcss.types import Bounds
+from torchcss.vision.camera import Camera
+from torchcss.vision.features import FeatureExtractor
+
+
+def problem(thicker: float) -> tuple[ShapedCost, torch.Tensor, ShapeParameters]:
+    """A picture of an arm whose cross-sections are larger than the catalogue's."""
+    body = load_body("arm7")
+    turn = torch.eye(3, dtype=torch.float64)
+    body = body.with_base(turn, torch.tensor([0.0, 0.3, -1.6], dtype=torch.float64))
+    camera = Camera(
+        [[400.0, 0, 159.5], [0, 400.0, 119.5], [0, 0, 1]], (320, 240),
+        R_camera_world=np.diag([1.0, -1.0, -1.0]),
+    )  # fmt: skip
+    x = body.rest.clone()
+    x[body.state_index("r_elbow_flexion")] = 0.6
+    parameters = ShapeParameters(body, ("a1", "a2"))
+    z = torch.zeros(len(parameters.names), dtype=torch.float64)
+    z += thicker * torch.tensor(
+        [
+            body.part_shape[body.part_names.index("r_" + name[:-3]), :2].mean()
+            for name in parameters.names
+        ]
+    )
+    true = with_shape(body, parameters.shape(z))
+    rotation, centre = true.part_poses(true.pose(x))
+    mesh = true.mesh(40, 40)
+    meshes = [
+        Mesh(
+            mesh.points[part].flatten(0, 1) @ rotation[part].T + centre[part],
+            mesh.normals[part].flatten(0, 1) @ rotation[part].T,
+            grid_faces(40, 40),
+            torch.tensor([0.9, 0.8, 0.7], dtype=torch.float64),
+        )
+        for part in range(true.num_parts)
+    ]
+    dark = torch.full((240, 320, 3), 10, dtype=torch.uint8)
+    picture = render_meshes(
+        meshes,
+        lambda p: tuple(camera.project(p)),  # type: ignore[arg-type]
+        240,
+        320,
+        background=dark,
+        eye_world=camera.centre_world,
+    ).image  # fmt: skip
+    field = FeatureExtractor()(picture.numpy()).edge_field().double()
+    joints = camera.project(body.pose(x).joints).uv
+    base = TrackingCost(
+        body=body,
+        camera=camera,
+        choice=CostChoice(contour=None, temporal=None, joints=JointTerm(sigma=1.0)),
+        observation=JointObservation(
+            body.joint_names, joints, torch.ones(len(joints)).double(), body.joint_names
+        ),
+    )
+    cost = ShapedCost(
+        base=base,
+        parameters=parameters,
+        contour=ContourTerm(),
+        edge_field=field,
+        contour_weight=150.0,
+    )
+    return cost, torch.cat([x, torch.zeros_like(z)]), parameters
+
+
+def test_a_thick_arm_is_found():
+    thicker = 0.2
+    cost, start, parameters = problem(thicker)
+    n = cost.base.body.num_parameters
+    held = Bounds(
+        torch.cat([start[:n], parameters.bounds.lower]),
+        torch.cat([start[:n], parameters.bounds.upper]),
+    )
+    fit = TrustRegionNewton(max_steps=20, tolerance=1e-2).minimise(cost, start[None], held)
+    assert torch.equal(fit.mean[0, :n], start[:n])
+    assert float(fit.cost[0]) < float(cost.value(start[None])[0]) - 1
+    body = cost.base.body
+    shape = parameters.shape(fit.mean[0, n:])
+    # The arm hangs across the line of sight along z: the picture shows its width, a number of x.
+    for part in ("r_upper_arm", "r_forearm"):
+        row = body.part_names.index(part)
+        grown = float(shape[row, :2].sum() / body.part_shape[row, :2].sum() - 1)
+        assert 0.4 * thicker < grown < 1.5 * thicker
+    whole = TrustRegionNewton(max_steps=10, tolerance=1e-2).minimise(cost, fit.mean, cost.bounds)
+    assert float(whole.cost[0]) <= float(fit.cost[0])
+
+
+def test_slope_is_that_of_nodes_that_keep_their_angles():
+    """The contour's slope in the shape: forces on the nodes times how far they move."""
+    cost, start, parameters = problem(0.1)
+    body, camera, n = cost.base.body, cost.base.camera, cost.base.body.num_parameters
+    model = cost.local_model(start[None])
+    torch.testing.assert_close(model.hessian, model.hessian.mT)
+    predictor, pose = ContourPredictor(body), body.pose(start[None, :n])
+    nodes = predictor(body, pose, camera.centre_world)
+    part = predictor.node_part
+    rotation, centre = (each[0, part] for each in body.part_poses(pose))
+    angles = surface_angles(
+        body.part_shape[part], ((nodes.points[0] - centre)[:, None] @ rotation)[:, 0]
+    )
+    force = cost.contour.point_cost(nodes, camera, cost.edge_field).gradient[0]
+    step = 1e-6
+    for column in range(len(parameters.names)):
+        z = torch.zeros_like(start[n:])
+        z[column] = step
+        ends = [surface_points(parameters.shape(s * z)[part], *angles).points for s in (1, -1)]
+        moved = (rotation @ (ends[0] - ends[1])[..., None])[..., 0] / (2 * step)
+        slope = cost.contour_weight / predictor.num_nodes * (force * moved).sum()
+        torch.testing.assert_close(model.gradient[0, n + column], slope, rtol=1e-6, atol=1e-4)

@@ -1,0 +1,100 @@
+"""The cost of pose, lengths and shape together: stages two and three of section 5 [IJRR].
+
+    f(x, z) = joints(x) + priors(x) + contour(x, z) + 1/2 z^T P z
+
+`x` is the state of a body (lengths included, if they are free), `z` its shape parameters
+(`torchcss.body.shape`), P the precision of their prior. Joints do not see the flesh; contours see
+both. Contour nodes and their edges are found fresh at every (x, z), and the derivatives hold them
+fixed, as everywhere: a node keeps its angles on the part's surface and moves with pose and shape.
+
+Every item has flesh of its own, so items are worked off one after another. Make a `ShapedCost` and
+give it to the optimiser; hold variables by bounds of no width.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchcss.body.shape import (
+    ShapeParameters,
+    lift_with_shape,
+    surface_angles,
+    surface_derivatives,
+    with_shape,
+)
+from torchcss.cost.contour import ContourTerm
+from torchcss.cost.total import TrackingCost
+from torchcss.cost.visibility import ContourPredictor
+from torchcss.types import Bounds, LocalModel, PointCost
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShapedCost:
+    """Cost of pose and shape; a `CostFunction` on states followed by shape parameters.
+
+    Attributes:
+        base: The terms that do not see the flesh; its body has the shape from which z counts.
+        parameters: Which shape numbers are free.
+        contour: The contour term.
+        edge_field: Edge energy times gradient direction of the image.
+        contour_weight: Nats per nu of the contour's mean cost per node.
+    """
+
+    base: TrackingCost
+    parameters: ShapeParameters
+    contour: ContourTerm
+    edge_field: Float[Tensor, "2 h w"]
+    contour_weight: float
+
+    @property
+    def bounds(self) -> Bounds:
+        """Limits of state and shape."""
+        pairs = zip(self.base.body.bounds, self.parameters.bounds, strict=True)
+        return Bounds(*(torch.cat(pair) for pair in pairs))
+
+    def take(self, items: Int[Tensor, " b"]) -> ShapedCost:
+        """The cost of some of the items: the same for all."""
+        return self
+
+    def value(self, x: Float[Tensor, "b m"]) -> Float[Tensor, " b"]:
+        """Cost in nats."""
+        return self.local_model(x).value
+
+    def local_model(self, x: Float[Tensor, "b m"]) -> LocalModel:
+        """Cost, gradient and Hessian."""
+        n = self.base.body.num_parameters
+        state, z = x[:, :n], x[:, n:]
+        plain = self.base.local_model(state)
+        flesh = [self._contour(state[item], z[item]) for item in range(len(x))]
+        pull = z @ self.parameters.precision
+        prior = 0.5 * (pull * z).sum(-1)
+        gradient = torch.cat([plain.gradient, pull], dim=-1)
+        hessian = x.new_zeros(*x.shape, x.shape[-1])
+        hessian[:, :n, :n] = plain.hessian
+        hessian[:, n:, n:] = self.parameters.precision
+        if not flesh:
+            return LocalModel(plain.value + prior, gradient, hessian)
+        seen = LocalModel(*(torch.stack(field) for field in zip(*flesh, strict=True)))
+        return LocalModel(
+            plain.value + prior + seen.value, gradient + seen.gradient, hessian + seen.hessian
+        )
+
+    def _contour(self, x: Float[Tensor, " n"], z: Float[Tensor, " z"]) -> LocalModel:
+        camera, shape = self.base.camera, self.parameters.shape(z)
+        body = with_shape(self.base.body, shape)
+        predictor = ContourPredictor(body)
+        pose = body.pose(x[None])
+        nodes = predictor(body, pose, camera.centre_world)
+        scale = self.contour_weight / (max(predictor.num_nodes, 1) * self.contour.nu)
+        cost = self.contour.point_cost(nodes, camera, self.edge_field)
+        cost = PointCost(*(scale * field[0] for field in cost))
+        pose, points, part = body.pose(x), nodes.points[0], predictor.node_part
+        rotation, centre = body.part_poses(pose)
+        local = ((points - centre[part])[:, None, :] @ rotation[part])[:, 0]
+        angles = surface_angles(shape[part], local)
+        derivatives = surface_derivatives(shape[part], *angles)
+        return lift_with_shape(body, pose, points, part, derivatives, cost, self.parameters)
