@@ -1,0 +1,199 @@
+"""What makes spurious minima fewer on cluttered frames: robust potentials, motion boundaries, flow.
+
+    python scripts/cost_minima.py --data DIR --out out/minima
+
+Section 3.1 [IJRR] wants few spurious minima, by robust error potentials and by edges weighted with
+motion boundaries, W = 1 - k S_p. Here the contour term is varied in both, without and with flow, on
+the same lines: through the truth (of the clip: the fit to the keypoints nearest the 3D reference),
+along joints and eigenvectors of the covariance of the mode there, as far as the limits admit. The
+frames are some of the rendered arm before clutter and, with `--data`, of DIR/balance_beam_4cam.
+A minimum is spurious if it is not the one nearest the truth; `torchcss.slices` says how minima and
+their prominence are found. A slice misleads if its lowest point is over 0.1 (radians, metres) away:
+few minima are worth nothing if the lowest is wrong. All potentials are given one cost of a node
+without match; all of them, the quadratic one too, saturate there, at the search window's edge.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+import tyro
+
+from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.errors import TorchcssError
+from torchcss.io import plots
+from torchcss.io.tracks import prepare_output_folder, write_summary
+from torchcss.pipeline import Settings, make_choice
+from torchcss.robust import Leclerc, Lorentzian, Quadratic
+from torchcss.scenes import Scene, arm_scenes, clip_scenes
+from torchcss.slices import PROMINENCE, find_minima, num_spurious
+
+TERMS = ("contour", "motion_boundaries", "flow", "stabiliser")
+POTENTIALS = {  # with sigma in pixels and the colour of its lines
+    "quadratic": (Quadratic, 2.5, "vermilion"),
+    "Lorentzian": (Lorentzian, 2.5, "blue"),
+    "Leclerc": (Leclerc, 2.5, "green"),
+    "Leclerc, wide": (Leclerc, 6.0, "purple"),  # as wide at half its depth as the Lorentzian
+}
+EMPHASES = (0.0, 0.3, 1.0)  # k; the paper found 0.2 to 0.4 to work well
+ON_BODY = ("root_z", "root_yaw", "r_shoulder_swing", "r_elbow_flexion", "l_elbow_flexion")
+ON_BODY += ("r_hip_flexion", "r_knee_flexion", "l_knee_flexion", "eigen 0", "eigen 1", "eigen 2")
+STATED = (0.0, 0.005, 0.01, PROMINENCE, 0.05, 0.1)  # least prominences; 0 counts every ripple
+LEAST = sorted({*STATED, *np.geomspace(0.002, 0.1, 25).tolist()})  # of the figure
+SILENT = CostChoice(contour=None, joints=None, stabiliser=None, temporal=None)
+FIRST, DRAWN, MISLEADING = ("quadratic", 0.0), "r_shoulder_swing", 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """Which frames, and how their slices are sampled."""
+
+    data: Path | None = None
+    """Folder that holds balance_beam_4cam; without it only the arm is looked at."""
+    seeds: tuple[int, ...] = (0, 1)
+    """Seeds of the arm's room."""
+    frames: tuple[int, ...] = (10, 25, 40)
+    """Frames of the arm's sequence."""
+    clip_frames: tuple[int, ...] = (10, 30, 70)
+    """Frames of the clip."""
+    samples: int = 401
+    """Samples of a slice."""
+    small: bool = False
+    """One frame of the arm, few samples: for tests."""
+    out: Path | None = None
+    """Folder for cost_minima.json and the figures."""
+
+
+class Curve(NamedTuple):
+    """What is kept of a slice: spurious minima by least prominence, and where it is lowest."""
+
+    frame: str
+    spurious: list[int]
+    lowest_at: float
+
+
+Curves = dict[tuple[str, str, str, float], list[Curve]]  # by body, terms, potential and k
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Count on all frames, print, draw; return what is written."""
+    if config.small:
+        config = replace(config, data=None, seeds=(0,), frames=(3,), samples=41)
+    if config.out is not None:
+        prepare_output_folder(config.out)
+    curves: Curves = defaultdict(list)
+    for scene in scenes(config):
+        measure(scene, config, curves)
+    rows = [row_of(key, curves) for key in sorted(curves, key=lambda key: key[:2])]
+    report = {"settings": config, "least_prominences": LEAST, "rows": rows}
+    print_table(rows)
+    if config.out is not None:
+        draw_counts(rows, config.out)
+        write_summary(config.out / "cost_minima.json", report)
+    return report
+
+
+def scenes(config: Config) -> Iterator[Scene]:
+    settings = Settings(body="arm8", terms=TERMS)
+    for seed in config.seeds:
+        generator, name = torch.Generator().manual_seed(seed), f"arm {seed}"
+        yield from arm_scenes(config.frames, generator=generator, settings=settings, name=name)
+    if config.data is not None:
+        folder, settings = config.data / "balance_beam_4cam", replace(settings, body="body34")
+        generator = torch.Generator().manual_seed(0)
+        yield from clip_scenes(folder, config.clip_frames, generator=generator, settings=settings)
+
+
+def contour_of(scene: Scene, potential: type, sigma: float, k: float) -> TrackingCost:
+    """A variant of the contour term; a node without match costs as many nats as by default."""
+    usual = make_choice(Settings(terms=TERMS, boundary_emphasis=k), 1.0)
+    assert usual.contour is not None
+    term = replace(usual.contour, potential_kind=potential, sigma=sigma)
+    ratio = term.unmatched / usual.contour.unmatched
+    term = replace(term, fitted_level=usual.contour.fitted_level * ratio)
+    choice = replace(SILENT, contour=term, contour_weight=usual.contour_weight / ratio)
+    field = scene.features.edge_field(boundary_emphasis=k).to(scene.truth)
+    return replace(scene.cost, choice=choice, edge_field=field)
+
+
+def measure(scene: Scene, config: Config, curves: Curves) -> None:
+    """Add the slices of one frame; draw those along one line."""
+    limits, body = scene.limits(scene.truth), scene.cost.body.name
+    flow = replace(scene.cost, choice=replace(SILENT, flow=scene.cost.choice.flow))
+    for line in scene.lines(scene.truth):
+        if body != "arm8" and line.name not in ON_BODY:
+            continue
+        offsets = np.linspace(*line.interval(limits), config.samples)
+        states = line.states(offsets)
+        by_flow, shown = flow.value(states).numpy(), defaultdict(dict)
+        for name, (potential, sigma, _) in POTENTIALS.items():
+            for k in EMPHASES:
+                edges = contour_of(scene, potential, sigma, k).value(states).numpy()
+                shown[name][f"k = {k:g}"] = edges
+                for terms, curve in (("contour", edges), ("contour + flow", edges + by_flow)):
+                    minima, extent = find_minima(curve), float(np.ptp(curve))
+                    counts = [num_spurious(minima.above(least * extent)) for least in LEAST]
+                    taken = Curve(scene.name, counts, float(offsets[curve.argmin()]))
+                    curves[body, terms, name, k].append(taken)
+        if line.name == DRAWN and config.out is not None:
+            title = f"Contour term of {scene.name}, {plots.title_of(line)}"
+            figure = plots.curves_figure(offsets, shown, plots.unit_of(line), title)
+            plots.save_figure(figure, config.out / f"variants_{scene.slug}.png")
+
+
+def row_of(key: tuple[str, str, str, float], curves: Curves) -> dict[str, Any]:
+    """Means over slices; and what is gained on the first row, with the error over frames."""
+    found, first, usual = curves[key], curves[*key[:2], *FIRST], LEAST.index(PROMINENCE)
+    gains: dict[str, list[int]] = defaultdict(list)
+    for curve, other in zip(found, first, strict=True):
+        gains[curve.frame].append(other.spurious[usual] - curve.spurious[usual])
+    by_frame = {frame: np.mean(gain) for frame, gain in gains.items()}
+    counts, of_first = (np.mean([c.spurious for c in curves], axis=0) for curves in (found, first))
+    return {
+        **dict(zip(("body", "terms", "potential", "k"), key, strict=True)),
+        "spurious": counts,
+        "share_of_first": counts / np.where(of_first > 0, of_first, np.nan),
+        "fewer_by_frame": by_frame,
+        "fewer": np.mean(list(by_frame.values())),
+        "standard_error": np.std(list(by_frame.values())) / max(len(by_frame) - 1, 1) ** 0.5,
+        "misleading": np.mean([abs(curve.lowest_at) > MISLEADING for curve in found]),
+        "num_slices": len(found),
+    }
+
+
+def print_table(rows: list[dict[str, Any]]) -> None:
+    for index, row in enumerate(rows):
+        if index % (len(POTENTIALS) * len(EMPHASES)) == 0:
+            print(f"\n{row['body']}, {row['terms']}: spurious minima by least prominence in %")
+            header = "".join(f"{100 * least:>8g}" for least in STATED)
+            print(f"{'potential':14}{'k':>5} |{header} | fewer at 2 % | misleading")
+        counts = "".join(f"{row['spurious'][LEAST.index(least)]:8.2f}" for least in STATED)
+        print(f"{row['potential']:14}{row['k']:5.1f} |{counts} |{row['fewer']:5.2f}", end="")
+        print(f" +- {row['standard_error']:.2f} |{100 * row['misleading']:9.0f} %")
+
+
+def draw_counts(rows: list[dict[str, Any]], out: Path) -> None:
+    figures: dict[str, dict[str, list[plots.CountCurve]]] = defaultdict(lambda: defaultdict(list))
+    for row in rows:
+        if row["k"] in EMPHASES[:2]:
+            label = f"{row['potential']}, {'motion boundaries' if row['k'] else 'plain edges'}"
+            look = POTENTIALS[row["potential"]][2], row["k"] == 0, row["share_of_first"][1:]
+            figures[row["body"]][row["terms"]].append(plots.CountCurve(label, *look))
+    for body, panels in figures.items():
+        figure = plots.counts_figure(np.array(LEAST[1:]), panels, f"Spurious minima of {body}")
+        plots.save_figure(figure, out / f"minima_{body}.png")
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Config, description=__doc__))
+    except TorchcssError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

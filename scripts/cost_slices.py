@@ -1,0 +1,194 @@
+"""Slices through the cost of a frame, by terms: how many minima, how continuous (Fig. 4, 7, 8).
+
+    python scripts/cost_slices.py --data DIR --out out/slices
+
+The frames are one of the rendered arm before clutter and, with `--data`, one of
+DIR/balance_beam_4cam. Lines go through the mode at which the optimiser arrives
+from the truth (for the clip, from the fit to the keypoints that is nearest the 3D reference), along
+joints and along eigenvectors of its covariance, close (a few standard deviations) and as far as the
+joint limits admit. How minima and jumps are counted is in `torchcss.slices`.
+
+Printed and written to the folder `--out`: a table by terms, the slices as figures, and, as Fig. 4
+[IJRR], a minimum that a joint limit displaced. `scripts/cost_minima.py` goes on from here: what
+makes minima fewer.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+
+from torchcss.errors import TorchcssError
+from torchcss.inference.trust_region import TrustRegionNewton
+from torchcss.io import plots
+from torchcss.io.tracks import prepare_output_folder, write_summary
+from torchcss.pipeline import Settings
+from torchcss.scenes import Scene, arm_scenes, clip_scenes
+from torchcss.slices import PROMINENCE, Line, sample_slice
+
+# As in [IJRR]: keypoints only say where to start, and so does the frame before.
+TERMS = ("contour", "motion_boundaries", "flow", "stabiliser", "interpenetration")
+# Of a body the lines that are looked at; of an arm all of them are.
+ON_BODY = (
+    *("root_x", "root_y", "root_z", "root_yaw", "lumbar_flexion", "neck_flexion"),
+    *("r_shoulder_swing", "r_shoulder_raising", "r_shoulder_twist", "r_elbow_flexion"),
+    *("l_shoulder_swing", "l_elbow_flexion", "r_hip_flexion", "r_hip_abduction"),
+    *("r_knee_flexion", "l_knee_flexion", "eigen 0", "eigen 1", "eigen 2", "eigen 3", "eigen 33"),
+)
+DRAWN = ("root_z", "r_shoulder_swing", "r_elbow_flexion", "r_knee_flexion", "eigen 0", "eigen 1")
+DRAWN += ("eigen 7", "eigen 33")  # the most certain of arm8 and body34
+NEAR = 0.35  # radians or metres to either side of a limit
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """Which frames, and how their slices are sampled."""
+
+    data: Path | None = None
+    """Folder that holds balance_beam_4cam; without it only the arm is looked at."""
+    frame: int = 15
+    """Frame of the arm's sequence."""
+    clip_frame: int = 30
+    """Frame of the clip."""
+    view: str = "cam01"
+    """Camera of the clip."""
+    seed: int = 0
+    """Seed of the arm's room and of starting poses."""
+    samples: int = 401
+    """Samples of a slice; jumps are also measured at twice the density."""
+    deviations: float = 4.0
+    """Half length of a close slice, standard deviations."""
+    prominence: float = PROMINENCE
+    """Least prominence of a minimum that counts, share of the slice's range."""
+    terms: tuple[str, ...] = TERMS
+    """Terms of the cost, see `torchcss.pipeline.ALL_TERMS`."""
+    small: bool = False
+    """The arm alone, few lines and samples: for tests."""
+    out: Path | None = None
+    """Folder for cost_slices.json and the figures."""
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Look at the frames, print, draw; return what is written."""
+    if config.small:
+        config = replace(config, data=None, frame=3, samples=51)
+    if config.out is not None:
+        prepare_output_folder(config.out)
+    report: dict[str, Any] = {"settings": config, "frames": {}}
+    for scene in scenes(config):
+        rows = look(scene, config)
+        table = summarise(rows)
+        print_table(scene.name, table, rows)
+        report["frames"][scene.name] = {"table": table, "slices": rows}
+        report["frames"][scene.name]["displaced_minimum"] = displaced_minimum(scene, config)
+    if config.out is not None:
+        write_summary(config.out / "cost_slices.json", report)
+    return report
+
+
+def scenes(config: Config) -> Iterator[Scene]:
+    generator = torch.Generator().manual_seed(config.seed)
+    settings = Settings(body="arm8", terms=config.terms)
+    yield from arm_scenes([config.frame], generator=generator, settings=settings)
+    if config.data is not None:
+        folder, settings = config.data / "balance_beam_4cam", replace(settings, body="body34")
+        yield from clip_scenes(
+            folder, [config.clip_frame], generator=generator, view=config.view, settings=settings
+        )
+
+
+def look(scene: Scene, config: Config) -> list[dict[str, Any]]:
+    """Slices through the mode, described and drawn."""
+    mode = scene.mode.mean
+    limits, lines, rows, drawn = scene.limits(mode), scene.lines(mode), [], []
+    chosen = [line.name for line in lines] if scene.cost.body.name == "arm8" else ON_BODY
+    for line in lines:
+        if line.name not in (DRAWN if config.small else chosen):
+            continue
+        pair = []
+        for scale, reach in (("close", config.deviations * line.deviation), ("far", math.inf)):
+            interval = line.interval(limits, reach)
+            taken = sample_slice(scene.cost.terms, line, interval, config.samples)
+            terms = {name: taken.report(name, config.prominence)._asdict() for name in taken.values}
+            row = {"line": line.name, "deviation": line.deviation, "interval": interval}
+            rows.append({**row, "scale": scale, "terms": terms})
+            pair.append((taken, plots.unit_of(line, close=scale == "close")))
+        if line.name in DRAWN:
+            drawn.append(pair)
+    if config.out is not None:
+        title = f"Cost of {scene.name}, by terms"
+        figure = plots.slices_figure(drawn, title, prominence=config.prominence)
+        plots.save_figure(figure, config.out / f"slices_{scene.slug}.png")
+    return rows
+
+
+def summarise(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Mean counts and worst jumps over all lines, by term and scale."""
+    table = []
+    for name in rows[0]["terms"]:
+        for scale in ("close", "far"):
+            found = [(row["terms"][name], row["line"]) for row in rows if row["scale"] == scale]
+            entry: dict[str, Any] = {"term": name, "scale": scale}
+            for key in ("num_minima_raw", "num_minima"):
+                entry[key] = float(np.mean([report[key] for report, _ in found]))
+            for key in ("largest_jump", "largest_jump_twice_density", "discontinuity"):
+                entry[key], entry[f"{key}_on"] = max((report[key], line) for report, line in found)
+            table.append(entry)
+    return table
+
+
+def print_table(name: str, table: list[dict[str, Any]], rows: list[dict[str, Any]]) -> None:
+    print(f"\n{name}: {len(rows) // 2} lines, close and far; jumps in % of the slice's range")
+    print(f"{'':24}|{'minima per slice':^18}|{'largest jump on any slice':^34}")
+    print(f"{'term':16}{'scale':>8}|{'all':>8}{'counted':>10}|", end="")
+    print(f"{'sampled':>8}{'2 x density':>12}{'bisected':>10}  bisected on")
+    for entry in table:
+        print(f"{entry['term']:16}{entry['scale']:>8}|{entry['num_minima_raw']:8.1f}", end="")
+        print(f"{entry['num_minima']:10.1f}|{100 * entry['largest_jump']:8.2f}", end="")
+        print(f"{100 * entry['largest_jump_twice_density']:12.2f}", end="")
+        print(f"{100 * entry['discontinuity']:10.3f}  {entry['discontinuity_on']}")
+
+
+def displaced_minimum(scene: Scene, config: Config) -> dict[str, Any] | None:
+    """The mode that presses hardest against a joint limit: Fig. 4 (a) [IJRR].
+
+    It is searched from the frame's mode with one joint after the other put at its limits.
+    """
+    cost, (lower, upper) = scene.cost, scene.cost.body.bounds
+    at_limit = [torch.diag_embed(limit) for limit in (lower, upper)]
+    mask = torch.eye(len(lower), dtype=torch.bool)
+    starts = torch.cat([torch.where(mask, limit, scene.mode.mean) for limit in at_limit])
+    starts = starts[starts.isfinite().all(dim=1)]
+    modes = TrustRegionNewton(max_steps=40).minimise(cost, starts, cost.body.bounds)
+    model = cost.local_model(modes.mean)
+    slope = torch.where(modes.active.bool(), model.gradient, 0.0)
+    mode, joint = divmod(int(slope.abs().argmax()), slope.shape[1])
+    if float(slope[mode, joint]) == 0:
+        return None
+    name = cost.body.state_names[joint]
+    line = Line(name, modes.mean[mode], torch.eye(slope.shape[1]).to(slope)[joint], 1.0)
+    low, high = line.interval(scene.limits(line.centre))
+    shown = (max(low, -NEAR), NEAR) if high < -low else (-NEAR, min(high, NEAR))
+    taken = sample_slice(cost.terms, line, shown, config.samples)
+    expansion = float(slope[mode, joint]), float(model.hessian[mode, joint, joint])
+    if config.out is not None:
+        title = f"{scene.name}: a minimum displaced by the limit of {plots.title_of(line)}"
+        figure = plots.limit_figure(taken, plots.unit_of(line), (low, high), expansion, title)
+        plots.save_figure(figure, config.out / f"limit_{scene.slug}.png")
+    return {"line": name, "slope_nats_per_radian": expansion[0], "cost_nats": modes.cost[mode]}
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Config, description=__doc__))
+    except TorchcssError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

@@ -1,0 +1,67 @@
+"""The slices by terms in their small mode."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "cost_slices.py"
+
+
+@pytest.fixture(scope="module")
+def script() -> ModuleType:
+    specification = importlib.util.spec_from_file_location("cost_slices", SCRIPT)
+    assert specification is not None
+    assert specification.loader is not None
+    module = importlib.util.module_from_spec(specification)
+    sys.modules["cost_slices"] = module
+    specification.loader.exec_module(module)
+    return module
+
+
+def test_small_mode(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "slices"
+    script.main(script.Config(small=True, out=out))
+    report = json.loads((out / "cost_slices.json").read_text())
+    assert list(report["frames"]) == ["arm, frame 3"]
+    frame = report["frames"]["arm, frame 3"]
+    assert (out / "slices_arm_frame_3.png").stat().st_size > 10_000
+    lines = [row["line"] for row in frame["slices"] if row["scale"] == "far"]
+    assert lines == ["r_shoulder_swing", "r_elbow_flexion", "eigen 0", "eigen 1", "eigen 7"]
+    names = set(frame["slices"][0]["terms"])
+    assert {"contour", "flow", "stabiliser", "sum"} <= names
+    for row in frame["slices"]:
+        low, high = row["interval"]
+        assert low <= 0 <= high
+        if row["scale"] == "close":
+            assert max(-low, high) <= 4.0 * row["deviation"] * (1 + 1e-9)
+        for term in row["terms"].values():
+            assert term["num_minima"] <= term["num_minima_raw"]
+            assert term["largest_jump_twice_density"] <= term["largest_jump"] * (1 + 1e-9) <= 1.0
+    table = {(row["term"], row["scale"]): row for row in frame["table"]}
+    # Smooth terms: what is left of their steepest steps is nothing.
+    for name in ("flow", "stabiliser"):
+        assert table[name, "far"]["discontinuity"] < 1e-3
+    # The mode is a minimum of the sum, and the slices are no noise.
+    assert 1 <= table["sum", "close"]["num_minima"] < 5
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in names)
+
+
+def test_real_frames_are_left_out_without_data(script: ModuleType) -> None:
+    assert script.Config().data is None
+    assert script.Config(small=True, data=Path("absent")).small
+
+
+def test_bad_frame_is_one_line() -> None:
+    run = subprocess.run(
+        [sys.executable, str(SCRIPT), "--frame", "0"], capture_output=True, text=True
+    )
+    assert run.returncode == 2
+    assert run.stderr.startswith("error: frames [0]")
