@@ -1,5 +1,6 @@
 import io
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -36,6 +37,11 @@ def test_both_wells_are_found_and_followed(generator):
         assert int(info.num_distinct) == 2
         assert int(info.status_counts.sum()) == int(info.num_samples) == 40
         assert float(state.mixture.log_weight.exp().sum()) == pytest.approx(1)
+        # The modes themselves are no draws; the others' weights lead back to the prior.
+        assert 1 <= float(info.survival.effective_sample_size) < 40
+        assert float(info.survival.survival_rate) * 40 == pytest.approx(
+            float(info.survival.effective_sample_size)
+        )
         # Equal minima share the posterior.
         assert float(info.effective_sample_size) == pytest.approx(2, abs=0.01)
     assert int(state.frame) == 5
@@ -73,7 +79,8 @@ def test_saved_and_restored_runs_continue_exactly(generator):
     mixture, *rest = torch.load(file)
     resumed = type(half)(GaussianMixture(**mixture), *rest)
     end = [s for s, _ in tracker.track(resumed, wells[3:], BOUNDS)][-1]
-    for a, b in zip((*whole.mixture, *whole[1:]), (*end.mixture, *end[1:]), strict=True):
+    assert whole.particles is end.particles is None
+    for a, b in zip((*whole.mixture, *whole[1:4]), (*end.mixture, *end[1:4]), strict=True):
         assert torch.equal(a, b)
 
 
@@ -89,9 +96,12 @@ class Shuffled:
     """A proposal whose samples come in another order."""
 
     def sample(self, mixture, num, bounds, *, generator):
-        x, parent = CSS.proposal.sample(mixture, num, bounds, generator=generator)
-        order = torch.randperm(len(x), generator=torch.Generator().manual_seed(5))
-        return Samples(x[order], parent[order])
+        samples = CSS.proposal.sample(mixture, num, bounds, generator=generator)
+        order = torch.randperm(num, generator=torch.Generator().manual_seed(5))
+        return Samples(*(field[order] for field in samples))
+
+    def log_density(self, mixture, x):
+        return CSS.proposal.log_density(mixture, x)
 
 
 def test_the_order_of_the_samples_is_irrelevant(generator):
@@ -192,3 +202,31 @@ def test_bad_input(generator):
     state = CSS.init(single(), generator=generator)
     with pytest.raises(ShapeError, match="bounds"):
         CSS.step(state, problems.DoubleWell(), problems.box(3, -1, 1))
+
+
+@pytest.mark.parametrize("screened", [False, True])
+def test_oversampling_descends_from_the_best_alone(generator, screened):
+    """Section 4.2 [RR]; by the screening cost, where there is one."""
+    starts = []
+
+    class Watched(problems.DoubleWell):
+        def local_model(self, x):
+            starts.append(x)
+            return super().local_model(x)
+
+    class Screened(Watched):
+        def screening(self):
+            return problems.Bowl(torch.eye(2).double(), torch.tensor([-2.0, 1.0]).double())
+
+    cost = Screened() if screened else Watched()
+    many = replace(CSS, num_samples=6, oversampling=20)
+    state = many.init(single(), generator=generator)
+    again = torch.Generator()
+    again.set_state(state.generator_state)
+    drawn = many.proposal.sample(state.mixture, 120, BOUNDS, generator=again).x
+    score = cost.screening().value(drawn) if screened else problems.DoubleWell().value(drawn)
+    starts.clear()
+    _, info = many.step(state, cost, BOUNDS)
+    assert int(info.num_samples) == 6
+    first = next(x for x in starts if len(x) == 6)
+    torch.testing.assert_close(first, drawn[score.argsort()[:6].sort().values])

@@ -5,13 +5,15 @@ the pose of every link, eq. 1 [IJRR] (the map A), and the world twist `(omega_j,
 joint: a point p carried by a link below joint j moves with `dp/dq_j = omega_j x p + v_j`.
 
 Trees come from a list of `JointSpecification` (the catalogue of bodies does that) or from any URDF
-file. pytorch-kinematics reads URDF numbers through float32, and its default backward pass drops the
-second-order terms; both are mended here, once, and nobody else calls it.
+file. pytorch-kinematics reads the files and puts joints and links in order; nobody else calls it.
+The poses are computed here: it takes one joint after the other, and its default backward pass drops
+the second-order terms. Joints at the same depth of the tree are turned together instead, in frames
+whose z axis is the joint's, so that a turn mixes two columns. Numbers are laid out with the batch
+innermost, as runs that a processor streams through; what is returned are views of that memory.
 """
 
 from __future__ import annotations
 
-import copy
 import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
@@ -22,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 import pytorch_kinematics as pk
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from torchcss.errors import BodyError, ShapeError, check_shape
@@ -105,17 +107,22 @@ class KinematicTree(nn.Module):
     joint_link: Tensor
     ancestors: Tensor
     joint_ancestors: Tensor
+    joint_constant: Tensor
+    joint_order: Tensor
+    joint_place: Tensor
+    parent_place: Tensor
+    link_constant: Tensor
+    link_place: Tensor
 
     def __init__(self, joints: Sequence[JointSpecification]) -> None:
         super().__init__()
         _check_specifications(joints)
         self.specifications = tuple(joints)
-        self._master = pk.Chain(_build_frames(joints), dtype=torch.float64)
-        self._chains: dict[tuple[torch.dtype, torch.device], pk.Chain] = {}
+        chain = pk.Chain(_build_frames(joints), dtype=torch.float64)
         by_name = {joint.name: joint for joint in joints}
-        self.joint_names = tuple(self._master.get_joint_parameter_names())
+        self.joint_names = tuple(chain.get_joint_parameter_names())
         moving = [by_name[name] for name in self.joint_names]
-        index = self._master.frame_to_idx
+        index = chain.frame_to_idx
         self.link_names = tuple(sorted(index, key=lambda name: index[name]))
         parents = {joint.link: joint.parent for joint in joints}
         ancestors = torch.zeros(len(moving), len(self.link_names), dtype=torch.bool)
@@ -135,6 +142,64 @@ class KinematicTree(nn.Module):
         self.register_buffer("joint_link", links)
         self.register_buffer("ancestors", ancestors)
         self.register_buffer("joint_ancestors", ancestors[:, links])
+        self._lay_out_levels()
+
+    def _lay_out_levels(self) -> None:
+        """Sort the moving joints by depth, and fold what is fixed between them into constants.
+
+        The frame of a moving joint is that of the joint above times a constant, turned about its z
+        axis or shifted along it. A link's frame is that of the nearest moving joint above it times
+        a constant. Place 0 of the frames is the base.
+        """
+        # Per link: the moving joint that carries it (None: the base) and its frame in that joint's.
+        carrier: dict[str, str | None] = {}
+        fixed: dict[str, np.ndarray] = {}
+        parent: dict[str, str | None] = {}
+        depth: dict[str, int] = {}
+        constant: dict[str, np.ndarray] = {}
+        for joint in self.specifications:
+            above = None if joint.parent is None else carrier[joint.parent]
+            offset = _offset_matrix(joint)
+            if joint.parent is not None:
+                offset = fixed[joint.parent] @ offset
+            if joint.kind == "fixed":
+                carrier[joint.link], fixed[joint.link] = above, offset
+                continue
+            aligned = _frame_along(joint.axis)
+            carrier[joint.link], fixed[joint.link] = joint.name, aligned.T
+            parent[joint.name], constant[joint.name] = above, offset @ aligned
+            depth[joint.name] = 1 if above is None else depth[above] + 1
+        order = sorted(self.joint_names, key=lambda name: depth[name])
+        place: dict[str | None, int] = {None: 0}
+        place |= {name: 1 + position for position, name in enumerate(order)}
+        within: dict[str | None, int] = {None: 0}  # place within the joint's own depth
+        kinds = {joint.name: joint.kind for joint in self.specifications}
+        self._levels: list[_Level] = []
+        for level in range(1, 1 + max(depth.values(), default=0)):
+            names = [name for name in order if depth[name] == level]
+            self._levels.append(
+                _Level(
+                    size=len(names),
+                    turns=any(kinds[name] == "revolute" for name in names),
+                    slides=any(kinds[name] == "prismatic" for name in names),
+                )
+            )
+            within |= {name: position for position, name in enumerate(names)}
+
+        def matrices(items: list[np.ndarray]) -> Tensor:
+            return torch.from_numpy(np.stack(items) if items else np.zeros((0, 4, 4)))
+
+        def indices(items: list[int]) -> Tensor:
+            return torch.tensor(items, dtype=torch.long)
+
+        self.register_buffer("joint_constant", matrices([constant[name] for name in order]))
+        self.register_buffer("joint_order", indices([self.joint_names.index(n) for n in order]))
+        self.register_buffer("joint_place", indices([place[name] for name in self.joint_names]))
+        self.register_buffer("parent_place", indices([within[parent[name]] for name in order]))
+        self.register_buffer("link_constant", matrices([fixed[name] for name in self.link_names]))
+        self.register_buffer(
+            "link_place", indices([place[carrier[name]] for name in self.link_names])
+        )
 
     @classmethod
     def from_urdf(cls, source: str | Path) -> KinematicTree:
@@ -178,16 +243,8 @@ class KinematicTree(nn.Module):
         self, q: Float[Tensor, "*batch q"]
     ) -> tuple[Float[Tensor, "*batch l 3 3"], Float[Tensor, "*batch l 3"]]:
         """Orientation and origin of every link in the tree's base frame; twice differentiable."""
-        check_shape("q", q, self.num_joints)
-        batch = q.shape[:-1]
-        chain = self._chain(q)
-        # The analytical backward of pytorch-kinematics treats the poses as constants in a second
-        # derivative; plain autograd through its forward pass does not.
-        transforms = chain.forward_kinematics_tensor(
-            q.reshape(batch.numel(), self.num_joints), analytical_grad=False
-        )
-        transforms = transforms.movedim(0, 1).reshape(*batch, len(self.link_names), 4, 4)
-        return transforms[..., :3, :3], transforms[..., :3, 3]
+        rotation, translation, _, _ = self.forward(q)
+        return rotation, translation
 
     def forward(
         self,
@@ -205,29 +262,127 @@ class KinematicTree(nn.Module):
         Returns:
             Link poses and joint twists in the world frame.
         """
-        rotation, translation = self.link_poses(q)
-        if base_rotation is not None:
-            rotation = base_rotation @ rotation
-            translation = translation @ base_rotation.T
-        if base_translation is not None:
-            translation = translation + base_translation
-        axis = torch.einsum("...qab,qb->...qa", rotation[..., self.joint_link, :, :], self.axes)
-        origin = translation[..., self.joint_link, :]
-        revolute = self.is_revolute[:, None]
-        velocity = torch.where(revolute, torch.linalg.cross(origin, axis), axis)
-        omega = torch.where(revolute, axis, torch.zeros_like(axis))
-        return TreePose(rotation, translation, omega, velocity)
+        check_shape("q", q, self.num_joints)
+        batch = q.shape[:-1]
+        flat = q.reshape(batch.numel(), self.num_joints)
+        frames = self.frames(flat, base_rotation, base_translation)
+        links = _followed_by(frames[self.link_place], self.link_constant)
+        parts = (links[:, :, :3], links[:, :, 3], *self.twists(frames))
+        return TreePose(
+            *(p.movedim(-1, 0).unflatten(0, batch) if batch else p[..., 0] for p in parts)
+        )
 
-    def _chain(self, q: Tensor) -> pk.Chain:
+    def frames(
+        self,
+        q: Float[Tensor, "b q"],
+        base_rotation: Float[Tensor, "3 3"] | None = None,
+        base_translation: Float[Tensor, "3"] | None = None,
+    ) -> Float[Tensor, "frames 3 4 b"]:
+        """Axes and origin (the columns) of the base and of all moving joints, by depth.
+
+        With `twists` and `points` this is what a cost of few points needs, without the poses of all
+        links; the batch is innermost. For the arguments see `forward`.
+        """
         if q.dtype != self.axes.dtype:
             raise ShapeError(
                 f"the state is {q.dtype} and the body {self.axes.dtype}: convert one, "
                 "for example with body.to(x.dtype)"
             )
-        key = (q.dtype, q.device)
-        if key not in self._chains:
-            self._chains[key] = copy.deepcopy(self._master).to(dtype=q.dtype, device=q.device)
-        return self._chains[key]
+        base = torch.eye(3, 4, dtype=q.dtype, device=q.device)
+        if base_rotation is not None:
+            base = torch.cat([base_rotation.to(q), base[:, 3:]], dim=1)
+        if base_translation is not None:
+            base = torch.cat([base[:, :3], base_translation.to(q)[:, None]], dim=1)
+        q = q.T[self.joint_order].contiguous()
+        revolute = self.is_revolute[self.joint_order, None]
+        angle, slide = torch.where(revolute, q, 0.0), torch.where(revolute, 0.0, q)[:, None, None]
+        cosine, sine = angle.cos()[:, None, None], angle.sin()[:, None, None]
+        sizes = [level.size for level in self._levels]
+        parts = (self.parent_place, self.joint_constant, cosine, sine, slide)
+        frames = base[None, :, :, None].expand(1, 3, 4, q.shape[1])
+        levels = [frames]
+        for level, place, constant, c, s, d in zip(
+            self._levels, *(part.split(sizes) for part in parts), strict=True
+        ):
+            x, y, z, t = _followed_by(frames[place], constant).split(1, dim=2)
+            if level.turns:
+                x, y = torch.addcmul(c * x, s, y), torch.addcmul(c * y, s, x, value=-1)
+            if level.slides:
+                t = torch.addcmul(t, d, z)
+            frames = torch.cat([x, y, z, t], dim=2)
+            levels.append(frames)
+        return torch.cat(levels)
+
+    def twists(
+        self, frames: Float[Tensor, "frames 3 4 b"]
+    ) -> tuple[Float[Tensor, "q 3 b"], Float[Tensor, "q 3 b"]]:
+        """Angular and linear parts of the joints' twists in the world, from `frames`."""
+        joints = frames[self.joint_place]
+        axis, origin = joints[:, :, 2], joints[:, :, 3]
+        x, y, z = axis.unbind(1)
+        a, b, c = origin.unbind(1)
+        moment = torch.stack([b * z - c * y, c * x - a * z, a * y - b * x], dim=1)
+        revolute = self.is_revolute[:, None, None]
+        return torch.where(revolute, axis, 0.0), torch.where(revolute, moment, axis)
+
+    def points(
+        self,
+        frames: Float[Tensor, "frames 3 4 b"],
+        link: Int[Tensor, " p"],
+        offset: Float[Tensor, "p 3"],
+    ) -> Float[Tensor, "p 3 b"]:
+        """World positions of points that are fixed in links, from `frames`.
+
+        Args:
+            frames: From `frames`.
+            link: Link of each point.
+            offset: Position in that link's frame, metres.
+        """
+        constant = self.link_constant[link]
+        place = (constant[:, :, :3] * offset[:, None, :]).sum(-1) + constant[:, :, 3]
+        return _followed_by(frames[self.link_place[link]], place[:, :, None])[:, :, 0]
+
+
+class _Level(NamedTuple):
+    """Joints at the same depth: how many, and how they move."""
+
+    size: int
+    turns: bool
+    slides: bool
+
+
+def _followed_by(
+    frames: Float[Tensor, "m 3 4 b"], constant: Float[Tensor, "m 4 c"]
+) -> Float[Tensor, "m 3 c b"]:
+    """Frames times constant matrices, entry by entry.
+
+    A matrix product would take as long, and round the same item differently in other batches.
+    """
+    rows = constant[:, None, :, :, None].unbind(2)
+    product = frames[:, :, :1] * rows[0]
+    for column, row in zip(frames[:, :, 1:].split(1, dim=2), rows[1:], strict=True):
+        product = torch.addcmul(product, column, row)
+    return product
+
+
+def _offset_matrix(joint: JointSpecification) -> np.ndarray:
+    """Where a joint sits in the link above, 4 x 4, its rotation made orthonormal."""
+    left, _, right = np.linalg.svd(np.asarray(joint.rotation, dtype=np.float64))
+    matrix = np.eye(4)
+    matrix[:3, :3] = left @ right
+    matrix[:3, 3] = joint.translation
+    return matrix
+
+
+def _frame_along(axis: Sequence[float]) -> np.ndarray:
+    """A rotation, 4 x 4, whose third column is the direction of an axis."""
+    z = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
+    helper = np.eye(3)[np.argmin(np.abs(z))]
+    x = np.cross(helper, z)
+    x /= np.linalg.norm(x)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
+    return matrix
 
 
 def _check_specifications(joints: Sequence[JointSpecification]) -> None:
@@ -266,10 +421,7 @@ def _build_frames(joints: Sequence[JointSpecification]) -> pk.Frame:
     frames: dict[str, pk.Frame] = {}
     root = None
     for joint in joints:
-        left, _, right = np.linalg.svd(np.asarray(joint.rotation, dtype=np.float64))
-        matrix = torch.eye(4, dtype=torch.float64)
-        matrix[:3, :3] = torch.from_numpy(left @ right)
-        matrix[:3, 3] = torch.tensor(joint.translation, dtype=torch.float64)
+        matrix = torch.from_numpy(_offset_matrix(joint))
         frame = pk.Frame(
             joint.link,
             link=pk.frame.Link(joint.link),

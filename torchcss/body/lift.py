@@ -20,6 +20,8 @@ curvature of the kinematics. The work over points does not depend on the number 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -36,7 +38,7 @@ def lift_to_joints(
     point_link: Int[Tensor, " p"],
     cost: PointCost,
     *,
-    second_order_kinematics: bool = True,
+    second_order_kinematics: bool | Float[Tensor, "*batch"] = True,
 ) -> LocalModel:
     """Sum a cost over points and differentiate it with respect to the joint values.
 
@@ -47,75 +49,108 @@ def lift_to_joints(
         points: World positions of the points, metres.
         point_link: The link that carries each point.
         cost: Value, gradient and Hessian of each point's cost in its world position.
-        second_order_kinematics: False leaves the curvature of the kinematics out (eq. 9 [RR]).
+        second_order_kinematics: False leaves the curvature of the kinematics out (eq. 9 [RR]); a
+            tensor scales it item by item.
 
     Returns:
         The cost summed over points, its gradient and its Hessian in the joints.
     """
+    batch, num_points, num_joints = points.shape[:-2], points.shape[-2], pose.omega.shape[-2]
     # Any fixed reference point will do; one near the body avoids cancellation.
     reference = pose.translation[..., :1, :]
     velocity = pose.velocity + torch.linalg.cross(pose.omega, reference.expand_as(pose.omega))
-    x, y, z = (points - reference).unbind(-1)
-    fx, fy, fz = cost.gradient.unbind(-1)
-    (axx, axy, axz), (_, ayy, ayz), (_, _, azz) = (
-        row.unbind(-1) for row in cost.hessian.unbind(-2)
-    )
-    # Components as whole tensors: on a CPU this is many times faster than 3 x 3 products.
+    # Components as whole tensors with the batch innermost: on a CPU this is many times faster than
+    # 3 x 3 products, and nothing is copied where the memory is laid out like that already.
+    x, y, z = _components(points - reference)
+    fx, fy, fz = _components(cost.gradient)
+    axx, axy, axz, _, ayy, ayz, _, _, azz = _components(cost.hessian.flatten(-2))
     # mixed = [p]x A and angular = [p]x A [p]x^T, of which the upper triangle is enough.
-    mixed = (
-        y * axz - z * axy, y * ayz - z * ayy, y * azz - z * ayz,
-        z * axx - x * axz, z * axy - x * ayz, z * axz - x * azz,
-        x * axy - y * axx, x * ayy - y * axy, x * ayz - y * axz,
-    )  # fmt: skip
-    angular = (
-        y * mixed[2] - z * mixed[1], z * mixed[0] - x * mixed[2], x * mixed[1] - y * mixed[0],
-        z * mixed[3] - x * mixed[5], x * mixed[4] - y * mixed[3], x * mixed[7] - y * mixed[6],
-    )  # fmt: skip
-    moment = (x * fx, x * fy, x * fz, y * fx, y * fy, y * fz, z * fx, z * fy, z * fz)
+    point, force = (x, y, z), (fx, fy, fz)
+    columns = [
+        _cross(point, column) for column in ((axx, axy, axz), (axy, ayy, ayz), (axz, ayz, azz))
+    ]
+    rows = tuple(zip(*columns, strict=True))
+    angular = [_cross(point, row) for row in rows]
+    mixed = [entry for row in rows for entry in row]
+    angular = [angular[i][j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))]
+    moment = [p * f for p in point for f in force]
     features = torch.stack(
-        [axx, axy, axz, ayy, ayz, azz, *mixed, *angular, *moment, fx, fy, fz], dim=-2
+        [axx, axy, axz, ayy, ayz, azz, *mixed, *angular, *moment, *force], dim=1
+    ).flatten(1)
+    below = ancestors.to(features)
+    if num_points > num_joints:  # fewer products by way of the links
+        links, place = torch.unique(point_link, return_inverse=True)
+        features = features.new_zeros(len(links), features.shape[1]).index_add(0, place, features)
+        below = below[:, links]
+    else:
+        below = below[:, point_link]
+    per_joint = (below @ features).unflatten(1, (33, batch.numel()))
+
+    (sxx, sxy, sxz, syy, syz, szz,
+     mxx, mxy, mxz, myx, myy, myz, mzx, mzy, mzz,
+     kxx, kxy, kxz, kyy, kyz, kzz,
+     pxx, pxy, pxz, pyx, pyy, pyz, pzx, pzy, pzz,
+     fx, fy, fz) = per_joint.unbind(1)  # fmt: skip
+    wx, wy, wz = _components(pose.omega)
+    vx, vy, vz = _components(velocity)
+    # Torque and force are the six components of the wrench; so are the reactions to a twist.
+    twist = (wx, wy, wz, vx, vy, vz)
+    gradient = _dot(twist, (pyz - pzy, pzx - pxz, pxy - pyx, fx, fy, fz))
+    turning = [
+        _dot((kxx, kxy, kxz, mxx, mxy, mxz), twist),
+        _dot((kxy, kyy, kyz, myx, myy, myz), twist),
+        _dot((kxz, kyz, kzz, mzx, mzy, mzz), twist),
+    ]
+    shifting = [
+        _dot((mxx, myx, mzx, sxx, sxy, sxz), twist),
+        _dot((mxy, myy, mzy, sxy, syy, syz), twist),
+        _dot((mxz, myz, mzz, sxz, syz, szz), twist),
+    ]
+    if second_order_kinematics is not False:
+        curvature = [
+            _dot((pxy, pxz, -pyy - pzz, fz, -fy), (wy, wz, wx, vy, vz)),
+            _dot((pyx, pyz, -pxx - pzz, fx, -fz), (wx, wz, wy, vz, vx)),
+            _dot((pzx, pzy, -pxx - pyy, fy, -fx), (wx, wy, wz, vx, vy)),
+        ]
+        if isinstance(second_order_kinematics, Tensor):
+            share = second_order_kinematics.reshape(batch.numel())
+            turning = [torch.addcmul(a, share, b) for a, b in zip(turning, curvature, strict=True)]
+        else:
+            turning = [a + b for a, b in zip(turning, curvature, strict=True)]
+    left = torch.stack(twist).permute(2, 1, 0).contiguous()
+    right = torch.stack([*turning, *shifting]).permute(2, 0, 1).contiguous()
+    # Every pair of joints on a branch once, the diagonal twice by half.
+    half_diagonal = joint_ancestors.to(left)
+    half_diagonal.diagonal().fill_(0.5)
+    upper = (left @ right).mul_(half_diagonal)
+    hessian = upper + upper.mT
+    return LocalModel(
+        cost.value.sum(-1),
+        gradient.T.reshape(*batch, num_joints),
+        hessian.reshape(*batch, num_joints, num_joints),
     )
-    links = torch.unique(point_link)
-    carried = (point_link[:, None] == links).to(features)
-    per_joint = (features @ carried) @ ancestors[:, links].T.to(features)
 
-    def symmetric(first: int) -> Tensor:
-        index = torch.tensor([0, 1, 2, 1, 3, 4, 2, 4, 5], device=points.device) + first
-        return per_joint[..., index, :].movedim(-2, -1).unflatten(-1, (3, 3))
 
-    def square(first: int) -> Tensor:
-        return per_joint[..., first : first + 9, :].movedim(-2, -1).unflatten(-1, (3, 3))
+def _components(vectors: Float[Tensor, "*batch m c"]) -> tuple[Float[Tensor, "m b"], ...]:
+    """Each component of some vectors, the batch flattened and innermost in memory."""
+    last = vectors.reshape(vectors.shape[:-2].numel(), *vectors.shape[-2:]).permute(2, 1, 0)
+    return last.contiguous().unbind()
 
-    k_vv, k_wv, k_ww, moment = symmetric(0), square(6), symmetric(15), square(21)
-    force = per_joint[..., 30:, :].movedim(-2, -1)
-    torque = torch.stack(
-        [
-            moment[..., 1, 2] - moment[..., 2, 1],
-            moment[..., 2, 0] - moment[..., 0, 2],
-            moment[..., 0, 1] - moment[..., 1, 0],
-        ],
-        dim=-1,
+
+def _dot(a: Sequence[Tensor], b: Sequence[Tensor]) -> Tensor:
+    """Sum of products, each added as it is made."""
+    total = a[0] * b[0]
+    for left, right in zip(a[1:], b[1:], strict=True):
+        total.addcmul_(left, right)
+    return total
+
+
+def _cross(a: Sequence[Tensor], b: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """Cross product of vectors given by their components."""
+    x, y, z = a
+    u, v, w = b
+    return (
+        (y * w).addcmul_(z, v, value=-1),
+        (z * u).addcmul_(x, w, value=-1),
+        (x * v).addcmul_(y, u, value=-1),
     )
-    omega = pose.omega
-    gradient = (omega * torque).sum(-1) + (velocity * force).sum(-1)
-
-    def times(matrix: Tensor, vector: Tensor) -> Tensor:
-        a, b, c = vector.unbind(-1)
-        return (
-            matrix[..., 0] * a[..., None]
-            + matrix[..., 1] * b[..., None]
-            + (matrix[..., 2] * c[..., None])
-        )
-
-    reaction_w = times(k_ww, omega) + times(k_wv, velocity)
-    reaction_v = times(k_wv.transpose(-1, -2), omega) + times(k_vv, velocity)
-    if second_order_kinematics:
-        trace = moment.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
-        reaction_w = reaction_w + times(moment, omega) - trace * omega
-        reaction_w = reaction_w + torch.linalg.cross(velocity, force)
-    twist = torch.cat([omega, velocity], dim=-1)
-    reaction = torch.cat([reaction_w, reaction_v], dim=-1)
-    upper = (twist @ reaction.transpose(-1, -2)) * joint_ancestors.to(twist)
-    hessian = upper + upper.transpose(-1, -2)
-    hessian = hessian - torch.diag_embed(upper.diagonal(dim1=-2, dim2=-1))
-    return LocalModel(cost.value.sum(-1), gradient, hessian)

@@ -8,7 +8,8 @@ Weights are kept as logarithms: the product over frames of Fig. 6, step 5, would
 Covariances may be singular, huge or tiny (see `torchcss.linalg`).
 
 What to call: `GaussianMixture.prune` to keep the best modes, `distinct_modes` to discard modes
-found before (step 2.3), `match_to_prior` for step 5.
+found before (step 2.3; `torchcss.inference.minima` counts them more strictly), `match_to_prior` for
+step 5, `GaussianMixture.merge` where components overlap and their moments are to be kept.
 """
 
 from __future__ import annotations
@@ -22,6 +23,9 @@ from torch import Tensor
 
 from torchcss.errors import ShapeError
 from torchcss.linalg import covariance_factor, log_determinant, symmetric_part, whitener
+
+_STATES_AT_ONCE = 1024
+"""States whose differences from all components are held in memory together."""
 
 
 class GaussianMixture(NamedTuple):
@@ -58,12 +62,20 @@ class GaussianMixture(NamedTuple):
         order = self.log_weight.argsort(descending=True, stable=True)
         return self.take(order[:num_modes]).normalise()
 
+    def squared_distance(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch k"]:
+        """Squared Mahalanobis distance from every component, in that component's own metric."""
+        shape, n = x.shape[:-1], x.shape[-1]
+        white, parts = whitener(self.covariance), []
+        # Component by component for many states at once, a few at a time to bound the memory.
+        for part in x.reshape(-1, n).split(_STATES_AT_ONCE):
+            apart = part - self.mean[:, None]
+            parts.append((apart @ white.mT).square().sum(-1).mT)
+        return torch.cat(parts).reshape(*shape, len(self.mean))
+
     def component_log_density(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch k"]:
         """Log-density of every component, without its weight."""
-        n = self.mean.shape[-1]
-        whitened = (whitener(self.covariance) @ (x[..., None, :] - self.mean)[..., None])[..., 0]
-        normaliser = n * math.log(2 * math.pi) + log_determinant(self.covariance)
-        return -0.5 * (whitened.square().sum(-1) + normaliser)
+        normaliser = x.shape[-1] * math.log(2 * math.pi) + log_determinant(self.covariance)
+        return -0.5 * (self.squared_distance(x) + normaliser)
 
     def log_density(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
         """Log-density of the mixture, its weights normalised."""
@@ -83,6 +95,29 @@ class GaussianMixture(NamedTuple):
         apart = self.mean - mean
         spread = self.covariance + apart[:, :, None] * apart[:, None, :]
         return mean, symmetric_part((weight[:, None, None] * spread).sum(0))
+
+    def merge(self, distance: float = 1.0) -> GaussianMixture:
+        """Merge components that lie within each other, keeping the mixture's moments.
+
+        The heaviest component absorbs all whose means lie within `distance` standard deviations of
+        its own, and takes their weight, mean and covariance together; then the heaviest of the rest
+        does, and so on. The mean and covariance of the whole mixture stay as they are.
+
+        Args:
+            distance: Threshold in standard deviations of the absorbing component.
+
+        Returns:
+            The merged mixture, the heaviest component first, its weights normalised.
+        """
+        rest, merged = self.prune(len(self.mean)), []
+        while len(rest.mean):
+            near = rest.take(torch.arange(1, device=rest.mean.device)).squared_distance(rest.mean)
+            near = near[:, 0] <= distance**2
+            near[0] = True
+            absorbed, rest = rest.take(near.nonzero()[:, 0]), rest.take((~near).nonzero()[:, 0])
+            merged.append((*absorbed.moments(), absorbed.log_weight.logsumexp(0)))
+        fields = (torch.stack(field) for field in zip(*merged, strict=True))
+        return GaussianMixture(*fields).prune(len(merged))
 
 
 class MixtureSamples(NamedTuple):

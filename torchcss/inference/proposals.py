@@ -2,21 +2,37 @@
 
 The paper's answer is `CovarianceScaled` (Fig. 6, steps 1 to 2.2): sample each mode's own Gaussian,
 inflated, so that most samples fall along the valleys in which other minima are likely, at low cost.
-`HeavyTailed` replaces the Gaussian by a Student t. `Spherical` is the paper's control with the same
-volume and no shape; `EigenDirectionGrid` is the regular pattern of Fig. 4 [RR].
+All proposals share one interface, `Proposal`, and differ in what a mode (mu, Sigma) becomes:
+
+| proposal | samples of a mode | where from |
+|---|---|---|
+| `CovarianceScaled` | N(mu, s Sigma) | Fig. 6 [IJRR] |
+| `HeavyTailed` | Student t of shape s Sigma | Fig. 6 [IJRR], "heavy tail sampling" |
+| `Spherical` | N(mu, r^2 I), r^2 the geometric mean of s Sigma's eigenvalues | Table 1 [IJRR] |
+| `EigenDirectionGrid` | steps along the widest eigenvectors of Sigma | Fig. 4 [RR] |
+| `Condensation` | N(mu, Q), the modes randomised by dynamical noise Q | Fig. 8d (1) [IJRR] |
+| `ChamRehg` | N(mu, Sigma + Q) where no other mode's is higher | Fig. 8d (2) [IJRR] |
+| `InflatedPosterior` | N(mu, s Sigma + Q), weights diluted to pi^(1/s) | section 9 [IJRR] |
+| `MixtureOfProposals` | those of its members, in given shares | |
 
 A scale is always named: `covariance_scale = s` multiplies the covariance (Fig. 6, s = 4 to 14),
 `deviation_scale = d` the standard deviations (Table 1; `d = sqrt(s)`). Exactly one is given.
 
-Samples outside the bounds are projected onto them (design decision 10). What to call by default:
-`CovarianceScaled(covariance_scale=8)`.
+Samples outside the bounds are projected onto them (design decision 10): each parameter for itself,
+or with `correlated_projection` to the nearest admissible state in the metric of the covariance, in
+which the others make up for what a bound takes. The latter keeps samples in their valley, at far
+lower cost, and therefore finds fewer minima (`scripts/table1.py --correlated-projection`).
+
+Every sample carries its importance weight back to the mixture that it was drawn from (see
+`torchcss.inference.importance`). What to call by default: `CovarianceScaled(covariance_scale=8)`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple, Protocol
 
 import torch
@@ -24,9 +40,17 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchcss.errors import ConfigurationError
-from torchcss.inference.mixture import GaussianMixture, draw_components, standard_normal
-from torchcss.linalg import covariance_factor, log_determinant
+from torchcss.inference.mixture import (
+    GaussianMixture,
+    MixtureSamples,
+    draw_components,
+    standard_normal,
+)
+from torchcss.linalg import cholesky_apply, covariance_factor, log_determinant, mask_free
 from torchcss.types import Bounds
+
+Deviation = float | tuple[float, ...]
+"""Standard deviation of every parameter, or one number for all."""
 
 
 class Samples(NamedTuple):
@@ -35,10 +59,14 @@ class Samples(NamedTuple):
     Attributes:
         x: Admissible states.
         parent: The mixture component that each came from.
+        log_weight: Importance weight, log of the mixture's density over the proposal's, where the
+            sample was drawn, before it was projected onto the bounds. `-inf` for what was not
+            drawn at random: the modes themselves, and regular patterns.
     """
 
     x: Float[Tensor, "s n"]
     parent: Int[Tensor, " s"]
+    log_weight: Float[Tensor, " s"]
 
 
 class Proposal(Protocol):
@@ -47,8 +75,23 @@ class Proposal(Protocol):
     def sample(
         self, mixture: GaussianMixture, num: int, bounds: Bounds, *, generator: torch.Generator
     ) -> Samples:
-        """Draw `num` admissible samples (a regular pattern may give fewer)."""
+        """Draw `num` admissible samples (a regular pattern may give fewer).
+
+        With infinite bounds the samples are as they were drawn.
+        """
         ...
+
+    def log_density(
+        self, mixture: GaussianMixture, x: Float[Tensor, "*batch n"]
+    ) -> Float[Tensor, "*batch"]:
+        """Log-density of what is drawn at random, before projection; `-inf` if nothing is."""
+        ...
+
+
+def unbounded(like: Float[Tensor, "*batch n"]) -> Bounds:
+    """No limits on states like these."""
+    limit = torch.full_like(like.reshape(-1, like.shape[-1])[0], math.inf)
+    return Bounds(-limit, limit)
 
 
 def _deviation_factor(
@@ -65,7 +108,7 @@ def _deviation_factor(
 
 
 def _capped(
-    covariance: Float[Tensor, "k n n"], max_deviation: float | tuple[float, ...] | None
+    covariance: Float[Tensor, "k n n"], max_deviation: Deviation | None
 ) -> Float[Tensor, "k n n"]:
     """Shrink parameters whose standard deviation exceeds a limit; correlations stay."""
     if max_deviation is None:
@@ -76,31 +119,234 @@ def _capped(
     return covariance * shrink[..., :, None] * shrink[..., None, :]
 
 
-def _scatter(
-    mixture: GaussianMixture,
-    covariance: Float[Tensor, "k n n"],
-    num: int,
-    bounds: Bounds,
-    draw: Callable[[int], Float[Tensor, "s n"]],
-    *,
-    include_modes: bool,
-    stratified: bool,
-    generator: torch.Generator,
-) -> Samples:
-    """Perturb modes by covariances, each chosen with its weight."""
-    own = mixture.log_weight[:0].long()
-    if include_modes:
-        own = mixture.log_weight.argsort(descending=True, stable=True)[:num]
-    count = num - len(own)
-    parent = draw_components(mixture.log_weight, count, generator=generator, stratified=stratified)
-    offset = (covariance_factor(covariance)[parent] @ draw(count)[..., None])[..., 0]
-    parent = torch.cat([own, parent])
-    x = mixture.mean[parent] + torch.cat([torch.zeros_like(mixture.mean[own]), offset])
-    return Samples(bounds.project(x), parent)
+def _noise(deviation: Deviation, like: Float[Tensor, "k n n"]) -> Float[Tensor, "n n"]:
+    """Covariance of independent dynamical noise."""
+    noise = torch.as_tensor(deviation, dtype=like.dtype, device=like.device)
+    return torch.diag_embed(noise.square().expand(like.shape[-1]))
+
+
+def _check_deviation(deviation: Deviation, name: str) -> None:
+    parts = deviation if isinstance(deviation, tuple) else (deviation,)
+    if not all(math.isfinite(part) and part >= 0 for part in parts):
+        raise ConfigurationError(
+            f"{name}.deviation: expected standard deviations, none negative, got {deviation}"
+        )
+
+
+_STATES_AT_ONCE = 1024
+"""Samples whose covariances are held in memory together."""
+
+_PROJECTION_ROUNDS = 60
+"""Rounds in which the bounds that hold may be found; few items take more than five."""
+
+_PATIENCE = 3
+"""Rounds in which the parameters that are wrong need not become fewer."""
+
+
+def project_in_metric(
+    x: Float[Tensor, "s n"], covariance: Float[Tensor, "s n n"], bounds: Bounds
+) -> Float[Tensor, "s n"]:
+    """Nearest admissible states in the metric of their covariances.
+
+    Parameters that are outside are held at their bounds and the others take their means given that,
+    `x_f + Sigma_fh Sigma_hh^-1 (b - x_h)`; what is outside then is held too, and what a bound holds
+    against its will is let go, until nothing changes: block principal pivoting (Júdice and Pires
+    1994), all such parameters at once as long as they become fewer, else the last of them alone. An
+    item that has not settled in time keeps what is held, and the rest is moved each for itself.
+
+    Args:
+        x: Any states.
+        covariance: Positive semi-definite. Where it leaves parameters no choice, they are moved
+            each for itself.
+        bounds: The box.
+    """
+    scale = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=torch.finfo(x.dtype).tiny).sqrt()
+    correlation = covariance / scale[:, :, None] / scale[:, None, :]
+    target, held, moved = bounds.project(x), torch.zeros_like(x, dtype=torch.bool), x.clone()
+    change, items = bounds.project(x) != x, torch.arange(len(x), device=x.device)
+    fewest = torch.full_like(items, x.shape[-1] + 1)
+    patience = torch.zeros_like(items)
+    for _ in range(_PROJECTION_ROUNDS):
+        items = items[change[items].any(-1)]
+        if not len(items):
+            break
+        flip = change[items]
+        number = flip.sum(-1)
+        fewer = number < fewest[items]
+        fewest[items] = torch.where(fewer, number, fewest[items])
+        patience[items] = torch.where(fewer, _PATIENCE, patience[items] - 1)
+        last = flip & (flip.flip(-1).cumsum(-1).flip(-1) == 1)
+        held[items] ^= torch.where((patience[items] < 0)[:, None], last, flip)
+        some, part = held[items], correlation[items]
+        inside = bounds.project(moved[items])
+        target[items] = torch.where(inside != moved[items], inside, target[items])
+        gap = torch.where(some, target[items] - x[items], 0.0)
+        factor, failed = torch.linalg.cholesky_ex(mask_free(part, some))
+        pull = torch.where(some, cholesky_apply(factor, gap / scale[items]), 0.0)
+        shift = torch.where(some, gap, scale[items] * (part @ pull[..., None])[..., 0])
+        sound = (failed == 0)[:, None] & shift.isfinite()
+        moved[items] = x[items] + torch.where(sound, shift, gap)
+        # A bound may pull inwards only: downwards from an upper one, upwards from a lower one.
+        inwards = torch.where(target[items] >= bounds.upper, pull <= 0, pull >= 0)
+        change[items] = torch.where(some, ~inwards, bounds.project(moved[items]) != moved[items])
+    return bounds.project(moved)
+
+
+_ROUNDS = 64
+"""Rounds of rejection: more than half of the draws of a round are kept unless many modes coincide,
+and then one in the number of modes."""
+
+_NORMALISER_DRAWS = 4096
+"""Draws from which the normaliser of a piecewise density is found, to within 1 %."""
+
+
+class _Law(NamedTuple):
+    """What a proposal draws from: a mixture of Gaussians or of Student t's.
+
+    Attributes:
+        mixture: Centres, shapes (the covariances of the Gaussians) and weights.
+        degrees_of_freedom: Of the t; None for Gaussians.
+        piecewise: At each state, only the component that is highest there counts.
+    """
+
+    mixture: GaussianMixture
+    degrees_of_freedom: int | None = None
+    piecewise: bool = False
+
+    def draw(self, num: int, *, stratified: bool, generator: torch.Generator) -> MixtureSamples:
+        """Draw samples, not projected."""
+        if not self.piecewise:
+            return self._draw(num, stratified, generator)
+        parts, found = [], 0
+        for _ in range(_ROUNDS):
+            parts.append(self._take_own(self._draw(num, stratified, generator)))
+            found += len(parts[-1].x)
+            if found >= num:
+                break
+        else:
+            parts.append(self._draw(num - found, stratified, generator))
+        x, component = (torch.cat(field)[:num] for field in zip(*parts, strict=True))
+        return MixtureSamples(x, component)
+
+    def log_density(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+        """Log-density of what is drawn."""
+        components = self._component_log_density(x)
+        if not self.piecewise:
+            return components.logsumexp(-1)
+        if len(self.mixture.mean) == 1:
+            return components[..., 0]
+        # The share of the mixture's draws that are kept is the mass below the highest components.
+        fixed = torch.Generator().manual_seed(0)
+        kept = len(self._take_own(self._draw(_NORMALISER_DRAWS, True, fixed)).x)
+        return components.amax(-1) - math.log(max(kept, 1) / _NORMALISER_DRAWS)
+
+    def _draw(self, num: int, stratified: bool, generator: torch.Generator) -> MixtureSamples:
+        mixture, n = self.mixture, self.mixture.mean.shape[-1]
+        component = draw_components(
+            mixture.log_weight, num, generator=generator, stratified=stratified
+        )
+        normal = standard_normal((num, n), mixture.mean, generator=generator)
+        if self.degrees_of_freedom is not None:
+            # A sum of squared normals is chi-squared; it is zero with probability zero only.
+            size = (num, self.degrees_of_freedom)
+            chi = standard_normal(size, mixture.mean, generator=generator)
+            least = torch.finfo(normal.dtype).eps
+            normal = normal / (chi.square().mean(-1, keepdim=True)).clamp(min=least).sqrt()
+        factor = covariance_factor(mixture.covariance)[component]
+        return MixtureSamples(
+            mixture.mean[component] + (factor @ normal[..., None])[..., 0], component
+        )
+
+    def _take_own(self, samples: MixtureSamples) -> MixtureSamples:
+        """Keep the samples at which their own component is the highest."""
+        density = self._component_log_density(samples.x)
+        own = density.gather(-1, samples.component[:, None])[:, 0] >= density.amax(-1)
+        return MixtureSamples(samples.x[own], samples.component[own])
+
+    def _component_log_density(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch k"]:
+        """Log-densities of the components with their weights."""
+        mixture, degrees, n = self.mixture, self.degrees_of_freedom, x.shape[-1]
+        log_weight = mixture.normalise().log_weight
+        if degrees is None:
+            return mixture.component_log_density(x) + log_weight
+        peak = math.lgamma((degrees + n) / 2) - math.lgamma(degrees / 2)
+        peak = peak - 0.5 * (n * math.log(degrees * math.pi) + log_determinant(mixture.covariance))
+        tail = torch.log1p(mixture.squared_distance(x) / degrees)
+        return peak - 0.5 * (degrees + n) * tail + log_weight
 
 
 @dataclass(frozen=True, kw_only=True)
-class CovarianceScaled:
+class _RandomProposal(ABC):
+    """A proposal that draws independent samples from a law made of the mixture's modes.
+
+    Attributes:
+        include_modes: Have the modes themselves, unperturbed, first among the samples, so that what
+            was found once is followed however small its weight.
+        stratified: Give every mode its share to within one sample, see `draw_components`.
+        correlated_projection: Move samples that are outside the bounds along their covariances, see
+            `project_in_metric`.
+    """
+
+    include_modes: bool = True
+    stratified: bool = False
+    correlated_projection: bool = False
+
+    @abstractmethod
+    def law(self, mixture: GaussianMixture) -> _Law:
+        """What is drawn from, before projection; of the same mixture object if that is its law."""
+
+    def log_density(
+        self, mixture: GaussianMixture, x: Float[Tensor, "*batch n"]
+    ) -> Float[Tensor, "*batch"]:
+        """Log-density of what is drawn at random, before projection."""
+        return self.law(mixture).log_density(x)
+
+    def sample(
+        self, mixture: GaussianMixture, num: int, bounds: Bounds, *, generator: torch.Generator
+    ) -> Samples:
+        """Draw samples, projected onto the bounds; the modes themselves first, the best of all."""
+        law = self.law(mixture)
+        own = mixture.log_weight[:0].long()
+        if self.include_modes:
+            own = mixture.log_weight.argsort(descending=True, stable=True)[:num]
+        x, component = law.draw(num - len(own), stratified=self.stratified, generator=generator)
+        if law.mixture is mixture:  # drawn from the mixture as it is
+            log_weight = torch.zeros_like(x[:, 0])
+        else:
+            log_weight = mixture.log_density(x) - law.log_density(x)
+        if self.correlated_projection:
+            parts = zip(x.split(_STATES_AT_ONCE), component.split(_STATES_AT_ONCE), strict=True)
+            shapes = law.mixture.covariance
+            x = torch.cat([project_in_metric(part, shapes[of], bounds) for part, of in parts])
+        return Samples(
+            bounds.project(torch.cat([mixture.mean[own], x])),
+            torch.cat([own, component]),
+            torch.cat([torch.full_like(mixture.mean[own, 0], -math.inf), log_weight]),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _ScaledProposal(_RandomProposal):
+    """A random proposal with one factor on the modes' spread.
+
+    Attributes:
+        covariance_scale: `s`, the factor on the covariance.
+        deviation_scale: The factor on the standard deviations, instead of `covariance_scale`.
+    """
+
+    covariance_scale: float | None = None
+    deviation_scale: float | None = None
+
+    def __post_init__(self) -> None:
+        _ = self._factor
+
+    @property
+    def _factor(self) -> float:
+        return _deviation_factor(self.covariance_scale, self.deviation_scale, type(self).__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CovarianceScaled(_ScaledProposal):
     """Sample every mode's Gaussian, inflated: `N(mu_i, s Sigma_i)`, Fig. 6 step 1.
 
     Attributes:
@@ -109,99 +355,56 @@ class CovarianceScaled:
         include_modes: Have the modes themselves, unperturbed, first among the samples, so that what
             was found once is followed however small its weight.
         stratified: See `draw_components`.
+        correlated_projection: Move samples that are outside the bounds along their covariances, see
+            `project_in_metric`.
         max_deviation: Limit on the standard deviation of the samples, one number or one per
             parameter; None for none.
     """
 
-    covariance_scale: float | None = None
-    deviation_scale: float | None = None
-    include_modes: bool = True
-    stratified: bool = False
-    max_deviation: float | tuple[float, ...] | None = None
+    max_deviation: Deviation | None = None
 
-    def __post_init__(self) -> None:
-        _deviation_factor(self.covariance_scale, self.deviation_scale, type(self).__name__)
-
-    def sample(
-        self, mixture: GaussianMixture, num: int, bounds: Bounds, *, generator: torch.Generator
-    ) -> Samples:
-        """Draw samples, projected onto the bounds."""
-        factor = _deviation_factor(self.covariance_scale, self.deviation_scale, type(self).__name__)
-
-        def draw(count: int) -> Tensor:
-            return standard_normal(
-                (count, mixture.mean.shape[-1]), mixture.mean, generator=generator
-            )
-
-        return _scatter(
-            mixture,
-            _capped(factor**2 * mixture.covariance, self.max_deviation),
-            num,
-            bounds,
-            draw,
-            include_modes=self.include_modes,
-            stratified=self.stratified,
-            generator=generator,
-        )
+    def law(self, mixture: GaussianMixture) -> _Law:
+        """Gaussians, inflated."""
+        if self._factor == 1 and self.max_deviation is None:
+            return _Law(mixture)
+        covariance = _capped(self._factor**2 * mixture.covariance, self.max_deviation)
+        return _Law(mixture._replace(covariance=covariance))
 
 
 @dataclass(frozen=True, kw_only=True)
-class HeavyTailed:
+class HeavyTailed(_ScaledProposal):
     """Sample a Student t of every mode: mostly near, sometimes very far.
 
     Attributes:
-        degrees_of_freedom: 1 for Cauchy; the tails thin out as it grows. The covariance of the
-            samples is `degrees / (degrees - 2)` times the scaled one where that exists.
         covariance_scale: Factor on the covariance that shapes the t.
         deviation_scale: The factor on its standard deviations, instead.
         include_modes: As in `CovarianceScaled`.
         stratified: As in `CovarianceScaled`.
+        correlated_projection: As in `CovarianceScaled`.
         max_deviation: As in `CovarianceScaled`, on the shape.
+        degrees_of_freedom: 1 for Cauchy; the tails thin out as it grows. The covariance of the
+            samples is `degrees / (degrees - 2)` times the scaled one where that exists.
     """
 
+    max_deviation: Deviation | None = None
     degrees_of_freedom: int = 3
-    covariance_scale: float | None = None
-    deviation_scale: float | None = None
-    include_modes: bool = True
-    stratified: bool = False
-    max_deviation: float | tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        _deviation_factor(self.covariance_scale, self.deviation_scale, type(self).__name__)
+        super().__post_init__()
         if self.degrees_of_freedom < 1:
             raise ConfigurationError(
                 f"HeavyTailed.degrees_of_freedom: expected at least 1, "
                 f"got {self.degrees_of_freedom}; 3 is usual"
             )
 
-    def sample(
-        self, mixture: GaussianMixture, num: int, bounds: Bounds, *, generator: torch.Generator
-    ) -> Samples:
-        """Draw samples, projected onto the bounds."""
-        factor = _deviation_factor(self.covariance_scale, self.deviation_scale, type(self).__name__)
-        degrees, n = self.degrees_of_freedom, mixture.mean.shape[-1]
-
-        def draw(count: int) -> Tensor:
-            normal = standard_normal((count, n), mixture.mean, generator=generator)
-            # A sum of squared normals is chi-squared; it is zero with probability zero only.
-            chi = standard_normal((count, degrees), mixture.mean, generator=generator)
-            least = torch.finfo(normal.dtype).eps
-            return normal / (chi.square().mean(-1, keepdim=True)).clamp(min=least).sqrt()
-
-        return _scatter(
-            mixture,
-            _capped(factor**2 * mixture.covariance, self.max_deviation),
-            num,
-            bounds,
-            draw,
-            include_modes=self.include_modes,
-            stratified=self.stratified,
-            generator=generator,
-        )
+    def law(self, mixture: GaussianMixture) -> _Law:
+        """Student t's, inflated."""
+        covariance = _capped(self._factor**2 * mixture.covariance, self.max_deviation)
+        return _Law(mixture._replace(covariance=covariance), self.degrees_of_freedom)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Spherical:
+class Spherical(_ScaledProposal):
     """Sample a ball of the same volume as each mode's ellipsoid: the paper's control, Table 1.
 
     The ball's standard deviation is the geometric mean of those along the covariance's
@@ -212,30 +415,105 @@ class Spherical:
         deviation_scale: The factor on the standard deviation, instead.
         include_modes: As in `CovarianceScaled`.
         stratified: As in `CovarianceScaled`.
+        correlated_projection: As in `CovarianceScaled`.
     """
 
-    covariance_scale: float | None = None
-    deviation_scale: float | None = None
-    include_modes: bool = True
-    stratified: bool = False
-
-    def __post_init__(self) -> None:
-        _deviation_factor(self.covariance_scale, self.deviation_scale, type(self).__name__)
-
-    def sample(
-        self, mixture: GaussianMixture, num: int, bounds: Bounds, *, generator: torch.Generator
-    ) -> Samples:
-        """Draw samples, projected onto the bounds."""
+    def law(self, mixture: GaussianMixture) -> _Law:
+        """Balls."""
         n = mixture.mean.shape[-1]
         variance = (log_determinant(mixture.covariance) / n).exp()
         eye = torch.eye(n, dtype=variance.dtype, device=variance.device)
-        ball = GaussianMixture(mixture.mean, variance[:, None, None] * eye, mixture.log_weight)
-        return CovarianceScaled(
-            covariance_scale=self.covariance_scale,
-            deviation_scale=self.deviation_scale,
-            include_modes=self.include_modes,
-            stratified=self.stratified,
-        ).sample(ball, num, bounds, generator=generator)
+        ball = variance[:, None, None] * eye
+        return _Law(mixture._replace(covariance=self._factor**2 * ball))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Condensation(_RandomProposal):
+    """Randomise the modes by dynamical noise alone: `N(mu_i, Q)`, Fig. 8d (1) [IJRR].
+
+    How CONDENSATION searches, and Heap and Hogg's tracker before its descents: the noise is the
+    same for every mode and knows nothing of what the image leaves open. For the particle filter
+    itself see `torchcss.inference.particle`.
+
+    Attributes:
+        deviation: Standard deviation of the noise, one number or one per parameter: `Q` is the
+            diagonal matrix of their squares.
+        include_modes: As in `CovarianceScaled`.
+        stratified: As in `CovarianceScaled`.
+        correlated_projection: As in `CovarianceScaled`.
+    """
+
+    deviation: Deviation
+
+    def __post_init__(self) -> None:
+        _check_deviation(self.deviation, "Condensation")
+
+    def law(self, mixture: GaussianMixture) -> _Law:
+        """Noise about every mode."""
+        noise = _noise(self.deviation, mixture.covariance)
+        return _Law(mixture._replace(covariance=noise.expand_as(mixture.covariance)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChamRehg(_RandomProposal):
+    """Sample within the modes' covariances, and add dynamical noise: Fig. 8d (2) [IJRR].
+
+    The sampler of Cham and Rehg's multiple-hypothesis tracker, as [IJRR] describes it: modes with
+    Gauss-Newton covariances, a piecewise Gaussian density because their modes come in clusters
+    (section 3.3), and a search region widened by exaggerated dynamical noise (section 1.2). Here
+    the density is proportional to `max_i pi_i N(x; mu_i, Sigma_i + Q)`: where the Gaussians of a
+    cluster overlap they do not add up, so that the cluster does not take all the samples. The
+    constant velocity is the dynamics' (`ConstantVelocity`), which moves the modes beforehand.
+
+    Attributes:
+        deviation: As in `Condensation`.
+        piecewise: False for the plain mixture.
+        include_modes: As in `CovarianceScaled`.
+        stratified: As in `CovarianceScaled`, before the draws of overlapped pieces are rejected.
+        correlated_projection: As in `CovarianceScaled`.
+    """
+
+    deviation: Deviation
+    piecewise: bool = True
+
+    def __post_init__(self) -> None:
+        _check_deviation(self.deviation, "ChamRehg")
+
+    def law(self, mixture: GaussianMixture) -> _Law:
+        """Gaussians widened by noise, each in its own piece of the state space."""
+        covariance = mixture.covariance + _noise(self.deviation, mixture.covariance)
+        return _Law(mixture._replace(covariance=covariance), piecewise=self.piecewise)
+
+
+@dataclass(frozen=True, kw_only=True)
+class InflatedPosterior(_ScaledProposal):
+    """Sample the posterior raised to the power 1/s, then noise: section 9 [IJRR].
+
+    To that power, a mode's Gaussian `pi N(mu, Sigma)` has the covariance `s Sigma` and the weight
+    `pi^(1/s)`: inflated and diluted. `Samples.log_weight` turns the samples back into fair ones.
+    `ParticleFilter(dilution=...)` is the same for a posterior of particles.
+
+    Attributes:
+        covariance_scale: `s`.
+        deviation_scale: `sqrt(s)`, instead.
+        deviation: Dynamical noise added to the inflated posterior, as in `Condensation`; zero if
+            the mixture is the prior of this frame already.
+        include_modes: As in `CovarianceScaled`.
+        stratified: As in `CovarianceScaled`.
+        correlated_projection: As in `CovarianceScaled`.
+    """
+
+    deviation: Deviation = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_deviation(self.deviation, "InflatedPosterior")
+
+    def law(self, mixture: GaussianMixture) -> _Law:
+        """Inflated Gaussians with diluted weights."""
+        scale = self._factor**2
+        covariance = scale * mixture.covariance + _noise(self.deviation, mixture.covariance)
+        return _Law(GaussianMixture(mixture.mean, covariance, mixture.log_weight / scale))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -244,7 +522,7 @@ class EigenDirectionGrid:
 
     Per mode: the mode, then `p deviation_scale sigma_j v_j` from it for `p = ±1, ..., ±num_steps`
     along the directions of greatest variance, one direction after another. The defaults give the
-    seven hypotheses of section 6 [RR] (design decision 7).
+    seven hypotheses of section 6 [RR]. The patterns of all modes form one pool (design decision 7).
 
     Attributes:
         num_directions: How many directions, `ns`.
@@ -255,6 +533,12 @@ class EigenDirectionGrid:
     num_directions: int = 3
     num_steps: int = 1
     deviation_scale: float = 1.0
+
+    def log_density(
+        self, mixture: GaussianMixture, x: Float[Tensor, "*batch n"]
+    ) -> Float[Tensor, "*batch"]:
+        """`-inf`: nothing is random."""
+        return torch.full_like(x[..., 0], -math.inf)
 
     def sample(
         self, mixture: GaussianMixture, num: int, bounds: Bounds, *, generator: torch.Generator
@@ -273,4 +557,81 @@ class EigenDirectionGrid:
         order = mixture.log_weight.argsort(descending=True, stable=True)
         x = (mixture.mean[:, None] + offset)[order].flatten(0, 1)
         parent = order.repeat_interleave(offset.shape[1])
-        return Samples(bounds.project(x[:num]), parent[:num])
+        x, parent = bounds.project(x[:num]), parent[:num]
+        return Samples(x, parent, torch.full_like(x[:, 0], -math.inf))
+
+
+@dataclass(frozen=True, kw_only=True)
+class MixtureOfProposals:
+    """Several proposals in fixed shares: local and far samples, random and regular ones.
+
+    Every random sample is weighed by the density of all members together, each by the number of
+    samples that it drew, whichever of them drew this one: a member that is close to the prior then
+    bounds all the weights. Give `include_modes` to the first member only.
+
+    Attributes:
+        proposals: The members.
+        shares: Their shares of the samples, not negative; equal by default. A regular pattern that
+            gives fewer leaves the rest to nobody.
+    """
+
+    proposals: tuple[Proposal, ...]
+    shares: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        shares = (1.0,) * len(self.proposals) if self.shares is None else self.shares
+        if not self.proposals or len(shares) != len(self.proposals):
+            raise ConfigurationError(
+                f"MixtureOfProposals: expected one share for each of at least one proposal, got "
+                f"{len(self.proposals)} proposals and {len(shares)} shares"
+            )
+        if not (min(shares) >= 0 and 0 < sum(shares) < math.inf):
+            raise ConfigurationError(
+                f"MixtureOfProposals.shares: expected positive numbers, got {shares}"
+            )
+
+    def _counts(self, num: int) -> list[int]:
+        """Samples of each member, `num` in all: its share, the first members' rounded up."""
+        shares = self.shares or (1.0,) * len(self.proposals)
+        ends = [0.0]
+        for share in shares:
+            ends.append(ends[-1] + share)
+        # Less than a sample's millionth is rounding, not a share.
+        whole = [math.ceil(num * end / ends[-1] - 1e-6) for end in ends]
+        return [after - before for before, after in pairwise(whole)]
+
+    def log_density(
+        self, mixture: GaussianMixture, x: Float[Tensor, "*batch n"]
+    ) -> Float[Tensor, "*batch"]:
+        """Log-density of the random members together, in their shares of each other."""
+        shares = self.shares or (1.0,) * len(self.proposals)
+        return self._joint_log_density(mixture, x, shares)
+
+    def _joint_log_density(
+        self, mixture: GaussianMixture, x: Tensor, shares: tuple[float, ...] | list[int]
+    ) -> Tensor:
+        densities, random_shares = [], []
+        for proposal, share in zip(self.proposals, shares, strict=True):
+            density = proposal.log_density(mixture, x)
+            if share and bool((density > -math.inf).any()):
+                densities.append(density)
+                random_shares.append(share)
+        if not densities:
+            return torch.full_like(x[..., 0], -math.inf)
+        part = torch.tensor(random_shares, dtype=x.dtype, device=x.device)
+        return (torch.stack(densities, -1) + (part / part.sum()).log()).logsumexp(-1)
+
+    def sample(
+        self, mixture: GaussianMixture, num: int, bounds: Bounds, *, generator: torch.Generator
+    ) -> Samples:
+        """Draw from the members one after another, and project onto the bounds."""
+        free = unbounded(mixture.mean)
+        drawn = [
+            proposal.sample(mixture, count, free, generator=generator)
+            for proposal, count in zip(self.proposals, self._counts(num), strict=True)
+        ]
+        x, parent, log_weight = (torch.cat(field) for field in zip(*drawn, strict=True))
+        random = log_weight > -math.inf
+        counts = [int((part.log_weight > -math.inf).sum()) for part in drawn]
+        joint = mixture.log_density(x) - self._joint_log_density(mixture, x, counts)
+        return Samples(bounds.project(x), parent, torch.where(random, joint, -math.inf))

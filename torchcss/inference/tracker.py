@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from jaxtyping import Float, Int, UInt8
@@ -31,8 +31,9 @@ from torch import Tensor
 
 from torchcss.errors import ConfigurationError, check_shape
 from torchcss.inference.dynamics import Diffusion, Dynamics
+from torchcss.inference.importance import Survival, survival
 from torchcss.inference.mixture import GaussianMixture, distinct_modes, match_to_prior
-from torchcss.inference.proposals import Proposal
+from torchcss.inference.proposals import Proposal, Samples
 from torchcss.inference.trust_region import TrustRegionNewton, check_bounds
 from torchcss.linalg import log_determinant
 from torchcss.types import Bounds, CostFunction, Status
@@ -43,6 +44,22 @@ costs that compare a sample with the mode that it came from. The cost then has `
 `CostFunction`)."""
 
 
+class Particles(NamedTuple):
+    """A posterior as weighted states, for trackers that weigh instead of descend.
+
+    Attributes:
+        x: The states.
+        velocity: How far each moved in the last frame.
+        log_weight: Unnormalised.
+        component: The mode of `TrackerState.mixture` that sums each up.
+    """
+
+    x: Float[Tensor, "s n"]
+    velocity: Float[Tensor, "s n"]
+    log_weight: Float[Tensor, " s"]
+    component: Int[Tensor, " s"]
+
+
 class TrackerState(NamedTuple):
     """What the next step needs, and nothing else.
 
@@ -51,12 +68,16 @@ class TrackerState(NamedTuple):
         velocity: How far each mode moved in the last frame; zero for a new mode.
         generator_state: State of the random number generator.
         frame: Number of frames seen, a scalar.
+        particles: What the mixture sums up, for particle filters. They draw new particles from the
+            mixture where there are none; so whoever maps the mixture to other coordinates maps the
+            particles too, or drops them.
     """
 
     mixture: GaussianMixture
     velocity: Float[Tensor, "k n"]
     generator_state: UInt8[Tensor, " bytes"]
     frame: Int[Tensor, ""]
+    particles: Particles | None = None
 
 
 class TrackerInfo(NamedTuple):
@@ -69,10 +90,12 @@ class TrackerInfo(NamedTuple):
         origin: Prior mode whose sample descended to each mode.
         status_counts: How many samples ended with each `Status`, by its number.
         num_steps: Optimiser iterations of every sample.
-        num_samples: Samples optimised, a scalar.
+        num_samples: Samples optimised, or weighed, a scalar.
         num_distinct: Distinct modes found before pruning, a scalar; 0 if modes were carried over.
         effective_sample_size: `1 / sum w^2` over the weights of the distinct modes, a scalar: how
             many modes share the posterior.
+        survival: How evenly the samples' importance weights are spread: those back to the prior
+            for samples that descend (section 8 [IJRR]), those of the posterior for particles.
     """
 
     cost: Float[Tensor, " k"]
@@ -83,6 +106,80 @@ class TrackerInfo(NamedTuple):
     num_samples: Int[Tensor, ""]
     num_distinct: Int[Tensor, ""]
     effective_sample_size: Float[Tensor, ""]
+    survival: Survival
+
+
+class SequenceTracker(Protocol):
+    """Anything that follows a mixture through a sequence of costs, one a frame.
+
+    `Tracker`, `ParticleFilter` and `AnnealedParticleFilter` are; see `Tracker` for the arguments.
+    """
+
+    @property
+    def num_samples(self) -> int:
+        """Samples per frame."""
+        ...
+
+    @property
+    def num_modes(self) -> int:
+        """Modes kept."""
+        ...
+
+    def init(self, mixture: GaussianMixture, *, generator: torch.Generator) -> TrackerState:
+        """Start from a mixture."""
+        ...
+
+    def step(
+        self,
+        state: TrackerState,
+        cost: CostFunction | CostFactory,
+        bounds: Bounds,
+        *,
+        scale: Float[Tensor, " n"] | None = None,
+        prior_variance: Float[Tensor, " n"] | None = None,
+    ) -> tuple[TrackerState, TrackerInfo]:
+        """Process one frame."""
+        ...
+
+    def track(
+        self,
+        state: TrackerState,
+        costs: Iterable[CostFunction | CostFactory],
+        bounds: Bounds,
+        *,
+        scale: Float[Tensor, " n"] | None = None,
+        prior_variance: Float[Tensor, " n"] | None = None,
+    ) -> Iterator[tuple[TrackerState, TrackerInfo]]:
+        """Step through a sequence."""
+        ...
+
+
+def initial_state(mixture: GaussianMixture, *, generator: torch.Generator) -> TrackerState:
+    """Where every tracker starts.
+
+    Args:
+        mixture: Prior of the first frame.
+        generator: On the CPU, so that every device sees the same samples. Its state is copied.
+
+    Raises:
+        ConfigurationError: If the generator is on another device.
+        ShapeError: If the mixture's tensors do not agree.
+    """
+    if generator.device.type != "cpu":
+        raise ConfigurationError(
+            f"Tracker.init: expected a generator on the CPU, got one on {generator.device}; "
+            "use torch.Generator()"
+        )
+    check_shape("mixture.mean", mixture.mean, None, None)
+    k, n = mixture.mean.shape
+    check_shape("mixture.covariance", mixture.covariance, k, n, n)
+    check_shape("mixture.log_weight", mixture.log_weight, k)
+    return TrackerState(
+        mixture=mixture.prune(k),
+        velocity=torch.zeros_like(mixture.mean),
+        generator_state=generator.get_state(),
+        frame=torch.zeros((), dtype=torch.long),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,6 +201,9 @@ class Tracker:
         coarse_every: If the cost has a method `coarse()` that returns a smoother cost (or None),
             every so many samples descend on that first, so that what moved farther than the cost's
             own basin reaches is found again; 0 for never.
+        oversampling: How many times as many samples are drawn as descend: above one, the best
+            `num_samples` are kept, by the cost's `screening()` if it has that cheaper self. Section
+            4.2 [RR] scores sampled hypotheses by their edges alone.
         standard_bhattacharyya: Match modes by the distance of the literature instead of the one
             printed (design decision 4).
     """
@@ -117,10 +217,11 @@ class Tracker:
     laplace_evidence: bool = False
     memory: float = 1.0
     coarse_every: int = 3
+    oversampling: int = 1
     standard_bhattacharyya: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("num_samples", "num_modes", "duplicate_distance"):
+        for name in ("num_samples", "num_modes", "duplicate_distance", "oversampling"):
             if not getattr(self, name) > 0:
                 raise ConfigurationError(
                     f"Tracker.{name}: expected a positive number, got {getattr(self, name)}"
@@ -129,31 +230,8 @@ class Tracker:
             raise ConfigurationError(f"Tracker.memory: expected 0 to 1, got {self.memory}")
 
     def init(self, mixture: GaussianMixture, *, generator: torch.Generator) -> TrackerState:
-        """Start from a mixture.
-
-        Args:
-            mixture: Prior of the first frame.
-            generator: On the CPU, so that every device sees the same samples. Its state is copied.
-
-        Raises:
-            ConfigurationError: If the generator is on another device.
-            ShapeError: If the mixture's tensors do not agree.
-        """
-        if generator.device.type != "cpu":
-            raise ConfigurationError(
-                f"Tracker.init: expected a generator on the CPU, got one on {generator.device}; "
-                "use torch.Generator()"
-            )
-        check_shape("mixture.mean", mixture.mean, None, None)
-        k, n = mixture.mean.shape
-        check_shape("mixture.covariance", mixture.covariance, k, n, n)
-        check_shape("mixture.log_weight", mixture.log_weight, k)
-        return TrackerState(
-            mixture=mixture.prune(k),
-            velocity=torch.zeros_like(mixture.mean),
-            generator_state=generator.get_state(),
-            frame=torch.zeros((), dtype=torch.long),
-        )
+        """Start from a mixture, see `initial_state`."""
+        return initial_state(mixture, generator=generator)
 
     def step(
         self,
@@ -185,9 +263,17 @@ class Tracker:
         prior = self.dynamics.predict(state.mixture, state.velocity)
 
         # 2.1, 2.2: choose components and sample them, inside the bounds.
-        samples = self.proposal.sample(prior, self.num_samples, bounds, generator=generator)
-        if not isinstance(cost, CostFunction):
-            cost = cost(samples.parent, prior)
+        drawn = self.num_samples * self.oversampling
+        samples = self.proposal.sample(prior, drawn, bounds, generator=generator)
+        spread = survival(samples.log_weight)
+        make_cost = cost if not isinstance(cost, CostFunction) else lambda *_, cost=cost: cost
+        cost = make_cost(samples.parent, prior)
+        if self.oversampling > 1:
+            score = getattr(cost, "screening", lambda cost=cost: cost)().value(samples.x)
+            score = score.nan_to_num(torch.inf)
+            best = score.argsort(stable=True)[: self.num_samples].sort().values
+            samples = Samples(*(part[best] for part in samples))
+            cost = make_cost(samples.parent, prior)
 
         # Before 2.3, if the cost has a smoother self, every so many samples descend on that first.
         if self.coarse_every and (coarse := getattr(cost, "coarse", lambda: None)()) is not None:
@@ -243,6 +329,7 @@ class Tracker:
             num_samples=torch.tensor(len(samples.x)),
             num_distinct=torch.tensor(len(distinct)),
             effective_sample_size=effective,
+            survival=spread,
         )
         state = TrackerState(mixture, velocity, generator.get_state(), state.frame + 1)
         return state, info

@@ -37,7 +37,6 @@ Call `TrustRegionNewton().minimise(cost, x0, bounds)`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -46,7 +45,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchcss.errors import ConfigurationError, ShapeError, check_shape
-from torchcss.linalg import cholesky_apply, damped_cholesky, inverse_on_free, mask_free
+from torchcss.linalg import (
+    cholesky_apply,
+    damped_cholesky,
+    inverse_on_free,
+    solve_lower,
+    wall,
+)
 from torchcss.types import Bounds, CostFunction, LocalModel, Modes, Status
 
 
@@ -55,17 +60,20 @@ class TrustRegionState(NamedTuple):
 
     Attributes:
         x: Current states, admissible.
-        model: Cost and derivatives there.
+        model: Cost and derivatives there; the cost of an item not evaluated yet is `inf`.
+        share: Which share of the second-order parts the model's Hessian contains; 1 is exact.
         radius: Trust radius, in units of `scale`.
         damping: `lambda` of eq. 13 for the coming step.
         step: The coming step; it stays inside the bounds.
-        predicted: Decrease that the quadratic model predicts for it, nats.
+        predicted: Decrease that the quadratic model predicts for it, nats; zero where the next
+            evaluation is to be at `x` itself.
         status: A `Status` per item.
         num_steps: Iterations taken.
     """
 
     x: Float[Tensor, "b n"]
     model: LocalModel
+    share: Float[Tensor, " b"]
     radius: Float[Tensor, " b"]
     damping: Float[Tensor, " b"]
     step: Float[Tensor, "b n"]
@@ -93,6 +101,13 @@ _FUTILE = 1e-3
 halfway along curved valleys; towards 0, a cost that jumps takes more steps to stop."""
 _PINNING_ROUNDS = 12
 """Solves that may be spent on finding which bounds a step ends at."""
+_FAST, _SLOW = 0.1, 0.01
+"""Share of the cost that a step must promise to remove for Gauss-Newton to be the better model, and
+below which the exact one is."""
+_POOL_SIZE = 1024
+"""Items worked on at a time on a CPU."""
+_FACTOR_CHUNK = 128
+"""Matrices factored at a time: they and their factors stay in the caches."""
 _GOOD_ERROR = 0.25
 """Relative error of the predicted decrease at which the radius stays as it is (measured: see
 `_next_radius`)."""
@@ -119,10 +134,11 @@ class TrustRegionNewton:
     tolerance: float = 1e-6
     initial_radius: float = 1.0
     factorisations: int = 8
+    pool_size: int | None = None
 
     def __post_init__(self) -> None:
-        for name in ("max_steps", "tolerance", "initial_radius", "factorisations"):
-            if not getattr(self, name) > 0:
+        for name in ("max_steps", "tolerance", "initial_radius", "factorisations", "pool_size"):
+            if getattr(self, name) is not None and not getattr(self, name) > 0:
                 raise ConfigurationError(
                     f"TrustRegionNewton.{name}: expected a positive number, "
                     f"got {getattr(self, name)}; leave it out for the default"
@@ -148,23 +164,24 @@ class TrustRegionNewton:
         Returns:
             A state whose non-finite items have `Status.NON_FINITE` and the start as given.
         """
-        x0 = x0.detach()
-        bounds = _like(bounds, x0)
-        start = bounds.project(x0)
-        model = _evaluate(cost, start)
-        finite = _is_finite(model) & start.isfinite().all(-1)
-        zero = torch.zeros_like(model.value)
-        state = TrustRegionState(
-            x=torch.where(finite[:, None], start, x0),
-            model=model,
-            radius=torch.full_like(zero, self.initial_radius),
+        state, _ = self.step(cost, self._start(x0), bounds, scale=scale)
+        return state
+
+    def _start(self, x0: Float[Tensor, "b n"]) -> TrustRegionState:
+        """Items that wait for their first evaluation, which is not counted as a step."""
+        b, n = x0.shape
+        zero = x0.new_zeros(b)
+        return TrustRegionState(
+            x=x0.detach().clone(),
+            model=LocalModel(zero + torch.inf, x0.new_zeros(b, n), x0.new_zeros(b, n, n)),
+            share=zero,
+            radius=zero + self.initial_radius,
             damping=zero,
-            step=torch.zeros_like(start),
+            step=x0.new_zeros(b, n),
             predicted=zero,
-            status=torch.where(finite, int(Status.RUNNING), int(Status.NON_FINITE)),
-            num_steps=torch.zeros_like(zero, dtype=torch.long),
+            status=torch.full_like(zero, int(Status.RUNNING), dtype=torch.long),
+            num_steps=torch.full_like(zero, -1, dtype=torch.long),
         )
-        return self._plan(state, bounds, _weight(start, scale), finite)
 
     def step(
         self,
@@ -179,22 +196,40 @@ class TrustRegionNewton:
         Items that are not `RUNNING` stay as they are.
         """
         bounds, weight = _like(bounds, state.x), _weight(state.x, scale)
-        running = state.status == Status.RUNNING
+        running, value = state.status == Status.RUNNING, state.model.value
         candidate = bounds.project(state.x + state.step)
-        model = _evaluate(cost, candidate)
-        decrease = torch.where(_is_finite(model), state.model.value - model.value, -torch.inf)
-        ratio = decrease / torch.where(running, state.predicted, 1.0)
-        accepted = running & (decrease >= 0) & (ratio > _LEAST_RATIO)
+        blended = getattr(cost, "blended_model", None)
+        if blended is None:
+            share = torch.ones_like(value)
+            model = cost.local_model(candidate)
+        else:
+            share = _share_of_second_order(value, state.predicted)
+            model = blended(candidate, share)
+        # Contiguous, because sums over other layouts round differently in other batches.
+        model = LocalModel(*(part.detach().contiguous() for part in model))
+        finite = _is_finite(model) & candidate.isfinite().all(-1)
+        decrease = torch.where(finite, value - model.value, -torch.inf)
+        stays = state.predicted == 0
+        ratio = decrease / torch.where(stays, 1.0, state.predicted)
+        accepted = running & finite & (stays | ((decrease >= 0) & (ratio > _LEAST_RATIO)))
         length = (weight * state.step.square()).sum(-1).sqrt()
         radius = _next_radius(state.radius, length, ratio, accepted)
-        state = state._replace(
+        if blended is not None:
+            radius = radius.clamp(max=self.initial_radius)
+        unusable = running & value.isinf() & ~accepted
+        state = TrustRegionState(
             x=torch.where(accepted[:, None], candidate, state.x),
             model=LocalModel(
-                torch.where(accepted, model.value, state.model.value),
+                torch.where(accepted, model.value, value),
                 torch.where(accepted[:, None], model.gradient, state.model.gradient),
                 torch.where(accepted[:, None, None], model.hessian, state.model.hessian),
             ),
-            radius=torch.where(running, radius, state.radius),
+            share=torch.where(accepted, share, state.share),
+            radius=torch.where(running & ~stays, radius, state.radius),
+            damping=state.damping * _change_of_damping(state, model, accepted, weight),
+            step=state.step,
+            predicted=state.predicted,
+            status=torch.where(unusable, int(Status.NON_FINITE), state.status),
             num_steps=state.num_steps + running,
         )
         state = self._plan(state, bounds, weight, accepted)
@@ -243,25 +278,31 @@ class TrustRegionNewton:
         if prior_variance is None:
             prior_variance = default_prior_variance(bounds)
 
-        state = self.init(cost, x0.reshape(-1, n), bounds, scale=scale)
-        # What a cost returns may be expanded or belong to it; results are written into copies.
-        result = _each(state, torch.Tensor.clone)
-        items = torch.arange(len(state.x), device=x0.device)
+        starts = x0.reshape(batch.numel(), n)
+        result = self._start(starts)
+        size = self.pool_size or (_POOL_SIZE if starts.device.type == "cpu" else len(starts))
+        items = torch.arange(len(starts), device=starts.device)
+        items, queue = items[:size], items[size:]
+        state = self._start(starts[items])
         restrict = getattr(cost, "take", None)
-        part = cost
-        while True:
-            running = state.status == Status.RUNNING
-            if not bool(running.all()):
-                done = torch.nonzero(~running)[:, 0]
-                _write(result, items[done], _each(state, lambda field, done=done: field[done]))
-                kept = torch.nonzero(running)[:, 0]
-                items, state = items[kept], _each(state, lambda field, kept=kept: field[kept])
-                if not len(items):
-                    break
-                part = cost if restrict is None else restrict(items)
-            elif not len(items):
-                break
+        part = cost if restrict is None or not len(queue) else restrict(items)
+        while len(items):
             state, _ = self.step(part, state, bounds, scale=scale)
+            done = torch.nonzero(state.status != Status.RUNNING)[:, 0]
+            if not len(done):
+                continue
+            _write(result, items[done], _take(state, done))
+            # Waiting items take the places of finished ones; when none waits the pool shrinks.
+            new, queue = queue[: len(done)], queue[len(done) :]
+            places, left = done[: len(new)], done[len(new) :]
+            if len(new):
+                _write(state, places, self._start(starts[new]))
+                items = items.index_copy(0, places, new)
+            if len(left):
+                kept = torch.ones_like(items, dtype=torch.bool).index_fill(0, left, False)
+                kept = torch.nonzero(kept)[:, 0]
+                items, state = items[kept], _take(state, kept)
+            part = cost if restrict is None else restrict(items)
 
         active = _held(result.x, result.model.gradient, bounds)
         sound = result.status != Status.NON_FINITE
@@ -287,32 +328,76 @@ class TrustRegionNewton:
 
         `accepted` says which items got where they are by their last step.
         """
-        model = state.model
+        x, model = state.x, state.model
         running = state.status == Status.RUNNING
-        free = running[:, None] & ~_held(state.x, model.gradient, bounds)
-        gradient = torch.where(free, model.gradient, 0.0)
-        hessian = mask_free(model.hessian, free)
-        # A factorisation cannot tell a curvature within the rounding of the diagonal from zero.
-        resolution = torch.finfo(hessian.dtype).eps
-        diagonal = hessian.diagonal(dim1=-2, dim2=-1)
-        diagonal.add_(8 * resolution * diagonal.abs())
+        free = running[:, None] & ~_held(x, model.gradient, bounds)
+        problem = _Quadratic.of(model, free, weight)
         # Curvature that could change the cost by `tolerance` over a unit length counts as none.
         floor = 2 * self.tolerance
         step, damping = _damped_step(
-            hessian, gradient, weight, state.radius, state.damping, floor, self.factorisations
+            problem, state.radius, state.damping, floor, self.factorisations
         )
-        step = _step_in_box(
-            hessian, gradient, weight, damping, free, state.x, step, bounds, 0.1 * self.tolerance
-        )
-        curved = (hessian @ step[..., None])[..., 0]
-        predicted = -(step * (gradient + 0.5 * curved)).sum(-1)
-        converged = running & (predicted < self.tolerance) & (damping <= floor)
+        step = _step_in_box(problem, damping, x, step, bounds, 0.1 * self.tolerance)
+        predicted = -(step * (problem.gradient + 0.5 * problem.times(step))).sum(-1)
+        converged = (predicted < self.tolerance) & (damping <= floor)
         # A short damped step that succeeds is progress along a curved valley, not an end.
-        futile = ~accepted & (predicted < _FUTILE * self.tolerance)
-        futile = futile | (predicted < 4 * resolution * model.value.abs())
-        status = torch.where(running & futile, int(Status.SMALL_STEP), state.status)
-        status = torch.where(converged, int(Status.CONVERGED), status)
-        return state._replace(step=step, damping=damping, predicted=predicted, status=status)
+        resolution = 4 * torch.finfo(x.dtype).eps * model.value.abs()
+        futile = (~accepted & (predicted < _FUTILE * self.tolerance)) | (predicted <= resolution)
+        # No item ends on a model that is not exact: it is evaluated once more where it stands.
+        ends = running & (converged | futile)
+        exact = state.share == 1
+        again = ends & ~exact
+        reason = torch.where(converged, int(Status.CONVERGED), int(Status.SMALL_STEP))
+        return state._replace(
+            step=torch.where(again[:, None], 0.0, step),
+            damping=damping,
+            predicted=torch.where(again, 0.0, predicted),
+            status=torch.where(ends & exact, reason, state.status),
+        )
+
+
+class _Quadratic(NamedTuple):
+    """The quadratic model on the free variables: those that no bound holds.
+
+    Attributes:
+        hessian: Second derivative; the free rows and columns matter.
+        gradient: First derivative, zero on variables that are not free.
+        ridge: What every factorisation adds to the diagonal: its rounding, and a wall where a
+            variable is not free.
+        free: Which variables may move.
+        weight: Diagonal of `W`.
+    """
+
+    hessian: Float[Tensor, "b n n"]
+    gradient: Float[Tensor, "b n"]
+    ridge: Float[Tensor, "b n"]
+    free: Bool[Tensor, "b n"]
+    weight: Float[Tensor, " n"]
+
+    @staticmethod
+    def of(model: LocalModel, free: Tensor, weight: Tensor) -> _Quadratic:
+        """The model of a cost."""
+        # A factorisation cannot tell a curvature within the rounding of the diagonal from zero.
+        diagonal = model.hessian.diagonal(dim1=-2, dim2=-1)
+        rounding = 8 * torch.finfo(weight.dtype).eps * diagonal.abs()
+        ridge = torch.where(free, rounding, wall(weight.dtype))
+        return _Quadratic(
+            model.hessian, torch.where(free, model.gradient, 0.0), ridge, free, weight
+        )
+
+    def take(self, items: Int[Tensor, " m"]) -> _Quadratic:
+        """Some of the items."""
+        hessian, gradient, ridge, free, weight = self
+        return _Quadratic(hessian[items], gradient[items], ridge[items], free[items], weight)
+
+    def times(self, vector: Float[Tensor, "b n"]) -> Float[Tensor, "b n"]:
+        """Hessian times a vector."""
+        # Faster than `@` here, and rounded alike in a batch of one.
+        return (self.hessian * vector[:, None, :]).sum(-1)
+
+    def norm(self, vector: Float[Tensor, "b n"]) -> Float[Tensor, " b"]:
+        """Length in the metric `W`."""
+        return (self.weight * vector.square()).sum(-1).sqrt()
 
 
 def default_prior_variance(bounds: Bounds) -> Float[Tensor, " n"]:
@@ -362,10 +447,20 @@ def _next_radius(radius: Tensor, length: Tensor, ratio: Tensor, accepted: Tensor
     )
 
 
+def _change_of_damping(
+    state: TrustRegionState, model: LocalModel, accepted: Tensor, weight: Tensor
+) -> Float[Tensor, " b"]:
+    """First guess of the next lambda over the last one: it falls with the gradient."""
+    before, after = (
+        (gradient.square() / weight).sum(-1).sqrt()
+        for gradient in (state.model.gradient, model.gradient)
+    )
+    shrinks = accepted & (after < before)
+    return torch.where(shrinks, after / torch.where(shrinks, before, 1.0), 1.0)
+
+
 def _damped_step(
-    hessian: Float[Tensor, "b n n"],
-    gradient: Float[Tensor, "b n"],
-    weight: Float[Tensor, " n"],
+    problem: _Quadratic,
     radius: Float[Tensor, " b"],
     damping: Float[Tensor, " b"],
     floor: float,
@@ -380,71 +475,93 @@ def _damped_step(
     Returns:
         The steps, and the lambdas that belong to them.
     """
-    n = gradient.shape[-1]
+    gradient, weight = problem.gradient, problem.weight
     length = (gradient.square() / weight).sum(-1).sqrt()
     # Kept where no factor is found in time: steepest descent.
     step = -gradient / weight * (radius / torch.where(length > 0, length, 1.0))[:, None]
     # A first guess where the undamped matrix is not definite.
-    curvature = hessian.diagonal(dim1=-2, dim2=-1) / weight
+    curvature = problem.hessian.diagonal(dim1=-2, dim2=-1) / weight
+    curvature = torch.where(problem.free, curvature, 0.0)
     guess = torch.maximum(-curvature.amin(-1), 1e-3 * curvature.abs().amax(-1))
     guess = torch.maximum(guess, 0.1 * length / radius)
-    probe = weight.sqrt() * torch.arange(1, n + 1, device=weight.device).to(weight).cos()
 
     found = torch.maximum(damping, guess)
-    trial = damping.clamp(min=floor)
-    low, high = torch.zeros_like(trial), torch.full_like(trial, torch.inf)
     todo = torch.arange(len(gradient), device=gradient.device)
+    lam, rad, guess = damping.clamp(min=floor), radius, guess
+    lo, hi = torch.zeros_like(lam), torch.full_like(lam, torch.inf)
     for remaining in reversed(range(rounds)):
-        h, g = (
-            (hessian, gradient) if len(todo) == len(gradient) else (hessian[todo], gradient[todo])
-        )
-        lam, rad, lo, hi = trial[todo], radius[todo], low[todo], high[todo]
-        factor, ok = damped_cholesky(h, lam[:, None] * weight)
-        if not bool(ok.all()):
-            factor = torch.where(ok[:, None, None], factor, torch.eye(n).to(factor))
-        d = -cholesky_apply(factor, g)
+        d, slope, ok = _solve_damped(problem, todo, lam[:, None] * weight)
         size = (weight * d.square()).sum(-1).sqrt()
         too_long, too_short = ok & (size > 1.25 * rad), ok & (size < 0.75 * rad) & (lam > floor)
-        solved = ok & ~too_long & ~too_short
         lo = torch.where(~ok | (size > rad), lam, lo)
         hi = torch.where(ok & (size <= rad), lam, hi)
-        best = d * (rad / torch.where(size > rad, size, rad))[:, None]
-
         # Almost singular and still short: the gradient has no share in the direction of negative
         # curvature ("hard case"; a saddle is one). Go along it as far as the radius allows.
         stuck = too_short & ((lo >= 0.5 * lam) | (remaining == 0))
+        best = d * (rad / torch.where(size > rad, size, rad))[:, None]
         if bool(stuck.any()):
-            down = cholesky_apply(factor, probe.expand_as(g))
-            down = cholesky_apply(factor, weight * down / down.norm(dim=-1, keepdim=True))
-            down = down / (weight * down.square()).sum(-1, keepdim=True).sqrt()
-            down = torch.where(((g * down).sum(-1) > 0)[:, None], -down, down)
-            along = (weight * d * down).sum(-1)
-            reach = (along.square() + (rad.square() - size.square()).clamp(min=0)).sqrt() - along
-            best = torch.where(stuck[:, None], d + reach[:, None] * down, best)
-            solved = solved | stuck
-
+            hard = torch.nonzero(stuck)[:, 0]
+            best[hard] = _along_negative_curvature(
+                problem, todo[hard], lam[hard, None] * weight, d[hard], rad[hard]
+            )
         step[todo] = torch.where(ok[:, None], best, step[todo])
         found[todo] = torch.where(ok, lam, torch.maximum(found[todo], 10 * lam))
-        unsolved = ~solved
-        if remaining == 0 or not bool(unsolved.any()):
+        left = torch.nonzero(~ok | too_long | (too_short & ~stuck))[:, 0]
+        if remaining == 0 or not len(left):
             break
-        half = torch.linalg.solve_triangular(factor, (weight * d)[..., None], upper=False)[..., 0]
-        slope = half.square().sum(-1)
+        todo, lam, rad, guess, lo, hi, size, slope, ok = (
+            part[left] for part in (todo, lam, rad, guess, lo, hi, size, slope, ok)
+        )
         newton = lam + size.square() / torch.where(slope > 0, slope, 1.0) * (size - rad) / rad
-        after = torch.where(ok, newton, torch.maximum(10 * lam, guess[todo])).clamp(min=floor)
+        after = torch.where(ok, newton, torch.maximum(10 * lam, guess)).clamp(min=floor)
         between = torch.where(hi.isfinite(), (lo * hi).sqrt(), 10 * lo)
-        after = torch.where((after > lo) & (after < hi), after, between)
-        low[todo], high[todo], trial[todo] = lo, hi, after
-        todo = todo[unsolved]
+        lam = torch.where((after > lo) & (after < hi), after, between)
     return step, found
 
 
+def _solve_damped(
+    problem: _Quadratic, items: Int[Tensor, " m"], damping: Float[Tensor, "m n"]
+) -> tuple[Float[Tensor, "m n"], Float[Tensor, " m"], Bool[Tensor, " m"]]:
+    """Steps of some items, `-1/2` the derivative of their squared lengths, and which exist.
+
+    Worked off a few at a time, so that matrices and factors need not leave the caches.
+    """
+    parts = []
+    for some, extra in zip(items.split(_FACTOR_CHUNK), damping.split(_FACTOR_CHUNK), strict=True):
+        part = problem.take(some)
+        factor, ok = damped_cholesky(part.hessian, extra + part.ridge, overwrite=True)
+        step = -torch.where(part.free, cholesky_apply(factor, part.gradient), 0.0)
+        slope = solve_lower(factor, part.weight * step).square().sum(-1)
+        parts.append((step, slope, ok))
+    step, slope, ok = (torch.cat(part) for part in zip(*parts, strict=True))
+    return step, slope, ok
+
+
+def _along_negative_curvature(
+    problem: _Quadratic,
+    items: Int[Tensor, " m"],
+    damping: Float[Tensor, "m n"],
+    step: Float[Tensor, "m n"],
+    radius: Float[Tensor, " m"],
+) -> Float[Tensor, "m n"]:
+    """Extend steps to the radius along the lowest eigenvector, found by two inverse iterations."""
+    part = problem.take(items)
+    weight, free = part.weight, part.free
+    probe = weight.sqrt() * torch.arange(1, len(weight) + 1, device=weight.device).to(weight).cos()
+    factor, _ = damped_cholesky(part.hessian, damping + part.ridge)
+    down = cholesky_apply(factor, torch.where(free, probe, 0.0))
+    down = cholesky_apply(factor, weight * down / down.norm(dim=-1, keepdim=True))
+    down = torch.where(free, down, 0.0)
+    down = down / part.norm(down)[:, None]
+    down = torch.where(((part.gradient * down).sum(-1) > 0)[:, None], -down, down)
+    along = (weight * step * down).sum(-1)
+    rest = (radius.square() - part.norm(step).square()).clamp(min=0)
+    return step + ((along.square() + rest).sqrt() - along)[:, None] * down
+
+
 def _step_in_box(
-    hessian: Float[Tensor, "b n n"],
-    gradient: Float[Tensor, "b n"],
-    weight: Float[Tensor, " n"],
+    problem: _Quadratic,
     damping: Float[Tensor, " b"],
-    free: Bool[Tensor, "b n"],
     x: Float[Tensor, "b n"],
     step: Float[Tensor, "b n"],
     bounds: Bounds,
@@ -458,22 +575,25 @@ def _step_in_box(
     matrices are principal parts of definite ones. An item not settled in time takes a projected
     gradient step so short that the model is sure to fall; its damping, changed in place, says so.
     """
-    below, above = free & (x + step < bounds.lower), free & (x + step > bounds.upper)
+    below, above = x + step < bounds.lower, x + step > bounds.upper
     pin = above.to(x) - below.to(x)  # 1 at the upper bound, -1 at the lower
     todo = torch.nonzero((pin != 0).any(-1))[:, 0]
+    high = wall(x.dtype)
     for _ in range(_PINNING_ROUNDS):
         if not len(todo):
             break
-        h, g, position, side = hessian[todo], gradient[todo], x[todo], pin[todo]
+        part, position, side = problem.take(todo), x[todo], pin[todo]
         gap = torch.where(side > 0, bounds.upper - position, bounds.lower - position)
         pinned = torch.where(side != 0, gap, 0.0)
-        loose = free[todo] & (side == 0)
-        force = torch.where(loose, g + (h @ pinned[..., None])[..., 0], 0.0)
-        ridge = damping[todo, None] * weight
-        factor, ok = damped_cholesky(mask_free(h, loose), ridge)
-        moved = torch.where(ok[:, None], pinned - cholesky_apply(factor, force), 0.0)
-        slope = g + (h @ moved[..., None])[..., 0] + ridge * moved
-        diagonal = h.diagonal(dim1=-2, dim2=-1) + ridge
+        loose = part.free & (side == 0)
+        force = torch.where(loose, part.gradient + part.times(pinned), 0.0)
+        ridge = damping[todo, None] * part.weight
+        wall_or_ridge = torch.where(side == 0, part.ridge, high)
+        factor, ok = damped_cholesky(part.hessian, ridge + wall_or_ridge)
+        moved = torch.where(loose & ok[:, None], -cholesky_apply(factor, force), pinned)
+        moved = torch.where(ok[:, None], moved, 0.0)
+        slope = part.gradient + part.times(moved) + ridge * moved
+        diagonal = part.hessian.diagonal(dim1=-2, dim2=-1) + ridge
         gain = slope.square() / (2 * torch.where(diagonal > 0, diagonal, 1.0))
         released = (side * slope > 0) & (gain > negligible)
         target = position + moved
@@ -482,10 +602,11 @@ def _step_in_box(
         pin[todo] = torch.where(released, 0.0, side) + above.to(x) - below.to(x)
         todo = todo[(released | below | above).any(-1) | ~ok]
     if len(todo):
+        part = problem.take(todo)
         # A bound on the largest eigenvalue in the metric W, row by row.
-        rows = (hessian[todo].abs() / (weight[:, None] * weight).sqrt()).sum(-1).amax(-1)
+        rows = (part.hessian.abs() / (part.weight[:, None] * part.weight).sqrt()).sum(-1).amax(-1)
         damping[todo] += rows
-        step[todo] = -gradient[todo] / weight / damping[todo, None]
+        step[todo] = -part.gradient / part.weight / damping[todo, None]
     return bounds.project(x + step) - x
 
 
@@ -500,14 +621,21 @@ def _like(bounds: Bounds, x: Tensor) -> Bounds:
     return Bounds(bounds.lower.to(x), bounds.upper.to(x))
 
 
-def _evaluate(cost: CostFunction, x: Float[Tensor, "b n"]) -> LocalModel:
-    value, gradient, hessian = cost.local_model(x)
-    return LocalModel(value.detach(), gradient.detach(), hessian.detach())
-
-
 def _is_finite(model: LocalModel) -> Bool[Tensor, " b"]:
-    curvature = model.hessian.isfinite().flatten(1).all(-1)
-    return model.value.isfinite() & model.gradient.isfinite().all(-1) & curvature
+    # A sum is finite if its terms are (short of overflow), and far cheaper than looking at each.
+    parts = model.value + model.gradient.sum(-1) + model.hessian.flatten(1).sum(-1)
+    return parts.isfinite()
+
+
+def _share_of_second_order(value: Float[Tensor, " b"], predicted: Float[Tensor, " b"]) -> Tensor:
+    """How much of the second-order parts the model at the next candidate is to contain.
+
+    None as long as the step promises to remove a good part of what the cost can fall by, all of
+    it near the end (after Fletcher and Xu 1987, who decide by the decrease that was had).
+    """
+    promise = predicted / torch.where(value > 0, value, 1.0)
+    exact = (_FAST - promise) / (_FAST - _SLOW)
+    return torch.where(value.isinf(), 0.0, exact.clamp(0, 1))
 
 
 def _held(
@@ -517,10 +645,12 @@ def _held(
     return ((x <= bounds.lower) & (gradient > 0)) | ((x >= bounds.upper) & (gradient < 0))
 
 
-def _each(state: TrustRegionState, function: Callable[[Tensor], Tensor]) -> TrustRegionState:
-    """Apply a function to every tensor of a state."""
+def _take(state: TrustRegionState, items: Int[Tensor, " m"]) -> TrustRegionState:
+    """Some items of a state."""
     x, model, *rest = state
-    return TrustRegionState(function(x), LocalModel(*map(function, model)), *map(function, rest))
+    return TrustRegionState(
+        x[items], LocalModel(*(part[items] for part in model)), *(part[items] for part in rest)
+    )
 
 
 def _write(result: TrustRegionState, items: Int[Tensor, " m"], part: TrustRegionState) -> None:

@@ -1,0 +1,198 @@
+"""Table 1 of [IJRR]: how many minima covariance scaled sampling (CSS) and spheres (SS) find.
+
+    python scripts/table1.py --body body34 --samples 2000 --scales 1 4 8 --seed 0 --out table1.json
+
+One pose per seed is seen as joints in one image (`torchcss.reprojection`), and the minima of that
+cost are searched from its start mode: samples of its covariance, scaled, against samples of a ball
+of the same volume; both are projected onto the joint limits and descend. Scales are factors on the
+standard deviations. A minimum counts if its descent converged, if it satisfies the limits, if the
+cost curves upwards there along all free variables, and if it is none that was found before. The
+paper's own figures stand beside ours; its poses and its priors are lost.
+
+Distances are Euclidean in the parameters, "deviations" in the start mode's metric; medians are over
+the raw samples, and over the minima. `--figures DIR` draws Figs. 1, 5 and 13.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+
+from torchcss.inference.proposals import CovarianceScaled, Spherical
+from torchcss.io import study_plots
+from torchcss.io.tracks import prepare_output_folder, write_summary
+from torchcss.reprojection import ReprojectionProblem
+from torchcss.sampling_study import TABLE1, SamplerRun, run_sampler, spectrum, study_problem
+
+COLUMNS = ("minima", "distance_raw", "distance", "deviations_raw", "deviations", "cost_raw", "cost")
+CHECKS = {
+    "minima_half": "distance / 2", "minima_double": "distance x 2", "valleys": "valleys",
+    "cheap": "cheap", "below_start": "below start", "converged": "converged", "inside": "inside",
+    "upward": "upward", "steps": "steps", "seconds": "seconds",
+}  # fmt: skip
+"""Minima when the duplicate distance is halved and doubled, those not joined by low paths, those at
+most `cheap` nats above the start, those below it; shares of the samples that pass each test."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """The problem, the search and the counting."""
+
+    body: str = "body34"
+    """A body of the catalogue."""
+    samples: int = 2000
+    """Samples per method and scale."""
+    scales: tuple[float, ...] = (1.0, 4.0, 8.0)
+    """Factors on the standard deviations."""
+    seed: int = 0
+    """Seed of pose, noise and samples."""
+    num_seeds: int = 1
+    """How many seeds from there; with several, the medians are printed."""
+    pose: Path | None = None
+    """JSON of parameter names and values: this pose instead of one drawn from plausible ones."""
+    pixel_noise: float = 2.0
+    """Noise of the image joints; with 2 pixels the ball at scale 1 is as large as the paper's."""
+    prior_scale: float = 3.0
+    """Factor on the stabilisers' deviations of the package, which make a tracker's priors; with 3,
+    CSS at scale 1 reaches about as far as in the paper."""
+    widest: float | None = None
+    """Largest deviation of a parameter of the start mode; a quarter of its range by default."""
+    all_joints: bool = False
+    """All joint centres but those of face and foot are seen, not only 15 of trunk and limbs."""
+    limits: bool = True
+    """Joint limits hold."""
+    correlated_projection: bool = False
+    """Samples return to the limits along their covariance instead of each parameter for itself."""
+    robust: bool = False
+    """Lorentzian instead of quadratic reprojection error."""
+    exact_steps: bool = True
+    """Descents take exact Hessians throughout, which keeps them in the basin that they start in."""
+    duplicate_distance: float = 1.0
+    """Minima closer than this many standard deviations are one; also counted at half and double."""
+    cheap: float = 20.0
+    """Nats above the start within which a minimum is a serious alternative; counted too."""
+    figures: Path | None = None
+    """Folder for the figures."""
+    out: Path | None = None
+    """JSON file to write."""
+
+
+def make_problem(config: Config, seed: int, body: str) -> ReprojectionProblem:
+    """The problem of one seed, with its start mode."""
+    given = config.pose if body == config.body else None
+    pose = None if given is None else json.loads(given.read_text(encoding="utf-8"))
+    return study_problem(
+        body, generator=torch.Generator().manual_seed(seed), pixel_noise=config.pixel_noise,
+        prior_scale=config.prior_scale, widest=config.widest, limits=config.limits,
+        robust=config.robust, all_joints=config.all_joints, pose=pose,
+    )  # fmt: skip
+
+
+def row_of(config: Config, run: SamplerRun, problem: ReprojectionProblem) -> dict[str, Any]:
+    """What the table says of a run."""
+    modes, tests, minima = run.found.modes, run.found.tests, run.found.minima
+    lengths = {"_raw": run.raw, "": run.minima}
+    return {
+        "minima": len(minima),
+        **{name + kind: float(values.quantile(0.5)) if len(values) else math.nan
+           for kind, part in lengths.items() for name, values in part._asdict().items()},
+        "minima_half": run.num_half, "minima_double": run.num_double, "valleys": run.num_valleys,
+        "cheap": int((modes.cost[minima] < problem.start.cost + config.cheap).sum()),
+        "below_start": int((modes.cost[minima] < problem.start.cost).sum()),
+        **{name: float(part.double().mean()) for name, part in tests._asdict().items()},
+        "steps": float(modes.num_steps.double().mean()), "seconds": run.seconds, "flips": run.flips,
+    }  # fmt: skip
+
+
+def print_table(rows: list[dict[str, Any]]) -> None:
+    """The paper's columns, ours above the paper's, and what the count is worth."""
+    titles = ("minima", "distance raw", "opt", "deviations raw", "opt", "cost raw", "opt")
+    print(f"{'':15}" + "".join(f"{title:>15}" for title in titles))
+    for row in rows:
+        name = f"{row['method']:>4} {row['scale']:4g}"
+        print(f"{name} ours " + "".join(f"{row[column]:15.4g}" for column in COLUMNS))
+        if (row["method"], row["scale"]) in TABLE1:
+            values = TABLE1[row["method"], row["scale"]]
+            print(f"{'paper':>14} " + "".join(f"{value:15.4g}" for value in values))
+    print(f"{'':10}" + "".join(f"{title:>14}" for title in CHECKS.values()))
+    for row in rows:
+        name = f"{row['method']:>4} {row['scale']:4g}"
+        print(f"{name} " + "".join(f"{row[column]:14.4g}" for column in CHECKS))
+        if row.get("flips"):
+            print(f"{'':12}flipped: " + ", ".join(f"{k} {n}" for k, n in row["flips"].items()))
+
+
+def run_seed(config: Config, seed: int) -> dict[str, Any]:
+    """All runs of one pose; the figures are of the last scale."""
+    problem, rows, last = make_problem(config, seed, config.body), [], {}
+    for method in ("CSS", "SS"):
+        for scale in config.scales:
+            kind = CovarianceScaled if method == "CSS" else Spherical
+            last[method] = run_sampler(
+                problem, kind(deviation_scale=scale, include_modes=False,
+                              correlated_projection=config.correlated_projection),
+                config.samples, generator=torch.Generator().manual_seed(1000 + seed),
+                distance=config.duplicate_distance, exact_steps=config.exact_steps,
+            )  # fmt: skip
+            rows.append({"method": method, "scale": scale, **row_of(config, last[method], problem)})
+    starts = {"arm8": make_problem(config, seed, "arm8").start, config.body: problem.start}
+    spectra = {name: spectrum(start.covariance).tolist() for name, start in starts.items()}
+    if config.figures is not None:
+        folder = prepare_output_folder(config.figures)
+        title = f"{config.body}, seed {seed}, scale {config.scales[-1]:g}, {config.samples} samples"
+        figures = {
+            "fig1": study_plots.minima_and_costs_figure(last, title),
+            "fig5": study_plots.spectra_figure(spectra),
+            "fig13": study_plots.samples_and_minima_figure(last, title),
+        }
+        for name, figure in figures.items():
+            figure.savefig(folder / f"{name}_seed{seed}.png", dpi=90)
+    ratio = {name: values[0] / values[-1] for name, values in spectra.items()}
+    return {"seed": seed, "spectrum_ratio": ratio, "start_cost": float(problem.start.cost),
+            "seconds": sum(row["seconds"] for row in rows), "rows": rows}  # fmt: skip
+
+
+def medians(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Medians over seeds; a run without minima has no distances to give."""
+    table = []
+    for rows in zip(*(run["rows"] for run in runs), strict=True):
+        row = {"method": rows[0]["method"]}
+        for key in (key for key, value in rows[0].items() if isinstance(value, (int, float))):
+            known = [other[key] for other in rows if not math.isnan(other[key])]
+            row[key] = float(np.median(known)) if known else math.nan
+        table.append(row)
+    return table
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Run, print, draw, write; return what is written."""
+    runs = []
+    for seed in range(config.seed, config.seed + config.num_seeds):
+        runs.append(run := run_seed(config, seed))
+        ratio = ", ".join(f"{name} {value:.0f}" for name, value in run["spectrum_ratio"].items())
+        print(f"seed {seed}: spectrum ratio {ratio}; start at {run['start_cost']:.2f} nats; "
+              f"{run['seconds']:.1f} s")  # fmt: skip
+        if config.num_seeds > 1:
+            print_table(run["rows"])
+    table = medians(runs) if len(runs) > 1 else runs[0]["rows"]
+    print(f"{len(runs)} seeds, medians:" if len(runs) > 1 else "")
+    print_table(table)
+    counts = {(row["method"], row["scale"]): row["minima"] for row in table}
+    times = {f"{scale:g}": counts["CSS", scale] / (counts["SS", scale] or math.nan)
+             for scale in config.scales}  # fmt: skip
+    print("minima of CSS over those of SS by scale:", times)
+    report = {"config": config, "runs": runs, "median": table, "css_over_ss": times}
+    if config.out is not None:
+        write_summary(prepare_output_folder(config.out.parent) / config.out.name, report)
+    return report
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config, description=__doc__))

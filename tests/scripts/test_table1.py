@@ -1,0 +1,71 @@
+"""Table 1 in its small mode."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "table1.py"
+
+
+@pytest.fixture
+def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    specification = importlib.util.spec_from_file_location("table1", SCRIPT)
+    assert specification is not None
+    assert specification.loader is not None
+    module = importlib.util.module_from_spec(specification)
+    monkeypatch.setitem(sys.modules, "table1", module)
+    specification.loader.exec_module(module)
+    return module
+
+
+def test_small_mode(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, figures = tmp_path / "tables" / "table1.json", tmp_path / "figures"
+    config = script.Config(samples=80, scales=(1.0, 8.0), seed=1, out=out, figures=figures)
+    script.main(config)
+    report = json.loads(out.read_text())
+    (run,) = report["runs"]
+    rows = {(row["method"], row["scale"]): row for row in run["rows"]}
+    assert set(rows) == {("CSS", 1.0), ("CSS", 8.0), ("SS", 1.0), ("SS", 8.0)}
+    for scale in (1.0, 8.0):
+        assert rows["CSS", scale]["cost_raw"] < rows["SS", scale]["cost_raw"]
+    assert rows["CSS", 8.0]["minima"] > max(rows["SS", 8.0]["minima"], rows["CSS", 1.0]["minima"])
+    assert report["css_over_ss"]["8"] == pytest.approx(
+        rows["CSS", 8.0]["minima"] / rows["SS", 8.0]["minima"]
+    )
+    for row in rows.values():
+        assert row["converged"] > 0.9
+        assert row["inside"] == 1
+        assert row["upward"] >= row["converged"], "what converged curves upwards"
+        assert row["minima_double"] <= row["minima"] <= row["minima_half"]
+        assert row["valleys"] <= row["minima"]
+    assert sum(rows["CSS", 8.0]["flips"].values()) > 0
+    assert run["spectrum_ratio"]["body34"] > 300
+    assert {path.name for path in figures.iterdir()} == {
+        "fig1_seed1.png", "fig5_seed1.png", "fig13_seed1.png",
+    }  # fmt: skip
+    text = capsys.readouterr().out
+    assert "paper" in text
+    assert "flipped: " in text
+
+
+def test_medians_and_a_given_pose(script: ModuleType, tmp_path: Path) -> None:
+    pose = tmp_path / "pose.json"
+    pose.write_text(json.dumps({"r_elbow_flexion": 1.2, "r_shoulder_swing": -0.5}))
+    config = script.Config(
+        body="arm8", samples=40, scales=(4.0,), num_seeds=2, pose=pose, robust=True, limits=False,
+        exact_steps=False, correlated_projection=True,
+    )  # fmt: skip
+    report = script.main(config)
+    assert len(report["runs"]) == 2
+    costs = sorted(run["rows"][0]["cost_raw"] for run in report["runs"])
+    assert report["median"][0]["cost_raw"] == pytest.approx(sum(costs) / 2)
+    problem = script.make_problem(config, 0, "arm8")
+    index = problem.cost.body.state_index("r_elbow_flexion")
+    assert float(problem.truth[index]) == 1.2
+    assert bool(problem.bounds.lower.isinf().all())
