@@ -79,6 +79,7 @@ def main(config: Config) -> dict[str, Any]:
     print(f"{'mean over frames, mm':28}" + "".join(f"{name:>24}" for name in sequences))
     print(f"{'':28}" + f"{'best   of K  lost  s/fr':>24}" * len(sequences))
     rows: dict[str, dict[str, Any]] = {}
+    report: dict[str, Any] = {}
     for name in config.rows:
         print(f"{name:28}", end="", flush=True)
         rows[name] = {}

@@ -20,10 +20,21 @@ LAYERS = (
     {"vision"},
     {"inference"},
     {"cost"},
-    {"presets", "initialise", "reprojection", "synthetic", "metrics"},
+    {
+        "presets",
+        "initialise",
+        "interpretations",
+        "reprojection",
+        "synthetic",
+        "metrics",
+        "slices",
+        "shape_fit",
+        "random_person",
+    },
+    {"sampling_study"},
     {"io"},
-    {"pipeline"},
-    {"demo", "cli"},
+    {"pipeline", "initialise_image"},
+    {"demo", "scenes", "cli", "cli_init"},
 )
 """Lowest first; a folder counts as one entry."""
 

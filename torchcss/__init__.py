@@ -6,6 +6,7 @@ of poses with covariances and weights (covariance scaled sampling, Sminchisescu 
 """
 
 from torchcss.body.model import BodyModel, load_body
+from torchcss.initialise import Initialisation, initialise
 from torchcss.io.tracks import Track, load_track
 from torchcss.pipeline import Settings, track_frames, track_video
 from torchcss.vision.camera import Camera
@@ -13,8 +14,10 @@ from torchcss.vision.camera import Camera
 __all__ = [
     "BodyModel",
     "Camera",
+    "Initialisation",
     "Settings",
     "Track",
+    "initialise",
     "load_body",
     "load_track",
     "track_frames",

@@ -3,6 +3,7 @@
 | verb | does |
 |---|---|
 | `torchcss demo` | renders a sequence, tracks it and prints the error against the truth |
+| `torchcss init IMAGE` | fits a body to one picture with marked joints |
 | `torchcss track VIDEO` | tracks a body through a video |
 
 Bad input ends with one line on standard error and exit status 2; Ctrl-C with status 130. What was
@@ -18,6 +19,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from torchcss.cli_init import Init
 from torchcss.demo import run_demo
 from torchcss.errors import OutputError, TorchcssError
 from torchcss.pipeline import TERMS, Settings, track_video
@@ -33,6 +35,8 @@ class Demo:
     """Seed of the rendering and of the tracker."""
     frames: int = 50
     """Number of frames, 25 per second."""
+    preset: str = "css"
+    """Tracker, see torchcss.presets."""
     samples: int | None = None
     """Samples per frame; the preset's number by default."""
     terms: tuple[str, ...] = TERMS
@@ -46,6 +50,7 @@ class Demo:
         """Run the verb."""
         settings = Settings(
             body="arm8",
+            preset=self.preset,
             samples=self.samples,
             keypoints_use="first",
             terms=self.terms,
@@ -74,6 +79,8 @@ class Track:
     """2D joints: OpenPose folder, COCO or AlphaPose JSON, NPZ, or clicked joints as JSON."""
     out: Path = Path("out/track")
     """Output folder."""
+    init: Path | None = None
+    """A fitted body that `torchcss init` wrote for the first frame, to start from."""
     camera_name: str | None = None
     """Camera in the file; by default the one whose video this is."""
     body: str = "body34"
@@ -98,6 +105,8 @@ class Track:
     """Samples per frame; the preset's number by default."""
     modes: int | None = None
     """Modes kept; the preset's number by default."""
+    oversampling: int = 1
+    """Draw so many times as many samples; those with the best edges descend."""
     terms: tuple[str, ...] = TERMS
     """Terms and priors of the cost."""
     contour_weight: float = Settings.contour_weight
@@ -122,6 +131,7 @@ class Track:
             preset=self.preset,
             samples=self.samples,
             modes=self.modes,
+            oversampling=self.oversampling,
             keypoints_use=self.keypoints_use,
             terms=self.terms,
             working_size=self.working_size,
@@ -145,6 +155,7 @@ class Track:
             layout=self.layout,
             normalised=self.normalised,
             masks=self.masks,
+            init=self.init,
         )
         print(
             f"{summary['num_frames']} frames, {summary['seconds_per_frame']:.2f} s each; "
@@ -153,7 +164,9 @@ class Track:
 
 
 Verb = (
-    Annotated[Demo, tyro.conf.subcommand("demo")] | Annotated[Track, tyro.conf.subcommand("track")]
+    Annotated[Demo, tyro.conf.subcommand("demo")]
+    | Annotated[Init, tyro.conf.subcommand("init")]
+    | Annotated[Track, tyro.conf.subcommand("track")]
 )
 
 

@@ -22,9 +22,10 @@ from torchcss.pipeline import (
     boundary_emphasis,
     make_choice,
     make_extractor,
+    make_settings_tracker,
     track_frames,
 )
-from torchcss.presets import make_tracker
+from torchcss.presets import PRESETS
 from torchcss.synthetic import arm_sequence
 
 KEYPOINT_NOISE_PX = 1.5
@@ -82,13 +83,7 @@ def run_demo(
         body.joint_names,
     )  # fmt: skip
     interval = 1 / sequence.frame_rate
-    tracker = make_tracker(
-        settings.preset,
-        "arm8",
-        num_samples=settings.samples,
-        num_modes=settings.modes,
-        motion=tuple((body.motion_rate * interval).tolist()),
-    )
+    tracker = make_settings_tracker(settings, body.motion_rate * interval)
     tracked = track_frames(
         (Frame(i, i * interval, image) for i, image in enumerate(sequence.frames)),
         body=first.body,
@@ -101,6 +96,7 @@ def run_demo(
         frame_interval=interval,
         generator=generator,
         boundary_emphasis=boundary_emphasis(settings),
+        limits=PRESETS[settings.preset].limits,
     )
     recorder = Recorder(
         folder=out,

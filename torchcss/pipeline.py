@@ -26,24 +26,29 @@ from tqdm import tqdm
 
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, has_root, move_base, root_pose
+from torchcss.cost.anthropometric import Anthropometric
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.edge_energy import EdgeEnergyField, EdgeEnergyTerm, edge_energy_field
 from torchcss.cost.flow import FlowTargets, FlowTerm, InteriorNodes, flow_targets
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
 from torchcss.cost.joints import JointObservation, JointTerm
-from torchcss.cost.temporal import MixturePrior
+from torchcss.cost.stabiliser import Stabiliser
+from torchcss.cost.temporal import MixturePrior, TemporalPrior
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.cost.visibility import ContourPredictor, visible_nodes
 from torchcss.errors import ConfigurationError, KeypointError, VideoError
 from torchcss.inference.mixture import GaussianMixture
-from torchcss.inference.tracker import Tracker, TrackerInfo, TrackerState
-from torchcss.initialise import default_sigma, initialise_from_joints
+from torchcss.inference.proposals import unbounded
+from torchcss.inference.tracker import SequenceTracker, Tracker, TrackerInfo, TrackerState
+from torchcss.initialise import Initialisation, default_sigma, initialise_from_joints
 from torchcss.io.cameras import check_image_size, read_camera
+from torchcss.io.fitted_body import read_fitted_body
 from torchcss.io.keypoints import Keypoints, read_keypoints
 from torchcss.io.overlay import ProjectedPart, draw_overlay
 from torchcss.io.tracks import TrackWriter, prepare_output_folder, write_summary
 from torchcss.io.video import Frame, VideoReader, VideoWriter
-from torchcss.presets import make_tracker
+from torchcss.presets import PRESETS, make_tracker
+from torchcss.robust import Quadratic
 from torchcss.stopwatch import Stopwatch
 from torchcss.synthetic import grid_faces
 from torchcss.types import Status
@@ -51,8 +56,11 @@ from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor
 from torchcss.vision.flow import TRACKING
 
-TERMS = ("contour", "joints", "stabiliser", "temporal")
-"""Terms and priors of the cost by default."""
+TERMS = (
+    *("contour", "motion_boundaries", "flow", "joints"),
+    *("stabiliser", "anthropometric", "interpenetration", "temporal"),
+)
+"""Terms and priors of the cost by default: all that do not stand in for one another."""
 
 ALL_TERMS = (
     *("contour", "motion_boundaries", "edge_energy", "flow", "joints"),
@@ -78,6 +86,8 @@ class Settings:
         preset: Tracker, a name in `presets.PRESETS`.
         samples: Samples per frame; the preset's number by default.
         modes: Modes kept; the preset's number by default.
+        oversampling: How many times as many samples are drawn; those with the best edges descend,
+            see `Tracker`.
         keypoints_use: "all": keypoints are observations in every frame; "first": they only
             give the first pose, as in the papers.
         terms: Terms and priors of the cost.
@@ -95,6 +105,7 @@ class Settings:
     preset: str = "css"
     samples: int | None = None
     modes: int | None = None
+    oversampling: int = 1
     keypoints_use: Literal["first", "all"] = "all"
     terms: tuple[str, ...] = TERMS
     working_size: int = 640
@@ -106,10 +117,12 @@ class Settings:
     overlay: bool = True
 
     def __post_init__(self) -> None:
+        if self.preset not in PRESETS:
+            raise ConfigurationError(f"no tracker {self.preset!r}; there are {', '.join(PRESETS)}")
         unknown = sorted(set(self.terms) - set(ALL_TERMS))
         if unknown:
             raise ConfigurationError(f"unknown terms {unknown}; there are {', '.join(ALL_TERMS)}")
-        for name in ("samples", "modes", "working_size"):
+        for name in ("samples", "modes", "working_size", "oversampling"):
             number = getattr(self, name)
             if number is not None and number < 1:
                 raise ConfigurationError(f"{name} must be at least 1, got {number}")
@@ -162,12 +175,13 @@ def track_frames(
     mixture: GaussianMixture,
     camera: Camera,
     extractor: FeatureExtractor,
-    tracker: Tracker,
+    tracker: SequenceTracker,
     choice: CostChoice,
     observe: Observe,
     frame_interval: float,
     generator: torch.Generator,
     boundary_emphasis: float = 0.0,
+    limits: bool = True,
     masks: Iterable[np.ndarray | Tensor] | None = None,
 ) -> Iterator[TrackedFrame]:
     """Track a body through a sequence of images.
@@ -184,6 +198,7 @@ def track_frames(
         frame_interval: Seconds between frames, which scales the expected motion.
         generator: Source of the samples.
         boundary_emphasis: Weight of motion boundaries, see `FrameFeatures.edge_field`.
+        limits: Whether joint limits hold.
         masks: Foreground of each of the images, of their size, as `FeatureExtractor` takes it;
             None: not known.
 
@@ -256,7 +271,8 @@ def track_frames(
             )
 
         prior = state.mixture
-        state, info = tracker.step(state, cost_of, body.bounds)
+        bounds = body.bounds if limits else unbounded(state.mixture.mean)
+        state, info = tracker.step(state, cost_of, bounds)
         searched, term_seconds = time.perf_counter(), dict(stopwatch.seconds)
         mean = state.mixture.mean
         terms = cost_of(info.origin[:1], prior).terms(mean[:1])
@@ -287,7 +303,10 @@ def follow_with_base(body: BodyModel, state: TrackerState) -> tuple[BodyModel, T
     )
     assert covariance is not None
     moved = mixture._replace(mean=mean, covariance=covariance)
-    return body, state._replace(mixture=moved, velocity=torch.zeros_like(state.velocity))
+    # Particles belong to the old base; a filter draws new ones from the mixture.
+    return body, state._replace(
+        mixture=moved, velocity=torch.zeros_like(state.velocity), particles=None
+    )
 
 
 def scale_keypoints(
@@ -350,7 +369,7 @@ class Recorder:
 
     folder: Path
     settings: Settings
-    tracker: Tracker
+    tracker: SequenceTracker
     camera: Camera
     frame_rate: float
     notes: list[str] = field(default_factory=list)
@@ -503,30 +522,60 @@ def boundary_emphasis(settings: Settings) -> float:
 
 
 def make_choice(settings: Settings, sigma: float) -> CostChoice:
-    """The cost that the settings ask for.
+    """The cost that the settings ask for: their terms, and what their preset has to say.
 
     Args:
-        settings: Which terms.
+        settings: Which terms, and which tracker.
         sigma: Keypoint noise in pixels of the working image.
     """
-    default, contour = CostChoice(), ContourTerm()
+    row = PRESETS[settings.preset]
     has = settings.terms.__contains__
+    repels = has("interpenetration") if row.interpenetration is None else row.interpenetration
+    potential: dict[str, Any] = {} if row.robust else {"potential_kind": Quadratic}
+    contour = ContourTerm(**potential)
     # The weights of motion boundaries make the wells of a fitted model shallower; what is back-
     # facing or hidden must not become cheaper than that. 0.3 takes 12 % on the demo's true states.
     shallower = 0.4 * boundary_emphasis(settings)
     level = contour.unmatched - (1 - shallower) * (contour.unmatched - contour.fitted_level)
     return CostChoice(
         contour=replace(contour, fitted_level=level) if has("contour") else None,
-        edge_energy=EdgeEnergyTerm() if has("edge_energy") else None,
-        flow=FlowTerm() if has("flow") else None,
-        joints=JointTerm(sigma=sigma) if has("joints") else None,
-        stabiliser=default.stabiliser if has("stabiliser") else None,
-        anthropometric=default.anthropometric if has("anthropometric") else None,
-        temporal=default.temporal if has("temporal") else None,
+        edge_energy=EdgeEnergyTerm(**potential) if has("edge_energy") else None,
+        flow=FlowTerm(**potential) if has("flow") else None,
+        joints=JointTerm(sigma=sigma, **potential) if has("joints") else None,
+        stabiliser=Stabiliser() if has("stabiliser") else None,
+        anthropometric=Anthropometric() if has("anthropometric") else None,
+        temporal=TemporalPrior() if has("temporal") else None,
         temporal_mixture=MixturePrior() if has("temporal_mixture") else None,
-        interpenetration=Interpenetration() if has("interpenetration") else None,
+        interpenetration=Interpenetration() if repels else None,
         contour_weight=settings.contour_weight,
+        curvature=row.curvature,
     )
+
+
+def make_settings_tracker(settings: Settings, motion: Float[Tensor, " n"]) -> SequenceTracker:
+    """The tracker that the settings ask for.
+
+    Args:
+        settings: Preset and numbers.
+        motion: Standard deviation of every parameter's motion per frame.
+
+    Raises:
+        ConfigurationError: If the preset's tracker cannot be oversampled.
+    """
+    tracker = make_tracker(
+        settings.preset,
+        settings.body,
+        num_samples=settings.samples,
+        num_modes=settings.modes,
+        motion=tuple(motion.tolist()),
+    )
+    if settings.oversampling == 1:
+        return tracker
+    if not isinstance(tracker, Tracker):
+        raise ConfigurationError(
+            f"oversampling: {settings.preset} does not descend from samples; leave it at 1"
+        )
+    return replace(tracker, oversampling=settings.oversampling)
 
 
 def track_video(
@@ -543,6 +592,7 @@ def track_video(
     layout: str | None = None,
     normalised: bool = False,
     masks: Path | None = None,
+    init: Path | None = None,
 ) -> dict[str, Any]:
     """Track a body through a video file.
 
@@ -560,6 +610,7 @@ def track_video(
         normalised: Whether keypoints are fractions of the image.
         masks: Foreground of every frame, white or in shades of belief: a video or a folder of
             images, of the size and number of the video's frames.
+        init: A body that `torchcss init` fitted to the first frame, to start from.
 
     Returns:
         The summary.
@@ -598,17 +649,20 @@ def track_video(
     dtype, device = settings.torch_dtype, settings.device
     eye = loaded.camera.to(dtype=dtype, device=device)
     sigma = _sigma(marks)
-    first = initialise_from_joints(
-        settings.body,
-        eye,
-        marks.keypoints[start],
-        marks.confidence[start],
-        marks.joint_names,
-        generator=generator,
-        joints=JointTerm(sigma=sigma),
-        dtype=dtype,
-        device=device,
-    )
+    if init is not None:
+        first = _first_pose_from_file(init, eye, settings)
+    else:
+        first = initialise_from_joints(
+            settings.body,
+            eye,
+            marks.keypoints[start],
+            marks.confidence[start],
+            marks.joint_names,
+            generator=generator,
+            joints=JointTerm(sigma=sigma),
+            dtype=dtype,
+            device=device,
+        )
     notes += first.report
     for note in notes:
         tqdm.write(note)
@@ -626,13 +680,7 @@ def track_video(
         )
 
     interval = stride / float(reader.info.frame_rate)
-    tracker = make_tracker(
-        settings.preset,
-        settings.body,
-        num_samples=settings.samples,
-        num_modes=settings.modes,
-        motion=tuple((first.body.motion_rate * interval).tolist()),
-    )
+    tracker = make_settings_tracker(settings, first.body.motion_rate * interval)
     recorder = Recorder(
         folder=out,
         settings=settings,
@@ -659,9 +707,24 @@ def track_video(
         frame_interval=interval,
         generator=generator,
         boundary_emphasis=boundary_emphasis(settings),
+        limits=PRESETS[settings.preset].limits,
         masks=None if foreground is None else (mask.image for mask in foreground),
     )
     return recorder.run(tracked, first.body, reader.num_selected)
+
+
+def _first_pose_from_file(path: Path, camera: Camera, settings: Settings) -> Initialisation:
+    """A fitted body, hung before the video's camera as it was before the picture's."""
+    fitted = read_fitted_body(
+        path, camera=camera, dtype=settings.torch_dtype, device=settings.device
+    )
+    if fitted.body.name != settings.body:
+        raise ConfigurationError(
+            f"{path}: the fitted body is {fitted.body.name}, to be tracked is {settings.body}; "
+            f"give the body {fitted.body.name}"
+        )
+    note = f"first pose: {len(fitted.cost)} hypotheses from {path}"
+    return Initialisation(fitted.body, fitted.mixture, fitted.cost, (note,))
 
 
 def _sigma(marks: Keypoints) -> float:

@@ -1,0 +1,192 @@
+"""Errors of initialisation from the joints of one image, as a table and as JSON.
+
+    python scripts/evaluate_initialise.py --data DIR --out initialise.json
+
+Synthetic people (`torchcss.random_person`): random proportions and poses, seen from any side,
+fourteen marked joints. Real frames (with `--data`): the beam clip from either camera and the
+rendered turn, against their 3D references. Errors are means over the limbs' twelve joints, then
+over people or frames. "Inside": the share of true parameters, and of true joints, inside the 95 %
+interval or ellipsoid that the nearest mode states. The last rows fit the same data from a single
+start, without limits, or without robust potential. Seconds are the processor's.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+import tyro
+from torch import Tensor
+
+from torchcss.cost.joints import JointTerm
+from torchcss.errors import TorchcssError
+from torchcss.initialise import default_sigma, initialise_from_joints
+from torchcss.interpretations import SINGLE_START, Search
+from torchcss.io.cameras import read_camera
+from torchcss.io.keypoints import read_keypoints
+from torchcss.io.tracks import prepare_output_folder, write_summary
+from torchcss.joint_names import canonical_joint_name
+from torchcss.metrics import LIMB_JOINTS, pa_mpjpe_mm, root_aligned_mpjpe_mm
+from torchcss.random_person import Person, coverage, random_person
+from torchcss.vision.camera import Camera
+
+LIMBS = {"thigh": ("hip", "knee"), "shank": ("knee", "ankle"), "upper_arm": ("shoulder", "elbow"),
+         "forearm": ("elbow", "wrist")}  # fmt: skip
+SYNTHETIC: dict[str, dict[str, float]] = {
+    "noise 0 px": {"noise_px": 0.0},
+    "noise 2 px": {"noise_px": 2.0},
+    "noise 5 px": {"noise_px": 5.0},
+    "2 px, 20 % missing": {"missing": 0.2},
+    "2 px, 5 % outliers": {"outliers": 0.05},
+}
+CLIPS = {
+    "beam, camera 1": ("balance_beam_4cam", "cam01.mp4", "keypoints2d_cam01.npz"),
+    "beam, camera 3": ("balance_beam_4cam", "cam03.mp4", "keypoints2d_cam03.npz"),
+    "rendered turn": ("rendered_turn", "video.mp4", "keypoints2d.npz"),
+}
+VARIANTS = ("full", "single start", "without limits", "not robust")
+COMPARED = ("noise 2 px", "2 px, 5 % outliers", *CLIPS)
+HEADS = ("best", "of 7", "of 50", "r-a best", "r-a of 7", "ratios %", "viol. %", "params %",
+         "joints %", "s")  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """What is fitted."""
+
+    data: Path | None = None
+    """Folder with balance_beam_4cam and rendered_turn; without it only synthetic people."""
+    people: int = 30
+    """Synthetic people per row."""
+    frames: int = 10
+    """Frames per clip, evenly spread."""
+    variants: tuple[str, ...] = VARIANTS
+    """Rows of the table."""
+    small: bool = False
+    """One person or frame, few starts and rows, to see that it runs."""
+    out: Path | None = None
+    """JSON file to write."""
+
+
+class Case(NamedTuple):
+    """Marked joints of one image with their truth; the person only where it is synthetic."""
+
+    camera: Camera
+    names: tuple[str, ...]
+    uv: Tensor
+    confidence: Tensor
+    joints: np.ndarray
+    sigma: float
+    lengths: dict[str, float]
+    person: Person | None = None
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Fit, print and write the table; return what is written."""
+    rows: list[dict[str, Any]] = []
+    report = {"unit": "mm, %, s", "direction": "lower is better; params and joints: 95 is right",
+              "setting": config, "rows": rows}  # fmt: skip
+    conditions = [*SYNTHETIC, *(CLIPS if config.data else ())]
+    print(f"{'':36}" + "".join(f"{head:>9}" for head in HEADS))
+    for variant in config.variants[: 2 if config.small else None]:
+        for condition in ("noise 2 px",) if config.small else conditions:
+            if variant != "full" and condition not in COMPARED:
+                continue
+            fits = [fit(case, variant, config, i) for i, case in cases(config, condition)]
+            mean = {key: mean_known([fit[key] for fit in fits]) for key in fits[0]}
+            rows.append({"variant": variant, "condition": condition, "count": len(fits), **mean,
+                         "per_case": fits})  # fmt: skip
+            cells = "".join(f"{value:9.1f}" for value in mean.values())
+            print(f"{variant:16}{condition:20}{cells}", flush=True)
+            if config.out is not None:
+                prepare_output_folder(config.out.parent)
+                write_summary(config.out, report)
+    return report
+
+
+def mean_known(values: list[float]) -> float:
+    """Mean without the NaNs; NaN if there is nothing else."""
+    known = [value for value in values if not math.isnan(value)]
+    return sum(known) / len(known) if known else math.nan
+
+
+def cases(config: Config, condition: str) -> Iterator[tuple[int, Case]]:
+    """The images of one condition, numbered."""
+    if condition in SYNTHETIC:
+        for seed in range(1 if config.small else config.people):
+            generator = torch.Generator().manual_seed(seed)
+            person = random_person(generator=generator, **SYNTHETIC[condition])  # type: ignore[arg-type]
+            noise = SYNTHETIC[condition].get("noise_px", 2.0)
+            yield seed, Case(
+                person.camera, person.joint_names, person.keypoints, person.confidence,
+                person.joints_world(LIMB_JOINTS).numpy(), max(noise, 1.0), person.body.lengths,
+                person,
+            )  # fmt: skip
+        return
+    assert config.data is not None
+    folder, video, file = CLIPS[condition]
+    camera = read_camera(config.data / folder / "cameras.json", video=video).camera
+    marks = read_keypoints(config.data / folder / file, image_size_wh=camera.image_size_wh)
+    reference = np.load(config.data / folder / "reference3d.npz")
+    names = [canonical_joint_name(str(name)) for name in reference["joint_names"]]
+    joints = reference["joints"][:, [names.index(name) for name in LIMB_JOINTS]]
+    at = {name: joints[:, i] for i, name in enumerate(LIMB_JOINTS)}
+    lengths = {
+        limb: float(np.nanmedian([np.linalg.norm(at[f"{side}_{a}"] - at[f"{side}_{b}"], axis=-1)
+                                  for side in "lr"])) for limb, (a, b) in LIMBS.items()
+    }  # fmt: skip
+    for frame in np.linspace(0, len(joints) - 1, config.frames).round().astype(int).tolist():
+        uv, seen = marks.keypoints[frame], marks.confidence[frame]
+        sigma = default_sigma(uv[seen > 0])
+        yield frame, Case(camera, marks.joint_names, uv, seen, joints[frame], sigma, lengths)
+
+
+def fit(case: Case, variant: str, config: Config, seed: int) -> dict[str, float]:
+    """Initialise and compare with the truth."""
+    search = Search(num_starts=8, num_flips=8, num_samples=8) if config.small else Search()
+    search = SINGLE_START if variant == "single start" else search
+    # With outliers at so high a level none is one: the quadratic potential.
+    joints = JointTerm(sigma=case.sigma, nu=1e6 if variant == "not robust" else JointTerm.nu)
+    generator = torch.Generator().manual_seed(seed)
+    began = time.process_time()
+    found = initialise_from_joints(
+        "body34", case.camera, case.uv, case.confidence, case.names, generator=generator,
+        joints=joints, search=replace(search, limits=variant != "without limits"), num_modes=50,
+    )  # fmt: skip
+    seconds = time.process_time() - began
+    body, states = found.body, found.hypotheses(50, generator=generator)
+    places = body.pose(states).joints[:, [body.joint_index(name) for name in LIMB_JOINTS]].numpy()
+    procrustes = pa_mpjpe_mm(places, case.joints)
+    aligned = root_aligned_mpjpe_mm(places, case.joints, LIMB_JOINTS)
+    modes = found.mixture.mean
+    outside = ((modes < body.lower) | (modes > body.upper)).any(-1)
+    share, right = (np.array([lengths[limb] for limb in LIMBS]) for lengths in
+                    (found.lengths, case.lengths))  # fmt: skip
+    ratios = (share / share.sum()) / (right / right.sum()) - 1
+    parameters, ellipsoids = math.nan, math.nan
+    if case.person is not None and found.free_body and found.free_mixture:
+        stated = coverage(case.person, found.free_body, found.free_mixture)
+        parameters, ellipsoids = 100 * stated.parameters, 100 * stated.joints
+    numbers = (
+        procrustes[0], procrustes[:7].min(), procrustes.min(), aligned[0], aligned[:7].min(),
+        100 * np.abs(ratios).mean(), 100 * outside.double().mean(), parameters, ellipsoids, seconds,
+    )  # fmt: skip
+    keys = ("pa_best_mm", "pa_best_of_7_mm", "pa_best_of_50_mm", "root_aligned_best_mm",
+            "root_aligned_best_of_7_mm", "length_ratio_error_percent", "limit_violations_percent",
+            "parameters_inside_percent", "joints_inside_percent", "seconds")  # fmt: skip
+    return dict(zip(keys, map(float, numbers), strict=True))
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Config, description=__doc__))
+    except TorchcssError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

@@ -1,0 +1,145 @@
+"""Shape columns against autograd through kinematics and surface together."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchcss.body.catalog import BODY_NAMES
+from torchcss.body.model import BodyModel, load_body
+from torchcss.body.shape import (
+    CROSS_SECTIONS,
+    ShapeParameters,
+    lift_with_shape,
+    surface_angles,
+    surface_derivatives,
+    surface_normal_derivatives,
+    with_shape,
+)
+from torchcss.body.surface import SHAPE_NAMES, surface_points
+from torchcss.types import Curvature, PointCost
+
+NUM_POINTS = 25
+
+
+def randn(generator: torch.Generator, *shape: int) -> Tensor:
+    return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+
+def shapes(num: int, generator: torch.Generator, *, bent: bool = True) -> Tensor:
+    """Random plausible shape numbers."""
+    low = torch.tensor([0.03, 0.03, 0.1, 0.4, 0.4, -0.3, -0.3, 0.2 if bent else 0.0, -3.0])
+    high = torch.tensor([0.15, 0.15, 0.3, 1.3, 1.3, 0.3, 0.3, 1.5 if bent else 0.0, 3.0])
+    share = torch.rand(num, 9, generator=generator, dtype=torch.float64)
+    return low.double() + share * (high - low).double()
+
+
+def angles(num: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    eta = 1.4 * (2 * torch.rand(num, generator=generator, dtype=torch.float64) - 1)
+    return eta, 3.1 * (2 * torch.rand(num, generator=generator, dtype=torch.float64) - 1)
+
+
+@pytest.mark.parametrize("bent", [True, False])
+def test_angles_undo_the_surface(generator: torch.Generator, bent: bool):
+    shape, (eta, omega) = shapes(50, generator, bent=bent), angles(50, generator)
+    found = surface_angles(shape, surface_points(shape, eta, omega).points)
+    torch.testing.assert_close(found[0], eta, atol=1e-9, rtol=0)
+    torch.testing.assert_close(found[1], omega, atol=1e-9, rtol=0)
+
+
+def test_surface_derivatives_are_finite_differences(generator: torch.Generator):
+    shape, (eta, omega) = shapes(20, generator), angles(20, generator)
+    local = surface_derivatives(shape, eta, omega)
+    normal = surface_normal_derivatives(shape, eta, omega)
+    for k in range(9):
+        step = torch.zeros(9, dtype=torch.float64)
+        step[k] = 1e-5
+        ends = [surface_points(shape + sign * step, eta, omega) for sign in (1, -1)]
+        slopes = [surface_derivatives(shape + sign * step, eta, omega).first for sign in (1, -1)]
+        for got, pair in (
+            (local.first[..., k], [end.points for end in ends]),
+            (normal[..., k], [end.normals for end in ends]),
+            (local.second[..., k], slopes),
+        ):
+            torch.testing.assert_close(got, (pair[0] - pair[1]) / 2e-5, atol=1e-7, rtol=1e-6)
+
+
+def test_left_and_right_share_their_parameters():
+    body = load_body("body34")
+    free = ShapeParameters(body)
+    assert len(free.names) == len(set(free.names)) == len(CROSS_SECTIONS) * 11
+    z = torch.linspace(-0.01, 0.01, len(free.names), dtype=torch.float64)
+    shape = free.shape(z)
+    left, right = (body.part_names.index(f"{side}_thigh") for side in "lr")
+    assert torch.equal(shape[left], shape[right])
+    assert torch.equal(free.shape(torch.zeros_like(z)), body.part_shape)
+    assert (free.bounds.lower < 0).all()
+    changed = (shape != body.part_shape).any(0)
+    assert [SHAPE_NAMES[k] for k in torch.nonzero(changed)[:, 0].tolist()] == list(CROSS_SECTIONS)
+
+
+@pytest.mark.parametrize("free_proportions", [False, True])
+@pytest.mark.parametrize("name", BODY_NAMES)
+def test_columns_are_exact(name: str, free_proportions: bool, generator: torch.Generator):
+    """Value, gradient and Hessian in pose and shape against double backward through both."""
+    body = load_body(name, free_proportions=free_proportions)
+    turn, _ = torch.linalg.qr(randn(generator, 3, 3))
+    body = body.with_base(turn * turn.det(), randn(generator, 3))
+    shape = shapes(body.num_parts, generator)
+    body = with_shape(body, shape)
+    # Left and right must have the same numbers for ties to make sense; here only T matters.
+    free = ShapeParameters(body, SHAPE_NAMES)
+    part = torch.randint(body.num_parts, (NUM_POINTS,), generator=generator)
+    eta, omega = angles(NUM_POINTS, generator)
+    slope, square = randn(generator, NUM_POINTS, 3), randn(generator, NUM_POINTS, 3, 3)
+    square = square + square.mT
+
+    def cost_at(points: Tensor) -> PointCost:
+        bowed = (square @ points[..., None])[..., 0]
+        return PointCost(
+            (points * (slope + 0.5 * bowed)).sum(-1), slope + bowed, square.expand(*points.shape, 3)
+        )
+
+    def total(both: Tensor) -> Tensor:
+        x, z = both[: body.num_parameters], both[body.num_parameters :]
+        rotation, centre = body.part_poses(body.pose(x))
+        local = surface_points(free.shape(z)[part], eta, omega).points
+        return cost_at((rotation[part] @ local[..., None])[..., 0] + centre[part]).value.sum()
+
+    x = body.bounds.project(randn(generator, body.num_parameters))
+    both = torch.cat([x, torch.zeros(len(free.names), dtype=torch.float64)])
+    pose = body.pose(x)
+    local = surface_derivatives(shape[part], eta, omega)
+    rotation, centre = body.part_poses(pose)
+    points = (rotation[part] @ local.points[..., None])[..., 0] + centre[part]
+    got = lift_with_shape(body, pose, points, part, local, cost_at(points), free)
+    torch.testing.assert_close(got.value, total(both))
+    gradient = torch.autograd.functional.jacobian(total, both)
+    hessian = torch.autograd.functional.hessian(total, both, vectorize=True)
+    torch.testing.assert_close(got.gradient, gradient, atol=1e-9, rtol=1e-9)
+    torch.testing.assert_close(got.hessian, hessian, atol=1e-8, rtol=1e-8)
+
+
+def test_gauss_newton_leaves_the_curvature_of_the_points_out(generator: torch.Generator):
+    body = load_body("arm7")
+    free = ShapeParameters(body)
+    part = torch.arange(body.num_parts).repeat(5)
+    eta, omega = angles(len(part), generator)
+    local = surface_derivatives(body.part_shape[part], eta, omega)
+    pose = body.pose(body.rest)
+    rotation, centre = body.part_poses(pose)
+    points = (rotation[part] @ local.points[..., None])[..., 0] + centre[part]
+    eye = torch.eye(3, dtype=torch.float64).expand(len(part), 3, 3)
+    cost = PointCost(randn(generator, len(part)), randn(generator, len(part), 3), eye)
+    got = lift_with_shape(
+        body, pose, points, part, local, cost, free, curvature=Curvature.GAUSS_NEWTON
+    )
+    assert float(torch.linalg.eigvalsh(got.hessian).min()) > -1e-12
+
+
+def test_other_body_is_untouched():
+    body = load_body("arm7")
+    before = body.part_shape.clone()
+    assert isinstance(with_shape(body, before + 1), BodyModel)
+    assert torch.equal(body.part_shape, before)

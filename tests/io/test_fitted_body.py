@@ -1,0 +1,99 @@
+"""A fitted body on disk and back, before the same camera or another one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torchcss.body.model import load_body
+from torchcss.body.shape import with_shape
+from torchcss.errors import BodyError
+from torchcss.inference.mixture import GaussianMixture
+from torchcss.initialise import Initialisation
+from torchcss.io.fitted_body import read_fitted_body, write_fitted_body
+from torchcss.vision.camera import Camera
+
+
+def rotation(generator: torch.Generator) -> torch.Tensor:
+    turn, _ = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64))
+    return turn * turn.det()
+
+
+@pytest.fixture
+def found(generator: torch.Generator) -> Initialisation:
+    lengths = {"thigh": 0.40, "forearm": 0.28}
+    body = load_body("body34", lengths=lengths, scale=1.05)
+    body = with_shape(body, 1.1 * body.part_shape)
+    body = body.with_base(rotation(generator), torch.tensor([0.1, 0.2, 3.0]).double())
+    x = body.bounds.project(0.2 * torch.randn(2, 34, generator=generator, dtype=torch.float64))
+    spread = torch.diag(torch.linspace(0.01, 0.1, 34, dtype=torch.float64)).expand(2, 34, 34)
+    weights = torch.tensor([0.7, 0.3], dtype=torch.float64).log()
+    mixture = GaussianMixture(x, spread, weights)
+    return Initialisation(
+        body, mixture, torch.tensor([1.0, 2.0]).double(), (), dict(body.lengths), 1.05
+    )
+
+
+def camera(generator: torch.Generator) -> Camera:
+    return Camera(
+        [[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], (640, 480),
+        R_camera_world=rotation(generator), t_camera_world=[0.1, 0.2, 0.3],
+    )  # fmt: skip
+
+
+def test_round_trip(found: Initialisation, generator: torch.Generator, tmp_path: Path):
+    write_fitted_body(tmp_path / "body.npz", found, camera(generator))
+    for path in (tmp_path, tmp_path / "body.npz"):
+        back = read_fitted_body(path)
+        assert back.body.lengths == pytest.approx(found.body.lengths)
+        for got, written in zip(back.mixture, found.mixture, strict=True):
+            assert torch.equal(got, written)
+        x = found.mixture.mean
+        ours, theirs = found.body.pose(x), back.body.pose(x)
+        torch.testing.assert_close(ours.joints, theirs.joints)
+        torch.testing.assert_close(
+            found.body.surface(ours).points, back.body.surface(theirs).points
+        )
+    assert read_fitted_body(tmp_path, dtype=torch.float32).mixture.mean.dtype == torch.float32
+
+
+def test_keeps_its_place_before_another_camera(
+    found: Initialisation, generator: torch.Generator, tmp_path: Path
+):
+    first, second = camera(generator), camera(generator)
+    write_fitted_body(tmp_path / "body.npz", found, first)
+    back = read_fitted_body(tmp_path, camera=second)
+    x = found.mixture.mean
+    torch.testing.assert_close(
+        first.to_camera_frame(found.body.pose(x).joints),
+        second.to_camera_frame(back.body.pose(x).joints),
+    )
+
+
+@pytest.mark.parametrize("what", ["missing", "garbage", "version", "array", "shape", "nan", "body"])
+def test_damaged_files(
+    found: Initialisation, generator: torch.Generator, tmp_path: Path, what: str
+):
+    path = tmp_path / "body.npz"
+    write_fitted_body(path, found, camera(generator))
+    arrays = dict(np.load(path))
+    changed = {
+        "version": {"schema_version": np.array(9)},
+        "shape": {"covariance": arrays["covariance"][:1]},
+        "nan": {"state": np.full_like(arrays["state"], np.nan)},
+        "body": {"body": np.array("body30")},
+    }.get(what, {})
+    if what == "missing":
+        path.unlink()
+    elif what == "garbage":
+        path.write_bytes(b"hello")
+    else:
+        arrays.update(changed)
+        if what == "array":
+            del arrays["lengths"]
+        np.savez(path, **arrays)
+    with pytest.raises(BodyError, match=r"body\.npz"):
+        read_fitted_body(path)

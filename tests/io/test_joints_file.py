@@ -1,0 +1,74 @@
+"""Joints of one picture from every kind of file."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from torchcss.errors import KeypointError
+from torchcss.io.joints_file import read_joints
+from torchcss.joint_names import ALIASES
+
+SIZE = (640, 480)
+
+
+def test_csv_with_and_without_heading(tmp_path: Path):
+    path = tmp_path / "joints.csv"
+    rows = "left wrist, 10.5, 20\n\nr_knee,30,40,0.5\nnose,,\n"
+    for text in (rows, "joint,u,v,confidence\n" + rows):
+        path.write_text(text)
+        found = read_joints(path, image_size_wh=SIZE)
+        assert found.joint_names == ("l_wrist", "r_knee")
+        assert found.keypoints.tolist() == [[10.5, 20], [30, 40]]
+        assert found.confidence.tolist() == [1, 0.5]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "no joints"),
+        ("a,b,c\n", "no joints"),
+        ("l_wrist,1,2\ntentacle,1,2\n", "row 2: unknown joint"),
+        ("l_wrist,1\n", "row 1"),
+        ("l_wrist,1,2\nr_wrist,1,x\n", "row 2"),
+        ("l_wrist,1,inf\n", "row 1"),
+        ("l_wrist,1,2\nleft_wrist,1,2\n", "twice"),
+    ],
+)
+def test_spoilt_csv(tmp_path: Path, text: str, message: str):
+    (tmp_path / "joints.csv").write_text(text)
+    with pytest.raises(KeypointError, match=message):
+        read_joints(tmp_path / "joints.csv", image_size_wh=SIZE)
+
+
+def test_mediapipe(tmp_path: Path):
+    rows = [{"x": 0.5, "y": i / 33, "z": 0.1, "visibility": 0.9} for i in range(33)]
+    for content in (rows, {"landmarks": rows}):
+        path = tmp_path / "pose.json"
+        path.write_text(json.dumps(content))
+        found = read_joints(path, image_size_wh=SIZE)
+        wrist = found.joint_names.index("l_wrist")
+        assert wrist == ALIASES["MediaPipe-33"].index("l_wrist")
+        np.testing.assert_allclose(found.keypoints[wrist], [319.5, 480 * wrist / 33 - 0.5])
+        assert float(found.confidence[wrist]) == 0.9
+    for spoilt in (
+        rows[:5],
+        [{**row, "x": "left"} for row in rows],
+        [{**rows[0], "x": 1e400}] * 33,
+    ):
+        path.write_text(json.dumps(spoilt))
+        with pytest.raises(KeypointError, match=r"pose\.json"):
+            read_joints(path, image_size_wh=SIZE)
+
+
+def test_other_formats_go_to_their_reader(tmp_path: Path):
+    path = tmp_path / "clicked.json"
+    path.write_text(json.dumps({"joints": {"l_wrist": [100, 200], "r_hip": [150, 220, 0.7]}}))
+    found = read_joints(path, image_size_wh=SIZE)
+    assert found.joint_names == ("l_wrist", "r_hip")
+    person = np.tile([[320.0, 240.0, 1.0]], (25, 1)) + np.arange(25)[:, None] * [[3, 4, 0]]
+    path.write_text(json.dumps({"people": [{"pose_keypoints_2d": person.flatten().tolist()}]}))
+    assert "l_wrist" in read_joints(path, image_size_wh=SIZE, layout="BODY_25").joint_names

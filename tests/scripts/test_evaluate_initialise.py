@@ -1,0 +1,48 @@
+"""The evaluation of initialisation in its small mode."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "evaluate_initialise.py"
+
+
+@pytest.fixture(scope="module")
+def script() -> ModuleType:
+    specification = importlib.util.spec_from_file_location("evaluate_initialise", SCRIPT)
+    assert specification is not None
+    assert specification.loader is not None
+    module = importlib.util.module_from_spec(specification)
+    sys.modules["evaluate_initialise"] = module
+    specification.loader.exec_module(module)
+    return module
+
+
+def test_small_mode(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    out = tmp_path / "tables" / "initialise.json"
+    script.main(script.Config(small=True, out=out))
+    rows = json.loads(out.read_text())["rows"]
+    assert [row["variant"] for row in rows] == ["full", "single start"]
+    for row in rows:
+        assert row["pa_best_mm"] >= row["pa_best_of_7_mm"] >= row["pa_best_of_50_mm"] > 0
+        assert row["limit_violations_percent"] == 0
+        assert 0 <= row["parameters_inside_percent"] <= 100
+        assert row["length_ratio_error_percent"] < 10
+        assert row["seconds"] > 0
+        assert len(row["per_case"]) == row["count"] == 1
+    assert "single start" in capsys.readouterr().out
+
+
+def test_frames_of_the_clips(script: ModuleType, shared_data: Path):
+    config = script.Config(data=shared_data, frames=2)
+    (first, case), (last, _) = script.cases(config, "beam, camera 1")
+    assert (first, last) == (0, 99)
+    assert case.joints.shape == (12, 3)
+    assert 0.38 < case.lengths["thigh"] < 0.44
+    assert case.person is None

@@ -1,0 +1,163 @@
+"""A fitted body and its first hypotheses on disk: what `torchcss init` writes and `track` takes.
+
+One NPZ file, schema version 1. K hypotheses, n parameters, P parts, L lengths:
+
+| array | shape | meaning |
+|---|---|---|
+| `schema_version` | | 1 |
+| `body` | | name of the body |
+| `scale` | | of the standard humanoid |
+| `length_names`, `lengths` | L | fitted lengths, metres |
+| `part_names`, `part_shape` | P, P 9 | shape numbers of the parts |
+| `state_names` | n | names of the parameters |
+| `state`, `covariance`, `log_weight`, `cost` | K n, K n n, K, K | the hypotheses, best first |
+| `base_rotation`, `base_translation` | 3 3, 3 | frame in which the root moves, in the world |
+| `camera_rotation`, `camera_translation`, `camera_matrix` | 3 3, 3, 3 3 | the picture's camera |
+
+`write_fitted_body` and `read_fitted_body`. The latter can hang the body before another camera of
+the same place, such as the calibrated one of a video whose first frame was fitted without.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from torchcss.body.model import BodyModel, load_body
+from torchcss.body.shape import with_shape
+from torchcss.errors import BodyError
+from torchcss.inference.mixture import GaussianMixture
+from torchcss.initialise import Initialisation
+from torchcss.io.atomic import replace_file
+from torchcss.io.safe_load import load_arrays
+from torchcss.vision.camera import Camera
+
+SCHEMA_VERSION = 1
+FITTED_BODY_NAME = "body.npz"
+
+
+class FittedBody(NamedTuple):
+    """A body with its hypotheses.
+
+    Attributes:
+        body: The body, on its base.
+        mixture: The hypotheses, best first.
+        cost: Their costs, nats.
+    """
+
+    body: BodyModel
+    mixture: GaussianMixture
+    cost: torch.Tensor
+
+
+def write_fitted_body(path: str | os.PathLike[str], found: Initialisation, camera: Camera) -> None:
+    """Write the result of an initialisation.
+
+    Args:
+        path: The NPZ file.
+        found: What was fitted.
+        camera: The camera of the picture.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    body, mixture = found.body, found.mixture
+    arrays = {
+        "schema_version": np.array(SCHEMA_VERSION),
+        "body": np.array(body.name),
+        "scale": np.array(found.scale),
+        "length_names": np.array(list(found.lengths), dtype=np.str_),
+        "lengths": np.array(list(found.lengths.values()), dtype=np.float64),
+        "part_names": np.array(body.part_names, dtype=np.str_),
+        "state_names": np.array(body.state_names, dtype=np.str_),
+    }
+    tensors = {
+        "part_shape": body.part_shape,
+        "state": mixture.mean,
+        "covariance": mixture.covariance,
+        "log_weight": mixture.log_weight,
+        "cost": found.cost,
+        "base_rotation": body.base_rotation,
+        "base_translation": body.base_translation,
+        "camera_rotation": camera.R_camera_world,
+        "camera_translation": camera.t_camera_world,
+        "camera_matrix": camera.K,
+    }
+    arrays |= {name: tensor.detach().double().cpu().numpy() for name, tensor in tensors.items()}
+    with replace_file(Path(path)) as partial:
+        np.savez(partial, **arrays)
+
+
+def read_fitted_body(
+    path: str | os.PathLike[str],
+    *,
+    camera: Camera | None = None,
+    dtype: torch.dtype = torch.float64,
+    device: torch.device | str = "cpu",
+) -> FittedBody:
+    """Read a fitted body back.
+
+    Args:
+        path: The NPZ file, or the folder that `torchcss init` wrote.
+        camera: The camera that will look at it, at the place of the picture's: the body keeps its
+            place before the camera. None: it keeps its place in the world.
+        dtype: Type of the body.
+        device: Where to put it.
+
+    Raises:
+        BodyError: If the file is missing, damaged, or of another version or body.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = path / FITTED_BODY_NAME
+    arrays = load_arrays(path, BodyError)
+    try:
+        if int(arrays["schema_version"]) != SCHEMA_VERSION:
+            raise BodyError(
+                f"{path}: schema version {int(arrays['schema_version'])}, expected "
+                f"{SCHEMA_VERSION}; write the file with this version of torchcss init"
+            )
+        names, lengths = arrays["length_names"].tolist(), arrays["lengths"].tolist()
+        name, scale = str(arrays["body"]), float(arrays["scale"])
+        bare = {name: length / scale for name, length in zip(names, lengths, strict=True)}
+        body = load_body(name, lengths=bare, scale=scale)
+        layout = {"state_names": body.state_names, "part_names": body.part_names}
+        for key, expected in layout.items():
+            if tuple(arrays[key].tolist()) != expected:
+                raise BodyError(f"{path}: {key} are not those of {name}; fit the body again")
+
+        def tensor(key: str, *shape: int) -> torch.Tensor:
+            values = torch.from_numpy(np.array(arrays[key], dtype=np.float64))
+            if values.shape != shape or not bool(values.isfinite().all()):
+                raise BodyError(
+                    f"{path}: {key}: expected finite numbers of shape {list(shape)}, "
+                    f"got {list(values.shape)}"
+                )
+            return values.to(dtype=dtype, device=device)
+
+        k, n = len(arrays["state"]), body.num_parameters
+        body = body.to(dtype=dtype, device=device)
+        body = with_shape(body, tensor("part_shape", body.num_parts, 9))
+        rotation, translation = tensor("base_rotation", 3, 3), tensor("base_translation", 3)
+        if camera is not None:
+            to, at = tensor("camera_rotation", 3, 3), tensor("camera_translation", 3)
+            back = camera.R_camera_world.to(to).T
+            rotation = back @ to @ rotation
+            translation = back @ (to @ translation + at - camera.t_camera_world.to(to))
+        mixture = GaussianMixture(
+            tensor("state", k, n), tensor("covariance", k, n, n), tensor("log_weight", k)
+        )
+        return FittedBody(body.with_base(rotation, translation), mixture, tensor("cost", k))
+    except KeyError as error:
+        raise BodyError(
+            f"{path}: not a fitted body: {error.args[0]} is missing; expected what torchcss init "
+            "writes"
+        ) from error
+    except (ValueError, TypeError) as error:
+        if isinstance(error, BodyError):
+            raise
+        raise BodyError(f"{path}: not a fitted body: {error}") from error
