@@ -8,7 +8,7 @@ interpenetration and stabiliser at 1008 nodes with their visibility. Each in sev
 * `value`: without derivatives, the price of a trial step;
 * `closed`: with gradient and exact Hessian in closed form, what the optimiser calls;
 * `plain`: the same by double backward (`peers/autograd_cost.py`), timed on one chunk, of the size
-  that suits it best, and extrapolated.
+  that suits it best, and extrapolated; `one_by_one`: with chunks of a single sample.
 
 Each repeat times every way in turn; ratios are taken within a repeat, so that a busy machine slows
 both sides. Memory is the peak of a process of its own. Then come the times of the full cost by
@@ -48,6 +48,7 @@ COMPARED = {  # with which other way each is compared
     "joints_plain": "joints_closed",
     "full_closed": "full_value",
     "full_plain": "full_closed",
+    "full_one_by_one": "full_closed",
 }
 Way = tuple[Callable[[Tensor], Any], Tensor]
 QUARTILES = {"lower_quartile": 0.25, "median": 0.5, "upper_quartile": 0.75}
@@ -66,7 +67,7 @@ class Config:
     """Floating type."""
     plain_joints: int = 256
     """Samples on which plain autograd of the joint term is timed."""
-    plain_full: int = 128
+    plain_full: int = 64
     """Samples on which plain autograd of the full cost is timed."""
     size_wh: tuple[int, int] = (640, 480)
     """Size of the made-up frames."""
@@ -90,6 +91,7 @@ def make_ways(config: Config) -> tuple[dict[str, Way], TrackingCost]:
         "full_value": (full.value, x),
         "full_closed": (full.local_model, x),
         "full_plain": (partial(autograd_model, full), x[: config.plain_full]),
+        "full_one_by_one": (partial(autograd_model, full), x[:1]),
     }, full
 
 
@@ -180,19 +182,18 @@ def print_table(report: dict[str, Any]) -> None:
     """The report for people."""
     config, metrics = report["config"], report["metrics"]
     print(f"{config.samples} samples, {config.dtype}, {report['threads']} threads")
-    print(f"{'ms':>15} {'quartile':>9} {'median':>9} {'quartile':>9} {'peak MiB':>9} {'added':>6}")
+    print(f"{'ms':>16} {'quartile':>9} {'median':>9} {'quartile':>9} {'peak MiB':>9} {'added':>6}")
     for name, row in metrics["seconds"].items():
         times = "".join(f" {1e3 * value:9.1f}" for value in row.values())
         peak, added = metrics["memory"][name].values()
-        print(f"{name:>15}{times} {peak:9.0f} {added:6.0f}")
+        print(f"{name:>16}{times} {peak:9.0f} {added:6.0f}")
     for name, ratio in metrics["ratio"].items():
         low, median, high = ratio.values()
         apart = metrics["relative_difference"].get(name)
         note = "" if apart is None else f"; relative difference {apart:.1e}"
         print(f"{name} takes {median:.2f} times {COMPARED[name]} ({low:.2f} to {high:.2f}){note}")
     for name, seconds in metrics["seconds_by_term"].items():
-        shares = ", ".join(f"{term} {1e3 * value:.0f}" for term, value in seconds.items())
-        print(f"{name} by term, ms: {shares}")
+        print(f"{name} by term, ms:", {term: round(1e3 * value) for term, value in seconds.items()})
     print(f"features of a frame: {metrics['seconds_of_features']['median']:.2f} s")
 
 

@@ -1,12 +1,13 @@
 """The study problem of `torchcss.reprojection` for JAX: Levenberg-Marquardt, jitted and vmapped.
 
-The state of the art for this kind of work in JAX: residuals with their analytic Jacobian, normal
-equations, a damping per item (Nielsen's rule), hard limits by an active set and projection,
-float64. A whole block of iterations is one compiled call, in which items that are done only cost
-their share; between the calls finished items are dropped, and the batch is padded to the next power
-of two, so that few sizes are compiled.
+Residuals with their analytic Jacobian, normal equations on the variables that no limit holds,
+Nielsen's damping per item, steps clipped to the limits, float64. The kinematics are unrolled over
+the joints, with the constants of the tree folded into the program. Two ways to run it:
 
-The kinematics are unrolled over the joints, with the constants of the tree folded into the program.
+* one compiled call, a `while_loop` under `vmap`, as one writes it first: every item costs as many
+  iterations as the slowest;
+* compacted: blocks of a few iterations are one compiled call, and between the calls the host drops
+  finished items and pads the batch to the next power of two, so that few sizes are compiled.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from torchcss.robust import Lorentzian, Quadratic
 
 jax.config.update("jax_enable_x64", True)
 
-FIRST_DAMPING = 1e-3
+FIRST_DAMPING = 0.1
 """Damping at the start over the largest diagonal entry of the normal equations."""
 BLOCK = 10
 """Iterations per compiled call."""
@@ -51,33 +52,39 @@ class JaxLevenbergMarquardt:
         cost: The problem; its stabiliser must not be None.
         max_steps: Iterations per item.
         tolerance: Predicted decrease, nats, below which an item is done.
+        compacted: Whether finished items are dropped.
     """
 
     def __init__(
-        self, cost: ReprojectionCost, *, max_steps: int = 200, tolerance: float = 1e-6
+        self,
+        cost: ReprojectionCost,
+        *,
+        max_steps: int = 200,
+        tolerance: float = 1e-6,
+        compacted: bool = True,
     ) -> None:
         self.residuals = _make_residuals(cost)
         self.lower, self.upper = (jnp.asarray(bound.numpy()) for bound in cost.body.bounds)
-        self.max_steps, self.tolerance = max_steps, tolerance
+        self.max_steps, self.tolerance, self.compacted = max_steps, tolerance, compacted
         self.start = jax.jit(jax.vmap(self._start))
-        self.block = jax.jit(jax.vmap(self._block))
+        self.block = jax.jit(jax.vmap(self._block if compacted else self._to_the_end))
 
-    def __call__(self, x0: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """States, costs and iterations reached from the starts."""
-        result = [np.empty_like(x0), np.empty(len(x0)), np.empty(len(x0), dtype=int)]
+    def __call__(self, x0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """States and iterations reached from the starts."""
+        x, steps = np.empty_like(x0), np.empty(len(x0), dtype=int)
         index = np.arange(len(x0))
-        items = self.start(jnp.asarray(_padded(x0)))
-        while True:
+        items = self.start(jnp.asarray(_padded(x0) if self.compacted else x0))
+        while len(index):
             items = self.block(items)
             done = np.asarray(items.done)[: len(index)]
-            for into, part in zip(result, (items.x, items.cost, items.steps), strict=True):
-                into[index[done]] = np.asarray(part)[: len(index)][done]
+            x[index[done]] = np.asarray(items.x)[: len(index)][done]
+            steps[index[done]] = np.asarray(items.steps)[: len(index)][done]
             left = np.flatnonzero(~done)
-            if not len(left):
-                return result[0], result[1], result[2]
             index = index[left]
-            take = jnp.asarray(_padded(left))
-            items = jax.tree.map(lambda part, take=take: part[take], items)
+            if len(left):
+                take = jnp.asarray(_padded(left))
+                items = jax.tree.map(lambda part, take=take: part[take], items)
+        return x, steps
 
     def _start(self, x: jax.Array) -> Items:
         x = jnp.clip(x, self.lower, self.upper)
@@ -91,6 +98,9 @@ class JaxLevenbergMarquardt:
     def _block(self, items: Items) -> Items:
         return jax.lax.fori_loop(0, BLOCK, lambda _, now: self._step(now), items)
 
+    def _to_the_end(self, items: Items) -> Items:
+        return jax.lax.while_loop(lambda now: ~now.done, self._step, items)
+
     def _step(self, now: Items) -> Items:
         gradient = now.residual @ now.jacobian
         held = ((now.x <= self.lower) & (gradient > 0)) | ((now.x >= self.upper) & (gradient < 0))
@@ -99,17 +109,17 @@ class JaxLevenbergMarquardt:
         jacobian = jnp.where(free, now.jacobian, 0.0)
         normal = jacobian.T @ jacobian
         damped = normal + jnp.diag(jnp.where(free, now.damping, 1.0))
-        factor = jax.scipy.linalg.cho_factor(damped)
-        newton = -jax.scipy.linalg.cho_solve(factor, gradient)
+        newton = -jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(damped), gradient)
         x = jnp.clip(now.x + newton, self.lower, self.upper)
         step = x - now.x
         predicted = -(gradient @ step + 0.5 * step @ (normal @ step))
         residual, jacobian = self.residuals(x)
         cost = 0.5 * jnp.sum(residual**2)
+        # A step that was clipped may promise a rise: then it is too long, and no sign of an end.
         ratio = (now.cost - cost) / jnp.where(predicted > 0, predicted, jnp.inf)
         better = (cost < now.cost) & (ratio > 1e-4)
         shrink = jnp.maximum(1 / 3, 1 - (2 * ratio - 1) ** 3)
-        stop = (predicted < self.tolerance) | (now.steps + 1 >= self.max_steps)
+        stop = (jnp.abs(predicted) < self.tolerance) | (now.steps + 1 >= self.max_steps)
         after = Items(
             jnp.where(better, x, now.x),
             jnp.where(better, cost, now.cost),

@@ -11,6 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchcss.cost import contour
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.visibility import ContourNodes
 from torchcss.robust import Leclerc
@@ -18,7 +19,7 @@ from torchcss.types import PointCost
 from torchcss.vision.camera import Camera
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from reference.contour import cost_of_fixed_matches
+from reference.contour import cost_of_fixed_matches, edges_along_lines
 
 WIDTH, HEIGHT = 128, 96
 TERM = ContourTerm()
@@ -144,6 +145,35 @@ def test_the_image_normal_is_that_of_the_projected_contour(generator: torch.Gene
         outward = ((jacobian * nodes.normals[..., None, :]).sum(-1) * m).sum(-1)
         assert (outward > 0).all()
         torch.testing.assert_close(m.norm(dim=-1), torch.ones_like(outward))
+
+
+@pytest.mark.parametrize(("window", "step"), [(12.0, 1.0), (7.5, 1.7)])
+def test_the_search_is_that_of_its_plain_twin(
+    window: float, step: float, generator: torch.Generator
+) -> None:
+    """All over the image and beyond: lines that leave it, or lie outside, among them."""
+    term, field = ContourTerm(window=window, step=step), rough_field(generator)
+    size = torch.tensor([WIDTH + 30.0, HEIGHT + 30.0], dtype=torch.float64)
+    uv = size * torch.rand(60, 2, generator=generator, dtype=torch.float64) - 15
+    angle = 7 * torch.rand(60, generator=generator, dtype=torch.float64)
+    normal = torch.stack([angle.cos(), angle.sin()], dim=-1)
+    found = term.search(uv, normal, field)
+    rows = zip(*(part.tolist() for part in found), strict=True)
+    got = sorted((node, distance, weight) for node, distance, weight in rows if weight > 1e-6)
+    expected = sorted(row for row in edges_along_lines(term, uv, normal, field) if row[2] > 1e-6)
+    assert len(got) > 60
+    torch.testing.assert_close(torch.tensor(got), torch.tensor(expected), rtol=0, atol=2e-4)
+
+
+def test_blocks_of_lines_are_invisible(
+    monkeypatch: pytest.MonkeyPatch, generator: torch.Generator
+) -> None:
+    camera, field = make_camera(), rough_field(generator)
+    nodes = random_nodes(camera, 2, generator=generator)
+    whole = TERM.point_cost(nodes, camera, field)
+    monkeypatch.setattr(contour, "_LINES", 7)
+    for ours, theirs in zip(TERM.point_cost(nodes, camera, field), whole, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-6 * float(theirs.abs().max()))
 
 
 def test_edges_are_found_where_they_are() -> None:

@@ -1,6 +1,8 @@
-"""Twin of the contour term's derivatives: the cost with its matches held fixed, for autograd."""
+"""Twins of the contour term: the cost with its matches held fixed, and the search for them."""
 
 from __future__ import annotations
+
+import math
 
 import torch
 from torch import Tensor
@@ -8,6 +10,7 @@ from torch import Tensor
 from torchcss.cost.contour import ContourTerm, EdgeAssignments
 from torchcss.cost.visibility import ContourNodes
 from torchcss.vision.camera import Camera
+from torchcss.vision.sampling import sample_bilinear
 
 
 def cost_of_fixed_matches(
@@ -41,3 +44,34 @@ def cost_of_fixed_matches(
     hidden = term.occlusion_factor * absent
     seen = nodes.visible * cost + (1 - nodes.visible) * hidden
     return nodes.exists * seen + (1 - nodes.exists) * absent
+
+
+def edges_along_lines(
+    term: ContourTerm, uv: Tensor, normal_uv: Tensor, edge_field: Tensor
+) -> list[tuple[int, float, float]]:
+    """Node, distance and weight of the maxima along search lines, one sample after another."""
+    reach, found = math.ceil(term.window / term.step) + 2, []
+    for node, (start, along) in enumerate(zip(uv, normal_uv, strict=True)):
+        response = []
+        for k in range(-reach, reach + 1):
+            field, inside = sample_bilinear(edge_field, start + k * term.step * along)
+            response.append(float((field @ along).abs() * inside))
+        edges = []
+        for i in range(2, len(response) - 2):
+            before, left, middle, right, after = response[i - 2 : i + 3]
+            if not (middle > left and middle >= right):
+                continue
+            # The parabola through three samples; then 1.5 samples to either side of its top.
+            shift = 0.5 * (right - left) / (2 * middle - left - right)
+            height = middle + 0.25 * (right - left) * shift
+            low = left + (0.5 - shift) * (before - left)
+            high = right + (0.5 + shift) * (after - right)
+            fall = min(middle - low, middle - high) / max(height, 1e-3)
+            sharpness = fall * 2 / (1.5 * term.step) ** 2 / 0.05
+            distance = (i - reach + shift) * term.step
+            if abs(distance) < term.window and sharpness > 0:
+                edges.append((distance, height * min(sharpness, 1.0)))
+        entered = [min(1.0, (term.window - abs(d)) / (0.25 * term.window)) for d, _ in edges]
+        total = sum(w * share for (_, w), share in zip(edges, entered, strict=True))
+        found += [(node, distance, weight / max(total, 1.0)) for distance, weight in edges]
+    return found

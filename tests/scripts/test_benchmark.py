@@ -13,7 +13,7 @@ import pytest
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "benchmark.py"
 WAYS = {
     *("joints_value", "joints_closed", "joints_plain"),
-    *("full_value", "full_closed", "full_plain"),
+    *("full_value", "full_closed", "full_plain", "full_one_by_one"),
 }
 TERMS = {"pose", "visibility", "contour", "flow", "joints", "interpenetration", "stabiliser"}
 

@@ -175,6 +175,36 @@ def test_pull_back_is_the_chain_rule(gauss_newton: bool, generator: torch.Genera
 
 
 @pytest.mark.parametrize("distortion", [None, MILD, WILD])
+@pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
+def test_image_normals_are_a_least_squares_solution(
+    distortion: list[float] | None, batch: tuple[int, ...], generator: torch.Generator
+) -> None:
+    camera = make_camera(distortion)
+    points = 0.4 * torch.randn(*batch, 6, 3, dtype=torch.float64, generator=generator)
+    normals = torch.randn(points.shape, dtype=torch.float64, generator=generator)
+    model = camera.project_with_derivatives(points)
+    assert model.valid.any()
+    solution = torch.linalg.lstsq(camera.jacobian(model).mT, normals[..., None]).solution[..., 0]
+    expected = solution / solution.norm(dim=-1, keepdim=True)
+    got = camera.image_normals(model, normals)
+    assert got.shape == model.uv.shape
+    torch.testing.assert_close(got[model.valid], expected[model.valid], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_image_normals_have_unit_length_everywhere(dtype: torch.dtype) -> None:
+    """Along u where there is none: a normal along the line of sight, or zero."""
+    for distortion in (None, MILD, WILD):
+        camera = make_camera(distortion)
+        points = points_in_camera_frame(camera, AWKWARD).to(dtype)
+        model = camera.project_with_derivatives(points)
+        for normals in (torch.ones_like(points), torch.zeros_like(points)):
+            got = camera.image_normals(model, normals)
+            torch.testing.assert_close(got.norm(dim=-1), torch.ones_like(model.depth))
+        assert (got == got.new_tensor([1.0, 0.0])).all()
+
+
+@pytest.mark.parametrize("distortion", [None, MILD, WILD])
 def test_projection_agrees_with_opencv(
     distortion: list[float] | None, generator: torch.Generator
 ) -> None:

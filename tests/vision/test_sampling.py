@@ -11,6 +11,8 @@ from torch import Tensor
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.vision.sampling import (
     gaussian_pyramid,
+    inside_image,
+    interpolate_bilinear,
     sample_bilinear,
     sample_bilinear_with_derivative,
 )
@@ -42,6 +44,10 @@ def test_sampling_agrees_with_the_plain_formula(
         - 1.5
     )
     values, inside = sample_bilinear(image, uv)
+    assert torch.equal(values, interpolate_bilinear(image, uv))
+    assert torch.equal(inside, inside_image(uv, *image.shape[1:]))
+    blocks = uv.movedim(-1, 0).contiguous().movedim(0, -1)
+    torch.testing.assert_close(interpolate_bilinear(image, blocks), values)
     again, derivative, inside_again = sample_bilinear_with_derivative(image, uv)
     assert values.shape == (*batch, 8, 3)
     assert values.dtype == dtype

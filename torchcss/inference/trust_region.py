@@ -392,8 +392,8 @@ class _Quadratic(NamedTuple):
 
     def times(self, vector: Float[Tensor, "b n"]) -> Float[Tensor, "b n"]:
         """Hessian times a vector."""
-        # Faster than `@` here, and rounded alike in a batch of one.
-        return (self.hessian * vector[:, None, :]).sum(-1)
+        # As a row: twice as fast as a column on a CPU, and rounded alike in a batch of one.
+        return (vector[:, None, :] @ self.hessian)[:, 0]
 
     def norm(self, vector: Float[Tensor, "b n"]) -> Float[Tensor, " b"]:
         """Length in the metric `W`."""

@@ -52,6 +52,7 @@ from torch import Tensor, nn
 
 from torchcss.errors import CameraError, check_shape
 from torchcss.types import PointCost
+from torchcss.vision.sampling import inside_image
 
 _GRAZING_RADIUS = 1.0e4
 """Normalised radius (0.006 degrees from the image plane) beyond which powers overflow float32."""
@@ -378,8 +379,7 @@ class Camera(nn.Module):
         """Tell which image points lie on a pixel; a pixel reaches half its side each way."""
         check_shape("uv", uv, 2)
         width, height = self.image_size_wh
-        u, v = uv.unbind(-1)
-        return (u >= -0.5) & (u < width - 0.5) & (v >= -0.5) & (v < height - 0.5)
+        return inside_image(uv, height, width)
 
     # From the image to the world.
 
