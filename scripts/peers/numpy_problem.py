@@ -1,4 +1,4 @@
-"""The study problem of `torchcss.reprojection` in NumPy, one state at a time, for SciPy's solvers.
+"""The study problem of `torchcss.reprojection` in NumPy, one state at a time, and SciPy's solvers.
 
 Residuals with their analytic Jacobian, as somebody who uses SciPy would write them: one pass over
 the moving joints, the fixed transforms between them folded into constants. Half the sum of squared
@@ -8,10 +8,16 @@ the signed root of its potential.
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
+import scipy.optimize
 import torch
 
 from torchcss.reprojection import ReprojectionCost
+
+INSIDE = 1e-9
+"""How far inside the limits a start of `least_squares` is moved; it refuses those on a limit."""
 
 
 class NumpyProblem:
@@ -95,6 +101,28 @@ class NumpyProblem:
         """Cost and gradient, for a solver that knows nothing of residuals."""
         residuals = self.residuals(x)
         return 0.5 * float(residuals @ residuals), residuals @ self.jacobian(x)
+
+    def solve(
+        self, x0: np.ndarray, method: Literal["trf", "L-BFGS-B"]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """States reached from the starts, one after the other, and evaluations of each."""
+        limits = scipy.optimize.Bounds(self.lower, self.upper)  # type: ignore[arg-type]
+        results = []
+        for x in x0:
+            if method == "trf":
+                x = np.clip(x, self.lower + INSIDE, self.upper - INSIDE)
+                result = scipy.optimize.least_squares(
+                    self.residuals,
+                    x,
+                    self.jacobian,  # type: ignore[arg-type]
+                    bounds=limits,
+                )
+            else:
+                result = scipy.optimize.minimize(
+                    self.value_and_gradient, x, jac=True, method=method, bounds=limits
+                )
+            results.append(result)
+        return np.stack([r.x for r in results]), np.array([r.nfev for r in results])
 
     def _pose(self, x: np.ndarray) -> None:
         """Points, joint axes and origins in the camera's frame, image errors; of one state."""
