@@ -14,7 +14,8 @@ Each repeat times every way in turn; ratios are taken within a repeat, so that a
 both sides. Memory is the peak of a process of its own. Then come the times of the full cost by
 term, and of the features of a frame with flow. Nothing is asserted.
 
-PROFILE
+What the profile says of the full cost: half of the local model is visibility, a sixth each the edge
+search of the contour term and the interpenetration, a tenth the lift; the rest is under a tenth.
 """
 
 from __future__ import annotations
