@@ -123,8 +123,10 @@ def flow(cost: TrackingCost, found: BodyPose, pose: BodyPose) -> Tensor:
     assert targets is not None
     nodes = interior(cost.body, found)
     eye = camera.centre_world
-    seen = visible_nodes(cost.body, found, eye, nodes.points, interior.node_part)
-    seen = seen * front_facing(nodes.points, nodes.normals, eye)
+    facing = front_facing(nodes.points, nodes.normals, eye)
+    seen = facing * visible_nodes(
+        cost.body, found, eye, nodes.points, interior.node_part, wanted=facing
+    )
     uv = camera.project(carried(found, pose, nodes.points, interior.node_link)).uv
     rho = term.potential(targets.weight * (uv - targets.uv).square().sum(-1)).rho
     return cost.choice.flow_weight / (interior.num_nodes * term.nu) * (seen * 0.5 * rho).sum(-1)

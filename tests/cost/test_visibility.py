@@ -80,8 +80,12 @@ def check_against_rays(body: BodyModel, x: Tensor) -> None:
     contour, inner = predictor(body, pose, EYE), interior(body, pose)
     points = torch.cat([contour.points, inner.points], dim=-2)
     own = torch.cat([predictor.node_part, interior.node_part])
-    seen = visible_nodes(body, pose, EYE, inner.points, interior.node_part)
-    hidden = torch.cat([contour.visible, seen], dim=-1) < 0.5
+    seen = visible_nodes(body, pose, EYE, points, own)
+    # Contours that do not exist are not looked at; the others are seen as any node is.
+    exists = contour.exists > 0
+    of_contour = seen[..., : predictor.num_nodes]
+    torch.testing.assert_close(contour.visible[exists], of_contour[exists], rtol=0, atol=1e-4)
+    hidden = seen < 0.5
     truth = is_hidden(body, pose, EYE, points, own)
     assert 0.1 < float(truth.double().mean()) < 0.9
     check(body, x, points, own, hidden, truth, by_own=False)
@@ -343,7 +347,7 @@ def test_line_of_sight_without_neighbours(generator: torch.Generator) -> None:
     rotation, centre = body.part_poses(pose)
     eye = -(centre[..., None, :] @ rotation)[..., 0, :]
     visible, free = line_of_sight(body, rotation, eye, nodes.points, other=predictor.other)
-    assert torch.equal(visible, nodes.visible)
+    assert torch.equal(visible[nodes.exists > 0], nodes.visible[nodes.exists > 0])
     assert torch.equal(free, torch.ones_like(free))
     # What is beside a neighbour is in front of it or behind it, and only there is it not free.
     _, free = line_of_sight(

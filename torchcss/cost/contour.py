@@ -135,8 +135,12 @@ class ContourTerm:
         )
         slot = peak // max(size, 1)
         node = peak - slot * size
-        shift = 0.5 * (right - left) / (2 * middle - left - right).clamp(min=_TINY)
-        height = middle + 0.25 * (right - left) * shift
+        curve = (2 * middle - left - right).clamp(min=_TINY)
+        shift = 0.5 * (right - left) / curve
+        # Half way between two samples the larger one changes, and with it the parabola; the third
+        # difference towards that side makes the height the same from either.
+        side = torch.where(shift > 0, 2 * right - middle - after, 2 * left - before - middle)
+        height = middle + 0.5 * shift.square() * (curve + shift.abs() * (side - curve))
         # How far the response falls to either side, 1.5 samples from the maximum. A maximum is born
         # on a slope, where it does not fall to one side: the weight starts at zero there.
         fall = middle - torch.maximum(

@@ -44,7 +44,7 @@ from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPai
 from torchcss.cost.joints import JointObservation, JointTerm
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.temporal import MixtureDensity, MixturePrior, TemporalPrior
-from torchcss.cost.visibility import ContourPredictor, visible_nodes
+from torchcss.cost.visibility import ContourPredictor, front_facing, visible_nodes
 from torchcss.stopwatch import Stopwatch
 from torchcss.types import Curvature, LocalModel, PointCost
 from torchcss.vision.camera import Camera
@@ -311,7 +311,9 @@ class TrackingCost:
             term, interior = choice.flow, self.interior
             with self._timed("visibility"):
                 points, normals = interior(body, pose)
-                seen = visible_nodes(body, pose, camera.centre_world, points, interior.node_part)
+                eye = camera.centre_world
+                facing = front_facing(points, normals, eye)
+                seen = visible_nodes(body, pose, eye, points, interior.node_part, wanted=facing)
             arguments = (points, normals, seen, camera, self.targets)
             yield _Observed(
                 "flow",

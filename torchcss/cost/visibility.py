@@ -200,9 +200,10 @@ class ContourPredictor(nn.Module):
             other=self.other,
             touching=self.touching,
             outward=self.clearance * normals,
+            wanted=(exists := exists.flatten(-2)),
             ramp=self.ramp,
         )
-        return ContourNodes(points, normals, exists.flatten(-2) * free, visible)
+        return ContourNodes(points, normals, exists * free, visible)
 
 
 def front_facing(
@@ -231,6 +232,8 @@ def visible_nodes(
     centre_world: Float[Tensor, "3"],
     points: Float[Tensor, "*batch p 3"],
     node_part: Int[Tensor, " p"],
+    *,
+    wanted: Float[Tensor, "*batch p"] | None = None,
 ) -> Float[Tensor, "*batch p"]:
     """Visibility of surface nodes past the other parts: 1 where seen, 0 where hidden.
 
@@ -242,12 +245,13 @@ def visible_nodes(
         centre_world: The camera's centre, metres.
         points: Nodes, world frame, metres.
         node_part: The part of each node.
+        wanted: 0 where a node is not looked at, as it faces away, say; it counts as seen.
     """
     rotation, centre = body.part_poses(pose)
     centre_world = centre_world.to(centre)
     eye = ((centre_world - centre)[..., None, :] @ rotation)[..., 0, :]
     other = 1 - torch.eye(body.num_parts, device=points.device)[node_part]
-    return line_of_sight(body, rotation, eye, points - centre_world, other=other)[0]
+    return line_of_sight(body, rotation, eye, points - centre_world, other=other, wanted=wanted)[0]
 
 
 def line_of_sight(
@@ -259,6 +263,7 @@ def line_of_sight(
     other: Float[Tensor, "p parts"],
     touching: Float[Tensor, "p parts"] | None = None,
     outward: Float[Tensor, "*batch p 3"] | None = None,
+    wanted: Float[Tensor, "*batch p"] | None = None,
     ramp: float = 0.010,
 ) -> tuple[Float[Tensor, "*batch p"], Float[Tensor, "*batch p"]]:
     """Visibility of points past all parts, and whether neighbouring parts leave them free.
@@ -273,6 +278,7 @@ def line_of_sight(
         other: 0 where a part cannot hide a point (its own), else 1.
         touching: 1 where a part is a neighbour of the point's own; None: nothing is.
         outward: How far beside the points neighbouring parts are looked for, metres.
+        wanted: 0 where a point is not looked at, as nothing depends on it, and gets 1.
         ramp: Width of the transition between visible and hidden, metres.
 
     Returns:
@@ -286,7 +292,9 @@ def line_of_sight(
         beside = rays if outward is None else rays + outward
         rays, others = torch.cat([rays, beside], dim=-2), torch.cat([others, touching > 0])
         behind = torch.cat([behind, (_BEHIND * parts.thickness).expand_as(behind)])
-    passed = (0.5 + _sight_gaps(parts, rotation, eye, rays, others, behind) / ramp).clamp(0, 1)
+        wanted = None if wanted is None else torch.cat([wanted, wanted], dim=-1)
+    gaps = _sight_gaps(parts, rotation, eye, rays, others, behind, wanted)
+    passed = (0.5 + gaps / ramp).clamp(0, 1)
     visible, free = passed[..., :num_nodes].to(eye), passed[..., num_nodes:].to(eye)
     return visible, torch.ones_like(visible) if touching is None else free
 
@@ -318,6 +326,11 @@ class _Shape(NamedTuple):
     c: Tensor
     s: Tensor
 
+    def narrowed(self, w: Tensor) -> tuple[Tensor, Tensor]:
+        """Reciprocal semi-axes of the cross-section at a height in units of the third."""
+        height = w.clamp(-1, 1)  # beyond the ends the taper is held
+        return self.ia / (1 + self.taper_x * height), self.ib / (1 + self.taper_y * height)
+
 
 class _Parts(NamedTuple):
     """Shapes of all parts.
@@ -325,6 +338,8 @@ class _Parts(NamedTuple):
     Attributes:
         table: The rows of `_Shape`, one column per part.
         radius: Of the sphere outside which a part hides nothing, metres.
+        around: Reciprocal semi-axes of an ellipsoid outside which a part hides nothing.
+        within: Squared radius, of a plain part's own ellipsoid, at which it hides for sure.
         thickness: Mean radius of the middle cross-section, metres.
         plain: Whether a part is round, straight and little tapered: a line of sight then has one
             nearest point, which a few steps find.
@@ -333,9 +348,15 @@ class _Parts(NamedTuple):
 
     table: Float[Tensor, "c parts"]
     radius: Float[Tensor, " parts"]
+    around: Float[Tensor, "3 parts"]
+    within: Float[Tensor, " parts"]
     thickness: Float[Tensor, " parts"]
     plain: Bool[Tensor, " parts"]
     bent: bool
+
+    def shapes(self, part: Int[Tensor, " m"]) -> _Shape:
+        """The shapes of some of them."""
+        return _Shape._make(self.table.index_select(1, part).unbind(0))
 
 
 def _tabulate(shape: Float[Tensor, "parts 9"], margin: float) -> _Parts:
@@ -353,7 +374,22 @@ def _tabulate(shape: Float[Tensor, "parts 9"], margin: float) -> _Parts:
     straight = _farthest(section, axes[:, 2], e1)
     radius = torch.where(is_bent, section + axes[:, 2], straight) + margin
     plain = is_round & ~is_bent & (taper.abs() < 0.35).all(-1)
-    return _Parts(torch.stack(table), radius, axes[:, :2].mean(-1), plain, bool(is_bent.any()))
+    # In two dimensions norms of order 2/e and 2 differ by no more than a factor 2^((1 - e) / 2), and
+    # here one is inside the other.
+    larger, smaller = (2 ** (0.5 * s * (1 - exponents)).clamp(min=0).sum(-1) for s in (1, -1))
+    around = larger[:, None] * torch.cat([widest, axes[:, 2:]], dim=-1) + margin
+    around = torch.where(is_bent[:, None], radius[:, None], around)
+    narrowest = torch.cat([axes[:, :2] * (1 - taper.abs()), axes[:, 2:]], dim=-1).amin(-1)
+    within = (1 / smaller - margin / narrowest).clamp(min=0).square()
+    return _Parts(
+        torch.stack(table),
+        radius,
+        1 / around.mT,
+        within,
+        axes[:, :2].mean(-1),
+        plain,
+        bool(is_bent.any()),
+    )
 
 
 def _farthest(a: Tensor, b: Tensor, exponent: Tensor) -> Tensor:
@@ -370,10 +406,12 @@ def _sight_gaps(
     rays: Float[Tensor, "*batch p 3"],
     others: Bool[Tensor, "p parts"],
     behind: Float[Tensor, "p parts"],
+    wanted: Float[Tensor, "*batch p"] | None,
 ) -> Float[Tensor, "*batch p"]:
-    """Signed distance of each line of sight to the nearest of the others, metres; inf if far off.
+    """Signed distance of each line of sight to the nearest of the others, metres.
 
-    A line counts from the camera to `behind` the ray's end.
+    It is as it is within half a ramp of zero, and infinite where it is larger for sure, of either
+    sign. A line counts from the camera to `behind` the ray's end.
     """
     (nodes, num_parts), batch = others.shape, rays.shape[:-1]
     if others.numel() == 0:
@@ -384,6 +422,7 @@ def _sight_gaps(
     # World axes in the part's frame, one after the other, then the camera's centre.
     frames = torch.cat([rotation.flatten(-2), eye], dim=-1)
     rays = rays.float().clamp(-_FAR, _FAR).reshape(-1, nodes, 3)
+    needed = None if wanted is None else (wanted > 0).reshape(-1, nodes, 1)
     gap = torch.full_like(rays[..., 0], torch.inf)
     at_once = _PAIRS_AT_ONCE if rays.device.type == "cpu" else 2**6 * _PAIRS_AT_ONCE
     poses = max(1, at_once // others.numel())
@@ -395,6 +434,8 @@ def _sight_gaps(
         for first in range(0, len(rays), poses):
             chunk = slice(first, first + poses)
             near = _near_pairs(parts, centre[chunk], rays[chunk], reach)
+            near = near if needed is None else near & needed[chunk]
+            near = near.flatten().nonzero()[:, 0]
             found = _least_gap(parts, frames[chunk], rays[chunk], near, behind, plain=plain)
             gap[chunk] = torch.minimum(gap[chunk], found)
     return gap.reshape(batch)
@@ -405,15 +446,53 @@ def _near_pairs(
     centre: Float[Tensor, "b parts 3"],
     rays: Float[Tensor, "b p 3"],
     reach: Float[Tensor, "p parts"],
-) -> Int[Tensor, " m"]:
-    """Flat index `[b p parts]` of the rays that meet a part's sphere before their end."""
+) -> Bool[Tensor, "b p parts"]:
+    """Which rays meet a part's sphere before their end."""
     length = rays.norm(dim=-1, keepdim=True)
     depth = (rays / length.clamp(min=_TINY)) @ centre.transpose(-1, -2)
     # Beyond the length of a tangent to the sphere; any ray where the camera is inside it.
     tangent = (1 - _ROUNDING) * centre.square().sum(-1) - parts.radius.square()
     tangent = torch.where(tangent > 0, tangent.clamp(min=0).sqrt(), -torch.inf)
-    near = (depth > tangent[:, None, :]) & (depth < length + reach)
-    return near.flatten().nonzero()[:, 0]
+    return (depth > tangent[:, None, :]) & (depth < length + reach)
+
+
+_Triple = tuple[Tensor, Tensor, Tensor]
+
+
+class _Stretches(NamedTuple):
+    """Stretches of lines of sight, each in the frame of a part that it may meet.
+
+    Attributes:
+        ray: The line.
+        part: The part.
+        foot: The line's point next to the part's centre, metres.
+        along: The line's unit direction.
+        begin: Where the stretch begins, metres from the foot.
+        end: Where it ends.
+    """
+
+    ray: Tensor
+    part: Tensor
+    foot: _Triple
+    along: _Triple
+    begin: Tensor
+    end: Tensor
+
+    def take(self, index: Int[Tensor, " k"]) -> _Stretches:
+        """Some of them."""
+        ray, part, *rest = (
+            v.index_select(0, index) for v in (*self[:2], *self.foot, *self.along, *self[4:])
+        )
+        return _Stretches(ray, part, tuple(rest[:3]), tuple(rest[3:6]), *rest[6:])
+
+    def point(self, s: Tensor) -> _Triple:
+        """Points at distances from the feet."""
+        x, y, z = (a + s * b for a, b in zip(self.foot, self.along, strict=True))
+        return x, y, z
+
+    def clamp(self, s: Tensor) -> Tensor:
+        """The nearest distances on the stretches."""
+        return torch.minimum(torch.maximum(s, self.begin), self.end)
 
 
 def _least_gap(
@@ -426,6 +505,31 @@ def _least_gap(
     plain: bool,
 ) -> Float[Tensor, "b p"]:
     """Signed distance of each line of sight to the nearest of the parts paired with it, metres."""
+    lines = _stretches(parts, frames, rays, near, behind)
+    # A stretch is empty where the part is behind the node or the camera.
+    lines = lines.take(_places((lines.begin <= lines.end) & _is_close(parts, lines)))
+    least = rays.new_full(rays.shape[:-1], torch.inf).flatten()
+    if plain:
+        s, curvature, square = _ellipsoid_minimum(parts.shapes(lines.part), lines)
+        hidden = _places(square < parts.within.index_select(0, lines.part))
+        least.index_fill_(0, lines.ray.index_select(0, hidden), -torch.inf)
+        open_ = _places(least.index_select(0, lines.ray) > 0)
+        lines, s, curvature = lines.take(open_), s[open_], curvature[open_]
+        gap = _gap(parts, lines, s, curvature, steps=_STEPS)
+    else:
+        lines, s, curvature = _sampled_minima(parts, lines)
+        gap = _gap(parts, lines, s, curvature, steps=_SAMPLED_STEPS, bent=parts.bent).amin(0)
+    return least.scatter_reduce(0, lines.ray, gap, "amin").view(rays.shape[:-1])
+
+
+def _stretches(
+    parts: _Parts,
+    frames: Float[Tensor, "b parts 12"],
+    rays: Float[Tensor, "b p 3"],
+    near: Int[Tensor, " m"],
+    behind: Float[Tensor, "p parts"],
+) -> _Stretches:
+    """Lines of sight in the frames of parts, from the camera to `behind` the rays' ends."""
     nodes, num_parts = behind.shape
     ray = near // num_parts
     part = near - ray * num_parts
@@ -438,115 +542,109 @@ def _least_gap(
     # Measured from the foot of the perpendicular from the part's centre, for precision.
     start = ox * x + oy * y + oz * z
     foot = (ox - start * x, oy - start * y, oz - start * z)
-    half = parts.radius.square()[part] - sum(a.square() for a in foot)
+    half = parts.radius.square().index_select(0, part) - sum(a.square() for a in foot)
     half = half.clamp(min=0).sqrt()
-    begin = torch.maximum(start, -half)
-    stop = start + length.flatten()[ray] + behind.flatten()[near - pose * behind.numel()]
-    end = torch.minimum(stop, half)
-    gap = _gap(
-        _Shape._make(parts.table.index_select(1, part).unbind(0)),
-        foot,
-        (x, y, z),
-        begin,
-        torch.maximum(begin, end),
-        plain=plain,
-        bent=parts.bent and not plain,
+    stop = start + length.flatten().index_select(0, ray)
+    stop = stop + behind.flatten().index_select(0, near - pose * behind.numel())
+    return _Stretches(
+        ray, part, foot, (x, y, z), torch.maximum(start, -half), torch.minimum(stop, half)
     )
-    gap = torch.where(begin > end, torch.inf, gap)  # the part is behind the node or the camera
-    least = torch.full_like(length, torch.inf)
-    return least.flatten().scatter_reduce(0, ray, gap, "amin").view_as(length)
 
 
-_Triple = tuple[Tensor, Tensor, Tensor]
+def _is_close(parts: _Parts, lines: _Stretches) -> Bool[Tensor, " m"]:
+    """Whether lines meet the ellipsoids around the parts."""
+    scale = parts.around.index_select(1, lines.part)
+    (px, py, pz), (dx, dy, dz) = (
+        (a * b for a, b in zip(v, scale, strict=True)) for v in (lines.foot, lines.along)
+    )
+    across, speed = px * dx + py * dy + pz * dz, dx * dx + dy * dy + dz * dz
+    return (px * px + py * py + pz * pz - 1) * speed < across.square()
+
+
+def _places(mask: Bool[Tensor, " m"]) -> Int[Tensor, " k"]:
+    return mask.nonzero()[:, 0]
 
 
 def _gap(
-    shape: _Shape,
-    foot: _Triple,
-    along: _Triple,
-    begin: Float[Tensor, " m"],
-    end: Float[Tensor, " m"],
+    parts: _Parts,
+    lines: _Stretches,
+    s: Float[Tensor, "*two m"],
+    curvature: Float[Tensor, "*two m"],
     *,
-    plain: bool,
-    bent: bool,
-) -> Float[Tensor, " m"]:
-    """Signed distance between a stretch of a line and a part, to first order, metres.
+    steps: int,
+    bent: bool = False,
+) -> Float[Tensor, "*two m"]:
+    """Signed distance between stretches of lines and parts, to first order, metres.
 
     Args:
-        shape: The part of each line.
-        foot: A point of the line in the part's frame, metres.
-        along: Its unit direction.
-        begin: Where the stretch begins, metres from the foot.
-        end: Where it ends.
-        plain: Whether the parts are, see `_Parts`.
+        parts: All parts.
+        lines: The stretches.
+        s: About where they are nearest, metres from the feet.
+        curvature: About the curvature of R^2/2 there.
+        steps: Steps towards where they are nearest.
         bent: Whether any of the parts is bent.
     """
-
-    def evaluate(s: Tensor) -> tuple[Tensor, _Triple]:
-        x, y, z = (a + s * b for a, b in zip(foot, along, strict=True))
-        return _radial_square(shape, x, y, z, bent=bent)
+    shape, along = parts.shapes(lines.part), lines.along
 
     def slope(s: Tensor) -> Tensor:
-        _, (gx, gy, gz) = evaluate(s)
+        _, (gx, gy, gz) = _radial_square(shape, *lines.point(s), bent=bent)
         return gx * along[0] + gy * along[1] + gz * along[2]
 
-    if plain:
-        s, curvature = _ellipsoid_minimum(shape, foot, along, begin, end)
-    else:
-        s, curvature, begin, end = _sampled_minima(slope, begin, end)
     last, before = s, slope(s)
-    s = torch.minimum(torch.maximum(s - before / curvature, begin), end)
-    for _ in range(1, _STEPS if plain else _SAMPLED_STEPS):
+    s = lines.clamp(s - before / curvature)
+    for _ in range(1, steps):
         # Secant; after a step too short for one, the curvature assumed at first.
         now, moved = slope(s), s - last
         secant = ((now - before) * moved + _MICRO * curvature) / (moved.square() + _MICRO)
         secant = torch.minimum(torch.maximum(secant, 0.3 * curvature), 10 * curvature)
         last, before = s, now
-        s = torch.minimum(torch.maximum(s - now / secant, begin), end)
-    square, (gx, gy, gz) = evaluate(s)
+        s = lines.clamp(s - now / secant)
+    square, (gx, gy, gz) = _radial_square(shape, *lines.point(s), bent=bent)
     radial = square.sqrt()
     # grad R = grad(R^2) / 2 R
     steepness = (gx.square() + gy.square() + gz.square()).sqrt().clamp(min=_TINY)
-    gap = (radial - 1) * radial / steepness
-    return gap if plain else gap.amin(0)
+    return (radial - 1) * radial / steepness
 
 
-def _ellipsoid_minimum(
-    shape: _Shape, foot: _Triple, along: _Triple, begin: Tensor, end: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Where a stretch of line is nearest to the tapered ellipsoid, and the curvature of R^2/2."""
-    curvature = s = torch.zeros_like(begin)
+def _ellipsoid_minimum(shape: _Shape, lines: _Stretches) -> _Triple:
+    """Where a stretch is nearest to the tapered ellipsoid, the curvature of R^2/2, and R^2."""
+    (x, y, z), (dx, dy, dz) = lines.foot, lines.along
+    z, dz = z * shape.ic, dz * shape.ic
+    curvature = s = torch.zeros_like(lines.begin)
+    ix, iy = shape.ia, shape.ib
     for _ in range(2):  # with the taper at the foot, then with that at the nearest point
-        height = ((foot[2] + s * along[2]) * shape.ic).clamp(-1, 1)
-        ix = shape.ia / (1 + shape.taper_x * height)
-        iy = shape.ib / (1 + shape.taper_y * height)
-        x, y, z = along[0] * ix, along[1] * iy, along[2] * shape.ic
-        curvature = (x * x + y * y + z * z).clamp(min=_TINY)
-        s = -(foot[0] * ix * x + foot[1] * iy * y + foot[2] * shape.ic * z) / curvature
-        s = torch.minimum(torch.maximum(s, begin), end)
-    return s, curvature
+        ix, iy = shape.narrowed(z + s * dz)
+        along = (dx * ix, dy * iy, dz)
+        curvature = sum(a * a for a in along).clamp(min=_TINY)
+        s = lines.clamp(-(x * ix * along[0] + y * iy * along[1] + z * dz) / curvature)
+    height = z + s * dz
+    ix, iy = shape.narrowed(height)
+    square = ((x + s * dx) * ix).square() + ((y + s * dy) * iy).square() + height.square()
+    return s, curvature, square
 
 
-def _sampled_minima(
-    slope: Callable[[Tensor], Tensor], begin: Tensor, end: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The first and the last minimum on a stretch: guess, curvature and bounds, each `[2 m]`.
+def _sampled_minima(parts: _Parts, lines: _Stretches) -> tuple[_Stretches, Tensor, Tensor]:
+    """The first and the last minimum on a stretch: bounds, guess and curvature, each `[2 m]`.
 
     There are no others: a line meets a bent part at most twice.
     """
-    s = torch.lerp(begin, end, torch.linspace(0, 1, _SAMPLES, device=end.device)[:, None])
-    rise = slope(s)
+    shape, along = parts.shapes(lines.part), lines.along
+    places = torch.linspace(0, 1, _SAMPLES, device=lines.end.device)[:, None]
+    s = torch.lerp(lines.begin, lines.end, places)
+    _, (gx, gy, gz) = _radial_square(shape, *lines.point(s), bent=parts.bent)
+    rise = gx * along[0] + gy * along[1] + gz * along[2]
     # A minimum is where a fall meets a climb, or at an end. It lies between samples k - 1 and k.
     falls, anything = rise < 0, torch.ones_like(rise[:1], dtype=torch.bool)
     minimum = torch.cat([anything, falls]) & torch.cat([~falls, anything])
-    number = torch.arange(_SAMPLES + 1, device=end.device)[:, None]
+    number = torch.arange(_SAMPLES + 1, device=s.device)[:, None]
     first = _SAMPLES - (minimum * number.flip(0)).amax(0)
     k = torch.stack([first, (minimum * number).amax(0)])
     left, right = (k - 1).clamp(min=0), k.clamp(max=_SAMPLES - 1)
     lower, upper = s.gather(0, left), s.gather(0, right)
     fall, climb = -rise.gather(0, left).clamp(max=0), rise.gather(0, right).clamp(min=0)
     change, width = (fall + climb).clamp(min=_TINY), upper - lower
-    return lower + width * fall / change, change / width.clamp(min=_TINY), lower, upper
+    lines = lines._replace(begin=lower, end=upper)
+    return lines, lower + width * fall / change, change / width.clamp(min=_TINY)
 
 
 def _radial_square(
