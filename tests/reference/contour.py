@@ -63,7 +63,9 @@ def edges_along_lines(
                 continue
             # The parabola through three samples; then 1.5 samples to either side of its top.
             shift = 0.5 * (right - left) / (2 * middle - left - right)
-            height = middle + 0.25 * (right - left) * shift
+            curve = 2 * middle - left - right
+            side = 2 * right - middle - after if shift > 0 else 2 * left - before - middle
+            height = middle + 0.5 * shift**2 * (curve + abs(shift) * (side - curve))
             low = left + (0.5 - shift) * (before - left)
             high = right + (0.5 + shift) * (after - right)
             fall = min(middle - low, middle - high) / max(height, 1e-3)

@@ -25,12 +25,11 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchcss.cost.visibility import ContourNodes
+from torchcss.cost.visibility import ContourNodes, places
 from torchcss.robust import Lorentzian, RobustPotential
 from torchcss.types import PointCost
 from torchcss.vision.camera import Camera
@@ -128,7 +127,7 @@ class ContourTerm:
         response[:, leaving] *= inside_image(line[:, leaving], *edge_field.shape[1:])
 
         rises = response[1:] > response[:-1]
-        peak = _places(rises[1:-2] & ~rises[2:-1])
+        peak = places(rises[1:-2] & ~rises[2:-1])
         size, count = start.shape[1], len(steps) - 4
         before, left, middle, right, after = (
             response[i : i + count].flatten().index_select(0, peak) for i in range(5)
@@ -224,17 +223,9 @@ class ContourTerm:
 
 def _seen(nodes: ContourNodes) -> tuple[ContourNodes, Int[Tensor, " k"]]:
     """The nodes that count at all, of the whole batch, and their places in it."""
-    index = _places(nodes.visible * nodes.exists > 0)
+    index = places(nodes.visible * nodes.exists > 0)
     last = nodes.exists.dim() - 1
     return ContourNodes(*(part.flatten(0, last).index_select(0, index) for part in nodes)), index
-
-
-def _places(mask: Bool[Tensor, "*shape"]) -> Int[Tensor, " k"]:
-    """Where a mask is true, counted through all of it."""
-    if mask.device.type == "cpu":
-        # Without a branch per element: six times faster than `nonzero`, here a fifth of the search.
-        return torch.from_numpy(np.flatnonzero(mask.numpy()))
-    return mask.flatten().nonzero()[:, 0]
 
 
 def _spread(
