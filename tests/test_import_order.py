@@ -22,8 +22,12 @@ LAYERS = (
     {"cost"},
     {
         "presets",
+        "first_pose",
+        "gross_marks",
+        "hypotheses",
         "initialise",
         "interpretations",
+        "marks",
         "reprojection",
         "synthetic",
         "metrics",

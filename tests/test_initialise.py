@@ -13,18 +13,14 @@ from torchcss.body.catalog import LENGTHS
 from torchcss.body.model import load_body
 from torchcss.cost.joints import JointTerm
 from torchcss.errors import BodyError, CameraError, ConfigurationError, KeypointError
-from torchcss.initialise import (
-    DEFAULT_VIEW_DEGREES,
-    Initialisation,
-    default_camera,
-    default_sigma,
-    initialise,
-    initialise_from_joints,
-    stature_of,
-)
+from torchcss.first_pose import initialise_from_joints
+from torchcss.hypotheses import Initialisation, hang_on_best, stature_of
+from torchcss.initialise import DEFAULT_VIEW_DEGREES, default_camera, initialise
 from torchcss.interpretations import PAPER_PROPORTIONS, SINGLE_START, Search
+from torchcss.marks import default_sigma
 from torchcss.metrics import LIMB_JOINTS, pa_mpjpe_mm
 from torchcss.random_person import Person, coverage, random_person
+from torchcss.types import Modes
 
 SMALL = Search(num_starts=24, num_trunks=2, num_flips=24, num_samples=8)
 
@@ -85,6 +81,27 @@ def test_limits_hold_and_lengths_stay_in_their_interval(found: Initialisation):
     assert "prior on proportions sets the scale" in "\n".join(found.report)
 
 
+def test_hung_on_the_best_fit_no_hypothesis_breaks_a_limit(generator: torch.Generator):
+    body = load_body("body34")
+    size = (2000, body.num_parameters)
+    share = torch.rand(size, generator=generator, dtype=torch.float64)
+    lower, upper = body.lower.clamp(min=-3), body.upper.clamp(max=3)
+    x = lower + share * (upper - lower)
+    x[1, body.state_index("root_pitch")] = body.upper[body.state_index("root_pitch")]
+    n = len(body.state_names)
+    fits = Modes(
+        x, torch.eye(n).expand(len(x), n, n), torch.arange(len(x)), x > upper,
+        torch.zeros(len(x)), torch.zeros(len(x)),
+    )  # fmt: skip
+    hung, kept = hang_on_best(body, fits)
+    # Those whose pitch is beyond 85 degrees there are left out.
+    assert 1900 < len(kept.cost) < 2000
+    assert int(kept.cost[0]) == 0
+    assert bool(((kept.mean >= hung.lower) & (kept.mean <= hung.upper)).all())
+    joints = body.pose(x).joints[kept.cost]
+    torch.testing.assert_close(hung.pose(kept.mean).joints, joints, rtol=0, atol=1e-9)
+
+
 def test_covariances_are_those_of_modes_with_unknown_lengths(found: Initialisation):
     assert bool((torch.linalg.eigvalsh(found.mixture.covariance) > 0).all())
     body, covariance = found.body, found.mixture.covariance[0]
@@ -106,6 +123,21 @@ def test_hypotheses_are_the_fits_and_then_samples(found: Initialisation):
     assert torch.equal(states[:fits], found.mixture.mean[:50])
     assert torch.equal(found.hypotheses(2, generator=generator), found.mixture.mean[:2])
     assert torch.equal(states, found.body.bounds.project(states))
+
+
+def test_gross_marks_are_named_and_the_pose_is_that_without_them():
+    someone = person(8, outliers=0.05)
+    gross = {
+        name for name, is_gross in zip(someone.joint_names, someone.gross, strict=True) if is_gross
+    }
+    assert gross == {"r_wrist", "r_knee", "l_ankle"}
+    found = find(someone, num_modes=None)
+    assert set(found.left_out) == gross
+    assert any("left out" in line and "r_knee" in line for line in found.report)
+    told = find(someone._replace(confidence=(~someone.gross).double()), num_modes=None)
+    assert float(found.cost[0]) == pytest.approx(float(told.cost[0]), abs=1.0)
+    assert bool((found.mixture.mean >= found.body.lower).all())
+    assert bool((found.mixture.mean <= found.body.upper).all())
 
 
 def test_many_starts_find_what_a_single_one_does_not(found: Initialisation):

@@ -23,7 +23,8 @@ import torch
 from torch import Tensor
 
 from torchcss.errors import CameraError
-from torchcss.initialise import Initialisation, default_camera, initialise, stature_of
+from torchcss.hypotheses import Initialisation, stature_of
+from torchcss.initialise import default_camera, initialise
 from torchcss.interpretations import Search
 from torchcss.io.atomic import prepare_output_folder, replace_file
 from torchcss.io.cameras import check_image_size, read_camera

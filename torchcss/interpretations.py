@@ -64,6 +64,8 @@ class Search:
         covariance_scale: Factor on their covariance.
         limits: Hold the joint limits (False only for comparison).
         anneal: Widen the keypoints' scale at first (False only for comparison).
+        leave_out: Leave marks out that fit no pose (False only for comparison); see
+            `torchcss.gross_marks`.
         max_steps: Iterations of the last descent.
         proportions: Which lengths are fitted, all by default; the others stay the standard
             humanoid's.
@@ -76,6 +78,7 @@ class Search:
     covariance_scale: float = 8.0
     limits: bool = True
     anneal: bool = True
+    leave_out: bool = True
     max_steps: int = 40
     proportions: tuple[str, ...] = PROPORTIONS
 
@@ -109,7 +112,9 @@ PAPER_PROPORTIONS = ("hip_width", "shoulder_width", "neck", "head")
 """The papers' eight internal proportions, which place hips, clavicles and the tip of the skull;
 left and right are one here."""
 
-SINGLE_START = Search(num_starts=1, num_flips=0, num_samples=0, anneal=False, max_steps=100)
+SINGLE_START = Search(
+    num_starts=1, num_flips=0, num_samples=0, anneal=False, leave_out=False, max_steps=100
+)
 """One descent from the rest pose: what a local fit without search does."""
 
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchcss.body.catalog import LENGTHS, PROPORTION_RANGE
@@ -41,6 +41,7 @@ class Person(NamedTuple):
         joint_names: Names of the marked joints.
         keypoints: Where they are marked, pixels.
         confidence: 0 where a joint is missing, else 1.
+        gross: Whether a mark is a gross outlier, which no fit is told.
     """
 
     body: BodyModel
@@ -49,6 +50,7 @@ class Person(NamedTuple):
     joint_names: tuple[str, ...]
     keypoints: Float[Tensor, "j 2"]
     confidence: Float[Tensor, " j"]
+    gross: Bool[Tensor, " j"]
 
     def joints_world(self, names: tuple[str, ...]) -> Float[Tensor, "j 3"]:
         """True positions of joints, metres."""
@@ -95,9 +97,11 @@ def random_person(
     noise = torch.randn(uv.shape, generator=generator, dtype=uv.dtype)
     chance = torch.rand(2, len(index), generator=generator, dtype=uv.dtype)
     anywhere = torch.rand(uv.shape, generator=generator, dtype=uv.dtype)
-    gross = (chance[0] < outliers)[:, None]
-    uv = torch.where(gross, anywhere * uv.new_tensor([WIDTH, HEIGHT]), uv + noise_px * noise)
-    return Person(body, state, camera, joint_names, uv, (chance[1] >= missing).to(uv))
+    gross = chance[0] < outliers
+    anywhere = anywhere * uv.new_tensor([WIDTH, HEIGHT])
+    uv = torch.where(gross[:, None], anywhere, uv + noise_px * noise)
+    confidence = (chance[1] >= missing).to(uv)
+    return Person(body, state, camera, joint_names, uv, confidence, gross)
 
 
 class Coverage(NamedTuple):

@@ -72,3 +72,17 @@ def test_other_formats_go_to_their_reader(tmp_path: Path):
     person = np.tile([[320.0, 240.0, 1.0]], (25, 1)) + np.arange(25)[:, None] * [[3, 4, 0]]
     path.write_text(json.dumps({"people": [{"pose_keypoints_2d": person.flatten().tolist()}]}))
     assert "l_wrist" in read_joints(path, image_size_wh=SIZE, layout="BODY_25").joint_names
+
+
+def test_coco_detections_of_a_picture_with_any_number(tmp_path: Path):
+    person = np.tile([[320.0, 240.0, 0.9]], (17, 1)) + np.arange(17)[:, None] * [[3, 4, 0]]
+    row = {"category_id": 1, "keypoints": person.flatten().tolist(), "score": 0.8}
+    path = tmp_path / "detections.json"
+    for number in (0, 1, 785, "000785.jpg"):
+        path.write_text(json.dumps([{**row, "image_id": number}]))
+        found = read_joints(path, image_size_wh=SIZE)
+        wrist = found.joint_names.index("l_wrist")
+        assert found.keypoints[wrist].tolist() == person[wrist, :2].tolist()
+    path.write_text(json.dumps([{**row, "image_id": number} for number in (1, 2)]))
+    with pytest.raises(KeypointError, match="nobody in the first frame"):
+        read_joints(path, image_size_wh=SIZE)

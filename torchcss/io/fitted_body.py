@@ -30,8 +30,8 @@ import torch
 from torchcss.body.model import BodyModel, load_body
 from torchcss.body.shape import with_shape
 from torchcss.errors import BodyError
+from torchcss.hypotheses import Initialisation
 from torchcss.inference.mixture import GaussianMixture
-from torchcss.initialise import Initialisation
 from torchcss.io.atomic import replace_file
 from torchcss.io.safe_load import load_arrays
 from torchcss.vision.camera import Camera

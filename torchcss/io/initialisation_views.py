@@ -102,7 +102,7 @@ def draw_hypotheses(
     canvas = FigureCanvasAgg(figure)
     views = (("as the camera sees them", 0.0), ("turned by 45 degrees", 45.0),
              ("from the side (camera to the left)", 90.0))  # fmt: skip
-    extent = 1.05 * float(np.abs(joints).max())
+    extent = 1.05 * float(max(np.abs(joints).max(), np.abs(seen[..., :2]).max()))
     for axes, (title, degrees) in zip(figure.subplots(1, 3), views, strict=True):
         turn = np.radians(degrees)
         across = np.cos(turn) * joints[..., 0] + np.sin(turn) * joints[..., 2]

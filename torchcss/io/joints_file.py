@@ -14,6 +14,7 @@ from __future__ import annotations
 import csv
 import math
 import os
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -73,10 +74,20 @@ def read_joints(
         rows = content if isinstance(content, list) else []
         if rows and isinstance(rows[0], dict) and {"x", "y"} <= set(rows[0]):
             return _read_mediapipe(path, rows, image_size_wh)
+        frame = _frame_of_single_image(content, frame)
     marks = read_keypoints(
         path, image_size_wh=image_size_wh, layout=layout, normalised=normalised, first_frame=frame
     )
     return Joints(marks.keypoints[frame], marks.confidence[frame], marks.joint_names, marks.report)
+
+
+def _frame_of_single_image(content: object, otherwise: int) -> int:
+    """Where COCO detections of one image are: its number counts as that of a video's frame."""
+    rows = content if isinstance(content, list) else []
+    images = {str(row.get("image_id")) if isinstance(row, dict) else "" for row in rows}
+    only = images.pop() if len(images) == 1 else ""
+    digits = re.findall(r"[0-9]+", Path(only).stem)
+    return int(digits[-1]) if digits else otherwise
 
 
 def _read_csv(path: Path) -> Joints:
