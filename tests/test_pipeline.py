@@ -27,11 +27,13 @@ from torchcss.pipeline import (
     follow_with_base,
     make_choice,
     make_extractor,
+    make_settings_tracker,
     scale_keypoints,
     track_frames,
     track_video,
 )
-from torchcss.presets import make_tracker
+from torchcss.presets import PRESETS, make_tracker
+from torchcss.robust import Quadratic
 from torchcss.synthetic import SyntheticSequence, arm_sequence
 from torchcss.vision.camera import Camera
 
@@ -325,6 +327,28 @@ def test_awkward_frames_leave_no_nan_and_lose_nothing():
         for part in frame.state.mixture:
             assert torch.isfinite(part).all(), name
         assert all(np.isfinite(value) for value in frame.terms.values()), name
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_row_of_the_table_can_be_run_by_its_name(preset: str):
+    settings, row = Settings(body="arm7", preset=preset, terms=ALL_TERMS), PRESETS[preset]
+    tracker = make_settings_tracker(settings, load_body("arm7").motion_rate / 25)
+    assert (tracker.num_samples, tracker.num_modes) == (row.samples_arm, row.modes_arm)
+    choice = make_choice(settings, 2.0)
+    assert choice.joints is not None
+    assert isinstance(choice.joints.potential, Quadratic) != row.robust
+    assert choice.curvature is row.curvature
+    assert (choice.interpenetration is None) == (row.interpenetration is False)
+    # The dynamics of particles are the temporal prior, and count once.
+    for prior in (choice.temporal, choice.temporal_mixture):
+        assert (prior is None) == (row.particles is not None)
+
+
+def test_a_particle_filter_weighs_by_the_observation_alone(clip: Path, tmp_path: Path):
+    terms = ("joints", "stabiliser", "temporal", "temporal_mixture")
+    summary = run(clip, tmp_path, preset="condensation", terms=terms, working_size=160)
+    assert set(summary["best_mode_cost_by_term"]) == {"joints", "stabiliser"}
+    assert np.isfinite(torchcss.load_track(tmp_path).joints_world).all()
 
 
 @pytest.mark.parametrize("size", [(1, 48), (48, 1), (1, 1), (37, 53)])

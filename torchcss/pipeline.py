@@ -90,7 +90,7 @@ class Settings:
             see `Tracker`.
         keypoints_use: "all": keypoints are observations in every frame; "first": they only
             give the first pose, as in the papers.
-        terms: Terms and priors of the cost.
+        terms: Terms and priors of the cost; see `make_choice` for what the preset changes.
         working_size: Longer side, in pixels, at which features are computed; larger images are
             reduced to it.
         contour_weight: Temperature of the contour term, see `CostChoice`.
@@ -524,6 +524,9 @@ def boundary_emphasis(settings: Settings) -> float:
 def make_choice(settings: Settings, sigma: float) -> CostChoice:
     """The cost that the settings ask for: their terms, and what their preset has to say.
 
+    A particle filter gets no temporal prior: its particles are moved by `p(x_t | x_{t-1})` already,
+    and weighed by `p(r_t | x_t)` alone (section 1.1 [IJRR]). The prior would count twice.
+
     Args:
         settings: Which terms, and which tracker.
         sigma: Keypoint noise in pixels of the working image.
@@ -531,6 +534,7 @@ def make_choice(settings: Settings, sigma: float) -> CostChoice:
     row = PRESETS[settings.preset]
     has = settings.terms.__contains__
     repels = has("interpenetration") if row.interpenetration is None else row.interpenetration
+    descends = row.particles is None
     potential: dict[str, Any] = {} if row.robust else {"potential_kind": Quadratic}
     contour = ContourTerm(**potential)
     # The weights of motion boundaries make the wells of a fitted model shallower; what is back-
@@ -544,8 +548,8 @@ def make_choice(settings: Settings, sigma: float) -> CostChoice:
         joints=JointTerm(sigma=sigma, **potential) if has("joints") else None,
         stabiliser=Stabiliser() if has("stabiliser") else None,
         anthropometric=Anthropometric() if has("anthropometric") else None,
-        temporal=TemporalPrior() if has("temporal") else None,
-        temporal_mixture=MixturePrior() if has("temporal_mixture") else None,
+        temporal=TemporalPrior() if has("temporal") and descends else None,
+        temporal_mixture=MixturePrior() if has("temporal_mixture") and descends else None,
         interpenetration=Interpenetration() if repels else None,
         contour_weight=settings.contour_weight,
         curvature=row.curvature,
