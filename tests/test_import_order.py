@@ -38,7 +38,7 @@ LAYERS = (
     {"sampling_study"},
     {"io"},
     {"pipeline", "initialise_image"},
-    {"demo", "scenes", "cli", "cli_init"},
+    {"demo", "scenes", "cli", "cli_init", "cli_export"},
 )
 """Lowest first; a folder counts as one entry."""
 

@@ -7,6 +7,7 @@ of poses with covariances and weights (covariance scaled sampling, Sminchisescu 
 
 from torchcss.body.model import BodyModel, load_body
 from torchcss.initialise import Initialisation, initialise
+from torchcss.io.export import export_track
 from torchcss.io.tracks import Track, load_track
 from torchcss.pipeline import Settings, track_frames, track_video
 from torchcss.vision.camera import Camera
@@ -17,6 +18,7 @@ __all__ = [
     "Initialisation",
     "Settings",
     "Track",
+    "export_track",
     "initialise",
     "load_body",
     "load_track",

@@ -5,6 +5,7 @@
 | `torchcss demo` | renders a sequence, tracks it and prints the error against the truth |
 | `torchcss init IMAGE` | fits a body to one picture with marked joints |
 | `torchcss track VIDEO` | tracks a body through a video |
+| `torchcss export TRACK` | writes a track for another program |
 
 Bad input ends with one line on standard error and exit status 2; Ctrl-C with status 130. What was
 tracked until then is on disk.
@@ -19,6 +20,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from torchcss.cli_export import Export
 from torchcss.cli_init import Init
 from torchcss.demo import run_demo
 from torchcss.errors import OutputError, TorchcssError
@@ -167,6 +169,7 @@ Verb = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Init, tyro.conf.subcommand("init")]
     | Annotated[Track, tyro.conf.subcommand("track")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
 )
 
 

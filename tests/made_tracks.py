@@ -1,0 +1,61 @@
+"""Tracks of random modes of any body, as the tracker would have written them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from torchcss.body.model import BodyModel
+from torchcss.io.tracks import Track, TrackWriter
+
+BEAM_UP = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)
+"""Turns Y up into Z up: world (x, y, z) = body (z, x, y)."""
+
+
+def make_track(
+    body: BodyModel,
+    counts: Sequence[int] = (2, 3, 2),
+    *,
+    seed: int = 0,
+    first_frame: int = 0,
+    rate: float = 60.0,
+    spread: float = 0.6,
+    up: torch.Tensor | None = None,
+) -> Track:
+    """Random poses within the joint limits, standing about upright; the base moves in frame 2."""
+    source = torch.Generator().manual_seed(seed)
+    up = torch.eye(3, dtype=torch.float64) if up is None else up
+    writer = TrackWriter("unused", state_names=body.state_names, joint_names=body.joint_names)
+    n = body.num_parameters
+    lower = body.lower.clamp(min=-spread)
+    upper = body.upper.clamp(max=spread)
+    for index, k in enumerate(counts):
+        # Two bases, as when the pitch of the root has come near a right angle.
+        lean = torch.tensor([0.2, -0.3, 0.1]) if index < 2 else torch.tensor([-0.4, 0.5, 0.2])
+        skew = torch.zeros(3, 3, dtype=torch.float64)
+        skew[0, 1], skew[0, 2], skew[1, 2] = lean.double()
+        turn = up @ torch.linalg.matrix_exp(skew - skew.T)
+        shift = torch.tensor([0.3, -1.2, 0.9 + 0.1 * index], dtype=torch.float64)
+        placed = body.with_base(turn, shift)
+        share = torch.rand(k, n, generator=source, dtype=torch.float64)
+        state = lower + share * (upper - lower)
+        factor = 0.02 * torch.randn(k, n, n, generator=source, dtype=torch.float64) / math.sqrt(n)
+        base = np.eye(4)
+        base[:3, :3], base[:3, 3] = turn, shift
+        writer.append(
+            frame=first_frame + index,
+            time_s=(first_frame + index) / rate,
+            state=state,
+            covariance=factor @ factor.mT,
+            log_weight=torch.linspace(1.0, 0.5, k).softmax(0).log(),
+            cost=torch.linspace(1.0, 2.0, k),
+            parent=torch.full((k,), -1)
+            if not index
+            else torch.arange(k).flip(0) % counts[index - 1],
+            joints_world=placed.pose(state).joints,
+            base_transform=base,
+        )
+    return writer.track()

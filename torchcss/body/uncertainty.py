@@ -1,0 +1,52 @@
+"""How sure the joints are in space: covariances of positions from the covariance of a state.
+
+A joint centre p moves with the state as `dp = J dx`; a state of covariance S leaves it the
+covariance `J S J^T` to first order. The Jacobian is read off the twists of the tree: a joint of
+the tree that carries p moves it with `omega x p + v`.
+
+Call `joint_covariance`; `joint_jacobian` gives J alone.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchcss.body.model import BodyModel, BodyPose
+from torchcss.errors import check_shape
+
+
+def joint_jacobian(body: BodyModel, pose: BodyPose) -> Float[Tensor, "*batch j 3 n"]:
+    """Derivatives of the joint centres in the state, metres per radian or metre.
+
+    Args:
+        body: The body.
+        pose: What `body.pose` gave.
+    """
+    tree = pose.tree
+    swept = torch.linalg.cross(tree.omega[..., None, :, :], pose.joints[..., :, None, :])
+    moved = swept + tree.velocity[..., None, :, :]
+    carries = body.tree.ancestors[:, body.marker_link].T
+    return torch.where(carries[..., None], moved, 0.0).mT @ body.tie
+
+
+def joint_covariance(
+    body: BodyModel, pose: BodyPose, covariance: Float[Tensor, "*batch n n"]
+) -> Float[Tensor, "*batch j 3 3"]:
+    """Covariances of the joint centres, square metres, to first order.
+
+    It is a good account of the spread as long as the state's deviations turn the limbs by well
+    under a radian; a limb that may swing further spreads along an arc, which no ellipsoid is.
+
+    Args:
+        body: The body.
+        pose: What `body.pose` gave for the means.
+        covariance: Covariances of the states.
+
+    Raises:
+        ShapeError: If the covariance has another size than the state.
+    """
+    check_shape("covariance", covariance, body.num_parameters, body.num_parameters)
+    jacobian = joint_jacobian(body, pose)
+    return jacobian @ covariance[..., None, :, :] @ jacobian.mT

@@ -1,0 +1,44 @@
+"""C3D: the joints as points, for the programs of gait laboratories.
+
+Written by ezc3d, an optional package. Points are in metres; a point that a frame lacks is marked as
+invalid (residual -1), as the format wants it. The description of the file says where it is from.
+
+Call `write_c3d`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from torchcss.errors import MissingExtraError
+from torchcss.io.export.selection import Selection
+
+
+def write_c3d(path: Path, selection: Selection, mode: int) -> None:
+    """Write one mode as C3D.
+
+    Args:
+        path: The file.
+        selection: The frames.
+        mode: Which of its modes.
+
+    Raises:
+        MissingExtraError: If ezc3d is not installed.
+    """
+    try:
+        import ezc3d  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise MissingExtraError(
+            'C3D needs the package ezc3d: pip install "torchcss[c3d]"'
+        ) from error
+    file = ezc3d.c3d()
+    point = file["parameters"]["POINT"]
+    point["RATE"]["value"] = [selection.rate]
+    point["LABELS"]["value"] = tuple(selection.joint_names)
+    point["DESCRIPTIONS"]["value"] = tuple("" for _ in selection.joint_names)
+    file.add_parameter("POINT", "UNITS", ["m"])
+    points = selection.joints[:, mode].transpose(2, 1, 0)
+    file["data"]["points"] = np.concatenate([points, np.ones_like(points[:1])])
+    file.write(str(path))

@@ -1,0 +1,94 @@
+"""Rotation matrices as the angles that files hold: Euler angles in any order, and axis-angle.
+
+Call `euler_angles` for BVH and MOT, `axis_angle` for SMPL, `about` for the matrix of one axis.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+ROTATION_ORDERS = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
+
+
+def about(axis: int, angle: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch 3 3"]:
+    """Rotation about one coordinate axis (0, 1, 2), radians, right-handed."""
+    angle = np.asarray(angle, dtype=np.float64)
+    j, k = (axis + 1) % 3, (axis + 2) % 3
+    matrix = np.zeros((*angle.shape, 3, 3))
+    matrix[..., axis, axis] = 1.0
+    matrix[..., j, j] = matrix[..., k, k] = np.cos(angle)
+    matrix[..., k, j] = np.sin(angle)
+    matrix[..., j, k] = -np.sin(angle)
+    return matrix
+
+
+def euler_angles(
+    rotation: Float[np.ndarray, "t *nodes 3 3"], order: str
+) -> Float[np.ndarray, "t *nodes 3"]:
+    """Angles a, b, c with `R = R_i(a) R_j(b) R_k(c)` for the order "IJK", radians.
+
+    The axes turn with the body (intrinsic), as in BVH. From frame to frame the angles are
+    continuous: of the two triples that give a rotation, and of their whole turns, each frame has
+    the nearest to the frame before. Where only a sum of a and c is determined (b a right angle), c
+    stays what it was.
+
+    Args:
+        rotation: Rotations, frame by frame.
+        order: A member of `ROTATION_ORDERS`.
+    """
+    i, j, k = ("XYZ".index(letter) for letter in order)
+    sign = 1.0 if (j - i) % 3 == 1 else -1.0
+    level = np.hypot(rotation[..., i, i], rotation[..., i, j])  # |cos b|
+    middle = np.arctan2(sign * rotation[..., i, k], level)
+    last = np.arctan2(-sign * rotation[..., i, j], rotation[..., i, i])
+    angles = np.zeros((*rotation.shape[:-2], 3))
+    before = np.zeros(angles.shape[1:])
+    for t in range(len(rotation)):
+        c = np.where(level[t] > 1e-9, last[t], before[..., 2])
+        # R_k(-c) taken off from the right leaves R_i(a) R_j(b), whose column j shows a alone.
+        column = (
+            np.cos(c)[..., None] * rotation[t, ..., :, j]
+            + sign * np.sin(c)[..., None] * rotation[t, ..., :, i]
+        )
+        a = np.arctan2(sign * column[..., k], column[..., j])
+        one = np.stack([a, middle[t], c], axis=-1)
+        other = np.stack([a + np.pi, np.pi - middle[t], c + np.pi], axis=-1)
+        near = [
+            before + np.remainder(triple - before + np.pi, 2 * np.pi) - np.pi
+            for triple in (one, other)
+        ]
+        far = [np.abs(triple - before).sum(-1, keepdims=True) for triple in near]
+        # The first frame keeps the usual range, however far from zero.
+        use_one = far[0] <= far[1] if t else np.ones_like(far[0], dtype=bool)
+        before = angles[t] = np.where(use_one, near[0], near[1])
+    return angles
+
+
+def axis_angle(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 3"]:
+    """Rotation vectors: the axis times the angle in [0, pi], radians.
+
+    By way of the unit quaternion, whose largest entry is never small (Shepperd 1978).
+    """
+    r = rotation
+    trace = np.trace(r, axis1=-2, axis2=-1)
+    diagonal = np.diagonal(r, axis1=-2, axis2=-1)
+    # Row m: the quaternion (w, x, y, z) times four times its entry m, from sums and differences.
+    skew = np.stack(
+        [r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]],
+        axis=-1,
+    )
+    rows = np.zeros((*trace.shape, 4, 4))
+    rows[..., 0, 0] = 1.0 + trace
+    rows[..., 0, 1:] = rows[..., 1:, 0] = skew
+    rows[..., 1:, 1:] = r + np.swapaxes(r, -1, -2)
+    for m in range(3):
+        rows[..., 1 + m, 1 + m] = 1.0 + 2.0 * diagonal[..., m] - trace
+    largest = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), axis=-1)
+    quaternion = np.take_along_axis(rows, largest[..., None, None], axis=-2)[..., 0, :]
+    quaternion = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    quaternion = np.where(quaternion[..., :1] < 0, -quaternion, quaternion)
+    sine = np.linalg.norm(quaternion[..., 1:], axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, quaternion[..., :1])
+    ratio = np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0)
+    return ratio * quaternion[..., 1:]

@@ -1,0 +1,255 @@
+"""Which modes and frames of a track go into a file, and in which frame of reference.
+
+A mode of the track is its rank in every frame, the best first; or, followed, the ancestors of the
+mode of that rank in the last frame. Where a frame has fewer modes, the file's format decides what
+stands there: nothing where that can be said, else the pose of the frame before.
+
+The world of a track is that of its camera file, whatever its up axis. Formats of animation and
+biomechanics want Y up: the world is then turned by quarter turns, so that the body's mean upward
+direction, or the axis that the caller names, becomes Y.
+
+Call `select`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from torchcss.errors import ConfigurationError
+from torchcss.io.tracks import Track
+
+DEFAULT_RATE = 25.0
+"""Frames per second where a single frame, or equal times, do not tell."""
+
+UP_AXES = ("x", "y", "z", "-x", "-y", "-z")
+
+_TO_Y_UP: dict[str, tuple[tuple[int, int, int], ...]] = {
+    # Z up: the cyclic exchange, file's (X, Y, Z) = world's (y, z, x), as Pose2Sim writes TRC files.
+    "y": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    "z": ((0, 1, 0), (0, 0, 1), (1, 0, 0)),
+    "x": ((0, 0, 1), (1, 0, 0), (0, 1, 0)),
+    "-y": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
+    "-z": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
+    "-x": ((0, 1, 0), (-1, 0, 0), (0, 0, 1)),
+}
+
+
+class Selection(NamedTuple):
+    """The chosen modes m of the chosen frames t, in the file's frame of reference.
+
+    Attributes:
+        frames: Index in the video.
+        times: Seconds since the video's first frame.
+        rate: Frames per second.
+        labels: What each mode is called in file names.
+        rank: Rank of the mode in the frame; -1 where the frame has no such mode.
+        log_weight: `-inf` where absent.
+        cost: Nats, `inf` where absent.
+        parent: Rank in the track's frame before, -1 for none.
+        state_names: Names of the parameters.
+        state: Means; of the nearest frame (before, else after) where absent.
+        covariance: Covariances, zero where absent.
+        joint_names: Names of the joints.
+        joints: Joint centres, metres, NaN where absent.
+        base: Base transforms that the states stand on.
+        turn: The file's frame from the world's.
+        upright: Orientation, in the file's frame, of a body that stands facing somewhere.
+        report: What was decided, one line each.
+    """
+
+    frames: Int[np.ndarray, " t"]
+    times: Float[np.ndarray, " t"]
+    rate: float
+    labels: tuple[str, ...]
+    rank: Int[np.ndarray, "t m"]
+    log_weight: Float[np.ndarray, "t m"]
+    cost: Float[np.ndarray, "t m"]
+    parent: Int[np.ndarray, "t m"]
+    state_names: tuple[str, ...]
+    state: Float[np.ndarray, "t m n"]
+    covariance: Float[np.ndarray, "t m n n"]
+    joint_names: tuple[str, ...]
+    joints: Float[np.ndarray, "t m j 3"]
+    base: Float[np.ndarray, "t m 4 4"]
+    turn: Float[np.ndarray, "3 3"]
+    upright: Float[np.ndarray, "3 3"]
+    report: tuple[str, ...]
+
+    @property
+    def present(self) -> np.ndarray:
+        """Where the frame has the mode, `[t m]`."""
+        return self.rank >= 0
+
+
+def select(
+    track: Track,
+    *,
+    mode: str | int = "best",
+    follow: bool = False,
+    start: int | None = None,
+    stop: int | None = None,
+    stride: int = 1,
+    y_up: bool = False,
+    world_up: str = "auto",
+) -> Selection:
+    """Choose modes and frames, and turn them into the file's frame of reference.
+
+    Args:
+        track: The track.
+        mode: "best", a rank from 0, or "all".
+        follow: Take the ancestors of the modes of the last frame instead of ranks.
+        start: First frame, counted as in the video.
+        stop: Frame before which to end.
+        stride: Take every so many of the track's frames.
+        y_up: Turn the world so that Y is up.
+        world_up: Which axis of the world is up, one of `UP_AXES`, or "auto": the one nearest to
+            the body's mean upward direction.
+
+    Raises:
+        ConfigurationError: If an option makes no sense, or no frame or mode is left.
+    """
+    if world_up != "auto" and world_up not in UP_AXES:
+        raise ConfigurationError(f"world_up: expected auto or {', '.join(UP_AXES)}, got {world_up}")
+    if stride < 1:
+        raise ConfigurationError(f"stride: expected at least 1, got {stride}")
+    first, last = track.frames.min(initial=0), track.frames.max(initial=0)
+    inside = np.flatnonzero(
+        (track.frames >= (first if start is None else start))
+        & (track.frames < (last + 1 if stop is None else stop))
+    )
+    if not inside.size:
+        raise ConfigurationError(
+            f"no frames to export: start {start} and stop {stop}, "
+            + (f"the track has the frames {first} to {last}" if track.frames.size else "no frames")
+        )
+    report: list[str] = []
+    kept = inside[::stride]
+    wanted = _wanted_ranks(track, mode, int(track.num_modes[inside].max(initial=0)))
+    ranks = (
+        _followed(track, wanted, inside)[::stride]
+        if follow
+        else np.where(wanted < track.num_modes[kept, None], wanted, -1)
+    )
+    seen = (ranks >= 0).any(axis=0)
+    if not seen.all():
+        raise ConfigurationError(
+            f"mode {wanted[np.argmin(seen)]}: no chosen frame has it; the track has up to "
+            f"{track.num_modes[kept].max(initial=0)} modes, counted from 0"
+        )
+    labels = ("",) if mode == "best" else tuple(f"mode{rank}" for rank in wanted)
+    for label, column in zip(labels, ranks.T, strict=True):
+        missing = int((column < 0).sum())
+        if missing:
+            report.append(f"{label or 'best mode'}: absent in {missing} of {len(kept)} frames")
+    turn, upright = _frame_of_file(track, kept, y_up, world_up, report)
+    rate = _rate(track.times[kept], report)
+
+    present = ranks >= 0
+    row = np.arange(len(kept))[:, None].repeat(len(wanted), axis=1)
+    # Where each pose is from: its own frame, or the nearest that has the mode.
+    source = _nearest_present(present)
+    held = (kept[source], ranks[source, np.arange(len(wanted))])
+    own = (kept[row], np.where(present, ranks, 0))
+    change = np.eye(4)
+    change[:3, :3] = turn
+    joints = np.where(present[..., None, None], track.joints_world[own], np.nan)
+    return Selection(
+        frames=track.frames[kept],
+        times=track.times[kept],
+        rate=rate,
+        labels=labels,
+        rank=ranks,
+        log_weight=np.where(present, track.log_weight[own], -np.inf),
+        cost=np.where(present, track.cost[own], np.inf),
+        parent=np.where(present, track.parent[own], -1),
+        state_names=track.state_names,
+        state=track.state[held],
+        covariance=np.where(present[..., None, None], track.covariance[own], 0.0),
+        joint_names=track.joint_names,
+        joints=joints @ turn.T,
+        base=change @ track.base_transform[held[0]],
+        turn=turn,
+        upright=upright,
+        report=tuple(report),
+    )
+
+
+def _wanted_ranks(track: Track, mode: str | int, available: int) -> np.ndarray:
+    if mode == "all":
+        return np.arange(available)
+    if mode == "best":
+        return np.zeros(1, dtype=np.int64)
+    if isinstance(mode, bool) or not isinstance(mode, (int, np.integer)) or mode < 0:
+        raise ConfigurationError(f"mode: expected best, all or a number from 0, got {mode!r}")
+    return np.array([mode])
+
+
+def _followed(track: Track, wanted: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """Ranks of the ancestors of the wanted modes of the last of the frames, `[t m]`."""
+    ranks = np.full((len(inside), len(wanted)), -1)
+    current = np.where(wanted < track.num_modes[inside[-1]], wanted, -1)
+    for row in range(len(inside) - 1, -1, -1):
+        ranks[row] = current
+        current = np.where(current >= 0, track.parent[inside[row], current], -1)
+    return ranks
+
+
+def _nearest_present(present: np.ndarray) -> np.ndarray:
+    """Per frame and mode: the last frame up to it that has the mode, else the first that has."""
+    rows = np.where(present, np.arange(len(present))[:, None], -1)
+    before = np.maximum.accumulate(rows, axis=0)
+    return np.where(before >= 0, before, np.argmax(present, axis=0))
+
+
+def _frame_of_file(
+    track: Track, kept: np.ndarray, y_up: bool, world_up: str, report: list[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The file's frame from the world's, and a standing body's orientation in it."""
+    axis = world_up
+    if world_up == "auto":
+        up = _mean_up(track, kept)
+        values = {name: float(np.array(_TO_Y_UP[name][1]) @ up) for name in UP_AXES}
+        axis = max(values, key=lambda name: values[name])
+        angle = np.degrees(np.arccos(min(values[axis], 1.0)))
+        if y_up:
+            report.append(
+                f"the world's {axis} axis is taken for up (the body's mean direction is "
+                f"{angle:.0f} degrees from it); set the axis with world_up"
+            )
+    matrix = np.array(_TO_Y_UP[axis], dtype=np.float64)
+    if y_up:
+        return matrix, np.eye(3)
+    return np.eye(3), matrix.T
+
+
+def _mean_up(track: Track, kept: np.ndarray) -> np.ndarray:
+    """Unit vector, in the world, from the hips to the head, or up the base where there are none."""
+    names = track.joint_names
+    if {"HumanoidRoot", "skull_tip"} <= set(names):
+        best = track.joints_world[kept, 0]
+        up = (best[:, names.index("skull_tip")] - best[:, names.index("HumanoidRoot")]).mean(0)
+    else:
+        up = track.base_transform[kept, :3, 1].mean(0)
+    length = float(np.linalg.norm(up))
+    return up / length if length > 0 else np.array([0.0, 1.0, 0.0])
+
+
+def _rate(times: np.ndarray, report: list[str]) -> float:
+    """Frames per second, made whole where it is so but for the rounding of the times."""
+    steps = np.diff(times)
+    if not steps.size or not (steps > 0).all():
+        report.append(f"a frame rate of {DEFAULT_RATE:g} is written: the track does not tell one")
+        return DEFAULT_RATE
+    step = float(np.median(steps))
+    if (np.abs(steps - step) > 0.01 * step).any():
+        report.append(
+            f"the frames are not evenly spaced in time ({1000 * steps.min():.1f} to "
+            f"{1000 * steps.max():.1f} ms); their median is written"
+        )
+    else:
+        step = float(times[-1] - times[0]) / len(steps)
+    rate = 1.0 / step
+    return float(round(rate)) if abs(rate - round(rate)) < 1e-6 * rate else rate

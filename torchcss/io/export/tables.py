@@ -1,0 +1,108 @@
+"""The joints of all chosen modes in one table, with their covariances: CSV and NPZ.
+
+The CSV is tidy, a row per frame, mode and joint:
+
+| column | meaning |
+|---|---|
+| `frame`, `time` | index in the video, seconds |
+| `mode`, `parent` | rank in the frame, 0 the best; rank in the track's frame before, -1 for none |
+| `weight`, `cost` | share of the mixture, nats |
+| `joint` | name |
+| `x`, `y`, `z` | metres |
+| `cov_xx`, `cov_xy`, `cov_xz`, `cov_yy`, `cov_yz`, `cov_zz` | square metres |
+
+The NPZ has the same as arrays (t frames, m modes, j joints; NaN where a frame lacks a mode):
+`frames`, `times` [t]; `mode`, `parent`, `log_weight`, `cost` [t m]; `joint_names` [j]; `joints`
+[t m j 3]; `joint_covariance` [t m j 3 3]; `frame_from_world` [3 3]; `frame_rate`.
+
+Call `joint_covariances`, then `csv_text` or `npz_arrays`.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from torchcss.body.model import BodyModel
+from torchcss.body.uncertainty import joint_covariance
+from torchcss.io.export.selection import Selection
+from torchcss.io.track_body import pose_track
+
+_CHUNK = 1024  # poses at a time: 30 MB of Jacobians
+_UPPER = np.triu_indices(3)
+
+
+def joint_covariances(selection: Selection, body: BodyModel) -> Float[np.ndarray, "t m j 3 3"]:
+    """Covariances of all joint centres, square metres, NaN where a frame lacks the mode.
+
+    Args:
+        selection: The modes.
+        body: The body, on the origin.
+    """
+    found = np.full((*selection.joints.shape, 3), np.nan)
+    rows, columns = np.nonzero(selection.present)
+    for start in range(0, len(rows), _CHUNK):
+        chosen = rows[start : start + _CHUNK], columns[start : start + _CHUNK]
+        state, base, covariance = (
+            torch.from_numpy(array[chosen])
+            for array in (selection.state, selection.base, selection.covariance)
+        )
+        pose = pose_track(body, state, base)
+        found[chosen] = joint_covariance(body, pose, covariance).numpy()
+    return found
+
+
+def csv_text(selection: Selection, covariance: Float[np.ndarray, "t m j 3 3"]) -> str:
+    """The table as text.
+
+    Args:
+        selection: The modes.
+        covariance: From `joint_covariances`.
+    """
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    names = ["cov_" + "xyz"[i] + "xyz"[j] for i, j in zip(*_UPPER, strict=True)]
+    writer.writerow(
+        ["frame", "time", "mode", "parent", "weight", "cost", "joint", "x", "y", "z", *names]
+    )
+    numbers = np.concatenate([selection.joints, covariance[..., _UPPER[0], _UPPER[1]]], axis=-1)
+    for t, m in np.argwhere(selection.present):
+        head = [
+            int(selection.frames[t]),
+            float(selection.times[t]),
+            int(selection.rank[t, m]),
+            int(selection.parent[t, m]),
+            float(np.exp(selection.log_weight[t, m])),
+            float(selection.cost[t, m]),
+        ]
+        for name, row in zip(selection.joint_names, numbers[t, m].tolist(), strict=True):
+            writer.writerow([*head, name, *row])
+    return out.getvalue()
+
+
+def npz_arrays(
+    selection: Selection, covariance: Float[np.ndarray, "t m j 3 3"]
+) -> dict[str, np.ndarray]:
+    """The table as arrays.
+
+    Args:
+        selection: The modes.
+        covariance: From `joint_covariances`.
+    """
+    return {
+        "frames": selection.frames,
+        "times": selection.times,
+        "frame_rate": np.array(selection.rate),
+        "mode": selection.rank,
+        "parent": selection.parent,
+        "log_weight": selection.log_weight,
+        "cost": selection.cost,
+        "joint_names": np.array(selection.joint_names, dtype=np.str_),
+        "joints": selection.joints,
+        "joint_covariance": covariance,
+        "frame_from_world": selection.turn,
+    }
