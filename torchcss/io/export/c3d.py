@@ -1,7 +1,7 @@
 """C3D: the joints as points, for the programs of gait laboratories.
 
 Written by ezc3d, an optional package. Points are in metres; a point that a frame lacks is marked as
-invalid (residual -1), as the format wants it. The description of the file says where it is from.
+invalid (residual -1), as the format wants it.
 
 Call `write_c3d`.
 """

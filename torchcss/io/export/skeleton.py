@@ -215,5 +215,5 @@ def t_pose(skeleton: Skeleton) -> Float[np.ndarray, "nodes 3 3"]:
         above = {skeleton.names[i] for i in skeleton.above(index)}
         for shoulder, angle in (("l_shoulder", np.pi / 2), ("r_shoulder", -np.pi / 2)):
             if shoulder in above:
-                turns[index] = about(2, angle)
+                turns[index] = about(2, np.array(angle))
     return turns
