@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from matplotlib.backend_bases import KeyEvent, MouseButton, MouseEvent
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_webagg_core import FigureCanvasWebAggCore, FigureManagerWebAgg
 from matplotlib.figure import Figure
 
 from torchcss.errors import ConfigurationError, KeypointError
@@ -67,6 +68,37 @@ def test_marks_skips_and_takes_back(clicker: JointClicker):
     push(clicker, 2)
     assert clicker.finished
     assert clicker.next_joint is None
+
+
+def test_a_notebooks_widget_answers_to_what_the_browser_sends():
+    figure = Figure(figsize=(11, 7))
+    canvas = FigureCanvasWebAggCore(figure)
+    clicker = JointClicker(PICTURE, figure=figure)
+    FigureManagerWebAgg(canvas, 1)
+    canvas.draw()
+
+    def send(kind: str, **what) -> None:
+        canvas.handle_event({"type": kind, "modifiers": [], "guiEvent": {}, "buttons": 1, **what})
+
+    def click(axes: int, place: tuple[float, float], button: int = 0) -> None:
+        transform = figure.axes[axes].transAxes if axes else figure.axes[0].transData
+        x, y = transform.transform(place)
+        for kind in ("button_press", "button_release"):
+            send(kind, x=x, y=figure.bbox.height - y, button=button)
+
+    click(0, (50, 20))
+    click(0, (70, 30))
+    click(0, (0, 0), button=2)
+    send("key_press", key="ks")
+    assert clicker.places[2:] == [None, None]
+    send("key_press", key="ku")
+    click(2, (0.5, 0.5))
+    click(2, (0.5, 0.5))
+    click(3, (0.5, 0.5))
+    np.testing.assert_allclose(clicker.joints.keypoints.numpy(), [[50, 20]], atol=1e-6)
+    assert clicker.next_joint == CLICKED[2]
+    send("key_press", key="kEnter")
+    assert clicker.finished
 
 
 def test_clicks_beside_the_picture_count_for_nothing(clicker: JointClicker):

@@ -4,9 +4,9 @@ Beside the picture stands a figure of the body with the joint that is next. Left
 right click or `s` skips it, `u` takes the last one back, Enter ends. Buttons do the same. Left and
 right are the person's own.
 
-`click_joints(image)` opens a window and waits. In a notebook with `%matplotlib widget`, make a
-`JointClicker(image)`, click, and take `clicker.joints` in a later cell. `write_clicked` saves them
-in the format that `torchcss.io.keypoints` calls clicked.
+`click_joints(image)` opens a window and waits. In a notebook with `%matplotlib widget` (package
+ipympl), make a `JointClicker(image)`, click, and take `clicker.joints` in a later cell.
+`write_clicked` saves them in the format that `torchcss.io.keypoints` calls clicked.
 """
 
 from __future__ import annotations
