@@ -53,9 +53,9 @@ camera or turned sideways. The other parameters are drawn from their sticky prio
 _FACE = ("nose", "l_eye", "r_eye", "l_ear", "r_ear")
 _FOOT = ("l_heel", "r_heel", "l_midtarsal", "r_midtarsal")
 
-CHUNK = 512
+CHUNK = 1024
 """States evaluated at a time: small enough for the caches, large enough to hide call overhead."""
-_VECTOR = 16
+_VECTOR = 32
 """A batch is filled up to a multiple of this, so that an item's bits do not depend on its place."""
 
 
@@ -83,6 +83,7 @@ class ReprojectionCost:
     pixel_noise: float
     potential: RobustPotential = field(default_factory=Quadratic)
     stabiliser: Stabiliser | None = field(default_factory=Stabiliser)
+    focal: tuple[float, float] = field(init=False)
 
     def __post_init__(self) -> None:
         if bool(self.camera.distortion.any()):
@@ -90,6 +91,8 @@ class ReprojectionCost:
                 f"{self.camera.name}: expected a camera without lens distortion, got "
                 f"{self.camera.distortion.tolist()}; undistort the observations first"
             )
+        focal_u, focal_v = (self.camera.K.diagonal()[:2] / self.pixel_noise).tolist()
+        object.__setattr__(self, "focal", (focal_u, focal_v))
 
     def take(self, items: Int[Tensor, " b"]) -> ReprojectionCost:
         """The cost restricted to some samples: the same for all of them."""
@@ -160,7 +163,7 @@ class ReprojectionCost:
         valid = z > camera.near
         w = torch.where(valid, torch.where(valid, z, 1.0).reciprocal(), 0.0)
         a, b = x * w, y * w
-        focal_u, focal_v = (camera.K.diagonal()[:2] / noise).tolist()
+        focal_u, focal_v = self.focal
         shift = (camera.K[:2, 2].to(self.target) - self.target) / noise
         width, height = (side / noise for side in camera.image_size_wh)
         u = torch.where(valid, focal_u * a + shift[:, :1], width)
@@ -181,7 +184,7 @@ class ReprojectionCost:
         rho, first, second = self.potential(u * u + v * v)
         bend = 2.0 * second if share is None else (2.0 * share) * second
         # Derivatives in the normalised coordinates (a, b), then in the point: da = w (1, 0, -a).
-        focal_u, focal_v = (self.camera.K.diagonal()[:2] / self.pixel_noise).tolist()
+        focal_u, focal_v = self.focal
         g_a, g_b = focal_u * first * u, focal_v * first * v
         h_aa = focal_u**2 * (first + bend * u * u)
         h_ab = (focal_u * focal_v) * (bend * u * v)

@@ -254,6 +254,35 @@ def test_jumping_costs_stop(height, generator):
     assert float((modes.cost - settled).median()) < 2 * height
 
 
+def test_a_concave_potential_does_not_shorten_the_steps(generator):
+    """The Gauss-Newton model promises too little there; that is no reason to distrust it."""
+
+    class Ramp:
+        """|x|, smoothed: its quadratic upper bound promises half of the decrease."""
+
+        def value(self, x):
+            return (1e-4 + x.square()).sqrt().sum(-1)
+
+        def local_model(self, x):
+            slope = x / (1e-4 + x.square()).sqrt()
+            curvature = (1e-4 + x.square()).rsqrt()
+            return LocalModel(self.value(x), slope, torch.diag_embed(curvature))
+
+    x0 = 50 + randn(10, 3, generator=generator)
+    modes = TrustRegionNewton(initial_radius=0.1).minimise(Ramp(), x0, problems.unbounded(3))
+    assert float(modes.mean.abs().max()) < 0.01
+    assert float(modes.num_steps.double().mean()) < 25
+
+
+def test_a_coarse_type_needs_a_cost_that_has_it():
+    newton = TrustRegionNewton(coarse_dtype=torch.float32)
+    x0 = torch.zeros(2, 3).double()
+    with pytest.raises(ConfigurationError, match=r"method to\(dtype\), got Rosenbrock"):
+        newton.minimise(problems.Rosenbrock(), x0, problems.unbounded(3))
+    single = newton.minimise(problems.Rosenbrock(), x0.float(), problems.unbounded(3))
+    assert single.mean.dtype == torch.float32, "nothing coarser to convert to"
+
+
 def test_step_limit_and_one_evaluation_a_step(generator):
     calls = []
 
