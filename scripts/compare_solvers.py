@@ -5,8 +5,7 @@
 One reprojection problem (`torchcss.reprojection`: 34 parameters, 22 joints in one image, sticky
 priors, joint limits) is descended from random starts by
 
-* `torchcss`: `TrustRegionNewton` on the closed-form cost, in float32 until the last steps, and
-  `torchcss float64`, the same in float64 throughout;
+* `torchcss`: `TrustRegionNewton` on the closed-form cost;
 * `scipy trf`: `scipy.optimize.least_squares` with bounds and an analytic Jacobian;
 * `scipy L-BFGS-B`, which gets value and gradient;
 * `jax`: Levenberg-Marquardt, jitted and vmapped (`peers/jax_lm.py`), and `jax compacted`, the same
@@ -54,11 +53,9 @@ from torchcss.linalg import covariance_factor
 from torchcss.reprojection import ReprojectionProblem, reprojection_problem
 from torchcss.robust import Lorentzian, Quadratic
 
-OURS, DOUBLE = "torchcss", "torchcss float64"
-TRF, LBFGS, JAX, COMPACTED = "scipy trf", "scipy L-BFGS-B", "jax", "jax compacted"
+OURS, TRF, LBFGS, JAX, COMPACTED = "torchcss", "scipy trf", "scipy L-BFGS-B", "jax", "jax compacted"
 LIBRARY = {
     OURS: "torch",
-    DOUBLE: "torch",
     TRF: "scipy",
     LBFGS: "scipy",
     JAX: "jax",
@@ -126,11 +123,8 @@ _SOLVERS: dict[tuple[Config, str], Any] = {}  # Kept by every process, because J
 
 def make_solver(config: Config, problem: ReprojectionProblem, name: str) -> Any:
     """A function from starts to states and iterations."""
-    if name in (OURS, DOUBLE):
-        coarse = torch.float32 if name == OURS else None
-        newton = TrustRegionNewton(
-            max_steps=200, tolerance=1e-12, initial_radius=config.radius, coarse_dtype=coarse
-        )
+    if name == OURS:
+        newton = TrustRegionNewton(max_steps=200, tolerance=1e-12, initial_radius=config.radius)
 
         def ours(x0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             modes = newton.minimise(problem.cost, torch.from_numpy(x0), problem.bounds)
@@ -232,20 +226,20 @@ def main(config: Config) -> dict[str, Any]:
 def print_table(report: dict[str, Any]) -> None:
     """The report for people."""
     print(
-        f"{'':>16} {'solves/s':>9} {'per core':>9} {'ours is':>8} {'steps':>6} {'converged':>9}",
+        f"{'':>15} {'solves/s':>9} {'per core':>9} {'ours is':>8} {'steps':>6} {'converged':>9}",
         end="",
     )
     print("".join(f"{f'cost {100 * q:.0f} %':>12}" for q in QUANTILES), " ours lower, higher")
     for name, row in report["solvers"].items():
         ratio = np.median(report["our_rate_over_theirs"][f"{name}, core"])
         print(
-            f"{name:>16} {row['solves_per_second']:9.1f} {row['solves_per_core_second']:9.1f} "
+            f"{name:>15} {row['solves_per_second']:9.1f} {row['solves_per_core_second']:9.1f} "
             f"{ratio:7.1f}x {row['steps_mean']:6.1f} {row['converged']:9.3f}"
             + "".join(f"{cost:12.2f}" for cost in row["cost_quantiles"])
             + f" {row['ours_lower']:11.2f} {row['ours_higher']:6.2f}"
         )
         print(
-            f"{'ours there':>59}" + "".join(f"{c:12.2f}" for c in row["our_cost_quantiles_there"])
+            f"{'ours there':>58}" + "".join(f"{c:12.2f}" for c in row["our_cost_quantiles_there"])
         )
 
 

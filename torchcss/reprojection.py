@@ -74,6 +74,7 @@ class ReprojectionCost:
         pixel_noise: Standard deviation of each coordinate, pixels.
         potential: `rho` of the squared error in units of the noise.
         stabiliser: The sticky prior, or None.
+        focal: Focal lengths in units of the noise, plain numbers.
     """
 
     body: BodyModel

@@ -274,15 +274,6 @@ def test_a_concave_potential_does_not_shorten_the_steps(generator):
     assert float(modes.num_steps.double().mean()) < 25
 
 
-def test_a_coarse_type_needs_a_cost_that_has_it():
-    newton = TrustRegionNewton(coarse_dtype=torch.float32)
-    x0 = torch.zeros(2, 3).double()
-    with pytest.raises(ConfigurationError, match=r"method to\(dtype\), got Rosenbrock"):
-        newton.minimise(problems.Rosenbrock(), x0, problems.unbounded(3))
-    single = newton.minimise(problems.Rosenbrock(), x0.float(), problems.unbounded(3))
-    assert single.mean.dtype == torch.float32, "nothing coarser to convert to"
-
-
 def test_step_limit_and_one_evaluation_a_step(generator):
     calls = []
 

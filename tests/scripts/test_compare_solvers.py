@@ -63,7 +63,7 @@ def test_absent_libraries_are_left_out(script: ModuleType, monkeypatch: pytest.M
 
     monkeypatch.setattr(script, "measure", measure)
     report = script.main(small(script))
-    assert asked == list(report["solvers"]) == [script.OURS, script.DOUBLE]
+    assert asked == list(report["solvers"]) == [script.OURS]
 
 
 @pytest.mark.parametrize("potential", ["quadratic", "lorentzian"])

@@ -22,8 +22,6 @@ once, at the candidate: its value decides on acceptance, its derivatives are kep
 No item of a batch influences another: radius, damping, acceptance and `Status` are per item, and
 `minimise` drops items as they finish (and restricts the cost by `cost.take(items)` if it has that).
 
-With `coarse_dtype` all but the last steps are taken on the cost in a cheaper type.
-
 An item stops as
 
 * `CONVERGED` when the undamped Newton step, on a positive definite model, promises less than
@@ -39,7 +37,7 @@ Call `TrustRegionNewton().minimise(cost, x0, bounds)`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -110,8 +108,6 @@ _POOL_SIZE = 1024
 """Items worked on at a time on a CPU."""
 _FACTOR_CHUNK = 128
 """Matrices factored at a time: they and their factors stay in the caches."""
-_COARSE_TOLERANCE = 1e-4
-"""Expected decrease, nats, at which the coarse type has done its part."""
 _PLEASANT = 0.25
 """Weight of the prediction's error where the cost falls by more than was predicted."""
 _GOOD_ERROR = 0.25
@@ -135,9 +131,6 @@ class TrustRegionNewton:
         factorisations: Cholesky factorisations that may be spent on the damping of one step; two
             to four are taken as a rule.
         pool_size: Items worked on at a time; by default 1024 on a CPU and all on other devices.
-        coarse_dtype: A cheaper floating type, `torch.float32` say, in which `minimise` evaluates
-            the cost in all but the last steps. The cost must have a method `to(dtype)`. The answer
-            has the type, the accuracy and the guarantees of `x0`'s own type.
     """
 
     max_steps: int = 100
@@ -145,7 +138,6 @@ class TrustRegionNewton:
     initial_radius: float = 1.0
     factorisations: int = 8
     pool_size: int | None = None
-    coarse_dtype: torch.dtype | None = None
 
     def __post_init__(self) -> None:
         for name in ("max_steps", "tolerance", "initial_radius", "factorisations", "pool_size"):
@@ -178,26 +170,20 @@ class TrustRegionNewton:
         state, _ = self.step(cost, self._start(x0), bounds, scale=scale)
         return state
 
-    def _start(
-        self, x0: Float[Tensor, "b n"], steps: Int[Tensor, " b"] | None = None
-    ) -> TrustRegionState:
-        """Items that wait for their first evaluation.
-
-        It is not counted as a step, unless `steps` have been taken to get there; then the model is
-        exact at once, because the end is near.
-        """
+    def _start(self, x0: Float[Tensor, "b n"]) -> TrustRegionState:
+        """Items that wait for their first evaluation, which is not counted as a step."""
         b, n = x0.shape
         zero = x0.new_zeros(b)
         return TrustRegionState(
             x=x0.detach().clone(),
             model=LocalModel(zero + torch.inf, x0.new_zeros(b, n), x0.new_zeros(b, n, n)),
-            share=zero if steps is None else zero + 1,
+            share=zero,
             radius=zero + self.initial_radius,
             damping=zero,
             step=x0.new_zeros(b, n),
             predicted=zero,
             status=torch.full_like(zero, int(Status.RUNNING), dtype=torch.long),
-            num_steps=torch.full_like(zero, -1, dtype=torch.long) if steps is None else steps,
+            num_steps=torch.full_like(zero, -1, dtype=torch.long),
         )
 
     def step(
@@ -221,7 +207,6 @@ class TrustRegionNewton:
             model = cost.local_model(candidate)
         else:
             share = _share_of_second_order(value, state.predicted)
-            share = torch.where(value.isinf(), state.share, share)
             model = blended(candidate, share)
         # Contiguous, because sums over other layouts round differently in other batches.
         model = LocalModel(*(part.detach().contiguous() for part in model))
@@ -250,8 +235,7 @@ class TrustRegionNewton:
             status=torch.where(unusable, int(Status.NON_FINITE), state.status),
             num_steps=state.num_steps + running,
         )
-        dtype = cost.dtype if isinstance(cost, _Coarse) else state.x.dtype
-        state = self._plan(state, bounds, weight, accepted, dtype)
+        state = self._plan(state, bounds, weight, accepted)
         spent = (state.status == Status.RUNNING) & (state.num_steps >= self.max_steps)
         status = torch.where(spent, int(Status.STEP_LIMIT), state.status)
         return state._replace(status=status), TrustRegionInfo(accepted, decrease)
@@ -297,10 +281,31 @@ class TrustRegionNewton:
         if prior_variance is None:
             prior_variance = default_prior_variance(bounds)
 
-        starts, steps = x0.reshape(batch.numel(), n), None
-        if self.coarse_dtype is not None and self.coarse_dtype != x0.dtype:
-            starts, steps = self._approach(cost, starts, bounds, scale)
-        result = self._descend(cost, starts, steps, bounds, scale)
+        starts = x0.reshape(batch.numel(), n)
+        result = self._start(starts)
+        size = self.pool_size or (_POOL_SIZE if starts.device.type == "cpu" else len(starts))
+        items = torch.arange(len(starts), device=starts.device)
+        items, queue = items[:size], items[size:]
+        state = self._start(starts[items])
+        restrict = getattr(cost, "take", None)
+        part = cost if restrict is None or not len(queue) else restrict(items)
+        while len(items):
+            state, _ = self.step(part, state, bounds, scale=scale)
+            done = torch.nonzero(state.status != Status.RUNNING)[:, 0]
+            if not len(done):
+                continue
+            _write(result, items[done], _take(state, done))
+            # Waiting items take the places of finished ones; when none waits the pool shrinks.
+            new, queue = queue[: len(done)], queue[len(done) :]
+            places, left = done[: len(new)], done[len(new) :]
+            if len(new):
+                _write(state, places, self._start(starts[new]))
+                items = items.index_copy(0, places, new)
+            if len(left):
+                kept = torch.ones_like(items, dtype=torch.bool).index_fill(0, left, False)
+                kept = torch.nonzero(kept)[:, 0]
+                items, state = items[kept], _take(state, kept)
+            part = cost if restrict is None else restrict(items)
 
         active = _held(result.x, result.model.gradient, bounds)
         sound = result.status != Status.NON_FINITE
@@ -315,72 +320,16 @@ class TrustRegionNewton:
             num_steps=result.num_steps.reshape(batch),
         )
 
-    def _approach(
-        self, cost: CostFunction, starts: Float[Tensor, "b n"], bounds: Bounds, scale: Tensor | None
-    ) -> tuple[Float[Tensor, "b n"], Int[Tensor, " b"]]:
-        """Descend on the cost in its coarse type; states no higher than the starts, steps taken."""
-        assert self.coarse_dtype is not None
-        convert = getattr(cost, "to", None)
-        if convert is None:
-            raise ConfigurationError(
-                f"TrustRegionNewton.coarse_dtype: expected a cost with a method to(dtype), got "
-                f"{type(cost).__name__}; leave coarse_dtype out"
-            )
-        rough = replace(self, tolerance=max(self.tolerance, _COARSE_TOLERANCE))
-        coarse = _Coarse(convert(self.coarse_dtype), self.coarse_dtype)
-        end = rough._descend(coarse, starts, None, bounds, scale)
-        # Rounding may lift a state that had hardly come down, or hide that a cost is finite.
-        lower = cost.value(end.x) <= cost.value(bounds.project(starts))
-        steps = end.num_steps.clamp(min=0, max=self.max_steps - 1)
-        return torch.where(lower[:, None], end.x, starts), steps
-
-    def _descend(
-        self,
-        cost: CostFunction,
-        starts: Float[Tensor, "b n"],
-        steps: Int[Tensor, " b"] | None,
-        bounds: Bounds,
-        scale: Tensor | None,
-    ) -> TrustRegionState:
-        """Iterate until every item has stopped, a pool of them at a time."""
-        result = self._start(starts, steps)
-        size = self.pool_size or (_POOL_SIZE if starts.device.type == "cpu" else len(starts))
-        items = torch.arange(len(starts), device=starts.device)
-        items, queue = items[:size], items[size:]
-        state = _take(result, items)
-        restrict = getattr(cost, "take", None)
-        part = cost if restrict is None or not len(queue) else restrict(items)
-        while len(items):
-            state, _ = self.step(part, state, bounds, scale=scale)
-            done = torch.nonzero(state.status != Status.RUNNING)[:, 0]
-            if not len(done):
-                continue
-            _write(result, items[done], _take(state, done))
-            # Waiting items take the places of finished ones; when none waits the pool shrinks.
-            new, queue = queue[: len(done)], queue[len(done) :]
-            places, left = done[: len(new)], done[len(new) :]
-            if len(new):
-                _write(state, places, _take(result, new))
-                items = items.index_copy(0, places, new)
-            if len(left):
-                kept = torch.ones_like(items, dtype=torch.bool).index_fill(0, left, False)
-                kept = torch.nonzero(kept)[:, 0]
-                items, state = items[kept], _take(state, kept)
-            part = cost if restrict is None else restrict(items)
-        return result
-
     def _plan(
         self,
         state: TrustRegionState,
         bounds: Bounds,
         weight: Float[Tensor, " n"],
         accepted: Bool[Tensor, " b"],
-        dtype: torch.dtype,
     ) -> TrustRegionState:
         """Find the next step of every running item, and stop those with nothing to gain.
 
-        `accepted` says which items got where they are by their last step, `dtype` in which type the
-        cost is rounded.
+        `accepted` says which items got where they are by their last step.
         """
         x, model = state.x, state.model
         running = state.status == Status.RUNNING
@@ -395,7 +344,7 @@ class TrustRegionNewton:
         predicted = -(step * (problem.gradient + 0.5 * problem.times(step))).sum(-1)
         converged = (predicted < self.tolerance) & (damping <= floor)
         # A short damped step that succeeds is progress along a curved valley, not an end.
-        resolution = 4 * torch.finfo(dtype).eps * model.value.abs()
+        resolution = 4 * torch.finfo(x.dtype).eps * model.value.abs()
         futile = (~accepted & (predicted < _FUTILE * self.tolerance)) | (predicted <= resolution)
         # No item ends on a model that is not exact: it is evaluated once more where it stands.
         ends = running & (converged | futile)
@@ -408,39 +357,6 @@ class TrustRegionNewton:
             predicted=torch.where(again, 0.0, predicted),
             status=torch.where(ends & exact, reason, state.status),
         )
-
-
-class _Coarse:
-    """A cost that is evaluated in a cheaper type, its numbers in the type of the states.
-
-    The steps stay in that type: their small factorisations take no longer in it, and in the cheaper
-    one they would round an item by where it lies in memory.
-    """
-
-    def __init__(self, cost: CostFunction, dtype: torch.dtype) -> None:
-        self.cost, self.dtype = cost, dtype
-        blended = getattr(cost, "blended_model", None)
-        if blended is not None:
-            self.blended_model = lambda x, share: _model_like(
-                x, blended(x.to(dtype), share.to(dtype))
-            )
-
-    def value(self, x: Float[Tensor, "b n"]) -> Float[Tensor, " b"]:
-        """Cost in nats."""
-        return self.cost.value(x.to(self.dtype)).to(x)
-
-    def local_model(self, x: Float[Tensor, "b n"]) -> LocalModel:
-        """Cost, gradient and Hessian."""
-        return _model_like(x, self.cost.local_model(x.to(self.dtype)))
-
-    def take(self, items: Int[Tensor, " m"]) -> _Coarse:
-        """The cost restricted to some items."""
-        restrict = getattr(self.cost, "take", None)
-        return self if restrict is None else _Coarse(restrict(items), self.dtype)
-
-
-def _model_like(x: Tensor, model: LocalModel) -> LocalModel:
-    return LocalModel(*(part.to(x) for part in model))
 
 
 class _Quadratic(NamedTuple):
@@ -732,7 +648,7 @@ def _share_of_second_order(value: Float[Tensor, " b"], predicted: Float[Tensor, 
     """
     promise = predicted / torch.where(value > 0, value, 1.0)
     exact = (_FAST - promise) / (_FAST - _SLOW)
-    return exact.clamp(0, 1)
+    return torch.where(value.isinf(), 0.0, exact.clamp(0, 1))
 
 
 def _held(
