@@ -14,8 +14,8 @@ Each repeat times every way in turn; ratios are taken within a repeat, so that a
 both sides. Memory is the peak of a process of its own. Then come the times of the full cost by
 term, and of the features of a frame with flow. Nothing is asserted.
 
-What the profile says of the full cost: two fifths of the local model is visibility, a fifth each the
-edge search of the contour term and the interpenetration, a tenth the lift; the rest is under a
+What the profile says of the full cost: two fifths of the local model is visibility, a fifth each
+the edge search of the contour term and the interpenetration, a tenth the lift; the rest is under a
 tenth. Within visibility no single function has more than a fifth: finding the contours, the refined
 gaps, the test of spheres and the turn into the parts' frames have about that each. Of what was
 tried last: leaving out lines that nothing depends on, ellipsoids about the parts and points deep

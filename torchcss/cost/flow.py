@@ -184,7 +184,8 @@ class FlowTerm:
     """The robust cost of the interior nodes' displacement from the previous frame.
 
     Attributes:
-        sigma: Scale of the difference between predicted and measured place, pixels.
+        sigma: Scale of the difference between predicted and measured place, pixels. The flow is
+            good to some tenths of a pixel; a wide scale lets a mode lag by as much in every frame.
         nu: Level of the outliers of one node (its unit only: the sum is normalised by N nu).
         fitted_level: Cost of a node without measurement, `nu_bf`, as a share of nu: above the mean
             error per node of a well-fitted model, which is 0.02 to 0.08 on the demo's sequence at
@@ -193,7 +194,7 @@ class FlowTerm:
         potential_kind: The potential rho.
     """
 
-    sigma: float = 1.5
+    sigma: float = 0.5
     nu: float = 1.0
     fitted_level: float = 0.1
     occlusion_factor: float = 1.1
