@@ -187,16 +187,16 @@ class FlowTerm:
         sigma: Scale of the difference between predicted and measured place, pixels. The flow is
             good to some tenths of a pixel; a wide scale lets a mode lag by as much in every frame.
         nu: Level of the outliers of one node (its unit only: the sum is normalised by N nu).
-        fitted_level: Cost of a node without measurement, `nu_bf`, as a share of nu: above the mean
-            error per node of a well-fitted model, which is 0.02 to 0.08 on the demo's sequence at
-            its true states, where the cloth does not slip.
+        fitted_level: Cost of a node without measurement, `nu_bf`, as a share of nu: about the mean
+            error per node of a fitted model, 0.1 to 0.3 on the demo's sequence at its true states
+            and 0.6 to 0.8 on the beam clip.
         occlusion_factor: k of `nu_occ = k nu_bf`, see `ContourTerm`.
         potential_kind: The potential rho.
     """
 
     sigma: float = 0.5
     nu: float = 1.0
-    fitted_level: float = 0.1
+    fitted_level: float = 0.3
     occlusion_factor: float = 1.1
     potential_kind: type = Lorentzian
 
