@@ -68,6 +68,7 @@ def initialise(
     contours: bool = True,
     working_size: int = 640,
     search: Search | None = None,
+    least_joints: int = 1,
     dtype: torch.dtype = torch.float64,
     device: torch.device | str = "cpu",
 ) -> Initialisation:
@@ -90,11 +91,12 @@ def initialise(
         contours: Run the second and third stage on the picture's contours.
         working_size: Longer side of the picture on which contours are searched.
         search: How widely interpretations are looked for.
+        least_joints: Fewest joints of the body that have to be marked.
         dtype: Type of the body.
         device: Where to compute.
 
     Raises:
-        KeypointError: If no joint of the body is marked, or all are at one place.
+        KeypointError: If fewer joints of the body are marked, or all are at one place.
         CameraError: If the camera is of another image size, or there is neither picture nor camera.
         BodyError: If the stature is no person's.
     """
@@ -117,8 +119,8 @@ def initialise(
     joints = JointTerm(sigma=sigma or default_sigma(keypoints[confidence > 0]))
     first = initialise_from_joints(
         body, camera, keypoints, confidence, names, generator=generator, joints=joints,
-        search=search, num_modes=num_modes, stature=stature, least_joints=1, dtype=dtype,
-        device=device,
+        search=search, num_modes=num_modes, stature=stature, least_joints=least_joints,
+        dtype=dtype, device=device,
     )  # fmt: skip
     notes += swapped_sides(
         first.body, first.mixture.mean[0], camera, keypoints, confidence, names, joints, generator

@@ -37,16 +37,19 @@ from torchcss.cost.temporal import MixturePrior, TemporalPrior
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.cost.visibility import ContourPredictor, visible_nodes
 from torchcss.errors import ConfigurationError, KeypointError, VideoError
+from torchcss.first_pose import LEAST_JOINTS
+from torchcss.hypotheses import Initialisation
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.proposals import unbounded
 from torchcss.inference.tracker import SequenceTracker, Tracker, TrackerInfo, TrackerState
-from torchcss.initialise import Initialisation, default_sigma, initialise_from_joints
+from torchcss.initialise import initialise
 from torchcss.io.cameras import check_image_size, read_camera
 from torchcss.io.fitted_body import read_fitted_body
 from torchcss.io.keypoints import Keypoints, read_keypoints
 from torchcss.io.overlay import ProjectedPart, draw_overlay
 from torchcss.io.tracks import TrackWriter, prepare_output_folder, write_summary
 from torchcss.io.video import Frame, VideoReader, VideoWriter
+from torchcss.marks import default_sigma
 from torchcss.presets import PRESETS, make_tracker
 from torchcss.robust import Quadratic
 from torchcss.stopwatch import Stopwatch
@@ -656,14 +659,18 @@ def track_video(
     if init is not None:
         first = _first_pose_from_file(init, eye, settings)
     else:
-        first = initialise_from_joints(
-            settings.body,
+        (frame,) = VideoReader(video, start=start, stop=start + 1)
+        first = initialise(
+            frame.image,
+            torch.cat([marks.keypoints[start], marks.confidence[start, :, None]], dim=-1),
             eye,
-            marks.keypoints[start],
-            marks.confidence[start],
-            marks.joint_names,
+            settings.body,
+            joint_names=marks.joint_names,
             generator=generator,
-            joints=JointTerm(sigma=sigma),
+            sigma=sigma,
+            contours="contour" in settings.terms,
+            working_size=settings.working_size,
+            least_joints=LEAST_JOINTS,
             dtype=dtype,
             device=device,
         )
