@@ -5,7 +5,8 @@ right click or `s` skips it, `u` takes the last one back, Enter ends. Buttons do
 right are the person's own.
 
 `click_joints(image)` opens a window and waits. In a notebook with `%matplotlib widget` (package
-ipympl), make a `JointClicker(image)`, click, and take `clicker.joints` in a later cell.
+ipympl, the extra `notebook`), make a `JointClicker(image)`, click, and take `clicker.joints` in a
+later cell.
 `write_clicked` saves them in the format that `torchcss.io.keypoints` calls clicked.
 """
 
