@@ -26,8 +26,8 @@ def test_small_mode(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) ->
     options = ("--bodies=arm8", "--samples", "30", "--repeats=1", "--at-least-s=0", "--cached")
     where = (f"--out={out}", f"--folder={tmp_path}", "--dtype=float64")
     command = [sys.executable, str(SCRIPT), *options, *where]
-    # Kernels without vector instructions are compiled sooner and are the same on every machine; they
-    # have a cache of their own, because the compiler takes vector code for theirs otherwise.
+    # Kernels without vector instructions are compiled sooner and are the same on every machine. In
+    # a cache of their own: the compiler would take vector code for theirs.
     cache = tmp_path_factory.getbasetemp().parent / "scalar_kernels"
     scalar = {
         **os.environ, "ATEN_CPU_CAPABILITY": "default", "TORCHINDUCTOR_CACHE_DIR": str(cache),
