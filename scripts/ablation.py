@@ -26,7 +26,8 @@ from evaluate_track import main as evaluate
 from torchcss.demo import run_demo
 from torchcss.errors import ConfigurationError, TorchcssError
 from torchcss.io.tracks import prepare_output_folder, write_summary
-from torchcss.pipeline import Settings, track_video
+from torchcss.settings import Settings
+from torchcss.track_files import track_video
 
 BASE = ("joints", "stabiliser", "temporal")
 EDGES = ("contour", *BASE)

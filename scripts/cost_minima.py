@@ -30,9 +30,9 @@ from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.errors import TorchcssError
 from torchcss.io import plots
 from torchcss.io.tracks import prepare_output_folder, write_summary
-from torchcss.pipeline import Settings, make_choice
 from torchcss.robust import Leclerc, Lorentzian, Quadratic
 from torchcss.scenes import Scene, arm_scenes, clip_scenes
+from torchcss.settings import Settings, make_choice
 from torchcss.slices import PROMINENCE, find_minima, num_spurious
 
 TERMS = ("contour", "motion_boundaries", "flow", "stabiliser")

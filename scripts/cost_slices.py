@@ -30,8 +30,8 @@ from torchcss.errors import TorchcssError
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.io import plots
 from torchcss.io.tracks import prepare_output_folder, write_summary
-from torchcss.pipeline import Settings
 from torchcss.scenes import Scene, arm_scenes, clip_scenes
+from torchcss.settings import Settings
 from torchcss.slices import PROMINENCE, Line, sample_slice
 
 # As in [IJRR]: keypoints only say where to start, and so does the frame before.
@@ -69,7 +69,7 @@ class Config:
     prominence: float = PROMINENCE
     """Least prominence of a minimum that counts, share of the slice's range."""
     terms: tuple[str, ...] = TERMS
-    """Terms of the cost, see `torchcss.pipeline.ALL_TERMS`."""
+    """Terms of the cost, see `torchcss.settings.ALL_TERMS`."""
     small: bool = False
     """The arm alone, few lines and samples: for tests."""
     out: Path | None = None

@@ -36,8 +36,11 @@ LAYERS = (
         "random_person",
     },
     {"sampling_study"},
+    {"settings"},
     {"io"},
     {"pipeline", "initialise_image"},
+    {"recorder"},
+    {"track_files"},
     {"demo", "scenes", "cli", "cli_init", "cli_export"},
 )
 """Lowest first; a folder counts as one entry."""

@@ -19,22 +19,19 @@ from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.tracker import Tracker, TrackerState
 from torchcss.io import tracks
 from torchcss.io.video import Frame, VideoWriter
-from torchcss.pipeline import (
+from torchcss.pipeline import TrackedFrame, follow_with_base, scale_keypoints, track_frames
+from torchcss.presets import PRESETS, make_tracker
+from torchcss.robust import Quadratic
+from torchcss.settings import (
     ALL_TERMS,
     Settings,
-    TrackedFrame,
     boundary_emphasis,
-    follow_with_base,
     make_choice,
     make_extractor,
     make_settings_tracker,
-    scale_keypoints,
-    track_frames,
-    track_video,
 )
-from torchcss.presets import PRESETS, make_tracker
-from torchcss.robust import Quadratic
 from torchcss.synthetic import SyntheticSequence, arm_sequence
+from torchcss.track_files import track_video
 from torchcss.vision.camera import Camera
 
 FRAMES = 4

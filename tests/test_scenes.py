@@ -12,15 +12,9 @@ import torch
 from torchcss.errors import ConfigurationError
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.io.video import Frame
-from torchcss.pipeline import (
-    ALL_TERMS,
-    Settings,
-    boundary_emphasis,
-    make_choice,
-    make_extractor,
-    track_frames,
-)
+from torchcss.pipeline import track_frames
 from torchcss.scenes import Scene, arm_scenes, clip_scenes
+from torchcss.settings import ALL_TERMS, Settings, boundary_emphasis, make_choice, make_extractor
 from torchcss.synthetic import arm_sequence
 
 TERMS = tuple(term for term in ALL_TERMS if term != "temporal_mixture")

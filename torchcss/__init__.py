@@ -9,7 +9,9 @@ from torchcss.body.model import BodyModel, load_body
 from torchcss.initialise import Initialisation, initialise
 from torchcss.io.export import export_track
 from torchcss.io.tracks import Track, load_track
-from torchcss.pipeline import Settings, track_frames, track_video
+from torchcss.pipeline import track_frames
+from torchcss.settings import Settings
+from torchcss.track_files import track_video
 from torchcss.vision.camera import Camera
 
 __all__ = [

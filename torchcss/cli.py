@@ -24,7 +24,8 @@ from torchcss.cli_export import Export
 from torchcss.cli_init import Init
 from torchcss.demo import run_demo
 from torchcss.errors import OutputError, TorchcssError
-from torchcss.pipeline import TERMS, Settings, track_video
+from torchcss.settings import TERMS, Settings
+from torchcss.track_files import track_video
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,16 +16,16 @@ from torchcss.cost.joints import JointObservation, JointTerm
 from torchcss.initialise import initialise_from_joints
 from torchcss.io.tracks import load_track, prepare_output_folder, write_summary
 from torchcss.io.video import Frame, VideoWriter
-from torchcss.pipeline import (
-    Recorder,
+from torchcss.pipeline import track_frames
+from torchcss.presets import PRESETS
+from torchcss.recorder import Recorder
+from torchcss.settings import (
     Settings,
     boundary_emphasis,
     make_choice,
     make_extractor,
     make_settings_tracker,
-    track_frames,
 )
-from torchcss.presets import PRESETS
 from torchcss.synthetic import arm_sequence
 
 KEYPOINT_NOISE_PX = 1.5

@@ -1,9 +1,9 @@
 """Single frames with their cost, a true state and the mode nearest to it: to look at a cost.
 
-A tracker sees many states of a frame for a moment; here one frame stays at hand. `frame_cost` puts
-the cost together as `torchcss.pipeline.track_frames` does for a tracker whose only mode in the
-frame before was a given state. A `Scene` adds the truth and the mode that the optimiser reaches
-from there, whose covariance says along which lines the cost is worth a look (`torchcss.slices`).
+A tracker sees many states of a frame for a moment; here one frame stays at hand. Its cost is that
+of a tracker whose only mode in the frame before was a given state. A `Scene` adds the truth and the
+mode that the optimiser reaches from there, whose covariance says along which lines the cost is
+worth a look (`torchcss.slices`).
 
 By default: `arm_scenes` for frames of the rendered arm, whose truth is exact, or `clip_scenes` for
 those of a recording with keypoints, where the fit to them that is nearest a 3D reference stands for
@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,12 +25,9 @@ from torch import Tensor
 
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES
-from torchcss.cost.edge_energy import edge_energy_field
-from torchcss.cost.flow import InteriorNodes, flow_targets
-from torchcss.cost.interpenetration import InterpenetrationPairs
+from torchcss.cost.frame import FrameCosts
 from torchcss.cost.joints import JointObservation
-from torchcss.cost.total import CostChoice, TrackingCost
-from torchcss.cost.visibility import ContourPredictor, visible_nodes
+from torchcss.cost.total import TrackingCost
 from torchcss.errors import ConfigurationError, TrackFileError
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.initialise import default_sigma, initialise_from_joints
@@ -39,17 +37,11 @@ from torchcss.io.safe_load import load_arrays
 from torchcss.io.video import VideoReader
 from torchcss.joint_names import canonical_joint_name
 from torchcss.metrics import LIMB_JOINTS, root_aligned_mpjpe_mm
-from torchcss.pipeline import (
-    Settings,
-    boundary_emphasis,
-    make_choice,
-    make_extractor,
-    scale_keypoints,
-)
+from torchcss.pipeline import scale_keypoints
+from torchcss.settings import Settings, boundary_emphasis, make_choice, make_extractor
 from torchcss.slices import Line, eigen_lines, joint_lines
 from torchcss.synthetic import arm_sequence
 from torchcss.types import Bounds, Modes
-from torchcss.vision.camera import Camera
 from torchcss.vision.features import FrameFeatures
 
 _NO_KEYPOINTS_PX = 1.0
@@ -101,59 +93,6 @@ class Scene(NamedTuple):
         return Bounds(lower.maximum(centre - far), upper.minimum(centre + far))
 
 
-def frame_cost(
-    body: BodyModel,
-    camera: Camera,
-    features: FrameFeatures,
-    choice: CostChoice,
-    *,
-    previous: Float[Tensor, " n"] | None = None,
-    frame_interval: float = 0.0,
-    observation: JointObservation | None = None,
-    boundary_emphasis: float = 0.3,
-) -> TrackingCost:
-    """The cost of one frame, as a tracker sees it whose only mode was `previous`.
-
-    Args:
-        body: The body on its base.
-        camera: Camera of the features.
-        features: Features of the frame.
-        choice: Terms and weights.
-        previous: The state one frame before; None: no flow and no temporal prior.
-        frame_interval: Seconds between the frames, for the temporal prior.
-        observation: Keypoints of the frame, in pixels of the features.
-        boundary_emphasis: Weight of motion boundaries, see `FrameFeatures.edge_field`.
-    """
-    edge_field = features.edge_field(boundary_emphasis=boundary_emphasis).to(body.tie)
-    interior, targets = InteriorNodes(body), None
-    if previous is not None and features.flow is not None:
-        before = body.pose(previous)
-        points = interior(body, before).points
-        targets = flow_targets(
-            interior,
-            body,
-            previous,
-            camera,
-            features.flow.to(body.tie),
-            None if features.flow_outlier is None else features.flow_outlier.to(body.tie),
-            visible_nodes(body, before, camera.centre_world, points, interior.node_part),
-        )
-    return TrackingCost(
-        body=body,
-        camera=camera,
-        choice=choice,
-        predictor=ContourPredictor(body),
-        edge_field=edge_field,
-        energy=None if choice.edge_energy is None else edge_energy_field(edge_field),
-        interior=interior,
-        targets=targets,
-        observation=observation,
-        pairs=None if choice.interpenetration is None else InterpenetrationPairs(body),
-        parent=previous,
-        deviation=body.motion_rate * frame_interval,
-    )
-
-
 def arm_scenes(
     frames: Sequence[int],
     *,
@@ -178,17 +117,17 @@ def arm_scenes(
     extractor, choice = make_extractor(settings), make_choice(settings, _NO_KEYPOINTS_PX)
     body = sequence.body.to(dtype=settings.torch_dtype)
     states = sequence.states.to(body.tie)
+    costs = FrameCosts(
+        body,
+        extractor.working_camera(sequence.camera),
+        choice,
+        frame_interval=1 / sequence.frame_rate,
+        boundary_emphasis=boundary_emphasis(settings),
+    )
     for index in frames:
         features = extractor(sequence.frames[index], sequence.frames[index - 1])
-        cost = frame_cost(
-            body,
-            extractor.working_camera(sequence.camera).to(body.dtype),
-            features,
-            choice,
-            previous=states[index - 1],
-            frame_interval=1 / sequence.frame_rate,
-            boundary_emphasis=boundary_emphasis(settings),
-        )
+        previous = states[index - 1]
+        cost = replace(costs(features, body=body, before=previous), parent=previous)
         image, truth = sequence.frames[index], states[index]
         yield _scene(f"{name}, frame {index}", image, features, cost, truth)
 
@@ -264,15 +203,15 @@ def _clip_scene(
         observation=observed[0],
     )
     previous = TrustRegionNewton().minimise(alone, truth[None], body.bounds).mean[0]
-    cost = frame_cost(
+    costs = FrameCosts(
         body,
         working,
-        features,
         make_choice(settings, sigma),
-        previous=previous,
         frame_interval=now.time_s - before.time_s,
-        observation=observed[1],
         boundary_emphasis=boundary_emphasis(settings),
+    )
+    cost = replace(
+        costs(features, body=body, before=previous, observation=observed[1]), parent=previous
     )
     return _scene(f"{view}, frame {frame}", now.image, features, cost, truth)
 

@@ -45,6 +45,7 @@ from torchcss.cost.joints import JointObservation, JointTerm
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.temporal import MixtureDensity, MixturePrior, TemporalPrior
 from torchcss.cost.visibility import ContourPredictor, front_facing, visible_nodes
+from torchcss.inference.mixture import GaussianMixture
 from torchcss.stopwatch import Stopwatch
 from torchcss.types import Curvature, LocalModel, PointCost
 from torchcss.vision.camera import Camera
@@ -156,6 +157,21 @@ class TrackingCost:
     deviation: Float[Tensor, " n"] | None = None
     previous: MixtureDensity | None = None
     stopwatch: Stopwatch | None = None
+
+    def of_children(self, parent: Int[Tensor, " b"], prior: GaussianMixture) -> TrackingCost:
+        """The cost for samples of a prior's modes: each is compared with the mode it came from.
+
+        Args:
+            parent: The mode of each sample; `targets` has those of all modes then.
+            prior: The modes, one frame ahead.
+        """
+        mixture = self.choice.temporal_mixture
+        return replace(
+            self,
+            targets=None if self.targets is None else self.targets.take(parent),
+            parent=prior.mean[parent],
+            previous=None if mixture is None else mixture.density(prior),
+        )
 
     def take(self, items: Int[Tensor, " b"]) -> TrackingCost:
         """The cost restricted to some samples: each keeps its own parent."""

@@ -1,0 +1,116 @@
+"""From the features of one frame to its cost: what a body, a camera and a choice of terms need.
+
+`FrameCosts` holds what is the same in all frames: the contour predictor, the interior nodes, the
+pairs of parts. Called with a frame's features and the modes of the frame before, it gives that
+frame's `TrackingCost`, with a flow target for the nodes of every mode. A tracker descends from
+samples of those modes; `TrackingCost.of_children` gives each sample the targets and the prior of
+the mode that it came from, and is the `CostFactory` that `Tracker.step` takes.
+
+    costs = FrameCosts(body, camera, choice, frame_interval=1 / 25, boundary_emphasis=0.3)
+    cost = costs(features, body=body, before=state.mixture.mean, observation=keypoints)
+    state, info = tracker.step(state, cost.of_children, body.bounds)
+"""
+
+from __future__ import annotations
+
+from jaxtyping import Float
+from torch import Tensor
+
+from torchcss.body.model import BodyModel
+from torchcss.cost.edge_energy import edge_energy_field
+from torchcss.cost.flow import FlowTargets, InteriorNodes, flow_targets
+from torchcss.cost.interpenetration import InterpenetrationPairs
+from torchcss.cost.joints import JointObservation
+from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.cost.visibility import ContourPredictor, visible_nodes
+from torchcss.stopwatch import Stopwatch
+from torchcss.vision.camera import Camera
+from torchcss.vision.features import FrameFeatures
+
+
+class FrameCosts:
+    """Makes the cost of one frame after another.
+
+    Args:
+        body: The body; later it may hang on another base.
+        camera: Camera of the features.
+        choice: Terms and weights.
+        frame_interval: Seconds between frames, which scales the expected motion.
+        boundary_emphasis: Weight of motion boundaries, see `FrameFeatures.edge_field`.
+
+    Attributes:
+        camera: Camera of the features, in the body's type and on its device.
+        choice: Terms and weights.
+        deviation: Expected motion of every parameter from one frame to the next.
+    """
+
+    def __init__(
+        self,
+        body: BodyModel,
+        camera: Camera,
+        choice: CostChoice,
+        *,
+        frame_interval: float = 0.0,
+        boundary_emphasis: float = 0.0,
+    ) -> None:
+        self.camera = camera.to(dtype=body.dtype, device=body.tie.device)
+        self.choice = choice
+        self.deviation = body.motion_rate * frame_interval
+        self.boundary_emphasis = boundary_emphasis
+        edges = choice.contour is not None or choice.edge_energy is not None
+        self.predictor = ContourPredictor(body) if edges else None
+        self.interior = InteriorNodes(body) if choice.flow is not None else None
+        repels = choice.interpenetration is not None
+        self.pairs = InterpenetrationPairs(body) if repels else None
+
+    def __call__(
+        self,
+        features: FrameFeatures,
+        *,
+        body: BodyModel,
+        before: Float[Tensor, "k n"] | None = None,
+        observation: JointObservation | None = None,
+        stopwatch: Stopwatch | None = None,
+    ) -> TrackingCost:
+        """The cost of a frame; with modes before it, `of_children` has to follow.
+
+        Args:
+            features: Features of the frame.
+            body: The body on this frame's base.
+            before: The modes of the frame before, which the flow carries on; None: no flow.
+            observation: Keypoints of the frame, in pixels of the features.
+            stopwatch: Where the time of evaluations is added up.
+        """
+        edge_field = features.edge_field(boundary_emphasis=self.boundary_emphasis).to(body.tie)
+        direct = self.choice.edge_energy is not None
+        return TrackingCost(
+            body=body,
+            camera=self.camera,
+            choice=self.choice,
+            predictor=self.predictor,
+            edge_field=edge_field,
+            energy=edge_energy_field(edge_field) if direct else None,
+            interior=self.interior,
+            targets=None if before is None else self._targets(features, body, before),
+            observation=observation,
+            pairs=self.pairs,
+            deviation=self.deviation,
+            stopwatch=stopwatch,
+        )
+
+    def _targets(
+        self, features: FrameFeatures, body: BodyModel, before: Float[Tensor, "k n"]
+    ) -> FlowTargets | None:
+        if self.interior is None or features.flow is None:
+            return None
+        pose = body.pose(before)
+        points, part = self.interior(body, pose).points, self.interior.node_part
+        return flow_targets(
+            self.interior,
+            body,
+            before,
+            self.camera,
+            features.flow.to(body.tie),
+            None if features.flow_outlier is None else features.flow_outlier.to(body.tie),
+            visible_nodes(body, pose, self.camera.centre_world, points, part),
+        )

@@ -1,0 +1,228 @@
+"""Writes a run as it goes: `track.npz`, `summary.json` and `overlay.mp4`.
+
+`Recorder.run` takes what `torchcss.pipeline.track_frames` yields; a run that is interrupted keeps
+what it has. `draw_modes` draws one frame of the overlay.
+"""
+
+from __future__ import annotations
+
+import platform
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+from tqdm import tqdm
+
+from torchcss.body.model import BodyModel
+from torchcss.inference.tracker import SequenceTracker
+from torchcss.io.overlay import ProjectedPart, draw_overlay
+from torchcss.io.tracks import TrackWriter, write_summary
+from torchcss.io.video import VideoWriter
+from torchcss.pipeline import TrackedFrame
+from torchcss.settings import Settings
+from torchcss.synthetic import grid_faces
+from torchcss.types import Status
+from torchcss.vision.camera import Camera
+
+_SAVE_SHARE = 0.05
+"""Share of the time that may go into saving the track as it grows: a full disk then leaves nearly
+all of it, since a save replaces the last good file only when it is complete."""
+
+
+def draw_modes(
+    tracked: TrackedFrame, camera: Camera, *, rings: int = 16, meridians: int = 20
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Draw the best mode as a shaded body and the others as outlines over the frame.
+
+    Args:
+        tracked: A tracked frame.
+        camera: Camera of the full-size image.
+        rings: Latitudes of the drawn mesh.
+        meridians: Longitudes of the drawn mesh.
+    """
+    body, mixture = tracked.body, tracked.state.mixture
+    mesh = body.mesh(rings, meridians)
+    faces = grid_faces(rings, meridians)
+    rotation, centre = body.part_poses(body.pose(mixture.mean))
+    local = mesh.points.flatten(1, 2)
+    points = local @ rotation.transpose(-1, -2) + centre[..., None, :]
+    modes = []
+    for mode in points:
+        parts = []
+        for part, vertices in enumerate(mode):
+            uv, depth, valid = (tensor.cpu() for tensor in camera.project(vertices))
+            parts.append(ProjectedPart(uv, depth, valid, faces, part))
+        modes.append(parts)
+    text = (
+        f"frame {tracked.frame.index}   {len(modes)} modes   cost {float(tracked.info.cost[0]):.1f}"
+    )
+    picture = draw_overlay(
+        torch.from_numpy(np.ascontiguousarray(tracked.frame.image)),
+        modes,
+        weights=mixture.weight,
+        text=text,
+    )
+    return picture.numpy()
+
+
+@dataclass(kw_only=True)
+class Recorder:
+    """Writes a run as it goes: track, summary and overlay.
+
+    Attributes:
+        folder: The output folder.
+        settings: What is run.
+        tracker: The tracker that the settings made, for its numbers.
+        camera: Camera of the full-size images, for the overlay.
+        frame_rate: Frames per second of the overlay.
+        notes: Lines for the user, also in the summary.
+        extra: Further entries of the summary.
+    """
+
+    folder: Path
+    settings: Settings
+    tracker: SequenceTracker
+    camera: Camera
+    frame_rate: float
+    notes: list[str] = field(default_factory=list)
+    extra: dict[str, Any] = field(default_factory=dict)
+
+    def run(self, frames: Iterator[TrackedFrame], body: BodyModel, total: int | None) -> dict:
+        """Track to the end, or to an interruption, which is recorded and raised again.
+
+        Args:
+            frames: What `track_frames` yields.
+            body: The body, for the names in the file.
+            total: Number of frames, for the progress bar.
+
+        Returns:
+            The summary.
+        """
+        writer = TrackWriter(
+            self.folder / "track.npz", state_names=body.state_names, joint_names=body.joint_names
+        )
+        totals: dict[str, float] = {}
+        terms: dict[str, float] = {}
+        term_seconds: dict[str, float] = {}
+        counts = {"samples": 0, "iterations": 0, "distinct": 0}
+        statuses = torch.zeros(len(Status), dtype=torch.long)
+        ended, began = "interrupted", time.perf_counter()
+        saved, took = began, 0.0
+        summary: dict[str, Any] = {}
+        with ExitStack() as stack:
+            film = None
+            if self.settings.overlay:
+                film = stack.enter_context(
+                    VideoWriter(self.folder / "overlay.mp4", self.frame_rate)
+                )
+            bar = stack.enter_context(tqdm(frames, total=total, unit="frame", dynamic_ncols=True))
+            try:
+                for frame in bar:
+                    self._append(writer, frame)
+                    drawn = time.perf_counter()
+                    if film is not None:
+                        film.write(draw_modes(frame, self.camera))
+                    seconds = {**frame.seconds, "overlay": time.perf_counter() - drawn}
+                    for into, values in (
+                        (totals, seconds),
+                        (terms, frame.terms),
+                        (term_seconds, frame.term_seconds),
+                    ):
+                        for name, value in values.items():
+                            into[name] = into.get(name, 0.0) + value
+                    counts["samples"] += int(frame.info.num_samples)
+                    counts["iterations"] += int(frame.info.num_steps.sum())
+                    counts["distinct"] += int(frame.info.num_distinct)
+                    statuses += frame.info.status_counts.cpu()
+                    bar.set_postfix(
+                        cost=f"{float(frame.info.cost[0]):.1f}",
+                        modes=len(frame.state.mixture.mean),
+                    )
+                    start = time.perf_counter()
+                    if _SAVE_SHARE * (start - saved) >= took:
+                        writer.save()
+                        saved = time.perf_counter()
+                        took = saved - start
+                ended = "complete"
+            finally:
+                if len(writer):
+                    writer.save()
+                    summary = self._summary(
+                        ended, len(writer), time.perf_counter() - began, totals, terms,
+                        term_seconds, counts, statuses,
+                    )  # fmt: skip
+                    write_summary(self.folder, summary)
+        return summary
+
+    def _append(self, writer: TrackWriter, frame: TrackedFrame) -> None:
+        base = np.eye(4)
+        base[:3, :3] = frame.body.base_rotation.cpu().numpy()
+        base[:3, 3] = frame.body.base_translation.cpu().numpy()
+        mixture = frame.state.mixture
+        writer.append(
+            frame=frame.frame.index,
+            time_s=frame.frame.time_s,
+            state=mixture.mean,
+            covariance=mixture.covariance,
+            log_weight=mixture.log_weight,
+            cost=frame.info.cost,
+            parent=frame.info.parent if len(writer) else torch.full_like(frame.info.parent, -1),
+            joints_world=frame.joints_world,
+            base_transform=base,
+        )
+
+    def _summary(
+        self,
+        ended: str,
+        num_frames: int,
+        wall: float,
+        seconds: dict[str, float],
+        terms: dict[str, float],
+        term_seconds: dict[str, float],
+        counts: dict[str, int],
+        statuses: Tensor,
+    ) -> dict[str, Any]:
+        return {
+            "ended": ended,
+            "body": self.settings.body,
+            "preset": self.settings.preset,
+            "seed": self.settings.seed,
+            "samples": self.tracker.num_samples,
+            "modes": self.tracker.num_modes,
+            "settings": asdict(self.settings),
+            "versions": {
+                "python": platform.python_version(),
+                **{name: version(name) for name in ("torchcss", "torch", "kornia", "numpy")},
+            },
+            "num_frames": num_frames,
+            "seconds_per_frame": wall / num_frames,
+            "seconds_per_frame_by_stage": {k: v / num_frames for k, v in seconds.items()},
+            "samples_optimised": counts["samples"],
+            "iterations": counts["iterations"],
+            "iterations_per_sample": counts["iterations"] / max(counts["samples"], 1),
+            "distinct_modes_per_frame": counts["distinct"] / num_frames,
+            "optimiser_status": {s.name.lower(): int(statuses[s]) for s in Status},
+            "best_mode_cost_by_term": {k: v / num_frames for k, v in terms.items()},
+            "share_of_cost_by_term": _shares(terms),
+            "share_of_search_time_by_term": _shares(
+                {
+                    **term_seconds,
+                    "optimiser": seconds.get("search", 0.0) - sum(term_seconds.values()),
+                }
+            ),
+            "notes": self.notes,
+            **self.extra,
+        }
+
+
+def _shares(values: dict[str, float]) -> dict[str, float]:
+    whole = sum(values.values())
+    return {name: value / whole if whole else 0.0 for name, value in values.items()}

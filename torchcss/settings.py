@@ -1,0 +1,179 @@
+"""How to track, as one record of choices, and what it makes: features, cost and tracker.
+
+`Settings` is what the command line shows and `summary.json` holds. `make_extractor`, `make_choice`
+and `make_settings_tracker` turn it into the three objects that `torchcss.pipeline` takes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchcss.cost.anthropometric import Anthropometric
+from torchcss.cost.contour import ContourTerm
+from torchcss.cost.edge_energy import EdgeEnergyTerm
+from torchcss.cost.flow import FlowTerm
+from torchcss.cost.interpenetration import Interpenetration
+from torchcss.cost.joints import JointTerm
+from torchcss.cost.stabiliser import Stabiliser
+from torchcss.cost.temporal import MixturePrior, TemporalPrior
+from torchcss.cost.total import CostChoice
+from torchcss.errors import ConfigurationError
+from torchcss.inference.tracker import SequenceTracker, Tracker
+from torchcss.presets import PRESETS, make_tracker
+from torchcss.robust import Quadratic
+from torchcss.vision.features import FeatureExtractor
+from torchcss.vision.flow import TRACKING
+
+TERMS = (
+    *("contour", "motion_boundaries", "flow", "joints"),
+    *("stabiliser", "anthropometric", "interpenetration", "temporal"),
+)
+"""Terms and priors of the cost by default: all that do not stand in for one another."""
+
+ALL_TERMS = (
+    *("contour", "motion_boundaries", "edge_energy", "flow", "joints"),
+    *("stabiliser", "anthropometric", "interpenetration", "temporal", "temporal_mixture"),
+)
+"""Terms and priors that can be chosen; see `torchcss.cost.total`. `motion_boundaries` weighs the
+edges of `contour` and `edge_energy` by the motion boundaries, `W = 1 - k S_p`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """How to track; everything here is in `summary.json`.
+
+    Attributes:
+        body: Body to track: arm7, arm8, body30, body32 or body34.
+        preset: Tracker, a name in `presets.PRESETS`.
+        samples: Samples per frame; the preset's number by default.
+        modes: Modes kept; the preset's number by default.
+        oversampling: How many times as many samples are drawn; those with the best edges descend,
+            see `Tracker`.
+        keypoints_use: "all": keypoints are observations in every frame; "first": they only
+            give the first pose, as in the papers.
+        terms: Terms and priors of the cost; see `make_choice` for what the preset changes.
+        working_size: Longer side, in pixels, at which features are computed; larger images are
+            reduced to it.
+        contour_weight: Temperature of the contour term, see `CostChoice`.
+        boundary_emphasis: k of `W = 1 - k S_p`, for the term `motion_boundaries`.
+        seed: Seed of all random numbers; the same seed gives the same track.
+        device: Where to compute.
+        dtype: "float64" or "float32".
+        overlay: Write `overlay.mp4`.
+    """
+
+    body: str = "body34"
+    preset: str = "css"
+    samples: int | None = None
+    modes: int | None = None
+    oversampling: int = 1
+    keypoints_use: Literal["first", "all"] = "all"
+    terms: tuple[str, ...] = TERMS
+    working_size: int = 640
+    contour_weight: float = 150.0
+    boundary_emphasis: float = 0.3
+    seed: int = 0
+    device: str = "cpu"
+    dtype: Literal["float64", "float32"] = "float64"
+    overlay: bool = True
+
+    def __post_init__(self) -> None:
+        if self.preset not in PRESETS:
+            raise ConfigurationError(f"no tracker {self.preset!r}; there are {', '.join(PRESETS)}")
+        unknown = sorted(set(self.terms) - set(ALL_TERMS))
+        if unknown:
+            raise ConfigurationError(f"unknown terms {unknown}; there are {', '.join(ALL_TERMS)}")
+        for name in ("samples", "modes", "working_size", "oversampling"):
+            number = getattr(self, name)
+            if number is not None and number < 1:
+                raise ConfigurationError(f"{name} must be at least 1, got {number}")
+        try:
+            torch.empty(0, device=self.device)
+        except (RuntimeError, AssertionError) as error:  # the latter without CUDA
+            raise ConfigurationError(
+                f"device {self.device!r} is not available here; use cpu"
+            ) from error
+
+    @property
+    def torch_dtype(self) -> torch.dtype:
+        """The floating type."""
+        return torch.float32 if self.dtype == "float32" else torch.float64
+
+
+def make_extractor(settings: Settings) -> FeatureExtractor:
+    """The features that the settings ask for, in their type and on their device."""
+    moving = {"flow", "motion_boundaries"} & set(settings.terms)
+    flow = TRACKING if moving else None
+    extractor = FeatureExtractor(working_size=settings.working_size, flow=flow)
+    return extractor.to(dtype=settings.torch_dtype, device=settings.device)
+
+
+def boundary_emphasis(settings: Settings) -> float:
+    """Emphasis k of the motion-boundary weights, zero if the settings do not ask for them."""
+    return settings.boundary_emphasis if "motion_boundaries" in settings.terms else 0.0
+
+
+def make_choice(settings: Settings, sigma: float) -> CostChoice:
+    """The cost that the settings ask for: their terms, and what their preset has to say.
+
+    A particle filter gets no temporal prior: its particles are moved by `p(x_t | x_{t-1})` already,
+    and weighed by `p(r_t | x_t)` alone (section 1.1 [IJRR]). The prior would count twice.
+
+    Args:
+        settings: Which terms, and which tracker.
+        sigma: Keypoint noise in pixels of the working image.
+    """
+    row = PRESETS[settings.preset]
+    has = settings.terms.__contains__
+    repels = has("interpenetration") if row.interpenetration is None else row.interpenetration
+    descends = row.particles is None
+    potential: dict[str, Any] = {} if row.robust else {"potential_kind": Quadratic}
+    contour = ContourTerm(**potential)
+    # The weights of motion boundaries make the wells of a fitted model shallower; what is back-
+    # facing or hidden must not become cheaper than that. 0.3 takes 12 % on the demo's true states.
+    shallower = 0.4 * boundary_emphasis(settings)
+    level = contour.unmatched - (1 - shallower) * (contour.unmatched - contour.fitted_level)
+    return CostChoice(
+        contour=replace(contour, fitted_level=level) if has("contour") else None,
+        edge_energy=EdgeEnergyTerm(**potential) if has("edge_energy") else None,
+        flow=FlowTerm(**potential) if has("flow") else None,
+        joints=JointTerm(sigma=sigma, **potential) if has("joints") else None,
+        stabiliser=Stabiliser() if has("stabiliser") else None,
+        anthropometric=Anthropometric() if has("anthropometric") else None,
+        temporal=TemporalPrior() if has("temporal") and descends else None,
+        temporal_mixture=MixturePrior() if has("temporal_mixture") and descends else None,
+        interpenetration=Interpenetration() if repels else None,
+        contour_weight=settings.contour_weight,
+        curvature=row.curvature,
+    )
+
+
+def make_settings_tracker(settings: Settings, motion: Float[Tensor, " n"]) -> SequenceTracker:
+    """The tracker that the settings ask for.
+
+    Args:
+        settings: Preset and numbers.
+        motion: Standard deviation of every parameter's motion per frame.
+
+    Raises:
+        ConfigurationError: If the preset's tracker cannot be oversampled.
+    """
+    tracker = make_tracker(
+        settings.preset,
+        settings.body,
+        num_samples=settings.samples,
+        num_modes=settings.modes,
+        motion=tuple(motion.tolist()),
+    )
+    if settings.oversampling == 1:
+        return tracker
+    if not isinstance(tracker, Tracker):
+        raise ConfigurationError(
+            f"oversampling: {settings.preset} does not descend from samples; leave it at 1"
+        )
+    return replace(tracker, oversampling=settings.oversampling)
