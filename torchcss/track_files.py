@@ -1,8 +1,8 @@
 """From files to files: video, camera and keypoints in, a first pose found, the track written.
 
-`track_video` is what `torchcss track` calls. The loop itself is `torchcss.pipeline.track_frames`, which takes
-any images; `torchcss.recorder.Recorder` writes what comes out as it goes, so that a stopped run
-keeps what it has.
+`track_video` is what `torchcss track` calls. The loop itself is `torchcss.pipeline.track_frames`,
+which takes any images; `torchcss.recorder.Recorder` writes what comes out as it goes, so that a
+stopped run keeps what it has.
 """
 
 from __future__ import annotations
