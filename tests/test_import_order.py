@@ -31,6 +31,7 @@ LAYERS = (
         "reprojection",
         "synthetic",
         "metrics",
+        "published",
         "slices",
         "shape_fit",
         "random_person",
@@ -38,10 +39,11 @@ LAYERS = (
     {"sampling_study"},
     {"settings"},
     {"io"},
-    {"pipeline", "initialise_image"},
+    {"pipeline", "initialise_image", "smooth"},
+    {"yardstick", "side_by_side"},
     {"recorder"},
     {"track_files"},
-    {"demo", "scenes", "cli", "cli_init", "cli_export"},
+    {"demo", "scenes", "cli", "cli_init", "cli_export", "cli_smooth"},
 )
 """Lowest first; a folder counts as one entry."""
 

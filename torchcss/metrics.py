@@ -21,8 +21,14 @@ so that R is no reflection, and s = tr(D S) / sum |X - mean|^2 (Umeyama, IEEE PA
 A monocular tracker keeps several modes. "Best mode" judges the one that it believes most; "best of
 modes" lets the reference choose, frame by frame, and tells whether the truth was among them.
 
+A track is lost where it fails and does not regain the body soon: `first_loss`. Whether a tracker
+knows how wrong it is tells `probability_within`: the true place of a joint, seen from an estimate
+of covariance C, lies at the squared Mahalanobis distance d^2 = e^T C^-1 e, and the ellipsoid
+through it holds the probability P(chi^2_3 < d^2). If the covariance is right these probabilities
+are spread evenly over 0..1, so that `coverage` at 50 % is 50 %, and so on.
+
 By default: `track_errors`, which takes a whole track and returns all of it; the functions above it
-serve single poses and tests.
+serve single poses and tests, those below it the comparison of trackers (`torchcss.yardstick`).
 """
 
 from __future__ import annotations
@@ -31,6 +37,7 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
@@ -45,6 +52,12 @@ LIMB_JOINTS: Final[tuple[str, ...]] = tuple(
 
 LOST_MM: Final = 250.0
 """Root-aligned error above which a frame counts as lost."""
+
+REGAIN_S: Final = 0.5
+"""Seconds within which a tracker may regain what it failed to follow, before that is a loss."""
+
+LEVELS: Final = (0.5, 0.9, 0.95)
+"""Probabilities of the regions by which calibration is told."""
 
 _FEWEST_TO_ALIGN = 3
 _MILLIMETRES = 1000.0
@@ -330,6 +343,91 @@ def track_errors(
     }
     lost = frames_lost(of_kind["root_aligned"].errors_mm)
     return TrackErrors(joint_names=tuple(chosen), lost=lost, **of_kind)
+
+
+def first_loss(
+    failed: Bool[ArrayLike, " t"], times_s: Float[ArrayLike, " t"], *, regain_s: float = REGAIN_S
+) -> int | None:
+    """Find where a track was lost for good: it failed there and in all frames of the time after.
+
+    What fails at the very end for a shorter time than that is no loss: nobody knows.
+
+    Args:
+        failed: Frames in which the body was not followed.
+        times_s: Their times, seconds, rising.
+        regain_s: How long a failure has to last.
+
+    Returns:
+        The first frame of the first such stretch, as an index; None if there is none.
+    """
+    start = None
+    for index, (fails, time) in enumerate(
+        zip(np.asarray(failed, bool), np.asarray(times_s, np.float64), strict=True)
+    ):
+        if not fails:
+            start = None
+            continue
+        start = (index, time) if start is None else start
+        # Frame times are rounded; half a millisecond is less than a frame of any camera.
+        if time - start[1] > regain_s - 0.0005:
+            return start[0]
+    return None
+
+
+def mask_overlap(
+    first: Bool[ArrayLike, "*batch h w"], second: Bool[ArrayLike, "*batch h w"]
+) -> Float[np.ndarray, "*batch"]:
+    """Intersection over union of two silhouettes; NaN where both are empty."""
+    first, second = np.asarray(first, bool), np.asarray(second, bool)
+    union = (first | second).sum(axis=(-2, -1))
+    common = (first & second).sum(axis=(-2, -1))
+    return np.where(union > 0, common / np.maximum(union, 1), np.nan)
+
+
+def probability_within(
+    squared_distance: Float[ArrayLike, "*batch"], dimensions: int
+) -> Float[np.ndarray, "*batch"]:
+    """Probability of the smallest region of a Gaussian that holds a point: chi-square's integral.
+
+    Args:
+        squared_distance: Squared Mahalanobis distance of the point; NaN stays NaN.
+        dimensions: Of the Gaussian.
+    """
+    distance = torch.as_tensor(np.asarray(squared_distance, np.float64))
+    half = torch.full_like(distance, dimensions / 2)
+    return torch.special.gammainc(half, distance / 2).numpy()
+
+
+def coverage(
+    probability: Float[ArrayLike, "*batch"], levels: Sequence[float] = LEVELS
+) -> dict[float, float]:
+    """Share of the truths that lie inside the regions of given probabilities.
+
+    Args:
+        probability: What `probability_within` gave; NaN is left out.
+        levels: Probabilities of the regions, which a calibrated tracker's shares equal.
+    """
+    known = np.asarray(probability, np.float64)
+    known = known[np.isfinite(known)]
+    return {level: float((known <= level).mean()) if known.size else np.nan for level in levels}
+
+
+def acceleration_error(
+    tracked_m: Float[ArrayLike, "t j 3"], reference_m: Float[ArrayLike, "t j 3"], interval_s: float
+) -> float:
+    """Mean distance of the joints' accelerations from the reference's, m/s^2: the jitter.
+
+    Accelerations are second differences of three frames in a row; a triple with an unknown
+    reference is left out. NaN if none is left.
+
+    Args:
+        tracked_m: Joint positions of one mode, metres.
+        reference_m: Where they should be; NaN where unknown.
+        interval_s: Seconds between the frames.
+    """
+    tracked, reference = _pair(tracked_m, reference_m)
+    bend = np.diff(tracked - reference, n=2, axis=0) / interval_s**2
+    return float(_mean(np.linalg.norm(bend, axis=-1).reshape(-1)))
 
 
 def _pair(tracked_m: ArrayLike, reference_m: ArrayLike) -> tuple[np.ndarray, np.ndarray]:

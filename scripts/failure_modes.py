@@ -1,0 +1,252 @@
+"""The failure modes of trackers: section 6 of [IJRR] on a sequence whose truth is known.
+
+    python scripts/failure_modes.py --sequence DIR --seeds 3 --stop-when-lost --out J --plot P.png
+
+DIR is a sequence folder (`torchcss.io.sequences`). Every preset starts from the same first pose per
+seed and gets one row: when it loses the body, its errors until then, whether the true mode is among
+those kept, how often the truth is inside the regions that it states, impossible poses, and what it
+takes. Definitions are in `torchcss.yardstick`. Beside ours stand the paper's own failure times,
+which were measured on its sequences.
+
+The trackers run side by side through the video and share its features. The file OUT is written
+whenever a run ends, and `--resume` goes on from it: what it has is not repeated. A study that is
+interrupted loses the runs that were under way; `--together` bounds their number.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import tyro
+from matplotlib.figure import Figure
+from tqdm import tqdm
+
+from torchcss.errors import ConfigurationError, TorchcssError
+from torchcss.io.failure_plots import ErrorCurves, failure_figure
+from torchcss.io.plots import save_figure
+from torchcss.io.sequences import RecordedSequence, read_sequence
+from torchcss.io.tracks import prepare_output_folder, read_summary, write_summary
+from torchcss.presets import PRESETS
+from torchcss.published import PUBLISHED
+from torchcss.settings import Settings
+from torchcss.side_by_side import Run, Start, find_start, track_together
+from torchcss.yardstick import Thresholds, number, over_seeds, summarise
+
+COLUMNS = {
+    # title: entry, factor, decimals
+    "best mm": ("root_aligned_mm", 1, 0),
+    "of K mm": ("root_aligned_best_of_modes_mm", 1, 0),
+    "PA mm": ("pa_mpjpe_mm", 1, 0),
+    "overlap": ("overlap", 1, 2),
+    "kept %": ("true_mode_kept", 100, 0),
+    "in 90 %": ("inside_90_best", 100, 0),
+    "nearest": ("inside_90_nearest", 100, 0),
+    "limits %": ("outside_share", 100, 0),
+    "deep %": ("deep_share", 100, 0),
+    "m/s^2": ("acceleration_error", 1, 1),
+    "evals": ("evaluations_per_frame", 1, 0),
+    "s/frame": ("search_s_per_frame", 1, 2),
+}
+"""What is printed: until the loss, the last two over all frames."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """What is tracked, by whom, and how long."""
+
+    sequence: Path
+    """Sequence folder."""
+    view: str | None = None
+    """Camera, of a sequence with several."""
+    presets: tuple[str, ...] = tuple(PRESETS)
+    """Trackers."""
+    seeds: int = 3
+    """Runs per tracker."""
+    first_seed: int = 0
+    """The first of the seeds."""
+    body: str = "body34"
+    """Body to track, where the sequence does not say which one moved."""
+    keypoints_use: Literal["first", "all"] = "first"
+    """Where keypoints are used: for the first pose only, as in the paper, or in all frames."""
+    start: int = 0
+    """First frame."""
+    frames: int | None = None
+    """Number of frames; all by default."""
+    stop_when_lost: bool = False
+    """End a run when the body is lost for good."""
+    together: int | None = None
+    """How many trackers run side by side; all of one seed by default."""
+    small: bool = False
+    """Four frames with few samples and small images, to see that it runs."""
+    device: str = "cpu"
+    """Where to compute."""
+    dtype: Literal["float64", "float32"] = "float64"
+    """Type of the numbers."""
+    out: Path | None = None
+    """JSON file to write."""
+    resume: bool = False
+    """Keep the runs that OUT has."""
+    plot: Path | None = None
+    """PNG file of error against time."""
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Run, print, draw, write; return what is written."""
+    if unknown := sorted(set(config.presets) - set(PRESETS)):
+        raise ConfigurationError(f"no trackers {unknown}; there are {', '.join(PRESETS)}")
+    sequence = read_sequence(config.sequence, view=config.view)
+    thresholds = Thresholds.of(sequence)
+    study = study_of(config, sequence, thresholds)
+    runs = earlier_runs(config, study)
+    done = {(run["preset"], run["seed"]) for run in runs}
+    report = write(config, study, runs)
+    for seed in range(config.first_seed, config.first_seed + config.seeds):
+        pending = [name for name in config.presets if (name, seed) not in done]
+        begin: Start | None = None
+        size = config.together or max(len(pending), 1)
+        for group in (pending[i : i + size] for i in range(0, len(pending), size)):
+            settings = [settings_of(config, study["body"], name, seed) for name in group]
+            begin = begin or find_start(sequence, settings[0], start=config.start)
+            for run in follow(config, sequence, settings, begin, thresholds):
+                runs.append(entry_of(run, thresholds, 1 / sequence.frame_rate))
+                report = write(config, study, runs)
+    print_table(report["table"], sequence.name)
+    if config.plot is not None:
+        save_figure(figure_of(config, study, runs), config.plot)
+    return report
+
+
+def study_of(config: Config, sequence: RecordedSequence, thresholds: Thresholds) -> dict[str, Any]:
+    """What all runs of a file have in common."""
+    shared = ("keypoints_use", "start", "frames", "stop_when_lost", "small", "dtype")
+    return {
+        "sequence": sequence.name,
+        "num_frames": sequence.num_frames,
+        "frame_rate": sequence.frame_rate,
+        "body": config.body if sequence.truth is None else sequence.truth.body.name,
+        "thresholds": asdict(thresholds),
+        **{name: getattr(config, name) for name in shared},
+    }
+
+
+def earlier_runs(config: Config, study: dict[str, Any]) -> list[dict[str, Any]]:
+    """The runs of a study that was stopped."""
+    if not config.resume:
+        return []
+    if config.out is None:
+        raise ConfigurationError("--resume: expected --out, the file to resume from")
+    if not config.out.exists():
+        return []
+    report = read_summary(config.out)
+    if report.get("study") != study:
+        raise ConfigurationError(
+            f"{config.out}: is of another study: expected {study}, found {report.get('study')}; "
+            "choose another --out"
+        )
+    return report["runs"]
+
+
+def write(config: Config, study: dict[str, Any], runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """Make the table of all trackers so far, and write what there is."""
+    table = {}
+    for name in PRESETS:
+        own = [run for run in runs if run["preset"] == name]
+        if measured := [run for run in own if "num_frames" in run]:
+            errors = sum(run["ended"].startswith("error") for run in own)
+            table[name] = {**over_seeds(measured), "errors": errors}
+    published = [row for row in PUBLISHED if row.sequence == study["sequence"]]
+    report = {"study": study, "published": published, "runs": runs, "table": table}
+    if config.out is not None:
+        write_summary(prepare_output_folder(config.out.parent) / config.out.name, report)
+    return report
+
+
+def settings_of(config: Config, body: str, preset: str, seed: int) -> Settings:
+    """How one tracker runs."""
+    settings = Settings(
+        body=body, preset=preset, seed=seed, keypoints_use=config.keypoints_use,
+        device=config.device, dtype=config.dtype, overlay=False,
+    )  # fmt: skip
+    if not config.small:
+        return settings
+    return replace(settings, samples=min(PRESETS[preset].samples_arm, 6), working_size=320)
+
+
+def follow(
+    config: Config, sequence: RecordedSequence, settings: list[Settings], begin: Start,
+    thresholds: Thresholds,
+) -> Iterator[Run]:  # fmt: skip
+    """Run some trackers side by side, with a progress bar."""
+    frames = 4 if config.small else config.frames or sequence.num_frames
+    stop = min(config.start + frames, sequence.num_frames)
+    with tqdm(total=stop - config.start, unit="frame", dynamic_ncols=True) as bar:
+
+        def progress(_: int, left: int) -> None:
+            bar.set_postfix(seed=settings[0].seed, trackers=left)
+            bar.update()
+
+        yield from track_together(
+            sequence, [(each, begin) for each in settings], thresholds,
+            start=config.start, stop=stop, stop_when_lost=config.stop_when_lost, progress=progress,
+        )  # fmt: skip
+
+
+def entry_of(run: Run, thresholds: Thresholds, interval_s: float) -> dict[str, Any]:
+    """A run as it is written."""
+    entry = {"preset": run.settings.preset, "seed": run.settings.seed, "ended": run.ended}
+    return entry | summarise(run.measures, thresholds, interval_s) if run.measures else entry
+
+
+def print_table(table: dict[str, dict[str, Any]], sequence: str) -> None:
+    """The medians, and the paper's words on the time of failure."""
+    told = {row.preset: row.told for row in PUBLISHED if row.sequence == sequence}
+    titles = "".join(f"{title:>9}" for title in COLUMNS)
+    print(f"{'median over seeds':22}{'lost':>6}{'at s (range)':>18}{'paper':>16}{titles}")
+    for name, row in table.items():
+        middle, least, most = (f"{t:.1f}" if math.isfinite(t) else "-" for t in row["lost_s"])
+        when = f"{middle} ({least}..{most})" if row["lost"] else "never"
+        cells = ""
+        for entry, factor, digits in COLUMNS.values():
+            value = factor * row[entry][0]
+            cells += f"{value:9.{digits}f}" if math.isfinite(value) else f"{'':9}"
+        ended = f"  {row['errors']} ended by an error" if row["errors"] else ""
+        lost = f"{row['lost']}/{row['seeds']}"
+        print(f"{name:22}{lost:>6}{when:>18}{told.get(name, ''):>16}{cells}{ended}")
+
+
+def figure_of(config: Config, study: dict[str, Any], runs: list[dict[str, Any]]) -> Figure:
+    """Error against time, a panel per tracker."""
+    measured = [run for run in runs if "per_frame" in run and run["preset"] in config.presets]
+    times = max((run["per_frame"]["time_s"] for run in measured), key=len)
+
+    def errors(run: dict[str, Any], key: str) -> list[float]:
+        known = [number(value) for value in run["per_frame"][key]]
+        return known + [math.inf] * (len(times) - len(known))
+
+    told = {row.preset: row.times_s for row in PUBLISHED if row.sequence == study["sequence"]}
+    curves = []
+    for name in dict.fromkeys(run["preset"] for run in measured):
+        own = [run for run in measured if run["preset"] == name]
+        best, nearest = (
+            np.array([errors(run, key) for run in own])
+            for key in ("root_aligned_mm", "root_aligned_best_of_modes_mm")
+        )
+        lost = [number(run["lost_s"]) for run in own]
+        curves.append(ErrorCurves(name, best, nearest, lost, told.get(name, ())))
+    failed_mm = study["thresholds"]["lost_mm"]
+    title = f"{study['sequence']}; dotted: frames with a greater error have failed"
+    return failure_figure(np.array(times), curves, title=title, failed_mm=failed_mm)
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Config, description=__doc__))
+    except TorchcssError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

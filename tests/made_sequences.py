@@ -1,0 +1,57 @@
+"""Sequence folders as other programs write them: the demo's arm in a few frames."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from torchcss.io.video import VideoWriter
+from torchcss.synthetic import SyntheticSequence, arm_sequence
+from torchcss.yardstick import silhouette
+
+NOISE_PX = 1.5
+
+
+def write_arm(folder: Path, num_frames: int, *, seed: int = 0) -> SyntheticSequence:
+    """Render the demo's arm and write everything that a folder may hold."""
+    generator = torch.Generator().manual_seed(seed)
+    made = arm_sequence(generator=generator, num_frames=num_frames)
+    folder.mkdir(parents=True, exist_ok=True)
+    with VideoWriter(folder / "video.mp4", made.frame_rate) as film:
+        for image in made.frames:
+            film.write(image)
+    camera, body = made.camera, made.body
+    entry = {
+        "video": "video.mp4",
+        "image_size_wh": list(camera.image_size_wh),
+        "K": camera.K.tolist(),
+        "R": camera.R_camera_world.tolist(),
+        "t": camera.t_camera_world.tolist(),
+    }
+    calibration = {"units": "metre, pixel", "cameras": {"cam01": entry}}
+    (folder / "cameras.json").write_text(json.dumps(calibration))
+    joints = made.joints_world
+    exact = camera.project(joints).uv
+    inside = camera.inside_image(exact).numpy()
+    noise = torch.randn(exact.shape, generator=generator, dtype=exact.dtype)
+    names = np.array(body.joint_names)
+    np.savez(
+        folder / "keypoints2d.npz",
+        keypoints=(exact + NOISE_PX * noise).numpy(), confidence=np.ones(inside.shape),
+        in_image=inside, joint_names=names, noise_px=np.array(NOISE_PX),
+    )  # fmt: skip
+    np.savez(
+        folder / "reference3d.npz", joints=joints.numpy(), joint_names=names, units=np.array("m")
+    )
+    np.savez(folder / "mask.npz", mask=np.stack([silhouette(body, x, camera) for x in made.states]))
+    base = np.eye(4)
+    base[:3, :3], base[:3, 3] = body.base_rotation, body.base_translation
+    np.savez(
+        folder / "truth.npz",
+        body=np.array(body.name), lengths=np.array(json.dumps(body.lengths)), base_transform=base,
+        state_names=np.array(body.state_names), states=made.states.numpy(),
+    )  # fmt: skip
+    return made

@@ -1,0 +1,462 @@
+"""How well a tracker follows a sequence whose truth is known, frame by frame and as a row.
+
+`Yardstick` measures every frame of a tracker, `summarise` makes a run one row of numbers, and
+`over_seeds` the rows of several runs one of medians. What the words mean (the figures are those of
+`Thresholds`):
+
+* A frame has *failed* if the best mode's mean root-aligned error exceeds 250 mm, or if its
+  silhouette overlaps the true one by less than 0.3 (intersection over union). The body is *lost*
+  at the first failed frame from which on all frames fail for half a second.
+* An arm hangs on a base that the tracker is told: its root is known, and root-aligned and absolute
+  errors are the same. Its frames fail above 150 mm: an arm that follows something else still begins
+  at the shoulder, and its four joints seldom lie 250 mm off in the mean.
+* The *true mode is kept* if the mean root-aligned error of any mode is below 100 mm; in angles, if
+  the true angles lie within three standard deviations of any mode (root of the mean squared
+  Mahalanobis distance per parameter).
+* *Calibration*: how often the true joints lie in the 50, 90, and 95 % regions of a mode, the
+  joint's covariance `J S J^T` (`torchcss.body.uncertainty`) enlarged by the reference's own.
+* A pose is *impossible* if an angle is more than a degree beyond its limit, or if a part is deeper
+  than 2 cm inside another one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchcss.body.model import BodyModel, BodyPose
+from torchcss.body.root import ROOT_NAMES, has_root, move_base
+from torchcss.body.uncertainty import joint_covariance
+from torchcss.cost.interpenetration import InterpenetrationPairs
+from torchcss.errors import ConfigurationError
+from torchcss.inference.tracker import TrackerInfo
+from torchcss.io.sequences import RecordedSequence
+from torchcss.io.video import Frame
+from torchcss.linalg import squared_mahalanobis
+from torchcss.metrics import (
+    LIMB_JOINTS,
+    LOST_MM,
+    REGAIN_S,
+    absolute_errors_mm,
+    acceleration_error,
+    best_of_modes,
+    coverage,
+    first_loss,
+    mask_overlap,
+    probability_within,
+    procrustes_errors_mm,
+    root_aligned_errors_mm,
+)
+from torchcss.pipeline import TrackedFrame
+from torchcss.raster import join_faces, rasterise
+from torchcss.synthetic import grid_faces
+from torchcss.vision.camera import Camera
+
+ARM_LOST_MM = 150.0
+"""Error above which a frame of an arm counts as failed."""
+
+_PLACE = ROOT_NAMES[:3]
+"""Where a body stands."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Thresholds:
+    """The figures that make the words precise; see the module's page.
+
+    Attributes:
+        lost_mm: Error above which a frame has failed.
+        least_overlap: Overlap below which it has.
+        regain_s: How long failing has to last to be a loss.
+        true_mode_mm: Error below which a mode is the true one.
+        true_mode_deviations: Standard deviations per angle below which it is.
+        outside_degrees: How far an angle may pass its limit.
+        deep_m: How deep parts may penetrate, metres.
+        reference_m: Standard deviation of the reference per coordinate, metres.
+    """
+
+    lost_mm: float = LOST_MM
+    least_overlap: float = 0.3
+    regain_s: float = REGAIN_S
+    true_mode_mm: float = 100.0
+    true_mode_deviations: float = 3.0
+    outside_degrees: float = 1.0
+    deep_m: float = 0.02
+    reference_m: float = 0.02
+
+    @classmethod
+    def of(cls, sequence: RecordedSequence) -> Thresholds:
+        """Those for a sequence.
+
+        A reference that is not of our bodies has its joints a few centimetres elsewhere. Where it
+        is, half a centimetre allows for what the linear covariance of a joint leaves out: a limb
+        of 0.3 m that is turned by 10 degrees leaves its tangent by 4.6 mm.
+        """
+        if sequence.truth is None:
+            return cls()
+        arm = not has_root(sequence.truth.body)
+        return cls(lost_mm=ARM_LOST_MM if arm else LOST_MM, reference_m=0.005)
+
+
+class FrameMeasures(NamedTuple):
+    """One frame of one tracker against the truth; modes as the tracker orders them, best first.
+
+    Attributes:
+        frame: Index in the video.
+        time_s: Seconds since the first frame tracked.
+        failed: Whether the best mode does not follow the body.
+        weight: Weights of the modes.
+        absolute_mm: Errors of the compared joints; NaN where the reference is unknown.
+        root_aligned_mm: The same with the roots on each other.
+        procrustes_mm: The same after the best similarity.
+        within: Probability of the region of a mode that just holds the true joint.
+        angle_deviations: Standard deviations per angle between a mode and the truth; NaN if the
+            true angles are not known.
+        joints_m: Compared joints of the best mode, metres.
+        reference_m: Where they should be; NaN where unknown.
+        overlap: Of the best mode's silhouette with the true one; NaN if that is not known.
+        outside_degrees: How far the best mode's worst angle is beyond its limit.
+        penetration_m: How deep the best mode's deepest node is inside another part, metres.
+        samples: Samples drawn.
+        evaluations: Evaluations of the cost: with two derivatives for each iteration of a
+            descending sample, or the value alone for each weighing of a particle.
+        seconds: Wall time by stage; that of the features is shared by all trackers.
+    """
+
+    frame: int
+    time_s: float
+    failed: bool
+    weight: Float[np.ndarray, " k"]
+    absolute_mm: Float[np.ndarray, "k j"]
+    root_aligned_mm: Float[np.ndarray, "k j"]
+    procrustes_mm: Float[np.ndarray, "k j"]
+    within: Float[np.ndarray, "k j"]
+    angle_deviations: Float[np.ndarray, " k"]
+    joints_m: Float[np.ndarray, "j 3"]
+    reference_m: Float[np.ndarray, "j 3"]
+    overlap: float
+    outside_degrees: float
+    penetration_m: float
+    samples: int
+    evaluations: int
+    seconds: dict[str, float]
+
+
+def num_evaluations(info: TrackerInfo) -> int:
+    """Evaluations of the cost in one step.
+
+    Each iteration of the optimiser is one; filters, which never iterate, weigh every sample once.
+    """
+    return int(info.num_steps.sum()) or int(info.num_samples)
+
+
+def penetration_depth(
+    body: BodyModel, pose: BodyPose, pairs: InterpenetrationPairs
+) -> Float[Tensor, "*batch"]:
+    """Depth of the deepest node of a part inside a part that is not its neighbour, metres.
+
+    To first order from the radial function R of the part (1 on its surface, see
+    `torchcss.cost.interpenetration`): `(1 - R) / |grad R|`, exact in a sphere.
+
+    Args:
+        body: The body.
+        pose: Any number of posed bodies.
+        pairs: The tables of that body, with as many nodes as the depth is to be exact.
+    """
+    near = pairs.near(body, pose, 1.0)
+    square, slope, _ = pairs.radial_square(near)
+    near, (square, slope) = near.select(square < 1, square, slope)
+    radius, slope = square.sqrt(), slope.norm(dim=-1)
+    tiny = torch.finfo(square.dtype).tiny
+    # |grad R^2| = 2 R |grad R|; it vanishes in the centre only, of which a node is never exactly.
+    depth = 2 * radius * (1 - radius) / slope.clamp(min=tiny)
+    batch = pose.x.shape[:-1]
+    deepest = depth.new_zeros(batch.numel())
+    return deepest.scatter_reduce(0, near.item[near.owner], depth, "amax").reshape(batch)
+
+
+def silhouette(
+    body: BodyModel, x: Float[Tensor, " n"], camera: Camera, *, rings: int = 16, meridians: int = 20
+) -> Bool[np.ndarray, "h w"]:
+    """Pixels whose centres see the posed body.
+
+    Args:
+        body: The body.
+        x: Its state.
+        camera: The camera.
+        rings: Latitudes of the drawn mesh.
+        meridians: Longitudes of the drawn mesh.
+    """
+    rotation, centre = body.part_poses(body.pose(x))
+    local = body.mesh(rings, meridians).points.flatten(1, 2)
+    points = (local @ rotation.transpose(-1, -2) + centre[:, None, :]).double().cpu()
+    grid = grid_faces(rings, meridians)
+    faces, _ = join_faces([grid] * len(points), [points.shape[1]] * len(points))
+    uv, depth, valid = camera.project(points.flatten(0, 1))
+    width, height = camera.image_size_wh
+    return (rasterise(uv, depth, faces, height, width, valid=valid).face >= 0).numpy()
+
+
+def compared_joints(sequence: RecordedSequence, body: BodyModel) -> tuple[str, ...]:
+    """The joints by which tracks are judged: of limbs, or all of an arm, that are mostly in view.
+
+    Raises:
+        ConfigurationError: If the sequence's reference has none of them.
+    """
+    wanted = LIMB_JOINTS if has_root(body) else body.joint_names
+    reference = torch.from_numpy(sequence.joints_world)
+    known = reference.isfinite().all(-1)
+    uv, _, valid = sequence.camera.project(reference.nan_to_num())
+    seen = known & valid & sequence.camera.inside_image(uv)
+    share = seen.sum(0) / known.sum(0).clamp(min=1)
+    chosen = tuple(
+        name
+        for name in wanted
+        if name in sequence.joint_names and share[sequence.joint_names.index(name)] >= 0.5
+    )
+    if not chosen:
+        raise ConfigurationError(
+            f"{sequence.name}: the reference has no joint of {body.name} in view; it has "
+            f"{', '.join(sequence.joint_names)}"
+        )
+    return chosen
+
+
+class Yardstick:
+    """Measures tracked frames of one sequence.
+
+    Args:
+        sequence: What is tracked.
+        body: The body that tracks it.
+        thresholds: What counts as failed.
+
+    Attributes:
+        compared: Names of the joints compared.
+    """
+
+    def __init__(self, sequence: RecordedSequence, body: BodyModel, thresholds: Thresholds) -> None:
+        self.sequence, self.thresholds = sequence, thresholds
+        self.compared = compared_joints(sequence, body)
+        # Both hips make the root, whether they are compared or not.
+        roots = ("l_hip", "r_hip") if has_root(body) else ()
+        self._common = list(dict.fromkeys((*self.compared, *roots)))
+        missing = [name for name in self._common if name not in sequence.joint_names]
+        if missing:
+            raise ConfigurationError(
+                f"{sequence.name}: cannot align the roots: the reference has no "
+                f"{' and '.join(missing)}"
+            )
+        self._column = [body.joint_index(name) for name in self._common]
+        index = [sequence.joint_names.index(name) for name in self._common]
+        self._reference = sequence.joints_world[:, index]
+        self._pairs = InterpenetrationPairs(body, rings=8, meridians=12)
+        self._rooted = bool(roots)
+
+    def __call__(self, tracked: TrackedFrame, start: Frame, features_s: float) -> FrameMeasures:
+        """Measure a frame.
+
+        Args:
+            tracked: The frame.
+            start: The first frame of the track.
+            features_s: What its features took, seconds.
+        """
+        sequence, limits = self.sequence, self.thresholds
+        body, mixture, number = tracked.body, tracked.state.mixture, tracked.frame.index
+        count = len(self.compared)
+        joints = tracked.joints_world[:, self._column].double().cpu().numpy()
+        reference = self._reference[number]
+        absolute = absolute_errors_mm(joints, reference)[:, :count]
+        aligned = absolute
+        if self._rooted:
+            aligned = root_aligned_errors_mm(joints, reference, self._common)[:, :count]
+        overlap = math.nan
+        if sequence.mask is not None:
+            drawn = silhouette(body, mixture.mean[0], sequence.camera)
+            overlap = float(mask_overlap(drawn, sequence.mask[number]))
+        best = body.pose(mixture.mean[0])
+        return FrameMeasures(
+            frame=number,
+            time_s=tracked.frame.time_s - start.time_s,
+            failed=_mean(aligned[0]) > limits.lost_mm or overlap < limits.least_overlap,
+            weight=mixture.weight.double().cpu().numpy(),
+            absolute_mm=absolute,
+            root_aligned_mm=aligned,
+            procrustes_mm=procrustes_errors_mm(joints[:, :count], reference[:count]),
+            within=self._within(tracked, reference[:count]),
+            angle_deviations=self._angle_deviations(tracked),
+            joints_m=joints[0, :count],
+            reference_m=reference[:count],
+            overlap=overlap,
+            outside_degrees=_outside(body, mixture.mean[0]),
+            penetration_m=float(penetration_depth(body, best, self._pairs)),
+            samples=int(tracked.info.num_samples),
+            evaluations=num_evaluations(tracked.info),
+            seconds={
+                "features": features_s,
+                "cost": tracked.seconds["features"],
+                "search": tracked.seconds["search"],
+            },
+        )
+
+    def _within(self, tracked: TrackedFrame, reference: np.ndarray) -> np.ndarray:
+        """Probability of the region of each mode that just holds each true joint."""
+        body, mixture = tracked.body, tracked.state.mixture
+        column = self._column[: len(self.compared)]
+        pose = body.pose(mixture.mean)
+        spread = joint_covariance(body, pose, mixture.covariance)[:, column].double().cpu()
+        spread = spread + self.thresholds.reference_m**2 * torch.eye(3, dtype=spread.dtype)
+        away = torch.from_numpy(reference) - pose.joints[:, column].double().cpu()
+        known = away.isfinite().all(-1)
+        distance = squared_mahalanobis(away.nan_to_num(), spread)
+        return probability_within(torch.where(known, distance, torch.nan).numpy(), 3)
+
+    def _angle_deviations(self, tracked: TrackedFrame) -> np.ndarray:
+        """Standard deviations per angle between each mode and the truth."""
+        truth, body, mixture = self.sequence.truth, tracked.body, tracked.state.mixture
+        if truth is None or truth.body.state_names != body.state_names:
+            return np.full(len(mixture.mean), np.nan)
+        x = truth.states[tracked.frame.index]
+        turn, shift = (part.double().cpu() for part in (body.base_rotation, body.base_translation))
+        angles = list(range(body.num_parameters))
+        if self._rooted:
+            _, x, _ = move_base(truth.body, turn, shift, x)
+            # Where the body stands goes with its size, which one image does not tell.
+            angles = [body.state_index(name) for name in body.state_names if name not in _PLACE]
+        away = (x - mixture.mean.double().cpu())[:, angles]
+        away = torch.remainder(away + math.pi, 2 * math.pi) - math.pi
+        spread = mixture.covariance.double().cpu()[:, angles][:, :, angles]
+        return (squared_mahalanobis(away, spread) / len(angles)).sqrt().numpy()
+
+
+def _outside(body: BodyModel, x: Float[Tensor, " n"]) -> float:
+    """How far the worst joint angle is beyond its limit, degrees."""
+    joints = [i for i, name in enumerate(body.state_names) if name not in ROOT_NAMES]
+    beyond = torch.maximum(body.lower - x, x - body.upper)[joints]
+    return math.degrees(max(0.0, float(beyond.max())))
+
+
+def _mean(values: Any) -> float:
+    """Mean of the numbers that are none of them NaN; NaN if there are none."""
+    values = np.asarray(values, np.float64).reshape(-1)
+    values = values[np.isfinite(values)]
+    return float(values.mean()) if values.size else math.nan
+
+
+def summarise(
+    measures: Sequence[FrameMeasures], thresholds: Thresholds, interval_s: float
+) -> dict[str, Any]:
+    """One run as the numbers of a table's row; NaN what cannot be measured.
+
+    Means are over the frames before the loss, while the tracker still had the body, since a run
+    that is stopped when it is lost has no others; samples and seconds are of all frames. Shares
+    are of frames, calibration is of joints in frames.
+
+    Args:
+        measures: All frames of the run, at least one.
+        thresholds: What counted as failed.
+        interval_s: Seconds between the frames.
+    """
+    times = [m.time_s for m in measures]
+    lost = first_loss([m.failed for m in measures], times, regain_s=thresholds.regain_s)
+    held = measures if lost is None else measures[: max(lost, 1)]
+    near = [_nearest(m) for m in held]
+    several = [(m, n) for m, n in zip(held, near, strict=True) if len(m.weight) > 1]
+    row: dict[str, Any] = {
+        "num_frames": len(measures),
+        "lost": lost is not None,
+        "lost_s": math.nan if lost is None else times[lost],
+        "failed_share": _mean([m.failed for m in measures]),
+        "num_frames_held": len(held) if lost is None else lost,
+        **_errors(held),
+        "true_mode_kept": _mean(
+            [
+                _mean(m.root_aligned_mm[n]) < thresholds.true_mode_mm
+                for m, n in zip(held, near, strict=True)
+            ]
+        ),
+        "true_angles_kept": math.nan
+        if np.isnan(held[0].angle_deviations).all()
+        else _mean([np.nanmin(m.angle_deviations) < thresholds.true_mode_deviations for m in held]),
+        "modes": _mean([len(m.weight) for m in held]),
+        # Of a calibrated mixture these two are equal: how sure it is of its best mode, and how
+        # often that is the nearest to the truth, where it has more than one.
+        "best_weight": _mean([m.weight[0] for m, _ in several]),
+        "best_is_nearest": _mean([n == 0 for _, n in several]),
+        "overlap": _mean([m.overlap for m in held]),
+        "acceleration_error": acceleration_error(
+            np.stack([m.joints_m for m in held]),
+            np.stack([m.reference_m for m in held]),
+            interval_s,
+        ),
+        "outside_share": _mean([m.outside_degrees > thresholds.outside_degrees for m in held]),
+        "deep_share": _mean([m.penetration_m > thresholds.deep_m for m in held]),
+        "outside_degrees": max(m.outside_degrees for m in held),
+        "penetration_mm": 1000 * max(m.penetration_m for m in held),
+        "samples_per_frame": _mean([m.samples for m in measures]),
+        "evaluations_per_frame": _mean([m.evaluations for m in measures]),
+        **{
+            f"{stage}_s_per_frame": _mean([m.seconds[stage] for m in measures])
+            for stage in measures[0].seconds
+        },
+        "per_frame": {
+            "time_s": times,
+            "failed": [m.failed for m in measures],
+            "root_aligned_mm": [_mean(m.root_aligned_mm[0]) for m in measures],
+            "root_aligned_best_of_modes_mm": [
+                _mean(m.root_aligned_mm[_nearest(m)]) for m in measures
+            ],
+            "overlap": [m.overlap for m in measures],
+        },
+    }
+    for name, which in (("best", [0] * len(held)), ("nearest", near)):
+        inside = np.stack([m.within[n] for m, n in zip(held, which, strict=True)])
+        row |= {f"inside_{round(100 * p)}_{name}": s for p, s in coverage(inside).items()}
+    return row
+
+
+def _nearest(measures: FrameMeasures) -> int:
+    """The mode that is nearest to the truth, the best one where that is not known."""
+    return max(0, int(best_of_modes(measures.root_aligned_mm)[1]))
+
+
+def _errors(measures: Sequence[FrameMeasures]) -> dict[str, float]:
+    """Mean errors of the best mode, and of the mode that is best by the error itself."""
+    kinds = {"mpjpe": "absolute_mm", "root_aligned": "root_aligned_mm", "pa_mpjpe": "procrustes_mm"}
+    errors = {}
+    for name, field in kinds.items():
+        values = [getattr(m, field) for m in measures]
+        errors[f"{name}_mm"] = _mean([_mean(value[0]) for value in values])
+        best = [_mean(best_of_modes(value)[0]) for value in values]
+        errors[f"{name}_best_of_modes_mm"] = _mean(best)
+    return errors
+
+
+def over_seeds(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Median, least and greatest over runs of one tracker of every number that `summarise` gives.
+
+    Args:
+        rows: The runs; None, which files have for NaN, counts as not known. Whoever did not lose
+            the body loses it later than anybody: infinite.
+    """
+    table: dict[str, Any] = {"seeds": len(rows), "lost": sum(row["lost"] for row in rows)}
+    for key, example in rows[0].items():
+        if key == "lost" or not (example is None or isinstance(example, (int, float))):
+            continue
+        missing = math.inf if key == "lost_s" else math.nan
+        values = [number(row[key], missing) for row in rows]
+        known = sorted(value for value in values if not math.isnan(value))
+        # The middle by hand: the mean of two middle ones may be that of infinities.
+        middle = known[(len(known) - 1) // 2 : len(known) // 2 + 1] if known else [math.nan]
+        table[key] = (sum(middle) / len(middle), *(known[:: max(len(known) - 1, 1)] or [math.nan]))
+    return table
+
+
+def number(value: float | None, missing: float = math.nan) -> float:
+    """What a run or its file says; `missing` for NaN and for null, which stands for it."""
+    return missing if value is None or math.isnan(value) else float(value)
