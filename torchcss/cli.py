@@ -5,6 +5,7 @@
 | `torchcss demo` | renders a sequence, tracks it and prints the error against the truth |
 | `torchcss init IMAGE` | fits a body to one picture with marked joints |
 | `torchcss track VIDEO` | tracks a body through a video |
+| `torchcss smooth TRACK` | makes one smooth trajectory of a track's modes |
 | `torchcss export TRACK` | writes a track for another program |
 
 Bad input ends with one line on standard error and exit status 2; Ctrl-C with status 130. What was
@@ -22,9 +23,11 @@ import tyro
 
 from torchcss.cli_export import Export
 from torchcss.cli_init import Init
+from torchcss.cli_smooth import Smooth, report
 from torchcss.demo import run_demo
 from torchcss.errors import OutputError, TorchcssError
 from torchcss.settings import TERMS, Settings
+from torchcss.smooth import smooth_file
 from torchcss.track_files import track_video
 
 
@@ -120,6 +123,9 @@ class Track:
     """Foreground of every frame: a video or a folder of images of the video's size."""
     overlay: bool = True
     """Write overlay.mp4."""
+    smooth: bool = False
+    """When done, write smooth.npz as well: one smooth trajectory through the modes of all frames,
+    as torchcss smooth does."""
     seed: int = 0
     """Seed of all random numbers."""
     device: str = "cpu"
@@ -164,12 +170,15 @@ class Track:
             f"{summary['num_frames']} frames, {summary['seconds_per_frame']:.2f} s each; "
             f"track, summary and overlay are in {self.out}"
         )
+        if self.smooth:
+            print(report(smooth_file(self.out)))
 
 
 Verb = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Init, tyro.conf.subcommand("init")]
     | Annotated[Track, tyro.conf.subcommand("track")]
+    | Annotated[Smooth, tyro.conf.subcommand("smooth")]
     | Annotated[Export, tyro.conf.subcommand("export")]
 )
 

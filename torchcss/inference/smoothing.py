@@ -1,0 +1,648 @@
+"""One trajectory through a sequence of mixtures: the best path of modes, and its joint refinement.
+
+A tracker decides frame by frame; once the sequence is over, later frames may tell which of the
+modes of an earlier one was right, and a motion that is possible tells where in a mode it went.
+
+`best_path` chooses one mode per frame, by dynamic programming (Viterbi 1967) over
+
+    sum_t  evidence * cost_t(k_t)  -  sum_t log N(x_t - x_t-1; 0, Q_t + Sigma_t-1 + Sigma_t)
+
+and, where the transition has an acceleration, over pairs of modes in the same way. `refine` then
+moves the states of the path together, to the least of
+
+    sum_t  f_t(x_t)  +  1/2 sum_t |(x_t - x_t-1) / (v d_t)|^2
+                     +  1/2 sum_t |(x_t - x_t-1 - (d_t / d_t-1) (x_t-1 - x_t-2)) / (a e_t)|^2
+
+within the joint limits, where f_t is any cost of frame t, `d_t` the time since the frame before and
+`e_t = d_t (d_t + d_t-1) / 2`. With Gaussian modes as costs (`GaussianEvidence`) this is the fixed
+interval smoother of Rauch, Tung and Striebel (1965) under limits; with the costs of the images it
+is the joint fit of the whole window. The Hessian is block-banded (three blocks wide with velocity
+alone, five with acceleration), so that a Newton step takes time linear in the number of frames, and
+so do the covariances, the diagonal blocks of its inverse.
+
+Both terms are deviations per frame and not densities of a Wiener process: errors of images persist
+over frames, so that more frames per second are not more evidence, and with terms that scale in the
+same way the smoothing of a motion does not depend on the frame rate. For the same reason a cost
+counts less than its nats when frames are weighed against each other: the parameter `evidence`, as
+`Tracker.memory` does while tracking.
+
+Where the coordinates of the state change between frames (a body is hung on another base),
+`changes` maps them: a step t that is in it takes states of frame t into the coordinates of frame
+t + 1. Everything is computed in float64 and returned in the type that came in.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchcss.errors import ConfigurationError, ShapeError, check_shape
+from torchcss.inference.band import Band, least_in_box
+from torchcss.inference.trust_region import default_prior_variance
+from torchcss.linalg import mask_free, symmetric_part, whitener
+from torchcss.types import Bounds, CostFunction, LocalModel, Status
+
+Changes = Mapping[int, Callable[[Tensor], Tensor]]
+"""By the index of a frame, a differentiable map `[*batch n] -> [*batch n]` from the coordinates of
+that frame to those of the next one. Frames that are not in it share the coordinates of the next."""
+
+_MOST_DAMPING = 1e12
+
+
+@dataclass(frozen=True, kw_only=True)
+class Transition:
+    """How a state moves between frames: standard deviations of its velocity and acceleration.
+
+    Attributes:
+        velocity: Units per second, one number or one per parameter; infinite: not judged. A body's
+            `motion_rate` is one.
+        acceleration: Change of velocity, units per second squared, likewise.
+    """
+
+    velocity: float | tuple[float, ...] = math.inf
+    acceleration: float | tuple[float, ...] = math.inf
+
+    def __post_init__(self) -> None:
+        for name in ("velocity", "acceleration"):
+            if not bool((torch.as_tensor(getattr(self, name)) > 0).all()):
+                raise ConfigurationError(
+                    f"Transition.{name}: expected positive numbers, got {getattr(self, name)}"
+                )
+
+    @property
+    def judges_acceleration(self) -> bool:
+        """Whether any parameter's acceleration is judged."""
+        return bool(torch.as_tensor(self.acceleration).isfinite().any())
+
+    def deviations(
+        self, times: Float[Tensor, " t"], n: int
+    ) -> tuple[Float[Tensor, "steps n"], Float[Tensor, "changes n"]]:
+        """Standard deviation of every motion, and of every change of motion, as terms count them.
+
+        Args:
+            times: Seconds.
+            n: Number of parameters.
+
+        Returns:
+            For `x_t - x_t-1`, from t = 1; and for `x_t - x_t-1 - r (x_t-1 - x_t-2)` with r the
+            ratio of the two time steps, from t = 2.
+        """
+        step = times.diff()[:, None]
+        change = 0.5 * step[1:] * (step[1:] + step[:-1])
+        velocity, acceleration = (
+            torch.as_tensor(deviation, dtype=times.dtype, device=times.device).expand(n)
+            for deviation in (self.velocity, self.acceleration)
+        )
+        return step * velocity, change * acceleration
+
+
+class Path(NamedTuple):
+    """What `best_path` chose.
+
+    Attributes:
+        mode: One mode per frame.
+        cost: Least of the sum, nats, a scalar.
+    """
+
+    mode: Int[Tensor, " t"]
+    cost: Float[Tensor, ""]
+
+
+class Refined(NamedTuple):
+    """What `refine` found.
+
+    Attributes:
+        mean: The states, within the bounds.
+        covariance: Of each state, all frames known: diagonal blocks of the inverse Hessian.
+        cost: Cost of each frame at its state, without the transitions, nats.
+        total: What was minimised, transitions included, a scalar.
+        active: True where a variable ended at a bound that holds it.
+        status: A `Status`, a scalar.
+        num_steps: Iterations, a scalar.
+    """
+
+    mean: Float[Tensor, "t n"]
+    covariance: Float[Tensor, "t n n"]
+    cost: Float[Tensor, " t"]
+    total: Float[Tensor, ""]
+    active: Bool[Tensor, "t n"]
+    status: Int[Tensor, ""]
+    num_steps: Int[Tensor, ""]
+
+
+class GaussianEvidence(NamedTuple):
+    """Frames of which each says `1/2 (x - mean)^T precision (x - mean)`; a `CostFunction`.
+
+    Attributes:
+        mean: What each frame says that the state is.
+        precision: Inverse covariance; zero for a frame that says nothing.
+    """
+
+    mean: Float[Tensor, "t n"]
+    precision: Float[Tensor, "t n n"]
+
+    @staticmethod
+    def of_modes(
+        mean: Float[Tensor, "t n"],
+        covariance: Float[Tensor, "t n n"],
+        *,
+        seen: Bool[Tensor, " t"] | None = None,
+        evidence: float = 1.0,
+    ) -> GaussianEvidence:
+        """From modes; covariances may be singular, see `torchcss.linalg`.
+
+        Args:
+            mean: The modes.
+            covariance: Their covariances.
+            seen: False for a frame without evidence.
+            evidence: Power of each frame's evidence, that is factor on the precisions.
+        """
+        white = whitener(covariance.double())
+        precision = evidence * symmetric_part(white.mT @ white)
+        if seen is not None:
+            precision = torch.where(seen[:, None, None], precision, 0.0)
+        return GaussianEvidence(mean.double(), precision)
+
+    def value(self, x: Float[Tensor, "t n"]) -> Float[Tensor, " t"]:
+        """Cost of every frame, nats."""
+        apart = x - self.mean
+        return 0.5 * (apart * (self.precision @ apart[..., None])[..., 0]).sum(-1)
+
+    def local_model(self, x: Float[Tensor, "t n"]) -> LocalModel:
+        """Cost, gradient and Hessian of every frame."""
+        pull = (self.precision @ (x - self.mean)[..., None])[..., 0]
+        return LocalModel(0.5 * ((x - self.mean) * pull).sum(-1), pull, self.precision)
+
+
+def best_path(
+    mean: Float[Tensor, "t k n"],
+    covariance: Float[Tensor, "t k n n"] | None,
+    cost: Float[Tensor, "t k"],
+    times: Float[Tensor, " t"],
+    transition: Transition,
+    *,
+    evidence: float = 1.0,
+    changes: Changes | None = None,
+    period: Float[Tensor, " n"] | None = None,
+) -> Path:
+    """Choose the mode of every frame, all frames considered.
+
+    Args:
+        mean: The modes of every frame; those of infinite cost may hold anything finite.
+        covariance: Their covariances, which widen the transition; None: modes are points.
+        cost: Negative logarithm of each mode's likelihood (or weight), nats; `inf`: no such mode.
+            A frame without any is passed over: all its modes cost the same.
+        times: Seconds, increasing; gaps make steps longer.
+        transition: What motion is to be expected. If it judges accelerations, pairs of modes are
+            the states of the search, in time `T K^3`.
+        evidence: Factor on the costs.
+        changes: Where coordinates change, see the module's page.
+        period: Period of each parameter, infinite for most: differences are taken the short way.
+
+    Returns:
+        The path and its cost. Of equally good paths that of the lower indices, from the end on.
+
+    Raises:
+        ShapeError: If the shapes do not agree, or a mode of finite cost is not finite.
+        ConfigurationError: If the times do not increase, or the evidence is not positive.
+    """
+    check_shape("mean", mean, None, None, None)
+    t, k, n = mean.shape
+    check_shape("cost", cost, t, k)
+    if covariance is not None:
+        check_shape("covariance", covariance, t, k, n, n)
+    times = _checked_times(times, t)
+    if not evidence > 0:
+        raise ConfigurationError(f"best_path: expected a positive evidence, got {evidence}")
+    node, present = evidence * cost.double(), cost.isfinite()
+    if bool(cost.isnan().any()):
+        raise ShapeError("best_path: costs hold NaN; expected numbers, inf for a missing mode")
+    node = torch.where(present.any(1, keepdim=True), node, 0.0)
+    state = mean.double()
+    spread = None if covariance is None else covariance.double()
+    finite = state.isfinite().all(-1)
+    if spread is not None:
+        finite &= spread.isfinite().all(-1).all(-1)
+    if not bool(finite[present].all()):
+        raise ShapeError("best_path: expected finite means and covariances of the modes")
+    motion, turn = transition.deviations(times, n)
+
+    def edge(step: int) -> Float[Tensor, "k k"]:
+        """Cost of going from each mode of a frame to each of the next."""
+        before, wide = _carried(
+            state[step], None if spread is None else spread[step], step, changes
+        )
+        apart = _short_way(state[step + 1][None] - before[:, None], period)
+        if spread is not None and wide is not None:
+            wide = wide[:, None] + spread[step + 1][None]
+        return _gaussian_cost(apart, motion[step], wide)
+
+    if not transition.judges_acceleration or t < 3:
+        edges = [edge(step) for step in range(t - 1)]
+        return _viterbi(node, edges)
+
+    def corner(step: int) -> Float[Tensor, "k k k"]:
+        """Cost of the change of motion over three frames, by the modes of the three."""
+        ratio = float((times[step + 2] - times[step + 1]) / (times[step + 1] - times[step]))
+        first, first_wide = state[step], None if spread is None else spread[step]
+        for hop in (step, step + 1):
+            first, first_wide = _carried(first, first_wide, hop, changes)
+        middle, wide = state[step + 1], None if spread is None else spread[step + 1]
+        middle, wide = _carried(middle, wide, step + 1, changes)
+        last = state[step + 2]
+        moved = _short_way(last[None] - middle[:, None], period)
+        came = _short_way(middle[None] - first[:, None], period)
+        if wide is not None and first_wide is not None and spread is not None:
+            wide = (
+                ratio**2 * first_wide[:, None, None]
+                + (1 + ratio) ** 2 * wide[:, None]
+                + spread[step + 2]
+            )
+        return _gaussian_cost(moved[None] - ratio * came[:, :, None], turn[step], wide)
+
+    return _second_order_viterbi(node, edge, corner)
+
+
+def refine(
+    cost: CostFunction,
+    start: Float[Tensor, "t n"],
+    times: Float[Tensor, " t"],
+    transition: Transition,
+    bounds: Bounds,
+    *,
+    changes: Changes | None = None,
+    scale: Float[Tensor, " n"] | None = None,
+    prior_variance: Float[Tensor, " n"] | None = None,
+    max_steps: int = 50,
+    tolerance: float = 1e-6,
+) -> Refined:
+    """Move the states of all frames together to where costs and transitions are least.
+
+    Newton's method on all frames at once, with the bounds held exactly in every step and damping
+    (eq. 13 [IJRR]) where a step fails. Frames whose Hessian spoils the definiteness of the whole
+    count with the absolute values of its curvatures.
+
+    Args:
+        cost: Costs of the frames: item t of its batch is frame t.
+        start: Where to start; moved into the bounds.
+        times: Seconds, increasing.
+        transition: What motion is to be expected.
+        bounds: Box limits, of shape `[n]` or, where they differ by frame, `[t n]`. Equal bounds
+            hold a variable where it is.
+        changes: Where coordinates change, see the module's page. Their curvature is neglected in
+            the Hessian and nowhere else.
+        scale: Length of each parameter that damping counts as one; ones by default.
+        prior_variance: Variance of each parameter before any image is seen: of variables that a
+            bound holds (design decision 9), and a weak prior on the others in the covariances,
+            not in the means. By default `default_prior_variance(bounds)`.
+        max_steps: Iterations, each one evaluation of all frames.
+        tolerance: Expected decrease of the sum, nats, below which it is done.
+
+    Returns:
+        States, covariances, costs. The sum is never above that of the start.
+
+    Raises:
+        ShapeError: If the shapes do not agree, or the start is not finite.
+        ConfigurationError: If times do not increase, or a lower bound exceeds the upper one.
+    """
+    check_shape("start", start, None, None)
+    t, n = start.shape
+    times = _checked_times(times, t)
+    limits = _checked_bounds(bounds, t, n)
+    if not bool(start.isfinite().all()):
+        raise ShapeError("refine: expected a finite start")
+    weight = start.new_ones(n).double() if scale is None else scale.double().square().reciprocal()
+    if prior_variance is None:
+        quarter = Bounds(limits.lower.amax(0), limits.upper.amin(0))
+        prior_variance = default_prior_variance(quarter)
+
+    def whole(x: Tensor) -> _Chain:
+        model = LocalModel(*(part.detach().double() for part in cost.local_model(x.to(start))))
+        return _Chain.of(model, _motion_terms(x, times, transition, changes or {}))
+
+    x = limits.project(start.double())
+    chain, damping, status, steps = whole(x), 0.0, Status.RUNNING, 0
+    if not chain.is_finite:
+        status = Status.NON_FINITE
+    while status is Status.RUNNING:
+        step, used = _chain_step(chain, x, limits, weight, damping)
+        predicted = -float((step * (chain.gradient + 0.5 * chain.times(step))).sum())
+        resolution = 4 * torch.finfo(start.dtype).eps * abs(float(chain.value))
+        if predicted < tolerance and used == damping == 0.0:
+            status = Status.CONVERGED
+        elif predicted <= max(1e-3 * tolerance, resolution):
+            status = Status.SMALL_STEP
+        elif steps >= max_steps:
+            status = Status.STEP_LIMIT
+        else:
+            steps += 1
+            # A sum may miss the bound that it is to reach by its rounding.
+            candidate = torch.where(step <= limits.lower - x, limits.lower, x + step)
+            candidate = torch.where(step >= limits.upper - x, limits.upper, candidate)
+            candidate = limits.project(candidate)
+            other = whole(candidate)
+            decrease = float(chain.value - other.value) if other.is_finite else -math.inf
+            if decrease >= 0 and decrease > 1e-4 * predicted:
+                x, chain = candidate, other
+                damping = 0.0 if damping < 1e-3 * chain.curvature(weight) else 0.2 * damping
+                if decrease < 0.25 * predicted:
+                    damping = max(2 * used, 1e-3 * chain.curvature(weight))
+            else:
+                damping = max(5 * used, 1e-2 * chain.curvature(weight))
+                if damping > _MOST_DAMPING * chain.curvature(weight):
+                    status = Status.SMALL_STEP
+
+    active = _held(x, chain.gradient, limits)
+    covariance = _marginals(chain, ~active, prior_variance.double())
+    return Refined(
+        mean=x.to(start),
+        covariance=covariance.to(start),
+        cost=chain.frame_value.to(start),
+        total=chain.value.to(start),
+        active=active,
+        status=torch.tensor(int(status)),
+        num_steps=torch.tensor(steps),
+    )
+
+
+# --- best path -----------------------------------------------------------------------------------
+
+
+def _carried(
+    state: Tensor, spread: Tensor | None, step: int, changes: Changes | None
+) -> tuple[Tensor, Tensor | None]:
+    """States of a frame and their covariances in the coordinates of the next."""
+    if not changes or step not in changes:
+        return state, spread
+    moved, slope = _with_slope(changes[step], state)
+    return moved, None if spread is None else slope @ spread @ slope.mT
+
+
+def _with_slope(
+    change: Callable[[Tensor], Tensor], x: Float[Tensor, "*b n"]
+) -> tuple[Float[Tensor, "*b n"], Float[Tensor, "*b n n"]]:
+    """A change of coordinates and its derivative."""
+    # The derivative in a step that all items share is that of every item in its own.
+    slope = torch.autograd.functional.jacobian(
+        lambda step: change(x + step), x.new_zeros(x.shape[-1])
+    )
+    assert isinstance(slope, Tensor)
+    return change(x).detach(), slope
+
+
+def _short_way(apart: Tensor, period: Tensor | None) -> Tensor:
+    """Differences of periodic parameters, at most half a period long."""
+    if period is None:
+        return apart
+    finite = torch.where(period.isfinite(), period, 1.0).to(apart)
+    return apart - torch.where(period.isfinite(), finite * (apart / finite).round(), 0.0)
+
+
+def _gaussian_cost(
+    apart: Float[Tensor, "*b n"], deviation: Float[Tensor, " n"], wide: Tensor | None
+) -> Float[Tensor, "*b"]:
+    """Negative log density of differences under the motion and the modes' own covariances.
+
+    In units of the motion's deviations, and without the constants that all paths share. Parameters
+    that are not judged are left out.
+    """
+    judged = deviation.isfinite()
+    z = apart[..., judged] / deviation[judged]
+    if wide is None:
+        return 0.5 * z.square().sum(-1)
+    units = torch.outer(deviation[judged], deviation[judged])
+    matrix = wide[..., judged, :][..., judged] / units
+    matrix.diagonal(dim1=-2, dim2=-1).add_(1.0)
+    factor = torch.linalg.cholesky(symmetric_part(matrix))
+    white = torch.linalg.solve_triangular(factor, z[..., None], upper=False)[..., 0]
+    return 0.5 * white.square().sum(-1) + factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+
+
+def _viterbi(node: Float[Tensor, "t k"], edges: list[Tensor]) -> Path:
+    """Least sum of nodes and edges, by dynamic programming."""
+    best, back = node[0], []
+    for edge, own in zip(edges, node[1:], strict=True):
+        reached, came_from = (best[:, None] + edge).min(0)
+        back.append(came_from)
+        best = reached + own
+    mode = [int(best.argmin())]
+    for came_from in reversed(back):
+        mode.append(int(came_from[mode[-1]]))
+    return Path(torch.tensor(mode[::-1], device=node.device), best.min())
+
+
+def _second_order_viterbi(
+    node: Float[Tensor, "t k"],
+    edge: Callable[[int], Float[Tensor, "k k"]],
+    corner: Callable[[int], Float[Tensor, "k k k"]],
+) -> Path:
+    """The same with a cost of every three frames: the states are pairs of neighbouring modes."""
+    t, k = node.shape
+    best, back = node[0][:, None] + edge(0) + node[1], []
+    for step in range(t - 2):
+        reached, came_from = (best[:, :, None] + corner(step)).min(0)
+        back.append(came_from)
+        best = reached + edge(step + 1) + node[step + 2]
+    before, last = divmod(int(best.flatten().argmin()), k)
+    mode = [last, before]
+    for came_from in reversed(back):
+        mode.append(int(came_from[mode[-1], mode[-2]]))
+    return Path(torch.tensor(mode[::-1], device=node.device), best.min())
+
+
+# --- refinement ----------------------------------------------------------------------------------
+
+
+class _Motion(NamedTuple):
+    """The transitions' share of the sum."""
+
+    value: Float[Tensor, ""]
+    gradient: Float[Tensor, "t n"]
+    band: Float[Tensor, "t w n n"]
+
+
+class _Chain(NamedTuple):
+    """The quadratic model of the whole sum.
+
+    Attributes:
+        value: The sum.
+        gradient: Its derivative.
+        hessian: Of the frames' costs.
+        motion: Second derivative of the transitions.
+        frame_value: Costs of the frames.
+    """
+
+    value: Float[Tensor, ""]
+    gradient: Float[Tensor, "t n"]
+    hessian: Float[Tensor, "t n n"]
+    motion: Float[Tensor, "t w n n"]
+    frame_value: Float[Tensor, " t"]
+
+    @staticmethod
+    def of(model: LocalModel, motion: _Motion) -> _Chain:
+        """Frames and transitions together."""
+        return _Chain(
+            model.value.sum() + motion.value,
+            model.gradient + motion.gradient,
+            symmetric_part(model.hessian),
+            motion.band,
+            model.value,
+        )
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether the sum has a value and derivatives."""
+        parts = (self.value, self.gradient, self.hessian)
+        return all(bool(part.isfinite().all()) for part in parts)
+
+    @property
+    def band(self) -> Band:
+        """Second derivative of the sum."""
+        block = self.motion.clone()
+        block[:, 0] += self.hessian
+        return Band(block)
+
+    def times(self, vector: Float[Tensor, "t n"]) -> Float[Tensor, "t n"]:
+        """Second derivative times a vector."""
+        return self.band.times(vector)
+
+    def convex(self) -> _Chain:
+        """With the frames' negative curvatures turned round."""
+        values, vectors = torch.linalg.eigh(self.hessian)
+        return self._replace(hessian=(vectors * values.abs()[:, None, :]) @ vectors.mT)
+
+    def curvature(self, weight: Float[Tensor, " n"]) -> float:
+        """A typical curvature in the damping's units, never zero."""
+        diagonal = self.band.block[:, 0].diagonal(dim1=-2, dim2=-1) / weight
+        typical = float(diagonal.abs().median())
+        return typical if typical > 0 else 1.0
+
+
+def _motion_terms(
+    x: Float[Tensor, "t n"], times: Float[Tensor, " t"], transition: Transition, changes: Changes
+) -> _Motion:
+    """Value, gradient and (Gauss-Newton) Hessian of the transitions."""
+    t, n = x.shape
+    motion, turn = transition.deviations(times, n)
+    eye = torch.eye(n, dtype=x.dtype, device=x.device)
+    width = 1 + min(2 if transition.judges_acceleration else 1, t - 1)
+    gradient, band = torch.zeros_like(x), x.new_zeros(t, width, n, n)
+    value = x.new_zeros(())
+    # Where each frame lies in the coordinates of the next and of the next but one.
+    ahead, slope = x.clone(), eye.repeat(t, 1, 1)
+    far, far_slope = x.clone(), eye.repeat(t, 1, 1)
+    for step in changes:
+        if step < t - 1:
+            ahead[step], slope[step] = _with_slope(changes[step], x[step])
+    far, far_slope = ahead.clone(), slope.clone()
+    for step in changes:
+        if 1 <= step < t - 1:
+            far[step - 1], turned = _with_slope(changes[step], ahead[step - 1])
+            far_slope[step - 1] = turned @ slope[step - 1]
+
+    def add(residual: Tensor, factors: list[Tensor]) -> None:
+        """Half a squared residual; `factors[d]` is its derivative by the state d frames earlier."""
+        nonlocal value
+        first = t - len(residual)
+        value = value + 0.5 * residual.square().sum()
+        for d, factor in enumerate(factors):
+            rows = slice(first - d, t - d)
+            gradient[rows] += (factor.mT @ residual[..., None])[..., 0]
+            for e in range(d, len(factors)):
+                band[rows, e - d] += factor.mT @ factors[e]
+
+    if t > 1:
+        weight = motion.reciprocal()
+        add(
+            weight * (x[1:] - ahead[:-1]),
+            [torch.diag_embed(weight), -weight[..., None] * slope[:-1]],
+        )
+    if t > 2 and transition.judges_acceleration:
+        weight = turn.reciprocal()
+        step = times.diff()
+        ratio = (step[1:] / step[:-1])[:, None]
+        add(
+            weight * (x[2:] - (1 + ratio) * ahead[1:-1] + ratio * far[:-2]),
+            [
+                torch.diag_embed(weight),
+                -(weight * (1 + ratio))[..., None] * slope[1:-1],
+                (weight * ratio)[..., None] * far_slope[:-2],
+            ],
+        )
+    return _Motion(value, gradient, band)
+
+
+def _chain_step(
+    chain: _Chain, x: Tensor, limits: Bounds, weight: Tensor, damping: float
+) -> tuple[Float[Tensor, "t n"], float]:
+    """The step to the least of the damped model in the box, and the damping that it took."""
+    fixed, held = limits.lower == limits.upper, _held(x, chain.gradient, limits)
+    lower, upper = limits.lower - x, limits.upper - x
+    trial, model = damping, chain
+    for attempt in range(60):
+        band = model.band.plus_diagonal(trial * weight)
+        # A definite model may take variables off their bounds; else those stay that are held.
+        for kept in (fixed, held):
+            if band.masked(~kept).factor() is not None:
+                step = least_in_box(band, chain.gradient, lower, upper, kept)
+                if step is not None:
+                    return step, trial
+        if attempt == 0:
+            model = chain.convex()
+        else:
+            trial = max(10 * trial, 1e-12 * chain.curvature(weight))
+    # Every entry of the model would have to be beyond all bounds; there is no step to take.
+    return torch.zeros_like(x), trial
+
+
+def _marginals(
+    chain: _Chain, free: Bool[Tensor, "t n"], prior_variance: Float[Tensor, " n"]
+) -> Float[Tensor, "t n n"]:
+    """Covariances of the states: diagonal blocks of the inverse Hessian on the free variables."""
+    model = chain
+    for attempt in range(60):
+        weak = prior_variance.reciprocal() * 10.0 ** max(attempt - 1, 0)
+        factor = model.band.plus_diagonal(weak).masked(free).factor()
+        if factor is not None:
+            break
+        model = chain.convex()
+    else:
+        return torch.diag_embed(prior_variance.expand_as(chain.gradient))
+    covariance = mask_free(factor.inverse_diagonal(), free)
+    covariance.diagonal(dim1=-2, dim2=-1).copy_(
+        torch.where(free, covariance.diagonal(dim1=-2, dim2=-1), prior_variance)
+    )
+    return covariance
+
+
+def _held(x: Tensor, gradient: Tensor, bounds: Bounds) -> Bool[Tensor, "t n"]:
+    """Variables at a bound that the sum pushes against it, or without room between two."""
+    pushed = ((x <= bounds.lower) & (gradient > 0)) | ((x >= bounds.upper) & (gradient < 0))
+    return pushed | (bounds.lower == bounds.upper)
+
+
+def _checked_times(times: Tensor, t: int) -> Float[Tensor, " t"]:
+    check_shape("times", times, t)
+    if t == 0:
+        raise ShapeError("smoothing: expected at least one frame, got none")
+    seconds = times.double()
+    if not bool((seconds.diff() > 0).all()) or not bool(seconds.isfinite().all()):
+        raise ConfigurationError("smoothing: expected times that increase from frame to frame")
+    return seconds
+
+
+def _checked_bounds(bounds: Bounds, t: int, n: int) -> Bounds:
+    for name, vector in zip(("lower", "upper"), bounds, strict=True):
+        if vector.shape not in ((n,), (t, n)):
+            raise ShapeError(
+                f"bounds.{name}: expected shape [{n}] or [{t}, {n}], got {list(vector.shape)}"
+            )
+    if not bool((bounds.lower <= bounds.upper).all()):
+        raise ConfigurationError("bounds: expected lower <= upper; correct the limits")
+    return Bounds(bounds.lower.double().expand(t, n), bounds.upper.double().expand(t, n))

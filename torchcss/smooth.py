@@ -1,0 +1,308 @@
+"""Smooth a track after the fact: one trajectory that explains all frames, with its covariances.
+
+A track holds, for every frame, the modes that the frame and those before it leave possible.
+`smooth_track` chooses among them with all frames in view (`inference.smoothing.best_path`), takes
+each chosen mode as what its frame says, and moves the states together to where that and the motion
+prior agree, within the joint limits (`inference.smoothing.refine`). It needs nothing but the track.
+
+The motion prior is the body's `motion_rate` for velocities, and `Smoothing.agility` times that for
+accelerations. A frame in which the tracker had nothing to go by (its modes were carried over, their
+cost is infinite) says nothing; its state follows from its neighbours.
+
+The result is a `Track` of one mode per frame, which everything that reads tracks can read; the
+alternatives stay in the track that it came from. `smooth_file` reads `track.npz`, writes
+`smooth.npz` beside it or elsewhere, and adds an entry `smoothed` to `summary.json`.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchcss.body.model import BodyModel
+from torchcss.body.root import ROOT_NAMES, has_root, move_base
+from torchcss.errors import ConfigurationError, TrackFileError
+from torchcss.inference.smoothing import (
+    GaussianEvidence,
+    Refined,
+    Transition,
+    best_path,
+    refine,
+)
+from torchcss.io.track_body import body_of_track, pose_track
+from torchcss.io.tracks import (
+    SUMMARY_NAME,
+    Track,
+    TrackWriter,
+    load_track,
+    prepare_output_folder,
+    read_summary,
+    write_summary,
+)
+
+SMOOTH_NAME = "smooth.npz"
+
+_SAME_BASE = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True)
+class Smoothing:
+    """How to smooth.
+
+    Attributes:
+        evidence: Power of each frame's likelihood when modes of several frames are weighed against
+            the motion between them, and of its precision in the covariances; below one because
+            errors of images persist over frames (see `Tracker.memory`, which is the same number).
+        agility: Standard deviation of accelerations over that of velocities, 1/s. The higher, the
+            closer the result stays to the modes.
+    """
+
+    evidence: float = 0.5
+    agility: float = 20.0
+
+    def __post_init__(self) -> None:
+        for name in ("evidence", "agility"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ConfigurationError(
+                    f"{name}: expected a positive number, got {getattr(self, name)}"
+                )
+
+
+class SmoothedTrack(NamedTuple):
+    """A smoothed track.
+
+    Attributes:
+        track: One mode per frame.
+        modes: Which of the modes of the track it came from each frame's was.
+        effect: What it changed, for people; numbers and lists.
+    """
+
+    track: Track
+    modes: Int[np.ndarray, " t"]
+    effect: dict[str, Any]
+
+
+def smooth_track(
+    track: Track, body: BodyModel | None = None, *, choice: Smoothing | None = None
+) -> SmoothedTrack:
+    """Smooth a track.
+
+    Args:
+        track: The track, with several modes per frame or one.
+        body: The body, if it is none of the catalogue's (see `body_of_track`).
+        choice: How to smooth.
+
+    Raises:
+        TrackFileError: If the track is empty, its times do not rise, or its body cannot be told.
+    """
+    choice, began = choice or Smoothing(), time.perf_counter()
+    if not (np.diff(track.times) > 0).all():
+        raise TrackFileError("the times of the track do not rise; it cannot be smoothed")
+    body = body_of_track(track, body)
+    bases = torch.from_numpy(track.base_transform)
+    times = torch.from_numpy(track.times)
+    state, covariance = torch.from_numpy(track.state), torch.from_numpy(track.covariance)
+    cost = torch.from_numpy(np.where(track.log_weight > -np.inf, track.cost, np.inf))
+    seen = cost.isfinite().any(1)
+    # Where a frame said nothing, its modes are the prior of the tracker; only those exist.
+    absent = torch.from_numpy(track.log_weight == -np.inf)
+    node = torch.where(seen[:, None], cost, torch.where(absent, math.inf, 0.0))
+    changes = base_changes(body, bases)
+    period = torch.full((body.num_parameters,), math.inf, dtype=torch.float64)
+    if has_root(body):
+        period[[body.state_index(name) for name in ROOT_NAMES[3:]]] = 2 * math.pi
+
+    rate = body.motion_rate
+    path = best_path(
+        state,
+        covariance,
+        node,
+        times,
+        Transition(velocity=tuple(rate.tolist())),
+        evidence=choice.evidence,
+        changes=changes,
+        period=period,
+    )
+    everywhere = torch.arange(len(times))
+    chosen = _unwrapped(state[everywhere, path.mode], changes, period)
+    evidence = GaussianEvidence.of_modes(
+        chosen, covariance[everywhere, path.mode], seen=seen, evidence=choice.evidence
+    )
+    # The evidence is counted by its power; so that the power leaves the balance of evidence and
+    # motion as it is, the motion is, too.
+    wider = choice.evidence**-0.5
+    smooth = refine(
+        evidence,
+        chosen,
+        times,
+        Transition(
+            velocity=tuple((wider * rate).tolist()),
+            acceleration=tuple((wider * choice.agility * rate).tolist()),
+        ),
+        body.bounds,
+        changes=changes,
+    )
+    result = _as_track(
+        track,
+        body,
+        smooth,
+        cost=cost[everywhere, path.mode] + smooth.cost / choice.evidence,
+    )
+    modes = path.mode.numpy()
+    return SmoothedTrack(
+        result,
+        modes,
+        {
+            **asdict(choice),
+            "evidence_of": "modes",
+            "seconds": time.perf_counter() - began,
+            **_effect(track, modes, result),
+            "frames_without_evidence": track.frames[~seen.numpy()],
+            "states_at_a_limit": int(smooth.active.sum()),
+        },
+    )
+
+
+def smooth_file(
+    track: str | os.PathLike[str],
+    *,
+    out: str | os.PathLike[str] | None = None,
+    choice: Smoothing | None = None,
+    body: BodyModel | None = None,
+) -> dict[str, Any]:
+    """Smooth a track on disk: `smooth.npz`, and an entry `smoothed` in `summary.json`.
+
+    Args:
+        track: `track.npz`, or the folder that it is in.
+        out: Output folder; by default that of the track.
+        choice: How to smooth.
+        body: The body, if it is none of the catalogue's.
+
+    Returns:
+        The entry of the summary.
+
+    Raises:
+        TorchcssError: With one line that says what was wrong.
+    """
+    path = Path(track)
+    folder = path if path.is_dir() else path.parent
+    found = load_track(path)
+    into = prepare_output_folder(folder if out is None else out)
+    done = smooth_track(found, body, choice=choice)
+    save_track(into / SMOOTH_NAME, done.track)
+    summary = read_summary(folder) if (folder / SUMMARY_NAME).is_file() else {}
+    entry = {"file": into / SMOOTH_NAME, **done.effect, "modes": done.modes}
+    write_summary(into, {**summary, "smoothed": entry})
+    return entry
+
+
+def save_track(path: Path, track: Track) -> None:
+    """Write a track to a file.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    writer = TrackWriter(path, state_names=track.state_names, joint_names=track.joint_names)
+    for index in range(len(track.frames)):
+        k = int(track.num_modes[index])
+        writer.append(
+            frame=int(track.frames[index]),
+            time_s=float(track.times[index]),
+            base_transform=track.base_transform[index],
+            **{
+                name: getattr(track, name)[index, :k]
+                for name in ("state", "covariance", "log_weight", "cost", "parent", "joints_world")
+            },
+        )
+    writer.save()
+
+
+def base_changes(
+    body: BodyModel, bases: Float[Tensor, "t 4 4"]
+) -> dict[int, Callable[[Tensor], Tensor]]:
+    """Where the base of a track moves: the map of states from each such frame's to the next one's.
+
+    Args:
+        body: The body, on any base.
+        bases: Base transforms of the frames.
+    """
+    moved = (bases.diff(dim=0).abs().amax((1, 2)) > _SAME_BASE).nonzero()[:, 0].tolist()
+    if moved and not has_root(body):
+        raise TrackFileError("the base of the track moves, but its body has no root parameters")
+
+    def change(step: int) -> Callable[[Tensor], Tensor]:
+        placed = body.with_base(bases[step, :3, :3], bases[step, :3, 3])
+        turn, shift = bases[step + 1, :3, :3], bases[step + 1, :3, 3]
+        return lambda x: move_base(placed, turn, shift, x)[1]
+
+    return {step: change(step) for step in moved}
+
+
+def jitter(joints: Float[np.ndarray, "t j 3"], times: Float[np.ndarray, " t"]) -> float:
+    """Mean acceleration of the joints, m/s^2; NaN for fewer than three frames."""
+    if len(times) < 3:
+        return math.nan
+    step = np.diff(times)[:, None, None]
+    velocity = np.diff(joints, axis=0) / step
+    change = np.diff(velocity, axis=0) / (0.5 * (step[1:] + step[:-1]))
+    return float(np.linalg.norm(change, axis=-1).mean())
+
+
+def _unwrapped(
+    state: Float[Tensor, "t n"],
+    changes: dict[int, Callable[[Tensor], Tensor]],
+    period: Float[Tensor, " n"],
+) -> Float[Tensor, "t n"]:
+    """The same states with every angle within half a turn of the one before."""
+    turns = period.isfinite()
+    whole, out = torch.where(turns, period, 1.0), [state[0]]
+    for step, own in enumerate(state[1:]):
+        before = changes[step](out[-1]) if step in changes else out[-1]
+        out.append(own + torch.where(turns, whole * ((before - own) / whole).round(), 0.0))
+    return torch.stack(out)
+
+
+def _as_track(track: Track, body: BodyModel, smooth: Refined, *, cost: Tensor) -> Track:
+    """A track of one mode per frame."""
+    joints = pose_track(body, smooth.mean, torch.from_numpy(track.base_transform)).joints
+    parent = np.zeros((len(track.frames), 1), dtype=np.int64)
+    parent[:1] = -1
+    return track._replace(
+        state=smooth.mean[:, None].numpy(),
+        covariance=smooth.covariance[:, None].numpy(),
+        log_weight=np.zeros((len(track.frames), 1)),
+        cost=cost[:, None].numpy(),
+        parent=parent,
+        joints_world=joints[:, None].numpy(),
+    )
+
+
+def _effect(track: Track, modes: Int[np.ndarray, " t"], smooth: Track) -> dict[str, Any]:
+    """What smoothing changed."""
+    everywhere = np.arange(len(modes))
+    parent = track.parent[everywhere, modes]
+    switched = (parent[1:] != modes[:-1]) & (parent[1:] >= 0)
+    best, path, after = (
+        track.joints_world[:, 0],
+        track.joints_world[everywhere, modes],
+        smooth.joints_world[:, 0],
+    )
+    return {
+        "frames_not_the_trackers_best": int((modes != 0).sum()),
+        "path_switches": int(switched.sum()),
+        "mean_change_mm": 1000 * float(np.linalg.norm(after - best, axis=-1).mean()),
+        "greatest_change_mm": 1000 * float(np.linalg.norm(after - best, axis=-1).max()),
+        "jitter_before_m_per_s2": jitter(best, track.times),
+        "jitter_of_the_path_m_per_s2": jitter(path, track.times),
+        "jitter_after_m_per_s2": jitter(after, track.times),
+    }
