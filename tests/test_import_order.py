@@ -39,7 +39,7 @@ LAYERS = (
     {"sampling_study"},
     {"settings"},
     {"io"},
-    {"pipeline", "initialise_image", "smooth"},
+    {"pipeline", "initialise_image", "smooth", "retarget"},
     {"yardstick", "side_by_side"},
     {"recorder"},
     {"track_files"},

@@ -1,0 +1,155 @@
+"""The retargeting script: what it writes, what reads it, and how it refuses."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+import torch
+
+from torchcss import export_track, load_body
+from torchcss.errors import ConfigurationError, OutputError
+from torchcss.io.motion_capture import LIMBS
+from torchcss.io.motion_parsers import MotionCaptureError
+from torchcss.io.tracks import TrackWriter
+
+SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
+
+
+def load(name: str) -> ModuleType:
+    specification = importlib.util.spec_from_file_location(name, SCRIPTS / f"{name}.py")
+    assert specification is not None
+    assert specification.loader is not None
+    module = importlib.util.module_from_spec(specification)
+    sys.modules[name] = module
+    specification.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def script() -> ModuleType:
+    return load("retarget")
+
+
+@pytest.fixture(scope="module")
+def motion(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A BVH of our own: ten frames at 20 Hz of a body that turns and bends its arms."""
+    body = load_body("body34", lengths={"thigh": 0.41})
+    writer = TrackWriter("unused", state_names=body.state_names, joint_names=body.joint_names)
+    for index in range(10):
+        state = body.bounds.project(body.sticky_mean.clone())
+        state[body.state_index("root_yaw")] = 0.2 * index
+        state[body.state_index("root_y")] = 0.9
+        state[body.state_index("l_elbow_flexion")] = 0.5 + 0.1 * math.sin(0.5 * index)
+        for side in "lr":
+            state[body.state_index(f"{side}_shoulder_raising")] = 0.6
+        writer.append(
+            frame=index,
+            time_s=index / 20,
+            state=state[None],
+            covariance=torch.eye(len(state), dtype=state.dtype)[None],
+            log_weight=torch.zeros(1),
+            cost=torch.zeros(1),
+            parent=torch.full((1,), -1),
+            joints_world=body.pose(state).joints[None],
+        )
+    folder = tmp_path_factory.mktemp("motion")
+    done = export_track(writer.track(), to="bvh", out=folder, frame="world", body=body)
+    return done.paths[0]
+
+
+def test_files_and_table(
+    script: ModuleType, motion: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, reference = tmp_path / "new" / "motion.npz", tmp_path / "reference.npz"
+    report, picture = tmp_path / "report.json", tmp_path / "picture.png"
+    config = script.Config(
+        file=motion, out=out, reference=reference, report=report, picture=picture,
+        rate=40, start=0.1, stop=0.3,
+    )  # fmt: skip
+    script.main(config)
+    with np.load(out) as arrays:
+        found = {name: arrays[name] for name in arrays.files}
+    lengths = json.loads(str(found["lengths"]))
+    assert lengths["thigh"] == pytest.approx(0.41, abs=2e-3)
+    body = load_body(str(found["body"]), lengths=lengths)
+    assert tuple(found["state_names"]) == body.state_names
+    assert found["states"].shape == (8, body.num_parameters)
+    assert float(found["frame_rate"]) == 40
+    assert float(found["start_s"]) == 0.1
+    assert str(found["source"]) == motion.name
+    base = torch.from_numpy(found["base_transform"])
+    body = body.with_base(base[:3, :3], base[:3, 3])
+    joints = body.pose(torch.from_numpy(found["states"])).joints
+    np.testing.assert_allclose(joints, found["joints_world"], atol=1e-12)
+    assert tuple(found["joint_names"]) == body.joint_names
+    assert found["error_mm"].shape == (8,)
+    assert found["error_mm"].max() < 5
+
+    positions, names = load("evaluate_track").read_reference(reference, "joints")
+    assert set(names) == {*LIMBS, "HumanoidRoot", "vt1"}
+    index = [body.joint_index(name) for name in names]
+    assert 1000 * np.linalg.norm(positions - joints[:, index].numpy(), axis=-1).mean() < 10
+    with np.load(reference) as arrays:
+        assert float(arrays["frame_rate"]) == 40
+
+    written = json.loads(report.read_text())
+    table = capsys.readouterr().out
+    for name in (*LIMBS, "all"):
+        row = written["error_mm"][name]
+        assert row["mean"] <= row["worst"]
+        assert f"{name} | {row['mean']:6.1f} {row['p95']:6.1f} {row['worst']:6.1f}" in table
+    assert written["num_frames"] == 8
+    assert written["frames_per_second"] > 0
+    assert set(written["share_of_frames_at_limit"]) <= set(body.state_names)
+    assert "unit: m" in table
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_units_and_rate_of_the_file(script: ModuleType, motion: Path, tmp_path: Path) -> None:
+    """A file that lies about both."""
+    out = tmp_path / "motion.npz"
+    options = {"units": "0.95", "source_rate": 10.0, "rate": 10.0, "stop": 0.3}
+    report = script.main(script.Config(file=motion, out=out, **options))
+    assert report["num_frames"] == 3
+    assert report["lengths_m"]["shank"] == pytest.approx(0.95 * 0.421, abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "match"),
+    [
+        ({"body": "arm7"}, ConfigurationError, "body30"),
+        ({"start": 7.0}, ConfigurationError, "expected a part"),
+        ({"rate": 0.0}, ConfigurationError, "rate"),
+        ({"units": "ell"}, ConfigurationError, "units"),
+        ({"file": Path("absent.bvh")}, MotionCaptureError, "no such file"),
+        ({"file": Path("motion.amc")}, MotionCaptureError, "ASF"),
+        ({"report": Path()}, ConfigurationError, "found a folder"),
+        ({"out": Path("/proc/none/motion.npz")}, OutputError, "cannot be written"),
+    ],
+)
+def test_bad_input(
+    script: ModuleType, motion: Path, tmp_path: Path, options: dict, error: type, match: str
+) -> None:
+    config = script.Config(**{"file": motion, "out": tmp_path / "motion.npz", **options})
+    with pytest.raises(error, match=match) as caught:
+        script.main(config)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "motion.npz").exists()
+
+
+def test_command_line(tmp_path: Path) -> None:
+    path = tmp_path / "motion.bvh"
+    path.write_text("HIERARCHY\nROOT Hips\n{\n")
+    command = [sys.executable, str(SCRIPTS / "retarget.py"), str(path), "--out"]
+    run = subprocess.run([*command, str(tmp_path / "m.npz")], capture_output=True, text=True)
+    assert run.returncode == 2
+    place = f"error: {path}: line 3: expected OFFSET, found 'the end of the file'"
+    assert run.stderr == f"{place}; get a complete copy\n"
