@@ -42,7 +42,7 @@ LAYERS = (
     {"pipeline", "initialise_image", "smooth", "retarget"},
     {"yardstick", "side_by_side"},
     {"recorder"},
-    {"track_files"},
+    {"track_files", "smooth_video"},
     {"demo", "scenes", "cli", "cli_init", "cli_export", "cli_smooth"},
 )
 """Lowest first; a folder counts as one entry."""

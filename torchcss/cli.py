@@ -28,6 +28,7 @@ from torchcss.demo import run_demo
 from torchcss.errors import OutputError, TorchcssError
 from torchcss.settings import TERMS, Settings
 from torchcss.smooth import smooth_file
+from torchcss.smooth_video import smooth_video
 from torchcss.track_files import track_video
 
 
@@ -126,6 +127,8 @@ class Track:
     smooth: bool = False
     """When done, write smooth.npz as well: one smooth trajectory through the modes of all frames,
     as torchcss smooth does."""
+    smooth_images: bool = False
+    """The same, and fit that trajectory to the images again: a second pass over the video."""
     seed: int = 0
     """Seed of all random numbers."""
     device: str = "cpu"
@@ -170,7 +173,19 @@ class Track:
             f"{summary['num_frames']} frames, {summary['seconds_per_frame']:.2f} s each; "
             f"track, summary and overlay are in {self.out}"
         )
-        if self.smooth:
+        if self.smooth_images:
+            done = smooth_video(
+                self.out,
+                video=self.video,
+                camera=self.camera,
+                keypoints=self.keypoints,
+                camera_name=self.camera_name,
+                layout=self.layout,
+                normalised=self.normalised,
+                masks=self.masks,
+            )
+            print(report(done))
+        elif self.smooth:
             print(report(smooth_file(self.out)))
 
 

@@ -1,4 +1,8 @@
-"""The verb `torchcss smooth`: one trajectory through the modes of a whole track."""
+"""The verb `torchcss smooth`: one trajectory through the modes of a whole track.
+
+With the track alone it takes seconds. With video, camera and keypoints it also fits the trajectory
+to the images again, which takes about as long as their features.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,9 @@ from typing import Annotated, Any
 
 import tyro
 
+from torchcss.errors import ConfigurationError
 from torchcss.smooth import Smoothing, smooth_file
+from torchcss.smooth_video import smooth_video
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,11 +29,49 @@ class Smooth:
     """Power of each frame's evidence; below 1 because errors of images persist over frames."""
     agility: float = Smoothing.agility
     """Expected accelerations over expected velocities, 1/s; lower is smoother."""
+    video: Path | None = None
+    """The video that was tracked: fit the trajectory to its images again."""
+    camera: Path | None = None
+    """Its calibration, as for track; needed with a video."""
+    keypoints: Path | None = None
+    """Its 2D joints, as for track; needed with a video."""
+    camera_name: str | None = None
+    """Camera in the file; by default the one whose video this is."""
+    layout: str | None = None
+    """Layout of a keypoint file that does not name its joints, e.g. BODY_25."""
+    normalised: bool = False
+    """Keypoints are fractions of the image instead of pixels."""
+    masks: Path | None = None
+    """Foreground of every frame: a video or a folder of images of the video's size."""
+    body: Path | None = None
+    """The fitted body, body.npz; by default the one beside the track, if any, else the flesh of the
+    standard humanoid on the track's lengths."""
 
     def run(self) -> None:
         """Run the verb."""
         choice = Smoothing(evidence=self.evidence, agility=self.agility)
-        print(report(smooth_file(self.track, out=self.out, choice=choice)))
+        if self.video is None:
+            print(report(smooth_file(self.track, out=self.out, choice=choice)))
+            return
+        if self.camera is None or self.keypoints is None:
+            raise ConfigurationError(
+                "--video: the images can be fitted only with --camera and --keypoints; give both, "
+                "or leave the video out"
+            )
+        done = smooth_video(
+            self.track,
+            video=self.video,
+            camera=self.camera,
+            keypoints=self.keypoints,
+            out=self.out,
+            choice=choice,
+            camera_name=self.camera_name,
+            layout=self.layout,
+            normalised=self.normalised,
+            masks=self.masks,
+            body=self.body,
+        )
+        print(report(done))
 
 
 def report(effect: dict[str, Any]) -> str:
@@ -45,4 +89,9 @@ def report(effect: dict[str, Any]) -> str:
     blind = len(effect["frames_without_evidence"])
     if blind:
         lines.append(f"{blind} frames had no evidence and follow from their neighbours")
+    if "mean_cost_after_images" in effect:
+        lines.append(
+            f"mean cost of a frame {effect['mean_cost_before_images']:.1f} to "
+            f"{effect['mean_cost_after_images']:.1f} nats"
+        )
     return "\n".join([*lines, f"wrote {effect['file']}"])

@@ -68,7 +68,7 @@ class Smoothing:
     """
 
     evidence: float = 0.5
-    agility: float = 20.0
+    agility: float = 10.0
 
     def __post_init__(self) -> None:
         for name in ("evidence", "agility"):
@@ -122,55 +122,38 @@ def smooth_track(
     if has_root(body):
         period[[body.state_index(name) for name in ROOT_NAMES[3:]]] = 2 * math.pi
 
-    rate = body.motion_rate
     path = best_path(
         state,
         covariance,
         node,
         times,
-        Transition(velocity=tuple(rate.tolist())),
+        Transition(velocity=tuple(body.motion_rate.tolist())),
         evidence=choice.evidence,
         changes=changes,
         period=period,
     )
     everywhere = torch.arange(len(times))
     chosen = _unwrapped(state[everywhere, path.mode], changes, period)
-    evidence = GaussianEvidence.of_modes(
-        chosen, covariance[everywhere, path.mode], seen=seen, evidence=choice.evidence
-    )
-    # The evidence is counted by its power; so that the power leaves the balance of evidence and
-    # motion as it is, the motion is, too.
-    wider = choice.evidence**-0.5
     smooth = refine(
-        evidence,
+        GaussianEvidence.of_modes(chosen, covariance[everywhere, path.mode], seen=seen),
         chosen,
         times,
-        Transition(
-            velocity=tuple((wider * rate).tolist()),
-            acceleration=tuple((wider * choice.agility * rate).tolist()),
-        ),
+        motion_prior(body, choice),
         body.bounds,
+        evidence=choice.evidence,
         changes=changes,
     )
-    result = _as_track(
-        track,
-        body,
-        smooth,
-        cost=cost[everywhere, path.mode] + smooth.cost / choice.evidence,
-    )
+    result = track_of(track, body, smooth, cost=cost[everywhere, path.mode] + smooth.cost)
     modes = path.mode.numpy()
-    return SmoothedTrack(
-        result,
-        modes,
-        {
-            **asdict(choice),
-            "evidence_of": "modes",
-            "seconds": time.perf_counter() - began,
-            **_effect(track, modes, result),
-            "frames_without_evidence": track.frames[~seen.numpy()],
-            "states_at_a_limit": int(smooth.active.sum()),
-        },
-    )
+    effect = {
+        **asdict(choice),
+        "evidence_of": "modes",
+        "seconds": time.perf_counter() - began,
+        **effect_of(track, modes, result),
+        "frames_without_evidence": track.frames[~seen.numpy()],
+        "states_at_a_limit": int(smooth.active.sum()),
+    }
+    return SmoothedTrack(result, modes, effect)
 
 
 def smooth_file(
@@ -198,9 +181,25 @@ def smooth_file(
     folder = path if path.is_dir() else path.parent
     found = load_track(path)
     into = prepare_output_folder(folder if out is None else out)
-    done = smooth_track(found, body, choice=choice)
+    return write_smoothed(smooth_track(found, body, choice=choice), into, folder)
+
+
+def write_smoothed(done: SmoothedTrack, into: Path, source: Path) -> dict[str, Any]:
+    """Write `smooth.npz`, and the source's summary with an entry `smoothed`.
+
+    Args:
+        done: What was smoothed.
+        into: Output folder.
+        source: Folder of the track.
+
+    Returns:
+        The entry.
+
+    Raises:
+        OutputError: If the folder cannot be written.
+    """
     save_track(into / SMOOTH_NAME, done.track)
-    summary = read_summary(folder) if (folder / SUMMARY_NAME).is_file() else {}
+    summary = read_summary(source) if (source / SUMMARY_NAME).is_file() else {}
     entry = {"file": into / SMOOTH_NAME, **done.effect, "modes": done.modes}
     write_summary(into, {**summary, "smoothed": entry})
     return entry
@@ -225,6 +224,18 @@ def save_track(path: Path, track: Track) -> None:
             },
         )
     writer.save()
+
+
+def motion_prior(body: BodyModel, choice: Smoothing) -> Transition:
+    """How a body is expected to move when its states are refined.
+
+    Evidence counts by its power, for the covariances; so that this leaves the balance of evidence
+    and motion as it is, the motion counts by it, too.
+    """
+    rate = body.motion_rate / choice.evidence**0.5
+    return Transition(
+        velocity=tuple(rate.tolist()), acceleration=tuple((choice.agility * rate).tolist())
+    )
 
 
 def base_changes(
@@ -258,22 +269,15 @@ def jitter(joints: Float[np.ndarray, "t j 3"], times: Float[np.ndarray, " t"]) -
     return float(np.linalg.norm(change, axis=-1).mean())
 
 
-def _unwrapped(
-    state: Float[Tensor, "t n"],
-    changes: dict[int, Callable[[Tensor], Tensor]],
-    period: Float[Tensor, " n"],
-) -> Float[Tensor, "t n"]:
-    """The same states with every angle within half a turn of the one before."""
-    turns = period.isfinite()
-    whole, out = torch.where(turns, period, 1.0), [state[0]]
-    for step, own in enumerate(state[1:]):
-        before = changes[step](out[-1]) if step in changes else out[-1]
-        out.append(own + torch.where(turns, whole * ((before - own) / whole).round(), 0.0))
-    return torch.stack(out)
+def track_of(track: Track, body: BodyModel, smooth: Refined, *, cost: Float[Tensor, " t"]) -> Track:
+    """The refined states as a track of one mode per frame.
 
-
-def _as_track(track: Track, body: BodyModel, smooth: Refined, *, cost: Tensor) -> Track:
-    """A track of one mode per frame."""
+    Args:
+        track: The track that they come from.
+        body: Its body, on the origin.
+        smooth: The states.
+        cost: Their costs, nats.
+    """
     joints = pose_track(body, smooth.mean, torch.from_numpy(track.base_transform)).joints
     parent = np.zeros((len(track.frames), 1), dtype=np.int64)
     parent[:1] = -1
@@ -287,8 +291,14 @@ def _as_track(track: Track, body: BodyModel, smooth: Refined, *, cost: Tensor) -
     )
 
 
-def _effect(track: Track, modes: Int[np.ndarray, " t"], smooth: Track) -> dict[str, Any]:
-    """What smoothing changed."""
+def effect_of(track: Track, modes: Int[np.ndarray, " t"], smooth: Track) -> dict[str, Any]:
+    """What smoothing changed.
+
+    Args:
+        track: The track that was smoothed.
+        modes: The path through its modes.
+        smooth: What came out.
+    """
     everywhere = np.arange(len(modes))
     parent = track.parent[everywhere, modes]
     switched = (parent[1:] != modes[:-1]) & (parent[1:] >= 0)
@@ -306,3 +316,17 @@ def _effect(track: Track, modes: Int[np.ndarray, " t"], smooth: Track) -> dict[s
         "jitter_of_the_path_m_per_s2": jitter(path, track.times),
         "jitter_after_m_per_s2": jitter(after, track.times),
     }
+
+
+def _unwrapped(
+    state: Float[Tensor, "t n"],
+    changes: dict[int, Callable[[Tensor], Tensor]],
+    period: Float[Tensor, " n"],
+) -> Float[Tensor, "t n"]:
+    """The same states with every angle within half a turn of the one before."""
+    turns = period.isfinite()
+    whole, out = torch.where(turns, period, 1.0), [state[0]]
+    for step, own in enumerate(state[1:]):
+        before = changes[step](out[-1]) if step in changes else out[-1]
+        out.append(own + torch.where(turns, whole * ((before - own) / whole).round(), 0.0))
+    return torch.stack(out)

@@ -1,5 +1,7 @@
 import math
 import sys
+import weakref
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +9,14 @@ import pytest
 import torch
 
 from torchcss.errors import ConfigurationError, ShapeError
-from torchcss.inference.smoothing import GaussianEvidence, Refined, Transition, best_path, refine
+from torchcss.inference.smoothing import (
+    GaussianEvidence,
+    Refined,
+    Transition,
+    best_path,
+    refine,
+    refine_in_windows,
+)
 from torchcss.types import Bounds, LocalModel, Status
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -373,6 +382,87 @@ def test_refinement_across_a_change_of_coordinates(acceleration: float):
     assert float(gradient.abs().max()) < 1e-4
 
 
+def one_by_one(evidence: GaussianEvidence) -> list[GaussianEvidence]:
+    """The cost of every frame alone."""
+    return [
+        GaussianEvidence(evidence.mean[[t]], evidence.precision[[t]])
+        for t in range(len(evidence.mean))
+    ]
+
+
+@pytest.mark.parametrize("window", [(4, 2), (5, 0), (9, 4), (20, 4)])
+def test_windows_come_near_what_all_frames_find_together(window: tuple[int, int]):
+    t, n, times = 14, 3, uneven_times(14)
+    evidence, transition = gaussian(t, n), Transition(velocity=6.0, acceleration=40.0)
+    start, bounds = evidence.mean, interval(n, -0.5, 0.4)
+    whole = refine(evidence, start, times, transition, bounds, evidence=0.5)
+    nothing = refine(evidence, start, times, transition, bounds, evidence=0.5, max_steps=0)
+    parts = refine_in_windows(
+        one_by_one(evidence), start, times, transition, bounds, evidence=0.5,
+        window=window[0], overlap=window[1], tolerance=1e-9,
+    )  # fmt: skip
+    gained = float(nothing.total - parts.total) / float(nothing.total - whole.total)
+    if window[0] > t:
+        assert parts.mean.numpy() == pytest.approx(whole.mean.numpy(), abs=1e-9)
+    assert (0.97 if window[1] else 0.9) < gained <= 1 + 1e-12
+    assert parts.cost.numpy() == pytest.approx(evidence.value(parts.mean).numpy())
+    # Where the same variables are free, the covariances are those of all frames.
+    same = (parts.active == whole.active).all()
+    if bool(same):
+        assert parts.covariance.numpy() == pytest.approx(whole.covariance.numpy(), rel=1e-6)
+
+
+def test_windows_across_a_change_of_coordinates():
+    t, times = 12, uneven_times(12)
+    flat = torch.stack([2 + times, 1 + 0.5 * times], dim=1) + 0.1 * draw(t, 2)
+    mean = flat.clone()
+    mean[7:] = to_polar(flat[7:])
+    evidence = GaussianEvidence.of_modes(mean, 0.1 * covariances(t, n=2))
+    transition, changes = Transition(velocity=3.0, acceleration=40.0), {6: to_polar}
+    whole = refine(evidence, mean, times, transition, interval(2), changes=changes)
+    parts = refine_in_windows(
+        one_by_one(evidence), mean, times, transition, interval(2), changes=changes,
+        window=8, overlap=5, tolerance=1e-9,
+    )  # fmt: skip
+    assert float(parts.total) == pytest.approx(float(whole.total), rel=2e-3)
+
+
+def test_windows_let_costs_go():
+    alive: list[weakref.ref] = []
+
+    class Cost:
+        def __init__(self, evidence: GaussianEvidence) -> None:
+            self.evidence = evidence
+
+        def value(self, x: torch.Tensor) -> torch.Tensor:
+            return self.evidence.value(x)
+
+        def local_model(self, x: torch.Tensor) -> LocalModel:
+            return self.evidence.local_model(x)
+
+    def costs() -> Iterator[Cost]:
+        for evidence in one_by_one(gaussian(30, 2)):
+            assert sum(ref() is not None for ref in alive) <= 6
+            cost = Cost(evidence)
+            alive.append(weakref.ref(cost))
+            yield cost
+            del cost
+
+    refine_in_windows(
+        costs(), draw(30, 2), uneven_times(30), Transition(velocity=3.0), interval(2), window=6,
+        overlap=3,
+    )  # fmt: skip
+    assert len(alive) == 30
+
+
+def test_bad_windows_are_refused():
+    arguments = (draw(5, 2), uneven_times(5), Transition(velocity=3.0), interval(2))
+    with pytest.raises(ConfigurationError, match="longer than its overlap"):
+        refine_in_windows(one_by_one(gaussian(5, 2)), *arguments, window=4, overlap=4)
+    with pytest.raises(ConfigurationError, match="5 frames, got 4"):
+        refine_in_windows(one_by_one(gaussian(4, 2)), *arguments)
+
+
 def refined(dtype: torch.dtype) -> Refined:
     evidence = gaussian(8, 3)
     return refine(
@@ -399,6 +489,12 @@ def test_a_cost_that_is_not_finite_is_reported():
     found = refine(evidence, start, uneven_times(5), Transition(velocity=1.0), interval(2))
     assert int(found.status) == Status.NON_FINITE
     assert torch.equal(found.mean, start)
+    evidence.precision[2] = math.nan
+    parts = refine_in_windows(
+        one_by_one(evidence), start, uneven_times(5), Transition(velocity=1.0), interval(2)
+    )
+    assert int(parts.status) == Status.NON_FINITE
+    assert bool(parts.covariance.isfinite().all())
 
 
 def test_nothing_known_at_all_leaves_the_start():

@@ -34,7 +34,7 @@ t + 1. Everything is computed in float64 and returned in the type that came in.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -153,7 +153,6 @@ class GaussianEvidence(NamedTuple):
         covariance: Float[Tensor, "t n n"],
         *,
         seen: Bool[Tensor, " t"] | None = None,
-        evidence: float = 1.0,
     ) -> GaussianEvidence:
         """From modes; covariances may be singular, see `torchcss.linalg`.
 
@@ -161,10 +160,9 @@ class GaussianEvidence(NamedTuple):
             mean: The modes.
             covariance: Their covariances.
             seen: False for a frame without evidence.
-            evidence: Power of each frame's evidence, that is factor on the precisions.
         """
         white = whitener(covariance.double())
-        precision = evidence * symmetric_part(white.mT @ white)
+        precision = symmetric_part(white.mT @ white)
         if seen is not None:
             precision = torch.where(seen[:, None, None], precision, 0.0)
         return GaussianEvidence(mean.double(), precision)
@@ -276,6 +274,7 @@ def refine(
     transition: Transition,
     bounds: Bounds,
     *,
+    evidence: float = 1.0,
     changes: Changes | None = None,
     scale: Float[Tensor, " n"] | None = None,
     prior_variance: Float[Tensor, " n"] | None = None,
@@ -295,6 +294,7 @@ def refine(
         transition: What motion is to be expected.
         bounds: Box limits, of shape `[n]` or, where they differ by frame, `[t n]`. Equal bounds
             hold a variable where it is.
+        evidence: Factor on the costs.
         changes: Where coordinates change, see the module's page. Their curvature is neglected in
             the Hessian and nowhere else.
         scale: Length of each parameter that damping counts as one; ones by default.
@@ -311,64 +311,113 @@ def refine(
         ShapeError: If the shapes do not agree, or the start is not finite.
         ConfigurationError: If times do not increase, or a lower bound exceeds the upper one.
     """
-    check_shape("start", start, None, None)
-    t, n = start.shape
-    times = _checked_times(times, t)
-    limits = _checked_bounds(bounds, t, n)
-    if not bool(start.isfinite().all()):
-        raise ShapeError("refine: expected a finite start")
-    weight = start.new_ones(n).double() if scale is None else scale.double().square().reciprocal()
-    if prior_variance is None:
-        quarter = Bounds(limits.lower.amax(0), limits.upper.amin(0))
-        prior_variance = default_prior_variance(quarter)
+    x, times, limits = _checked(start, times, bounds)
+    sum_ = _Sum(cost, evidence, times, transition, changes or {}, start.dtype)
+    weight = _damping_weight(x, scale)
+    x, chain, status, steps = _descend(sum_, x, limits, weight, max_steps, tolerance)
+    return _refined(chain, x, limits, prior_variance, status, steps, evidence, start)
 
-    def whole(x: Tensor) -> _Chain:
-        model = LocalModel(*(part.detach().double() for part in cost.local_model(x.to(start))))
-        return _Chain.of(model, _motion_terms(x, times, transition, changes or {}))
 
-    x = limits.project(start.double())
-    chain, damping, status, steps = whole(x), 0.0, Status.RUNNING, 0
-    if not chain.is_finite:
-        status = Status.NON_FINITE
-    while status is Status.RUNNING:
-        step, used = _chain_step(chain, x, limits, weight, damping)
-        predicted = -float((step * (chain.gradient + 0.5 * chain.times(step))).sum())
-        resolution = 4 * torch.finfo(start.dtype).eps * abs(float(chain.value))
-        if predicted < tolerance and used == damping == 0.0:
-            status = Status.CONVERGED
-        elif predicted <= max(1e-3 * tolerance, resolution):
-            status = Status.SMALL_STEP
-        elif steps >= max_steps:
-            status = Status.STEP_LIMIT
-        else:
-            steps += 1
-            # A sum may miss the bound that it is to reach by its rounding.
-            candidate = torch.where(step <= limits.lower - x, limits.lower, x + step)
-            candidate = torch.where(step >= limits.upper - x, limits.upper, candidate)
-            candidate = limits.project(candidate)
-            other = whole(candidate)
-            decrease = float(chain.value - other.value) if other.is_finite else -math.inf
-            if decrease >= 0 and decrease > 1e-4 * predicted:
-                x, chain = candidate, other
-                damping = 0.0 if damping < 1e-3 * chain.curvature(weight) else 0.2 * damping
-                if decrease < 0.25 * predicted:
-                    damping = max(2 * used, 1e-3 * chain.curvature(weight))
-            else:
-                damping = max(5 * used, 1e-2 * chain.curvature(weight))
-                if damping > _MOST_DAMPING * chain.curvature(weight):
-                    status = Status.SMALL_STEP
+def refine_in_windows(
+    costs: Iterable[CostFunction],
+    start: Float[Tensor, "t n"],
+    times: Float[Tensor, " t"],
+    transition: Transition,
+    bounds: Bounds,
+    *,
+    evidence: float = 1.0,
+    changes: Changes | None = None,
+    scale: Float[Tensor, " n"] | None = None,
+    prior_variance: Float[Tensor, " n"] | None = None,
+    window: int = 9,
+    overlap: int = 4,
+    max_steps: int = 15,
+    tolerance: float = 0.05,
+) -> Refined:
+    """`refine` a window of frames at a time, for costs that are dear to keep.
 
-    active = _held(x, chain.gradient, limits)
-    covariance = _marginals(chain, ~active, prior_variance.double())
-    return Refined(
-        mean=x.to(start),
-        covariance=covariance.to(start),
-        cost=chain.frame_value.to(start),
-        total=chain.value.to(start),
-        active=active,
-        status=torch.tensor(int(status)),
-        num_steps=torch.tensor(steps),
-    )
+    Windows overlap, so that each frame is moved with frames after it in view. What is outside a
+    window stays where it is at the time and holds the window by the transitions: the windows
+    descend on the same sum as `refine`, and none raises it. Only the covariances consider all
+    frames at once: each frame's Hessian is kept from the last time it was moved.
+
+    Args:
+        costs: The cost of every frame in their order, each for states `[b n]`. They are asked for
+            when their window begins, and let go when it is done.
+        start: Where to start; moved into the bounds.
+        times: Seconds, increasing.
+        transition: What motion is to be expected.
+        bounds: Box limits, of shape `[n]` or `[t n]`.
+        evidence: Factor on the costs.
+        changes: Where coordinates change.
+        scale: As in `refine`.
+        prior_variance: As in `refine`.
+        window: Frames moved together.
+        overlap: Frames of a window that the next one moves again.
+        max_steps: Iterations in a window.
+        tolerance: Expected decrease of a window's sum, nats, below which it is done.
+
+    Returns:
+        As `refine`; the status is the least good of the windows', the steps are all of theirs.
+
+    Raises:
+        ShapeError: As `refine`.
+        ConfigurationError: As `refine`, or if there are fewer costs than frames, or a window is not
+            longer than its overlap.
+    """
+    x, times, limits = _checked(start, times, bounds)
+    if not 0 <= overlap < window:
+        raise ConfigurationError(
+            f"refine_in_windows: expected a window longer than its overlap, got {window} and "
+            f"{overlap}"
+        )
+    t, weight, changes = len(x), _damping_weight(x, scale), changes or {}
+    queue, held = iter(costs), {}
+    models: list[LocalModel] = []
+    worst, steps, first = Status.CONVERGED, 0, 0
+    while len(models) < t:
+        last = min(first + window, t)
+        for frame in range(max([*held, first - 1]) + 1, last):
+            held[frame] = next(queue, None)
+            if held[frame] is None:
+                raise ConfigurationError(
+                    f"refine_in_windows: expected a cost for each of {t} frames, got {frame}"
+                )
+        # The neighbours that transitions reach stay where they are.
+        before, after = max(first - 2, 0), min(last + 2, t)
+        near = range(before, after)
+        moves = torch.tensor([first <= frame < last for frame in near], device=x.device)[:, None]
+        part = x[before:after]
+        box = Bounds(
+            torch.where(moves, limits.lower[before:after], part),
+            torch.where(moves, limits.upper[before:after], part),
+        )
+        # (Nothing keeps the costs of a window but `held`.)
+        part, chain, status, taken = _descend(
+            _Sum(
+                _FrameByFrame([held.get(frame) for frame in near]),
+                evidence,
+                times[before:after],
+                transition,
+                {step - before: change for step, change in changes.items() if step in near},
+                start.dtype,
+            ),
+            part,
+            box,
+            weight,
+            max_steps,
+            tolerance,
+        )
+        x[before:after] = part
+        worst, steps = max(worst, status), steps + taken
+        done = t if last == t else last - overlap
+        for frame in range(len(models), done):
+            models.append(LocalModel(*(entry[frame - before] for entry in chain.frames)))
+            del held[frame]
+        first = done
+    frames = LocalModel(*(torch.stack(entries) for entries in zip(*models, strict=True)))
+    chain = _Chain.of(frames, _motion_terms(x, times, transition, changes))
+    return _refined(chain, x, limits, prior_variance, worst, steps, evidence, start)
 
 
 # --- best path -----------------------------------------------------------------------------------
@@ -475,24 +524,24 @@ class _Chain(NamedTuple):
         gradient: Its derivative.
         hessian: Of the frames' costs.
         motion: Second derivative of the transitions.
-        frame_value: Costs of the frames.
+        frames: The frames' costs alone.
     """
 
     value: Float[Tensor, ""]
     gradient: Float[Tensor, "t n"]
     hessian: Float[Tensor, "t n n"]
     motion: Float[Tensor, "t w n n"]
-    frame_value: Float[Tensor, " t"]
+    frames: LocalModel
 
     @staticmethod
-    def of(model: LocalModel, motion: _Motion) -> _Chain:
+    def of(frames: LocalModel, motion: _Motion) -> _Chain:
         """Frames and transitions together."""
         return _Chain(
-            model.value.sum() + motion.value,
-            model.gradient + motion.gradient,
-            symmetric_part(model.hessian),
+            frames.value.sum() + motion.value,
+            frames.gradient + motion.gradient,
+            symmetric_part(frames.hessian),
             motion.band,
-            model.value,
+            frames,
         )
 
     @property
@@ -578,6 +627,116 @@ def _motion_terms(
     return _Motion(value, gradient, band)
 
 
+class _Sum(NamedTuple):
+    """What is minimised: weighted costs of the frames, and transitions.
+
+    Attributes:
+        cost: Costs of the frames.
+        evidence: Factor on them.
+        times: Seconds.
+        transition: What motion is to be expected.
+        changes: Where coordinates change.
+        dtype: Type in which the costs are evaluated.
+    """
+
+    cost: CostFunction
+    evidence: float
+    times: Float[Tensor, " t"]
+    transition: Transition
+    changes: Changes
+    dtype: torch.dtype
+
+    def at(self, x: Float[Tensor, "t n"]) -> _Chain:
+        """The model of the sum at a state."""
+        model = self.cost.local_model(x.to(self.dtype))
+        frames = LocalModel(*(self.evidence * part.detach().double() for part in model))
+        return _Chain.of(frames, _motion_terms(x, self.times, self.transition, self.changes))
+
+
+class _FrameByFrame(NamedTuple):
+    """The costs of single frames as the cost of all of them; None costs nothing."""
+
+    costs: list[CostFunction | None]
+
+    def value(self, x: Float[Tensor, "t n"]) -> Float[Tensor, " t"]:
+        """Cost of every frame, nats."""
+        return self.local_model(x).value
+
+    def local_model(self, x: Float[Tensor, "t n"]) -> LocalModel:
+        """Cost, gradient and Hessian of every frame."""
+        models = [
+            LocalModel(
+                own.new_zeros(1), own.new_zeros(1, len(own)), own.new_zeros(1, len(own), len(own))
+            )
+            if cost is None
+            else cost.local_model(own[None])
+            for cost, own in zip(self.costs, x, strict=True)
+        ]
+        return LocalModel(*(torch.cat(parts) for parts in zip(*models, strict=True)))
+
+
+def _descend(
+    sum_: _Sum, x: Tensor, limits: Bounds, weight: Tensor, max_steps: int, tolerance: float
+) -> tuple[Float[Tensor, "t n"], _Chain, Status, int]:
+    """Newton's method on all frames at once; the state, the model there, why it ended, how long."""
+    x = limits.project(x)
+    chain, damping, steps = sum_.at(x), 0.0, 0
+    if not chain.is_finite:
+        return x, chain, Status.NON_FINITE, 0
+    while True:
+        step, used = _chain_step(chain, x, limits, weight, damping)
+        predicted = -float((step * (chain.gradient + 0.5 * chain.times(step))).sum())
+        resolution = 4 * torch.finfo(sum_.dtype).eps * abs(float(chain.value))
+        if predicted < tolerance and used == damping == 0.0:
+            return x, chain, Status.CONVERGED, steps
+        if predicted <= max(1e-3 * tolerance, resolution):
+            return x, chain, Status.SMALL_STEP, steps
+        if steps >= max_steps:
+            return x, chain, Status.STEP_LIMIT, steps
+        steps += 1
+        # A sum may miss the bound that it is to reach by its rounding.
+        candidate = torch.where(step <= limits.lower - x, limits.lower, x + step)
+        candidate = torch.where(step >= limits.upper - x, limits.upper, candidate)
+        other = sum_.at(limits.project(candidate))
+        decrease = float(chain.value - other.value) if other.is_finite else -math.inf
+        typical = chain.curvature(weight)
+        if decrease >= 0 and decrease > 1e-4 * predicted:
+            x, chain = limits.project(candidate), other
+            damping = 0.0 if damping < 1e-3 * typical else 0.2 * damping
+            if decrease < 0.25 * predicted:
+                damping = max(2 * used, 1e-3 * typical)
+        else:
+            damping = max(5 * used, 1e-2 * typical)
+            if damping > _MOST_DAMPING * typical:
+                return x, chain, Status.SMALL_STEP, steps
+
+
+def _refined(
+    chain: _Chain,
+    x: Float[Tensor, "t n"],
+    limits: Bounds,
+    prior_variance: Tensor | None,
+    status: Status,
+    steps: int,
+    evidence: float,
+    like: Tensor,
+) -> Refined:
+    """The result, in the type that came in."""
+    if prior_variance is None:
+        within = Bounds(limits.lower.amax(0), limits.upper.amin(0))
+        prior_variance = default_prior_variance(within)
+    active = _held(x, chain.gradient, limits)
+    return Refined(
+        mean=x.to(like),
+        covariance=_marginals(chain, ~active, prior_variance.double()).to(like),
+        cost=(chain.frames.value / evidence).to(like),
+        total=chain.value.to(like),
+        active=active,
+        status=torch.tensor(int(status)),
+        num_steps=torch.tensor(steps),
+    )
+
+
 def _chain_step(
     chain: _Chain, x: Tensor, limits: Bounds, weight: Tensor, damping: float
 ) -> tuple[Float[Tensor, "t n"], float]:
@@ -604,8 +763,12 @@ def _chain_step(
 def _marginals(
     chain: _Chain, free: Bool[Tensor, "t n"], prior_variance: Float[Tensor, " n"]
 ) -> Float[Tensor, "t n n"]:
-    """Covariances of the states: diagonal blocks of the inverse Hessian on the free variables."""
-    model = chain
+    """Covariances of the states: diagonal blocks of the inverse Hessian on the free variables.
+
+    A frame whose cost is not finite says nothing.
+    """
+    finite = chain.hessian.isfinite().all(-1).all(-1)[:, None, None]
+    chain = model = chain._replace(hessian=torch.where(finite, chain.hessian, 0.0))
     for attempt in range(60):
         weak = prior_variance.reciprocal() * 10.0 ** max(attempt - 1, 0)
         factor = model.band.plus_diagonal(weak).masked(free).factor()
@@ -637,7 +800,13 @@ def _checked_times(times: Tensor, t: int) -> Float[Tensor, " t"]:
     return seconds
 
 
-def _checked_bounds(bounds: Bounds, t: int, n: int) -> Bounds:
+def _checked(
+    start: Tensor, times: Tensor, bounds: Bounds
+) -> tuple[Float[Tensor, "t n"], Float[Tensor, " t"], Bounds]:
+    """The start within the bounds, times and bounds of every frame, in float64."""
+    check_shape("start", start, None, None)
+    t, n = start.shape
+    times = _checked_times(times, t)
     for name, vector in zip(("lower", "upper"), bounds, strict=True):
         if vector.shape not in ((n,), (t, n)):
             raise ShapeError(
@@ -645,4 +814,11 @@ def _checked_bounds(bounds: Bounds, t: int, n: int) -> Bounds:
             )
     if not bool((bounds.lower <= bounds.upper).all()):
         raise ConfigurationError("bounds: expected lower <= upper; correct the limits")
-    return Bounds(bounds.lower.double().expand(t, n), bounds.upper.double().expand(t, n))
+    if not bool(start.isfinite().all()):
+        raise ShapeError("refine: expected a finite start")
+    limits = Bounds(bounds.lower.double().expand(t, n), bounds.upper.double().expand(t, n))
+    return limits.project(start.detach().double()), times, limits
+
+
+def _damping_weight(x: Tensor, scale: Tensor | None) -> Float[Tensor, " n"]:
+    return x.new_ones(x.shape[-1]) if scale is None else scale.double().square().reciprocal()

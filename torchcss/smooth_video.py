@@ -1,0 +1,293 @@
+"""Smooth a track with its video in view: a second pass in which all frames share what they see.
+
+`torchcss.smooth` takes the mode of a frame as a Gaussian, found when only the frames before were
+known, with a temporal prior about the frame before in it. `smooth_frames` starts from that result
+and fits the states again to the images, a window of frames at a time: the cost of every frame
+(edges, keypoints, flow, priors, but no temporal prior about a parent mode) plus the motion prior
+over all of them (`inference.smoothing.refine_in_windows`). Frames that the tracker had lost get the
+evidence of their image again.
+
+The flow of a frame carries the nodes of the frame before, as the start has them.
+
+`smooth_video` does it for files, and writes what `smooth_file` writes.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from torchcss.body.model import BodyModel
+from torchcss.cost.frame import FrameCosts
+from torchcss.cost.joints import JointObservation
+from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.errors import ConfigurationError, KeypointError, VideoError
+from torchcss.inference.smoothing import refine_in_windows
+from torchcss.io.cameras import check_image_size, read_camera
+from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body
+from torchcss.io.keypoints import Keypoints, read_keypoints
+from torchcss.io.track_body import body_of_track
+from torchcss.io.tracks import (
+    SUMMARY_NAME,
+    Track,
+    load_track,
+    prepare_output_folder,
+    read_summary,
+)
+from torchcss.io.video import Frame, VideoReader
+from torchcss.marks import default_sigma
+from torchcss.pipeline import Observe, scale_keypoints
+from torchcss.settings import Settings, boundary_emphasis, make_choice, make_extractor
+from torchcss.smooth import (
+    SmoothedTrack,
+    Smoothing,
+    base_changes,
+    effect_of,
+    motion_prior,
+    smooth_track,
+    track_of,
+    write_smoothed,
+)
+from torchcss.types import Status
+from torchcss.vision.camera import Camera
+from torchcss.vision.features import FeatureExtractor
+
+
+def smooth_frames(
+    track: Track,
+    frames: Iterable[Frame],
+    *,
+    body: BodyModel | None = None,
+    camera: Camera,
+    extractor: FeatureExtractor,
+    cost: CostChoice,
+    observe: Observe,
+    choice: Smoothing | None = None,
+    boundary_emphasis: float = 0.0,
+    masks: Iterable[np.ndarray | Tensor] | None = None,
+) -> SmoothedTrack:
+    """Smooth a track, and fit the result to the images again.
+
+    Args:
+        track: The track.
+        frames: The images of its frames, in order.
+        body: The body with its flesh; None: told from the track, with the flesh of the standard
+            humanoid.
+        camera: Camera of the full-size images.
+        extractor: Makes the features, at its working size.
+        cost: Terms and weights; temporal terms are left out. Pixels are those of the working image.
+        observe: Keypoints by frame.
+        choice: How to smooth.
+        boundary_emphasis: See `FrameFeatures.edge_field`.
+        masks: Foreground of each of the images; None: not known.
+
+    Raises:
+        TorchcssError: As `smooth_track`; or if frames are missing.
+    """
+    choice = choice or Smoothing()
+    first, began = smooth_track(track, body, choice=choice), time.perf_counter()
+    body = body_of_track(track, body)
+    start, bases = (
+        torch.from_numpy(array) for array in (first.track.state[:, 0], track.base_transform)
+    )
+    changes = base_changes(body, bases)
+    make_cost = FrameCosts(
+        body,
+        extractor.working_camera(camera),
+        replace(cost, temporal=None, temporal_mixture=None),
+        boundary_emphasis=boundary_emphasis,
+    )
+    at_start: list[float] = []
+
+    def costs() -> Iterator[TrackingCost]:
+        last, foregrounds = None, None if masks is None else iter(masks)
+        images = iter(tqdm(frames, total=len(track.frames), unit="frame", dynamic_ncols=True))
+        for row, index in enumerate(track.frames.tolist()):
+            frame = next(images, None)
+            if frame is None or frame.index != index:
+                raise VideoError(
+                    f"the video has no frame {index} where the track expects it; give the video "
+                    "that was tracked"
+                )
+            mask = None
+            if foregrounds is not None and (mask := next(foregrounds, None)) is None:
+                raise VideoError(f"the masks end before frame {index}; give one for every frame")
+            before = start[row - 1 : row] if row else None
+            if before is not None and row - 1 in changes:
+                before = changes[row - 1](before)
+            one = make_cost(
+                extractor(frame.image, last, mask),
+                body=body.with_base(bases[row, :3, :3], bases[row, :3, 3]),
+                before=before,
+                observation=observe(frame.index),
+            )
+            last = frame.image
+            at_start.append(float(one.value(start[row : row + 1])))
+            yield one
+
+    refined = refine_in_windows(
+        costs(),
+        start,
+        torch.from_numpy(track.times),
+        motion_prior(body, choice),
+        body.bounds,
+        evidence=choice.evidence,
+        changes=changes,
+    )
+    result = track_of(track, body, refined, cost=refined.cost)
+    effect = {
+        **first.effect,
+        **effect_of(track, first.modes, result),
+        "evidence_of": "images",
+        "seconds": first.effect["seconds"] + time.perf_counter() - began,
+        "states_at_a_limit": int(refined.active.sum()),
+        "mean_cost_before_images": float(np.mean(at_start)),
+        "mean_cost_after_images": float(refined.cost.mean()),
+        "status": Status(int(refined.status)).name.lower(),
+        "iterations": int(refined.num_steps),
+    }
+    return SmoothedTrack(result, first.modes, effect)
+
+
+def smooth_video(
+    track: str | os.PathLike[str],
+    *,
+    video: Path,
+    camera: Path,
+    keypoints: Path,
+    out: str | os.PathLike[str] | None = None,
+    choice: Smoothing | None = None,
+    camera_name: str | None = None,
+    layout: str | None = None,
+    normalised: bool = False,
+    masks: Path | None = None,
+    body: Path | None = None,
+) -> dict[str, Any]:
+    """Smooth a track on disk with its video: `smooth.npz` and an entry in `summary.json`.
+
+    Args:
+        track: `track.npz`, or the folder that it is in; its `summary.json` has the settings.
+        video: The video that was tracked, or a folder of images.
+        camera: Calibration file, see `torchcss.io.cameras`.
+        keypoints: 2D joints, see `torchcss.io.keypoints`.
+        out: Output folder; by default that of the track.
+        choice: How to smooth.
+        camera_name: Which camera of the file; by default the one of this video.
+        layout: Layout of a keypoint file that does not name its joints.
+        normalised: Whether keypoints are fractions of the image.
+        masks: Foreground of every frame.
+        body: The fitted body; by default `body.npz` beside the track if there is one, else the
+            flesh of the standard humanoid on the lengths of the track.
+
+    Returns:
+        The entry of the summary.
+
+    Raises:
+        TorchcssError: With one line that says what was wrong, for any bad input.
+    """
+    path = Path(track)
+    folder = path if path.is_dir() else path.parent
+    found = load_track(path)
+    into = prepare_output_folder(folder if out is None else out)
+    settings = settings_of(folder, found)
+    fitted = folder / FITTED_BODY_NAME if body is None else Path(body)
+    flesh = read_fitted_body(fitted).body if body is not None or fitted.is_file() else None
+    if not len(found.frames):
+        raise VideoError(f"{path}: the track has no frames")
+    first, stop = int(found.frames[0]), int(found.frames[-1]) + 1
+    reader = VideoReader(video, start=first, stop=stop)
+    width, height = reader.info.width, reader.info.height
+    foreground = None if masks is None else VideoReader(masks, start=first, stop=stop)
+    if foreground is not None:
+        size = foreground.info.width, foreground.info.height
+        if size != (width, height):
+            raise VideoError(f"{masks}: masks must have the video's size {width} x {height}")
+    loaded = read_camera(camera, camera_name=camera_name, video=video)
+    check_image_size(loaded.camera, width, height)
+    marks = read_keypoints(
+        keypoints,
+        image_size_wh=(width, height),
+        num_frames=reader.info.num_frames or reader.count_frames(),
+        layout=layout,
+        normalised=normalised,
+        first_frame=first,
+    )
+    extractor = make_extractor(settings)
+    working = extractor.working_shape(width, height)
+    scaled = scale_keypoints(marks.keypoints, (width, height), working).double()
+    confidence = marks.confidence.double()
+
+    def observe(index: int) -> JointObservation | None:
+        if settings.keypoints_use == "first" and index != first:
+            return None
+        return JointObservation(
+            found.joint_names, scaled[index], confidence[index], marks.joint_names
+        )
+
+    wanted = set(found.frames.tolist())
+    done = smooth_frames(
+        found,
+        (frame for frame in reader if frame.index in wanted),
+        body=flesh,
+        camera=loaded.camera,
+        extractor=extractor,
+        cost=make_choice(settings, keypoint_noise(marks) * working[0] / width),
+        observe=observe,
+        choice=choice,
+        boundary_emphasis=boundary_emphasis(settings),
+        masks=None
+        if foreground is None
+        else (mask.image for mask in foreground if mask.index in wanted),
+    )
+    return write_smoothed(done, into, folder)
+
+
+def settings_of(folder: Path, track: Track) -> Settings:
+    """The settings that a track was made with, for evaluation on the processor in float64.
+
+    Args:
+        folder: Where its `summary.json` is; without one, the defaults.
+        track: The track, which tells its body then.
+
+    Raises:
+        ConfigurationError: If the summary's settings are not those of this version.
+    """
+    entries: dict[str, Any] = {}
+    if (folder / SUMMARY_NAME).is_file():
+        entries = read_summary(folder).get("settings", {})
+    known = {field.name for field in fields(Settings)}
+    try:
+        entries = {name: value for name, value in entries.items() if name in known}
+        if "terms" in entries:
+            entries["terms"] = tuple(entries["terms"])
+        settings = Settings(**{"body": "", **entries, "device": "cpu", "dtype": "float64"})
+    except (TypeError, AttributeError) as error:
+        raise ConfigurationError(
+            f"{folder / SUMMARY_NAME}: its settings are not those of torchcss: {error}"
+        ) from error
+    return settings if settings.body else replace(settings, body=body_of_track(track).name)
+
+
+def keypoint_noise(marks: Keypoints) -> float:
+    """Keypoint noise in pixels, from the person's typical size over the whole sequence.
+
+    Raises:
+        KeypointError: If no frame has two keypoints.
+    """
+    sizes = [
+        default_sigma(points[seen > 0])
+        for points, seen in zip(marks.keypoints, marks.confidence, strict=True)
+        if int((seen > 0).sum()) >= 2
+    ]
+    if not sizes:
+        raise KeypointError("no frame has two keypoints; leave the video out")
+    return float(np.median(sizes))
