@@ -9,16 +9,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import orthogonal_procrustes
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.joint_names import JOINT_NAMES
 from torchcss.metrics import (
     LIMB_JOINTS,
     absolute_errors_mm,
+    acceleration_error,
     best_of_modes,
+    coverage,
+    first_loss,
     frames_lost,
+    mask_overlap,
     mpjpe_mm,
     pa_mpjpe_mm,
+    probability_within,
     procrustes_align,
     procrustes_errors_mm,
     root_aligned_errors_mm,
@@ -258,3 +264,80 @@ def test_bad_input_is_a_typed_error() -> None:
         track_errors(tracked, reference, LIMB_JOINTS, compared=["nose"])
     with pytest.raises(ShapeError, match="all is NaN"):
         track_errors(tracked, np.full_like(reference, np.nan), LIMB_JOINTS)
+
+
+TIMES = np.arange(40) / 25
+
+
+def failing(*stretches: tuple[int, int]) -> np.ndarray:
+    failed = np.zeros(len(TIMES), bool)
+    for start, stop in stretches:
+        failed[start:stop] = True
+    return failed
+
+
+@pytest.mark.parametrize(
+    ("failed", "expected"),
+    [
+        (failing(), None),
+        (failing((3, 40)), 3),
+        (failing((3, 12)), None),  # regained after 0.32 s
+        (failing((3, 16)), None),  # 0.48 s from first to last
+        (failing((3, 17)), 3),  # 0.52 s
+        (failing((3, 12), (13, 40)), 13),
+        (failing((30, 40)), None),  # at the end, too short to know
+        (failing((0, 40)), 0),
+    ],
+)
+def test_a_loss_is_a_failure_that_lasts(failed: np.ndarray, expected: int | None) -> None:
+    assert first_loss(failed, TIMES) == expected
+
+
+def test_a_loss_does_not_hang_on_the_rounding_of_times() -> None:
+    times = np.round(np.arange(20) / 30, 3)  # 15 frames are half a second
+    failed = np.zeros(20, bool)
+    failed[2:18] = True
+    assert first_loss(failed, times) == first_loss(failed, np.arange(20) / 30) == 2
+    assert first_loss(failed, times, regain_s=0.55) is None
+    assert first_loss(failed[:17], times[:17]) is None
+
+
+def test_overlap_of_silhouettes() -> None:
+    first, second = np.zeros((3, 10, 10), bool), np.zeros((3, 10, 10), bool)
+    first[0, :4], second[0, 2:6] = True, True  # 20 of 60 pixels
+    second[1, 0, 0] = True
+    overlap = mask_overlap(first, second)
+    np.testing.assert_allclose(overlap, [1 / 3, 0.0, np.nan])
+    np.testing.assert_allclose(mask_overlap(second, second)[:2], 1.0)
+
+
+@pytest.mark.parametrize("dimensions", [1, 3, 8, 34])
+def test_probability_within_is_the_chi_square_distribution(dimensions: int) -> None:
+    distance = np.linspace(0, 4 * dimensions, 50).reshape(5, 10)
+    expected = chi2(dimensions).cdf(distance)
+    np.testing.assert_allclose(probability_within(distance, dimensions), expected, atol=1e-12)
+    assert np.isnan(probability_within(np.nan, dimensions))
+
+
+def test_coverage_of_a_calibrated_estimate_is_the_level() -> None:
+    count = 4000
+    random = np.random.default_rng(0)
+    distance = np.square(random.normal(size=(count, 3))).sum(-1)
+    distance[:5] = np.nan
+    for level, share in coverage(probability_within(distance, 3)).items():
+        assert share == pytest.approx(level, abs=4 * (level * (1 - level) / count) ** 0.5)
+    assert coverage([0.4, 0.6, np.nan], [0.5]) == {0.5: 0.5}
+    assert np.isnan(coverage([np.nan])[0.9])
+
+
+def test_acceleration_error_sees_jitter_and_no_steady_offset() -> None:
+    reference = poses((6,))
+    moving = reference + np.arange(6)[:, None, None] * [0.1, 0, 0] + 0.3
+    assert acceleration_error(moving, reference, 0.04) == pytest.approx(0.0, abs=1e-9)
+    jitter = reference.copy()
+    jitter[::2, :, 1] += 0.01  # 0.01 up and down: second differences of 0.02
+    assert acceleration_error(jitter, reference, 0.1) == pytest.approx(2.0)
+    holes = reference.copy()
+    holes[2, 1:] = np.nan  # what is known of the others is not affected
+    assert acceleration_error(jitter, holes, 0.1) == pytest.approx(2.0)
+    assert np.isnan(acceleration_error(jitter[:2], reference[:2], 0.1))

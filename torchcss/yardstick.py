@@ -36,6 +36,7 @@ from torchcss.body.root import ROOT_NAMES, has_root, move_base
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.cost.interpenetration import InterpenetrationPairs
 from torchcss.errors import ConfigurationError
+from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.tracker import TrackerInfo
 from torchcss.io.sequences import RecordedSequence
 from torchcss.io.video import Frame
@@ -157,25 +158,25 @@ def num_evaluations(info: TrackerInfo) -> int:
 
 
 def penetration_depth(
-    body: BodyModel, pose: BodyPose, pairs: InterpenetrationPairs
+    body: BodyModel, pose: BodyPose, pairs: InterpenetrationPairs, surface: Tensor
 ) -> Float[Tensor, "*batch"]:
-    """Depth of the deepest node of a part inside a part that is not its neighbour, metres.
-
-    To first order from the radial function R of the part (1 on its surface, see
-    `torchcss.cost.interpenetration`): `(1 - R) / |grad R|`, exact in a sphere.
+    """How deep the deepest node of a part is inside a part that is not its neighbour, metres.
 
     Args:
         body: The body.
         pose: Any number of posed bodies.
-        pairs: The tables of that body, with as many nodes as the depth is to be exact.
+        pairs: The tables of that body, with as many nodes as shall be looked at.
+        surface: Points on every part in its frame, `[parts points 3]`, the nearest of which gives
+            the depth.
     """
     near = pairs.near(body, pose, 1.0)
-    square, slope, _ = pairs.radial_square(near)
-    near, (square, slope) = near.select(square < 1, square, slope)
-    radius, slope = square.sqrt(), slope.norm(dim=-1)
-    tiny = torch.finfo(square.dtype).tiny
-    # |grad R^2| = 2 R |grad R|; it vanishes in the centre only, of which a node is never exactly.
-    depth = 2 * radius * (1 - radius) / slope.clamp(min=tiny)
+    square, _, _ = pairs.radial_square(near)
+    near, _ = near.select(square < 1)
+    inside = pairs.second[near.pair][near.owner]
+    depth = torch.zeros_like(near.points[:, 0])
+    for part in inside.unique().tolist():
+        own = inside == part
+        depth[own] = torch.cdist(near.points[own], surface[part]).amin(-1)
     batch = pose.x.shape[:-1]
     deepest = depth.new_zeros(batch.numel())
     return deepest.scatter_reduce(0, near.item[near.owner], depth, "amax").reshape(batch)
@@ -201,6 +202,31 @@ def silhouette(
     uv, depth, valid = camera.project(points.flatten(0, 1))
     width, height = camera.image_size_wh
     return (rasterise(uv, depth, faces, height, width, valid=valid).face >= 0).numpy()
+
+
+def region_probability(
+    body: BodyModel,
+    mixture: GaussianMixture,
+    joints: Sequence[int],
+    reference_m: Float[np.ndarray, "*k j 3"],
+    deviation_m: float,
+) -> Float[np.ndarray, "k j"]:
+    """Probability of the region that a mode states for a joint and that just holds the true one.
+
+    Args:
+        body: The body.
+        mixture: The modes.
+        joints: Which joint centres.
+        reference_m: Where they are, metres; NaN where unknown.
+        deviation_m: Standard deviation of the reference per coordinate.
+    """
+    pose, joints = body.pose(mixture.mean), list(joints)
+    spread = joint_covariance(body, pose, mixture.covariance)[:, joints].double().cpu()
+    spread = spread + deviation_m**2 * torch.eye(3, dtype=spread.dtype)
+    away = torch.from_numpy(reference_m) - pose.joints[:, joints].double().cpu()
+    known = away.isfinite().all(-1)
+    distance = squared_mahalanobis(away.nan_to_num(), spread)
+    return probability_within(torch.where(known, distance, torch.nan).numpy(), 3)
 
 
 def compared_joints(sequence: RecordedSequence, body: BodyModel) -> tuple[str, ...]:
@@ -256,6 +282,7 @@ class Yardstick:
         index = [sequence.joint_names.index(name) for name in self._common]
         self._reference = sequence.joints_world[:, index]
         self._pairs = InterpenetrationPairs(body, rings=8, meridians=12)
+        self._surface = body.mesh(48, 64).points.flatten(1, 2)
         self._rooted = bool(roots)
 
     def __call__(self, tracked: TrackedFrame, start: Frame, features_s: float) -> FrameMeasures:
@@ -288,13 +315,15 @@ class Yardstick:
             absolute_mm=absolute,
             root_aligned_mm=aligned,
             procrustes_mm=procrustes_errors_mm(joints[:, :count], reference[:count]),
-            within=self._within(tracked, reference[:count]),
+            within=region_probability(
+                body, mixture, self._column[:count], reference[:count], limits.reference_m
+            ),
             angle_deviations=self._angle_deviations(tracked),
             joints_m=joints[0, :count],
             reference_m=reference[:count],
             overlap=overlap,
             outside_degrees=_outside(body, mixture.mean[0]),
-            penetration_m=float(penetration_depth(body, best, self._pairs)),
+            penetration_m=float(penetration_depth(body, best, self._pairs, self._surface)),
             samples=int(tracked.info.num_samples),
             evaluations=num_evaluations(tracked.info),
             seconds={
@@ -303,18 +332,6 @@ class Yardstick:
                 "search": tracked.seconds["search"],
             },
         )
-
-    def _within(self, tracked: TrackedFrame, reference: np.ndarray) -> np.ndarray:
-        """Probability of the region of each mode that just holds each true joint."""
-        body, mixture = tracked.body, tracked.state.mixture
-        column = self._column[: len(self.compared)]
-        pose = body.pose(mixture.mean)
-        spread = joint_covariance(body, pose, mixture.covariance)[:, column].double().cpu()
-        spread = spread + self.thresholds.reference_m**2 * torch.eye(3, dtype=spread.dtype)
-        away = torch.from_numpy(reference) - pose.joints[:, column].double().cpu()
-        known = away.isfinite().all(-1)
-        distance = squared_mahalanobis(away.nan_to_num(), spread)
-        return probability_within(torch.where(known, distance, torch.nan).numpy(), 3)
 
     def _angle_deviations(self, tracked: TrackedFrame) -> np.ndarray:
         """Standard deviations per angle between each mode and the truth."""
@@ -450,10 +467,10 @@ def over_seeds(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
             continue
         missing = math.inf if key == "lost_s" else math.nan
         values = [number(row[key], missing) for row in rows]
-        known = sorted(value for value in values if not math.isnan(value))
+        known = sorted(value for value in values if not math.isnan(value)) or [math.nan]
         # The middle by hand: the mean of two middle ones may be that of infinities.
-        middle = known[(len(known) - 1) // 2 : len(known) // 2 + 1] if known else [math.nan]
-        table[key] = (sum(middle) / len(middle), *(known[:: max(len(known) - 1, 1)] or [math.nan]))
+        middle = (known[(len(known) - 1) // 2] + known[len(known) // 2]) / 2
+        table[key] = (middle, known[0], known[-1])
     return table
 
 

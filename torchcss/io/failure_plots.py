@@ -80,7 +80,7 @@ def failure_figure(
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
     }
     figure.legend(
-        list(entries.values()), list(entries), loc="outside lower center", ncols=4, fontsize=9,
+        list(entries.values()), list(entries), loc="outside lower center", ncols=5, fontsize=9,
         frameon=False,
     )  # fmt: skip
     figure.suptitle(title, fontsize=10)
@@ -110,7 +110,7 @@ def _draw(axes: Axes, times: np.ndarray, tracker: ErrorCurves, failed_mm: float)
     inside = [time for time in tracker.published_s if time <= times[-1]]
     if inside:
         axes.plot(
-            inside, np.full(len(inside), top), "v", color="black", ms=8, clip_on=False, zorder=4,
+            inside, np.full(len(inside), 0.95 * top), "v", color="black", ms=7, zorder=4,
             label="failure in the paper, on its own sequence",
         )  # fmt: skip
     count = len(tracker.lost_s)

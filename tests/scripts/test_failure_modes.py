@@ -1,0 +1,161 @@
+"""The study of failure modes in its small mode."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from torchcss.errors import ConfigurationError
+from torchcss.io.failure_plots import ErrorCurves, failure_figure
+from torchcss.presets import PRESETS
+from torchcss.published import PUBLISHED
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from made_sequences import write_arm
+
+SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "failure_modes.py"
+
+
+@pytest.fixture
+def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    specification = importlib.util.spec_from_file_location("failure_modes", SCRIPT)
+    assert specification is not None
+    assert specification.loader is not None
+    module = importlib.util.module_from_spec(specification)
+    monkeypatch.setitem(sys.modules, "failure_modes", module)
+    specification.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("study") / "arm"
+    write_arm(folder, 4)
+    return folder
+
+
+def test_small_mode_and_resume(
+    script: ModuleType, arm: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    out, plot = tmp_path / "tables" / "j.json", tmp_path / "p.png"
+    options = {"sequence": arm, "small": True, "out": out, "plot": plot}
+    presets = ("robust_single", "condensation")
+    script.main(script.Config(presets=presets[:1], seeds=1, **options))
+    assert plot.stat().st_size > 10_000
+
+    asked = []
+    follow = script.follow
+
+    def spy(config, sequence, settings, begin, thresholds):
+        asked.append([(each.preset, each.seed) for each in settings])
+        return follow(config, sequence, settings, begin, thresholds)
+
+    monkeypatch.setattr(script, "follow", spy)
+    script.main(script.Config(presets=presets, seeds=2, resume=True, together=1, **options))
+    assert asked == [[("condensation", 0)], [("robust_single", 1)], [("condensation", 1)]]
+    report = json.loads(out.read_text())
+    assert [(run["preset"], run["seed"]) for run in report["runs"]] == [
+        ("robust_single", 0), ("condensation", 0), ("robust_single", 1), ("condensation", 1),
+    ]  # fmt: skip
+    for run in report["runs"]:
+        assert run["ended"] == "complete"
+        assert run["num_frames"] == len(run["per_frame"]["time_s"]) == 4
+    rows = report["table"]
+    assert set(rows) == set(presets)
+    row = rows["robust_single"]
+    assert (row["seeds"], row["lost"], row["errors"]) == (2, 0, 0)
+    assert row["lost_s"] == [None] * 3
+    middle, least, most = row["root_aligned_mm"]
+    errors = sorted(run["root_aligned_mm"] for run in report["runs"][::2])
+    assert (least, most) == pytest.approx(tuple(errors))
+    assert middle == pytest.approx(sum(errors) / 2)
+    assert rows["condensation"]["evaluations_per_frame"][0] == 6
+    assert row["evaluations_per_frame"][0] <= 20
+    assert {entry["preset"] for entry in report["published"]} >= {"gaussian_single", "css"}
+    text = capsys.readouterr().out
+    assert "2.6 s" in text  # the paper's robust tracker
+    assert "0/2" in text
+    assert "never" in text
+
+    with pytest.raises(ConfigurationError, match="another study"):
+        script.main(script.Config(resume=True, start=1, **options))
+
+
+def test_a_lost_track_in_the_table(
+    script: ModuleType, arm: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    times = [0.0, 0.04, 0.08]
+    measured = {"time_s": times, "root_aligned_mm": [10.0, 300.0, None]}
+    measured["root_aligned_best_of_modes_mm"] = [10.0, 200.0, 200.0]
+    base = {"preset": "single", "ended": "lost", "num_frames": 3, "per_frame": measured}
+    entries = {key: 1.0 for key, _, _ in script.COLUMNS.values()}
+    runs = [
+        {**base, **entries, "seed": 0, "lost": True, "lost_s": 0.04},
+        {**base, **entries, "seed": 1, "lost": False, "lost_s": None, "ended": "complete"},
+        {"preset": "single", "seed": 2, "ended": "error: LinAlgError: singular"},
+    ]
+    config = script.Config(sequence=arm, presets=("single",))
+    report = script.write(config, {"sequence": "arm"}, runs)
+    script.print_table(report["table"], "arm")
+    text = capsys.readouterr().out
+    assert "1/2" in text
+    assert "- (0.0..-)" in text
+    assert "1 ended by an error" in text
+    study = {"sequence": "arm", "thresholds": {"lost_mm": 250.0}}
+    figure = script.figure_of(config, study, runs)
+    (axes,) = [axes for axes in figure.axes if axes.get_visible()]
+    assert axes.get_title() == "single: lost 1 of 2"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [({"presets": ("nobody",)}, "no trackers"), ({"resume": True, "out": None}, "expected --out")],
+)
+def test_bad_options(
+    script: ModuleType, arm: Path, change: dict[str, object], message: str
+) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        script.main(script.Config(sequence=arm, **change))
+
+
+def test_command_line(tmp_path: Path) -> None:
+    command = [sys.executable, str(SCRIPT), "--sequence", str(tmp_path / "absent")]
+    run = subprocess.run(command, capture_output=True, text=True)
+    assert run.returncode == 2
+    assert run.stderr.startswith("error: ")
+    assert "is no folder" in run.stderr
+
+
+def test_published_figures_are_of_our_trackers() -> None:
+    assert {row.preset for row in PUBLISHED} <= set(PRESETS)
+    pairs = [(row.sequence, row.preset) for row in PUBLISHED]
+    assert len(set(pairs)) == len(pairs)
+    told = {pair: row.told for pair, row in zip(pairs, PUBLISHED, strict=True)}
+    assert told["arm", "gaussian_single"] == "0.5 s and 2.2 s"
+    assert told["arm", "css"] == "never"
+    assert told["body-dark", "css_limits"] == "fails"
+
+
+def test_the_figure_shows_medians_ranges_and_losses() -> None:
+    times = np.array([0.0, 0.1, 0.2])
+    lost = np.array([[10.0, 20, 30], [20, 400, np.inf], [30, np.nan, np.inf]])
+    curves = [
+        ErrorCurves("a", lost, lost - 1, [np.nan, 0.1, 0.1], [0.15, 7.0]),
+        *[ErrorCurves(str(i), lost[:1], lost[:1], [np.nan]) for i in range(4)],
+    ]
+    figure = failure_figure(times, curves, title="t", failed_mm=250.0)
+    shown = [axes for axes in figure.axes if axes.get_visible()]
+    assert len(shown) == 5
+    lines = {line.get_label(): line for line in shown[0].get_lines()}
+    np.testing.assert_allclose(lines["best mode, median"].get_ydata(), [20, 210, np.nan])
+    assert list(lines["body lost"].get_xdata()) == [0.1, 0.1]
+    assert list(lines["failure in the paper, on its own sequence"].get_xdata()) == [0.15]
+    assert "body lost" not in {line.get_label() for line in shown[1].get_lines()}
