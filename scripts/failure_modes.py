@@ -117,7 +117,7 @@ def main(config: Config) -> dict[str, Any]:
                 runs.append(entry_of(run, thresholds, 1 / sequence.frame_rate))
                 report = write(config, study, runs)
     print_table(report["table"], sequence.name)
-    if config.plot is not None:
+    if config.plot is not None and report["table"]:
         save_figure(figure_of(config, study, runs), config.plot)
     return report
 
