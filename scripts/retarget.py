@@ -35,12 +35,7 @@ from matplotlib.figure import Figure
 
 from torchcss.errors import ConfigurationError, TorchcssError
 from torchcss.io.atomic import replace_file
-from torchcss.io.motion_capture import (
-    MotionCapture,
-    limb_positions,
-    read_motion_capture,
-    resample,
-)
+from torchcss.io.motion_capture import MotionCapture, read_motion_capture, resample
 from torchcss.io.tracks import prepare_output_folder, write_summary
 from torchcss.retarget import Retargeted, retarget
 
@@ -205,9 +200,7 @@ def picture(motion: MotionCapture, result: Retargeted, columns: int = 7) -> Figu
         for chain in ("shoulder elbow wrist hand_tip", "hip knee ankle heel toe ankle")
     ] + [["l_hip", "r_hip", "HumanoidRoot", "vl5", "vt1", "skullbase", "skull_tip"],
          ["l_shoulder", "vt1", "r_shoulder"], ["skullbase", "nose"]]  # fmt: skip
-    body = result.joints.numpy()
-    _, _, limbs = limb_positions(motion)
-    source = motion.joints + (result.targets.numpy() - limbs)[:, :1]
+    body, source = result.joints.numpy(), result.source.numpy()
     figure = Figure(figsize=(2.6 * columns, 7.4), layout="constrained")
     axes = figure.subplots(2, columns)
     for column, frame in enumerate(np.linspace(0, len(body) - 1, columns).round().astype(int)):

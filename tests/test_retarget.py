@@ -29,6 +29,7 @@ from torchcss.retarget import (
     Retargeting,
     collision_depth,
     fit_lengths,
+    levelled,
     retarget,
 )
 
@@ -119,7 +120,7 @@ def test_a_known_motion_comes_back(subject: BodyModel, generator: torch.Generato
 def test_the_world_is_as_promised(subject: BodyModel, generator: torch.Generator) -> None:
     """Y up, path about the origin, feet on the floor, facing the middle of the turns."""
     states = moving(subject, count=20, turns=0.3)
-    states[:, 0] += torch.linspace(3, 5, len(states))
+    states[:, 0] += torch.linspace(3, 3.8, len(states))
     states[:, subject.state_index("root_yaw")] += 2.0
     capture = capture_of(subject, states)
     found = retarget(capture, generator=generator)
@@ -137,6 +138,8 @@ def test_the_world_is_as_promised(subject: BodyModel, generator: torch.Generator
     _, _, limbs = limb_positions(capture)
     shift = found.targets - torch.from_numpy(limbs)
     torch.testing.assert_close(shift, shift[:1, :1].expand_as(shift))
+    moved = found.source - torch.from_numpy(capture.joints)
+    torch.testing.assert_close(moved, shift[:1, :1].expand_as(moved))
     lower, upper = found.body.bounds
     assert bool(((found.states >= lower) & (found.states <= upper)).all())
     # Left where it was, it stays there.
@@ -256,6 +259,27 @@ def test_derivatives_against_autograd(subject: BodyModel, generator: torch.Gener
     both = replace(cost, repulsion=term, pairs=pairs).local_model(states)
     for found, expected, own in zip(both, model, apart, strict=True):
         torch.testing.assert_close(found, expected + own)
+
+
+@pytest.mark.parametrize("degrees", [-2.0, 0.0, 1.5, 10.0])
+def test_a_tilted_floor_is_levelled(degrees: float, generator: torch.Generator) -> None:
+    """Steps along a diagonal, with a jump; a ramp is left alone."""
+    t = torch.linspace(-1, 1, 60, dtype=torch.float64)
+    path = torch.stack([0.8 * t, 0.9 + 0 * t, 1.2 * t], dim=-1)
+    joints = path[:, None] + torch.randn(60, 5, 3, generator=generator, dtype=torch.float64)
+    joints[..., 1] = 0.8 * torch.rand(60, 5, generator=generator, dtype=torch.float64) + 0.1
+    joints[:, 0, 1] = torch.where((t > 0.3) & (t < 0.6), 0.4, 0.0)
+    joints[:, 0, ::2] = path[:, ::2]
+    axis = torch.tensor([1.2, 0.0, -0.8], dtype=torch.float64) / math.hypot(1.2, 0.8)
+    x, _, z = (axis * math.radians(degrees)).tolist()
+    turn = torch.linalg.matrix_exp(torch.tensor([[0, -z, 0], [z, 0, -x], [0, x, 0]]).double())
+    found, report = levelled(joints @ turn.T, path @ turn.T)
+    if 0.2 < abs(degrees) < 4:
+        torch.testing.assert_close(found, joints, atol=2e-3, rtol=0)
+        assert f"{abs(degrees):.1f} degrees" in report[0]
+    else:
+        torch.testing.assert_close(found, joints @ turn.T)
+        assert report == []
 
 
 def test_depth_of_collisions(subject: BodyModel) -> None:

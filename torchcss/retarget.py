@@ -57,6 +57,10 @@ _NEAR = 0.25
 """Metres between the middle of hips or shoulders and the joint that carries them, at most."""
 _ON_FLOOR = 0.05
 """Share of frames in which the lowest foot may be below the floor: in most others one stands."""
+_LEAST_PATH = 1.0
+"""Metres of a path that tell the slope of its floor."""
+_LEAST_TILT, _MOST_TILT = 0.2, 4.0
+"""Degrees of a floor that is not level by mistake."""
 _DEEP = 0.01
 """Metres that a surface must be inside another part to count as a collision."""
 
@@ -104,6 +108,7 @@ class Retargeted(NamedTuple):
         joints: Its joint centres, `BodyModel.joint_names`, metres.
         target_names: The limbs' joints that were followed.
         targets: Where the source has them, in the same world.
+        source: All joints of the source, in the same world.
         error: Distances between body and source, metres.
         at_limit: Angles that a limit holds.
         depth: How deep the flesh of one part is inside another, metres; 0 if nowhere.
@@ -115,6 +120,7 @@ class Retargeted(NamedTuple):
     joints: Float[Tensor, "t j 3"]
     target_names: tuple[str, ...]
     targets: Float[Tensor, "t limbs 3"]
+    source: Float[Tensor, "t k 3"]
     error: Float[Tensor, "t limbs"]
     at_limit: Bool[Tensor, "t n"]
     depth: Float[Tensor, " t"]
@@ -197,7 +203,8 @@ def retarget(
         body: Name of a body with a root.
         generator: Source of the starting poses.
         choice: How; the defaults suit everyday motion of adults.
-        centred: Move the middle of the path over the origin, and the floor to height zero.
+        centred: Move the middle of the path over the origin and the floor to height zero, and level
+            it where the recording has it tilted by a degree or two.
 
     Raises:
         ConfigurationError: If the body has no root.
@@ -208,11 +215,13 @@ def retarget(
     if body not in BODY_NAMES or not has_root(load_body(body)):
         whole = [name for name in BODY_NAMES if has_root(load_body(name))]
         raise ConfigurationError(f"body: expected one of {', '.join(whole)}, got {body!r}")
-    source = torch.from_numpy(motion.joints).clone()
+    source, level = torch.from_numpy(motion.joints).clone(), []
     if centred:
         source -= _middle_of_path(source[:, list(index)], names)
+        source, level = levelled(source, source[:, list(index)].mean(1))
     limbs = source[:, list(index)]
     lengths, report = fit_lengths(names, limbs, foot=_foot_length(motion, names, index))
+    report += level
     model = load_body(body, lengths=lengths)
     others, line = _anchored(motion, model, names, index)
     report.append(line)
@@ -224,14 +233,26 @@ def retarget(
         feet = [model.joint_index(f"{side}_{end}") for side in "lr" for end in ("heel", "toe")]
         floor = model.pose(states).joints[:, feet, 1].amin(-1).quantile(_ON_FLOOR)
         drop = torch.stack([0 * floor, -floor, 0 * floor])
-        model, limbs = model.with_base(model.base_rotation, drop), limbs + drop
+        model = model.with_base(model.base_rotation, drop)
+        limbs, source = limbs + drop, source + drop
     joints = model.pose(states).joints
     error = (joints[:, [model.joint_index(name) for name in names]] - limbs).norm(dim=-1)
     slack = 1e-6
     at_limit = (states <= model.lower + slack) | (states >= model.upper - slack)
     depth, pairs = collision_depth(model, states)
     report += _findings(model, states, at_limit, depth, pairs)
-    return Retargeted(model, states, joints, names, limbs, error, at_limit, depth, tuple(report))
+    return Retargeted(
+        body=model,
+        states=states,
+        joints=joints,
+        target_names=names,
+        targets=limbs,
+        source=source,
+        error=error,
+        at_limit=at_limit,
+        depth=depth,
+        report=tuple(report),
+    )
 
 
 def fit_lengths(
@@ -320,6 +341,42 @@ def collision_depth(
         depths.append(deepest)
         names += found
     return torch.cat(depths), names
+
+
+def levelled(
+    joints: Float[Tensor, "t j 3"], path: Float[Tensor, "t 3"]
+) -> tuple[Float[Tensor, "t j 3"], list[str]]:
+    """Turn a motion so that its lowest joints stay at one height all along its path.
+
+    The slope along the path's main direction is the median over pairs of frames that are far apart
+    there (Theil 1950, Sen 1968), which jumps do not disturb. A short path tells no slope, and a
+    steep one is stairs or a ramp: both stay as they are.
+
+    Args:
+        joints: All joints, metres, Y up.
+        path: Where the body is.
+
+    Returns:
+        The joints, turned about a horizontal axis through the origin, and a line if they were.
+    """
+    flat = path - path.mean(0)
+    flat = flat * flat.new_tensor([1, 0, 1])
+    direction = torch.linalg.svd(flat, full_matrices=False).Vh[0]
+    along, lowest = flat @ direction, joints[..., 1].amin(1)
+    apart = along[:, None] - along
+    far = apart > max(0.5 * float(apart.max()), _LEAST_PATH)
+    if not bool(far.any()):
+        return joints, []
+    slope = ((lowest[:, None] - lowest)[far] / apart[far]).median()
+    degrees = math.degrees(math.atan(slope))
+    if not _LEAST_TILT < abs(degrees) < _MOST_TILT:
+        return joints, []
+    up = joints.new_tensor([0.0, 1.0, 0.0])
+    # The rotation that takes the rising direction to the horizontal one.
+    rising = (direction + slope * up) / (1 + slope**2).sqrt()
+    skew = torch.outer(direction, rising) - torch.outer(rising, direction)
+    turn = torch.linalg.matrix_exp(skew * (slope.atan() / slope.atan().sin()))
+    return joints @ turn.T, [f"floor: tilted by {abs(degrees):.1f} degrees in the source, levelled"]
 
 
 def _middle_of_path(
