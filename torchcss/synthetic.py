@@ -1,30 +1,52 @@
-"""Rendered sequences with exact ground truth: the demo's arm before clutter.
+"""Rendered sequences with exact ground truth: the demo's arm, and those of the papers' section 6.
 
 `arm_sequence` moves the eight parameters of arm8 smoothly, bending and rotating with reaching
 motion towards the camera, before a cluttered, unevenly lit room with a bright pillar (the arm
 experiment of section 6 [IJRR] in small). The rendered surface is finer than the tracker's mesh and
 carries a cloth texture. Frames come from the package's own renderer, so nothing else is needed.
+
+`render_sequence` renders any motion of any body as a dressed figure in a room (`torchcss.figure`,
+`torchcss.render`; the extra `render`). `shot("arm")`, `"body-clutter"` and `"body-dark"` are the
+three sequences of section 6 [IJRR]; `shot_of_motion` films a motion of the user's.
+
+The truth is exact for the rendered surface. Pixel centres are rasterised (`torchcss.raster`), which
+gives mask and part. The flow of a pixel is that of the surface point that it sees, carried to the
+next frame by its triangle; the point is hidden there if its triangle looks away, if it leaves the
+image, or if another surface is nearer. Nothing but the figure moves, so elsewhere the flow is 0 and
+hidden is what the figure covers next; shadows, which move too, are no motion.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
+from torch.nn import functional
 
+from torchcss.body.catalog import LENGTHS, PROPORTION_RANGE
 from torchcss.body.model import BodyModel, load_body
+from torchcss.cost.anthropometric import Anthropometric, proportion_columns
+from torchcss.errors import ConfigurationError
+from torchcss.figure import Figure, Outfit, Skin, distance_to_part
+from torchcss.motions import MOTIONS, Motion, sample_times
 from torchcss.raster import (
     Lighting,
     Mesh,
     add_sensor_noise,
     clutter_background,
+    interpolate,
+    join_faces,
     random_texture,
+    rasterise,
     render_meshes,
 )
+from torchcss.render import Lamp, Place, Stage, Style
 from torchcss.vision.camera import Camera
 
 _SKIN = (0.86, 0.63, 0.52)
@@ -154,3 +176,509 @@ def grid_faces(rings: int, meridians: int) -> Tensor:
     bottom = torch.stack([torch.zeros_like(fan), fan + 1, fan], dim=-1)
     top = torch.stack([torch.zeros_like(fan), fan, fan + 1], dim=-1) + (rings - 1) * meridians
     return torch.cat([sides, bottom, top])
+
+
+# The papers' sequences, with a dressed figure in a room (the extra `render`).
+
+
+class SequenceFrame(NamedTuple):
+    """A rendered frame and its truth; pixel centres are at integers.
+
+    Attributes:
+        image: The picture, red, green, blue.
+        mask: Whether the first surface on the line of sight is the tracked figure.
+        part: Which part of the body it is, -1 where it is none.
+        depth: Depth of the surface, metres; `inf` in the room.
+        joints: Joint centres, world frame, metres.
+        uv: Their projections, pixels.
+        visible: Whether the first surface on the line of sight to a joint is its own limb.
+        in_image: Whether it projects into the image.
+        flow: Motion to the next frame, pixels; 0 where nothing moves. None for the last frame.
+        occluded: Whether what is seen here is hidden or out of the image in the next frame.
+    """
+
+    image: UInt8[Tensor, "h w 3"]
+    mask: Bool[Tensor, "h w"]
+    part: Int[Tensor, "h w"]
+    depth: Float[Tensor, "h w"]
+    joints: Float[Tensor, "j 3"]
+    uv: Float[Tensor, "j 2"]
+    visible: Bool[Tensor, " j"]
+    in_image: Bool[Tensor, " j"]
+    flow: Float[Tensor, "h w 2"] | None
+    occluded: Bool[Tensor, "h w"] | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shot:
+    """All that a sequence is rendered from.
+
+    Attributes:
+        name: Name of the sequence.
+        body: The body of the person, on its base, of the person's own lengths.
+        states: Its states.
+        frame_rate: Frames per second.
+        camera: Who looks.
+        style: Room and light.
+        outfit: Clothes and deformations.
+        floor: Height of the floor in the world, metres.
+        seed: Seed of everything that is drawn.
+        description: A line about it.
+        bystander: For an arm: whether the still rest of the person stands beside it.
+        spacing: Cells of the figure's mesh, metres.
+    """
+
+    name: str
+    body: BodyModel
+    states: Float[Tensor, "t n"]
+    frame_rate: float
+    camera: Camera
+    style: Style = field(default_factory=Style)
+    outfit: Outfit = field(default_factory=Outfit)
+    floor: float = 0.0
+    seed: int = 0
+    description: str = ""
+    bystander: bool = False
+    spacing: float = 0.009
+
+    @property
+    def base_transform(self) -> Float[Tensor, "4 4"]:
+        """Base of the body in the world."""
+        matrix = torch.eye(4, dtype=self.body.dtype)
+        matrix[:3, :3], matrix[:3, 3] = self.body.base_rotation, self.body.base_translation
+        return matrix
+
+    def frames(self) -> Iterator[SequenceFrame]:
+        """Render; the same frames whenever it is called."""
+        generator = torch.Generator().manual_seed(self.seed)
+        figures = [Figure(self.body, self.outfit, generator=generator, spacing=self.spacing)]
+        if self.bystander:
+            figures.append(_rest_of_person(self.body, self.outfit, generator))
+        return render_sequence(
+            self.body, self.states, camera=self.camera, style=self.style, figures=figures,
+            floor=self.floor, generator=generator,
+        )  # fmt: skip
+
+
+def render_sequence(
+    body: BodyModel,
+    states: Float[Tensor, "t n"],
+    *,
+    camera: Camera,
+    generator: torch.Generator,
+    style: Style | None = None,
+    outfit: Outfit | None = None,
+    figures: Sequence[Figure] | None = None,
+    floor: float | None = None,
+) -> Iterator[SequenceFrame]:
+    """Render any motion of any body, frame by frame.
+
+    Args:
+        body: The body on its base; arms, people, or anything with parts.
+        states: Its states.
+        camera: Who looks, in the body's world (Y up); without distortion.
+        generator: Source of the figure, the room and the sensor's noise.
+        style: Room and light.
+        outfit: Clothes and deformations of the figure that is made where none is given.
+        figures: The figure of the body; further ones stand still, hide and are no truth.
+        floor: Height of the floor; by default that of the lowest point of the first state.
+
+    Raises:
+        MissingExtraError: If pyvista is not installed.
+        CameraError: If the camera has a distortion.
+    """
+    style = style or Style()
+    figure, *others = figures or [Figure(body, outfit, generator=generator)]
+    still = [other.pose(other.body.rest) for other in others]
+    faces, owner = join_faces(
+        [figure.faces, *(other.faces for other in others)],
+        [figure.num_vertices, *(other.num_vertices for other in others)],
+    )
+    part = torch.full_like(owner, -1)
+    part[owner == 0] = figure.part
+    truth = _Truth(camera, faces, part, joints_own_parts(body))
+    joints = body.pose(states).joints
+    place = _place(joints, camera, floor)
+    with Stage(camera, place, style, generator=generator) as stage:
+        stage.add(figure.faces, figure.colour)
+        for other, skin in zip(others, still, strict=True):
+            stage.move(stage.add(other.faces, other.colour), *skin)
+        skins = (figure.pose(state) for state in states)
+        upcoming: Skin | None = next(skins, None)
+        labels = None
+        for index in range(len(states)):
+            skin, upcoming = upcoming, next(skins, None)
+            assert skin is not None
+            stage.move(0, *skin)
+            picture = add_sensor_noise(
+                stage.picture(), generator=generator, read=style.read_noise, shot=style.shot_noise
+            )
+            world = torch.cat([skin.vertices, *(s.vertices for s in still)])
+            labels = labels or truth.labels(world)
+            after, flow, occluded = None, None, None
+            if upcoming is not None:
+                world = torch.cat([upcoming.vertices, *(s.vertices for s in still)])
+                after = truth.labels(world)
+                flow, occluded = truth.flow(labels, after)
+            uv, visible, in_image = truth.joints(labels, joints[index])
+            yield SequenceFrame(
+                picture, labels.part >= 0, labels.part, labels.depth, joints[index], uv, visible,
+                in_image, flow, occluded,
+            )  # fmt: skip
+            labels = after
+
+
+class _Labels(NamedTuple):
+    """What is seen at every pixel centre, and what is needed to look for a point later."""
+
+    face: Int[Tensor, "h w"]
+    barycentric: Float[Tensor, "h w 3"]
+    part: Int[Tensor, "h w"]
+    depth: Float[Tensor, "h w"]
+    fine_depth: Float[Tensor, "2h 2w"]
+    world: Float[Tensor, "v 3"]
+    facing: Bool[Tensor, " f"]
+
+
+class _Truth:
+    """Labels, flow and visibility of meshes whose corners move."""
+
+    def __init__(
+        self,
+        camera: Camera,
+        faces: Int[Tensor, "f 3"],
+        part: Int[Tensor, " f"],
+        own: Bool[Tensor, "j parts"],
+    ) -> None:
+        self.camera, self.faces, self.part, self.own = camera, faces, part, own
+        self.width, self.height = camera.image_size_wh
+
+    def labels(self, world: Float[Tensor, "v 3"]) -> _Labels:
+        """Rasterise posed meshes, at the picture's size and at twice the size."""
+        uv, depth, valid = self.camera.project(world)
+        seen = rasterise(uv, depth, self.faces, self.height, self.width, valid=valid)
+        part = torch.where(seen.face >= 0, self.part[seen.face.clamp(min=0)], -1)
+        fine = rasterise(
+            (uv + 0.5) * 2 - 0.5, depth, self.faces, 2 * self.height, 2 * self.width, valid=valid
+        )
+        first, second, third = uv[self.faces].unbind(1)
+        a, b = second - first, third - first
+        # Rows count downwards: a triangle that runs anticlockwise to the eye has a negative area.
+        facing = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] < 0
+        return _Labels(seen.face, seen.barycentric, part, seen.depth, fine.depth, world, facing)
+
+    def flow(self, now: _Labels, after: _Labels) -> tuple[Tensor, Tensor]:
+        """Motion of every pixel to the next frame, and whether it is hidden there."""
+        flow = now.depth.new_zeros(self.height, self.width, 2)
+        occluded = after.part >= 0
+        row, column = (now.part >= 0).nonzero(as_tuple=True)
+        face = now.face[row, column]
+        points = interpolate(after.world, self.faces, face, now.barycentric[row, column])
+        uv, depth, valid = self.camera.project(points)
+        here = torch.stack([column, row], -1).to(uv)
+        flow[row, column] = uv - here
+        outside = ~valid | ~self._inside(uv)
+        hidden = (
+            outside | ~after.facing[face] | (depth > self._depth_around(after, uv) + _SKIN_DEEP)
+        )
+        occluded[row, column] = hidden
+        return flow, occluded
+
+    def joints(
+        self, labels: _Labels, joints: Float[Tensor, "j 3"]
+    ) -> tuple[Float[Tensor, "j 2"], Bool[Tensor, " j"], Bool[Tensor, " j"]]:
+        """Projections of joints, whether they are visible, and whether they are in the image."""
+        uv, depth, valid = self.camera.project(joints)
+        inside = valid & self._inside(uv)
+        visible = torch.zeros_like(inside)
+        for index in inside.nonzero()[:, 0].tolist():
+            u, v = (int(x) for x in uv[index].round().tolist())
+            # A joint on the outline, such as the top of the head, may lie a hair beside its limb.
+            rows, columns = slice(max(v - 1, 0), v + 2), slice(max(u - 1, 0), u + 2)
+            part, surface = labels.part[rows, columns], labels.depth[rows, columns]
+            own = (part >= 0) & self.own[index][part.clamp(min=0)]
+            visible[index] = bool((own & (surface > depth[index] - _JOINT_DEEP)).any())
+        return uv, visible, inside
+
+    def _inside(self, uv: Tensor) -> Tensor:
+        u, v = uv.unbind(-1)
+        return (u >= -0.5) & (v >= -0.5) & (u < self.width - 0.5) & (v < self.height - 0.5)
+
+    def _depth_around(self, labels: _Labels, uv: Tensor) -> Tensor:
+        """The farthest of the four surfaces around a point of the picture, half a pixel apart."""
+        fine = (uv + 0.5) * 2 - 0.5
+        low = fine.floor().long()
+        found = []
+        for du, dv in ((0, 0), (1, 0), (0, 1), (1, 1)):
+            column = (low[:, 0] + du).clamp(0, 2 * self.width - 1)
+            row = (low[:, 1] + dv).clamp(0, 2 * self.height - 1)
+            found.append(labels.fine_depth[row, column])
+        return torch.stack(found).amax(0)
+
+
+_SKIN_DEEP = 0.005
+"""Metres that a point may lie behind the surface that the picture has there and count as seen."""
+
+_JOINT_DEEP = 0.2
+"""Metres that the surface may lie before a joint centre that it covers as its own flesh."""
+
+
+def joints_own_parts(body: BodyModel) -> Bool[Tensor, "j parts"]:
+    """Which parts hold a joint centre inside them, or within 2 cm, in the rest pose.
+
+    Args:
+        body: The body.
+    """
+    pose = body.pose(body.rest)
+    rotation, centre = body.part_poses(pose)
+    local = (pose.joints[None] - centre[:, None]) @ rotation
+    distance = [distance_to_part(s, p) for s, p in zip(body.part_shape, local, strict=True)]
+    return (torch.stack(distance) < 0.02).T
+
+
+def random_lengths(*, generator: torch.Generator) -> dict[str, float]:
+    """Lengths of a person drawn from the anthropometric prior, within its 10 %, metres.
+
+    Args:
+        generator: Source of randomness.
+    """
+    free = load_body("body34", free_proportions=True)
+    factor = torch.linalg.cholesky(Anthropometric().covariance(free))
+    drawn = factor @ torch.randn(len(factor), generator=generator, dtype=torch.float64)
+    lengths = dict(LENGTHS)
+    for name, extra in zip(proportion_columns(free), drawn.tolist(), strict=True):
+        margin = PROPORTION_RANGE * LENGTHS[name]
+        lengths[name] += min(max(extra, -margin), margin)
+    return lengths
+
+
+def look_at(
+    eye: Sequence[float],
+    target: Sequence[float],
+    *,
+    focal_px: float,
+    image_size_wh: tuple[int, int] = (640, 480),
+    name: str = "cam01",
+) -> Camera:
+    """A camera with level rows that looks at a point; Y is up.
+
+    Args:
+        eye: Its centre, metres.
+        target: What it looks at.
+        focal_px: Focal length.
+        image_size_wh: Width and height of the picture.
+        name: Its name.
+    """
+    width, height = image_size_wh
+    centre = torch.as_tensor(eye, dtype=torch.float64)
+    forward = functional.normalize(torch.as_tensor(target, dtype=torch.float64) - centre, dim=-1)
+    up = forward.new_tensor([0.0, 1.0, 0.0])
+    right = functional.normalize(torch.linalg.cross(forward, up), dim=-1)
+    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    K = [[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]]
+    return Camera(
+        K, image_size_wh, R_camera_world=rotation, t_camera_world=-rotation @ centre, name=name
+    )
+
+
+def _place(joints: Float[Tensor, "t j 3"], camera: Camera, floor: float | None) -> Place:
+    """Where the motion is, seen from the camera."""
+    lowest, highest = joints.amin((0, 1)), joints.amax((0, 1))
+    middle = 0.5 * (lowest + highest)
+    away = camera.R_camera_world[2].clone()
+    away[1] = 0
+    away = functional.normalize(away, dim=-1)
+    behind = float(((joints - middle) @ away).max())
+    ground = float(lowest[1]) - 0.05 if floor is None else floor
+    return Place(middle, ground, behind + 0.15)
+
+
+def _rest_of_person(arm: BodyModel, outfit: Outfit, generator: torch.Generator) -> Figure:
+    """Somebody standing still whose right arm is the given one."""
+    body = load_body("body34", lengths=arm.lengths)
+    start = body.tree.link_index("r_sternoclavicular_link")
+    place = body.pose(body.rest).tree.translation[start]
+    base = arm.base_translation - arm.base_rotation @ place
+    own = ("r_clavicle", "r_upper_arm", "r_forearm", "r_hand")
+    return Figure(body.with_base(arm.base_rotation, base), outfit, generator=generator, without=own)
+
+
+def _stand(body: BodyModel, state: Float[Tensor, " n"]) -> BodyModel:
+    """The body on a base from which its lowest point in a state touches the ground, Y = 0."""
+    lowest = body.surface(body.pose(state)).points[:, 1].min()
+    return body.with_base(
+        body.base_rotation, body.base_translation - lowest * lowest.new_tensor([0.0, 1.0, 0.0])
+    )
+
+
+CLUTTER = Style()
+"""The room of the papers' Figs. 9 and 10: clutter, uneven light, bright pillar."""
+
+DARK = Style(
+    room="dark",
+    lamps=(Lamp(place=(-1.4, 1.6, 2.6), strength=0.9, cone=40.0),),
+    shadows=False,
+    fill=0.12,
+    ambient=0.06,
+)
+"""That of Fig. 11: black background."""
+
+STYLES = {"clutter": CLUTTER, "dark": DARK}
+
+
+def shot(
+    name: str,
+    *,
+    seed: int = 0,
+    num_frames: int | None = None,
+    frame_rate: float = 50.0,
+    small: bool = False,
+) -> Shot:
+    """One of the sequences of section 6 [IJRR], ready to be rendered.
+
+    Args:
+        name: "arm", "body-clutter" or "body-dark".
+        seed: Seed of the person, the room and the noise; the motion is always the same.
+        num_frames: Number of frames; all of the motion by default.
+        frame_rate: Frames per second.
+        small: A quarter of the picture's width and height, for tests.
+
+    Raises:
+        ConfigurationError: If there is no such sequence.
+    """
+    if name not in MOTIONS:
+        raise ConfigurationError(f"no sequence {name!r}; expected one of {', '.join(MOTIONS)}")
+    poses, description = MOTIONS[name]
+    times = sample_times(poses.duration, frame_rate, num_frames)
+    is_arm = poses.body.startswith("arm")
+    lengths = None if is_arm else random_lengths(generator=torch.Generator().manual_seed(seed))
+    body = load_body(poses.body, lengths=lengths)
+    if is_arm:
+        body = body.with_base(torch.eye(3), torch.tensor([0.42, 1.40, 0.0]))
+        states = poses.states(body, times)
+        camera = look_at((0.0, 1.30, 1.85), (0.0, 1.30, 0.0), focal_px=640.0)
+        style, outfit, spacing = ARM_STYLE, ARM_OUTFIT, 0.006
+    else:
+        states = poses.states(body, times)
+        body = _stand(body, states[0])
+        camera = look_at((0.3, 1.35, 3.7), (0.0, 0.93, 0.0), focal_px=720.0)
+        style, outfit = (DARK, DARK_OUTFIT) if name == "body-dark" else (CLUTTER, CLUTTER_OUTFIT)
+        spacing = 0.009
+    if small:
+        camera, spacing = camera.resized(160, 120), 2 * spacing
+    return Shot(
+        name=name, body=body, states=states, frame_rate=frame_rate, camera=camera, style=style,
+        outfit=outfit, seed=seed, description=description, bystander=is_arm, spacing=spacing,
+    )  # fmt: skip
+
+
+ARM_STYLE = Style(
+    pillars=(0.36,),
+    pillar_width=0.10,
+    wall=0.5,
+    specular=0.35,
+    lamps=(
+        Lamp(place=(-1.2, 1.3, 1.6), target=(-0.1, 0.0, 0.0), strength=0.85, cone=40.0),
+        Lamp(place=(1.8, 0.8, 1.2), target=(-0.3, 0.0, -0.5), strength=0.45, cone=40.0),
+    ),
+)
+ARM_OUTFIT = Outfit(
+    sleeve=0.55,
+    pattern="stripes",
+    shirt=(0.25, 0.33, 0.55),
+    accent=(0.72, 0.72, 0.70),
+    looseness=0.06,
+    muscle=0.009,
+)
+CLUTTER_OUTFIT = Outfit(sleeve=1.85, pattern="plaid", looseness=0.06)
+DARK_OUTFIT = Outfit(
+    sleeve=1.85,
+    pattern="stripes",
+    shirt=(0.60, 0.60, 0.58),
+    accent=(0.40, 0.42, 0.46),
+    trousers=(0.42, 0.42, 0.45),
+    looseness=0.045,
+)
+
+
+def shot_of_motion(
+    motion: Motion,
+    *,
+    name: str = "mocap",
+    style: Style | None = None,
+    outfit: Outfit | None = None,
+    camera: Camera | None = None,
+    seed: int = 0,
+    num_frames: int | None = None,
+    small: bool = False,
+) -> Shot:
+    """Film any motion, by default with a camera that sees all of it from the front.
+
+    Args:
+        motion: Body and states.
+        name: Name of the sequence.
+        style: Room and light.
+        outfit: Clothes and deformations.
+        camera: Who looks.
+        seed: Seed of the figure, the room and the noise.
+        num_frames: Only the first frames.
+        small: A quarter of the picture's width and height, for tests.
+    """
+    states = motion.states[:num_frames]
+    points = motion.body.surface(motion.body.pose(states)).points
+    camera = camera or camera_in_front(motion.body, states)
+    if small:
+        width, height = camera.image_size_wh
+        camera = camera.resized(width // 4, height // 4)
+    return Shot(
+        name=name,
+        body=motion.body,
+        states=states,
+        frame_rate=motion.frame_rate,
+        camera=camera,
+        style=style or CLUTTER,
+        outfit=outfit or CLUTTER_OUTFIT,
+        floor=float(points[..., 1].min()),
+        seed=seed,
+        description=motion.description,
+        spacing=0.018 if small else 0.009,
+    )
+
+
+def camera_in_front(
+    body: BodyModel,
+    states: Float[Tensor, "t n"],
+    *,
+    focal_px: float = 720.0,
+    image_size_wh: tuple[int, int] = (640, 480),
+    margin: float = 0.06,
+) -> Camera:
+    """A camera at eye height that sees the whole motion, from where the body looks at first.
+
+    Args:
+        body: The body.
+        states: Its motion.
+        focal_px: Focal length.
+        image_size_wh: Width and height of the picture.
+        margin: Share of the picture's width and height to leave free on every side.
+    """
+    points = body.surface(body.pose(states)).points
+    lowest, highest = points.amin((0, 1)), points.amax((0, 1))
+    middle = 0.5 * (lowest + highest)
+    link = int(body.part_link[0])
+    front = body.pose(states[0]).tree.rotation[link, :, 2].clone()
+    front[1] = 0
+    front = functional.normalize(front, dim=-1)
+    width, height = image_size_wh
+    border = points.new_tensor([margin * width, margin * height])
+    distance = 1.0
+    while True:
+        eye = middle + distance * front + points.new_tensor([0.0, 0.12 * distance, 0.0])
+        camera = look_at(
+            eye.tolist(), middle.tolist(), focal_px=focal_px, image_size_wh=image_size_wh
+        )
+        uv, _, valid = camera.project(points)
+        inside = (uv > border).all() & (uv < uv.new_tensor([width, height]) - border).all()
+        if bool(valid.all() & inside) or distance > 50:
+            return camera
+        distance *= 1.05
