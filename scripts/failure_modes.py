@@ -22,13 +22,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import tyro
-from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from torchcss.errors import ConfigurationError, TorchcssError
-from torchcss.io.failure_plots import ErrorCurves, failure_figure
+from torchcss.io.failure_plots import error_curves, failure_figure
 from torchcss.io.plots import save_figure
 from torchcss.io.sequences import RecordedSequence, read_sequence
 from torchcss.io.tracks import prepare_output_folder, read_summary, write_summary
@@ -36,7 +34,7 @@ from torchcss.presets import PRESETS
 from torchcss.published import PUBLISHED
 from torchcss.settings import Settings
 from torchcss.side_by_side import Run, Start, find_start, track_together
-from torchcss.yardstick import Thresholds, number, over_seeds, summarise
+from torchcss.yardstick import Thresholds, over_seeds, summarise
 
 COLUMNS = {
     # title: entry, factor, decimals
@@ -118,7 +116,11 @@ def main(config: Config) -> dict[str, Any]:
                 report = write(config, study, runs)
     print_table(report["table"], sequence.name)
     if config.plot is not None and report["table"]:
-        save_figure(figure_of(config, study, runs), config.plot)
+        told = {row.preset: row.times_s for row in report["published"]}
+        times, curves = error_curves([r for r in runs if r["preset"] in config.presets], told)
+        title = f"{sequence.name}; dotted: frames with a greater error have failed"
+        figure = failure_figure(times, curves, title=title, failed_mm=thresholds.lost_mm)
+        save_figure(figure, config.plot)
     return report
 
 
@@ -218,30 +220,6 @@ def print_table(table: dict[str, dict[str, Any]], sequence: str) -> None:
         ended = f"  {row['errors']} ended by an error" if row["errors"] else ""
         lost = f"{row['lost']}/{row['seeds']}"
         print(f"{name:22}{lost:>6}{when:>18}{told.get(name, ''):>16}{cells}{ended}")
-
-
-def figure_of(config: Config, study: dict[str, Any], runs: list[dict[str, Any]]) -> Figure:
-    """Error against time, a panel per tracker."""
-    measured = [run for run in runs if "per_frame" in run and run["preset"] in config.presets]
-    times = max((run["per_frame"]["time_s"] for run in measured), key=len)
-
-    def errors(run: dict[str, Any], key: str) -> list[float]:
-        known = [number(value) for value in run["per_frame"][key]]
-        return known + [math.inf] * (len(times) - len(known))
-
-    told = {row.preset: row.times_s for row in PUBLISHED if row.sequence == study["sequence"]}
-    curves = []
-    for name in dict.fromkeys(run["preset"] for run in measured):
-        own = [run for run in measured if run["preset"] == name]
-        best, nearest = (
-            np.array([errors(run, key) for run in own])
-            for key in ("root_aligned_mm", "root_aligned_best_of_modes_mm")
-        )
-        lost = [number(run["lost_s"]) for run in own]
-        curves.append(ErrorCurves(name, best, nearest, lost, told.get(name, ())))
-    failed_mm = study["thresholds"]["lost_mm"]
-    title = f"{study['sequence']}; dotted: frames with a greater error have failed"
-    return failure_figure(np.array(times), curves, title=title, failed_mm=failed_mm)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from torchcss.errors import ConfigurationError
-from torchcss.io.failure_plots import ErrorCurves, failure_figure
+from torchcss.io.failure_plots import ErrorCurves, error_curves, failure_figure
 from torchcss.presets import PRESETS
 from torchcss.published import PUBLISHED
 
@@ -37,7 +37,7 @@ def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 @pytest.fixture(scope="module")
 def arm(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("study") / "arm"
-    write_arm(folder, 4)
+    write_arm(folder, 3)
     return folder
 
 
@@ -67,7 +67,7 @@ def test_small_mode_and_resume(
     ]  # fmt: skip
     for run in report["runs"]:
         assert run["ended"] == "complete"
-        assert run["num_frames"] == len(run["per_frame"]["time_s"]) == 4
+        assert run["num_frames"] == len(run["per_frame"]["time_s"]) == 3
     rows = report["table"]
     assert set(rows) == set(presets)
     row = rows["robust_single"]
@@ -109,10 +109,14 @@ def test_a_lost_track_in_the_table(
     assert "1/2" in text
     assert "- (0.0..-)" in text
     assert "1 ended by an error" in text
-    study = {"sequence": "arm", "thresholds": {"lost_mm": 250.0}}
-    figure = script.figure_of(config, study, runs)
-    (axes,) = [axes for axes in figure.axes if axes.get_visible()]
-    assert axes.get_title() == "single: lost 1 of 2"
+    shown, (curve,) = error_curves(runs, {"single": (2.6,)})
+    assert shown.tolist() == times
+    np.testing.assert_equal(curve.best_mm, [[10, 300, np.nan]] * 2)
+    np.testing.assert_equal(curve.lost_s, [0.04, np.nan])
+    assert curve.published_s == (2.6,)
+    runs[0]["per_frame"] = {key: values[:2] for key, values in measured.items()}
+    _, (curve,) = error_curves(runs, {})
+    np.testing.assert_equal(curve.best_mm[0], [10, 300, np.inf])  # it was stopped
 
 
 @pytest.mark.parametrize(

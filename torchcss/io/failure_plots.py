@@ -1,14 +1,14 @@
 """Error against time of many trackers, one panel each, in colours that everybody can tell apart.
 
-Nothing opens a window or changes global state; see `torchcss.io.plots`. Call `failure_figure`, then
-`save_figure` of that module.
+Nothing opens a window or changes global state; see `torchcss.io.plots`. Call `error_curves`,
+`failure_figure`, then `save_figure` of that module.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -40,6 +40,41 @@ class ErrorCurves(NamedTuple):
     best_of_modes_mm: Float[np.ndarray, "seeds t"]
     lost_s: Sequence[float]
     published_s: Sequence[float] = ()
+
+
+def error_curves(
+    runs: Sequence[Mapping[str, Any]], published_s: Mapping[str, Sequence[float]]
+) -> tuple[Float[np.ndarray, " t"], list[ErrorCurves]]:
+    """Times of the frames, and the panels, from runs as `scripts/failure_modes.py` writes them.
+
+    Args:
+        runs: What `torchcss.yardstick.summarise` gave, with `preset`; at least one with frames.
+            Runs that ended before the first frame have none, and are left out.
+        published_s: When the paper's trackers failed, by preset.
+    """
+    runs = [run for run in runs if "per_frame" in run]
+    times = np.array(max((run["per_frame"]["time_s"] for run in runs), key=len), np.float64)
+
+    def errors(own: Sequence[Mapping[str, Any]], key: str) -> np.ndarray:
+        values = np.full((len(own), len(times)), np.inf)
+        for row, run in zip(values, own, strict=True):
+            known = run["per_frame"][key]
+            row[: len(known)] = np.array(known, np.float64)  # what files have for NaN is None
+        return values
+
+    curves = []
+    for name in dict.fromkeys(run["preset"] for run in runs):
+        own = [run for run in runs if run["preset"] == name]
+        curves.append(
+            ErrorCurves(
+                name,
+                errors(own, "root_aligned_mm"),
+                errors(own, "root_aligned_best_of_modes_mm"),
+                np.array([run["lost_s"] for run in own], np.float64).tolist(),
+                published_s.get(name, ()),
+            )
+        )
+    return times, curves
 
 
 def failure_figure(
