@@ -96,7 +96,7 @@ def body() -> BodyModel:
 
 def test_smoothing_takes_the_other_mode_and_the_noise_away(body: BodyModel):
     track, truth = noisy_track(body)
-    done = smooth_track(track)
+    done = smooth_track(track, choice=Smoothing(evidence=0.5))
     # Every fifth frame's best mode was the other pose.
     right = [1 if index % 5 == 2 else 0 for index in range(30)]
     assert done.modes.tolist() == right
@@ -252,6 +252,8 @@ def test_files_stay_and_the_summary_says_what_was_done(tmp_path: Path, body: Bod
     assert summary["smoothed"]["agility"] == 8
     assert len(summary["smoothed"]["modes"]) == 30
     assert load_track(tmp_path / "smooth.npz").state.shape[1] == 1
+    with pytest.raises(ConfigurationError, match="would replace it"):
+        smooth_file(tmp_path / "smooth.npz")
     # Elsewhere, from the file itself, without a summary; again is the same.
     (tmp_path / "summary.json").unlink()
     elsewhere = tmp_path / "other"

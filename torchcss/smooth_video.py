@@ -30,19 +30,13 @@ from torchcss.body.model import BodyModel
 from torchcss.cost.frame import FrameCosts
 from torchcss.cost.joints import JointObservation
 from torchcss.cost.total import CostChoice, TrackingCost
-from torchcss.errors import ConfigurationError, KeypointError, VideoError
+from torchcss.errors import ConfigurationError, KeypointError, TrackFileError, VideoError
 from torchcss.inference.smoothing import refine_in_windows
 from torchcss.io.cameras import check_image_size, read_camera
 from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body
 from torchcss.io.keypoints import Keypoints, read_keypoints
 from torchcss.io.track_body import body_of_track
-from torchcss.io.tracks import (
-    SUMMARY_NAME,
-    Track,
-    load_track,
-    prepare_output_folder,
-    read_summary,
-)
+from torchcss.io.tracks import SUMMARY_NAME, Track, read_summary
 from torchcss.io.video import Frame, VideoReader
 from torchcss.marks import default_sigma
 from torchcss.pipeline import Observe, scale_keypoints
@@ -53,6 +47,7 @@ from torchcss.smooth import (
     base_changes,
     effect_of,
     motion_prior,
+    open_track,
     smooth_track,
     track_of,
     write_smoothed,
@@ -194,15 +189,12 @@ def smooth_video(
     Raises:
         TorchcssError: With one line that says what was wrong, for any bad input.
     """
-    path = Path(track)
-    folder = path if path.is_dir() else path.parent
-    found = load_track(path)
-    into = prepare_output_folder(folder if out is None else out)
+    found, folder, into = open_track(track, out)
     settings = settings_of(folder, found)
     fitted = folder / FITTED_BODY_NAME if body is None else Path(body)
     flesh = read_fitted_body(fitted).body if body is not None or fitted.is_file() else None
     if not len(found.frames):
-        raise VideoError(f"{path}: the track has no frames")
+        raise TrackFileError(f"{track}: the track has no frames, of which the video could show any")
     first, stop = int(found.frames[0]), int(found.frames[-1]) + 1
     reader = VideoReader(video, start=first, stop=stop)
     width, height = reader.info.width, reader.info.height
