@@ -3,7 +3,7 @@
 A chain of T states of n parameters, in which terms tie up to w neighbours, has a Hessian of T x T
 blocks of which those within w - 1 of the diagonal are not zero. Everything here takes time linear
 in T and cubic in n: the Cholesky factor, solutions, the diagonal blocks of the inverse, and the
-minimum between bounds. `inference.smoothing` is what it is for.
+minimum between bounds. `inference.chain` is what it is for.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from torch import Tensor
 from torchcss.linalg import mask_free, symmetric_part
 
 _ROUNDS = 200
+"""Sets of pinned variables tried; ten are many."""
 _HALVINGS = 40
 """Of a step along the projected arc; after them it is shorter than the rounding."""
 

@@ -33,9 +33,7 @@ t + 1. Everything is computed in float64 and returned in the type that came in.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import torch
@@ -43,63 +41,31 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchcss.errors import ConfigurationError, ShapeError, check_shape
-from torchcss.inference.band import Band, least_in_box
+from torchcss.inference.chain import (
+    Chain,
+    ChainSum,
+    Changes,
+    Transition,
+    descend,
+    held_by,
+    marginals,
+    motion_terms,
+    with_slope,
+)
 from torchcss.inference.trust_region import default_prior_variance
-from torchcss.linalg import mask_free, symmetric_part, whitener
+from torchcss.linalg import symmetric_part, whitener
 from torchcss.types import Bounds, CostFunction, LocalModel, Status
 
-Changes = Mapping[int, Callable[[Tensor], Tensor]]
-"""By the index of a frame, a differentiable map `[*batch n] -> [*batch n]` from the coordinates of
-that frame to those of the next one. Frames that are not in it share the coordinates of the next."""
-
-_MOST_DAMPING = 1e12
-
-
-@dataclass(frozen=True, kw_only=True)
-class Transition:
-    """How a state moves between frames: standard deviations of its velocity and acceleration.
-
-    Attributes:
-        velocity: Units per second, one number or one per parameter; infinite: not judged. A body's
-            `motion_rate` is one.
-        acceleration: Change of velocity, units per second squared, likewise.
-    """
-
-    velocity: float | tuple[float, ...] = math.inf
-    acceleration: float | tuple[float, ...] = math.inf
-
-    def __post_init__(self) -> None:
-        for name in ("velocity", "acceleration"):
-            if not bool((torch.as_tensor(getattr(self, name)) > 0).all()):
-                raise ConfigurationError(
-                    f"Transition.{name}: expected positive numbers, got {getattr(self, name)}"
-                )
-
-    @property
-    def judges_acceleration(self) -> bool:
-        """Whether any parameter's acceleration is judged."""
-        return bool(torch.as_tensor(self.acceleration).isfinite().any())
-
-    def deviations(
-        self, times: Float[Tensor, " t"], n: int
-    ) -> tuple[Float[Tensor, "steps n"], Float[Tensor, "changes n"]]:
-        """Standard deviation of every motion, and of every change of motion, as terms count them.
-
-        Args:
-            times: Seconds.
-            n: Number of parameters.
-
-        Returns:
-            For `x_t - x_t-1`, from t = 1; and for `x_t - x_t-1 - r (x_t-1 - x_t-2)` with r the
-            ratio of the two time steps, from t = 2.
-        """
-        step = times.diff()[:, None]
-        change = 0.5 * step[1:] * (step[1:] + step[:-1])
-        velocity, acceleration = (
-            torch.as_tensor(deviation, dtype=times.dtype, device=times.device).expand(n)
-            for deviation in (self.velocity, self.acceleration)
-        )
-        return step * velocity, change * acceleration
+__all__ = [
+    "Changes",
+    "GaussianEvidence",
+    "Path",
+    "Refined",
+    "Transition",
+    "best_path",
+    "refine",
+    "refine_in_windows",
+]
 
 
 class Path(NamedTuple):
@@ -312,9 +278,9 @@ def refine(
         ConfigurationError: If times do not increase, or a lower bound exceeds the upper one.
     """
     x, times, limits = _checked(start, times, bounds)
-    sum_ = _Sum(cost, evidence, times, transition, changes or {}, start.dtype)
+    sum_ = ChainSum(cost, evidence, times, transition, changes or {}, start.dtype)
     weight = _damping_weight(x, scale)
-    x, chain, status, steps = _descend(sum_, x, limits, weight, max_steps, tolerance)
+    x, chain, status, steps = descend(sum_, x, limits, weight, max_steps, tolerance)
     return _refined(chain, x, limits, prior_variance, status, steps, evidence, start)
 
 
@@ -393,8 +359,8 @@ def refine_in_windows(
             torch.where(moves, limits.upper[before:after], part),
         )
         # (Nothing keeps the costs of a window but `held`.)
-        part, chain, status, taken = _descend(
-            _Sum(
+        part, chain, status, taken = descend(
+            ChainSum(
                 _FrameByFrame([held.get(frame) for frame in near]),
                 evidence,
                 times[before:after],
@@ -416,7 +382,7 @@ def refine_in_windows(
             del held[frame]
         first = done
     frames = LocalModel(*(torch.stack(entries) for entries in zip(*models, strict=True)))
-    chain = _Chain.of(frames, _motion_terms(x, times, transition, changes))
+    chain = Chain.of(frames, motion_terms(x, times, transition, changes))
     return _refined(chain, x, limits, prior_variance, worst, steps, evidence, start)
 
 
@@ -429,20 +395,8 @@ def _carried(
     """States of a frame and their covariances in the coordinates of the next."""
     if not changes or step not in changes:
         return state, spread
-    moved, slope = _with_slope(changes[step], state)
+    moved, slope = with_slope(changes[step], state)
     return moved, None if spread is None else slope @ spread @ slope.mT
-
-
-def _with_slope(
-    change: Callable[[Tensor], Tensor], x: Float[Tensor, "*b n"]
-) -> tuple[Float[Tensor, "*b n"], Float[Tensor, "*b n n"]]:
-    """A change of coordinates and its derivative."""
-    # The derivative in a step that all items share is that of every item in its own.
-    slope = torch.autograd.functional.jacobian(
-        lambda step: change(x + step), x.new_zeros(x.shape[-1])
-    )
-    assert isinstance(slope, Tensor)
-    return change(x).detach(), slope
 
 
 def _short_way(apart: Tensor, period: Tensor | None) -> Tensor:
@@ -508,151 +462,6 @@ def _second_order_viterbi(
 # --- refinement ----------------------------------------------------------------------------------
 
 
-class _Motion(NamedTuple):
-    """The transitions' share of the sum."""
-
-    value: Float[Tensor, ""]
-    gradient: Float[Tensor, "t n"]
-    band: Float[Tensor, "t w n n"]
-
-
-class _Chain(NamedTuple):
-    """The quadratic model of the whole sum.
-
-    Attributes:
-        value: The sum.
-        gradient: Its derivative.
-        hessian: Of the frames' costs.
-        motion: Second derivative of the transitions.
-        frames: The frames' costs alone.
-    """
-
-    value: Float[Tensor, ""]
-    gradient: Float[Tensor, "t n"]
-    hessian: Float[Tensor, "t n n"]
-    motion: Float[Tensor, "t w n n"]
-    frames: LocalModel
-
-    @staticmethod
-    def of(frames: LocalModel, motion: _Motion) -> _Chain:
-        """Frames and transitions together."""
-        return _Chain(
-            frames.value.sum() + motion.value,
-            frames.gradient + motion.gradient,
-            symmetric_part(frames.hessian),
-            motion.band,
-            frames,
-        )
-
-    @property
-    def is_finite(self) -> bool:
-        """Whether the sum has a value and derivatives."""
-        parts = (self.value, self.gradient, self.hessian)
-        return all(bool(part.isfinite().all()) for part in parts)
-
-    @property
-    def band(self) -> Band:
-        """Second derivative of the sum."""
-        block = self.motion.clone()
-        block[:, 0] += self.hessian
-        return Band(block)
-
-    def times(self, vector: Float[Tensor, "t n"]) -> Float[Tensor, "t n"]:
-        """Second derivative times a vector."""
-        return self.band.times(vector)
-
-    def convex(self) -> _Chain:
-        """With the frames' negative curvatures turned round."""
-        values, vectors = torch.linalg.eigh(self.hessian)
-        return self._replace(hessian=(vectors * values.abs()[:, None, :]) @ vectors.mT)
-
-    def curvature(self, weight: Float[Tensor, " n"]) -> float:
-        """A typical curvature in the damping's units, never zero."""
-        diagonal = self.band.block[:, 0].diagonal(dim1=-2, dim2=-1) / weight
-        typical = float(diagonal.abs().median())
-        return typical if typical > 0 else 1.0
-
-
-def _motion_terms(
-    x: Float[Tensor, "t n"], times: Float[Tensor, " t"], transition: Transition, changes: Changes
-) -> _Motion:
-    """Value, gradient and (Gauss-Newton) Hessian of the transitions."""
-    t, n = x.shape
-    motion, turn = transition.deviations(times, n)
-    eye = torch.eye(n, dtype=x.dtype, device=x.device)
-    width = 1 + min(2 if transition.judges_acceleration else 1, t - 1)
-    gradient, band = torch.zeros_like(x), x.new_zeros(t, width, n, n)
-    value = x.new_zeros(())
-    # Where each frame lies in the coordinates of the next and of the next but one.
-    ahead, slope = x.clone(), eye.repeat(t, 1, 1)
-    far, far_slope = x.clone(), eye.repeat(t, 1, 1)
-    for step in changes:
-        if step < t - 1:
-            ahead[step], slope[step] = _with_slope(changes[step], x[step])
-    far, far_slope = ahead.clone(), slope.clone()
-    for step in changes:
-        if 1 <= step < t - 1:
-            far[step - 1], turned = _with_slope(changes[step], ahead[step - 1])
-            far_slope[step - 1] = turned @ slope[step - 1]
-
-    def add(residual: Tensor, factors: list[Tensor]) -> None:
-        """Half a squared residual; `factors[d]` is its derivative by the state d frames earlier."""
-        nonlocal value
-        first = t - len(residual)
-        value = value + 0.5 * residual.square().sum()
-        for d, factor in enumerate(factors):
-            rows = slice(first - d, t - d)
-            gradient[rows] += (factor.mT @ residual[..., None])[..., 0]
-            for e in range(d, len(factors)):
-                band[rows, e - d] += factor.mT @ factors[e]
-
-    if t > 1:
-        weight = motion.reciprocal()
-        add(
-            weight * (x[1:] - ahead[:-1]),
-            [torch.diag_embed(weight), -weight[..., None] * slope[:-1]],
-        )
-    if t > 2 and transition.judges_acceleration:
-        weight = turn.reciprocal()
-        step = times.diff()
-        ratio = (step[1:] / step[:-1])[:, None]
-        add(
-            weight * (x[2:] - (1 + ratio) * ahead[1:-1] + ratio * far[:-2]),
-            [
-                torch.diag_embed(weight),
-                -(weight * (1 + ratio))[..., None] * slope[1:-1],
-                (weight * ratio)[..., None] * far_slope[:-2],
-            ],
-        )
-    return _Motion(value, gradient, band)
-
-
-class _Sum(NamedTuple):
-    """What is minimised: weighted costs of the frames, and transitions.
-
-    Attributes:
-        cost: Costs of the frames.
-        evidence: Factor on them.
-        times: Seconds.
-        transition: What motion is to be expected.
-        changes: Where coordinates change.
-        dtype: Type in which the costs are evaluated.
-    """
-
-    cost: CostFunction
-    evidence: float
-    times: Float[Tensor, " t"]
-    transition: Transition
-    changes: Changes
-    dtype: torch.dtype
-
-    def at(self, x: Float[Tensor, "t n"]) -> _Chain:
-        """The model of the sum at a state."""
-        model = self.cost.local_model(x.to(self.dtype))
-        frames = LocalModel(*(self.evidence * part.detach().double() for part in model))
-        return _Chain.of(frames, _motion_terms(x, self.times, self.transition, self.changes))
-
-
 class _FrameByFrame(NamedTuple):
     """The costs of single frames as the cost of all of them; None costs nothing."""
 
@@ -675,44 +484,8 @@ class _FrameByFrame(NamedTuple):
         return LocalModel(*(torch.cat(parts) for parts in zip(*models, strict=True)))
 
 
-def _descend(
-    sum_: _Sum, x: Tensor, limits: Bounds, weight: Tensor, max_steps: int, tolerance: float
-) -> tuple[Float[Tensor, "t n"], _Chain, Status, int]:
-    """Newton's method on all frames at once; the state, the model there, why it ended, how long."""
-    x = limits.project(x)
-    chain, damping, steps = sum_.at(x), 0.0, 0
-    if not chain.is_finite:
-        return x, chain, Status.NON_FINITE, 0
-    while True:
-        step, used = _chain_step(chain, x, limits, weight, damping)
-        predicted = -float((step * (chain.gradient + 0.5 * chain.times(step))).sum())
-        resolution = 4 * torch.finfo(sum_.dtype).eps * abs(float(chain.value))
-        if predicted < tolerance and used == damping == 0.0:
-            return x, chain, Status.CONVERGED, steps
-        if predicted <= max(1e-3 * tolerance, resolution):
-            return x, chain, Status.SMALL_STEP, steps
-        if steps >= max_steps:
-            return x, chain, Status.STEP_LIMIT, steps
-        steps += 1
-        # A sum may miss the bound that it is to reach by its rounding.
-        candidate = torch.where(step <= limits.lower - x, limits.lower, x + step)
-        candidate = torch.where(step >= limits.upper - x, limits.upper, candidate)
-        other = sum_.at(limits.project(candidate))
-        decrease = float(chain.value - other.value) if other.is_finite else -math.inf
-        typical = chain.curvature(weight)
-        if decrease >= 0 and decrease > 1e-4 * predicted:
-            x, chain = limits.project(candidate), other
-            damping = 0.0 if damping < 1e-3 * typical else 0.2 * damping
-            if decrease < 0.25 * predicted:
-                damping = max(2 * used, 1e-3 * typical)
-        else:
-            damping = max(5 * used, 1e-2 * typical)
-            if damping > _MOST_DAMPING * typical:
-                return x, chain, Status.SMALL_STEP, steps
-
-
 def _refined(
-    chain: _Chain,
+    chain: Chain,
     x: Float[Tensor, "t n"],
     limits: Bounds,
     prior_variance: Tensor | None,
@@ -725,69 +498,16 @@ def _refined(
     if prior_variance is None:
         within = Bounds(limits.lower.amax(0), limits.upper.amin(0))
         prior_variance = default_prior_variance(within)
-    active = _held(x, chain.gradient, limits)
+    active = held_by(x, chain.gradient, limits)
     return Refined(
         mean=x.to(like),
-        covariance=_marginals(chain, ~active, prior_variance.double()).to(like),
+        covariance=marginals(chain, ~active, prior_variance.double()).to(like),
         cost=(chain.frames.value / evidence).to(like),
         total=chain.value.to(like),
         active=active,
         status=torch.tensor(int(status)),
         num_steps=torch.tensor(steps),
     )
-
-
-def _chain_step(
-    chain: _Chain, x: Tensor, limits: Bounds, weight: Tensor, damping: float
-) -> tuple[Float[Tensor, "t n"], float]:
-    """The step to the least of the damped model in the box, and the damping that it took."""
-    fixed, held = limits.lower == limits.upper, _held(x, chain.gradient, limits)
-    lower, upper = limits.lower - x, limits.upper - x
-    trial, model = damping, chain
-    for attempt in range(60):
-        band = model.band.plus_diagonal(trial * weight)
-        # A definite model may take variables off their bounds; else those stay that are held.
-        for kept in (fixed, held):
-            if band.masked(~kept).factor() is not None:
-                step = least_in_box(band, chain.gradient, lower, upper, kept)
-                if step is not None:
-                    return step, trial
-        if attempt == 0:
-            model = chain.convex()
-        else:
-            trial = max(10 * trial, 1e-12 * chain.curvature(weight))
-    # Every entry of the model would have to be beyond all bounds; there is no step to take.
-    return torch.zeros_like(x), trial
-
-
-def _marginals(
-    chain: _Chain, free: Bool[Tensor, "t n"], prior_variance: Float[Tensor, " n"]
-) -> Float[Tensor, "t n n"]:
-    """Covariances of the states: diagonal blocks of the inverse Hessian on the free variables.
-
-    A frame whose cost is not finite says nothing.
-    """
-    finite = chain.hessian.isfinite().all(-1).all(-1)[:, None, None]
-    chain = model = chain._replace(hessian=torch.where(finite, chain.hessian, 0.0))
-    for attempt in range(60):
-        weak = prior_variance.reciprocal() * 10.0 ** max(attempt - 1, 0)
-        factor = model.band.plus_diagonal(weak).masked(free).factor()
-        if factor is not None:
-            break
-        model = chain.convex()
-    else:
-        return torch.diag_embed(prior_variance.expand_as(chain.gradient))
-    covariance = mask_free(factor.inverse_diagonal(), free)
-    covariance.diagonal(dim1=-2, dim2=-1).copy_(
-        torch.where(free, covariance.diagonal(dim1=-2, dim2=-1), prior_variance)
-    )
-    return covariance
-
-
-def _held(x: Tensor, gradient: Tensor, bounds: Bounds) -> Bool[Tensor, "t n"]:
-    """Variables at a bound that the sum pushes against it, or without room between two."""
-    pushed = ((x <= bounds.lower) & (gradient > 0)) | ((x >= bounds.upper) & (gradient < 0))
-    return pushed | (bounds.lower == bounds.upper)
 
 
 def _checked_times(times: Tensor, t: int) -> Float[Tensor, " t"]:

@@ -1,0 +1,324 @@
+"""States in a row, tied to their neighbours: the sum that smoothing minimises, and its descent.
+
+`ChainSum` is `sum_t f_t(x_t)` plus the transitions of `torchcss.inference.smoothing`; at a state it
+gives a `Chain`, the quadratic model of the whole, whose Hessian is block-banded
+(`torchcss.inference.band`). `descend` is Newton's method on it, with limits and damping;
+`marginals` are the covariances of the states.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchcss.errors import ConfigurationError
+from torchcss.inference.band import Band, least_in_box
+from torchcss.linalg import mask_free, symmetric_part
+from torchcss.types import Bounds, CostFunction, LocalModel, Status
+
+Changes = Mapping[int, Callable[[Tensor], Tensor]]
+"""By the index of a frame, a differentiable map `[*batch n] -> [*batch n]` from the coordinates of
+that frame to those of the next one. Frames that are not in it share the coordinates of the next."""
+
+_MOST_DAMPING = 1e12
+"""Multiple of a typical curvature; a step so short changes nothing."""
+_ATTEMPTS = 60
+"""At making a matrix definite by more and more damping, tenfold each time."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Transition:
+    """How a state moves between frames: standard deviations of its velocity and acceleration.
+
+    Attributes:
+        velocity: Units per second, one number or one per parameter; infinite: not judged. A body's
+            `motion_rate` is one.
+        acceleration: Change of velocity, units per second squared, likewise.
+    """
+
+    velocity: float | tuple[float, ...] = math.inf
+    acceleration: float | tuple[float, ...] = math.inf
+
+    def __post_init__(self) -> None:
+        for name in ("velocity", "acceleration"):
+            if not bool((torch.as_tensor(getattr(self, name)) > 0).all()):
+                raise ConfigurationError(
+                    f"Transition.{name}: expected positive numbers, got {getattr(self, name)}"
+                )
+
+    @property
+    def judges_acceleration(self) -> bool:
+        """Whether any parameter's acceleration is judged."""
+        return bool(torch.as_tensor(self.acceleration).isfinite().any())
+
+    def deviations(
+        self, times: Float[Tensor, " t"], n: int
+    ) -> tuple[Float[Tensor, "steps n"], Float[Tensor, "changes n"]]:
+        """Standard deviation of every motion, and of every change of motion, as terms count them.
+
+        Args:
+            times: Seconds.
+            n: Number of parameters.
+
+        Returns:
+            For `x_t - x_t-1`, from t = 1; and for `x_t - x_t-1 - r (x_t-1 - x_t-2)` with r the
+            ratio of the two time steps, from t = 2.
+        """
+        step = times.diff()[:, None]
+        change = 0.5 * step[1:] * (step[1:] + step[:-1])
+        velocity, acceleration = (
+            torch.as_tensor(deviation, dtype=times.dtype, device=times.device).expand(n)
+            for deviation in (self.velocity, self.acceleration)
+        )
+        return step * velocity, change * acceleration
+
+
+class Motion(NamedTuple):
+    """The transitions' share of the sum."""
+
+    value: Float[Tensor, ""]
+    gradient: Float[Tensor, "t n"]
+    band: Float[Tensor, "t w n n"]
+
+
+class Chain(NamedTuple):
+    """The quadratic model of the whole sum.
+
+    Attributes:
+        value: The sum.
+        gradient: Its derivative.
+        hessian: Of the frames' costs.
+        motion: Second derivative of the transitions.
+        frames: The frames' costs alone.
+    """
+
+    value: Float[Tensor, ""]
+    gradient: Float[Tensor, "t n"]
+    hessian: Float[Tensor, "t n n"]
+    motion: Float[Tensor, "t w n n"]
+    frames: LocalModel
+
+    @staticmethod
+    def of(frames: LocalModel, motion: Motion) -> Chain:
+        """Frames and transitions together."""
+        return Chain(
+            frames.value.sum() + motion.value,
+            frames.gradient + motion.gradient,
+            symmetric_part(frames.hessian),
+            motion.band,
+            frames,
+        )
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether the sum has a value and derivatives."""
+        parts = (self.value, self.gradient, self.hessian)
+        return all(bool(part.isfinite().all()) for part in parts)
+
+    @property
+    def band(self) -> Band:
+        """Second derivative of the sum."""
+        block = self.motion.clone()
+        block[:, 0] += self.hessian
+        return Band(block)
+
+    def times(self, vector: Float[Tensor, "t n"]) -> Float[Tensor, "t n"]:
+        """Second derivative times a vector."""
+        return self.band.times(vector)
+
+    def convex(self) -> Chain:
+        """With the frames' negative curvatures turned round."""
+        values, vectors = torch.linalg.eigh(self.hessian)
+        return self._replace(hessian=(vectors * values.abs()[:, None, :]) @ vectors.mT)
+
+    def curvature(self, weight: Float[Tensor, " n"]) -> float:
+        """A typical curvature in the damping's units, never zero."""
+        diagonal = self.band.block[:, 0].diagonal(dim1=-2, dim2=-1) / weight
+        typical = float(diagonal.abs().median())
+        return typical if typical > 0 else 1.0
+
+
+class ChainSum(NamedTuple):
+    """What is minimised: weighted costs of the frames, and transitions.
+
+    Attributes:
+        cost: Costs of the frames.
+        evidence: Factor on them.
+        times: Seconds.
+        transition: What motion is to be expected.
+        changes: Where coordinates change.
+        dtype: Type in which the costs are evaluated.
+    """
+
+    cost: CostFunction
+    evidence: float
+    times: Float[Tensor, " t"]
+    transition: Transition
+    changes: Changes
+    dtype: torch.dtype
+
+    def at(self, x: Float[Tensor, "t n"]) -> Chain:
+        """The model of the sum at a state."""
+        model = self.cost.local_model(x.to(self.dtype))
+        frames = LocalModel(*(self.evidence * part.detach().double() for part in model))
+        return Chain.of(frames, motion_terms(x, self.times, self.transition, self.changes))
+
+
+def descend(
+    sum_: ChainSum, x: Tensor, limits: Bounds, weight: Tensor, max_steps: int, tolerance: float
+) -> tuple[Float[Tensor, "t n"], Chain, Status, int]:
+    """Newton's method on all frames at once; the state, the model there, why it ended, how long."""
+    x = limits.project(x)
+    chain, damping, steps = sum_.at(x), 0.0, 0
+    if not chain.is_finite:
+        return x, chain, Status.NON_FINITE, 0
+    while True:
+        step, used = _chain_step(chain, x, limits, weight, damping)
+        predicted = -float((step * (chain.gradient + 0.5 * chain.times(step))).sum())
+        resolution = 4 * torch.finfo(sum_.dtype).eps * abs(float(chain.value))
+        if predicted < tolerance and used == damping == 0.0:
+            return x, chain, Status.CONVERGED, steps
+        if predicted <= max(1e-3 * tolerance, resolution):
+            return x, chain, Status.SMALL_STEP, steps
+        if steps >= max_steps:
+            return x, chain, Status.STEP_LIMIT, steps
+        steps += 1
+        # A sum may miss the bound that it is to reach by its rounding.
+        candidate = torch.where(step <= limits.lower - x, limits.lower, x + step)
+        candidate = torch.where(step >= limits.upper - x, limits.upper, candidate)
+        other = sum_.at(limits.project(candidate))
+        decrease = float(chain.value - other.value) if other.is_finite else -math.inf
+        typical = chain.curvature(weight)
+        if decrease >= 0 and decrease > 1e-4 * predicted:
+            x, chain = limits.project(candidate), other
+            damping = 0.0 if damping < 1e-3 * typical else 0.2 * damping
+            if decrease < 0.25 * predicted:
+                damping = max(2 * used, 1e-3 * typical)
+        else:
+            damping = max(5 * used, 1e-2 * typical)
+            if damping > _MOST_DAMPING * typical:
+                return x, chain, Status.SMALL_STEP, steps
+
+
+def marginals(
+    chain: Chain, free: Bool[Tensor, "t n"], prior_variance: Float[Tensor, " n"]
+) -> Float[Tensor, "t n n"]:
+    """Covariances of the states: diagonal blocks of the inverse Hessian on the free variables.
+
+    A frame whose cost is not finite says nothing.
+    """
+    finite = chain.hessian.isfinite().all(-1).all(-1)[:, None, None]
+    chain = model = chain._replace(hessian=torch.where(finite, chain.hessian, 0.0))
+    for attempt in range(_ATTEMPTS):
+        weak = prior_variance.reciprocal() * 10.0 ** max(attempt - 1, 0)
+        factor = model.band.plus_diagonal(weak).masked(free).factor()
+        if factor is not None:
+            break
+        model = chain.convex()
+    else:
+        return torch.diag_embed(prior_variance.expand_as(chain.gradient))
+    covariance = mask_free(factor.inverse_diagonal(), free)
+    covariance.diagonal(dim1=-2, dim2=-1).copy_(
+        torch.where(free, covariance.diagonal(dim1=-2, dim2=-1), prior_variance)
+    )
+    return covariance
+
+
+def held_by(x: Tensor, gradient: Tensor, bounds: Bounds) -> Bool[Tensor, "t n"]:
+    """Variables at a bound that the sum pushes against it, or without room between two."""
+    pushed = ((x <= bounds.lower) & (gradient > 0)) | ((x >= bounds.upper) & (gradient < 0))
+    return pushed | (bounds.lower == bounds.upper)
+
+
+def motion_terms(
+    x: Float[Tensor, "t n"], times: Float[Tensor, " t"], transition: Transition, changes: Changes
+) -> Motion:
+    """Value, gradient and (Gauss-Newton) Hessian of the transitions."""
+    t, n = x.shape
+    motion, turn = transition.deviations(times, n)
+    eye = torch.eye(n, dtype=x.dtype, device=x.device)
+    width = 1 + min(2 if transition.judges_acceleration else 1, t - 1)
+    gradient, band = torch.zeros_like(x), x.new_zeros(t, width, n, n)
+    value = x.new_zeros(())
+    # Where each frame lies in the coordinates of the next and of the next but one.
+    ahead, slope = x.clone(), eye.repeat(t, 1, 1)
+    for step in changes:
+        if step < t - 1:
+            ahead[step], slope[step] = with_slope(changes[step], x[step])
+    far, far_slope = ahead.clone(), slope.clone()
+    for step in changes:
+        if 1 <= step < t - 1:
+            far[step - 1], turned = with_slope(changes[step], ahead[step - 1])
+            far_slope[step - 1] = turned @ slope[step - 1]
+
+    def add(residual: Tensor, factors: list[Tensor]) -> None:
+        """Half a squared residual; `factors[d]` is its derivative by the state d frames earlier."""
+        nonlocal value
+        first = t - len(residual)
+        value = value + 0.5 * residual.square().sum()
+        for d, factor in enumerate(factors):
+            rows = slice(first - d, t - d)
+            gradient[rows] += (factor.mT @ residual[..., None])[..., 0]
+            for e in range(d, len(factors)):
+                band[rows, e - d] += factor.mT @ factors[e]
+
+    if t > 1:
+        weight = motion.reciprocal()
+        add(
+            weight * (x[1:] - ahead[:-1]),
+            [torch.diag_embed(weight), -weight[..., None] * slope[:-1]],
+        )
+    if t > 2 and transition.judges_acceleration:
+        weight = turn.reciprocal()
+        step = times.diff()
+        ratio = (step[1:] / step[:-1])[:, None]
+        add(
+            weight * (x[2:] - (1 + ratio) * ahead[1:-1] + ratio * far[:-2]),
+            [
+                torch.diag_embed(weight),
+                -(weight * (1 + ratio))[..., None] * slope[1:-1],
+                (weight * ratio)[..., None] * far_slope[:-2],
+            ],
+        )
+    return Motion(value, gradient, band)
+
+
+def with_slope(
+    change: Callable[[Tensor], Tensor], x: Float[Tensor, "*b n"]
+) -> tuple[Float[Tensor, "*b n"], Float[Tensor, "*b n n"]]:
+    """A change of coordinates and its derivative."""
+    # The derivative in a step that all items share is that of every item in its own.
+    slope = torch.autograd.functional.jacobian(
+        lambda step: change(x + step), x.new_zeros(x.shape[-1])
+    )
+    assert isinstance(slope, Tensor)
+    return change(x).detach(), slope
+
+
+def _chain_step(
+    chain: Chain, x: Tensor, limits: Bounds, weight: Tensor, damping: float
+) -> tuple[Float[Tensor, "t n"], float]:
+    """The step to the least of the damped model in the box, and the damping that it took."""
+    fixed, held = limits.lower == limits.upper, held_by(x, chain.gradient, limits)
+    lower, upper = limits.lower - x, limits.upper - x
+    trial, model = damping, chain
+    for attempt in range(_ATTEMPTS):
+        band = model.band.plus_diagonal(trial * weight)
+        # A definite model may take variables off their bounds; else those stay that are held.
+        for kept in (fixed, held):
+            if band.masked(~kept).factor() is not None:
+                step = least_in_box(band, chain.gradient, lower, upper, kept)
+                if step is not None:
+                    return step, trial
+        if attempt == 0:
+            model = chain.convex()
+        else:
+            trial = max(10 * trial, 1e-12 * chain.curvature(weight))
+    # Every entry of the model would have to be beyond all bounds; there is no step to take.
+    return torch.zeros_like(x), trial
