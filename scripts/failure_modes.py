@@ -117,7 +117,9 @@ def main(config: Config) -> dict[str, Any]:
     print_table(report["table"], sequence.name)
     if config.plot is not None and report["table"]:
         told = {row.preset: row.times_s for row in report["published"]}
-        times, curves = error_curves([r for r in runs if r["preset"] in config.presets], told)
+        order = [name for name in PRESETS if name in config.presets]
+        shown = [run for name in order for run in runs if run["preset"] == name]
+        times, curves = error_curves(shown, told)
         title = f"{sequence.name}; dotted: frames with a greater error have failed"
         figure = failure_figure(times, curves, title=title, failed_mm=thresholds.lost_mm)
         save_figure(figure, config.plot)
