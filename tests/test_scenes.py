@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from torchcss.cost.total import TrackingCost
 from torchcss.errors import ConfigurationError
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.io.video import Frame
@@ -17,7 +18,7 @@ from torchcss.scenes import Scene, arm_scenes, clip_scenes
 from torchcss.settings import ALL_TERMS, Settings, boundary_emphasis, make_choice, make_extractor
 from torchcss.synthetic import arm_sequence
 
-TERMS = tuple(term for term in ALL_TERMS if term != "temporal_mixture")
+TERMS = tuple(term for term in ALL_TERMS if term not in ("temporal_mixture", "region"))
 SETTINGS = Settings(body="arm8", terms=TERMS)
 
 
@@ -43,10 +44,9 @@ class Spy:
         return SimpleNamespace(mixture=mixture), SimpleNamespace(origin=torch.tensor([0]))
 
 
-def test_the_cost_is_the_trackers(scene: Scene) -> None:
-    """Term by term that of a tracker whose only mode was at the truth one frame before."""
+def costs_of_a_tracker_at_the_truth(settings: Settings, num_frames: int) -> list[TrackingCost]:
     generator = torch.Generator().manual_seed(0)
-    sequence = arm_sequence(generator=generator, num_frames=3)
+    sequence = arm_sequence(generator=generator, num_frames=num_frames)
     spy, n = Spy(sequence.states), sequence.states.shape[1]
     start = GaussianMixture(
         sequence.states[:1], torch.eye(n, dtype=torch.float64)[None], torch.zeros(1).double()
@@ -56,20 +56,38 @@ def test_the_cost_is_the_trackers(scene: Scene) -> None:
         body=sequence.body,
         mixture=start,
         camera=sequence.camera,
-        extractor=make_extractor(SETTINGS),
+        extractor=make_extractor(settings),
         tracker=spy,  # type: ignore[arg-type]
-        choice=make_choice(SETTINGS, 1.0),
+        choice=make_choice(settings, 1.0),
         observe=lambda index: None,
         frame_interval=1 / 25,
         generator=generator,
-        boundary_emphasis=boundary_emphasis(SETTINGS),
+        boundary_emphasis=boundary_emphasis(settings),
     ):
         pass
+    return spy.costs
+
+
+def test_the_cost_is_the_trackers(scene: Scene) -> None:
+    """Term by term that of a tracker whose only mode was at the truth one frame before."""
+    cost = costs_of_a_tracker_at_the_truth(SETTINGS, 3)[2]
     x = scene.truth + 0.02
-    expected, found = spy.costs[2].terms(x[None]), scene.cost.terms(x[None])
+    expected, found = cost.terms(x[None]), scene.cost.terms(x[None])
     assert set(found) == set(expected) >= {"contour", "edge_energy", "flow", "temporal"}
-    for name, cost in expected.items():
-        torch.testing.assert_close(found[name], cost, msg=name)
+    for name, value in expected.items():
+        torch.testing.assert_close(found[name], value, msg=name)
+
+
+def test_colours_are_those_of_the_frame_before() -> None:
+    settings = Settings(body="arm8", terms=("region",))
+    scene = next(arm_scenes([1], generator=torch.Generator().manual_seed(0), settings=settings))
+    first, second = costs_of_a_tracker_at_the_truth(settings, 2)
+    x = scene.truth[None]
+    assert not first.terms(x).get("region", torch.zeros(1)).any(), "nothing is known at first"
+    torch.testing.assert_close(scene.cost.terms(x)["region"], second.terms(x)["region"])
+    # A fitted outline costs less than half, which is what colours that say nothing cost.
+    share = float(scene.cost.terms(x)["region"]) / scene.cost.choice.region_weight
+    assert 0 < share < 0.4
 
 
 def test_the_mode_is_near_the_truth(scene: Scene) -> None:

@@ -124,6 +124,8 @@ class Track:
     """Foreground of every frame: a video or a folder of images of the video's size."""
     overlay: bool = True
     """Write overlay.mp4."""
+    recovery: bool = True
+    """Tell from the costs when the track is lost, and search more widely then."""
     smooth: bool = False
     """When done, write smooth.npz as well: one smooth trajectory through the modes of all frames,
     as torchcss smooth does."""
@@ -153,6 +155,7 @@ class Track:
             device=self.device,
             dtype=self.dtype,
             overlay=self.overlay,
+            recovery=self.recovery,
         )
         summary = track_video(
             self.video,

@@ -19,6 +19,7 @@ from torchcss.io.video import Frame, VideoWriter
 from torchcss.pipeline import track_frames
 from torchcss.presets import PRESETS
 from torchcss.recorder import Recorder
+from torchcss.recovery import Recovery
 from torchcss.settings import (
     Settings,
     boundary_emphasis,
@@ -97,6 +98,8 @@ def run_demo(
         generator=generator,
         boundary_emphasis=boundary_emphasis(settings),
         limits=PRESETS[settings.preset].limits,
+        recovery=Recovery() if settings.recovery else None,
+        jumps_every=PRESETS[settings.preset].jumps_every,
     )
     recorder = Recorder(
         folder=out,

@@ -140,7 +140,7 @@ def find_interpretations(
     starts = [fits]
     if search.num_flips and (segments := Segments(body)).limbs:
         trunks = _distinct_trunks(cost, segments, fits, search.num_trunks)
-        starts.append(_flips(cost, segments, trunks, bounds, search.num_flips))
+        starts.append(flips(cost, segments, trunks, bounds, search.num_flips))
     if search.num_samples or search.anneal:
         modes = _optimise(_widened(cost, _MIDDLE), fits, bounds, 2)
         keep = distinct_modes(modes.mean, modes.covariance, modes.cost)[:16]
@@ -211,7 +211,7 @@ def _distinct_trunks(
     return x[kept]
 
 
-def _flips(
+def flips(
     cost: TrackingCost,
     segments: Segments,
     x: Float[Tensor, "m n"],

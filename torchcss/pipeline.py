@@ -28,12 +28,18 @@ from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.proposals import unbounded
 from torchcss.inference.tracker import SequenceTracker, TrackerInfo, TrackerState
 from torchcss.io.video import Frame
+from torchcss.jumps import with_flips
+from torchcss.recovery import Recovery
 from torchcss.stopwatch import Stopwatch
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor
 
 _PITCH_LIMIT = math.radians(55)
 """The base follows once the root's pitch exceeds this, well before it locks at 90 degrees."""
+
+
+NUM_JUMPS = 8
+"""Flips of the best mode that join the search where jumps are made."""
 
 
 class TrackedFrame(NamedTuple):
@@ -49,6 +55,8 @@ class TrackedFrame(NamedTuple):
         seconds: Wall time of the frame by stage.
         term_seconds: Wall time of the search by what was evaluated; the rest of it is the
             optimiser's own.
+        lost: Whether the track counts as lost, see `torchcss.recovery`.
+        loss_score: By how many deviations the image costs more than before, see `LossMonitor`.
     """
 
     frame: Frame
@@ -59,6 +67,8 @@ class TrackedFrame(NamedTuple):
     terms: dict[str, float]
     seconds: dict[str, float]
     term_seconds: dict[str, float]
+    lost: bool = False
+    loss_score: float = 0.0
 
 
 Observe = Callable[[int], JointObservation | None]
@@ -80,6 +90,8 @@ def track_frames(
     boundary_emphasis: float = 0.0,
     limits: bool = True,
     masks: Iterable[np.ndarray | Tensor] | None = None,
+    recovery: Recovery | None = None,
+    jumps_every: int = 0,
 ) -> Iterator[TrackedFrame]:
     """Track a body through a sequence of images.
 
@@ -98,6 +110,9 @@ def track_frames(
         limits: Whether joint limits hold.
         masks: Foreground of each of the images, of their size, as `FeatureExtractor` takes it;
             None: not known.
+        recovery: How losses are told and what is done then; None: nothing.
+        jumps_every: Every how many frames the flips of the best mode join the search, see
+            `torchcss.jumps`; 0: never.
 
     Yields:
         A `TrackedFrame` for every frame.
@@ -110,7 +125,8 @@ def track_frames(
         boundary_emphasis=boundary_emphasis,
     )
     last_image, foregrounds = None, None if masks is None else iter(masks)
-    state = tracker.init(mixture, generator=generator)
+    state, appearance = tracker.init(mixture, generator=generator), None
+    lost, watch = False, None if recovery is None else recovery.monitor.init()
     for frame in frames:
         clock = time.perf_counter()
         mask = None
@@ -118,30 +134,47 @@ def track_frames(
             raise VideoError(f"the masks end before frame {frame.index}; give one for every frame")
         features = extractor(frame.image, last_image, mask)
         last_image = frame.image
+        searching, num_prior = tracker, len(state.mixture.mean)
+        if lost and recovery is not None:
+            searching = recovery.widened(tracker)
+            state = recovery.with_jumps(state, body, camera)
+        elif jumps_every and int(state.frame) % jumps_every == 0:
+            state = with_flips(state, body, camera, num=NUM_JUMPS)
         stopwatch = Stopwatch()
         cost = costs(
             features,
             body=body,
             before=state.mixture.mean,
             observation=observe(frame.index),
+            appearance=appearance,
             stopwatch=stopwatch,
         )
         featured = time.perf_counter()
         prior = state.mixture
         bounds = body.bounds if limits else unbounded(prior.mean)
-        state, info = tracker.step(state, cost.of_children, bounds)
+        state, info = searching.step(state, cost.of_children, bounds)
+        if len(prior.mean) > num_prior:
+            # A mode that was jumped to goes back to the best one, from which the jump was made.
+            info = info._replace(parent=torch.where(info.parent < num_prior, info.parent, 0))
         searched, term_seconds = time.perf_counter(), dict(stopwatch.seconds)
         mean = state.mixture.mean
-        terms = cost.of_children(info.origin[:1], prior).terms(mean[:1])
+        values = cost.of_children(info.origin[:1], prior).terms(mean[:1])
+        terms = {name: float(value[0]) for name, value in values.items()}
+        if recovery is not None and watch is not None:
+            watch, lost = recovery.judge(watch, terms)
+        if not lost:
+            appearance = costs.learn(appearance, features, body, mean[0])
         yield TrackedFrame(
             frame,
             body,
             state,
             info,
             body.pose(mean).joints,
-            {name: float(value[0]) for name, value in terms.items()},
+            terms,
             {"features": featured - clock, "search": searched - featured},
             term_seconds,
+            lost,
+            0.0 if watch is None else watch.score,
         )
         body, state = follow_with_base(body, state)
 

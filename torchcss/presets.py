@@ -5,7 +5,8 @@ a body, 10 for Cham and Rehg's.
 
 | name | tracker | from |
 |---|---|---|
-| css | covariance scaled sampling | [IJRR] Fig. 6 |
+| css | covariance scaled sampling, modes kept apart, and kinematic jumps | [IJRR] Fig. 6 |
+| css_figure_6 | covariance scaled sampling alone | [IJRR] Fig. 6 |
 | css_heavy_tailed | the same with Student t tails | [IJRR] Fig. 6 |
 | css_limits, css_constrained | without and with non-interpenetration | [IJRR] section 6.2 |
 | multiple_hypothesis | a regular pattern along the most uncertain directions | [RR] Fig. 4 |
@@ -81,6 +82,10 @@ class Preset:
         limits: Whether joint limits hold, see `bounds`.
         interpenetration: Whether parts repel each other; None: as the cost is set up otherwise.
         curvature: Which Hessian the cost gives.
+        separation: Mean distance of the joint centres, metres, from which two modes count as two
+            explanations, see `Tracker`. The papers have none; their modes are distinct minima.
+        jumps_every: Every how many frames the flips of the best mode join the search, see
+            `torchcss.jumps`; 0, as in the papers: never.
     """
 
     what: str
@@ -98,6 +103,8 @@ class Preset:
     limits: bool = True
     interpenetration: bool | None = None
     curvature: Curvature = Curvature.EXACT
+    separation: float = 0.0
+    jumps_every: int = 0
 
     def __post_init__(self) -> None:
         if (self.proposal is None) == (self.particles is None):
@@ -123,12 +130,14 @@ _PERSISTENCE = 0.8
 """Of all trackers without dynamics of their own, so that they differ in the search alone."""
 
 _CSS = Preset(
-    what="covariance scaled sampling, [IJRR] Fig. 6 with s = 8",
+    what="covariance scaled sampling, [IJRR] Fig. 6 with s = 8, modes kept apart, and jumps",
     proposal=CovarianceScaled(covariance_scale=8.0, max_deviation=1.0),
     samples_arm=40,
     samples_body=60,
     memory=0.5,
     persistence=_PERSISTENCE,
+    separation=0.05,
+    jumps_every=3,
 )
 _SINGLE = Preset(
     what="one robust mode with joint limits, no search ([IJRR] section 6)",
@@ -174,6 +183,12 @@ def _least_squares(row: Preset, what: str) -> Preset:
 
 PRESETS: dict[str, Preset] = {
     "css": _CSS,
+    "css_figure_6": replace(
+        _CSS,
+        what="css as printed: the best minima however alike, no jumps to flipped poses",
+        separation=0.0,
+        jumps_every=0,
+    ),
     "css_heavy_tailed": replace(
         _CSS,
         what="covariance scaled sampling with Student t tails, [IJRR] Fig. 6",
@@ -215,6 +230,8 @@ PRESETS: dict[str, Preset] = {
         what="css, but sampled by dynamical noise instead of scaled covariances ([IJRR] section 6)",
         proposal=Condensation(deviation=0.0),
         noise=3.0,
+        separation=0.0,
+        jumps_every=0,
     ),
     "cham_rehg": _CHAM_REHG,
     "cham_rehg_ssd": _least_squares(
@@ -289,4 +306,5 @@ def make_tracker(
         optimiser=TrustRegionNewton(max_steps=20, tolerance=1e-2),
         memory=row.memory,
         dynamics=dynamics,
+        separation=row.separation,
     )

@@ -361,6 +361,24 @@ def _chunks(length: Int[Tensor, " r"]) -> list[slice]:
     return [slice(a, b) for a, b in pairwise(cuts)]
 
 
+def grid_faces(rings: int, meridians: int) -> Int[Tensor, "f 3"]:
+    """Triangles of a mesh of rings closed around the part, poles capped by fans.
+
+    Args:
+        rings: Latitudes.
+        meridians: Longitudes.
+    """
+    ring, step = torch.meshgrid(torch.arange(rings - 1), torch.arange(meridians), indexing="ij")
+    here = ring * meridians + step
+    beside = ring * meridians + (step + 1) % meridians
+    quads = torch.stack([here, beside, here + meridians, beside + meridians], dim=-1).reshape(-1, 4)
+    sides = torch.cat([quads[:, [0, 1, 3]], quads[:, [0, 3, 2]]])
+    fan = torch.arange(1, meridians - 1)
+    bottom = torch.stack([torch.zeros_like(fan), fan + 1, fan], dim=-1)
+    top = torch.stack([torch.zeros_like(fan), fan, fan + 1], dim=-1) + (rings - 1) * meridians
+    return torch.cat([sides, bottom, top])
+
+
 def join_faces(
     faces: Sequence[Int[Tensor, "f 3"]], num_vertices: Sequence[int]
 ) -> tuple[Int[Tensor, "F 3"], Int[Tensor, " F"]]:

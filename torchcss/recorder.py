@@ -112,8 +112,10 @@ class Recorder:
         totals: dict[str, float] = {}
         terms: dict[str, float] = {}
         term_seconds: dict[str, float] = {}
-        counts = {"samples": 0, "iterations": 0, "distinct": 0}
+        counts = {"samples": 0, "iterations": 0, "distinct": 0, "lost": 0}
         statuses = torch.zeros(len(Status), dtype=torch.long)
+        events: list[dict[str, Any]] = []
+        lost = False
         ended, began = "interrupted", time.perf_counter()
         saved, took = began, 0.0
         summary: dict[str, Any] = {}
@@ -141,6 +143,17 @@ class Recorder:
                     counts["samples"] += int(frame.info.num_samples)
                     counts["iterations"] += int(frame.info.num_steps.sum())
                     counts["distinct"] += int(frame.info.num_distinct)
+                    if frame.lost != lost:
+                        lost = frame.lost
+                        events.append(
+                            {
+                                "event": "lost" if lost else "found",
+                                "frame": frame.frame.index,
+                                "time_s": frame.frame.time_s,
+                                "deviations": frame.loss_score,
+                            }
+                        )
+                    counts["lost"] += frame.lost
                     statuses += frame.info.status_counts.cpu()
                     bar.set_postfix(
                         cost=f"{float(frame.info.cost[0]):.1f}",
@@ -157,7 +170,7 @@ class Recorder:
                     writer.save()
                     summary = self._summary(
                         ended, len(writer), time.perf_counter() - began, totals, terms,
-                        term_seconds, counts, statuses,
+                        term_seconds, counts, statuses, events,
                     )  # fmt: skip
                     write_summary(self.folder, summary)
         return summary
@@ -189,6 +202,7 @@ class Recorder:
         term_seconds: dict[str, float],
         counts: dict[str, int],
         statuses: Tensor,
+        events: list[dict[str, Any]],
     ) -> dict[str, Any]:
         return {
             "ended": ended,
@@ -209,6 +223,8 @@ class Recorder:
             "iterations": counts["iterations"],
             "iterations_per_sample": counts["iterations"] / max(counts["samples"], 1),
             "distinct_modes_per_frame": counts["distinct"] / num_frames,
+            "events": events,
+            "frames_searched_widely": counts["lost"],
             "optimiser_status": {s.name.lower(): int(statuses[s]) for s in Status},
             "best_mode_cost_by_term": {k: v / num_frames for k, v in terms.items()},
             "share_of_cost_by_term": _shares(terms),

@@ -1,7 +1,8 @@
 """Single frames with their cost, a true state and the mode nearest to it: to look at a cost.
 
 A tracker sees many states of a frame for a moment; here one frame stays at hand. Its cost is that
-of a tracker whose only mode in the frame before was a given state. A `Scene` adds the truth and the
+of a tracker whose only mode in the frame before was a given state, and that knows colours from that
+frame alone. A `Scene` adds the truth and the
 mode that the optimiser reaches from there, whose covariance says along which lines the cost is
 worth a look (`torchcss.slices`).
 
@@ -126,8 +127,10 @@ def arm_scenes(
     )
     for index in frames:
         features = extractor(sequence.frames[index], sequence.frames[index - 1])
-        previous = states[index - 1]
-        cost = replace(costs(features, body=body, before=previous), parent=previous)
+        previous, before = states[index - 1], extractor(sequence.frames[index - 1])
+        appearance = costs.learn(None, before, body, previous)
+        cost = costs(features, body=body, before=previous, appearance=appearance)
+        cost = replace(cost, parent=previous)
         image, truth = sequence.frames[index], states[index]
         yield _scene(f"{name}, frame {index}", image, features, cost, truth)
 
@@ -210,9 +213,14 @@ def _clip_scene(
         frame_interval=now.time_s - before.time_s,
         boundary_emphasis=boundary_emphasis(settings),
     )
-    cost = replace(
-        costs(features, body=body, before=previous, observation=observed[1]), parent=previous
+    cost = costs(
+        features,
+        body=body,
+        before=previous,
+        observation=observed[1],
+        appearance=costs.learn(None, extractor(before.image), body, previous),
     )
+    cost = replace(cost, parent=previous)
     return _scene(f"{view}, frame {frame}", now.image, features, cost, truth)
 
 

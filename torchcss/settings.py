@@ -19,6 +19,7 @@ from torchcss.cost.edge_energy import EdgeEnergyTerm
 from torchcss.cost.flow import FlowTerm
 from torchcss.cost.interpenetration import Interpenetration
 from torchcss.cost.joints import JointTerm
+from torchcss.cost.region import RegionTerm
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.temporal import MixturePrior, TemporalPrior
 from torchcss.cost.total import CostChoice
@@ -30,13 +31,13 @@ from torchcss.vision.features import FeatureExtractor
 from torchcss.vision.flow import TRACKING
 
 TERMS = (
-    *("contour", "motion_boundaries", "flow", "joints"),
+    *("contour", "motion_boundaries", "region", "flow", "joints"),
     *("stabiliser", "anthropometric", "interpenetration", "temporal"),
 )
 """Terms and priors of the cost by default: all that do not stand in for one another."""
 
 ALL_TERMS = (
-    *("contour", "motion_boundaries", "edge_energy", "flow", "joints"),
+    *("contour", "motion_boundaries", "edge_energy", "region", "flow", "joints"),
     *("stabiliser", "anthropometric", "interpenetration", "temporal", "temporal_mixture"),
 )
 """Terms and priors that can be chosen; see `torchcss.cost.total`. `motion_boundaries` weighs the
@@ -65,6 +66,7 @@ class Settings:
         device: Where to compute.
         dtype: "float64" or "float32".
         overlay: Write `overlay.mp4`.
+        recovery: Tell from the costs when the track is lost, and search more widely then.
     """
 
     body: str = "body34"
@@ -81,6 +83,7 @@ class Settings:
     device: str = "cpu"
     dtype: Literal["float64", "float32"] = "float64"
     overlay: bool = True
+    recovery: bool = True
 
     def __post_init__(self) -> None:
         if self.preset not in PRESETS:
@@ -109,7 +112,9 @@ def make_extractor(settings: Settings) -> FeatureExtractor:
     """The features that the settings ask for, in their type and on their device."""
     moving = {"flow", "motion_boundaries"} & set(settings.terms)
     flow = TRACKING if moving else None
-    extractor = FeatureExtractor(working_size=settings.working_size, flow=flow)
+    extractor = FeatureExtractor(
+        working_size=settings.working_size, flow=flow, colour="region" in settings.terms
+    )
     return extractor.to(dtype=settings.torch_dtype, device=settings.device)
 
 
@@ -141,6 +146,7 @@ def make_choice(settings: Settings, sigma: float) -> CostChoice:
     return CostChoice(
         contour=replace(contour, fitted_level=level) if has("contour") else None,
         edge_energy=EdgeEnergyTerm(**potential) if has("edge_energy") else None,
+        region=RegionTerm() if has("region") else None,
         flow=FlowTerm(**potential) if has("flow") else None,
         joints=JointTerm(sigma=sigma, **potential) if has("joints") else None,
         stabiliser=Stabiliser() if has("stabiliser") else None,

@@ -27,6 +27,7 @@ from torchcss.marks import default_sigma
 from torchcss.metrics import first_loss
 from torchcss.pipeline import TrackedFrame, scale_keypoints, track_frames
 from torchcss.presets import PRESETS
+from torchcss.recovery import Recovery
 from torchcss.settings import (
     Settings,
     boundary_emphasis,
@@ -243,6 +244,8 @@ def _follow(
         generator=begin.generator,
         boundary_emphasis=boundary_emphasis(settings),
         limits=PRESETS[settings.preset].limits,
+        recovery=Recovery() if settings.recovery else None,
+        jumps_every=PRESETS[settings.preset].jumps_every,
     )
 
 

@@ -28,6 +28,7 @@ from torchcss.marks import default_sigma
 from torchcss.pipeline import scale_keypoints, track_frames
 from torchcss.presets import PRESETS
 from torchcss.recorder import Recorder
+from torchcss.recovery import Recovery
 from torchcss.settings import (
     Settings,
     boundary_emphasis,
@@ -172,6 +173,8 @@ def track_video(
         generator=generator,
         boundary_emphasis=boundary_emphasis(settings),
         limits=PRESETS[settings.preset].limits,
+        jumps_every=PRESETS[settings.preset].jumps_every,
+        recovery=Recovery() if settings.recovery else None,
         masks=None if foreground is None else (mask.image for mask in foreground),
     )
     return recorder.run(tracked, first.body, reader.num_selected)

@@ -183,11 +183,11 @@ class ContourTerm:
         self, nodes: ContourNodes, camera: Camera, edge_field: Float[Tensor, "2 h w"]
     ) -> Float[Tensor, "*batch p"]:
         """Cost of every node, in units of nu."""
-        seen, index = _seen(nodes)
+        seen, index = seen_nodes(nodes)
         model = camera.project_with_derivatives(seen.points)
         normal = camera.image_normals(model, seen.normals)
         depth, _, _ = self._wells(model.uv, normal, edge_field)
-        return self._compose(nodes, _spread(model.valid * depth, index, nodes))
+        return self._compose(nodes, spread(model.valid * depth, index, nodes))
 
     def point_cost(
         self,
@@ -198,7 +198,7 @@ class ContourTerm:
         gauss_newton: bool = False,
     ) -> PointCost:
         """The same with first and second derivatives in the nodes' positions."""
-        seen, index = _seen(nodes)
+        seen, index = seen_nodes(nodes)
         model = camera.project_with_derivatives(seen.points)
         normal = camera.image_normals(model, seen.normals)
         depth, slope, curvature = self._wells(model.uv, normal, edge_field)
@@ -208,7 +208,7 @@ class ContourTerm:
         cost = camera.pull_back(
             model, model.valid * depth, gradient, hessian, gauss_newton=gauss_newton
         )
-        value, gradient, hessian = (_spread(part, index, nodes) for part in cost)
+        value, gradient, hessian = (spread(part, index, nodes) for part in cost)
         return PointCost(self._compose(nodes, value), gradient, hessian)
 
     def _compose(
@@ -221,14 +221,14 @@ class ContourTerm:
         return nodes.exists * seen + (1 - nodes.exists) * back_facing
 
 
-def _seen(nodes: ContourNodes) -> tuple[ContourNodes, Int[Tensor, " k"]]:
+def seen_nodes(nodes: ContourNodes) -> tuple[ContourNodes, Int[Tensor, " k"]]:
     """The nodes that count at all, of the whole batch, and their places in it."""
     index = places(nodes.visible * nodes.exists > 0)
     last = nodes.exists.dim() - 1
     return ContourNodes(*(part.flatten(0, last).index_select(0, index) for part in nodes)), index
 
 
-def _spread(
+def spread(
     part: Float[Tensor, "k *rest"], index: Int[Tensor, " k"], nodes: ContourNodes
 ) -> Float[Tensor, "*batch p *rest"]:
     """What was worked out for the nodes that count, and zero for the others."""

@@ -14,9 +14,8 @@ evaluated.
 
 E must be twice continuously differentiable for that. It is a uniform cubic B-spline whose
 coefficients are the energies, blurred by a Gaussian; a weighted mean of energies never leaves
-[0, 1]. Value, gradient and Hessian are those of this one interpolant. The blur lowers a ridge, so
-its height is restored up to the top of the range. Coefficients outside the image are zero: the
-energy, and all its derivatives, fade over two pixels across the border.
+[0, 1] (`torchcss.vision.spline`). The blur lowers a ridge, so its height is restored up to the top
+of the range.
 
 Where the body has no contour and where it is hidden the costs are those of the contour term.
 
@@ -28,100 +27,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import kornia
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn import functional
 
 from torchcss.cost.visibility import ContourNodes
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.robust import Lorentzian, RobustPotential
 from torchcss.types import PointCost
 from torchcss.vision.camera import Camera
-
-_MARGIN = 4
-"""Zero coefficients around the image, pixels: beyond two the spline is zero for good."""
+from torchcss.vision.spline import SplineField, spline_field
 
 _RIDGE = 1.2
 """Standard deviation of the ridge that the edge detector makes of a clean step, pixels."""
 
 
-class EdgeEnergySample(NamedTuple):
-    """The energy at image points, with its derivatives along u and v.
-
-    Attributes:
-        value: Energy in [0, 1]; 0 outside the image.
-        gradient: First derivatives, per pixel.
-        hessian: Second derivatives, per square pixel.
-    """
-
-    value: Float[Tensor, "*batch p"]
-    gradient: Float[Tensor, "*batch p 2"]
-    hessian: Float[Tensor, "*batch p 2 2"]
-
-
-class EdgeEnergyField(NamedTuple):
-    """The edge energy of an image as a smooth function.
-
-    Attributes:
-        coefficients: Coefficients of the spline at the pixel centres, within a margin of zeros.
-    """
-
-    coefficients: Float[Tensor, "y x"]
-
-    def value(self, uv: Float[Tensor, "*batch p 2"]) -> Float[Tensor, "*batch p"]:
-        """Evaluate the spline without its derivatives.
-
-        Args:
-            uv: Pixel coordinates, anywhere.
-        """
-        (f,), (by_value,) = self._summed_along_u(uv, num_derivatives=0)
-        return _dot(by_value, f).reshape(uv.shape[:-1])
-
-    def sample(self, uv: Float[Tensor, "*batch p 2"]) -> EdgeEnergySample:
-        """Evaluate the spline and its derivatives.
-
-        Args:
-            uv: Pixel coordinates, anywhere.
-        """
-        (f, f_u, f_uu), along_v = self._summed_along_u(uv, num_derivatives=2)
-        by_value, by_slope, by_curvature = along_v
-        mixed = _dot(by_slope, f_u)
-        gradient = torch.stack([_dot(by_value, f_u), _dot(by_slope, f)], dim=-1)
-        hessian = torch.stack([_dot(by_value, f_uu), mixed, mixed, _dot(by_curvature, f)], dim=-1)
-        return EdgeEnergySample(
-            _dot(by_value, f).reshape(uv.shape[:-1]),
-            gradient.reshape(uv.shape),
-            hessian.reshape(*uv.shape, 2),
-        )
-
-    def _summed_along_u(
-        self, uv: Tensor, *, num_derivatives: int
-    ) -> tuple[list[list[Tensor]], list[list[Tensor]]]:
-        """The four rows around each point, summed with the weights along u and their derivatives.
-
-        Returns the sums by derivative and row, and the weights along v by derivative and row. One
-        tensor a tap: on a CPU three times faster than 4 x 4 patches and small matrix products.
-        """
-        height, width = self.coefficients.shape
-        column, u = _cell(uv[..., 0].flatten(), width)
-        row, v = _cell(uv[..., 1].flatten(), height)
-        along_u, along_v = _basis(u, num_derivatives), _basis(v, num_derivatives)
-        flat, first = self.coefficients.to(uv).flatten(), row * width + column
-        sums: list[list[Tensor]] = [[] for _ in along_u]
-        for down in range(4):
-            taps = [flat.index_select(0, first + (down * width + right)) for right in range(4)]
-            for into, weights in zip(sums, along_u, strict=True):
-                into.append(_dot(weights, taps))
-        return sums, along_v
-
-
-def edge_energy_field(
-    edge_field: Float[Tensor, "2 h w"], *, smoothing: float = 2.0
-) -> EdgeEnergyField:
+def edge_energy_field(edge_field: Float[Tensor, "2 h w"], *, smoothing: float = 2.0) -> SplineField:
     """Make the smooth edge energy of a frame.
 
     Args:
@@ -157,7 +80,7 @@ def edge_energy_field(
     # The spline's own kernel has a variance of 1/3.
     height = math.sqrt(1.0 + (smoothing**2 + 1.0 / 3.0) / _RIDGE**2)
     coefficients = (height * energy[0, 0]).clamp(0.0, 1.0)
-    return EdgeEnergyField(functional.pad(coefficients, (_MARGIN,) * 4))
+    return spline_field(coefficients[None])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,7 +114,7 @@ class EdgeEnergyTerm:
         return 0.5 * float(self.potential(torch.ones((), dtype=torch.float64)).rho)
 
     def value(
-        self, nodes: ContourNodes, camera: Camera, field: EdgeEnergyField
+        self, nodes: ContourNodes, camera: Camera, field: SplineField
     ) -> Float[Tensor, "*batch p"]:
         """Cost of every node, in units of nu."""
         projection = camera.project(nodes.points)
@@ -202,7 +125,7 @@ class EdgeEnergyTerm:
         self,
         nodes: ContourNodes,
         camera: Camera,
-        field: EdgeEnergyField,
+        field: SplineField,
         *,
         gauss_newton: bool = False,
     ) -> PointCost:
@@ -229,29 +152,3 @@ class EdgeEnergyTerm:
         hidden = self.occlusion_factor * back_facing
         seen = nodes.visible * 0.5 * rho + (1 - nodes.visible) * hidden
         return nodes.exists * seen + (1 - nodes.exists) * back_facing
-
-
-def _cell(coordinate: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """First of the four coefficients that a coordinate blends, and its fraction of the way."""
-    # Clamped in the margin, where all four are zero. Four-byte indices are faster to select with.
-    within = coordinate.clamp(1.5 - _MARGIN, size - 2 * _MARGIN + 1.5)
-    lower = within.detach().floor()
-    return lower.int() + (_MARGIN - 1), within - lower
-
-
-def _basis(t: Tensor, num_derivatives: int) -> list[list[Tensor]]:
-    """The four cubic B-splines on a cell, then their first and second derivatives (0 or 2)."""
-    r = 1 - t
-    t2, r2 = t * t, r * r
-    splines = [[r2 * r / 6, 2 / 3 - t2 + 0.5 * t2 * t, 2 / 3 - r2 + 0.5 * r2 * r, t2 * t / 6]]
-    if num_derivatives:
-        splines.append([-0.5 * r2, 1.5 * t2 - 2 * t, 2 * r - 1.5 * r2, 0.5 * t2])
-        splines.append([r, 3 * t - 2, 3 * r - 2, t])
-    return splines
-
-
-def _dot(weights: list[Tensor], values: list[Tensor]) -> Tensor:
-    total = weights[0] * values[0]
-    for weight, value in zip(weights[1:], values[1:], strict=True):
-        total = torch.addcmul(total, weight, value)
-    return total

@@ -13,6 +13,7 @@ the mode that it came from, and is the `CostFactory` that `Tracker.step` takes.
 
 from __future__ import annotations
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -21,9 +22,11 @@ from torchcss.cost.edge_energy import edge_energy_field
 from torchcss.cost.flow import FlowTargets, InteriorNodes, flow_targets
 from torchcss.cost.interpenetration import InterpenetrationPairs
 from torchcss.cost.joints import JointObservation
+from torchcss.cost.region import RegionImages, part_layers, region_field, region_masks
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.cost.visibility import ContourPredictor, visible_nodes
 from torchcss.stopwatch import Stopwatch
+from torchcss.vision.appearance import Appearance
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FrameFeatures
 
@@ -57,8 +60,11 @@ class FrameCosts:
         self.choice = choice
         self.deviation = body.motion_rate * frame_interval
         self.boundary_emphasis = boundary_emphasis
-        edges = choice.contour is not None or choice.edge_energy is not None
-        self.predictor = ContourPredictor(body) if edges else None
+        outlines = (choice.contour, choice.edge_energy, choice.region)
+        self.predictor = ContourPredictor(body) if any(outlines) else None
+        layers, layer_of_part = part_layers(body)
+        self.num_layers = len(layers)
+        self.layer_of_part = torch.tensor(layer_of_part, device=body.tie.device)
         self.interior = InteriorNodes(body) if choice.flow is not None else None
         repels = choice.interpenetration is not None
         self.pairs = InterpenetrationPairs(body) if repels else None
@@ -70,6 +76,7 @@ class FrameCosts:
         body: BodyModel,
         before: Float[Tensor, "k n"] | None = None,
         observation: JointObservation | None = None,
+        appearance: Appearance | None = None,
         stopwatch: Stopwatch | None = None,
     ) -> TrackingCost:
         """The cost of a frame; with modes before it, `of_children` has to follow.
@@ -79,6 +86,7 @@ class FrameCosts:
             body: The body on this frame's base.
             before: The modes of the frame before, which the flow carries on; None: no flow.
             observation: Keypoints of the frame, in pixels of the features.
+            appearance: What the body and its surroundings look like, see `learn`; None: not known.
             stopwatch: Where the time of evaluations is added up.
         """
         edge_field = features.edge_field(boundary_emphasis=self.boundary_emphasis).to(body.tie)
@@ -90,6 +98,7 @@ class FrameCosts:
             predictor=self.predictor,
             edge_field=edge_field,
             energy=edge_energy_field(edge_field) if direct else None,
+            region=None if appearance is None else self._region(features, appearance),
             interior=self.interior,
             targets=None if before is None else self._targets(features, body, before),
             observation=observation,
@@ -97,6 +106,34 @@ class FrameCosts:
             deviation=self.deviation,
             stopwatch=stopwatch,
         )
+
+    def learn(
+        self,
+        appearance: Appearance | None,
+        features: FrameFeatures,
+        body: BodyModel,
+        state: Float[Tensor, " n"],
+    ) -> Appearance | None:
+        """Take in what body and surroundings look like in a frame; None without a region term.
+
+        Args:
+            appearance: What was known before; None: nothing.
+            features: Features of the frame, with colours.
+            body: The body on this frame's base.
+            state: Its pose.
+        """
+        if self.choice.region is None or features.colour is None:
+            return None
+        if appearance is None:
+            appearance = Appearance.unknown(self.num_layers, like=features.colour)
+        inside, outside = region_masks(body, state, self.camera)
+        return appearance.learn(features.colour, inside, outside)
+
+    def _region(self, features: FrameFeatures, appearance: Appearance) -> RegionImages | None:
+        if self.choice.region is None or self.predictor is None or features.colour is None:
+            return None
+        field = region_field(appearance.likeness(features.colour))
+        return RegionImages(field, self.layer_of_part[self.predictor.node_part])
 
     def _targets(
         self, features: FrameFeatures, body: BodyModel, before: Float[Tensor, "k n"]

@@ -13,6 +13,7 @@ temperature: the nats that a term contributes per nu of mean cost per node (desi
 |---|---|---|
 | `contour` | edges along the normals of occluding contours | 3.1.2, eq. 8 |
 | `edge_energy` | the edge energy itself at the same nodes | 3.1 |
+| `region` | colours on either side of the same nodes | 8 |
 | `flow` | displacement of interior nodes against the optical flow | 3.1.2, eq. 9 |
 | `joints` | 2D joint correspondences | 5 |
 | `anthropometric` | lengths of the limbs, where they are free | 3.2.1 |
@@ -38,10 +39,11 @@ from torch import Tensor
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.cost.anthropometric import Anthropometric, proportion_columns
 from torchcss.cost.contour import ContourTerm
-from torchcss.cost.edge_energy import EdgeEnergyField, EdgeEnergyTerm
+from torchcss.cost.edge_energy import EdgeEnergyTerm
 from torchcss.cost.flow import FlowTargets, FlowTerm, InteriorNodes
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
 from torchcss.cost.joints import JointObservation, JointTerm
+from torchcss.cost.region import RegionImages, RegionTerm
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.temporal import MixtureDensity, MixturePrior, TemporalPrior
 from torchcss.cost.visibility import ContourPredictor, front_facing, visible_nodes
@@ -49,6 +51,7 @@ from torchcss.inference.mixture import GaussianMixture
 from torchcss.stopwatch import Stopwatch
 from torchcss.types import Curvature, LocalModel, PointCost
 from torchcss.vision.camera import Camera
+from torchcss.vision.spline import SplineField
 
 CHUNK = 512
 """Most samples evaluated at a time: enough to hide the overhead of calls."""
@@ -71,6 +74,7 @@ class CostChoice:
     Attributes:
         contour: The edge term, or None.
         edge_energy: The direct edge-energy potential, or None.
+        region: The term of the colours on either side of the contour, or None.
         flow: The flow term, or None.
         joints: The keypoint term, or None.
         stabiliser: The sticky prior, or None.
@@ -80,6 +84,7 @@ class CostChoice:
         interpenetration: The repulsion between parts, or None.
         contour_weight: Nats per nu of the contour's mean cost per node.
         edge_energy_weight: Nats per nu of the edge energy's mean cost per node.
+        region_weight: Nats per nu of the region term's mean cost per node.
         flow_weight: Nats per nu of the flow's mean cost per node. At 50 it holds real limbs a
             little better, but where the flow misses a fast hand, as on the demo, it holds that
             back; at 20 the edges win.
@@ -89,6 +94,7 @@ class CostChoice:
 
     contour: ContourTerm | None = field(default_factory=ContourTerm)
     edge_energy: EdgeEnergyTerm | None = None
+    region: RegionTerm | None = None
     flow: FlowTerm | None = None
     joints: JointTerm | None = field(default_factory=JointTerm)
     stabiliser: Stabiliser | None = field(default_factory=Stabiliser)
@@ -98,6 +104,7 @@ class CostChoice:
     interpenetration: Interpenetration | None = None
     contour_weight: float = 150.0
     edge_energy_weight: float = 150.0
+    region_weight: float = 400.0
     flow_weight: float = 20.0
     joint_weight: float = 1.0
     curvature: Curvature = Curvature.EXACT
@@ -130,9 +137,10 @@ class TrackingCost:
         body: The body, hung on its base.
         camera: The camera of the image that the features were computed on.
         choice: Terms and weights.
-        predictor: Contour predictor of the body; None switches contour and edge energy off.
+        predictor: Contour predictor of the body; None switches contour, edge energy and region off.
         edge_field: Edge energy times gradient direction; None switches the contour term off.
         energy: The edge energy as a smooth function; None switches the edge-energy term off.
+        region: What the pixels look like, as smooth functions; None switches the region term off.
         interior: Interior nodes of the body, for the flow term; None switches it off.
         targets: Where the flow carried the nodes of each sample's parent mode, `[b p 2]`.
         observation: Keypoints of the frame, in that image's pixels; None if there are none.
@@ -148,7 +156,8 @@ class TrackingCost:
     choice: CostChoice
     predictor: ContourPredictor | None = None
     edge_field: Float[Tensor, "2 h w"] | None = None
-    energy: EdgeEnergyField | None = None
+    energy: SplineField | None = None
+    region: RegionImages | None = None
     interior: InteriorNodes | None = None
     targets: FlowTargets | None = None
     observation: JointObservation | None = None
@@ -199,6 +208,7 @@ class TrackingCost:
             self._without_images(),
             contour=self.choice.contour,
             edge_energy=self.choice.edge_energy,
+            region=self.choice.region,
             stabiliser=None,
             anthropometric=None,
             temporal=None,
@@ -212,6 +222,10 @@ class TrackingCost:
         return self._chunked(
             lambda x, part: (torch.stack(list(part._values(x).values())).sum(0),), x
         )[0]
+
+    def landmarks(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch j 3"]:
+        """Joint centres, metres: by how far they are apart two states are unlike each other."""
+        return self.body.pose(x).joints
 
     def terms(self, x: Float[Tensor, "*batch n"]) -> dict[str, Float[Tensor, "*batch"]]:
         """Cost of every term and prior by name, nats."""
@@ -229,13 +243,15 @@ class TrackingCost:
         return LocalModel(*self._chunked(lambda x, part: tuple(part._local_model(x)), x))
 
     def _without_images(self) -> CostChoice:
-        return replace(self.choice, contour=None, edge_energy=None, flow=None, joints=None)
+        return replace(
+            self.choice, contour=None, edge_energy=None, region=None, flow=None, joints=None
+        )
 
     @property
     def _chunk(self) -> int:
         """Samples to evaluate at a time."""
         choice, nodes = self.choice, 1
-        if self.predictor is not None and (choice.contour or choice.edge_energy):
+        if self.predictor is not None and (choice.contour or choice.edge_energy or choice.region):
             nodes += self.predictor.num_nodes
         if self.interior is not None and choice.flow:
             nodes += self.interior.num_nodes
@@ -305,7 +321,8 @@ class TrackingCost:
         choice, body, camera, predictor = self.choice, self.body, self.camera, self.predictor
         matches = choice.contour is not None and self.edge_field is not None
         direct = choice.edge_energy is not None and self.energy is not None
-        if predictor is not None and (matches or direct):
+        regions = choice.region is not None and self.region is not None
+        if predictor is not None and (matches or direct or regions):
             with self._timed("visibility"):
                 nodes = predictor(body, pose, camera.centre_world)
             # None on a robot without flesh.
@@ -313,6 +330,7 @@ class TrackingCost:
             for name, term, image, weight in (
                 ("contour", choice.contour, self.edge_field, choice.contour_weight),
                 ("edge_energy", choice.edge_energy, self.energy, choice.edge_energy_weight),
+                ("region", choice.region, self.region, choice.region_weight),
             ):
                 if term is not None and image is not None:
                     yield _Observed(

@@ -219,6 +219,29 @@ def distinct_modes(
     return torch.stack(kept) if kept else order
 
 
+def separated(landmarks: Float[Tensor, "k m d"], distance: float, num: int) -> Int[Tensor, " num"]:
+    """Choose modes that are unlike each other, best first.
+
+    Args:
+        landmarks: Points of each mode, the best mode first.
+        distance: Mean distance of the landmarks below which two modes are alike.
+        num: How many to choose.
+
+    Returns:
+        Indices of the modes: of those alike only the best, and the best of the others only if that
+        leaves places; in the order given.
+    """
+    chosen: list[int] = []
+    alike: list[int] = []
+    for mode, points in enumerate(landmarks):
+        apart = (landmarks[chosen] - points).norm(dim=-1).mean(-1)
+        (chosen if bool((apart >= distance).all()) else alike).append(mode)
+        if len(chosen) == num:
+            break
+    chosen = sorted(chosen + alike[: num - len(chosen)])
+    return torch.tensor(chosen, device=landmarks.device, dtype=torch.long)
+
+
 def bhattacharyya(
     first: GaussianMixture, second: GaussianMixture, *, standard: bool = False
 ) -> Float[Tensor, "k m"]:

@@ -71,6 +71,8 @@ class FrameFeatures(NamedTuple):
         motion_boundary: Motion-boundary potential S_p in 0..1, section 3.1.2 [IJRR]: low on the
             boundaries, 1 elsewhere; None if not computed.
         mask: Foreground in 0..1; None if none was given.
+        colour: Red, green, blue in 0..1, three times the same for a grey frame; None if not asked
+            for.
     """
 
     grey: Float[Tensor, "h w"]
@@ -80,6 +82,7 @@ class FrameFeatures(NamedTuple):
     flow_outlier: Float[Tensor, "h w"] | None = None
     motion_boundary: Float[Tensor, "h w"] | None = None
     mask: Float[Tensor, "h w"] | None = None
+    colour: Float[Tensor, "3 h w"] | None = None
 
     def edge_field(self, *, boundary_emphasis: float = 0.3) -> Float[Tensor, "2 h w"]:
         """Edge energy times direction, weighted by motion boundaries and foreground.
@@ -116,6 +119,7 @@ class FeatureExtractor(nn.Module):
             no features of motion.
         working_size: Longer side of the features in pixels; larger frames are reduced to it,
             smaller ones are left as they are. None: never reduce.
+        colour: Keep the colours, for terms that look at them.
 
     Raises:
         ConfigurationError: If the working size is not a positive whole number.
@@ -129,6 +133,7 @@ class FeatureExtractor(nn.Module):
         edges: EdgeConfiguration | None = None,
         flow: FlowConfiguration | None = None,
         working_size: int | None = None,
+        colour: bool = False,
     ) -> None:
         super().__init__()
         if working_size is not None and (working_size < 1 or int(working_size) != working_size):
@@ -138,6 +143,7 @@ class FeatureExtractor(nn.Module):
         self.edges = edges or EdgeConfiguration()
         self.flow = flow
         self.working_size = working_size
+        self.colour = colour
         # Rec. 601, the weights of video decoders.
         self.register_buffer("luma", torch.tensor([0.299, 0.587, 0.114]), persistent=False)
 
@@ -172,7 +178,8 @@ class FeatureExtractor(nn.Module):
             ShapeError: If a picture is of another shape or type, empty, or outside 0..1 or not
                 finite, or if the pictures differ in size.
         """
-        grey = self._grey("frame", frame)
+        levels = self._levels("frame", frame)
+        grey = self._luma(levels)
         height, width = grey.shape
         for name, other in (("previous", previous), ("mask", mask)):
             if other is not None and tuple(other.shape[:2]) != (height, width):
@@ -187,6 +194,7 @@ class FeatureExtractor(nn.Module):
             edge_energy=edges.energy,
             edge_direction=edges.direction,
             mask=None if mask is None else self._resized(self._grey("mask", mask)),
+            colour=self._colour(levels) if self.colour else None,
         )
         if previous is None or self.flow is None:
             return features
@@ -218,6 +226,17 @@ class FeatureExtractor(nn.Module):
 
     def _grey(self, name: str, picture: Tensor | np.ndarray) -> Float[Tensor, "h w"]:
         """Convert a picture to grey levels in 0..1, with the dtype and device of the module."""
+        return self._luma(self._levels(name, picture))
+
+    def _luma(self, levels: Float[Tensor, "h w *c"]) -> Float[Tensor, "h w"]:
+        return levels if levels.ndim == 2 else levels @ self.luma
+
+    def _colour(self, levels: Float[Tensor, "h w *c"]) -> Float[Tensor, "3 h w"]:
+        channels = [levels] * 3 if levels.ndim == 2 else levels.unbind(-1)
+        return torch.stack([self._resized(channel) for channel in channels])
+
+    def _levels(self, name: str, picture: Tensor | np.ndarray) -> Float[Tensor, "h w *c"]:
+        """Convert a picture to levels in 0..1, grey or of three colours."""
         if not isinstance(picture, Tensor):
             # A copy only where torch cannot share the memory: read-only or mirrored arrays.
             picture = np.require(picture, requirements=["C", "W"])
@@ -237,7 +256,7 @@ class FeatureExtractor(nn.Module):
                 f"floating point in 0..1, got {picture.dtype} {list(picture.shape)}"
             )
         levels = picture.to(self.luma)
-        levels = levels if grey else levels[..., :3] @ self.luma
+        levels = levels if grey else levels[..., :3]
         if picture.dtype in _WHITE:
             return levels / _WHITE[picture.dtype]
         least, greatest = (float(bound) for bound in levels.aminmax())

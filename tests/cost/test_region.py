@@ -1,0 +1,150 @@
+"""The region term: derivatives per point, levels, and masks of a posed body."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchcss.body.model import load_body
+from torchcss.cost.region import (
+    RegionImages,
+    RegionTerm,
+    part_layers,
+    region_field,
+    region_masks,
+)
+from torchcss.cost.silhouette import part_map
+from torchcss.cost.visibility import ContourNodes
+from torchcss.types import PointCost
+from torchcss.vision.camera import Camera
+
+WIDTH, HEIGHT = 80, 60
+DISTORTION = [-0.33, 0.046, -0.0043, 0.0041, 0.067]
+
+
+def make_camera(distortion: list[float] | None = None) -> Camera:
+    K = [[70.0, 0.0, 39.5], [0.0, 72.0, 29.5], [0.0, 0.0, 1.0]]
+    camera = Camera(K, (WIDTH, HEIGHT), distortion=distortion)
+    return camera.to(torch.float64)
+
+
+def some_nodes(*batch: int, count: int = 30, generator: torch.Generator) -> ContourNodes:
+    """Nodes in the image, outside it, behind the camera, hidden, and absent."""
+    points = torch.randn(*batch, count, 3, generator=generator, dtype=torch.float64)
+    points = points * torch.tensor([0.6, 0.5, 0.3]) + torch.tensor([0.0, 0.0, 2.0])
+    points[..., 0, :] = torch.tensor([5.0, 0.0, 2.0], dtype=torch.float64)
+    points[..., 1, 2] = -1.0
+    normals = torch.randn(*batch, count, 3, generator=generator, dtype=torch.float64)
+    normals = normals / normals.norm(dim=-1, keepdim=True)
+    exists = torch.ones(*batch, count, dtype=torch.float64)
+    exists[..., 2], exists[..., 3] = 0.0, 0.4
+    visible = torch.ones_like(exists)
+    visible[..., 4], visible[..., 5] = 0.0, 0.7
+    return ContourNodes(points, normals, exists, visible)
+
+
+def some_images(count: int, generator: torch.Generator) -> RegionImages:
+    likeness = 2 * torch.rand(3, HEIGHT, WIDTH, generator=generator, dtype=torch.float64) - 1
+    field = region_field(likeness)
+    field = field._replace(coefficients=field.coefficients.double())
+    return RegionImages(field, torch.arange(count) % 3)
+
+
+def frozen_value(
+    term: RegionTerm, nodes: ContourNodes, camera: Camera, images: RegionImages, points: Tensor
+) -> Tensor:
+    """The plain twin: the module's formula, normals fixed, differentiable in the points."""
+    with torch.no_grad():
+        model = camera.project_with_derivatives(nodes.points)
+        normal = camera.image_normals(model, nodes.normals)
+    uv = camera.project(points).uv
+    inside = images.field.value(uv - term.offset * normal, images.layer)
+    outside = images.field.value(uv + term.offset * normal, images.layer)
+    contrast = torch.where(model.valid, inside - outside, 0.0)
+    found = 0.5 * term.nu * (1 - 0.5 * contrast)
+    level = term.fitted_level * term.nu
+    seen = nodes.visible * found + (1 - nodes.visible) * term.occlusion_factor * level
+    return nodes.exists * seen + (1 - nodes.exists) * level
+
+
+@pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
+@pytest.mark.parametrize("distortion", [None, DISTORTION])
+def test_derivatives_per_point_are_those_of_autograd(
+    batch: tuple[int, ...], distortion: list[float] | None, generator: torch.Generator
+) -> None:
+    camera, term = make_camera(distortion), RegionTerm(nu=1.3)
+    nodes = some_nodes(*batch, generator=generator)
+    images = some_images(nodes.exists.shape[-1], generator)
+    got = term.point_cost(nodes, camera, images)
+    points = nodes.points.clone().requires_grad_()
+    value = frozen_value(term, nodes, camera, images, points)
+    (gradient,) = torch.autograd.grad(value.sum(), points, create_graph=True)
+    rows = [
+        torch.autograd.grad(gradient[..., a].sum(), points, retain_graph=True)[0] for a in range(3)
+    ]
+    valid = camera.project(nodes.points).valid[..., None]
+    expected = PointCost(
+        value.detach(),
+        torch.where(valid, gradient.detach(), 0.0),
+        torch.where(valid[..., None], torch.stack(rows, dim=-2), 0.0),
+    )
+    for ours, theirs in zip(got, expected, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(term.value(nodes, camera, images), got.value)
+
+
+def test_a_perfect_outline_costs_nothing_and_an_inverted_one_everything() -> None:
+    camera, term = make_camera(), RegionTerm()
+    likeness = torch.full((1, HEIGHT, WIDTH), -1.0, dtype=torch.float64)
+    likeness[:, :, :40] = 1.0
+    edge = torch.tensor([[39.5, 30.0]])
+    points = torch.cat([(edge - torch.tensor([39.5, 29.5])) / torch.tensor([70.0, 72.0]) * 2.0,
+                        torch.full((1, 1), 2.0)], dim=-1).double()  # fmt: skip
+    one = torch.ones(1, dtype=torch.float64)
+    outward = torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)
+    layer = torch.zeros(1, dtype=torch.long)
+    for normals, cost in ((outward, 0.0), (-outward, 1.0)):
+        nodes = ContourNodes(points, normals, one, one)
+        value = term.value(nodes, camera, RegionImages(region_field(likeness), layer))
+        assert float(value) == pytest.approx(cost, abs=0.1)
+        nothing = RegionImages(region_field(0 * likeness), layer)
+        assert float(term.value(nodes, camera, nothing)) == 0.5
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_single_precision_and_no_nodes(dtype: torch.dtype, generator: torch.Generator) -> None:
+    camera, term = make_camera().to(dtype), RegionTerm()
+    nodes = ContourNodes(*(part.to(dtype) for part in some_nodes(4, generator=generator)))
+    images = some_images(30, generator)
+    for part in term.point_cost(nodes, camera, images):
+        assert part.dtype == dtype
+        assert part.isfinite().all()
+    none = ContourNodes(*(part[..., :0, :] if part.ndim == 3 else part[..., :0] for part in nodes))
+    empty = images._replace(layer=images.layer[:0])
+    assert term.value(none, camera, empty).shape == (4, 0)
+
+
+def test_masks_of_a_posed_body_are_inside_and_around_its_parts() -> None:
+    body = load_body("body34").with_base(
+        torch.eye(3, dtype=torch.float64), torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64)
+    )
+    K = [[150.0, 0.0, 79.5], [0.0, 150.0, 99.5], [0.0, 0.0, 1.0]]
+    camera = Camera(K, (160, 200)).to(torch.float64)
+    names, layer_of = part_layers(body)
+    assert len(names) < body.num_parts
+    left, right = (body.part_names.index(f"{side}_forearm") for side in "lr")
+    assert layer_of[left] == layer_of[right]
+    parts = part_map(body, body.rest, camera)
+    inside, around = region_masks(body, body.rest, camera, reach=12)
+    assert inside.shape == around.shape == (len(names), 200, 160)
+    assert not (inside & around).any()
+    layer_map = torch.tensor((*layer_of, -1))[parts]
+    for layer, name in enumerate(names):
+        own = layer_map == layer
+        assert not (inside[layer] & ~own).any(), name
+        assert not (around[layer] & own).any(), name
+        if own.any():
+            assert around[layer].any(), name
+    thigh, shank = names.index("thigh"), names.index("shank")
+    assert not (around[thigh] & (layer_map == shank)).any(), "the limb goes on there"

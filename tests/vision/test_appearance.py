@@ -1,0 +1,72 @@
+"""Colours of things and their surroundings."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchcss.vision.appearance import BINS, Appearance, colour_bins
+
+RED, GREEN, GREY = (0.9, 0.1, 0.1), (0.1, 0.8, 0.2), (0.5, 0.5, 0.5)
+
+
+def picture(*, like: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """A red square on green, with a grey stripe that runs through both; and where the square is."""
+    image = torch.tensor(GREEN, dtype=torch.float64)[:, None, None].repeat(1, 40, 60)
+    thing = torch.zeros(40, 60, dtype=torch.bool)
+    thing[10:30, 20:40] = True
+    image[:, thing] = torch.tensor(RED, dtype=torch.float64)[:, None]
+    image[:, 20:22] = torch.tensor(GREY, dtype=torch.float64)[:, None, None]
+    return (image if like is None else image.to(like)), thing
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_pixels_look_like_what_they_were_learnt_to_be(dtype: torch.dtype) -> None:
+    image, thing = picture(like=torch.zeros((), dtype=dtype))
+    known = Appearance.unknown(2, like=image).learn(
+        image, torch.stack([thing, ~thing & False]), torch.stack([~thing, ~thing & False])
+    )
+    likeness = known.likeness(image)
+    assert likeness.shape == (2, 40, 60)
+    assert likeness.dtype == dtype
+    assert float(likeness[0, 12, 25]) > 0.95
+    assert float(likeness[0, 5, 5]) < -0.95
+    assert abs(float(likeness[0, 21, 25])) < 0.5, "grey is both"
+    assert not likeness[1].any(), "a thing never seen looks like nothing"
+    stranger = torch.full_like(image, 0.02)
+    assert float(known.likeness(stranger)[0].abs().max()) < 1e-6
+
+
+def test_the_ratio_is_that_of_the_posteriors() -> None:
+    generator = torch.Generator().manual_seed(0)
+    image = torch.rand(3, 64, 64, generator=generator, dtype=torch.float64) ** 2
+    thing = torch.rand(64, 64, generator=generator) < 0.3
+    known = Appearance.unknown(1, like=image).learn(image, thing[None], ~thing[None])
+    assert float(known.inside.sum()) == pytest.approx(1.0)
+    likeness = known.likeness(image)
+    assert float(likeness.abs().max()) <= 1.0
+    # The same colours inside and out: nothing to tell them apart on average.
+    assert abs(float(likeness[0][thing].mean() - likeness[0][~thing].mean())) < 0.6
+
+
+def test_old_colours_are_forgotten_by_degrees_and_too_few_pixels_teach_nothing() -> None:
+    image, thing = picture()
+    known = Appearance.unknown(1, like=image).learn(image, thing[None], ~thing[None])
+    blue = torch.zeros_like(image)
+    blue[2] = 0.9
+    after = known.learn(blue, thing[None], ~thing[None], inside_rate=0.25, outside_rate=0.5)
+    place = int(colour_bins(blue)[0, 0])
+    assert float(after.inside[0, place]) == pytest.approx(0.25)
+    assert float(after.outside[0, place]) == pytest.approx(0.5)
+    torch.testing.assert_close(after.inside.sum(-1), torch.ones(1, dtype=torch.float64))
+    few = torch.zeros_like(thing)
+    few[0, :10] = True
+    same = known.learn(blue, few[None], few[None])
+    torch.testing.assert_close(same.inside, known.inside)
+    torch.testing.assert_close(same.outside, known.outside)
+
+
+def test_the_whole_range_of_colours_has_bins() -> None:
+    corners = torch.tensor([[0.0, 1.0], [0.0, 1.0], [0.0, 1.0]])[:, None]
+    assert colour_bins(corners).flatten().tolist() == [0, BINS**3 - 1]

@@ -1,0 +1,44 @@
+"""Which part of a posed body each pixel sees, by rasterising its surface.
+
+For masks, for colours, for the overlap of silhouettes. The costs do not use it: for thousands of
+samples visibility is found node by node (`torchcss.cost.visibility`).
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchcss.body.model import BodyModel
+from torchcss.raster import grid_faces, rasterise
+from torchcss.vision.camera import Camera
+
+
+def part_map(
+    body: BodyModel,
+    state: Float[Tensor, " n"],
+    camera: Camera,
+    *,
+    rings: int = 12,
+    meridians: int = 16,
+) -> Int[Tensor, "h w"]:
+    """The part that each pixel sees, -1 where it sees none.
+
+    Args:
+        body: The body on its base.
+        state: Its pose.
+        camera: Camera of the image.
+        rings: Latitudes of the mesh of each part.
+        meridians: Longitudes of the mesh of each part.
+    """
+    mesh = body.mesh(rings, meridians)
+    faces = grid_faces(rings, meridians).to(mesh.points.device)
+    rotation, centre = body.part_poses(body.pose(state))
+    vertices = mesh.points.flatten(1, 2) @ rotation.mT + centre[:, None]
+    offsets = vertices.shape[1] * torch.arange(body.num_parts, device=faces.device)
+    every = (faces + offsets[:, None, None]).flatten(0, 1)
+    uv, depth, valid = camera.project(vertices.flatten(0, 1))
+    width, height = camera.image_size_wh
+    face = rasterise(uv, depth, every, height, width, valid=valid).face
+    return torch.where(face >= 0, face // len(faces), face)

@@ -1,0 +1,125 @@
+"""Colours of things and of what surrounds them, and how much a pixel looks like either.
+
+[IJRR] section 8 names foreground and background statistics as a likelihood worth adding. Here the
+colours of each thing (a layer) and of its surroundings are histograms, learned from frames in which
+it is known where the thing is, and forgotten by degrees. For a pixel of colour c,
+
+    likeness = tanh(1/2 log p(c | thing) / p(c | surroundings)) = P(thing | c) - P(surroundings | c)
+
+with equal prior odds: 1 where only the thing has that colour, -1 where only the surroundings have,
+0 where both or neither do.
+
+By default: `Appearance.unknown`, then per frame `likeness`, and `learn` once the thing is found.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn import functional
+
+BINS = 12
+"""Bins per colour channel."""
+
+_FEWEST = 30.0
+"""Pixels from which a histogram counts as known."""
+
+_FLOOR = 3e-5
+"""Probability of any bin besides what was seen, against a mean of 1 / 1728."""
+
+
+class Appearance(NamedTuple):
+    """Colour histograms of some layers.
+
+    Attributes:
+        inside: Share of the pixels of each thing in each bin; zero if it was never seen.
+        outside: The same of its surroundings.
+    """
+
+    inside: Float[Tensor, "layers bins"]
+    outside: Float[Tensor, "layers bins"]
+
+    @classmethod
+    def unknown(cls, num_layers: int, *, like: Tensor) -> Appearance:
+        """What is known before the first frame.
+
+        Args:
+            num_layers: Number of things.
+            like: A tensor of the dtype and on the device wanted.
+        """
+        nothing = like.new_zeros(num_layers, BINS**3)
+        return cls(nothing, nothing.clone())
+
+    def learn(
+        self,
+        colour: Float[Tensor, "3 h w"],
+        inside: Bool[Tensor, "layers h w"],
+        outside: Bool[Tensor, "layers h w"],
+        *,
+        inside_rate: float = 0.05,
+        outside_rate: float = 0.2,
+    ) -> Appearance:
+        """Take in a frame in which the things were found.
+
+        Args:
+            colour: Red, green, blue in 0..1.
+            inside: Pixels of each thing.
+            outside: Pixels of its surroundings.
+            inside_rate: Share of the new frame in the things' colours, where they are known.
+            outside_rate: The same for the surroundings.
+        """
+        bins = colour_bins(colour)
+        return Appearance(
+            _mix(self.inside, bins, inside, inside_rate),
+            _mix(self.outside, bins, outside, outside_rate),
+        )
+
+    def likeness(self, colour: Float[Tensor, "3 h w"]) -> Float[Tensor, "layers h w"]:
+        """How much each pixel looks like each thing, in -1..1; 0 for a thing never seen.
+
+        Args:
+            colour: Red, green, blue in 0..1.
+        """
+        bins = colour_bins(colour)
+        known = (self.inside.sum(-1) > 0) & (self.outside.sum(-1) > 0)
+        ratio = (_smooth(self.inside) + _FLOOR).log() - (_smooth(self.outside) + _FLOOR).log()
+        ratio = torch.where(known[:, None], ratio, 0.0)
+        return (0.5 * ratio).tanh()[:, bins]
+
+
+def colour_bins(colour: Float[Tensor, "3 h w"]) -> Int[Tensor, "h w"]:
+    """The bin of each pixel.
+
+    Args:
+        colour: Red, green, blue in 0..1.
+    """
+    red, green, blue = (colour * BINS).long().clamp(0, BINS - 1)
+    return (red * BINS + green) * BINS + blue
+
+
+def _mix(old: Tensor, bins: Tensor, masks: Tensor, rate: float) -> Tensor:
+    rows = []
+    for histogram, mask in zip(old, masks, strict=True):
+        seen = bins[mask]
+        if len(seen) >= _FEWEST:
+            new = torch.bincount(seen, minlength=BINS**3).to(histogram) / len(seen)
+            share = rate if bool(histogram.sum() > 0) else 1.0
+            histogram = torch.lerp(histogram, new, share)
+        rows.append(histogram)
+    return torch.stack(rows)
+
+
+def _smooth(histograms: Float[Tensor, "layers bins"]) -> Float[Tensor, "layers bins"]:
+    """Spread each bin over its neighbours, by 1/4, 1/2, 1/4 along each channel."""
+    cube = histograms.reshape(-1, 1, BINS, BINS, BINS)
+    kernel = histograms.new_tensor([0.25, 0.5, 0.25])
+    for axis in range(3):
+        shape = [1, 1, 1, 1, 1]
+        shape[2 + axis] = 3
+        padding = [0, 0, 0]
+        padding[axis] = 1
+        cube = functional.conv3d(cube, kernel.reshape(shape), padding=tuple(padding))
+    return cube.reshape(histograms.shape)
