@@ -51,6 +51,33 @@ _SPREAD_POSE = {
 """Degrees: the pose in which the skin is made. No two limbs touch in it, and everyday poses are not
 far from it."""
 
+_PADDING = {
+    "vt1": ("neck", (0.165, 0.044, 0.058)),
+    "shoulder": ("upper_arm", (0.053, 0.053, 0.053)),
+    "elbow": ("forearm", (0.041, 0.041, 0.041)),
+    "wrist": ("hand", (0.027, 0.030, 0.027)),
+    "vl5": ("chest", (0.142, 0.130, 0.102)),
+    "hip": ("thigh", (0.082, 0.120, 0.088)),
+    "knee": ("shank", (0.056, 0.056, 0.059)),
+    "ankle": ("foot", (0.044, 0.060, 0.046)),
+}
+"""Ellipsoids about joints that fill the waists between parts: a part that must be there, and the
+semi-axes right, up and forwards, metres."""
+
+_FEATURES = {
+    "head": (
+        ((0.0, -0.092, -0.012), (0.015, 0.022, 0.026)),
+        ((0.0, -0.052, -0.086), (0.036, 0.036, 0.030)),
+        ((0.073, 0.010, -0.006), (0.010, 0.018, 0.031)),
+        ((-0.073, 0.010, -0.006), (0.010, 0.018, 0.031)),
+    ),
+    "hand": (((0.0, 0.040, -0.015), (0.013, 0.016, 0.042)),),
+}
+"""Nose, chin, ears and thumb: centre and semi-axes in the part's frame, metres."""
+
+_THUMB_TILT = 0.55
+"""Radians between thumb and hand."""
+
 _INFLUENCES = 4
 """Parts that may share a vertex."""
 
@@ -82,7 +109,7 @@ class Outfit:
 
     sleeve: float = 0.6
     hem: float = -0.2
-    trouser_leg: float = 1.92
+    trouser_leg: float = 2.1
     pattern: str = "plaid"
     shirt: Colour = (0.62, 0.16, 0.17)
     accent: Colour = (0.80, 0.78, 0.74)
@@ -141,9 +168,10 @@ class Figure:
         self.shape = _other_girths(body, self.outfit.girth, generator)
         kept = [i for i, name in enumerate(body.part_names) if name not in without]
         bind_rotation, bind_centre = body.part_poses(body.pose(_spread_state(body)))
-        vertices, self.faces = _smooth_union(
-            self.shape[kept], bind_rotation[kept], bind_centre[kept], spacing
-        )
+        blobs = [(self.shape[kept], bind_rotation[kept], bind_centre[kept])]
+        blobs.append(_padding(body, bind_rotation, bind_centre, without))
+        shapes, rotations, centres = (torch.cat(group) for group in zip(*blobs, strict=True))
+        vertices, self.faces = _smooth_union(shapes, rotations, centres, spacing)
         # Where every vertex is for every part, and how near.
         local = (vertices[None] - bind_centre[:, None]) @ bind_rotation
         distance = torch.stack(
@@ -170,9 +198,11 @@ class Figure:
         """Fix colours, looseness and the random fields of all vertices."""
         outfit, body = self.outfit, self.body
         along = _along_limb(body, self.shape, local, nearest)
-        self.colour, cloth = _colours(
+        colour, cloth = _colours(
             body, outfit, self.shape, local, nearest, along, vertices, generator
         )
+        # Borders of patterns and clothes run through the middle of triangles.
+        self.colour: Float[Tensor, "v 3"] = _smooth(colour, self.faces, 1)
         radius = (self.shape[:, 0] * self.shape[:, 1]).sqrt()
         radius = (self._weight * radius[self._owner]).sum(-1)
         still = torch.tensor(
@@ -287,6 +317,36 @@ def _spread_state(body: BodyModel) -> Tensor:
     return body.bounds.project(state)
 
 
+def _padding(
+    body: BodyModel, rotation: Tensor, centre: Tensor, without: Sequence[str]
+) -> tuple[Float[Tensor, "k 9"], Float[Tensor, "k 3 3"], Float[Tensor, "k 3"]]:
+    """What is there besides the parts in the spread pose: flesh about joints, features."""
+    joints = body.pose(_spread_state(body)).joints
+    shapes, rotations, centres = [], [], []
+
+    def add(axes: Sequence[float], turn: Tensor, place: Tensor) -> None:
+        shapes.append([*axes, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
+        rotations.append(turn)
+        centres.append(place)
+
+    for index, name in enumerate(body.joint_names):
+        side = name[:2] if name[:2] in ("l_", "r_") else ""
+        owner, axes = _PADDING.get(name.removeprefix(side), ("", ()))
+        if side + owner in body.part_names and side + owner not in without:
+            add(axes, body.base_rotation, joints[index])
+    for index, name in enumerate(body.part_names):
+        bare = name.removeprefix("l_").removeprefix("r_")
+        for place, axes in _FEATURES.get(bare, ()) if name not in without else ():
+            turn = rotation[index]
+            if bare == "hand":
+                c, s = math.cos(_THUMB_TILT), math.sin(_THUMB_TILT)
+                turn = turn @ turn.new_tensor([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]])
+            add(axes, turn, centre[index] + rotation[index] @ rotation.new_tensor(place))
+    if not shapes:
+        return rotation.new_zeros(0, 9), rotation[:0], centre[:0]
+    return rotation.new_tensor(shapes), torch.stack(rotations), torch.stack(centres)
+
+
 def _smooth_union(
     shape: Float[Tensor, "parts 9"],
     rotation: Float[Tensor, "parts 3 3"],
@@ -333,7 +393,8 @@ def _smooth_union(
     a, b, c = vertices[faces].unbind(1)
     if float((a * torch.linalg.cross(b, c)).sum()) < 0:
         faces = faces.flip(-1)
-    return vertices, faces
+    # Slivers, whose normals mean nothing, become ordinary triangles.
+    return _smooth(vertices, faces, 2), faces
 
 
 def _shares(body: BodyModel, distance: Tensor, faces: Tensor) -> Float[Tensor, "v parts"]:
@@ -408,7 +469,7 @@ def _colours(
     shirt |= where("pelvis") & (along > outfit.hem)
     shirt |= where("neck") & (along < -0.35)
     trousers = (where("pelvis") & ~shirt) | (where("thigh", "shank") & (along < outfit.trouser_leg))
-    shoes = where("foot") | (where("shank") & (along > 1.97))
+    shoes = where("foot") | (where("shank") & (along > 2.1))
     colour = vertices.new_tensor(outfit.skin).expand(len(vertices), 3).clone()
     x, _, z = local.unbind(-1)
     if outfit.pattern == "plaid":

@@ -126,9 +126,9 @@ def clamped_spline(
 def plant_feet(body: BodyModel, states: Float[Tensor, "t n"]) -> Float[Tensor, "t n"]:
     """Turn the legs so that the feet stay where they are in the first state.
 
-    Heel, midtarsal and toe are held by least squares over the five angles of a leg (Gauss-Newton
-    from the state before), so that a foot may still roll a little about its long axis, for which
-    the bodies have no joint.
+    Heel, midtarsal and toe are held by least squares over the five angles of a leg (Gauss-Newton,
+    all states at once). A foot may still roll a little about its long axis, for which the bodies
+    have no joint.
 
     Args:
         body: A body with legs.
@@ -144,28 +144,26 @@ def plant_feet(body: BodyModel, states: Float[Tensor, "t n"]) -> Float[Tensor, "
     link = body.marker_link[marks]
     goal = body.pose(states[0]).joints[marks]
     planted = states.clone()
+    planted[:, columns] = states[0, columns]
     identity = torch.eye(3).to(states).expand(len(names), 3, 3)
-    for index in range(1, len(states)):
-        state = planted[index].clone()
-        state[columns] = planted[index - 1, columns]
-        for _ in range(6):
-            pose = body.pose(state)
-            apart = pose.joints[marks] - goal
-            cost = PointCost(0.5 * apart.square().sum(-1), apart, identity)
-            model = body.lift(
-                pose, pose.joints[marks], link, cost, curvature=Curvature.GAUSS_NEWTON
-            )
-            hessian = model.hessian[columns][:, columns]
-            damped = hessian + 1e-4 * torch.eye(len(columns)).to(states)
-            state[columns] -= torch.linalg.solve(damped, model.gradient[columns])
-            state = body.bounds.project(state)
-        planted[index] = state
+    damping = 1e-5 * torch.eye(len(columns)).to(states)
+    for _ in range(20):
+        pose = body.pose(planted)
+        points = pose.joints[:, marks]
+        apart = points - goal
+        cost = PointCost(
+            0.5 * apart.square().sum(-1), apart, identity.expand(len(states), -1, 3, 3)
+        )
+        model = body.lift(pose, points, link, cost, curvature=Curvature.GAUSS_NEWTON)
+        hessian = model.hessian[:, columns][:, :, columns] + damping
+        planted[:, columns] -= torch.linalg.solve(hessian, model.gradient[:, columns])
+        planted = body.bounds.project(planted)
     return planted
 
 
 def _stance(times: int) -> dict[str, tuple[float, ...]]:
     """Legs a little apart with soft knees, soles flat."""
-    angles = {"hip_flexion": 13, "hip_abduction": 6, "knee_flexion": 26, "ankle_flexion": -13}
+    angles = {"hip_flexion": 9, "hip_abduction": 6, "knee_flexion": 18, "ankle_flexion": -9}
     return {f"{side}_{name}": (value,) * times for side in "lr" for name, value in angles.items()}
 
 
@@ -216,7 +214,7 @@ BODY_DARK = KeyPoses(
     times=(0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0),
     degrees={
         "root_x": (0, -0.01, -0.03, -0.04, -0.01, 0.02, 0.04, 0.04, 0.02),
-        "root_y": (0, -0.01, -0.05, -0.07, -0.03, -0.02, -0.04, -0.06, -0.03),
+        "root_y": (0, -0.01, -0.035, -0.045, -0.02, -0.02, -0.035, -0.04, -0.02),
         "root_yaw": (0, -10, -28, -34, -16, 14, 32, 34, 22),
         "lumbar_flexion": (0, 4, 14, 18, 8, 4, 10, 12, 6),
         "lumbar_bending": (0, 3, 8, 5, 0, -4, -8, -6, -3),

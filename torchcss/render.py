@@ -5,6 +5,10 @@ A `Stage` holds a room, its lights and one or more meshes that change from frame
 with uneven light on them, and before the wall posters, shelves full of boxes, cartons and a bright
 pillar, all drawn from a generator; or nothing but a dark curtain.
 
+The room does not move and is drawn once. In every frame the figures are drawn over it, and the
+first lamp's light is taken away where they stand in it: on the room's surfaces and on the figures
+themselves, by the lamp's own picture of them (a shadow map).
+
 The picture is drawn at twice the size and averaged, so that edges are smooth and a pixel is what a
 sensor's would be. VTK's window is laid so that pixel centres are at integers, as in the camera: the
 silhouette agrees with `torchcss.raster.rasterise` to a fraction of a pixel, which a test measures.
@@ -28,12 +32,21 @@ from torch.nn import functional
 
 from torchcss.errors import CameraError, ConfigurationError
 from torchcss.figure import Colour, load_pyvista
-from torchcss.raster import value_noise
+from torchcss.raster import join_faces, rasterise, value_noise
 from torchcss.vision.camera import Camera
 
 _SUPERSAMPLE = 2
 _NEAR, _FAR = 0.05, 30.0
 """Metres from the camera between which things are drawn."""
+
+_SHADOW_MAP = 512
+"""Pixels of a lamp's picture of the figures."""
+
+_SHADOW_BIAS = 0.025
+"""Metres that a point must lie behind what the lamp sees to be in its shadow."""
+
+_OWN_SHADOW = 0.6
+"""Share of its lightness that a figure loses in its own shadow."""
 
 _TILE = 128
 """Pixels of the pictures that boxes and posters bear."""
@@ -81,12 +94,12 @@ class Style:
 
     room: str = "clutter"
     lamps: tuple[Lamp, ...] = (
-        Lamp(place=(-1.6, 1.9, 2.4), target=(0.1, -0.1, 0.0), strength=0.85, cone=38.0),
-        Lamp(place=(2.4, 1.2, 1.0), target=(0.3, 0.0, -1.0), strength=0.35, cone=45.0),
+        Lamp(place=(-1.6, 1.9, 2.4), target=(0.1, -0.1, 0.0), strength=1.0, cone=40.0),
+        Lamp(place=(2.4, 1.2, 1.0), target=(0.3, 0.0, -1.0), strength=0.5, cone=45.0),
     )
     shadows: bool = True
-    fill: float = 0.22
-    ambient: float = 0.16
+    fill: float = 0.28
+    ambient: float = 0.2
     specular: float = 0.22
     shininess: float = 18.0
     pillars: tuple[float, ...] = (0.68,)
@@ -149,13 +162,28 @@ class Stage:
             self._add_clutter(camera, place, generator)
         else:
             self._add_dark(place, generator)
-        self._add_lights(place, shadows=style.shadows)
+        lights = self._add_lights(place, shadows=style.shadows)
         self._room = self._screenshot()[..., :3]
+        self._shadow: _Shadow | None = None
+        if style.shadows and lights:
+            points, seen = self._seen_points(camera)
+            lights[0].intensity = 0.0
+            key = (self._room - self._screenshot()[..., :3]).clamp(min=0)
+            lamp = style.lamps[0]
+            self._shadow = _Shadow(
+                self._frame.about(place.middle, lamp.place),
+                self._frame.about(place.middle, lamp.target),
+                lamp.cone,
+                points,
+                key * seen[..., None],
+            )
         self._plotter.close()
         # The room stays as it is; only the figures are drawn again and again.
         self._plotter = self._make_plotter(camera)
         self._add_lights(place, shadows=False)
         self._meshes: list[Any] = []
+        self._colours: list[Tensor] = []
+        self._faces: list[Tensor] = []
 
     def _make_plotter(self, camera: Camera) -> Any:
         width, height = camera.image_size_wh
@@ -165,6 +193,8 @@ class Stage:
             lighting="none",
         )
         plotter.set_background("black")
+        # The averaging smooths the edges already, and would otherwise be paid for eight times.
+        plotter.render_window.SetMultiSamples(0)
         _set_camera(plotter.camera, camera)
         return plotter
 
@@ -191,6 +221,8 @@ class Stage:
         self._draw(mesh, scalars="colour", rgb=True, specular=self._style.specular,
                    specular_power=self._style.shininess)  # fmt: skip
         self._meshes.append(mesh)
+        self._colours.append(colour)
+        self._faces.append(faces)
         return len(self._meshes) - 1
 
     def move(
@@ -210,11 +242,40 @@ class Stage:
 
     def picture(self) -> UInt8[Tensor, "h w 3"]:
         """Take a picture, without sensor noise."""
+        room = self._room
+        if self._shadow is not None and self._meshes:
+            room = self._cast(self._shadow)
         drawn = self._screenshot()
         covered = drawn[..., 3:] / 255
-        large = drawn[..., :3] * covered + self._room * (1 - covered)
+        large = drawn[..., :3] * covered + room * (1 - covered)
         pooled = functional.avg_pool2d(large.permute(2, 0, 1)[None], _SUPERSAMPLE)
         return pooled[0].permute(1, 2, 0).round().to(torch.uint8)
+
+    def _cast(self, shadow: _Shadow) -> Tensor:
+        """Darken the figures where they shade themselves; return the room with their shadow."""
+        corners = [torch.from_numpy(mesh.points) for mesh in self._meshes]
+        faces, _ = join_faces(self._faces, [len(points) for points in corners])
+        depth = shadow.map(torch.cat(corners), faces)
+        for mesh, points, colour in zip(self._meshes, corners, self._colours, strict=True):
+            lit = 1 - _OWN_SHADOW * shadow.of_points(points, depth)[:, None]
+            mesh.point_data["colour"] = _to_bytes(colour * lit)
+        return self._room - shadow.of_room(depth)
+
+    def _seen_points(self, camera: Camera) -> tuple[Float[Tensor, "h w 3"], Tensor]:
+        """What the room's pixels show, in the world, and which of them show anything."""
+        depth = torch.from_numpy(-np.array(self._plotter.get_image_depth())).double()
+        seen = depth.isfinite()
+        rows, columns = depth.shape
+        v, u = torch.meshgrid(
+            torch.arange(rows).double(), torch.arange(columns).double(), indexing="ij"
+        )
+        u, v = ((x + 0.5) / _SUPERSAMPLE - 0.5 for x in (u, v))
+        K = camera.K
+        ray = torch.stack(
+            [(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], torch.ones_like(u)], -1
+        )
+        local = ray * torch.where(seen, depth, 1.0)[..., None] - camera.t_camera_world
+        return local @ camera.R_camera_world, seen.float()
 
     def close(self) -> None:
         """Free the window."""
@@ -238,7 +299,9 @@ class Stage:
         if mesh.point_data.active_normals_name is not None:
             actor.prop.interpolation = "phong"
 
-    def _add_lights(self, place: Place, *, shadows: bool) -> None:
+    def _add_lights(self, place: Place, *, shadows: bool) -> list[Any]:
+        """Add the lamps and the fill; returns the lamps."""
+        lights = []
         for lamp in self._style.lamps:
             light = self._pyvista.Light(
                 position=self._frame.about(place.middle, lamp.place),
@@ -251,6 +314,7 @@ class Stage:
                 exponent=lamp.softness,
             )
             self._plotter.add_light(light)
+            lights.append(light)
         if shadows:
             self._plotter.enable_shadows()
         if self._style.fill > 0:
@@ -263,6 +327,7 @@ class Stage:
                     positional=False,
                 )
             )
+        return lights
 
     def _add_dark(self, place: Place, generator: torch.Generator) -> None:
         wall = -place.behind - self._style.wall
@@ -284,7 +349,7 @@ class Stage:
         scenery.floor(wall, _boards(generator), cell=0.02)
         middle = self._frame.height_of_view(camera, wall)
         # Posters in the upper half.
-        for _ in range(6):
+        for _ in range(9):
             x, y = draw.uniform(left, right), middle + draw.uniform(0.05, 0.75) * wide / 2
             w, h = draw.uniform(0.25, 0.5), draw.uniform(0.3, 0.6)
             scenery.box(x, y, wall + 0.012, w, h, 0.01)
@@ -302,7 +367,7 @@ class Stage:
                 scenery.box(x + w / 2, y + h / 2, wall + 0.02 + deep / 2, w, h, deep)
                 x += w + (draw.uniform(0.005, 0.02) if draw.uniform(0, 1) < 0.7 else 0.15)
         # Cartons on the floor, before the wall.
-        for _ in range(7):
+        for _ in range(9):
             w, h = draw.uniform(0.25, 0.5), draw.uniform(0.2, 0.5)
             scenery.box(
                 draw.uniform(left, right), h / 2, wall + draw.uniform(0.25, 0.5), w, h, 0.35
@@ -317,7 +382,7 @@ class Stage:
         for share in self._style.pillars:
             x = self._frame.sideways(camera, share * camera.image_size_wh[0], wall + 0.32)
             self._rod((x, 0.0, wall + 0.32), (x, 4.2, wall + 0.32), self._style.pillar_width / 2,
-                      (0.97, 0.97, 0.94), ambient=0.45)  # fmt: skip
+                      (0.86, 0.86, 0.84), ambient=0.4)  # fmt: skip
 
     def _rod(self, start: Sequence[float], end: Sequence[float], radius: float, colour: Colour,
              *, ambient: float | None = None) -> None:  # fmt: skip
@@ -402,6 +467,71 @@ class _Draw:
         colour = (self.uniform(low, high) * (1 + saturation * (hue - hue.mean()))).clamp(0, 1)
         r, g, b = colour.tolist()
         return r, g, b
+
+
+class _Shadow:
+    """The shadow of meshes in the light of one lamp.
+
+    All of the room is taken to be behind the figures as seen from the lamp, which is how the rooms
+    are laid out; only a figure asks how deep it is.
+
+    Args:
+        place: Where the lamp is, world frame.
+        target: What it points at.
+        cone: Half angle of its cone, degrees.
+        points: What every pixel of the room's picture shows.
+        light: What the lamp adds to it.
+    """
+
+    def __init__(
+        self,
+        place: Sequence[float],
+        target: Sequence[float],
+        cone: float,
+        points: Float[Tensor, "h w 3"],
+        light: Float[Tensor, "h w 3"],
+    ) -> None:
+        forward = torch.as_tensor(target, dtype=torch.float64) - torch.as_tensor(place)
+        forward = functional.normalize(forward, dim=-1)
+        side = forward.new_tensor([0.0, 1.0, 0.0] if abs(float(forward[1])) < 0.9 else [1.0, 0, 0])
+        right = functional.normalize(torch.linalg.cross(forward, side), dim=-1)
+        rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+        focal = 0.5 * _SHADOW_MAP / math.tan(math.radians(min(cone, 70.0)))
+        middle = 0.5 * (_SHADOW_MAP - 1)
+        self.camera = Camera(
+            [[focal, 0, middle], [0, focal, middle], [0, 0, 1]],
+            (_SHADOW_MAP, _SHADOW_MAP),
+            R_camera_world=rotation,
+            t_camera_world=-rotation @ torch.as_tensor(place, dtype=torch.float64),
+        )
+        uv, _, valid = self.camera.project(points)
+        place_in_map = torch.where(valid[..., None], uv / middle - 1, 9.0)
+        self.room, self.light = place_in_map.float(), light
+
+    def map(self, points: Float[Tensor, "v 3"], faces: Tensor) -> Float[Tensor, "s s"]:
+        """Depth of meshes as the lamp sees them."""
+        uv, depth, valid = self.camera.project(points.double())
+        return rasterise(uv, depth, faces, _SHADOW_MAP, _SHADOW_MAP, valid=valid).depth
+
+    def of_room(self, depth: Float[Tensor, "s s"]) -> Float[Tensor, "h w 3"]:
+        """Light that the room loses; a lamp is no point, so that the edge is soft."""
+        covered = depth.isfinite().float()[None, None]
+        soft = functional.avg_pool2d(covered, 5, stride=1, padding=2)
+        share = functional.grid_sample(soft, self.room[None], align_corners=True)[0, 0]
+        return share[..., None] * self.light
+
+    def of_points(
+        self, points: Float[Tensor, "v 3"], depth: Float[Tensor, "s s"]
+    ) -> Float[Tensor, " v"]:
+        """Share of the lamp that is hidden from points of the meshes themselves."""
+        uv, own, _ = self.camera.project(points.double())
+        column, row = uv.round().long().clamp(2, _SHADOW_MAP - 3).unbind(-1)
+        hidden = [
+            own > depth[row + dv, column + du] + _SHADOW_BIAS
+            for du in (-2, -1, 0, 1, 2)
+            for dv in (-2, -1, 0, 1, 2)
+        ]
+        return torch.stack(hidden).float().mean(0)
 
 
 class _Scenery:

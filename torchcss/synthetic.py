@@ -33,17 +33,16 @@ from torchcss.body.catalog import LENGTHS, PROPORTION_RANGE
 from torchcss.body.model import BodyModel, load_body
 from torchcss.cost.anthropometric import Anthropometric, proportion_columns
 from torchcss.errors import ConfigurationError
-from torchcss.figure import Figure, Outfit, Skin, distance_to_part
+from torchcss.figure import Figure, Outfit, Skin
+from torchcss.mesh_truth import MeshTruth, joints_own_parts
 from torchcss.motions import MOTIONS, Motion, sample_times
 from torchcss.raster import (
     Lighting,
     Mesh,
     add_sensor_noise,
     clutter_background,
-    interpolate,
     join_faces,
     random_texture,
-    rasterise,
     render_meshes,
 )
 from torchcss.render import Lamp, Place, Stage, Style
@@ -250,14 +249,19 @@ class Shot:
 
     def frames(self) -> Iterator[SequenceFrame]:
         """Render; the same frames whenever it is called."""
-        generator = torch.Generator().manual_seed(self.seed)
-        figures = [Figure(self.body, self.outfit, generator=generator, spacing=self.spacing)]
-        if self.bystander:
-            figures.append(_rest_of_person(self.body, self.outfit, generator))
+        figures, generator = self.figures()
         return render_sequence(
             self.body, self.states, camera=self.camera, style=self.style, figures=figures,
             floor=self.floor, generator=generator,
         )  # fmt: skip
+
+    def figures(self) -> tuple[list[Figure], torch.Generator]:
+        """The figure of the body and whoever stands beside it; the generator as they leave it."""
+        generator = torch.Generator().manual_seed(self.seed)
+        figures = [Figure(self.body, self.outfit, generator=generator, spacing=self.spacing)]
+        if self.bystander:
+            figures.append(_rest_of_person(self.body, self.outfit, generator, 1.5 * self.spacing))
+        return figures, generator
 
 
 def render_sequence(
@@ -296,7 +300,7 @@ def render_sequence(
     )
     part = torch.full_like(owner, -1)
     part[owner == 0] = figure.part
-    truth = _Truth(camera, faces, part, joints_own_parts(body))
+    truth = MeshTruth(camera, faces, part, joints_own_parts(body))
     joints = body.pose(states).joints
     place = _place(joints, camera, floor)
     with Stage(camera, place, style, generator=generator) as stage:
@@ -326,114 +330,6 @@ def render_sequence(
                 in_image, flow, occluded,
             )  # fmt: skip
             labels = after
-
-
-class _Labels(NamedTuple):
-    """What is seen at every pixel centre, and what is needed to look for a point later."""
-
-    face: Int[Tensor, "h w"]
-    barycentric: Float[Tensor, "h w 3"]
-    part: Int[Tensor, "h w"]
-    depth: Float[Tensor, "h w"]
-    fine_depth: Float[Tensor, "2h 2w"]
-    world: Float[Tensor, "v 3"]
-    facing: Bool[Tensor, " f"]
-
-
-class _Truth:
-    """Labels, flow and visibility of meshes whose corners move."""
-
-    def __init__(
-        self,
-        camera: Camera,
-        faces: Int[Tensor, "f 3"],
-        part: Int[Tensor, " f"],
-        own: Bool[Tensor, "j parts"],
-    ) -> None:
-        self.camera, self.faces, self.part, self.own = camera, faces, part, own
-        self.width, self.height = camera.image_size_wh
-
-    def labels(self, world: Float[Tensor, "v 3"]) -> _Labels:
-        """Rasterise posed meshes, at the picture's size and at twice the size."""
-        uv, depth, valid = self.camera.project(world)
-        seen = rasterise(uv, depth, self.faces, self.height, self.width, valid=valid)
-        part = torch.where(seen.face >= 0, self.part[seen.face.clamp(min=0)], -1)
-        fine = rasterise(
-            (uv + 0.5) * 2 - 0.5, depth, self.faces, 2 * self.height, 2 * self.width, valid=valid
-        )
-        first, second, third = uv[self.faces].unbind(1)
-        a, b = second - first, third - first
-        # Rows count downwards: a triangle that runs anticlockwise to the eye has a negative area.
-        facing = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] < 0
-        return _Labels(seen.face, seen.barycentric, part, seen.depth, fine.depth, world, facing)
-
-    def flow(self, now: _Labels, after: _Labels) -> tuple[Tensor, Tensor]:
-        """Motion of every pixel to the next frame, and whether it is hidden there."""
-        flow = now.depth.new_zeros(self.height, self.width, 2)
-        occluded = after.part >= 0
-        row, column = (now.part >= 0).nonzero(as_tuple=True)
-        face = now.face[row, column]
-        points = interpolate(after.world, self.faces, face, now.barycentric[row, column])
-        uv, depth, valid = self.camera.project(points)
-        here = torch.stack([column, row], -1).to(uv)
-        flow[row, column] = uv - here
-        outside = ~valid | ~self._inside(uv)
-        hidden = (
-            outside | ~after.facing[face] | (depth > self._depth_around(after, uv) + _SKIN_DEEP)
-        )
-        occluded[row, column] = hidden
-        return flow, occluded
-
-    def joints(
-        self, labels: _Labels, joints: Float[Tensor, "j 3"]
-    ) -> tuple[Float[Tensor, "j 2"], Bool[Tensor, " j"], Bool[Tensor, " j"]]:
-        """Projections of joints, whether they are visible, and whether they are in the image."""
-        uv, depth, valid = self.camera.project(joints)
-        inside = valid & self._inside(uv)
-        visible = torch.zeros_like(inside)
-        for index in inside.nonzero()[:, 0].tolist():
-            u, v = (int(x) for x in uv[index].round().tolist())
-            # A joint on the outline, such as the top of the head, may lie a hair beside its limb.
-            rows, columns = slice(max(v - 1, 0), v + 2), slice(max(u - 1, 0), u + 2)
-            part, surface = labels.part[rows, columns], labels.depth[rows, columns]
-            own = (part >= 0) & self.own[index][part.clamp(min=0)]
-            visible[index] = bool((own & (surface > depth[index] - _JOINT_DEEP)).any())
-        return uv, visible, inside
-
-    def _inside(self, uv: Tensor) -> Tensor:
-        u, v = uv.unbind(-1)
-        return (u >= -0.5) & (v >= -0.5) & (u < self.width - 0.5) & (v < self.height - 0.5)
-
-    def _depth_around(self, labels: _Labels, uv: Tensor) -> Tensor:
-        """The farthest of the four surfaces around a point of the picture, half a pixel apart."""
-        fine = (uv + 0.5) * 2 - 0.5
-        low = fine.floor().long()
-        found = []
-        for du, dv in ((0, 0), (1, 0), (0, 1), (1, 1)):
-            column = (low[:, 0] + du).clamp(0, 2 * self.width - 1)
-            row = (low[:, 1] + dv).clamp(0, 2 * self.height - 1)
-            found.append(labels.fine_depth[row, column])
-        return torch.stack(found).amax(0)
-
-
-_SKIN_DEEP = 0.005
-"""Metres that a point may lie behind the surface that the picture has there and count as seen."""
-
-_JOINT_DEEP = 0.2
-"""Metres that the surface may lie before a joint centre that it covers as its own flesh."""
-
-
-def joints_own_parts(body: BodyModel) -> Bool[Tensor, "j parts"]:
-    """Which parts hold a joint centre inside them, or within 2 cm, in the rest pose.
-
-    Args:
-        body: The body.
-    """
-    pose = body.pose(body.rest)
-    rotation, centre = body.part_poses(pose)
-    local = (pose.joints[None] - centre[:, None]) @ rotation
-    distance = [distance_to_part(s, p) for s, p in zip(body.part_shape, local, strict=True)]
-    return (torch.stack(distance) < 0.02).T
 
 
 def random_lengths(*, generator: torch.Generator) -> dict[str, float]:
@@ -493,7 +389,9 @@ def _place(joints: Float[Tensor, "t j 3"], camera: Camera, floor: float | None) 
     return Place(middle, ground, behind + 0.15)
 
 
-def _rest_of_person(arm: BodyModel, outfit: Outfit, generator: torch.Generator) -> Figure:
+def _rest_of_person(
+    arm: BodyModel, outfit: Outfit, generator: torch.Generator, spacing: float
+) -> Figure:
     """Somebody standing still whose right arm is the given one."""
     body = load_body("body34", lengths=arm.lengths)
     start = body.tree.link_index("r_sternoclavicular_link")
@@ -516,10 +414,12 @@ CLUTTER = Style()
 
 DARK = Style(
     room="dark",
-    lamps=(Lamp(place=(-1.4, 1.6, 2.6), strength=0.9, cone=40.0),),
-    shadows=False,
-    fill=0.12,
-    ambient=0.06,
+    lamps=(
+        Lamp(place=(-1.4, 1.7, 2.8), strength=1.1, cone=40.0),
+        Lamp(place=(2.2, 1.0, 0.6), strength=0.45, cone=50.0),
+    ),
+    fill=0.2,
+    ambient=0.08,
 )
 """That of Fig. 11: black background."""
 
@@ -573,7 +473,7 @@ def shot(
 
 
 ARM_STYLE = Style(
-    pillars=(0.36,),
+    pillars=(0.385,),
     pillar_width=0.10,
     wall=0.5,
     specular=0.35,
