@@ -415,7 +415,7 @@ CLUTTER = Style()
 DARK = Style(
     room="dark",
     lamps=(
-        Lamp(place=(-1.4, 1.7, 2.8), strength=1.1, cone=40.0),
+        Lamp(place=(-1.4, 1.1, 2.8), strength=1.1, cone=40.0),
         Lamp(place=(2.2, 1.0, 0.6), strength=0.45, cone=50.0),
     ),
     fill=0.2,
@@ -461,7 +461,8 @@ def shot(
     else:
         states = poses.states(body, times)
         body = _stand(body, states[0])
-        camera = look_at((0.3, 1.35, 3.7), (0.0, 0.93, 0.0), focal_px=720.0)
+        # Room above the head for arms that reach up.
+        camera = look_at((0.3, 1.35, 3.7), (0.0, 1.0, 0.0), focal_px=720.0)
         style, outfit = (DARK, DARK_OUTFIT) if name == "body-dark" else (CLUTTER, CLUTTER_OUTFIT)
         spacing = 0.009
     if small:
