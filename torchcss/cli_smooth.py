@@ -6,7 +6,7 @@ to the images again, which takes about as long as their features.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,7 +14,7 @@ import tyro
 
 from torchcss.errors import ConfigurationError
 from torchcss.smooth import Smoothing, smooth_file
-from torchcss.smooth_video import smooth_video
+from torchcss.smooth_video import IMAGES, smooth_video
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,8 +27,9 @@ class Smooth:
     """Folder for smooth.npz and summary.json; by default the track's folder."""
     evidence: float = Smoothing.evidence
     """Power of each frame's evidence; below 1 because errors of images persist over frames."""
-    agility: float = Smoothing.agility
-    """Expected accelerations over expected velocities, 1/s; lower is smoother."""
+    agility: float | None = None
+    """Expected accelerations over expected velocities, 1/s; lower is smoother. 10 by default, 20
+    with a video."""
     video: Path | None = None
     """The video that was tracked: fit the trajectory to its images again."""
     camera: Path | None = None
@@ -49,7 +50,9 @@ class Smooth:
 
     def run(self) -> None:
         """Run the verb."""
-        choice = Smoothing(evidence=self.evidence, agility=self.agility)
+        choice = replace(Smoothing() if self.video is None else IMAGES, evidence=self.evidence)
+        if self.agility is not None:
+            choice = replace(choice, agility=self.agility)
         if self.video is None:
             print(report(smooth_file(self.track, out=self.out, choice=choice)))
             return

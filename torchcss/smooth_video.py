@@ -56,6 +56,10 @@ from torchcss.types import Status
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor
 
+IMAGES = Smoothing(agility=20.0)
+"""How to smooth by default. Images say where the body is more exactly than the modes of a tracker
+do, so that motion may be freer; chosen on the same view as the other default."""
+
 
 def smooth_frames(
     track: Track,
@@ -81,14 +85,14 @@ def smooth_frames(
         extractor: Makes the features, at its working size.
         cost: Terms and weights; temporal terms are left out. Pixels are those of the working image.
         observe: Keypoints by frame.
-        choice: How to smooth.
+        choice: How to smooth; `IMAGES` by default.
         boundary_emphasis: See `FrameFeatures.edge_field`.
         masks: Foreground of each of the images; None: not known.
 
     Raises:
         TorchcssError: As `smooth_track`; or if frames are missing.
     """
-    choice = choice or Smoothing()
+    choice = choice or IMAGES
     first, began = smooth_track(track, body, choice=choice), time.perf_counter()
     body = body_of_track(track, body)
     start, bases = (
@@ -175,7 +179,7 @@ def smooth_video(
         camera: Calibration file, see `torchcss.io.cameras`.
         keypoints: 2D joints, see `torchcss.io.keypoints`.
         out: Output folder; by default that of the track.
-        choice: How to smooth.
+        choice: How to smooth; `IMAGES` by default.
         camera_name: Which camera of the file; by default the one of this video.
         layout: Layout of a keypoint file that does not name its joints.
         normalised: Whether keypoints are fractions of the image.
