@@ -124,6 +124,26 @@ def test_a_point_that_leaves_the_image_is_occluded() -> None:
     assert bool(occluded[out].all())
 
 
+def test_a_joint_is_visible_through_its_own_flesh_only(
+    two_spheres: tuple[MeshTruth, Tensor, Tensor],
+) -> None:
+    truth, now, _ = two_spheres
+    looking = MeshTruth(
+        truth.camera, truth.faces, truth.part, torch.tensor([[True, False]]).expand(4, 2)
+    )
+    eye = truth.camera.centre_world
+    small = now[24 * 36 :].mean(0)
+    joints = torch.stack([
+        torch.tensor([0.4, 0.2, 0.55]).double(),  # just under the large sphere's surface
+        torch.tensor([0.0, 0.0, 0.0]).double(),  # too deep in it to be a joint of its surface
+        small + 0.3 * (small - eye),  # before its surface, and behind the small sphere
+        torch.tensor([5.0, 0.0, 0.0]).double(),  # beside the picture
+    ])  # fmt: skip
+    _, visible, inside = looking.joints(truth.labels(now), joints)
+    assert visible.tolist() == [True, False, False, False]
+    assert inside.tolist() == [True, True, True, False]
+
+
 def test_joints_belong_to_the_parts_around_them() -> None:
     body = load_body("body34")
     own = joints_own_parts(body)

@@ -155,8 +155,6 @@ class Stage:
             )
         self._pyvista, self._style = pyvista, style
         self._frame = _RoomFrame.of(camera, place)
-        # Without a display VTK tries X11 first and says so on the console; it then finds EGL.
-        pyvista.vtk_verbosity("off")
         self._plotter = self._make_plotter(camera)
         if style.room == "clutter":
             self._add_clutter(camera, place, generator)
@@ -187,11 +185,13 @@ class Stage:
 
     def _make_plotter(self, camera: Camera) -> Any:
         width, height = camera.image_size_wh
-        plotter = self._pyvista.Plotter(
-            off_screen=True,
-            window_size=(_SUPERSAMPLE * width, _SUPERSAMPLE * height),
-            lighting="none",
-        )
+        # Without a display VTK tries X11 first and says so on the console; it then finds EGL.
+        with self._pyvista.vtk_verbosity("off"):
+            plotter = self._pyvista.Plotter(
+                off_screen=True,
+                window_size=(_SUPERSAMPLE * width, _SUPERSAMPLE * height),
+                lighting="none",
+            )
         plotter.set_background("black")
         # The averaging smooths the edges already, and would otherwise be paid for eight times.
         plotter.render_window.SetMultiSamples(0)
