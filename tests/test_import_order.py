@@ -35,6 +35,7 @@ LAYERS = (
         "mesh_truth",
         "motions",
         "render",
+        "rooms",
         "metrics",
         "published",
         "slices",

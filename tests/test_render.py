@@ -12,7 +12,8 @@ from torchcss.body.model import load_body
 from torchcss.errors import CameraError, ConfigurationError
 from torchcss.figure import Figure, Outfit
 from torchcss.raster import rasterise
-from torchcss.render import Place, Stage, Style
+from torchcss.render import Stage, Style
+from torchcss.rooms import Place
 from torchcss.synthetic import look_at
 from torchcss.vision.camera import Camera
 

@@ -1,9 +1,7 @@
 """Pictures of a figure in a room, by pyvista (VTK) off screen.
 
 A `Stage` holds a room, its lights and one or more meshes that change from frame to frame, seen by a
-`torchcss.vision.camera.Camera`. Rooms are made around what the camera sees: a back wall and a floor
-with uneven light on them, and before the wall posters, shelves full of boxes, cartons and a bright
-pillar, all drawn from a generator; or nothing but a dark curtain.
+`torchcss.vision.camera.Camera`. The rooms are those of `torchcss.rooms`.
 
 The room does not move and is drawn once. In every frame the figures are drawn over it, and the
 first lamp's light is taken away where they stand in it: on the room's surfaces and on the figures
@@ -22,7 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -32,7 +30,8 @@ from torch.nn import functional
 
 from torchcss.errors import CameraError, ConfigurationError
 from torchcss.figure import Colour, load_pyvista
-from torchcss.raster import join_faces, rasterise, value_noise
+from torchcss.raster import join_faces, rasterise
+from torchcss.rooms import Place, Room, RoomFrame, clutter_room, dark_room
 from torchcss.vision.camera import Camera
 
 _SUPERSAMPLE = 2
@@ -47,9 +46,6 @@ _SHADOW_BIAS = 0.025
 
 _OWN_SHADOW = 0.6
 """Share of its lightness that a figure loses in its own shadow."""
-
-_TILE = 128
-"""Pixels of the pictures that boxes and posters bear."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,20 +112,6 @@ class Style:
             )
 
 
-class Place(NamedTuple):
-    """Where a figure is in a room.
-
-    Attributes:
-        middle: Middle of what moves, world frame, metres.
-        floor: Height of the floor, metres (Y up).
-        behind: How far the motion reaches behind its middle, seen from the camera, metres.
-    """
-
-    middle: Float[Tensor, "3"]
-    floor: float
-    behind: float
-
-
 class Stage:
     """A room with figures, ready to be photographed again and again.
 
@@ -154,12 +136,17 @@ class Stage:
                 "with zero coefficients"
             )
         self._pyvista, self._style = pyvista, style
-        self._frame = _RoomFrame.of(camera, place)
+        self._frame = RoomFrame.of(camera, place)
         self._plotter = self._make_plotter(camera)
+        wall = -place.behind - style.wall
         if style.room == "clutter":
-            self._add_clutter(camera, place, generator)
+            room = clutter_room(
+                camera, self._frame, wall=wall, pillars=style.pillars,
+                pillar_width=style.pillar_width, generator=generator,
+            )  # fmt: skip
         else:
-            self._add_dark(place, generator)
+            room = dark_room(wall=wall, generator=generator)
+        self._furnish(room)
         lights = self._add_lights(place, shadows=style.shadows)
         self._room = self._screenshot()[..., :3]
         self._shadow: _Shadow | None = None
@@ -212,12 +199,8 @@ class Stage:
             faces: Corner indices of the triangles.
             colour: Display colour of every vertex, 0 to 1.
         """
-        mesh = self._pyvista.PolyData.from_regular_faces(
-            np.zeros((len(colour), 3), np.float32), faces.cpu().numpy()
-        )
-        mesh.point_data["Normals"] = np.zeros((len(colour), 3), np.float32)
-        mesh.point_data.active_normals_name = "Normals"
-        mesh.point_data["colour"] = _to_bytes(colour)
+        nowhere = torch.zeros_like(colour)
+        mesh = self._new_mesh(nowhere, nowhere, faces, colour)
         self._draw(mesh, scalars="colour", rgb=True, specular=self._style.specular,
                    specular_power=self._style.shininess)  # fmt: skip
         self._meshes.append(mesh)
@@ -296,8 +279,7 @@ class Stage:
             "diffuse": 1.0,
         } | options
         actor = self._plotter.add_mesh(mesh, show_scalar_bar=False, reset_camera=False, **options)
-        if mesh.point_data.active_normals_name is not None:
-            actor.prop.interpolation = "phong"
+        actor.prop.interpolation = "phong"
 
     def _add_lights(self, place: Place, *, shadows: bool) -> list[Any]:
         """Add the lamps and the fill; returns the lamps."""
@@ -329,144 +311,34 @@ class Stage:
             )
         return lights
 
-    def _add_dark(self, place: Place, generator: torch.Generator) -> None:
-        wall = -place.behind - self._style.wall
-        scenery = _Scenery(_Draw(generator))
-        cloth = 0.035 * (1 + 0.25 * value_noise(192, 256, cell=16, generator=generator))
-        cloth = cloth[..., None] * torch.tensor([0.95, 0.95, 1.15])
-        scenery.wall(-5.0, 5.0, 5.0, wall, cloth, cell=0.04)
-        boards = 0.05 * (1 + 0.3 * value_noise(128, 128, cell=8, generator=generator))
-        scenery.floor(wall, boards[..., None] * torch.tensor([1.1, 1.0, 0.9]), cell=0.08)
-        self._draw(scenery.mesh(self._pyvista, self._frame), scalars="colour", rgb=True)
+    def _furnish(self, room: Room) -> None:
+        mesh = room.scenery.mesh(self._frame)
+        drawn = self._new_mesh(mesh.vertices, mesh.normals, mesh.faces, mesh.colour)
+        self._draw(drawn, scalars="colour", rgb=True, specular=0.08)
+        for rods, more in ((room.rods, {}), (room.pillars, {"ambient": 0.4})):
+            for rod in rods:
+                a, b = self._frame.points([rod.start, rod.end]).tolist()
+                axis = np.subtract(b, a)
+                cylinder = self._pyvista.Cylinder(
+                    center=np.add(a, b) / 2,
+                    direction=axis,
+                    radius=rod.radius,
+                    height=float(np.linalg.norm(axis)),
+                    resolution=40,
+                )
+                cylinder = cylinder.triangulate().compute_normals(
+                    split_vertices=True, feature_angle=40.0
+                )
+                self._draw(cylinder, color=rod.colour, specular=0.25, specular_power=25.0, **more)
 
-    def _add_clutter(self, camera: Camera, place: Place, generator: torch.Generator) -> None:
-        draw = _Draw(generator)
-        wall = -place.behind - self._style.wall
-        left, right = self._frame.span(camera, wall)
-        wide = right - left
-        scenery = _Scenery(draw)
-        scenery.wall(left - 1.5, right + 1.5, 4.2, wall, _plaster(generator), cell=0.02)
-        scenery.floor(wall, _boards(generator), cell=0.02)
-        middle = self._frame.height_of_view(camera, wall)
-        # Posters in the upper half.
-        for _ in range(9):
-            x, y = draw.uniform(left, right), middle + draw.uniform(0.05, 0.75) * wide / 2
-            w, h = draw.uniform(0.25, 0.5), draw.uniform(0.3, 0.6)
-            scenery.box(x, y, wall + 0.012, w, h, 0.01)
-        # Shelves, with boxes on them.
-        for level in (-0.36, -0.02, 0.34):
-            y = middle + level * wide / 2 + draw.uniform(-0.05, 0.05)
-            start = left + draw.uniform(0.0, 0.4) * wide
-            end = start + draw.uniform(0.35, 0.6) * wide
-            wood = scenery.wood()
-            scenery.box((start + end) / 2, y - 0.012, wall + 0.11, end - start, 0.024, 0.22, wood)
-            x = start + 0.03
-            while x < end - 0.1:
-                w, h = draw.uniform(0.05, 0.2), draw.uniform(0.08, 0.26)
-                deep = draw.uniform(0.08, 0.2)
-                scenery.box(x + w / 2, y + h / 2, wall + 0.02 + deep / 2, w, h, deep)
-                x += w + (draw.uniform(0.005, 0.02) if draw.uniform(0, 1) < 0.7 else 0.15)
-        # Cartons on the floor, before the wall.
-        for _ in range(9):
-            w, h = draw.uniform(0.25, 0.5), draw.uniform(0.2, 0.5)
-            scenery.box(
-                draw.uniform(left, right), h / 2, wall + draw.uniform(0.25, 0.5), w, h, 0.35
-            )
-        self._draw(scenery.mesh(self._pyvista, self._frame), scalars="colour", rgb=True,
-                   specular=0.08)  # fmt: skip
-        # Broomsticks and laths that lean against the wall: long edges like those of limbs.
-        for _ in range(5):
-            x, lean = draw.uniform(left, right), draw.uniform(-0.25, 0.25)
-            self._rod((x, 0.0, wall + 0.3), (x + lean, draw.uniform(1.3, 2.2), wall + 0.03), 0.016,
-                      draw.colour(0.2, 0.7))  # fmt: skip
-        for share in self._style.pillars:
-            x = self._frame.sideways(camera, share * camera.image_size_wh[0], wall + 0.32)
-            self._rod((x, 0.0, wall + 0.32), (x, 4.2, wall + 0.32), self._style.pillar_width / 2,
-                      (0.86, 0.86, 0.84), ambient=0.4)  # fmt: skip
-
-    def _rod(self, start: Sequence[float], end: Sequence[float], radius: float, colour: Colour,
-             *, ambient: float | None = None) -> None:  # fmt: skip
-        a, b = self._frame.points([start, end]).tolist()
-        axis = np.subtract(b, a)
-        rod = self._pyvista.Cylinder(
-            center=np.add(a, b) / 2,
-            direction=axis,
-            radius=radius,
-            height=float(np.linalg.norm(axis)),
-            resolution=40,
+    def _new_mesh(self, vertices: Tensor, normals: Tensor, faces: Tensor, colour: Tensor) -> Any:
+        mesh = self._pyvista.PolyData.from_regular_faces(
+            vertices.float().cpu().numpy(), faces.cpu().numpy()
         )
-        rod = rod.triangulate().compute_normals(split_vertices=True, feature_angle=40.0)
-        more = {} if ambient is None else {"ambient": ambient}
-        self._draw(rod, color=colour, specular=0.25, specular_power=25.0, **more)
-
-
-class _RoomFrame(NamedTuple):
-    """The room's axes: right and towards the camera are level, as seen by the camera.
-
-    Its origin is on the floor under the figure's middle.
-    """
-
-    origin: Tensor
-    axes: Tensor  # rows: right, up, towards the camera
-
-    @classmethod
-    def of(cls, camera: Camera, place: Place) -> _RoomFrame:
-        back = -camera.R_camera_world[2]
-        up = back.new_tensor([0.0, 1.0, 0.0])
-        back = functional.normalize(back - up * (back @ up), dim=-1)
-        right = torch.linalg.cross(up, back)
-        origin = torch.stack(
-            [place.middle[0], torch.as_tensor(place.floor).to(up), place.middle[2]]
-        )
-        return cls(origin.to(up), torch.stack([right, up, back]))
-
-    def points(self, places: Any) -> Float[Tensor, "p 3"]:
-        """Places in the room, in the world."""
-        return torch.as_tensor(places).to(self.axes) @ self.axes + self.origin
-
-    def about(self, middle: Tensor, offset: Sequence[float]) -> list[float]:
-        """A place given from the figure's middle, in the world."""
-        return (middle.to(self.axes) + torch.as_tensor(offset).to(self.axes) @ self.axes).tolist()
-
-    def ray(self, camera: Camera, u: float, v: float) -> tuple[Tensor, Tensor]:
-        """Where the camera is in the room, and the direction of a pixel."""
-        K = camera.K
-        direction = torch.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], K[2, 2]])
-        start = self.axes @ (camera.centre_world - self.origin)
-        return start, self.axes @ (camera.R_camera_world.mT @ direction)
-
-    def sideways(self, camera: Camera, u: float, depth: float) -> float:
-        """How far right a column of the picture meets the plane at `depth`."""
-        start, direction = self.ray(camera, u, camera.image_size_wh[1] / 2)
-        return float(start[0] + (depth - start[2]) / direction[2] * direction[0])
-
-    def span(self, camera: Camera, depth: float) -> tuple[float, float]:
-        """Left and right end of what the camera sees of the plane at `depth`."""
-        return self.sideways(camera, 0.0, depth), self.sideways(
-            camera, camera.image_size_wh[0], depth
-        )
-
-    def height_of_view(self, camera: Camera, depth: float) -> float:
-        """How high above the floor the middle of the picture is on the plane at `depth`."""
-        width, height = camera.image_size_wh
-        start, direction = self.ray(camera, width / 2, height / 2)
-        return float(start[1] + (depth - start[2]) / direction[2] * direction[1])
-
-
-class _Draw:
-    """Random numbers and colours."""
-
-    def __init__(self, generator: torch.Generator) -> None:
-        self.generator = generator
-
-    def uniform(self, low: float, high: float) -> float:
-        return low + (high - low) * float(torch.rand((), generator=self.generator))
-
-    def colour(self, low: float, high: float, saturation: float = 0.55) -> Colour:
-        hue = torch.rand(3, generator=self.generator)
-        colour = (self.uniform(low, high) * (1 + saturation * (hue - hue.mean()))).clamp(0, 1)
-        r, g, b = colour.tolist()
-        return r, g, b
+        mesh.point_data["Normals"] = normals.float().cpu().numpy()
+        mesh.point_data.active_normals_name = "Normals"
+        mesh.point_data["colour"] = _to_bytes(colour)
+        return mesh
 
 
 class _Shadow:
@@ -532,149 +404,6 @@ class _Shadow:
             for dv in (-2, -1, 0, 1, 2)
         ]
         return torch.stack(hidden).float().mean(0)
-
-
-class _Scenery:
-    """Rectangles with pictures on them, in the room's frame, as one mesh.
-
-    Pictures are colours of vertices and not textures: VTK's shadow maps take a texture for relief.
-    """
-
-    def __init__(self, draw: _Draw) -> None:
-        self.draw = draw
-        self.points: list[Tensor] = []
-        self.normals: list[Tensor] = []
-        self.colours: list[Tensor] = []
-        self.faces: list[Tensor] = []
-        self.count = 0
-
-    def quad(self, corners: Sequence[Sequence[float]], picture: Tensor, cell: float) -> None:
-        """A rectangle, anticlockwise from its lower left; the picture's first row is the top."""
-        a, b, _, d = torch.tensor(corners, dtype=torch.float64)
-        columns, rows = (max(int((side - a).norm() / cell), 1) + 1 for side in (b, d))
-        v, u = torch.meshgrid(
-            torch.linspace(0, 1, rows, dtype=a.dtype), torch.linspace(0, 1, columns, dtype=a.dtype),
-            indexing="ij",
-        )  # fmt: skip
-        u, v = u.reshape(-1, 1), v.reshape(-1, 1)
-        normal = functional.normalize(torch.linalg.cross(b - a, d - a), dim=-1)
-        row = ((1 - v[:, 0]) * (picture.shape[0] - 1)).round().long()
-        column = (u[:, 0] * (picture.shape[1] - 1)).round().long()
-        at = torch.arange((rows - 1) * columns).view(rows - 1, columns)[:, :-1].reshape(-1)
-        at = at + self.count
-        self.points.append(a + u * (b - a) + v * (d - a))
-        self.normals.append(normal.expand(len(u), 3))
-        self.colours.append(picture[row, column])
-        self.faces.append(torch.stack([at, at + 1, at + columns + 1], -1))
-        self.faces.append(torch.stack([at, at + columns + 1, at + columns], -1))
-        self.count += len(u)
-
-    def wall(
-        self, left: float, right: float, top: float, depth: float, picture: Tensor, cell: float
-    ) -> None:
-        """The wall at the back."""
-        corners = [(left, 0.0, depth), (right, 0.0, depth), (right, top, depth), (left, top, depth)]
-        self.quad(corners, picture, cell)
-
-    def floor(self, wall: float, picture: Tensor, cell: float) -> None:
-        """The floor, from before the wall to behind the camera."""
-        corners = [(-4.0, 0.0, 5.0), (4.0, 0.0, 5.0), (4.0, 0.0, wall), (-4.0, 0.0, wall)]
-        self.quad(corners, picture, cell)
-
-    def box(
-        self, x: float, y: float, z: float, wide: float, high: float, deep: float,
-        picture: Tensor | None = None,
-    ) -> None:  # fmt: skip
-        """A box about its middle with the same picture on all sides, a random one by default."""
-        picture = self.picture() if picture is None else picture
-        a, b, c = wide / 2, high / 2, deep / 2
-        for side in (
-            [(-a, -b, c), (a, -b, c), (a, b, c), (-a, b, c)],
-            [(a, -b, c), (a, -b, -c), (a, b, -c), (a, b, c)],
-            [(-a, -b, -c), (-a, -b, c), (-a, b, c), (-a, b, -c)],
-            [(-a, b, c), (a, b, c), (a, b, -c), (-a, b, -c)],
-            [(-a, -b, -c), (a, -b, -c), (a, -b, c), (-a, -b, c)],
-        ):
-            self.quad([(x + p, y + q, z + r) for p, q, r in side], picture, 0.006)
-
-    def mesh(self, pyvista: Any, frame: _RoomFrame) -> Any:
-        """All of it, in the world."""
-        points = frame.points(torch.cat(self.points))
-        mesh = pyvista.PolyData.from_regular_faces(
-            points.float().numpy(), torch.cat(self.faces).numpy()
-        )
-        mesh.point_data["Normals"] = (torch.cat(self.normals) @ frame.axes).float().numpy()
-        mesh.point_data.active_normals_name = "Normals"
-        mesh.point_data["colour"] = _to_bytes(torch.cat(self.colours))
-        return mesh
-
-    def wood(self) -> Float[Tensor, "h w 3"]:
-        """Planks."""
-        y, x = _grid(_TILE)
-        grain = 1 + 0.15 * (40 * y + 3 * (5 * x).sin()).sin()
-        return grain[..., None] * torch.tensor([0.42, 0.29, 0.18])
-
-    def picture(self) -> Float[Tensor, "h w 3"]:
-        """Something printed: stripes, patches, rings or lines of text."""
-        draw, (y, x) = self.draw, _grid(_TILE)
-        picture = torch.tensor(draw.colour(0.15, 0.75)).repeat(_TILE, _TILE, 1)
-        kind = int(draw.uniform(0, 4))
-        if kind == 0:
-            slope, count = draw.uniform(-2, 2), draw.uniform(3, 9)
-            stripes = ((x + slope * y) * count).remainder(1.0) < draw.uniform(0.2, 0.6)
-            picture[stripes] = torch.tensor(draw.colour(0.1, 0.9))
-        elif kind == 1:
-            for _ in range(7):
-                cx, cy, w, h = (draw.uniform(0, 1) for _ in range(4))
-                patch = ((x - cx).abs() < 0.3 * w) & ((y - cy).abs() < 0.3 * h)
-                picture[patch] = torch.tensor(draw.colour(0.1, 0.9))
-        elif kind == 2:
-            cx, cy, count = draw.uniform(0.2, 0.8), draw.uniform(0.2, 0.8), draw.uniform(2, 6)
-            reach = ((x - cx) ** 2 + (y - cy) ** 2).sqrt()
-            picture[(reach * count).remainder(1.0) < 0.45] = torch.tensor(draw.colour(0.1, 0.9))
-        else:
-            label = (y > 0.25) & (y < 0.7) & (x > 0.1) & (x < 0.9)
-            picture[label] = torch.tensor(draw.colour(0.6, 0.9, 0.3))
-            lines = (y > 0.32) & (y < 0.64) & ((y * 24).remainder(1.0) < 0.45)
-            lines &= (x > 0.16) & (x < draw.uniform(0.5, 0.84))
-            picture[lines] = torch.tensor(draw.colour(0.05, 0.3))
-        stain = value_noise(_TILE, _TILE, cell=16, generator=draw.generator)
-        return picture * (1 + 0.06 * stain)[..., None]
-
-
-def _grid(size: int) -> tuple[Tensor, Tensor]:
-    """Rows and columns of a square picture, 0 to 1."""
-    y, x = torch.meshgrid(*(torch.linspace(0, 1, size),) * 2, indexing="ij")
-    return y, x
-
-
-def _plaster(generator: torch.Generator) -> Float[Tensor, "h w 3"]:
-    """A stained wall, dark above a pale rail and pale below it."""
-    draw = _Draw(generator)
-    rows, columns = 420, 640
-    stain = value_noise(rows, columns, cell=90, octaves=5, generator=generator)[..., None]
-    height = torch.linspace(4.2, 0, rows)[:, None, None]
-    upper, lower = (
-        torch.tensor(draw.colour(0.35, 0.5, 0.5)),
-        torch.tensor(draw.colour(0.5, 0.62, 0.3)),
-    )
-    wall = torch.where(height > 1.25, upper, lower) * (1 + 0.07 * stain)
-    rail = (height > 1.2) & (height < 1.27)
-    return torch.where(rail, torch.tensor([0.72, 0.72, 0.70]), wall)
-
-
-def _boards(generator: torch.Generator) -> Float[Tensor, "h w 3"]:
-    """A floor of boards that run away from the camera."""
-    draw = _Draw(generator)
-    rows, columns = 300, 600
-    grain = value_noise(rows // 10, columns, cell=6, octaves=3, generator=generator)
-    grain = functional.interpolate(grain[None, None], (rows, columns), mode="bilinear")[0, 0]
-    across = torch.linspace(0, 42, columns)
-    tone = 1 + 0.14 * (across.floor() * 12.9898).sin()
-    joint = torch.where(across.remainder(1.0) < 0.06, 0.55, 1.0)
-    return ((tone * joint) * (1 + 0.08 * grain))[..., None] * torch.tensor(
-        draw.colour(0.3, 0.42, 0.5)
-    )
 
 
 def _to_bytes(colour: Float[Tensor, "*v 3"]) -> np.ndarray:

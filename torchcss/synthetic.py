@@ -45,7 +45,8 @@ from torchcss.raster import (
     random_texture,
     render_meshes,
 )
-from torchcss.render import Lamp, Place, Stage, Style
+from torchcss.render import Lamp, Stage, Style
+from torchcss.rooms import Place
 from torchcss.vision.camera import Camera
 
 _SKIN = (0.86, 0.63, 0.52)
