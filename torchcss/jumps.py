@@ -28,7 +28,7 @@ _NOISE = 0.02
 
 
 def with_flips(
-    state: TrackerState, body: BodyModel, camera: Camera, *, num: int, log_odds: float = -20.0
+    state: TrackerState, body: BodyModel, camera: Camera, *, num: int, log_odds: float = -5.0
 ) -> TrackerState:
     """A tracker's state with the flips of its best mode among its modes.
 

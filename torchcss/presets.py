@@ -71,6 +71,9 @@ class Preset:
         modes_arm: Modes kept for an arm.
         modes_body: Modes kept for a body.
         memory: See `Tracker`.
+        evidence: See `Tracker`. On the rendered arm 0.1 (with a memory of 0.98) takes the best
+            mode's error from 128 to 59 mm: of two poses that look alike the one that was right so
+            far stays the best.
         proposal_arm: Where samples go for an arm, if elsewhere than for a body.
         persistence: Share of its last motion that a mode goes on with: 0 is driftless diffusion, 1
             constant velocity. The papers' trackers have 0. With 0.8 a mode does not lag behind a
@@ -96,6 +99,7 @@ class Preset:
     modes_arm: int = 3
     modes_body: int = 7
     memory: float = 1.0
+    evidence: float = 1.0
     proposal_arm: Proposal | None = None
     persistence: float = 0.0
     noise: float = 1.0
@@ -134,7 +138,8 @@ _CSS = Preset(
     proposal=CovarianceScaled(covariance_scale=8.0, max_deviation=1.0),
     samples_arm=40,
     samples_body=60,
-    memory=0.5,
+    memory=0.98,
+    evidence=0.1,
     persistence=_PERSISTENCE,
     separation=0.05,
     jumps_every=3,
@@ -185,7 +190,9 @@ PRESETS: dict[str, Preset] = {
     "css": _CSS,
     "css_figure_6": replace(
         _CSS,
-        what="css as printed: the best minima however alike, no jumps to flipped poses",
+        what="css as printed: weights multiplied, minima however alike, no jumps to flips",
+        memory=1.0,
+        evidence=1.0,
         separation=0.0,
         jumps_every=0,
     ),
@@ -305,6 +312,7 @@ def make_tracker(
         num_modes=num_modes,
         optimiser=TrustRegionNewton(max_steps=20, tolerance=1e-2),
         memory=row.memory,
+        evidence=row.evidence,
         dynamics=dynamics,
         separation=row.separation,
     )

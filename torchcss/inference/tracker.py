@@ -200,9 +200,12 @@ class Tracker:
         duplicate_distance: See `distinct_modes`.
         laplace_evidence: Weigh a mode by its Laplace evidence, likelihood times
             `sqrt(det Sigma)`, instead of the likelihood at the mode alone (design decision 5).
-        memory: Power of the prior's weights in step 5. One is Fig. 6, which takes frames as
-            independent evidence; with a sharp likelihood a mode that led for some frames can then
-            never be overtaken. Errors persist over frames, which a power below one allows for.
+        memory: Power of the prior's weights in step 5. One is Fig. 6; below one, old evidence is
+            forgotten by degrees.
+        evidence: Power of a frame's likelihood in the weights, step 3. One is Fig. 6, which takes
+            frames as independent evidence. They are not: what a body model lacks, clutter and
+            occlusion cost the same modes in frame after frame. With a sharp likelihood the first
+            frames then decide for good, or, where memory is short, each frame anew.
         coarse_every: If the cost has a method `coarse()` that returns a smoother cost (or None),
             every so many samples descend on that first, so that what moved farther than the cost's
             own basin reaches is found again; 0 for never.
@@ -226,6 +229,7 @@ class Tracker:
     duplicate_distance: float = 1.0
     laplace_evidence: bool = False
     memory: float = 1.0
+    evidence: float = 1.0
     coarse_every: int = 3
     oversampling: int = 1
     standard_bhattacharyya: bool = False
@@ -303,7 +307,7 @@ class Tracker:
         )
         if len(distinct):
             # 3: weights by the likelihood at the modes.
-            log_weight = -energy[distinct]
+            log_weight = -self.evidence * energy[distinct]
             if self.laplace_evidence:
                 log_weight = log_weight + 0.5 * log_determinant(modes.covariance[distinct])
             unpruned = GaussianMixture(
