@@ -11,7 +11,7 @@ Kinematic Jump Processes, CVPR 2003, do so for every sample).
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchcss.body.flips import Segments
@@ -25,6 +25,18 @@ from torchcss.vision.camera import Camera
 
 _NOISE = 0.02
 """Scale by which flips are judged, as a share of the body's extent in the image."""
+
+_MOST_NOISE = 6.0
+"""Scales by which a joint may miss its place: as far as the ranking of the flips looks. Where joint
+limits leave nearly no flip, what they leave looks different, and a descent from it leads nowhere.
+"""
+
+_ALL = 1_000_000
+"""More combinations than any body has."""
+
+_APART = 0.15
+"""Least distance of some joint, metres, at which two poses are two. A body has a thousand flips
+that differ by the tilt of a foot or of the trunk, and they are the most plausible."""
 
 
 def with_flips(
@@ -65,20 +77,36 @@ def flipped_poses(
         num: Most poses wanted.
 
     Returns:
-        The poses, the given one among them if it is as plausible; none for a body without limbs
-        that can flip.
+        The poses, each with a joint `_APART` from where it is in the given one and in the others;
+        none for a body without limbs that can flip, or wholly out of the camera's sight.
     """
     segments = Segments(body)
+    nothing = x.new_zeros(0, len(x))
     if not segments.limbs or num < 1:
-        return x.new_zeros(0, len(x))
-    uv, _, valid = camera.project(body.pose(x).joints)
+        return nothing
+    joints = body.pose(x).joints
+    uv, _, valid = camera.project(joints)
     if not bool(valid.any()):
-        return x.new_zeros(0, len(x))
+        return nothing
     extent = float((uv[valid].amax(0) - uv[valid].amin(0)).max())
+    sigma = max(1.0, _NOISE * extent)
     cost = TrackingCost(
         body=body,
         camera=camera,
-        choice=CostChoice(contour=None, joints=JointTerm(sigma=max(1.0, _NOISE * extent))),
+        choice=CostChoice(contour=None, joints=JointTerm(sigma=sigma)),
         observation=JointObservation(body.joint_names, uv, valid.to(uv), body.joint_names),
     )
-    return flips(cost, segments, x[None], body.bounds, num)
+    poses = flips(cost, segments, x[None], body.bounds, _ALL)
+    places = body.pose(poses).joints
+    missed = torch.where(valid, (camera.project(places).uv - uv).norm(dim=-1), 0.0).amax(-1)
+    left = torch.nonzero((missed <= _MOST_NOISE * sigma) & _differ(places, joints))[:, 0]
+    chosen = []
+    while len(left) and len(chosen) < num:
+        chosen.append(left[0])
+        left = left[_differ(places[left], places[left[0]])]
+    return poses[torch.stack(chosen)] if chosen else nothing
+
+
+def _differ(places: Float[Tensor, "s j 3"], others: Float[Tensor, "j 3"]) -> Bool[Tensor, " s"]:
+    """Whether some joint is `_APART` from where it is in another pose."""
+    return (places - others).norm(dim=-1).amax(-1) >= _APART
