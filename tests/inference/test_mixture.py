@@ -12,6 +12,7 @@ from torchcss.inference.mixture import (
     distinct_modes,
     draw_components,
     match_to_prior,
+    separated,
 )
 
 
@@ -206,3 +207,49 @@ def test_densities_of_many_states_at_once(generator):
     x = 5 * torch.randn(2500, 2, generator=generator, dtype=torch.float64)
     torch.testing.assert_close(mixture.log_density(x)[::500], mixture.log_density(x[::500]))
     assert mixture.log_density(x[:0]).shape == (0,)
+
+
+def separated_one_by_one(landmarks: torch.Tensor, distance: float, num: int) -> list[int]:
+    """The definition, mode by mode in plain numbers."""
+    modes = landmarks.tolist()
+
+    def apart(a: int, b: int) -> float:
+        return sum(math.dist(p, q) for p, q in zip(modes[a], modes[b], strict=True)) / len(modes[a])
+
+    best: list[int] = []
+    for mode in range(len(modes)):
+        if all(apart(mode, other) >= distance for other in best):
+            best.append(mode)
+    best = best[:num]
+    others = [mode for mode in range(len(modes)) if mode not in best]
+    return sorted(best + others[: num - len(best)])
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    k=st.integers(1, 12),
+    points=st.integers(1, 3),
+    num=st.integers(1, 14),
+    distance=st.sampled_from([0.0, 0.5, 1.5, 4.0, 100.0]),
+    single_precision=st.booleans(),
+    seed=st.integers(0, 2**31),
+)
+def test_separated_is_its_definition(k, points, num, distance, single_precision, seed):
+    drawn = torch.Generator().manual_seed(seed)
+    dtype = torch.float32 if single_precision else torch.float64
+    landmarks = 2 * torch.randn(k, points, 3, generator=drawn, dtype=dtype)
+    chosen = separated(landmarks, distance, num)
+    assert chosen.dtype == torch.long
+    assert chosen.tolist() == separated_one_by_one(landmarks, distance, num)
+    assert len(chosen) == min(k, num)
+    # The best is always among them.
+    assert int(chosen[0]) == 0
+
+
+def test_separated_of_alike_modes_keeps_the_best():
+    landmarks = torch.tensor([0.0, 0.1, 0.2, 3.0, 3.1, 9.0])[:, None, None]
+    assert separated(landmarks, 1.0, 3).tolist() == [0, 3, 5]
+    # Places left go to the best of the others.
+    assert separated(landmarks, 1.0, 4).tolist() == [0, 1, 3, 5]
+    assert separated(landmarks[:3], 1.0, 2).tolist() == [0, 1]
+    assert separated(landmarks[:0], 1.0, 2).tolist() == []

@@ -230,3 +230,58 @@ def test_oversampling_descends_from_the_best_alone(generator, screened):
     assert int(info.num_samples) == 6
     first = next(x for x in starts if len(x) == 6)
     torch.testing.assert_close(first, drawn[score.argsort()[:6].sort().values])
+
+
+def test_evidence_is_the_power_of_the_likelihood(generator):
+    well = problems.DoubleWell(tilt=0.4)
+    for evidence in (1.0, 0.1):
+        tracker = replace(CSS, evidence=evidence)
+        state, info = tracker.step(tracker.init(single(), generator=generator), well, BOUNDS)
+        torch.testing.assert_close(state.mixture.weight, (-evidence * info.cost).softmax(0))
+        assert info.parent.tolist() == [0, -1]
+    # Frame after frame it adds up: the odds of two modes are those of all costs so far.
+    assert float(info.cost[1] - info.cost[0]) > 0.5
+    both = GaussianMixture(
+        well.minima, 0.01 * torch.eye(2).double().expand(2, 2, 2), torch.zeros(2).double()
+    )
+    tracker = Tracker(proposal=EigenDirectionGrid(), num_samples=20, num_modes=2, evidence=0.1)
+    state = tracker.init(both, generator=generator)
+    *_, (state, info) = tracker.track(state, [well] * 30, BOUNDS)
+    odds = state.mixture.log_weight[0] - state.mixture.log_weight[1]
+    torch.testing.assert_close(odds, 3 * (info.cost[1] - info.cost[0]), rtol=1e-3, atol=1e-3)
+
+
+class Comb(problems.AutogradCost):
+    """Minima near -3, -1.5, 0, 1.5 and 3, the best at 0, the next best beside it."""
+
+    def __init__(self):
+        turn = 2 * torch.pi / 1.5
+        super().__init__(
+            lambda x: 6 * (1 - (turn * x[0]).cos()) + (0.3 * x[0] - 0.1).square() + 2 * x[1] ** 2
+        )
+
+
+class CombWithLandmarks(Comb):
+    """The landmark is where the state is; a second one never moves, and halves the mean."""
+
+    def landmarks(self, x):
+        return torch.stack([x, torch.zeros_like(x)], dim=-2)
+
+
+def test_separation_keeps_modes_whose_landmarks_differ(generator):
+    def found(cost, separation: float, num_modes: int) -> list[int]:
+        tracker = replace(CSS, num_samples=60, num_modes=num_modes, separation=separation)
+        start = tracker.init(single((0.0, 0.0), (0.6, 0.1)), generator=generator)
+        state, _ = tracker.step(start, cost, problems.box(2, -3.7, 3.7))
+        # In multiples of the distance between two minima, the best mode first.
+        return (state.mixture.mean[:, 0] / 1.5).round().int().tolist()
+
+    assert found(CombWithLandmarks(), 0.0, 5) == [0, 1, -1, 2, -2]
+    # Next neighbours' landmarks are 0.75 apart on average, every second one's 1.5.
+    assert found(CombWithLandmarks(), 0.7, 3) == [0, 1, -1]
+    assert found(CombWithLandmarks(), 1.4, 3) == [0, 2, -2]
+    # Places left go to the best of those alike; the order is that of the weights.
+    assert found(CombWithLandmarks(), 1.4, 4) == [0, 1, 2, -2]
+    assert found(CombWithLandmarks(), 50.0, 3) == [0, 1, -1]
+    # A cost without landmarks is not concerned.
+    assert found(Comb(), 1.4, 3) == [0, 1, -1]
