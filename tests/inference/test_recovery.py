@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 import pytest
 import torch
@@ -116,7 +117,7 @@ def test_a_sharper_monitor_alarms_first():
 
 @pytest.mark.parametrize("name", ["slack", "threshold", "most", "burn_in", "window", "floor"])
 @pytest.mark.parametrize("value", [0, -1, float("nan")])
-def test_bad_configuration(name: str, value: float):
+def test_bad_configuration(name: str, value: Any):
     with pytest.raises(ConfigurationError, match=rf"LossMonitor\.{name}"):
         LossMonitor(**{name: value})
 
