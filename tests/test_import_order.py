@@ -41,6 +41,7 @@ LAYERS = (
         "slices",
         "shape_fit",
         "random_person",
+        "recovery",
     },
     {"sampling_study"},
     {"settings"},
