@@ -15,13 +15,12 @@ from torchcss.errors import ConfigurationError
 from torchcss.figure import distance_to_part
 from torchcss.mesh_truth import MeshTruth, joints_own_parts
 from torchcss.motions import Motion
-from torchcss.raster import join_faces
+from torchcss.raster import grid_faces, join_faces
 from torchcss.synthetic import (
     STYLES,
     SequenceFrame,
     Shot,
     camera_in_front,
-    grid_faces,
     look_at,
     random_lengths,
     shot,

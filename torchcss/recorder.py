@@ -27,8 +27,8 @@ from torchcss.io.overlay import ProjectedPart, draw_overlay
 from torchcss.io.tracks import TrackWriter, write_summary
 from torchcss.io.video import VideoWriter
 from torchcss.pipeline import TrackedFrame
+from torchcss.raster import grid_faces
 from torchcss.settings import Settings
-from torchcss.synthetic import grid_faces
 from torchcss.types import Status
 from torchcss.vision.camera import Camera
 

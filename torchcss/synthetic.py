@@ -41,6 +41,7 @@ from torchcss.raster import (
     Mesh,
     add_sensor_noise,
     clutter_background,
+    grid_faces,
     join_faces,
     random_texture,
     render_meshes,
@@ -158,24 +159,6 @@ def arm_sequence(
     return SyntheticSequence(
         frames=frames, frame_rate=frame_rate, camera=camera, body=body, states=states
     )
-
-
-def grid_faces(rings: int, meridians: int) -> Tensor:
-    """Triangles `[f 3]` of a mesh of rings closed around the part, poles capped by fans.
-
-    Args:
-        rings: Latitudes.
-        meridians: Longitudes.
-    """
-    ring, step = torch.meshgrid(torch.arange(rings - 1), torch.arange(meridians), indexing="ij")
-    here = ring * meridians + step
-    beside = ring * meridians + (step + 1) % meridians
-    quads = torch.stack([here, beside, here + meridians, beside + meridians], dim=-1).reshape(-1, 4)
-    sides = torch.cat([quads[:, [0, 1, 3]], quads[:, [0, 3, 2]]])
-    fan = torch.arange(1, meridians - 1)
-    bottom = torch.stack([torch.zeros_like(fan), fan + 1, fan], dim=-1)
-    top = torch.stack([torch.zeros_like(fan), fan, fan + 1], dim=-1) + (rings - 1) * meridians
-    return torch.cat([sides, bottom, top])
 
 
 # The papers' sequences, with a dressed figure in a room (the extra `render`).

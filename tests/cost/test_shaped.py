@@ -18,8 +18,7 @@ from torchcss.cost.shaped import ShapedCost
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.cost.visibility import ContourPredictor
 from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.raster import Mesh, render_meshes
-from torchcss.synthetic import grid_faces
+from torchcss.raster import Mesh, grid_faces, render_meshes
 from torchcss.types import Bounds
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor

@@ -23,8 +23,7 @@ from torchcss.cost.visibility import (
     line_of_sight,
     visible_nodes,
 )
-from torchcss.raster import rasterise
-from torchcss.synthetic import grid_faces
+from torchcss.raster import grid_faces, rasterise
 from torchcss.vision.camera import Camera
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))

@@ -22,7 +22,7 @@ from torchcss.body.catalog import LENGTHS
 from torchcss.body.model import BodyModel
 from torchcss.io.atomic import replace_file
 from torchcss.io.overlay import PALETTE, ProjectedPart, draw_overlay
-from torchcss.synthetic import grid_faces
+from torchcss.raster import grid_faces
 from torchcss.vision.camera import Camera
 
 _BONES = (
