@@ -37,6 +37,7 @@ from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.root import ROOT_NAMES, has_root, move_base
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.cost.interpenetration import InterpenetrationPairs
+from torchcss.cost.silhouette import part_map
 from torchcss.errors import ConfigurationError
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.tracker import TrackerInfo
@@ -58,8 +59,6 @@ from torchcss.metrics import (
     root_aligned_errors_mm,
 )
 from torchcss.pipeline import TrackedFrame
-from torchcss.raster import join_faces, rasterise
-from torchcss.synthetic import grid_faces
 from torchcss.vision.camera import Camera
 
 ARM_LOST_MM = 150.0
@@ -196,14 +195,7 @@ def silhouette(
         rings: Latitudes of the drawn mesh.
         meridians: Longitudes of the drawn mesh.
     """
-    rotation, centre = body.part_poses(body.pose(x))
-    local = body.mesh(rings, meridians).points.flatten(1, 2)
-    points = (local @ rotation.transpose(-1, -2) + centre[:, None, :]).double().cpu()
-    grid = grid_faces(rings, meridians)
-    faces, _ = join_faces([grid] * len(points), [points.shape[1]] * len(points))
-    uv, depth, valid = camera.project(points.flatten(0, 1))
-    width, height = camera.image_size_wh
-    return (rasterise(uv, depth, faces, height, width, valid=valid).face >= 0).numpy()
+    return (part_map(body, x, camera, rings=rings, meridians=meridians) >= 0).cpu().numpy()
 
 
 def region_probability(
