@@ -22,7 +22,7 @@ from torchcss.motions import (
     read_motion,
     sample_times,
 )
-from torchcss.synthetic import random_lengths
+from torchcss.random_person import random_lengths
 
 RATE = 50.0
 FASTEST_HAND = 3.0

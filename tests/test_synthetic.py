@@ -15,6 +15,7 @@ from torchcss.errors import ConfigurationError
 from torchcss.figure import distance_to_part
 from torchcss.mesh_truth import MeshTruth, joints_own_parts
 from torchcss.motions import Motion
+from torchcss.random_person import random_lengths
 from torchcss.raster import grid_faces, join_faces
 from torchcss.synthetic import (
     STYLES,
@@ -22,7 +23,6 @@ from torchcss.synthetic import (
     Shot,
     camera_in_front,
     look_at,
-    random_lengths,
     shot,
     shot_of_motion,
 )

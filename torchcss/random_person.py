@@ -5,7 +5,8 @@ humanoid), in a pose drawn from the sticky priors, turned any way about the vert
 camera of `torchcss.reprojection`: 1920 x 1080 pixels, at 3.5 m. Marks have Gaussian noise; some may
 be missing, and some may be anywhere in the image.
 
-Call `random_person(generator=...)`; `coverage` tells whether stated covariances hold the truth.
+Call `random_person(generator=...)`, or `random_lengths` for the lengths alone; `coverage` tells
+whether stated covariances hold the truth.
 """
 
 from __future__ import annotations
@@ -77,14 +78,7 @@ def random_person(
         missing: Probability that a joint is missing.
         outliers: Probability that its mark is anywhere in the image.
     """
-    free = load_body(body_name, free_proportions=True)
-    names = list(proportion_columns(free))
-    factor = torch.linalg.cholesky(Anthropometric().covariance(free))
-    drawn = factor @ torch.randn(len(names), generator=generator, dtype=torch.float64)
-    lengths = dict(LENGTHS)
-    for name, extra in zip(names, drawn.tolist(), strict=True):
-        margin = PROPORTION_RANGE * LENGTHS[name]
-        lengths[name] += min(max(extra, -margin), margin)
+    lengths = random_lengths(generator=generator, body_name=body_name)
     place = torch.tensor([0.0, 0.0, -DISTANCE], dtype=torch.float64)
     body = load_body(body_name, lengths=lengths).with_base(torch.eye(3), place)
     state = plausible_pose(body, generator=generator)
@@ -102,6 +96,23 @@ def random_person(
     uv = torch.where(gross[:, None], anywhere, uv + noise_px * noise)
     confidence = (chance[1] >= missing).to(uv)
     return Person(body, state, camera, joint_names, uv, confidence, gross)
+
+
+def random_lengths(*, generator: torch.Generator, body_name: str = "body34") -> dict[str, float]:
+    """Lengths of a person drawn from the anthropometric prior, within its 10 %, metres.
+
+    Args:
+        generator: Source of randomness.
+        body_name: The body; lengths that it does not have are those of the standard humanoid.
+    """
+    free = load_body(body_name, free_proportions=True)
+    factor = torch.linalg.cholesky(Anthropometric().covariance(free))
+    drawn = factor @ torch.randn(len(factor), generator=generator, dtype=torch.float64)
+    lengths = dict(LENGTHS)
+    for name, extra in zip(proportion_columns(free), drawn.tolist(), strict=True):
+        margin = PROPORTION_RANGE * LENGTHS[name]
+        lengths[name] += min(max(extra, -margin), margin)
+    return lengths
 
 
 class Coverage(NamedTuple):

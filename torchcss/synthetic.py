@@ -29,13 +29,12 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from torchcss.body.catalog import LENGTHS, PROPORTION_RANGE
 from torchcss.body.model import BodyModel, load_body
-from torchcss.cost.anthropometric import Anthropometric, proportion_columns
 from torchcss.errors import ConfigurationError
 from torchcss.figure import Figure, Outfit, Skin
 from torchcss.mesh_truth import MeshTruth, joints_own_parts
 from torchcss.motions import MOTIONS, Motion, sample_times
+from torchcss.random_person import random_lengths
 from torchcss.raster import (
     Lighting,
     Mesh,
@@ -314,22 +313,6 @@ def render_sequence(
                 in_image, flow, occluded,
             )  # fmt: skip
             labels = after
-
-
-def random_lengths(*, generator: torch.Generator) -> dict[str, float]:
-    """Lengths of a person drawn from the anthropometric prior, within its 10 %, metres.
-
-    Args:
-        generator: Source of randomness.
-    """
-    free = load_body("body34", free_proportions=True)
-    factor = torch.linalg.cholesky(Anthropometric().covariance(free))
-    drawn = factor @ torch.randn(len(factor), generator=generator, dtype=torch.float64)
-    lengths = dict(LENGTHS)
-    for name, extra in zip(proportion_columns(free), drawn.tolist(), strict=True):
-        margin = PROPORTION_RANGE * LENGTHS[name]
-        lengths[name] += min(max(extra, -margin), margin)
-    return lengths
 
 
 def look_at(
