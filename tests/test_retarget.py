@@ -14,7 +14,7 @@ from torchcss.body.catalog import LENGTHS
 from torchcss.body.model import BodyModel, differentiate_twice, load_body
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
 from torchcss.cost.stabiliser import Stabiliser
-from torchcss.errors import ConfigurationError
+from torchcss.errors import ConfigurationError, MotionCaptureError
 from torchcss.io.motion_capture import (
     LIMBS,
     MotionCapture,
@@ -22,7 +22,6 @@ from torchcss.io.motion_capture import (
     read_motion_capture,
     resample,
 )
-from torchcss.io.motion_parsers import MotionCaptureError
 from torchcss.retarget import (
     PointDistances,
     Points,

@@ -44,6 +44,10 @@ class KeypointError(TorchcssError, ValueError):
     """A keypoint file is missing, malformed, of unknown layout or has nobody in it."""
 
 
+class MotionCaptureError(TorchcssError, ValueError):
+    """A motion capture file is missing, malformed, or not of the format that its name says."""
+
+
 class TrackFileError(TorchcssError, ValueError):
     """A track file is missing, malformed or of another schema version."""
 

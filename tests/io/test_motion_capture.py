@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from torchcss import export_track, load_body
-from torchcss.errors import ConfigurationError
+from torchcss.errors import ConfigurationError, MotionCaptureError
 from torchcss.io.motion_capture import (
     LIMBS,
     UNITS,
@@ -22,7 +22,6 @@ from torchcss.io.motion_capture import (
     read_motion_capture,
     resample,
 )
-from torchcss.io.motion_parsers import MotionCaptureError
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from made_tracks import make_track

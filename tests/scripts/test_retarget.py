@@ -15,9 +15,8 @@ import pytest
 import torch
 
 from torchcss import export_track, load_body
-from torchcss.errors import ConfigurationError, OutputError
+from torchcss.errors import ConfigurationError, MotionCaptureError, OutputError
 from torchcss.io.motion_capture import LIMBS
-from torchcss.io.motion_parsers import MotionCaptureError
 from torchcss.io.tracks import TrackWriter
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"

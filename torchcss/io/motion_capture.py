@@ -33,9 +33,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from torchcss.errors import ConfigurationError
+from torchcss.errors import ConfigurationError, MotionCaptureError
 from torchcss.io.export.rotations import about
-from torchcss.io.motion_parsers import MotionCaptureError, Segment, parse_acclaim, parse_bvh
+from torchcss.io.motion_parsers import Segment, parse_acclaim, parse_bvh
 from torchcss.io.safe_load import shortened
 from torchcss.joint_names import canonical_joint_name
 

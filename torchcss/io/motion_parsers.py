@@ -17,13 +17,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from torchcss.errors import TorchcssError
+from torchcss.errors import MotionCaptureError
 from torchcss.io.export.rotations import about
 from torchcss.io.safe_load import one_line, shortened
-
-
-class MotionCaptureError(TorchcssError, ValueError):
-    """A motion capture file is missing, malformed, or not of the format that its name says."""
 
 
 class Turn(NamedTuple):
