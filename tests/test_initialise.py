@@ -17,7 +17,7 @@ from torchcss.first_pose import initialise_from_joints
 from torchcss.hypotheses import Initialisation, hang_on_best, stature_of
 from torchcss.initialise import DEFAULT_VIEW_DEGREES, default_camera, initialise
 from torchcss.interpretations import PAPER_PROPORTIONS, SINGLE_START, Search
-from torchcss.marks import default_sigma
+from torchcss.marks import default_sigma, typical_sigma
 from torchcss.metrics import LIMB_JOINTS, pa_mpjpe_mm
 from torchcss.random_person import Person, coverage, random_person
 from torchcss.types import Modes
@@ -280,6 +280,16 @@ def test_default_sigma_follows_the_persons_size():
     box = torch.tensor([[0.0, 0.0], [300.0, 400.0]])
     assert default_sigma(box) == pytest.approx(3.0)
     assert default_sigma(box / 100) == 1.0
+
+
+def test_typical_sigma_is_that_of_the_middle_frame():
+    box = torch.tensor([[0.0, 0.0], [300.0, 400.0], [0.0, 400.0]])
+    keypoints = torch.stack([box, 2 * box, 4 * box, 100 * box])
+    confidence = torch.tensor([[1, 1, 1], [0.3, 1, 0.3], [1, 1, 1], [1, 0, 0]])
+    assert typical_sigma(keypoints, confidence) == pytest.approx(6.0)
+    assert typical_sigma(keypoints[:2], confidence[:2]) == pytest.approx(4.5)
+    with pytest.raises(KeypointError, match="no frame has two keypoints"):
+        typical_sigma(keypoints[3:], confidence[3:])
 
 
 def test_public_name():

@@ -6,6 +6,7 @@ Everything here is about the marks as given; nothing is exchanged, moved or left
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -83,6 +84,29 @@ def default_sigma(keypoints: Float[Tensor, "j 2"]) -> float:
         return 3.0
     diagonal = (keypoints.max(dim=0).values - keypoints.min(dim=0).values).norm()
     return max(1.0, 0.006 * float(diagonal))
+
+
+def typical_sigma(keypoints: Float[Tensor, "t j 2"], confidence: Float[Tensor, "t j"]) -> float:
+    """Noise of a sequence's keypoints, pixels, from the person's typical size in it.
+
+    Args:
+        keypoints: Pixels.
+        confidence: 0 where a joint is missing.
+
+    Raises:
+        KeypointError: If no frame has two keypoints.
+    """
+    sizes = [
+        default_sigma(points[seen])
+        for points, seen in zip(keypoints, confidence > 0, strict=True)
+        if int(seen.sum()) >= 2
+    ]
+    if not sizes:
+        raise KeypointError(
+            "no frame has two keypoints, at least one has to; the person's size in the image, and "
+            "with it the keypoints' noise, cannot be told: give other keypoints"
+        )
+    return statistics.median(sizes)
 
 
 def check_joints(

@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 
 from torchcss.body.root import has_root
@@ -23,7 +22,7 @@ from torchcss.hypotheses import Initialisation
 from torchcss.initialise import initialise
 from torchcss.io.sequences import RecordedSequence
 from torchcss.io.video import Frame, VideoReader
-from torchcss.marks import default_sigma
+from torchcss.marks import typical_sigma
 from torchcss.metrics import first_loss
 from torchcss.pipeline import TrackedFrame, scale_keypoints, track_frames
 from torchcss.presets import PRESETS
@@ -69,14 +68,14 @@ def find_start(sequence: RecordedSequence, settings: Settings, *, start: int = 0
     camera = sequence.camera.to(dtype=dtype, device=device)
     truth = sequence.truth
     if truth is not None and truth.body.name == settings.body and not has_root(truth.body):
-        sigma = sequence.keypoint_noise_px or _typical_sigma(sequence)
+        sigma = sequence.keypoint_noise_px or typical_sigma(marks.keypoints, marks.confidence)
         first = initialise_from_joints(
             settings.body, camera, marks.keypoints[start], marks.confidence[start],
             marks.joint_names, generator=generator, joints=JointTerm(sigma=sigma),
             placed=truth.body.to(dtype=dtype, device=device), dtype=dtype, device=device,
         )  # fmt: skip
         return Start(first, sigma, generator)
-    sigma = _typical_sigma(sequence)
+    sigma = typical_sigma(marks.keypoints, marks.confidence)
     (frame,) = VideoReader(sequence.video, start=start, stop=start + 1)
     first = initialise(
         frame.image,
@@ -93,18 +92,6 @@ def find_start(sequence: RecordedSequence, settings: Settings, *, start: int = 0
         device=device,
     )
     return Start(first, sigma, generator)
-
-
-def _typical_sigma(sequence: RecordedSequence) -> float:
-    """Keypoint noise from the person's typical size in the image."""
-    marks = sequence.keypoints
-    seen = marks.confidence > 0
-    sizes = [
-        default_sigma(points[known])
-        for points, known in zip(marks.keypoints, seen, strict=True)
-        if int(known.sum()) >= 2
-    ]
-    return float(np.median(sizes))
 
 
 class SharedFeatures(FeatureExtractor):

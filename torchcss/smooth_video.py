@@ -30,15 +30,15 @@ from torchcss.body.model import BodyModel
 from torchcss.cost.frame import FrameCosts
 from torchcss.cost.joints import JointObservation
 from torchcss.cost.total import CostChoice, TrackingCost
-from torchcss.errors import ConfigurationError, KeypointError, TrackFileError, VideoError
+from torchcss.errors import ConfigurationError, TrackFileError, VideoError
 from torchcss.inference.smoothing import refine_in_windows
 from torchcss.io.cameras import check_image_size, read_camera
 from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body
-from torchcss.io.keypoints import Keypoints, read_keypoints
+from torchcss.io.keypoints import read_keypoints
 from torchcss.io.track_body import body_of_track
 from torchcss.io.tracks import SUMMARY_NAME, Track, read_summary
 from torchcss.io.video import Frame, VideoReader
-from torchcss.marks import default_sigma
+from torchcss.marks import typical_sigma
 from torchcss.pipeline import Observe, scale_keypoints
 from torchcss.settings import Settings, boundary_emphasis, make_choice, make_extractor
 from torchcss.smooth import (
@@ -217,6 +217,7 @@ def smooth_video(
         normalised=normalised,
         first_frame=first,
     )
+    sigma = typical_sigma(marks.keypoints, marks.confidence)
     extractor = make_extractor(settings)
     working = extractor.working_shape(width, height)
     scaled = scale_keypoints(marks.keypoints, (width, height), working).double()
@@ -236,7 +237,7 @@ def smooth_video(
         body=flesh,
         camera=loaded.camera,
         extractor=extractor,
-        cost=make_choice(settings, keypoint_noise(marks) * working[0] / width),
+        cost=make_choice(settings, sigma * working[0] / width),
         observe=observe,
         choice=choice,
         boundary_emphasis=boundary_emphasis(settings),
@@ -271,19 +272,3 @@ def settings_of(folder: Path, track: Track) -> Settings:
             f"{folder / SUMMARY_NAME}: its settings are not those of torchcss: {error}"
         ) from error
     return settings if settings.body else replace(settings, body=body_of_track(track).name)
-
-
-def keypoint_noise(marks: Keypoints) -> float:
-    """Keypoint noise in pixels, from the person's typical size over the whole sequence.
-
-    Raises:
-        KeypointError: If no frame has two keypoints.
-    """
-    sizes = [
-        default_sigma(points[seen > 0])
-        for points, seen in zip(marks.keypoints, marks.confidence, strict=True)
-        if int((seen > 0).sum()) >= 2
-    ]
-    if not sizes:
-        raise KeypointError("no frame has two keypoints; leave the video out")
-    return float(np.median(sizes))

@@ -10,21 +10,20 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from tqdm import tqdm
 
 from torchcss.cost.joints import JointObservation
-from torchcss.errors import ConfigurationError, KeypointError, VideoError
+from torchcss.errors import ConfigurationError, VideoError
 from torchcss.first_pose import LEAST_JOINTS
 from torchcss.hypotheses import Initialisation
 from torchcss.initialise import initialise
 from torchcss.io.cameras import check_image_size, read_camera
 from torchcss.io.fitted_body import read_fitted_body
-from torchcss.io.keypoints import Keypoints, read_keypoints
+from torchcss.io.keypoints import read_keypoints
 from torchcss.io.tracks import prepare_output_folder
 from torchcss.io.video import VideoReader
-from torchcss.marks import default_sigma
+from torchcss.marks import typical_sigma
 from torchcss.pipeline import scale_keypoints, track_frames
 from torchcss.presets import PRESETS
 from torchcss.recorder import Recorder
@@ -109,7 +108,7 @@ def track_video(
     generator = torch.Generator().manual_seed(settings.seed)
     dtype, device = settings.torch_dtype, settings.device
     eye = loaded.camera.to(dtype=dtype, device=device)
-    sigma = _sigma(marks)
+    sigma = typical_sigma(marks.keypoints, marks.confidence)
     if init is not None:
         first = _first_pose_from_file(init, eye, settings)
     else:
@@ -192,15 +191,3 @@ def _first_pose_from_file(path: Path, camera: Camera, settings: Settings) -> Ini
         )
     note = f"first pose: {len(fitted.cost)} hypotheses from {path}"
     return Initialisation(fitted.body, fitted.mixture, fitted.cost, (note,))
-
-
-def _sigma(marks: Keypoints) -> float:
-    """Keypoint noise, from the person's typical size over the whole sequence."""
-    sizes = [
-        default_sigma(points[seen > 0])
-        for points, seen in zip(marks.keypoints, marks.confidence, strict=True)
-        if int((seen > 0).sum()) >= 2
-    ]
-    if not sizes:
-        raise KeypointError("no frame has two keypoints; nothing can be tracked from them")
-    return float(np.median(sizes))
