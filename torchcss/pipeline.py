@@ -134,12 +134,14 @@ def track_frames(
             raise VideoError(f"the masks end before frame {frame.index}; give one for every frame")
         features = extractor(frame.image, last_image, mask)
         last_image = frame.image
+        jumping = time.perf_counter()
         searching, num_prior = tracker, len(state.mixture.mean)
         if lost and recovery is not None:
             searching = recovery.widened(tracker)
             state = recovery.with_jumps(state, body, camera)
         elif jumps_every and int(state.frame) % jumps_every == 0:
             state = with_flips(state, body, camera, num=NUM_JUMPS)
+        jumped = time.perf_counter() - jumping
         stopwatch = Stopwatch()
         cost = costs(
             features,
@@ -171,7 +173,10 @@ def track_frames(
             info,
             body.pose(mean).joints,
             terms,
-            {"features": featured - clock, "search": searched - featured},
+            {
+                "features": featured - clock - jumped,
+                "search": searched - featured + jumped,
+            },
             term_seconds,
             lost,
             0.0 if watch is None else watch.score,

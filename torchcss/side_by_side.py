@@ -103,7 +103,10 @@ class SharedFeatures(FeatureExtractor):
 
     def __init__(self, extractor: FeatureExtractor) -> None:
         super().__init__(
-            edges=extractor.edges, flow=extractor.flow, working_size=extractor.working_size
+            edges=extractor.edges,
+            flow=extractor.flow,
+            working_size=extractor.working_size,
+            colour=extractor.colour,
         )
         self.to(dtype=extractor.luma.dtype, device=extractor.luma.device)
         self._last: tuple[tuple[Any, ...], FrameFeatures] | None = None
