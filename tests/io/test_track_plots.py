@@ -154,6 +154,21 @@ def test_a_contact_sheet_shows_the_frames_asked_for(tmp_path: Path) -> None:
         track_plots.contact_sheet(video, ())
 
 
+def test_a_contact_sheet_of_an_overlay_counts_as_the_track_does(
+    track: Track, tmp_path: Path
+) -> None:
+    overlay = tmp_path / "overlay.mp4"
+    with VideoWriter(overlay, 25) as film:
+        for level in (0, 120, 240):
+            film.write(np.full((48, 64, 3), level, np.uint8))
+    figure = track_plots.contact_sheet(overlay, track.frames[1:], track=track)
+    assert [axes.get_title() for axes in figure.axes] == ["frame 11, 0.18 s", "frame 12, 0.20 s"]
+    means = [np.asarray(axes.get_images()[0].get_array()).mean() for axes in figure.axes]
+    np.testing.assert_allclose(means, [120, 240], atol=4)
+    with pytest.raises(ConfigurationError, match="no frames \\[0\\]"):
+        track_plots.contact_sheet(overlay, (0, 11), track=track)
+
+
 def test_a_body_of_ones_own(body: BodyModel) -> None:
     track = make_track(body)
     figure = track_plots.side_view_figure(track, 0, body=body.to(dtype=torch.float32))

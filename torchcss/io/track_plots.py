@@ -243,15 +243,17 @@ def contact_sheet(
     video: str | os.PathLike[str],
     frames: Sequence[int],
     *,
+    track: Track | None = None,
     columns: int | None = None,
     width_px: int = 360,
 ) -> Figure:
     """Frames of a video in a grid, with their times.
 
     Args:
-        video: The video, or a folder of images; for a track, its `overlay.mp4`, whose frames count
-            from the first one tracked.
+        video: The video, or a folder of images.
         frames: Which frames, in the order in which they are shown.
+        track: The track, if the video is its `overlay.mp4`. Frames and times are then those of the
+            video that was tracked.
         columns: Images in a row; all in one by default, up to six.
         width_px: Width to which wider images are reduced.
 
@@ -259,20 +261,24 @@ def contact_sheet(
         ConfigurationError: If no frames are asked for, or some that the video does not have.
         VideoError: If the video cannot be read.
     """
-    wanted = set(frames)
-    if not wanted:
+    if not len(frames):
         raise ConfigurationError("frames: expected at least one, got none")
+    place = {int(frame): int(frame) for frame in frames}
+    if track is not None:
+        row = {int(frame): row for row, frame in enumerate(track.frames)}
+        place = {frame: row.get(frame, -1) for frame in place}
     images: dict[int, tuple[float, np.ndarray]] = {}
-    for frame in VideoReader(video, stop=max(*wanted, 0) + 1):
-        if frame.index in wanted:
+    for frame in VideoReader(video, stop=max(*place.values(), 0) + 1):
+        if frame.index in place.values():
             height, width = frame.image.shape[:2]
             if width > width_px:
                 size = (width_px, max(round(height * width_px / width), 1))
                 small = np.asarray(Image.fromarray(frame.image).resize(size))
             else:
                 small = frame.image
-            images[frame.index] = frame.time_s, small
-    if missing := sorted(wanted - set(images)):
+            time = frame.time_s if track is None else float(track.times[frame.index])
+            images[frame.index] = time, small
+    if missing := [frame for frame, row in place.items() if row not in images]:
         raise ConfigurationError(f"{video}: no frames {missing}; choose others")
 
     columns = columns or min(len(frames), 6)
@@ -284,7 +290,7 @@ def contact_sheet(
     for axes in grid.flat:
         axes.set_axis_off()
     for axes, index in zip(grid.flat, frames, strict=False):
-        time, image = images[index]
+        time, image = images[place[int(index)]]
         axes.imshow(image)
         axes.set_title(f"frame {index}, {time:.2f} s", fontsize=9)
     return figure
