@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,8 @@ from torchcss.errors import ConfigurationError, OutputError, VideoError
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.tracker import Tracker, TrackerState
 from torchcss.io import tracks
+from torchcss.io.fitted_body import read_fitted_body
+from torchcss.io.track_body import body_of_track
 from torchcss.io.video import Frame, VideoWriter
 from torchcss.pipeline import TrackedFrame, follow_with_base, scale_keypoints, track_frames
 from torchcss.presets import PRESETS, make_tracker
@@ -81,16 +84,24 @@ def run(clip: Path, out: Path, **settings) -> dict:
     )
 
 
-def test_writes_what_the_design_says(clip: Path, tmp_path: Path):
-    summary = track_video(
+@pytest.fixture(scope="module")
+def tracked(clip: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
+    """A folder that the clip was tracked into, with all defaults, and the summary."""
+    folder = tmp_path_factory.mktemp("tracked")
+    return folder, track_video(
         clip / "video.mp4",
         camera=clip / "cameras.json",
         keypoints=clip / "keypoints.npz",
-        out=tmp_path,
+        out=folder,
         settings=Settings(body="arm7", samples=6, modes=2),
     )
-    assert {p.name for p in tmp_path.iterdir()} == {"track.npz", "summary.json", "overlay.mp4"}
-    track = torchcss.load_track(tmp_path)
+
+
+def test_writes_what_the_design_says(tracked: tuple[Path, dict]):
+    folder, summary = tracked
+    names = {"track.npz", "summary.json", "overlay.mp4", "body.npz"}
+    assert {p.name for p in folder.iterdir()} == names
+    track = torchcss.load_track(folder)
     assert track.frames.tolist() == list(range(FRAMES))
     assert track.state_names == load_body("arm7").state_names
     k = track.state.shape[1]
@@ -99,7 +110,7 @@ def test_writes_what_the_design_says(clip: Path, tmp_path: Path):
     weights = np.exp(track.log_weight)
     np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-9)
     assert (np.diff(weights, axis=1) <= 0).all()
-    on_disk = tracks.read_summary(tmp_path)
+    on_disk = tracks.read_summary(folder)
     assert on_disk["ended"] == summary["ended"] == "complete"
     assert (on_disk["samples"], on_disk["modes"], on_disk["body"]) == (6, 2, "arm7")
     assert on_disk["samples_optimised"] == 6 * FRAMES
@@ -114,6 +125,33 @@ def test_writes_what_the_design_says(clip: Path, tmp_path: Path):
     ):
         assert key in on_disk
     assert (track.parent[0] == -1).all()
+
+
+def test_the_body_lies_beside_the_track(clip: Path, tracked: tuple[Path, dict], tmp_path: Path):
+    """What was fitted, and again where it was given; the user's own file stays as it is."""
+    fitted = read_fitted_body(tracked[0])
+    body = body_of_track(torchcss.load_track(tracked[0]), fitted.body)
+    # Flesh that was fitted, on the lengths of the track.
+    assert not torch.equal(body.part_shape, load_body("arm7", lengths=body.lengths).part_shape)
+    own = tmp_path / "own" / "body.npz"
+    own.parent.mkdir()
+    shutil.copy(tracked[0] / "body.npz", own)
+    before = own.read_bytes()
+    for init, out in ((own, tmp_path / "out"), (own.parent, own.parent), (own, own.parent)):
+        track_video(
+            clip / "video.mp4",
+            camera=clip / "cameras.json",
+            keypoints=clip / "keypoints.npz",
+            out=out,
+            init=init,
+            settings=Settings(body="arm7", samples=2, modes=1, overlay=False, terms=("joints",)),
+            stop=1,
+        )
+        again = read_fitted_body(out)
+        torch.testing.assert_close(again.body.part_shape, body.part_shape)
+        assert again.body.lengths == pytest.approx(fitted.body.lengths)
+        torch.testing.assert_close(again.mixture.mean, fitted.mixture.mean)
+    assert own.read_bytes() == before
 
 
 def test_same_seed_same_track(clip: Path, tmp_path: Path):

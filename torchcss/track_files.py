@@ -19,7 +19,7 @@ from torchcss.first_pose import LEAST_JOINTS
 from torchcss.hypotheses import Initialisation
 from torchcss.initialise import initialise
 from torchcss.io.cameras import check_image_size, read_camera
-from torchcss.io.fitted_body import read_fitted_body
+from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body, write_fitted_body
 from torchcss.io.keypoints import read_keypoints
 from torchcss.io.tracks import prepare_output_folder
 from torchcss.io.video import VideoReader
@@ -60,7 +60,8 @@ def track_video(
         video: A video, or a folder of images.
         camera: Calibration file, see `torchcss.io.cameras`.
         keypoints: 2D joints, see `torchcss.io.keypoints`.
-        out: Folder for `track.npz`, `summary.json` and `overlay.mp4`.
+        out: Folder for `track.npz`, `summary.json`, `overlay.mp4`, and the body at its first pose,
+            `body.npz`, by which `torchcss.smooth_video` knows its flesh.
         settings: How to track.
         camera_name: Which camera of the file; by default the one of this video.
         start: First frame.
@@ -81,6 +82,7 @@ def track_video(
     settings = settings or Settings()
     out = Path(out)
     prepare_output_folder(out)
+    fitted_path = out / FITTED_BODY_NAME
     part = {"start": start, "stop": stop, "stride": stride}
     reader = VideoReader(video, **part)
     width, height = reader.info.width, reader.info.height
@@ -130,6 +132,9 @@ def track_video(
     notes += first.report
     for note in notes:
         tqdm.write(note)
+    # What it was read from stays as it is, be it in the same folder.
+    if init is None or Path(init).resolve() not in (out.resolve(), fitted_path.resolve()):
+        write_fitted_body(fitted_path, first, eye)
 
     extractor = make_extractor(settings)
     working = extractor.working_shape(width, height)
@@ -190,4 +195,6 @@ def _first_pose_from_file(path: Path, camera: Camera, settings: Settings) -> Ini
             f"give the body {fitted.body.name}"
         )
     note = f"first pose: {len(fitted.cost)} hypotheses from {path}"
-    return Initialisation(fitted.body, fitted.mixture, fitted.cost, (note,))
+    return Initialisation(
+        fitted.body, fitted.mixture, fitted.cost, (note,), fitted.lengths, fitted.scale
+    )

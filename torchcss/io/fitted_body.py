@@ -21,6 +21,7 @@ the same place, such as the calibrated one of a video whose first frame was fitt
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -47,11 +48,15 @@ class FittedBody(NamedTuple):
         body: The body, on its base.
         mixture: The hypotheses, best first.
         cost: Their costs, nats.
+        lengths: Fitted lengths, metres, as the file has them; empty where they were given.
+        scale: Of the standard humanoid.
     """
 
     body: BodyModel
     mixture: GaussianMixture
     cost: torch.Tensor
+    lengths: Mapping[str, float]
+    scale: float
 
 
 def write_fitted_body(path: str | os.PathLike[str], found: Initialisation, camera: Camera) -> None:
@@ -151,7 +156,9 @@ def read_fitted_body(
         mixture = GaussianMixture(
             tensor("state", k, n), tensor("covariance", k, n, n), tensor("log_weight", k)
         )
-        return FittedBody(body.with_base(rotation, translation), mixture, tensor("cost", k))
+        body = body.with_base(rotation, translation)
+        fitted = dict(zip(names, lengths, strict=True))
+        return FittedBody(body, mixture, tensor("cost", k), fitted, scale)
     except KeyError as error:
         raise BodyError(
             f"{path}: not a fitted body: {error.args[0]} is missing; expected what torchcss init "
