@@ -274,3 +274,9 @@ def test_track_smooths_when_it_is_done(files: Path, capsys: pytest.CaptureFixtur
     found = load_track(files / "out" / "smooth.npz")
     assert found.state.shape[:2] == (3, 1)
     assert "smoothed" in read_summary(files / "out")
+
+
+def test_public_names():
+    assert torchcss.smooth_track is smooth_track
+    assert torchcss.smooth_file is smooth_file
+    assert callable(torchcss.smooth_video)

@@ -11,6 +11,8 @@ from torchcss.io.export import export_track
 from torchcss.io.tracks import Track, load_track
 from torchcss.pipeline import track_frames
 from torchcss.settings import Settings
+from torchcss.smooth import smooth_file, smooth_track
+from torchcss.smooth_video import smooth_video
 from torchcss.track_files import track_video
 from torchcss.vision.camera import Camera
 
@@ -24,6 +26,9 @@ __all__ = [
     "initialise",
     "load_body",
     "load_track",
+    "smooth_file",
+    "smooth_track",
+    "smooth_video",
     "track_frames",
     "track_video",
 ]
