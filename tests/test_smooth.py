@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+import torchcss
 from torchcss import cli, load_body, load_track
 from torchcss.body.model import BodyModel
 from torchcss.body.root import move_base
