@@ -109,13 +109,7 @@ class Recorder:
         writer = TrackWriter(
             self.folder / "track.npz", state_names=body.state_names, joint_names=body.joint_names
         )
-        totals: dict[str, float] = {}
-        terms: dict[str, float] = {}
-        term_seconds: dict[str, float] = {}
-        counts = {"samples": 0, "iterations": 0, "distinct": 0, "lost": 0}
-        statuses = torch.zeros(len(Status), dtype=torch.long)
-        events: list[dict[str, Any]] = []
-        lost = False
+        totals = _Totals()
         ended, began = "interrupted", time.perf_counter()
         saved, took = began, 0.0
         summary: dict[str, Any] = {}
@@ -132,29 +126,7 @@ class Recorder:
                     drawn = time.perf_counter()
                     if film is not None:
                         film.write(draw_modes(frame, self.camera))
-                    seconds = {**frame.seconds, "overlay": time.perf_counter() - drawn}
-                    for into, values in (
-                        (totals, seconds),
-                        (terms, frame.terms),
-                        (term_seconds, frame.term_seconds),
-                    ):
-                        for name, value in values.items():
-                            into[name] = into.get(name, 0.0) + value
-                    counts["samples"] += int(frame.info.num_samples)
-                    counts["iterations"] += int(frame.info.num_steps.sum())
-                    counts["distinct"] += int(frame.info.num_distinct)
-                    if frame.lost != lost:
-                        lost = frame.lost
-                        events.append(
-                            {
-                                "event": "lost" if lost else "found",
-                                "frame": frame.frame.index,
-                                "time_s": frame.frame.time_s,
-                                "deviations": frame.loss_score,
-                            }
-                        )
-                    counts["lost"] += frame.lost
-                    statuses += frame.info.status_counts.cpu()
+                    totals.add(frame, overlay_s=time.perf_counter() - drawn)
                     bar.set_postfix(
                         cost=f"{float(frame.info.cost[0]):.1f}",
                         modes=len(frame.state.mixture.mean),
@@ -168,10 +140,8 @@ class Recorder:
             finally:
                 if len(writer):
                     writer.save()
-                    summary = self._summary(
-                        ended, len(writer), time.perf_counter() - began, totals, terms,
-                        term_seconds, counts, statuses, events,
-                    )  # fmt: skip
+                    wall = time.perf_counter() - began
+                    summary = self._summary(ended, len(writer), wall, totals)
                     write_summary(self.folder, summary)
         return summary
 
@@ -192,18 +162,7 @@ class Recorder:
             base_transform=base,
         )
 
-    def _summary(
-        self,
-        ended: str,
-        num_frames: int,
-        wall: float,
-        seconds: dict[str, float],
-        terms: dict[str, float],
-        term_seconds: dict[str, float],
-        counts: dict[str, int],
-        statuses: Tensor,
-        events: list[dict[str, Any]],
-    ) -> dict[str, Any]:
+    def _summary(self, ended: str, num_frames: int, wall: float, totals: _Totals) -> dict[str, Any]:
         return {
             "ended": ended,
             "body": self.settings.body,
@@ -218,24 +177,82 @@ class Recorder:
             },
             "num_frames": num_frames,
             "seconds_per_frame": wall / num_frames,
-            "seconds_per_frame_by_stage": {k: v / num_frames for k, v in seconds.items()},
-            "samples_optimised": counts["samples"],
-            "iterations": counts["iterations"],
-            "iterations_per_sample": counts["iterations"] / max(counts["samples"], 1),
-            "distinct_modes_per_frame": counts["distinct"] / num_frames,
-            "events": events,
-            "frames_searched_widely": counts["lost"],
-            "optimiser_status": {s.name.lower(): int(statuses[s]) for s in Status},
-            "best_mode_cost_by_term": {k: v / num_frames for k, v in terms.items()},
-            "share_of_cost_by_term": _shares(terms),
-            "share_of_search_time_by_term": _shares(
-                {
-                    **term_seconds,
-                    "optimiser": seconds.get("search", 0.0) - sum(term_seconds.values()),
-                }
-            ),
+            **totals.summary(num_frames),
             "notes": self.notes,
             **self.extra,
+        }
+
+
+@dataclass(kw_only=True)
+class _Totals:
+    """What the frames of a run add up to.
+
+    Attributes:
+        seconds: Wall time by stage.
+        terms: Cost of the best modes by term, nats.
+        term_seconds: Wall time of the search by what was evaluated.
+        samples: Samples optimised, or weighed.
+        iterations: Iterations of the optimiser, of all samples.
+        distinct: Distinct modes found.
+        lost: Frames that counted as lost.
+        statuses: How many samples ended with each `Status`, by its number.
+        events: When the target was lost and found.
+    """
+
+    seconds: dict[str, float] = field(default_factory=dict)
+    terms: dict[str, float] = field(default_factory=dict)
+    term_seconds: dict[str, float] = field(default_factory=dict)
+    samples: int = 0
+    iterations: int = 0
+    distinct: int = 0
+    lost: int = 0
+    statuses: Tensor = field(default_factory=lambda: torch.zeros(len(Status), dtype=torch.long))
+    events: list[dict[str, Any]] = field(default_factory=list)
+
+    def add(self, frame: TrackedFrame, *, overlay_s: float) -> None:
+        """Take in a frame, and how long it took to draw it."""
+        for into, values in (
+            (self.seconds, {**frame.seconds, "overlay": overlay_s}),
+            (self.terms, frame.terms),
+            (self.term_seconds, frame.term_seconds),
+        ):
+            for name, value in values.items():
+                into[name] = into.get(name, 0.0) + value
+        self.samples += int(frame.info.num_samples)
+        self.iterations += int(frame.info.num_steps.sum())
+        self.distinct += int(frame.info.num_distinct)
+        self.lost += frame.lost
+        self.statuses += frame.info.status_counts.cpu()
+        was_lost = bool(self.events) and self.events[-1]["event"] == "lost"
+        if frame.lost != was_lost:
+            self.events.append(
+                {
+                    "event": "lost" if frame.lost else "found",
+                    "frame": frame.frame.index,
+                    "time_s": frame.frame.time_s,
+                    "deviations": frame.loss_score,
+                }
+            )
+
+    def summary(self, num_frames: int) -> dict[str, Any]:
+        """The entries of the summary.
+
+        Args:
+            num_frames: Frames written; an interruption may leave one more than was added.
+        """
+        optimiser = self.seconds.get("search", 0.0) - sum(self.term_seconds.values())
+        return {
+            "seconds_per_frame_by_stage": {k: v / num_frames for k, v in self.seconds.items()},
+            "samples_optimised": self.samples,
+            "iterations": self.iterations,
+            "iterations_per_sample": self.iterations / max(self.samples, 1),
+            "distinct_modes_per_frame": self.distinct / num_frames,
+            "events": self.events,
+            "frames_searched_widely": self.lost,
+            "optimiser_status": {s.name.lower(): int(self.statuses[s]) for s in Status},
+            "best_mode_cost_by_term": {k: v / num_frames for k, v in self.terms.items()},
+            "share_of_cost_by_term": _shares(self.terms),
+            "share_of_search_time_by_term": _shares({**self.term_seconds, "optimiser": optimiser}),
         }
 
 
