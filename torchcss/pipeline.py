@@ -126,7 +126,8 @@ def track_frames(
     )
     last_image, foregrounds = None, None if masks is None else iter(masks)
     state, appearance = tracker.init(mixture, generator=generator), None
-    lost, watch = False, None if recovery is None else recovery.monitor.init()
+    lost, num_lost = False, 0
+    watch = None if recovery is None else recovery.monitor.init()
     for frame in frames:
         clock = time.perf_counter()
         mask = None
@@ -136,7 +137,7 @@ def track_frames(
         last_image = frame.image
         jumping = time.perf_counter()
         searching, num_prior = tracker, len(state.mixture.mean)
-        if lost and recovery is not None:
+        if recovery is not None and 0 < num_lost <= recovery.patience:
             searching = recovery.widened(tracker)
             state = recovery.with_jumps(state, body, camera)
         elif jumps_every and int(state.frame) % jumps_every == 0:
@@ -164,6 +165,7 @@ def track_frames(
         terms = {name: float(value[0]) for name, value in values.items()}
         if recovery is not None and watch is not None:
             watch, lost = recovery.judge(watch, terms)
+            num_lost = num_lost + 1 if lost else 0
         if not lost:
             appearance = costs.learn(appearance, features, body, mean[0])
         yield TrackedFrame(

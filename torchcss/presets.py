@@ -74,6 +74,7 @@ class Preset:
         evidence: See `Tracker`. On the rendered arm 0.1 (with a memory of 0.98) takes the best
             mode's error from 128 to 59 mm: of two poses that look alike the one that was right so
             far stays the best.
+        finalists: See `Tracker`; it matters with many samples only.
         proposal_arm: Where samples go for an arm, if elsewhere than for a body.
         persistence: Share of its last motion that a mode goes on with: 0 is driftless diffusion, 1
             constant velocity. The papers' trackers have 0. With 0.8 a mode does not lag behind a
@@ -100,6 +101,7 @@ class Preset:
     modes_body: int = 7
     memory: float = 1.0
     evidence: float = 1.0
+    finalists: int = 0
     proposal_arm: Proposal | None = None
     persistence: float = 0.0
     noise: float = 1.0
@@ -140,6 +142,7 @@ _CSS = Preset(
     samples_body=60,
     memory=0.98,
     evidence=0.1,
+    finalists=100,
     persistence=_PERSISTENCE,
     separation=0.05,
     jumps_every=3,
@@ -193,6 +196,7 @@ PRESETS: dict[str, Preset] = {
         what="css as printed: weights multiplied, minima however alike, no jumps to flips",
         memory=1.0,
         evidence=1.0,
+        finalists=0,
         separation=0.0,
         jumps_every=0,
     ),
@@ -313,6 +317,7 @@ def make_tracker(
         optimiser=TrustRegionNewton(max_steps=20, tolerance=1e-2),
         memory=row.memory,
         evidence=row.evidence,
+        finalists=row.finalists,
         dynamics=dynamics,
         separation=row.separation,
     )

@@ -32,6 +32,8 @@ class Recovery:
         modes: How many times as many modes.
         scale: Factor on the covariance scale.
         num_flips: Most flips of the best mode that join the search, see `torchcss.jumps`.
+        patience: Frames in a row that are searched widely. What is not found by then has left, or
+            the picture has changed for good; the track stays marked as lost.
     """
 
     monitor: LossMonitor = field(default_factory=LossMonitor)
@@ -39,6 +41,7 @@ class Recovery:
     modes: int = 2
     scale: float = 2.0
     num_flips: int = 12
+    patience: int = 25
 
     def judge(self, state: MonitorState, terms: Mapping[str, float]) -> tuple[MonitorState, bool]:
         """Take in what the terms of a frame cost at the best mode; see `LossMonitor.update`."""

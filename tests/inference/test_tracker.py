@@ -285,3 +285,31 @@ def test_separation_keeps_modes_whose_landmarks_differ(generator):
     assert found(CombWithLandmarks(), 50.0, 3) == [0, 1, -1]
     # A cost without landmarks is not concerned.
     assert found(Comb(), 1.4, 3) == [0, 1, -1]
+
+
+def test_a_race_leaves_the_best_minima_and_takes_fewer_evaluations(generator):
+    def run(finalists: int):
+        tracker = replace(CSS, num_samples=200, num_modes=5, finalists=finalists)
+        start = tracker.init(single((0.0, 0.0), (0.6, 0.1)), generator=generator)
+        return tracker.step(start, Comb(), problems.box(2, -3.7, 3.7))
+
+    (every, all_of_them), (raced, info) = run(0), run(20)
+    torch.testing.assert_close(raced.mixture.mean[:3], every.mixture.mean[:3], rtol=0, atol=1e-3)
+    assert int(info.num_samples) == int(all_of_them.num_samples) == 200
+    assert int(info.status_counts.sum()) <= 20
+    assert int(info.num_steps.sum()) < 0.8 * int(all_of_them.num_steps.sum())
+
+
+def test_a_race_never_drops_the_modes_that_go_on(generator):
+    """The lesser well is the worst of all starts once half of the samples are near the better."""
+    well = problems.DoubleWell(tilt=0.4)
+    both = GaussianMixture(
+        well.minima,
+        1e-4 * torch.eye(2).double().expand(2, 2, 2),
+        torch.tensor([0.0, -9.0]).double(),
+    )
+    tracker = replace(CSS, num_samples=60, num_modes=2, finalists=4)
+    state, _ = tracker.step(tracker.init(both, generator=generator), well, BOUNDS)
+    torch.testing.assert_close(
+        state.mixture.mean.sort(dim=0).values, well.minima.sort(dim=0).values, rtol=0, atol=0.05
+    )

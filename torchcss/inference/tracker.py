@@ -22,7 +22,7 @@ restored continues exactly as one that was never interrupted.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Protocol
 
 import torch
@@ -47,6 +47,10 @@ CostFactory = Callable[[Tensor, GaussianMixture], CostFunction]
 """Makes a frame's cost from the samples' parents `[s]` and the prior mixture that they index, for
 costs that compare a sample with the mode that it came from. The cost then has `take` (see
 `CostFunction`)."""
+
+
+_HEAT_STEPS = 3
+"""Steps of descent after which samples are compared."""
 
 
 class Particles(NamedTuple):
@@ -94,7 +98,8 @@ class TrackerInfo(NamedTuple):
         parent: Prior mode matched with each mode (Fig. 6 step 5); -1 for none.
         origin: Prior mode whose sample descended to each mode.
         status_counts: How many samples ended with each `Status`, by its number.
-        num_steps: Optimiser iterations of every sample.
+        num_steps: Optimiser iterations of every descent; a sample that goes on after a comparison
+            (`Tracker.finalists`) has several.
         num_samples: Samples optimised, or weighed, a scalar.
         num_distinct: Distinct modes found before pruning, a scalar; 0 if modes were carried over.
         effective_sample_size: `1 / sum w^2` over the weights of the distinct modes, a scalar: how
@@ -212,6 +217,9 @@ class Tracker:
         oversampling: How many times as many samples are drawn as descend: above one, the best
             `num_samples` are kept, by the cost's `screening()` if it has that cheaper self. Section
             4.2 [RR] scores sampled hypotheses by their edges alone.
+        finalists: With more samples than these, all descend a few steps, the better of them a few
+            more, and so many to the end: a sample that starts far up seldom overtakes. Zero: all
+            descend to the end, as in Fig. 6.
         standard_bhattacharyya: Match modes by the distance of the literature instead of the one
             printed (design decision 4).
         separation: Modes whose landmarks are nearer to each other than this, on average, are one
@@ -232,6 +240,7 @@ class Tracker:
     evidence: float = 1.0
     coarse_every: int = 3
     oversampling: int = 1
+    finalists: int = 0
     standard_bhattacharyya: bool = False
     separation: float = 0.0
 
@@ -297,6 +306,9 @@ class Tracker:
             rough = self.optimiser.minimise(part, samples.x[some], bounds, scale=scale)
             samples = samples._replace(x=samples.x.index_copy(0, some, rough.mean))
 
+        started = len(samples.x)
+        cost, samples, raced = self._race(cost, samples, len(prior.mean), bounds, scale)
+
         # 2.3: descend from every sample, and discard minima found before.
         modes = self.optimiser.minimise(
             cost, samples.x, bounds, scale=scale, prior_variance=prior_variance
@@ -345,14 +357,52 @@ class Tracker:
             parent=parent,
             origin=origin,
             status_counts=torch.bincount(modes.status, minlength=len(Status)),
-            num_steps=modes.num_steps,
-            num_samples=torch.tensor(len(samples.x)),
+            num_steps=torch.cat([modes.num_steps, raced]),
+            num_samples=torch.tensor(started),
             num_distinct=torch.tensor(len(distinct)),
             effective_sample_size=effective,
             survival=spread,
         )
         state = TrackerState(mixture, velocity, generator.get_state(), state.frame + 1)
         return state, info
+
+    def _race(
+        self,
+        cost: CostFunction,
+        samples: Samples,
+        num_modes: int,
+        bounds: Bounds,
+        scale: Float[Tensor, " n"] | None,
+    ) -> tuple[CostFunction, Samples, Int[Tensor, " r"]]:
+        """Drop what falls behind in descending, until the finalists are left.
+
+        Returns:
+            The cost of the finalists, the finalists where they have got to, and the steps that were
+            taken.
+        """
+        steps = []
+        count = len(samples.x)
+        if self.finalists and count > self.finalists:
+            heat = replace(self.optimiser, max_steps=_HEAT_STEPS)
+            for size in (round((count * self.finalists) ** 0.5), self.finalists):
+                modes = heat.minimise(cost, samples.x, bounds, scale=scale)
+                steps.append(modes.num_steps)
+                # Samples in one minimum count as one, or the best would take all places.
+                rank = torch.full_like(modes.cost, torch.inf)
+                distinct = distinct_modes(
+                    modes.mean, modes.covariance, modes.cost, distance=self.duplicate_distance
+                )
+                rank[distinct] = modes.cost[distinct].nan_to_num(torch.inf)
+                # The modes that go on from the last frame come first, and are never dropped.
+                rank[:num_modes] = -torch.inf
+                kept = min(size, int((rank < torch.inf).sum()))
+                best = rank.argsort(stable=True)[:kept].sort().values
+                samples = samples._replace(x=modes.mean)
+                samples = Samples(*(part[best] for part in samples))
+                restrict = getattr(cost, "take", None)
+                cost = cost if restrict is None else restrict(best)
+        raced = torch.cat(steps) if steps else samples.parent.new_zeros(0)
+        return cost, samples, raced
 
     def track(
         self,
