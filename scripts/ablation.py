@@ -34,14 +34,16 @@ EDGES = ("contour", *BASE)
 BOUNDARIES = ("motion_boundaries", *EDGES)
 FLOW = ("flow", *BOUNDARIES)
 BODY = ("interpenetration", *FLOW)
+REGION = ("region", *BODY)
 ROWS = {
     "joints and priors only": BASE,
     "+ contour": EDGES,
     "+ motion boundaries": BOUNDARIES,
     "+ flow": FLOW,
     "+ interpenetration": BODY,
-    "+ edge energy": ("edge_energy", *BODY),
-    "+ previous mixture": ("temporal_mixture", *BODY),
+    "+ region": REGION,
+    "+ edge energy": ("edge_energy", *REGION),
+    "+ previous mixture": ("temporal_mixture", *REGION),
     "contour + flow": ("flow", *EDGES),
     "contour + interpenetration": ("interpenetration", *EDGES),
     "edge energy for contour": ("edge_energy", *BASE),

@@ -247,7 +247,7 @@ def test_motion_of_a_frame_of_one_colour_is_unusable(
 def test_motion_of_thin_small_and_saturated_frames(
     size: tuple[int, int], dtype: torch.dtype, generator: torch.Generator
 ) -> None:
-    extractor = FeatureExtractor(flow=TRACKING, working_size=24).to(dtype)
+    extractor = FeatureExtractor(flow=TRACKING, working_size=24, colour=True).to(dtype)
     frames = torch.randint(0, 256, (2, *size, 4), generator=generator, dtype=torch.uint8)
     saturated = torch.where(frames > 128, 255, 0).to(torch.uint8)
     for before, after in (frames, saturated, (frames[0], saturated[1])):
@@ -273,3 +273,17 @@ def test_motion_between_pictures_of_all_kinds(picture: torch.Tensor) -> None:
     for previous in (sixteen, with_alpha, picture.float() / 255.0, extractor(picture).grey):
         features = extractor(shifted, previous)
         torch.testing.assert_close(features.flow, expected.flow, rtol=0.0, atol=1e-2)
+
+
+def test_colours_are_those_of_the_frame_at_the_working_size(picture: torch.Tensor) -> None:
+    assert FeatureExtractor()(picture).colour is None
+    extractor = FeatureExtractor(colour=True)
+    features = extractor(picture)
+    torch.testing.assert_close(features.colour, picture[..., :3].movedim(-1, 0) / 255.0)
+    torch.testing.assert_close(
+        torch.einsum("chw,c->hw", features.colour, extractor.luma), features.grey
+    )
+    grey = extractor(features.grey)
+    torch.testing.assert_close(grey.colour, features.grey.expand(3, -1, -1))
+    small = FeatureExtractor(colour=True, working_size=20)(picture)
+    assert small.colour.shape == (3, *small.grey.shape)
