@@ -46,7 +46,7 @@ LAYERS = (
     {"sampling_study"},
     {"settings"},
     {"io"},
-    {"pipeline", "initialise_image", "smooth", "retarget"},
+    {"pipeline", "initialise_image", "first_frame", "smooth", "retarget"},
     {"yardstick", "side_by_side"},
     {"recorder"},
     {"track_files", "smooth_video"},

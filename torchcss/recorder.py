@@ -23,11 +23,10 @@ from tqdm import tqdm
 
 from torchcss.body.model import BodyModel
 from torchcss.inference.tracker import SequenceTracker
-from torchcss.io.overlay import ProjectedPart, draw_overlay
+from torchcss.io.overlay import draw_overlay, project_body
 from torchcss.io.tracks import TrackWriter, write_summary
 from torchcss.io.video import VideoWriter
 from torchcss.pipeline import TrackedFrame
-from torchcss.raster import grid_faces
 from torchcss.settings import Settings
 from torchcss.types import Status
 from torchcss.vision.camera import Camera
@@ -49,18 +48,7 @@ def draw_modes(
         meridians: Longitudes of the drawn mesh.
     """
     body, mixture = tracked.body, tracked.state.mixture
-    mesh = body.mesh(rings, meridians)
-    faces = grid_faces(rings, meridians)
-    rotation, centre = body.part_poses(body.pose(mixture.mean))
-    local = mesh.points.flatten(1, 2)
-    points = local @ rotation.transpose(-1, -2) + centre[..., None, :]
-    modes = []
-    for mode in points:
-        parts = []
-        for part, vertices in enumerate(mode):
-            uv, depth, valid = (tensor.cpu() for tensor in camera.project(vertices))
-            parts.append(ProjectedPart(uv, depth, valid, faces, part))
-        modes.append(parts)
+    modes = project_body(body, mixture.mean, camera, rings=rings, meridians=meridians)
     text = (
         f"frame {tracked.frame.index}   {len(modes)} modes   cost {float(tracked.info.cost[0]):.1f}"
     )

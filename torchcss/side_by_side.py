@@ -17,9 +17,9 @@ import torch
 from torchcss.body.root import has_root
 from torchcss.cost.joints import JointObservation, JointTerm
 from torchcss.errors import TorchcssError
-from torchcss.first_pose import LEAST_JOINTS, initialise_from_joints
+from torchcss.first_frame import initialise_video
+from torchcss.first_pose import initialise_from_joints
 from torchcss.hypotheses import Initialisation
-from torchcss.initialise import initialise
 from torchcss.io.sequences import RecordedSequence
 from torchcss.io.video import Frame, VideoReader
 from torchcss.marks import typical_sigma
@@ -76,20 +76,8 @@ def find_start(sequence: RecordedSequence, settings: Settings, *, start: int = 0
         )  # fmt: skip
         return Start(first, sigma, generator)
     sigma = typical_sigma(marks.keypoints, marks.confidence)
-    (frame,) = VideoReader(sequence.video, start=start, stop=start + 1)
-    first = initialise(
-        frame.image,
-        torch.cat([marks.keypoints[start], marks.confidence[start, :, None]], dim=-1),
-        camera,
-        settings.body,
-        joint_names=marks.joint_names,
-        generator=generator,
-        sigma=sigma,
-        contours="contour" in settings.terms,
-        working_size=settings.working_size,
-        least_joints=LEAST_JOINTS,
-        dtype=dtype,
-        device=device,
+    first = initialise_video(
+        sequence.video, marks, camera, settings, start=start, sigma=sigma, generator=generator
     )
     return Start(first, sigma, generator)
 

@@ -15,9 +15,8 @@ from tqdm import tqdm
 
 from torchcss.cost.joints import JointObservation
 from torchcss.errors import ConfigurationError, VideoError
-from torchcss.first_pose import LEAST_JOINTS
+from torchcss.first_frame import initialise_video
 from torchcss.hypotheses import Initialisation
-from torchcss.initialise import initialise
 from torchcss.io.cameras import check_image_size, read_camera
 from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body, write_fitted_body
 from torchcss.io.keypoints import read_keypoints
@@ -114,20 +113,8 @@ def track_video(
     if init is not None:
         first = _first_pose_from_file(init, eye, settings)
     else:
-        (frame,) = VideoReader(video, start=start, stop=start + 1)
-        first = initialise(
-            frame.image,
-            torch.cat([marks.keypoints[start], marks.confidence[start, :, None]], dim=-1),
-            eye,
-            settings.body,
-            joint_names=marks.joint_names,
-            generator=generator,
-            sigma=sigma,
-            contours="contour" in settings.terms,
-            working_size=settings.working_size,
-            least_joints=LEAST_JOINTS,
-            dtype=dtype,
-            device=device,
+        first = initialise_video(
+            video, marks, eye, settings, start=start, sigma=sigma, generator=generator
         )
     notes += first.report
     for note in notes:

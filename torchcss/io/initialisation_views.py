@@ -21,8 +21,7 @@ from torch import Tensor
 from torchcss.body.catalog import LENGTHS
 from torchcss.body.model import BodyModel
 from torchcss.io.atomic import replace_file
-from torchcss.io.overlay import PALETTE, ProjectedPart, draw_overlay
-from torchcss.raster import grid_faces
+from torchcss.io.overlay import PALETTE, draw_overlay, project_body
 from torchcss.vision.camera import Camera
 
 _BONES = (
@@ -57,17 +56,7 @@ def draw_fit(
         keypoints: The marked joints.
         text: A line for the lower left corner.
     """
-    rings, meridians = 20, 24
-    mesh, faces = body.mesh(rings, meridians), grid_faces(rings, meridians)
-    rotation, centre = body.part_poses(body.pose(x))
-    points = mesh.points.flatten(1, 2) @ rotation.mT + centre[..., None, :]
-    modes = []
-    for mode in points:
-        parts = []
-        for part, vertices in enumerate(mode):
-            uv, depth, valid = (tensor.cpu() for tensor in camera.project(vertices))
-            parts.append(ProjectedPart(uv, depth, valid, faces, part))
-        modes.append(parts)
+    modes = project_body(body, x, camera, rings=20, meridians=24)
     picture = torch.from_numpy(np.ascontiguousarray(image))
     return draw_overlay(picture, modes, weights=weights, keypoints=keypoints, text=text).numpy()
 

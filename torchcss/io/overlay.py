@@ -28,8 +28,17 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 from torch.nn import functional
 
+from torchcss.body.model import BodyModel
 from torchcss.errors import ConfigurationError, ShapeError, check_shape
-from torchcss.raster import Fragments, interpolate, join_faces, rasterise, vertex_normals
+from torchcss.raster import (
+    Fragments,
+    grid_faces,
+    interpolate,
+    join_faces,
+    rasterise,
+    vertex_normals,
+)
+from torchcss.vision.camera import Camera
 
 PALETTE: tuple[tuple[int, int, int], ...] = (
     (86, 180, 233),
@@ -126,6 +135,30 @@ class _Window(NamedTuple):
         if maps.shape[1:] == (self.height, self.width):
             return maps
         return functional.interpolate(maps[None], (self.height, self.width), mode="bilinear")[0]
+
+
+def project_body(
+    body: BodyModel, x: Float[Tensor, "k n"], camera: Camera, *, rings: int, meridians: int
+) -> list[list[ProjectedPart]]:
+    """Project the surface of a body in several poses, as `draw_overlay` takes it.
+
+    Args:
+        body: The body on its base.
+        x: Its poses, the best first.
+        camera: Camera of the picture.
+        rings: Latitudes of the mesh of each part.
+        meridians: Longitudes of the mesh of each part.
+    """
+    local, faces = body.mesh(rings, meridians).points.flatten(1, 2), grid_faces(rings, meridians)
+    rotation, centre = body.part_poses(body.pose(x))
+    poses = []
+    for points in local @ rotation.mT + centre[..., None, :]:
+        parts = []
+        for part, vertices in enumerate(points):
+            uv, depth, valid = (tensor.cpu() for tensor in camera.project(vertices))
+            parts.append(ProjectedPart(uv, depth, valid, faces, part))
+        poses.append(parts)
+    return poses
 
 
 def draw_overlay(
