@@ -13,7 +13,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "torchcss"
 
 LAYERS = (
-    {"types", "errors", "joint_names", "stopwatch"},
+    {"types", "errors", "joint_names", "stopwatch", "reading"},
     {"linalg", "robust"},
     {"raster"},
     {"body"},

@@ -586,7 +586,7 @@ def test_bad_files(tmp_path: Path, suffix: str) -> None:
             read_motion_capture(tmp_path / "motion.amc")
     path.mkdir()
     if suffix != "asf":
-        check("cannot be read")
+        check("expected a file, found a folder")
 
 
 def test_other_files_are_refused(tmp_path: Path) -> None:

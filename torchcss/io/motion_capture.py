@@ -33,9 +33,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from torchcss.body.bvh_text import Segment, parse_bvh
 from torchcss.errors import ConfigurationError, MotionCaptureError
 from torchcss.io.export.rotations import about
-from torchcss.io.motion_parsers import Segment, parse_acclaim, parse_bvh
+from torchcss.io.motion_parsers import parse_acclaim
 from torchcss.io.safe_load import shortened
 from torchcss.joint_names import canonical_joint_name
 

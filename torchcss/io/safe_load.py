@@ -16,6 +16,9 @@ from typing import Any
 import numpy as np
 
 from torchcss.errors import TorchcssError
+from torchcss.reading import one_line, read_bytes, shortened
+
+__all__ = ["load_arrays", "load_json", "one_line", "real_numbers", "shortened"]
 
 
 def load_json(path: Path, error_class: type[TorchcssError]) -> Any:
@@ -24,7 +27,7 @@ def load_json(path: Path, error_class: type[TorchcssError]) -> Any:
     Raises:
         error_class: If the file is missing, empty, unreadable or not JSON.
     """
-    data = _read_bytes(path, error_class)
+    data = read_bytes(path, error_class)
     try:
         return json.loads(data)
     except (ValueError, RecursionError) as error:
@@ -37,7 +40,7 @@ def load_arrays(path: Path, error_class: type[TorchcssError]) -> Mapping[str, np
     Raises:
         error_class: If the file is missing, damaged, no NPZ file, or holds pickled objects.
     """
-    if not _read_bytes(path, error_class, 4).startswith(b"PK"):
+    if not read_bytes(path, error_class, 4).startswith(b"PK"):
         raise error_class(f"{path}: not an NPZ file; expected what numpy.savez writes")
     try:
         # The stream is ours: NumPy does not close its own where the archive turns out damaged.
@@ -75,31 +78,3 @@ def _only_numbers(value: object) -> bool:
     if isinstance(value, list):
         return all(_only_numbers(entry) for entry in value)
     return isinstance(value, (int, float)) and not isinstance(value, bool)
-
-
-def one_line(error: BaseException) -> str:
-    """What an exception says, in one short line."""
-    return " ".join(str(error).split())[:120] or type(error).__name__
-
-
-def shortened(value: object) -> str:
-    """A piece of a file for a message, in one short line."""
-    text = " ".join(repr(value).split())
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
-def _read_bytes(path: Path, error_class: type[TorchcssError], size: int = -1) -> bytes:
-    try:
-        if path.is_dir():
-            raise error_class(f"{path}: expected a file, found a folder")
-        with path.open("rb") as stream:
-            data = stream.read(size)
-    except FileNotFoundError as error:
-        raise error_class(f"{path}: there is no such file; check the path") from error
-    except (OSError, ValueError) as error:  # ValueError: a null character in the name
-        if isinstance(error, error_class):
-            raise
-        raise error_class(f"{str(path)!r}: cannot be read: {one_line(error)}") from error
-    if not data:
-        raise error_class(f"{path}: the file is empty")
-    return data
