@@ -48,9 +48,9 @@ LAYERS = (
     {"io"},
     {"pipeline", "initialise_image", "first_frame", "smooth", "retarget"},
     {"yardstick", "side_by_side"},
-    {"recorder"},
+    {"recorder", "live"},
     {"track_files", "smooth_video"},
-    {"demo", "scenes", "cli", "cli_init", "cli_export", "cli_smooth"},
+    {"demo", "scenes", "cli", "cli_init", "cli_export", "cli_smooth", "cli_view"},
 )
 """Lowest first; a folder counts as one entry."""
 

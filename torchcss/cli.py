@@ -7,6 +7,7 @@
 | `torchcss track VIDEO` | tracks a body through a video |
 | `torchcss smooth TRACK` | makes one smooth trajectory of a track's modes |
 | `torchcss export TRACK` | writes a track for another program |
+| `torchcss view TRACK` | shows a track in space over its pictures (rerun) |
 
 Bad input ends with one line on standard error and exit status 2; Ctrl-C with status 130. What was
 tracked until then is on disk.
@@ -24,6 +25,7 @@ import tyro
 from torchcss.cli_export import Export
 from torchcss.cli_init import Init
 from torchcss.cli_smooth import Smooth, report
+from torchcss.cli_view import View
 from torchcss.demo import run_demo
 from torchcss.errors import OutputError, TorchcssError
 from torchcss.settings import TERMS, Settings
@@ -198,6 +200,7 @@ Verb = (
     | Annotated[Track, tyro.conf.subcommand("track")]
     | Annotated[Smooth, tyro.conf.subcommand("smooth")]
     | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[View, tyro.conf.subcommand("view")]
 )
 
 

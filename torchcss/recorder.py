@@ -1,19 +1,21 @@
 """Writes a run as it goes: `track.npz`, `summary.json` and `overlay.mp4`.
 
 `Recorder.run` takes what `torchcss.pipeline.track_frames` yields; a run that is interrupted keeps
-what it has. `draw_modes` draws one frame of the overlay.
+what it has. Whatever else should see the frames as they come is a `Sink`: the overlay's film is
+one, the live viewer (`torchcss.live`) another. `draw_modes` draws one frame of the overlay.
 """
 
 from __future__ import annotations
 
 import platform
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import asdict, dataclass, field
+from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -23,6 +25,7 @@ from tqdm import tqdm
 
 from torchcss.body.model import BodyModel
 from torchcss.inference.tracker import SequenceTracker
+from torchcss.io.cameras import camera_entry
 from torchcss.io.overlay import draw_overlay, project_body
 from torchcss.io.tracks import TrackWriter, write_summary
 from torchcss.io.video import VideoWriter
@@ -61,6 +64,47 @@ def draw_modes(
     return picture.numpy()
 
 
+Draw = Callable[[], UInt8[np.ndarray, "h w 3"]]
+"""Returns the frame with its modes drawn over it, drawn when it is asked for, and only once."""
+
+
+class Sink(Protocol):
+    """What wants to see the frames of a run as they come."""
+
+    def add(self, frame: TrackedFrame, draw: Draw) -> None:
+        """Take the next frame.
+
+        Args:
+            frame: What the tracker found.
+            draw: Its picture, the same for all sinks.
+        """
+        ...
+
+    def close(self) -> None:
+        """The run is over, or was interrupted."""
+        ...
+
+
+class Film:
+    """The sink that writes `overlay.mp4`.
+
+    Args:
+        path: The file.
+        frame_rate: Frames per second.
+    """
+
+    def __init__(self, path: Path, frame_rate: float) -> None:
+        self._writer = VideoWriter(path, frame_rate)
+
+    def add(self, frame: TrackedFrame, draw: Draw) -> None:
+        """Append the picture."""
+        self._writer.write(draw())
+
+    def close(self) -> None:
+        """Complete the file."""
+        self._writer.close()
+
+
 @dataclass(kw_only=True)
 class Recorder:
     """Writes a run as it goes: track, summary and overlay.
@@ -73,6 +117,7 @@ class Recorder:
         frame_rate: Frames per second of the overlay.
         notes: Lines for the user, also in the summary.
         extra: Further entries of the summary.
+        sinks: What sees the frames besides; closed at the end of the run.
     """
 
     folder: Path
@@ -82,6 +127,7 @@ class Recorder:
     frame_rate: float
     notes: list[str] = field(default_factory=list)
     extra: dict[str, Any] = field(default_factory=dict)
+    sinks: Sequence[Sink] = ()
 
     def run(self, frames: Iterator[TrackedFrame], body: BodyModel, total: int | None) -> dict:
         """Track to the end, or to an interruption, which is recorded and raised again.
@@ -102,18 +148,19 @@ class Recorder:
         saved, took = began, 0.0
         summary: dict[str, Any] = {}
         with ExitStack() as stack:
-            film = None
+            sinks = list(self.sinks)
             if self.settings.overlay:
-                film = stack.enter_context(
-                    VideoWriter(self.folder / "overlay.mp4", self.frame_rate)
-                )
+                sinks.insert(0, Film(self.folder / "overlay.mp4", self.frame_rate))
+            for sink in sinks:
+                stack.push(partial(_close, sink))
             bar = stack.enter_context(tqdm(frames, total=total, unit="frame", dynamic_ncols=True))
             try:
                 for frame in bar:
                     self._append(writer, frame)
                     drawn = time.perf_counter()
-                    if film is not None:
-                        film.write(draw_modes(frame, self.camera))
+                    draw = cache(partial(draw_modes, frame, self.camera))
+                    for sink in sinks:
+                        sink.add(frame, draw)
                     totals.add(frame, overlay_s=time.perf_counter() - drawn)
                     bar.set_postfix(
                         cost=f"{float(frame.info.cost[0]):.1f}",
@@ -167,8 +214,17 @@ class Recorder:
             "seconds_per_frame": wall / num_frames,
             **totals.summary(num_frames),
             "notes": self.notes,
+            # As in a camera file, so that this file is one.
+            "units": "metre, pixel",
+            "cameras": {self.camera.name: camera_entry(self.camera)},
             **self.extra,
         }
+
+
+def _close(sink: Sink, kind: type[BaseException] | None, *_: object) -> None:
+    # The first error is the one to report; a full disk will refuse the closing too.
+    with nullcontext() if kind is None else suppress(OSError):
+        sink.close()
 
 
 @dataclass(kw_only=True)
@@ -198,7 +254,7 @@ class _Totals:
     events: list[dict[str, Any]] = field(default_factory=list)
 
     def add(self, frame: TrackedFrame, *, overlay_s: float) -> None:
-        """Take in a frame, and how long it took to draw it."""
+        """Take in a frame, and how long the sinks took, drawing included."""
         for into, values in (
             (self.seconds, {**frame.seconds, "overlay": overlay_s}),
             (self.terms, frame.terms),

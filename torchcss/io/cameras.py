@@ -127,6 +127,21 @@ def read_camera(
     return LoadedCamera(camera, note is None, note, entry.video)
 
 
+def camera_entry(camera: Camera) -> dict[str, Any]:
+    """Return what a camera file in JSON has under the camera's name.
+
+    Args:
+        camera: The camera; its world is in metres.
+    """
+    return {
+        "image_size_wh": list(camera.image_size_wh),
+        "K": camera.K.tolist(),
+        "distortion": camera.distortion.tolist(),
+        "R": camera.R_camera_world.tolist(),
+        "t": camera.t_camera_world.tolist(),
+    }
+
+
 def check_image_size(camera: Camera, width: int, height: int) -> None:
     """Make sure that a camera belongs to images of this size.
 

@@ -30,6 +30,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchcss.io.atomic import prepare_output_folder, replace_file
+from torchcss.io.cameras import camera_entry
 from torchcss.io.video import VideoWriter
 from torchcss.synthetic import SequenceFrame, Shot
 from torchcss.vision.camera import Camera
@@ -153,11 +154,7 @@ def _write_joints(folder: Path, shot: Shot, frames: list[_Joints], noise_px: flo
 def _write_camera(path: Path, camera: Camera) -> None:
     entry = {
         "video": "video.mp4",
-        "image_size_wh": list(camera.image_size_wh),
-        "K": camera.K.tolist(),
-        "distortion": camera.distortion.tolist(),
-        "R": camera.R_camera_world.tolist(),
-        "t": camera.t_camera_world.tolist(),
+        **camera_entry(camera),
         "centre_world": camera.centre_world.tolist(),
     }
     content = {

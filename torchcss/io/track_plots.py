@@ -170,14 +170,25 @@ def num_explanations(track: Track, *, apart: float = APART) -> np.ndarray:
         track: The track.
         apart: Mean distance of the joint centres from which modes differ, metres.
     """
-    counts = np.zeros(len(track.frames), np.int64)
-    for row, num in enumerate(track.num_modes):
-        kept: list[np.ndarray] = []
-        for joints in track.joints_world[row, :num]:
-            if all(np.linalg.norm(joints - other, axis=-1).mean() >= apart for other in kept):
-                kept.append(joints)
-        counts[row] = len(kept)
-    return counts
+    counts = [
+        count_apart(joints[:num], apart=apart)
+        for joints, num in zip(track.joints_world, track.num_modes, strict=True)
+    ]
+    return np.array(counts, np.int64)
+
+
+def count_apart(joints: Float[np.ndarray, "k j 3"], *, apart: float = APART) -> int:
+    """How many of the modes of one frame differ from all better ones.
+
+    Args:
+        joints: Joint centres of the modes, the best first.
+        apart: Mean distance of the joint centres from which modes differ, metres.
+    """
+    kept: list[np.ndarray] = []
+    for own in joints:
+        if all(np.linalg.norm(own - other, axis=-1).mean() >= apart for other in kept):
+            kept.append(own)
+    return len(kept)
 
 
 def modes_figure(track: Track, summary: Mapping[str, Any] | None = None) -> Figure:

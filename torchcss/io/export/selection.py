@@ -13,6 +13,7 @@ Call `select`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -210,10 +211,10 @@ def _frame_of_file(
     """The file's frame from the world's, and a standing body's orientation in it."""
     axis = world_up
     if world_up == "auto":
-        up = _mean_up(track, kept)
-        values = {name: float(np.array(_TO_Y_UP[name][1]) @ up) for name in UP_AXES}
-        axis = max(values, key=lambda name: values[name])
-        angle = np.degrees(np.arccos(min(values[axis], 1.0)))
+        axis, agreement = up_axis(
+            track.joint_names, track.joints_world[kept, 0], track.base_transform[kept]
+        )
+        angle = np.degrees(np.arccos(min(agreement, 1.0)))
         if y_up:
             report.append(
                 f"the world's {axis} axis is taken for up (the body's mean direction is "
@@ -225,16 +226,30 @@ def _frame_of_file(
     return np.eye(3), matrix.T
 
 
-def _mean_up(track: Track, kept: np.ndarray) -> np.ndarray:
-    """Unit vector, in the world, from the hips to the head, or up the base where there are none."""
-    names = track.joint_names
+def up_axis(
+    joint_names: Sequence[str],
+    joints: Float[np.ndarray, "t j 3"],
+    base: Float[np.ndarray, "t 4 4"],
+) -> tuple[str, float]:
+    """Which axis of the world is up, and the cosine of its angle to the body's upward direction.
+
+    That is the mean direction from the hips to the head, or up the base where there are none.
+
+    Args:
+        joint_names: Names of the joints.
+        joints: Joint centres, world frame.
+        base: World from the frame in which the root moves.
+    """
+    names = list(joint_names)
     if {"HumanoidRoot", "skull_tip"} <= set(names):
-        best = track.joints_world[kept, 0]
-        up = (best[:, names.index("skull_tip")] - best[:, names.index("HumanoidRoot")]).mean(0)
+        up = (joints[:, names.index("skull_tip")] - joints[:, names.index("HumanoidRoot")]).mean(0)
     else:
-        up = track.base_transform[kept, :3, 1].mean(0)
+        up = base[:, :3, 1].mean(0)
     length = float(np.linalg.norm(up))
-    return up / length if length > 0 else np.array([0.0, 1.0, 0.0])
+    up = up / length if length > 0 else np.array([0.0, 1.0, 0.0])
+    values = {name: float(np.array(_TO_Y_UP[name][1]) @ up) for name in UP_AXES}
+    axis = max(values, key=lambda name: values[name])
+    return axis, values[axis]
 
 
 def _rate(times: np.ndarray, report: list[str]) -> float:

@@ -1,0 +1,393 @@
+"""Tracks in the rerun viewer: the modes in space over the picture that they explain.
+
+`Viewer` takes one `PosedFrame` after the other, whether they come from a file
+(`torchcss.io.view_track`) or from a tracker that runs (`torchcss.live`), and logs
+
+| entity | what |
+|---|---|
+| `world/camera`, `world/camera/picture` | the frustum; the frame with its modes, as JPEG |
+| `world/modes/K/skeleton` | lines between the joint centres of the mode of rank K, the best 0 |
+| `world/modes/K/uncertainty` | ellipsoids of `DEVIATIONS` standard deviations of the joints |
+| `world/modes/K/body/PART` | the flesh |
+| `cost/K`, `weight/K` | of every mode, nats, and 0 to 1 |
+| `modes/number`, `modes/apart` | how many modes, and how many of them are unlike all better ones |
+| `modes/effective` | `1 / sum w^2` |
+| `events` | when the track was lost and found |
+
+on the timelines `frame` (index in the video) and `time` (seconds). Modes have the colours that they
+have in the overlay; opacity tells their weight relative to the best.
+
+`open_recording` says where a recording goes. rerun is an optional package: the extra `viewer`.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from kornia.geometry.conversions import rotation_matrix_to_quaternion
+from PIL import Image
+from torch import Tensor
+
+from torchcss.body.model import BodyModel, BodyPose
+from torchcss.body.uncertainty import joint_covariance
+from torchcss.errors import ConfigurationError
+from torchcss.io.overlay import PALETTE
+from torchcss.io.track_plots import bones_of, count_apart
+from torchcss.io.viewer_layout import layout, rerun, world_axes
+from torchcss.raster import grid_faces
+from torchcss.vision.camera import Camera
+
+if TYPE_CHECKING:
+    import rerun as rr
+
+DEVIATIONS = 2.0
+"""Half-axes of the ellipsoids, standard deviations."""
+
+APPLICATION = "torchcss"
+
+_COUNTS = {"number": "modes", "apart": "of these 5 cm apart", "effective": "effective number"}
+
+_RINGS, _MERIDIANS = 9, 14
+_FAINTEST, _FLESH, _MIST = 0.25, 0.6, 0.6
+"""Opacity of the lines of a mode that weighs nothing, and, relative to its lines, of the best
+mode's flesh and of ellipsoids."""
+_BONE_RADIUS = 0.006
+_PLANE = 0.3
+"""Radius of the best mode's lines, metres; the frustum's length relative to the body's distance."""
+_LARGEST_PICTURE = 1280
+"""Longer side, pixels, to which larger pictures are reduced."""
+_JPEG_QUALITY = 85
+_FILE_CHUNKS_S = 5.0
+
+
+class PosedFrame(NamedTuple):
+    """One frame as a viewer shows it, modes best first.
+
+    Attributes:
+        number: Index in the video.
+        time_s: Seconds since the video's first frame.
+        weight: Weights of the modes, adding up to 1.
+        cost: Their costs, nats; infinite where nothing was seen.
+        joints: Their joint centres, metres, world frame.
+        covariance: Covariances of the joint centres, square metres.
+        rotation: World orientation of their parts of flesh.
+        centre: World place of their parts of flesh.
+        picture: The frame with its modes, or None.
+        lost: Whether the track counts as lost.
+    """
+
+    number: int
+    time_s: float
+    weight: Float[np.ndarray, " k"]
+    cost: Float[np.ndarray, " k"]
+    joints: Float[np.ndarray, "k j 3"]
+    covariance: Float[np.ndarray, "k j 3 3"]
+    rotation: Float[np.ndarray, "k p 3 3"]
+    centre: Float[np.ndarray, "k p 3"]
+    picture: UInt8[np.ndarray, "h w 3"] | None = None
+    lost: bool = False
+
+
+def posed_frame(
+    number: int,
+    time_s: float,
+    body: BodyModel,
+    pose: BodyPose,
+    *,
+    covariance: Float[Tensor, "k n n"],
+    weight: Float[Tensor, " k"],
+    cost: Float[Tensor, " k"],
+    picture: UInt8[np.ndarray, "h w 3"] | None = None,
+    lost: bool = False,
+) -> PosedFrame:
+    """Put together what a viewer shows of a frame.
+
+    Args:
+        number: Index in the video.
+        time_s: Seconds since the video's first frame.
+        body: The body.
+        pose: Its poses in the world, the best first.
+        covariance: Covariances of the states.
+        weight: Weights of the modes.
+        cost: Their costs, nats.
+        picture: The frame with its modes.
+        lost: Whether the track counts as lost.
+    """
+    rotation, centre = body.part_poses(pose)
+    spread = joint_covariance(body, pose, covariance)
+    return PosedFrame(
+        number=number,
+        time_s=time_s,
+        weight=_array(weight),
+        cost=_array(cost),
+        joints=_array(pose.joints),
+        covariance=_array(spread),
+        rotation=_array(rotation),
+        centre=_array(centre),
+        picture=picture,
+        lost=lost,
+    )
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().double().cpu().numpy()
+
+
+def has_display() -> bool:
+    """Whether a window can be opened here."""
+    if sys.platform != "linux":
+        return True
+    return any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+
+
+def open_recording(
+    name: str, *, save: Path | None = None, connect: str | None = None
+) -> rr.RecordingStream:
+    """Start a recording that goes to a file, to a viewer that runs, or to one that is started.
+
+    Args:
+        name: What the viewer calls it.
+        save: The file, usually `.rrd`; it grows as the recording does.
+        connect: Address of a viewer, such as `rerun+http://127.0.0.1:9876/proxy`; `rerun` prints
+            its own when it starts. With `save`, both get the recording.
+
+    Raises:
+        MissingExtraError: If rerun is not installed.
+        ConfigurationError: If a viewer would have to be started where there is no display, or the
+            address is none.
+    """
+    package = rerun()
+    # A file is read faster when rows come in large chunks; someone who watches wants them at once.
+    watched = save is None or connect is not None
+    chunks = None if watched else package.ChunkBatcherConfig(flush_tick=_FILE_CHUNKS_S)
+    recording = package.RecordingStream(APPLICATION, batcher_config=chunks)
+    # What a recording holds depends on the track alone.
+    recording.set_log_time_enabled(False)
+    recording.set_log_tick_enabled(False)
+    sinks = []
+    if save is not None:
+        sinks.append(package.FileSink(str(save)))
+    if connect is not None:
+        sinks.append(_viewer_at(connect))
+    if sinks:
+        recording.set_sinks(*sinks)
+    elif has_display():
+        recording.spawn()
+    else:
+        raise ConfigurationError(
+            "there is no display here to open a viewer on; save a recording (--save FILE.rrd), and "
+            "open it elsewhere with: rerun FILE.rrd"
+        )
+    recording.send_recording_name(name)
+    return recording
+
+
+def _viewer_at(address: str) -> object:
+    try:
+        return rerun().GrpcSink(address)
+    except ValueError as error:
+        raise ConfigurationError(
+            f"{address}: not the address of a viewer; expected one such as "
+            "rerun+http://127.0.0.1:9876/proxy"
+        ) from error
+
+
+class Viewer:
+    """Logs frames into a recording.
+
+    Args:
+        recording: Where to, see `open_recording`.
+        body: The body with its flesh, for the mesh; its base does not matter.
+        num_modes: Modes that a frame has at most.
+        camera: The camera of the pictures; None: not known.
+        up: Axis of the world that is up: x, y, z, -x, -y or -z.
+    """
+
+    def __init__(
+        self,
+        recording: rr.RecordingStream,
+        body: BodyModel,
+        *,
+        num_modes: int,
+        camera: Camera | None = None,
+        up: str = "y",
+    ) -> None:
+        self._recording = recording
+        self._body = body
+        self._bones = np.array(bones_of(body), dtype=np.int64).reshape(-1, 2)
+        self._num_modes = num_modes
+        self._camera = camera
+        self._up = up
+        self._began = False
+        self._lost = False
+        self._shown = 0
+
+    def add(self, frame: PosedFrame) -> None:
+        """Log a frame.
+
+        Args:
+            frame: The frame, later than the last.
+        """
+        package, log = rerun(), self._recording.log
+        if not self._began:
+            self._begin(frame)
+        self._recording.set_time("frame", sequence=frame.number)
+        self._recording.set_time("time", duration=frame.time_s)
+        if frame.picture is not None:
+            log("world/camera/picture", _jpeg(frame.picture))
+        for mode in range(len(frame.weight)):
+            self._log_mode(frame, mode)
+        for mode in range(len(frame.weight), self._shown):
+            self._hide_mode(mode)
+        self._shown = len(frame.weight)
+        numbers = (len(frame.weight), count_apart(frame.joints), 1 / np.square(frame.weight).sum())
+        for name, number in zip(_COUNTS, numbers, strict=True):
+            log(f"modes/{name}", package.Scalars(float(number)))
+        if frame.lost != self._lost:
+            text = f"frame {frame.number}: told {'lost' if frame.lost else 'found'}"
+            level = package.TextLogLevel.WARN if frame.lost else package.TextLogLevel.INFO
+            log("events", package.TextLog(text, level=level))
+        self._lost = frame.lost
+
+    def close(self, *, patience_s: float = 10.0) -> None:
+        """Hand over what was logged, and end the recording.
+
+        Args:
+            patience_s: How long to wait for a viewer that does not answer.
+        """
+        # A viewer that was closed before the track ended is no reason to fail.
+        with suppress(RuntimeError):
+            self._recording.flush(timeout_sec=patience_s)
+        self._recording.disconnect()
+
+    def _begin(self, frame: PosedFrame) -> None:
+        """Log what does not change, and how the viewer is to be laid out."""
+        package, log = rerun(), self._recording.log
+        self._began = True
+        log("world", world_axes(self._up), static=True)
+        best = frame.joints[0]
+        if self._camera is not None:
+            self._log_camera(self._camera, best)
+        surface = self._body.mesh(_RINGS, _MERIDIANS)
+        vertices, normals = (
+            field.flatten(1, 2).float().cpu().numpy() for field in (surface.points, surface.normals)
+        )
+        faces = grid_faces(_RINGS, _MERIDIANS).numpy()
+        for mode in range(self._num_modes):
+            for part, name in enumerate(self._body.part_names):
+                mesh = package.Mesh3D(
+                    vertex_positions=vertices[part],
+                    vertex_normals=normals[part],
+                    triangle_indices=faces,
+                )
+                log(f"world/modes/{mode}/body/{name}", mesh, static=True)
+            line = package.SeriesLines(
+                colors=PALETTE[mode % len(PALETTE)],
+                names="best mode" if mode == 0 else f"mode {mode + 1}",
+                widths=2.5 if mode == 0 else 1.2,
+            )
+            for series in ("cost", "weight"):
+                log(f"{series}/{mode}", line, static=True)
+        for (name, label), colour in zip(_COUNTS.items(), PALETTE, strict=False):
+            line = package.SeriesLines(colors=colour, names=label, widths=2.0)
+            log(f"modes/{name}", line, static=True)
+        self._recording.send_blueprint(layout(best, self._camera, self._up))
+
+    def _log_camera(self, camera: Camera, joints: Float[np.ndarray, "j 3"]) -> None:
+        package, log = rerun(), self._recording.log
+        camera = _reduced(camera)
+        turn = _array(camera.R_camera_world).T
+        centre = _array(camera.centre_world)
+        K = _array(camera.K).copy()
+        K[:2, 2] += 0.5  # the viewer counts pixels from the picture's corner, we from a centre
+        log("world/camera", package.Transform3D(translation=centre, mat3x3=turn), static=True)
+        pinhole = package.Pinhole(
+            image_from_camera=K,
+            resolution=camera.image_size_wh,
+            camera_xyz=package.ViewCoordinates.RDF,
+            image_plane_distance=_PLANE * float(np.linalg.norm(joints.mean(0) - centre)),
+        )
+        log("world/camera", pinhole, static=True)
+
+    def _log_mode(self, frame: PosedFrame, mode: int) -> None:
+        package, log = rerun(), self._recording.log
+        path = f"world/modes/{mode}"
+        share = float(frame.weight[mode] / frame.weight[0]) if frame.weight[0] > 0 else 1.0
+        opacity = _FAINTEST + (1 - _FAINTEST) * min(share, 1.0)
+        colour = (*PALETTE[mode % len(PALETTE)], round(255 * opacity))
+        thickness = 1.0 if mode == 0 else 0.7
+        joints = frame.joints[mode]
+        strips = package.LineStrips3D(
+            joints[self._bones], colors=colour, radii=thickness * _BONE_RADIUS
+        )
+        log(f"{path}/skeleton", strips)
+        half_sizes, quaternions = ellipsoids(frame.covariance[mode])
+        shapes = package.Ellipsoids3D(
+            centers=joints,
+            half_sizes=half_sizes,
+            quaternions=quaternions,
+            colors=(*colour[:3], round(colour[3] * _MIST)),
+            fill_mode=package.components.FillMode.Solid,
+        )
+        log(f"{path}/uncertainty", shapes)
+        flesh = package.Mesh3D.from_fields(
+            albedo_factor=(*colour[:3], round(255 * _FLESH * share * opacity))
+        )
+        for part, name in enumerate(self._body.part_names):
+            place = package.Transform3D(
+                translation=frame.centre[mode, part], mat3x3=frame.rotation[mode, part]
+            )
+            log(f"{path}/body/{name}", place, flesh)
+        cost = frame.cost[mode]
+        log(f"cost/{mode}", package.Scalars(float(cost) if np.isfinite(cost) else np.nan))
+        log(f"weight/{mode}", package.Scalars(float(frame.weight[mode])))
+
+    def _hide_mode(self, mode: int) -> None:
+        """From here on there is no such mode."""
+        package, log = rerun(), self._recording.log
+        for name in ("skeleton", "uncertainty"):
+            log(f"world/modes/{mode}/{name}", package.Clear(recursive=False))
+        # Meshes do not change and cannot be cleared: they become invisible.
+        for name in self._body.part_names:
+            hidden = package.Mesh3D.from_fields(albedo_factor=(0, 0, 0, 0))
+            log(f"world/modes/{mode}/body/{name}", hidden)
+        for series in ("cost", "weight"):
+            log(f"{series}/{mode}", package.Scalars(np.nan))
+
+
+def ellipsoids(
+    covariance: Float[np.ndarray, "j 3 3"],
+) -> tuple[Float[np.ndarray, "j 3"], Float[np.ndarray, "j 4"]]:
+    """Half-axes, metres, and orientations (x y z w) of the ellipsoids of covariances.
+
+    Args:
+        covariance: Covariances of points, square metres.
+    """
+    values, axes = np.linalg.eigh(covariance)
+    # Eigenvectors may form a mirrored frame, which no rotation is.
+    axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
+    wxyz = rotation_matrix_to_quaternion(torch.from_numpy(axes)).numpy()
+    return DEVIATIONS * np.sqrt(values.clip(min=0)), np.roll(wxyz, -1, axis=-1)
+
+
+def _reduced(camera: Camera) -> Camera:
+    """The camera of the pictures as they are saved."""
+    width, height = camera.image_size_wh
+    factor = min(1.0, _LARGEST_PICTURE / max(width, height))
+    return camera.resized(max(round(factor * width), 1), max(round(factor * height), 1))
+
+
+def _jpeg(picture: UInt8[np.ndarray, "h w 3"]) -> rr.EncodedImage:
+    image = Image.fromarray(picture)
+    image.thumbnail((_LARGEST_PICTURE, _LARGEST_PICTURE))
+    stream = io.BytesIO()
+    image.save(stream, "JPEG", quality=_JPEG_QUALITY)
+    return rerun().EncodedImage(contents=stream.getvalue(), media_type="image/jpeg")
