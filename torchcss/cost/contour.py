@@ -230,8 +230,8 @@ def seen_nodes(nodes: ContourNodes) -> tuple[ContourNodes, Int[Tensor, " k"]]:
 
 def spread(
     part: Float[Tensor, "k *rest"], index: Int[Tensor, " k"], nodes: ContourNodes
-) -> Float[Tensor, "*batch p *rest"]:
-    """What was worked out for the nodes that count, and zero for the others."""
+) -> Float[Tensor, "..."]:
+    """What was worked out for the nodes that count, `[*batch p *rest]`, and zero for the others."""
     components = part.movedim(0, -1)
     shape, rest = nodes.exists.shape, components.shape[:-1]
     whole = components.new_zeros(*rest, shape.numel()).index_copy(-1, index, components)

@@ -1,0 +1,80 @@
+"""The page "From the papers to the code": complete, and every reference on it leads somewhere."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+PAGES = ("from_the_papers_to_the_code.md", "mathematics.md")
+PAPERS = (REPOSITORY / "docs" / PAGES[0]).read_text(encoding="utf-8")
+
+NUMBERS = {
+    ("[IJRR]", "eq."): 13,
+    ("[IJRR]", "Fig."): 15,
+    ("[IJRR]", "Table"): 1,
+    ("[RR]", "eq."): 11,
+    ("[RR]", "Fig."): 9,
+}
+"""The last number of each kind in either paper."""
+
+
+def resolve(reference: str) -> object:
+    """The module, or what a module holds, or the field of a record."""
+    module_name, names = reference, []
+    while True:
+        try:
+            found: object = importlib.import_module(module_name)
+            break
+        except ModuleNotFoundError:
+            module_name, _, name = module_name.rpartition(".")
+            names.insert(0, name)
+    for name in names:
+        fields = getattr(found, "__annotations__", {})
+        found = getattr(found, name) if hasattr(found, name) else fields[name]
+    return found
+
+
+def references(text: str) -> set[str]:
+    return set(re.findall(r"`(torchcss(?:\.\w+)+)`", text))
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_name_is_in_the_package(page: str) -> None:
+    text = (REPOSITORY / "docs" / page).read_text(encoding="utf-8")
+    found = references(text)
+    assert found
+    for reference in sorted(found):
+        resolve(reference)
+
+
+def test_a_name_that_is_not_there_is_noticed() -> None:
+    for wrong in ("torchcss.robust.Lorentz", "torchcss.roboust", "torchcss.types.Modes.meen"):
+        with pytest.raises((AttributeError, KeyError)):
+            resolve(wrong)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_file_exists(page: str) -> None:
+    text = (REPOSITORY / "docs" / page).read_text(encoding="utf-8")
+    files = re.findall(r"\b((?:scripts|notebooks|tests|docs)/[\w/]+\.\w+)", text)
+    linked = re.findall(r"\]\((?!https?:)([^)#]+)\)", text)
+    for path in files:
+        assert (REPOSITORY / path).is_file(), path
+    for path in linked:
+        assert (REPOSITORY / "docs" / path).is_file(), path
+
+
+@pytest.mark.parametrize(("paper", "kind"), NUMBERS)
+def test_every_number_is_there_once(paper: str, kind: str) -> None:
+    sections = re.split(r"^## ", PAPERS, flags=re.MULTILINE)[1:]
+    own = "\n".join(section for section in sections if section.startswith(paper))
+    rows = re.findall(rf"^\| {re.escape(kind)} (\d+) \|(.*)\|(.*)\|$", own, flags=re.MULTILINE)
+    assert [int(number) for number, *_ in rows] == list(range(1, NUMBERS[paper, kind] + 1))
+    for number, what, where in rows:
+        assert what.strip(), number
+        honest = "not reproduced" in where or "the same" in where or "as " in where
+        assert honest or "`" in where or "](" in where, number
