@@ -55,7 +55,7 @@ def test_api_page(site: Path) -> None:
     assert "uv: Float[Tensor, '*batch p 2']" in words
     assert 'href="../robust.html#Lorentzian"' in text
     assert "Alias for field number" not in text
-    assert 'href="cost/contour.html"' in (site / "torchcss" / "cost.html").read_text()
+    assert 'href="../torchcss/cost/contour.html"' in (site / "torchcss" / "cost.html").read_text()
     # The members of a private base class are explained where its public children point to.
     assert 'id="_Scaled.sigma"' in (site / "torchcss" / "robust.html").read_text()
 
