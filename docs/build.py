@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import os
 import re
 import shutil
 import types
@@ -25,10 +26,12 @@ from pkgutil import walk_packages
 from urllib.parse import unquote, urlsplit
 
 import nbformat
+from latex2mathml.converter import convert as mathml
 from nbconvert import MarkdownExporter
 from nbconvert.preprocessors import ExecutePreprocessor
-from pdoc import render, render_helpers
+from pdoc import render
 from pdoc.doc import Module
+from traitlets.config import Config
 
 import torchcss
 
@@ -42,9 +45,17 @@ README_PAGES = {
 """Sections of the README that are pages of their own; all others make up the front page."""
 
 _JAXTYPING = re.compile(
-    r'jaxtyping\.(?=\w+\[)|<span class="n">jaxtyping</span><span class="o">.</span>'
+    r'jaxtyping\.(?=\w+\[)|<span class=\\?"n\\?">jaxtyping</span><span class=\\?"o\\?">.</span>'
 )
 """Where a type comes from, which readers of `Float[Tensor, "n"]` need not be told."""
+
+_FORMULA = re.compile(
+    r"(```.*?```|`[^`]*`)|\$\$(.+?)\$\$|\$(?=\S)([^$\n]+?)(?<=\S)\$", flags=re.DOTALL
+)
+"""Code, which is left as it is, or a formula that stands by itself, or one in the text."""
+
+_KERNEL = Config({"KernelManager": {"transport": "ipc"}} if os.name == "posix" else {})
+"""Sockets of the file system: over TCP, Jupyter warns that anybody on the machine may listen."""
 
 
 def main() -> None:
@@ -84,13 +95,13 @@ def build(out: Path, *, modules: Iterable[str] | None = None, execute: bool = Tr
         everything = pages | {name: Module.from_name(name) for name in names}
         render.configure(docformat="google", template_directory=DOCS / "templates")
         render.env.globals["pages"] = {name: each.obj.title for name, each in pages.items()}
-        render_helpers.markdown_extensions["latex"] = None
         for name, module in everything.items():
             target = out / f"{name.replace('.', '/')}.html"
             target.parent.mkdir(parents=True, exist_ok=True)
             text = render.html_module(module, everything)
             target.write_text(_JAXTYPING.sub("", text), encoding="utf-8")
-        (out / "search.js").write_text(render.search_index(everything), encoding="utf-8")
+        index = _JAXTYPING.sub("", render.search_index(everything))
+        (out / "search.js").write_text(index, encoding="utf-8")
     if broken := list(broken_links(out)):
         raise SystemExit("\n".join(["links that lead nowhere:", *broken]))
 
@@ -112,8 +123,8 @@ def guide(out: Path, *, execute: bool) -> Iterator[tuple[str, str]]:
     yield "mathematics", (DOCS / "mathematics.md").read_text(encoding="utf-8")
     for notebook in sorted((REPOSITORY / "notebooks").glob("*.ipynb")):
         yield notebook.stem, notebook_text(notebook, out / "pictures", execute=execute)
-    papers = "from_the_papers_to_the_code"
-    yield papers, (DOCS / f"{papers}.md").read_text(encoding="utf-8")
+    for name in ("from_the_papers_to_the_code", "decisions"):
+        yield name, (DOCS / f"{name}.md").read_text(encoding="utf-8")
     yield "scripts", scripts_text()
     for name, headings in README_PAGES.items():
         text = "".join(sections[heading] for heading in headings)
@@ -143,7 +154,7 @@ def notebook_text(path: Path, pictures: Path, *, execute: bool) -> str:
     bare = not any(cell.get("outputs") for cell in notebook.cells)
     if bare and execute:
         print(f"executing {path.name}")
-        ExecutePreprocessor(timeout=None).preprocess(
+        ExecutePreprocessor(timeout=None, config=_KERNEL).preprocess(
             notebook, {"metadata": {"path": str(path.parent)}}
         )
     notebook.metadata["language_info"] = {"name": "python"}  # else its code has no colours
@@ -161,12 +172,23 @@ def page(name: str, text: str) -> Module:
     text = re.sub(r"\]\((?:\.\./)?notebooks/(pictures/[^)]*)\)", r"](\1)", text)
     text = re.sub(r"\]\((?:\.\./)?scripts/(\w+)\.py\)", r"](scripts.html#\1)", text)
     text = re.sub(r"\]\((?:\.\./|docs/)?(?:notebooks/)?(\w+)\.(?:md|ipynb)\)", r"](\1.html)", text)
+    text = _FORMULA.sub(_set, text)
     module = types.ModuleType(name, text)
     heading = re.search(r"^# (.+)$", text, flags=re.MULTILINE)
     if heading is None:
         raise SystemExit(f"the page {name} has no heading")
     module.__dict__.update(title=heading[1], __docformat__="markdown", __all__=[])
     return Module(module)
+
+
+def _set(match: re.Match[str]) -> str:
+    """Set a formula as MathML, which browsers draw without help."""
+    code, alone, within = match.groups()
+    if code:
+        return code
+    if alone:
+        return f"<div>{mathml(alone, display='block')}</div>"
+    return f"<span>{mathml(within)}</span>"
 
 
 class _Links(HTMLParser):

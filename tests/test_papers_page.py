@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-PAGES = ("from_the_papers_to_the_code.md", "mathematics.md")
+PAGES = ("from_the_papers_to_the_code.md", "mathematics.md", "decisions.md")
 PAPERS = (REPOSITORY / "docs" / PAGES[0]).read_text(encoding="utf-8")
 
 NUMBERS = {
@@ -78,3 +78,12 @@ def test_every_number_is_there_once(paper: str, kind: str) -> None:
         assert what.strip(), number
         honest = "not reproduced" in where or "the same" in where or "as " in where
         assert honest or "`" in where or "](" in where, number
+
+
+def test_every_decision_that_a_docstring_refers_to_is_told() -> None:
+    page = (REPOSITORY / "docs" / "decisions.md").read_text(encoding="utf-8")
+    told = re.findall(r"^\| decision (\d+) \|", page, flags=re.MULTILINE)
+    assert [int(number) for number in told] == list(range(1, 13))
+    for path in (REPOSITORY / "torchcss").rglob("*.py"):
+        for number in re.findall(r"design,? decision (\d+)", path.read_text(encoding="utf-8")):
+            assert number in told, path
