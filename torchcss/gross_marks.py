@@ -73,7 +73,16 @@ def explain(
 
 
 def leave_out(cost: TrackingCost, fits: Modes, search: Search) -> Bool[Tensor, " m"]:
-    """Leave marks out, one at a time, as long as that pays; none if that would be very many."""
+    """Leave marks out, one at a time, as long as that pays; none if that would be very many.
+
+    Args:
+        cost: The cost with all marks.
+        fits: Its fits, the best first.
+        search: Limits and effort.
+
+    Returns:
+        Which marks are gross.
+    """
     assert cost.observation is not None
     weight = cost.observation.weight
     gross, price = torch.zeros_like(weight, dtype=torch.bool), price_of_leaving_out(cost)

@@ -164,7 +164,14 @@ def _optimise(cost: TrackingCost, x: Tensor, bounds: Bounds, steps: int) -> Mode
 def descend(
     cost: TrackingCost, x: Tensor, bounds: Bounds, schedule: tuple[tuple[float, int], ...]
 ) -> Tensor:
-    """Descend with the keypoints' scale widened by each factor in turn, so many steps each."""
+    """Descend with the keypoints' scale widened by each factor in turn.
+
+    Args:
+        cost: The joints' cost.
+        x: Where to start.
+        bounds: Box limits.
+        schedule: Factors on the scale, and the most steps with each.
+    """
     for factor, steps in schedule:
         x = _optimise(_widened(cost, factor), x, bounds, steps).mean
     return x
@@ -218,7 +225,15 @@ def flips(
     bounds: Bounds,
     num: int,
 ) -> Float[Tensor, "s n"]:
-    """The best combinations of forward-backward flips of some poses, their angles solved for."""
+    """The best combinations of forward-backward flips of some poses, their angles solved for.
+
+    Args:
+        cost: The joints' cost.
+        segments: The limbs and the trunk's parts that lean one way or the other.
+        x: The poses.
+        bounds: Box limits.
+        num: How many states to return, at the most.
+    """
     body, device = cost.body, x.device
     trunk = [g for g in segments.trunk if g != "head"]
     # The hand of a body moves with its forearm; that of an arm has joints of its own.

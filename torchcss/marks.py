@@ -118,6 +118,16 @@ def check_joints(
 ) -> tuple[str, ...]:
     """Refuse joints from which nothing can be fitted, and say what is odd about the others.
 
+    Args:
+        name: What the messages call the picture.
+        observation: The marked joints.
+        body: The body that they belong to.
+        camera: The camera that sees them.
+        least: How many joints a fit needs.
+
+    Returns:
+        What is odd, one sentence each.
+
     Raises:
         KeypointError: If too few joints are seen, or all are at one place.
     """

@@ -240,7 +240,7 @@ def root_aligned_mpjpe_mm(
     *,
     root: str | None = None,
 ) -> Float[np.ndarray, "*batch"]:
-    """Mean over the known joints of `root_aligned_errors_mm`, pose by pose."""
+    """Mean over the known joints of `root_aligned_errors_mm`, pose by pose; see there."""
     return _mean(root_aligned_errors_mm(tracked_m, reference_m, joint_names, root=root))
 
 

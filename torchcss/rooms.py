@@ -46,7 +46,14 @@ class Place(NamedTuple):
 
 
 class PaintedMesh(NamedTuple):
-    """Triangles with colours, world frame, metres."""
+    """Triangles with colours, world frame, metres.
+
+    Attributes:
+        vertices: Their corners.
+        normals: Unit outward normals at the corners.
+        faces: Indices of the corners of each triangle.
+        colour: RGB in 0..1 at the corners.
+    """
 
     vertices: Float[Tensor, "v 3"]
     normals: Float[Tensor, "v 3"]

@@ -109,7 +109,13 @@ def with_shape(body: BodyModel, shape: Float[Tensor, "parts 9"]) -> BodyModel:
 
 
 class ShapeDerivatives(NamedTuple):
-    """Surface points in their part's frame and their derivatives in the nine shape numbers."""
+    """Surface points in their part's frame and their derivatives in the nine shape numbers.
+
+    Attributes:
+        points: Metres.
+        first: First derivatives.
+        second: Second derivatives.
+    """
 
     points: Float[Tensor, "p 3"]
     first: Float[Tensor, "p 3 9"]
@@ -148,7 +154,13 @@ def surface_derivatives(
 def surface_normal_derivatives(
     shape: Float[Tensor, "p 9"], eta: Float[Tensor, " p"], omega: Float[Tensor, " p"]
 ) -> Float[Tensor, "p 3 9"]:
-    """First derivatives of the unit outward normals in the shape numbers, at held angles."""
+    """First derivatives of the unit outward normals in the shape numbers, at held angles.
+
+    Args:
+        shape: The shape numbers of each point's part.
+        eta: Latitudes.
+        omega: Longitudes.
+    """
     with torch.enable_grad():
         s = shape.detach().requires_grad_()
         normals = surface_points(s, eta.detach(), omega.detach()).normals

@@ -30,7 +30,12 @@ _LEAST_BEND = 1e-6
 
 
 class SurfaceSample(NamedTuple):
-    """Points of a surface with unit outward normals, in the part's frame."""
+    """Points of a surface with unit outward normals, in the part's frame.
+
+    Attributes:
+        points: Metres.
+        normals: Perpendicular to the surface, of length one, outwards.
+    """
 
     points: Float[Tensor, "*batch 3"]
     normals: Float[Tensor, "*batch 3"]

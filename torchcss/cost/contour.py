@@ -197,7 +197,14 @@ class ContourTerm:
         *,
         gauss_newton: bool = False,
     ) -> PointCost:
-        """The same with first and second derivatives in the nodes' positions."""
+        """The same with first and second derivatives in the nodes' positions.
+
+        Args:
+            nodes: Contour nodes of the posed body.
+            camera: The camera that took the image.
+            edge_field: As in `search`.
+            gauss_newton: Leave the curvature of the projection out.
+        """
         seen, index = seen_nodes(nodes)
         model = camera.project_with_derivatives(seen.points)
         normal = camera.image_normals(model, seen.normals)
@@ -231,7 +238,16 @@ def seen_nodes(nodes: ContourNodes) -> tuple[ContourNodes, Int[Tensor, " k"]]:
 def spread(
     part: Float[Tensor, "k *rest"], index: Int[Tensor, " k"], nodes: ContourNodes
 ) -> Float[Tensor, "..."]:
-    """What was worked out for the nodes that count, `[*batch p *rest]`, and zero for the others."""
+    """What was worked out for the nodes that count, and zero for the others.
+
+    Args:
+        part: One row per node that counts.
+        index: Their places, from `seen_nodes`.
+        nodes: All nodes.
+
+    Returns:
+        One row per node, `[*batch p *rest]`.
+    """
     components = part.movedim(0, -1)
     shape, rest = nodes.exists.shape, components.shape[:-1]
     whole = components.new_zeros(*rest, shape.numel()).index_copy(-1, index, components)

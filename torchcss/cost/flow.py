@@ -63,6 +63,8 @@ class InteriorNodes(nn.Module):
     Attributes:
         node_part: The part of each node.
         node_link: The link of each node.
+        points_part: The nodes in the frames of their parts, metres.
+        normals_part: Their unit outward normals.
     """
 
     node_part: Int[Tensor, " p"]

@@ -155,7 +155,14 @@ class RegionTerm:
         *,
         gauss_newton: bool = False,
     ) -> PointCost:
-        """The same with first and second derivatives in the nodes' positions."""
+        """The same with first and second derivatives in the nodes' positions.
+
+        Args:
+            nodes: Contour nodes of the posed body.
+            camera: The camera that took the image.
+            images: How much every pixel looks like each part.
+            gauss_newton: Leave the curvature of the projection out.
+        """
         seen, index = seen_nodes(nodes)
         layer = images.layer[index % len(images.layer)]
         model = camera.project_with_derivatives(seen.points)

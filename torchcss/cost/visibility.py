@@ -106,6 +106,8 @@ class ContourPredictor(nn.Module):
         num_rings: Rings per part; a part's nodes are those of its rings, then of its meridians.
         node_part: The part of each node.
         node_link: The link of each node.
+        other: Row of each node: 1 for the other parts, which can hide it, 0 for its own.
+        touching: Row of each node: 1 for the parts that touch its own.
     """
 
     node_part: Tensor

@@ -80,7 +80,13 @@ class Transition:
 
 
 class Motion(NamedTuple):
-    """The transitions' share of the sum."""
+    """The transitions' share of the sum.
+
+    Attributes:
+        value: Nats.
+        gradient: By the state of every frame.
+        band: The Hessian, in the layout of `Band.block`.
+    """
 
     value: Float[Tensor, ""]
     gradient: Float[Tensor, "t n"]
@@ -173,7 +179,20 @@ class ChainSum(NamedTuple):
 def descend(
     sum_: ChainSum, x: Tensor, limits: Bounds, weight: Tensor, max_steps: int, tolerance: float
 ) -> tuple[Float[Tensor, "t n"], Chain, Status, int]:
-    """Newton's method on all frames at once; the state, the model there, why it ended, how long."""
+    """Newton's method on all frames at once.
+
+    Args:
+        sum_: The sum that is minimised.
+        x: States to start from.
+        limits: Box limits on the state of every frame.
+        weight: Metric of the damping, as in `TrustRegionNewton`: one over the squared scale of each
+            parameter.
+        max_steps: Most evaluations after the first.
+        tolerance: Promised decrease, nats, below which the descent has converged.
+
+    Returns:
+        The states, the model there, why it ended, and how many steps it took.
+    """
     x = limits.project(x)
     chain, damping, steps = sum_.at(x), 0.0, 0
     if not chain.is_finite:
@@ -211,7 +230,10 @@ def marginals(
 ) -> Float[Tensor, "t n n"]:
     """Covariances of the states: diagonal blocks of the inverse Hessian on the free variables.
 
-    A frame whose cost is not finite says nothing.
+    Args:
+        chain: The model at the minimum. A frame whose cost is not finite says nothing.
+        free: Variables that no bound holds; the others get the prior's variance.
+        prior_variance: Variance of each parameter before any image is seen.
     """
     finite = chain.hessian.isfinite().all(-1).all(-1)[:, None, None]
     chain = model = chain._replace(hessian=torch.where(finite, chain.hessian, 0.0))
@@ -239,7 +261,14 @@ def held_by(x: Tensor, gradient: Tensor, bounds: Bounds) -> Bool[Tensor, "t n"]:
 def motion_terms(
     x: Float[Tensor, "t n"], times: Float[Tensor, " t"], transition: Transition, changes: Changes
 ) -> Motion:
-    """Value, gradient and (Gauss-Newton) Hessian of the transitions."""
+    """Value, gradient and (Gauss-Newton) Hessian of the transitions.
+
+    Args:
+        x: State of every frame.
+        times: Times of the frames, seconds.
+        transition: How far states may move, and may change how they move.
+        changes: Steps at which the coordinates of the state change, and how.
+    """
     t, n = x.shape
     motion, turn = transition.deviations(times, n)
     eye = torch.eye(n, dtype=x.dtype, device=x.device)

@@ -111,7 +111,16 @@ def tempered_log_weight(
 def resample(
     log_weight: Float[Tensor, " s"], num: int, *, generator: torch.Generator
 ) -> Int[Tensor, " m"]:
-    """Indices of samples drawn again by their weight, at equal steps of the cumulated weight."""
+    """Draw samples again by their weight, at equal steps of the cumulated weight.
+
+    Args:
+        log_weight: Weights of the samples, unnormalised.
+        num: How many to draw.
+        generator: Where randomness comes from.
+
+    Returns:
+        Indices of the samples drawn.
+    """
     return draw_components(log_weight, num, generator=generator, stratified=True)
 
 

@@ -75,9 +75,14 @@ class Proposal(Protocol):
     def sample(
         self, mixture: GaussianMixture, num: int, bounds: Bounds, *, generator: torch.Generator
     ) -> Samples:
-        """Draw `num` admissible samples (a regular pattern may give fewer).
+        """Draw admissible samples.
 
-        With infinite bounds the samples are as they were drawn.
+        Args:
+            mixture: The prior, one frame ahead.
+            num: How many; a regular pattern may give fewer.
+            bounds: Limits onto which samples are projected; with infinite ones the samples are as
+                they were drawn.
+            generator: Where randomness comes from.
         """
         ...
 

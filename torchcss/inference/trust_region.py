@@ -196,7 +196,14 @@ class TrustRegionNewton:
     ) -> tuple[TrustRegionState, TrustRegionInfo]:
         """Evaluate the planned steps once, keep those that lower the cost, and plan the next.
 
-        Items that are not `RUNNING` stay as they are.
+        Args:
+            cost: What is minimised, one item per row of the state.
+            state: From `init` or the step before. Items that are not `RUNNING` stay as they are.
+            bounds: Box limits on the state.
+            scale: See `init`.
+
+        Returns:
+            The next state, and what became of the steps.
         """
         bounds, weight = _like(bounds, state.x), _weight(state.x, scale)
         running, value = state.status == Status.RUNNING, state.model.value

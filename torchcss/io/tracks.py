@@ -1,6 +1,6 @@
 """A track on disk: every frame's modes in `track.npz`, what was run in `summary.json`.
 
-Section 6 of the design, schema version 1. T frames, K the largest number of modes, n parameters,
+Schema version 1. T frames, K the largest number of modes, n parameters,
 J joints:
 
 | array | shape | meaning |

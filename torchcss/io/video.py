@@ -85,6 +85,9 @@ class VideoReader:
         stride: Every how many frames one is taken.
         image_frame_rate: Frames per second of images, which do not say it themselves.
 
+    Attributes:
+        info: Frame rate and size, as the file states them.
+
     Raises:
         VideoError: If nothing can be read, no frame is selected, or the stride is not positive.
     """

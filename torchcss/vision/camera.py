@@ -116,6 +116,10 @@ class Camera(nn.Module):
         name: How messages and files call the camera.
         near: Points nearer than this depth (metres) are invalid.
 
+    Attributes:
+        maximum_radius: Distance from the axis at unit depth up to which the distortion can be
+            undone; points farther out are invalid.
+
     Raises:
         CameraError: If a value is not finite, `K` is not of the form above, the rotation is not
             one, or the image is empty.

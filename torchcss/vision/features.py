@@ -121,6 +121,9 @@ class FeatureExtractor(nn.Module):
             smaller ones are left as they are. None: never reduce.
         colour: Keep the colours, for terms that look at them.
 
+    Attributes:
+        luma: Weights of red, green and blue in the grey image.
+
     Raises:
         ConfigurationError: If the working size is not a positive whole number.
     """

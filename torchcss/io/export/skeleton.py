@@ -68,7 +68,11 @@ class Node(NamedTuple):
 
 
 class Skeleton(NamedTuple):
-    """Nodes, parents before children, each followed by all that hangs on it."""
+    """The joints as a tree.
+
+    Attributes:
+        nodes: Parents before children, each followed by all that hangs on it.
+    """
 
     nodes: tuple[Node, ...]
 
