@@ -48,7 +48,7 @@ LAYERS = (
     {"io"},
     {"pipeline", "initialise_image", "first_frame", "smooth", "retarget"},
     {"yardstick", "side_by_side"},
-    {"recorder", "live"},
+    {"recorder", "view_files", "live"},
     {"track_files", "smooth_video"},
     {"demo", "scenes", "cli", "cli_init", "cli_export", "cli_smooth", "cli_view"},
 )

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 
+from torchcss.cost.view import View
 from torchcss.first_pose import LEAST_JOINTS
 from torchcss.hypotheses import Initialisation
 from torchcss.initialise import initialise
@@ -24,6 +26,7 @@ def initialise_video(
     start: int,
     sigma: float,
     generator: torch.Generator,
+    others: Sequence[View] = (),
 ) -> Initialisation:
     """Fit pose, proportions and shape to the frame where tracking starts.
 
@@ -35,6 +38,7 @@ def initialise_video(
         start: The frame.
         sigma: Noise of the keypoints, pixels of the full image.
         generator: Source of the starting poses.
+        others: What further cameras see of that moment, see `initialise`.
 
     Raises:
         TorchcssError: If the frame cannot be read, or too few joints are marked in it.
@@ -51,6 +55,7 @@ def initialise_video(
         contours="contour" in settings.terms,
         working_size=settings.working_size,
         least_joints=LEAST_JOINTS,
+        others=others,
         dtype=settings.torch_dtype,
         device=settings.device,
     )

@@ -9,7 +9,7 @@ with. Their covariances are those of the pose with the lengths unknown: the inve
 and lengths together, of which the pose's block is kept.
 
 One image does not tell a large person from a small one farther away: `stature` fixes the scale,
-else the anthropometric prior does.
+or the view of another camera (`others`), else the anthropometric prior does.
 
 Call `initialise_from_joints`, for the first frame of a video say.
 """
@@ -17,6 +17,8 @@ Call `initialise_from_joints`, for the first frame of a video say.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -27,6 +29,7 @@ from torchcss.body.root import has_root, move_base, root_pose
 from torchcss.cost.anthropometric import Anthropometric
 from torchcss.cost.joints import JointObservation, JointTerm
 from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.cost.view import View
 from torchcss.errors import CameraError
 from torchcss.gross_marks import best_distinct, explain, refine
 from torchcss.hypotheses import (
@@ -65,6 +68,7 @@ def initialise_from_joints(
     stature: float | None = None,
     placed: BodyModel | None = None,
     least_joints: int = LEAST_JOINTS,
+    others: Sequence[View] = (),
     dtype: torch.dtype = torch.float64,
     device: torch.device | str = "cpu",
 ) -> Initialisation:
@@ -83,6 +87,8 @@ def initialise_from_joints(
         stature: Height of the standing person, metres, where it is known.
         placed: A body whose base and lengths are known: only its own parameters are fitted.
         least_joints: Fewest joints to accept; with fewer than three much stays at its prior.
+        others: What further cameras see at the same time, in the same world; only their keypoints
+            matter. Starts and gross marks are looked for in the first camera's view.
         dtype: Type of the body.
         device: Where to compute.
 
@@ -111,7 +117,13 @@ def initialise_from_joints(
     )
 
     def cost_of(body: BodyModel) -> TrackingCost:
-        return TrackingCost(body=body, camera=camera, choice=choice, observation=observation)
+        return TrackingCost(
+            body=body,
+            camera=camera,
+            choice=choice,
+            observation=observation,
+            others=tuple(others),
+        )
 
     if placed is not None:
         _check_in_view(placed, camera)
@@ -128,7 +140,7 @@ def initialise_from_joints(
         observation.weight = torch.where(gross, 0.0, observation.weight)
     lengths = fitted_lengths(free, fits.mean[0], stature)
 
-    def load(**options: bool) -> BodyModel:
+    def load(**options: Any) -> BodyModel:
         bare = {name: length / scale for name, length in lengths.items()}
         body = load_body(name, dtype=dtype, device=device, lengths=bare, scale=scale, **options)
         return body.with_base(free.base_rotation, free.base_translation)
@@ -153,7 +165,7 @@ def initialise_from_joints(
         kept = kept._replace(covariance=covariance)
     free_fits = fits if num_modes is None else Modes(*(field[:num_modes] for field in fits))
     result = as_initialisation(body, kept, warnings)
-    report = [*result.report, scale_report(stature, lengths)]
+    report = [*result.report, scale_report(stature, lengths, num_views=1 + len(others))]
     if (line := undetermined_line(body, kept, joints=cost_of(body))) is not None:
         report.append(line)
     return result._replace(

@@ -196,14 +196,15 @@ def fitted_lengths(
     return lengths
 
 
-def scale_report(stature: float | None, lengths: Mapping[str, float]) -> str:
+def scale_report(stature: float | None, lengths: Mapping[str, float], *, num_views: int = 1) -> str:
     """The line that says what sets the scale, and the lengths."""
     fitted = ", ".join(f"{name} {length:.3f} m" for name, length in lengths.items())
-    source = (
-        "the prior on proportions sets the scale, which one image does not show"
-        if stature is None
-        else f"the known stature of {stature:g} m sets the scale"
-    )
+    if stature is not None:
+        source = f"the known stature of {stature:g} m sets the scale"
+    elif num_views > 1:
+        source = f"{num_views} views set the scale"
+    else:
+        source = "the prior on proportions sets the scale, which one image does not show"
     return f"{source}; lengths within 10 % of the standard humanoid: {fitted}"
 
 

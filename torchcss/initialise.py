@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -25,6 +26,7 @@ from torchcss.body.shape import WHOLE_SHAPE, ShapeParameters, with_shape
 from torchcss.cost.anthropometric import Anthropometric
 from torchcss.cost.joints import JointObservation, JointTerm
 from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.cost.view import View
 from torchcss.cost.visibility import ContourPredictor
 from torchcss.errors import CameraError
 from torchcss.first_pose import initialise_from_joints
@@ -69,6 +71,7 @@ def initialise(
     working_size: int = 640,
     search: Search | None = None,
     least_joints: int = 1,
+    others: Sequence[View] = (),
     dtype: torch.dtype = torch.float64,
     device: torch.device | str = "cpu",
 ) -> Initialisation:
@@ -92,6 +95,8 @@ def initialise(
         working_size: Longer side of the picture on which contours are searched.
         search: How widely interpretations are looked for.
         least_joints: Fewest joints of the body that have to be marked.
+        others: What further cameras see at the same time, in the same world; of these the keypoints
+            are used.
         dtype: Type of the body.
         device: Where to compute.
 
@@ -120,7 +125,7 @@ def initialise(
     first = initialise_from_joints(
         body, camera, keypoints, confidence, names, generator=generator, joints=joints,
         search=search, num_modes=num_modes, stature=stature, least_joints=least_joints,
-        dtype=dtype, device=device,
+        others=others, dtype=dtype, device=device,
     )  # fmt: skip
     notes += swapped_sides(
         first.body, first.mixture.mean[0], camera, keypoints, confidence, names, joints, generator
@@ -145,8 +150,9 @@ def initialise(
         anthropometric=Anthropometric() if stature is None else Anthropometric(stature=0.0),
     )
     cost = TrackingCost(
-        body=first.body, camera=working, choice=choice, edge_field=field, observation=observation
-    )
+        body=first.body, camera=working, choice=choice, edge_field=field, observation=observation,
+        others=tuple(view.of_keypoints(factor) for view in others),
+    )  # fmt: skip
     return _with_contours(first, cost, stature, search or Search(), num_modes)
 
 
@@ -159,6 +165,7 @@ def _with_contours(
 ) -> Initialisation:
     """The second and the third stage, and the hypotheses refined on the body that they find."""
     name, scale, rooted = first.body.name, first.scale, has_root(first.body)
+    scale_line = partial(scale_report, stature, num_views=len(cost.views))
 
     def load(lengths: Mapping[str, float], *, free: bool) -> BodyModel:
         bare = {name: length / scale for name, length in lengths.items()}
@@ -210,10 +217,10 @@ def _with_contours(
         mixture=result.mixture,
         cost=result.cost,
         report=(
-            *(line for line in first.report if line != scale_report(stature, first.lengths)),
+            *(line for line in first.report if line != scale_line(first.lengths)),
             f"shape: {len(parameters.names)} numbers of the parts fitted to the contours; "
             f"{len(kept.cost)} distinct fits to joints and contours, best cost {third.cost:.1f}",
-            scale_report(stature, lengths),
+            scale_line(lengths),
         ),
         lengths=lengths,
         stages=(*first.stages, second, third),

@@ -4,14 +4,18 @@
 tracker, and the base transform moved where the root's angles near their lock. `torchcss.cost.frame`
 makes the cost of a frame from its features; whoever looks at a cost, or smooths a track, uses the
 same. `torchcss.track_files.track_video` wraps the loop for files.
+
+Any number of synchronised, calibrated cameras may look on (`ViewStream`): what all of them see adds
+up in the cost. A camera that sends pictures of one colour, or none any more, is out: it says
+nothing until it is back.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -20,9 +24,9 @@ from torch import Tensor
 
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, has_root, move_base, root_pose
-from torchcss.cost.frame import FrameCosts
+from torchcss.cost.frame import FrameCosts, beside
 from torchcss.cost.joints import JointObservation
-from torchcss.cost.total import CostChoice
+from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.errors import VideoError
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.proposals import unbounded
@@ -31,8 +35,9 @@ from torchcss.io.video import Frame
 from torchcss.jumps import with_flips
 from torchcss.recovery import Recovery
 from torchcss.stopwatch import Stopwatch
+from torchcss.vision.appearance import Appearance
 from torchcss.vision.camera import Camera
-from torchcss.vision.features import FeatureExtractor
+from torchcss.vision.features import FeatureExtractor, FrameFeatures
 
 _PITCH_LIMIT = math.radians(55)
 """The base follows once the root's pitch exceeds this, well before it locks at 90 degrees."""
@@ -57,6 +62,7 @@ class TrackedFrame(NamedTuple):
             optimiser's own.
         lost: Whether the track counts as lost, see `torchcss.recovery`.
         loss_score: By how many deviations the image costs more than before, see `LossMonitor`.
+        others: The images of the other cameras; None from one that has ended.
     """
 
     frame: Frame
@@ -69,10 +75,76 @@ class TrackedFrame(NamedTuple):
     term_seconds: dict[str, float]
     lost: bool = False
     loss_score: float = 0.0
+    others: tuple[Frame | None, ...] = ()
 
 
 Observe = Callable[[int], JointObservation | None]
 """Keypoints of a frame by its index, in pixels of the working image; None if there are none."""
+
+
+class ViewStream(NamedTuple):
+    """What a further camera sends, one image for each of the first camera's.
+
+    Attributes:
+        frames: The images, in order; where they end before the first camera's, the view is out.
+        camera: Camera of the full-size images, in the first one's world.
+        observe: Keypoints by this stream's frames.
+        masks: Foreground of each of the images, of their size; None: not known.
+    """
+
+    frames: Iterable[Frame]
+    camera: Camera
+    observe: Observe
+    masks: Iterable[np.ndarray | Tensor] | None = None
+
+
+class _Watcher:
+    """One camera's part of the loop: features, and what things look like in its images."""
+
+    def __init__(
+        self,
+        costs: FrameCosts,
+        extractor: FeatureExtractor,
+        observe: Observe,
+        masks: Iterable[np.ndarray | Tensor] | None,
+    ) -> None:
+        self.costs, self.extractor, self.observe = costs, extractor, observe
+        self.masks = None if masks is None else iter(masks)
+        self.last: np.ndarray | None = None
+        self.appearance: Appearance | None = None
+        self.index: int | None = None
+        self.features: FrameFeatures | None = None
+
+    def look(self, frame: Frame | None) -> None:
+        """Take in the next image; None, or one of a single colour, is a view that is out."""
+        self.index, self.features = None if frame is None else frame.index, None
+        if frame is None:
+            self.last = None
+            return
+        mask = None
+        if self.masks is not None and (mask := next(self.masks, None)) is None:
+            raise VideoError(f"the masks end before frame {frame.index}; give one for every frame")
+        # There is no flow out of or into a missing picture.
+        if frame.image.size and frame.image.min() == frame.image.max():
+            self.last = None
+            return
+        self.features = self.extractor(frame.image, self.last, mask)
+        self.last = frame.image
+
+    def cost(self, body: BodyModel, before: Tensor, stopwatch: Stopwatch) -> TrackingCost:
+        """The cost of the image taken in last."""
+        return self.costs(
+            self.features,
+            body=body,
+            before=before,
+            observation=None if self.index is None else self.observe(self.index),
+            appearance=self.appearance,
+            stopwatch=stopwatch,
+        )
+
+    def learn(self, body: BodyModel, state: Tensor) -> None:
+        """Take in what body and surroundings look like in that image."""
+        self.appearance = self.costs.learn(self.appearance, self.features, body, state)
 
 
 def track_frames(
@@ -92,6 +164,7 @@ def track_frames(
     masks: Iterable[np.ndarray | Tensor] | None = None,
     recovery: Recovery | None = None,
     jumps_every: int = 0,
+    others: Sequence[ViewStream] = (),
 ) -> Iterator[TrackedFrame]:
     """Track a body through a sequence of images.
 
@@ -112,46 +185,45 @@ def track_frames(
             None: not known.
         recovery: How losses are told and what is done then; None: nothing.
         jumps_every: Every how many frames the flips of the best mode join the search, see
-            `torchcss.jumps`; 0: never.
+            `torchcss.jumps`; 0: never. Not where several cameras look on: to them a flip looks
+            different.
+        others: What further cameras send.
 
     Yields:
         A `TrackedFrame` for every frame.
     """
-    costs = FrameCosts(
-        body,
-        extractor.working_camera(camera),
-        choice,
-        frame_interval=frame_interval,
-        boundary_emphasis=boundary_emphasis,
-    )
-    last_image, foregrounds = None, None if masks is None else iter(masks)
-    state, appearance = tracker.init(mixture, generator=generator), None
+
+    def watcher(camera: Camera, observe: Observe, masks: Iterable[Any] | None) -> _Watcher:
+        costs = FrameCosts(
+            body,
+            extractor.working_camera(camera),
+            choice,
+            frame_interval=frame_interval,
+            boundary_emphasis=boundary_emphasis,
+        )
+        return _Watcher(costs, extractor, observe, masks)
+
+    watchers = [watcher(camera, observe, masks)]
+    watchers += [watcher(other.camera, other.observe, other.masks) for other in others]
+    streams = [iter(other.frames) for other in others]
+    state = tracker.init(mixture, generator=generator)
     lost, num_lost = False, 0
     watch = None if recovery is None else recovery.monitor.init()
     for frame in frames:
         clock = time.perf_counter()
-        mask = None
-        if foregrounds is not None and (mask := next(foregrounds, None)) is None:
-            raise VideoError(f"the masks end before frame {frame.index}; give one for every frame")
-        features = extractor(frame.image, last_image, mask)
-        last_image = frame.image
+        beside_it = tuple(next(stream, None) for stream in streams)
+        for each, image in zip(watchers, (frame, *beside_it), strict=True):
+            each.look(image)
         jumping = time.perf_counter()
         searching, num_prior = tracker, len(state.mixture.mean)
         if recovery is not None and 0 < num_lost <= recovery.patience:
             searching = recovery.widened(tracker)
             state = recovery.with_jumps(state, body, camera)
-        elif jumps_every and int(state.frame) % jumps_every == 0:
+        elif jumps_every and not others and int(state.frame) % jumps_every == 0:
             state = with_flips(state, body, camera, num=NUM_JUMPS)
         jumped = time.perf_counter() - jumping
         stopwatch = Stopwatch()
-        cost = costs(
-            features,
-            body=body,
-            before=state.mixture.mean,
-            observation=observe(frame.index),
-            appearance=appearance,
-            stopwatch=stopwatch,
-        )
+        cost = beside([each.cost(body, state.mixture.mean, stopwatch) for each in watchers])
         featured = time.perf_counter()
         prior = state.mixture
         bounds = body.bounds if limits else unbounded(prior.mean)
@@ -164,10 +236,11 @@ def track_frames(
         values = cost.of_children(info.origin[:1], prior).terms(mean[:1])
         terms = {name: float(value[0]) for name, value in values.items()}
         if recovery is not None and watch is not None:
-            watch, lost = recovery.judge(watch, terms)
+            watch, lost = recovery.judge(watch, _per_view(terms, watchers))
             num_lost = num_lost + 1 if lost else 0
         if not lost:
-            appearance = costs.learn(appearance, features, body, mean[0])
+            for each in watchers:
+                each.learn(body, mean[0])
         yield TrackedFrame(
             frame,
             body,
@@ -182,8 +255,15 @@ def track_frames(
             term_seconds,
             lost,
             0.0 if watch is None else watch.score,
+            beside_it,
         )
         body, state = follow_with_base(body, state)
+
+
+def _per_view(terms: dict[str, float], watchers: Sequence[_Watcher]) -> dict[str, float]:
+    """What a frame costs a view: the sum falls when a view is out, and is no better for it."""
+    seen = max(1, sum(each.features is not None for each in watchers))
+    return {name: value / seen for name, value in terms.items()}
 
 
 def follow_with_base(body: BodyModel, state: TrackerState) -> tuple[BodyModel, TrackerState]:

@@ -32,14 +32,11 @@ from torchcss.cost.joints import JointObservation
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.errors import ConfigurationError, TrackFileError, VideoError
 from torchcss.inference.smoothing import refine_in_windows
-from torchcss.io.cameras import check_image_size, read_camera
 from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body
-from torchcss.io.keypoints import read_keypoints
 from torchcss.io.track_body import body_of_track
 from torchcss.io.tracks import SUMMARY_NAME, Track, read_summary
-from torchcss.io.video import Frame, VideoReader
-from torchcss.marks import typical_sigma
-from torchcss.pipeline import Observe, scale_keypoints
+from torchcss.io.video import Frame
+from torchcss.pipeline import Observe
 from torchcss.settings import Settings, boundary_emphasis, make_choice, make_extractor
 from torchcss.smooth import (
     SmoothedTrack,
@@ -53,6 +50,7 @@ from torchcss.smooth import (
     write_smoothed,
 )
 from torchcss.types import Status
+from torchcss.view_files import ViewFiles, open_view
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor
 
@@ -200,50 +198,38 @@ def smooth_video(
     if not len(found.frames):
         raise TrackFileError(f"{track}: the track has no frames, of which the video could show any")
     first, stop = int(found.frames[0]), int(found.frames[-1]) + 1
-    reader = VideoReader(video, start=first, stop=stop)
-    width, height = reader.info.width, reader.info.height
-    foreground = None if masks is None else VideoReader(masks, start=first, stop=stop)
-    if foreground is not None:
-        size = foreground.info.width, foreground.info.height
-        if size != (width, height):
-            raise VideoError(f"{masks}: masks must have the video's size {width} x {height}")
-    loaded = read_camera(camera, camera_name=camera_name, video=video)
-    check_image_size(loaded.camera, width, height)
-    marks = read_keypoints(
-        keypoints,
-        image_size_wh=(width, height),
-        num_frames=reader.info.num_frames or reader.count_frames(),
+    files = ViewFiles(
+        video=Path(video),
+        keypoints=Path(keypoints),
+        camera_name=camera_name,
+        masks=masks,
         layout=layout,
         normalised=normalised,
-        first_frame=first,
     )
-    sigma = typical_sigma(marks.keypoints, marks.confidence)
+    view = open_view(files, camera, start=first, stop=stop)
     extractor = make_extractor(settings)
-    working = extractor.working_shape(width, height)
-    scaled = scale_keypoints(marks.keypoints, (width, height), working).double()
-    confidence = marks.confidence.double()
+    working = extractor.working_shape(*view.size_wh)
+    look = view.marks(found.joint_names, torch.zeros((), dtype=torch.float64))
 
     def observe(index: int) -> JointObservation | None:
         if settings.keypoints_use == "first" and index != first:
             return None
-        return JointObservation(
-            found.joint_names, scaled[index], confidence[index], marks.joint_names
-        )
+        return look(index, working)
 
     wanted = set(found.frames.tolist())
     done = smooth_frames(
         found,
-        (frame for frame in reader if frame.index in wanted),
+        (frame for frame in view.reader if frame.index in wanted),
         body=flesh,
-        camera=loaded.camera,
+        camera=view.camera.camera,
         extractor=extractor,
-        cost=make_choice(settings, sigma * working[0] / width),
+        cost=make_choice(settings, view.sigma * working[0] / view.size_wh[0]),
         observe=observe,
         choice=choice,
         boundary_emphasis=boundary_emphasis(settings),
         masks=None
-        if foreground is None
-        else (mask.image for mask in foreground if mask.index in wanted),
+        if view.masks is None
+        else (mask.image for mask in view.masks if mask.index in wanted),
     )
     return write_smoothed(done, into, folder)
 

@@ -7,23 +7,22 @@ stopped run keeps what it has.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from tqdm import tqdm
 
+from torchcss.body.model import load_body
 from torchcss.cost.joints import JointObservation
-from torchcss.errors import ConfigurationError, VideoError
+from torchcss.cost.view import View
+from torchcss.errors import CameraError, ConfigurationError
 from torchcss.first_frame import initialise_video
 from torchcss.hypotheses import Initialisation
-from torchcss.io.cameras import check_image_size, read_camera
 from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body, write_fitted_body
-from torchcss.io.keypoints import read_keypoints
 from torchcss.io.tracks import prepare_output_folder
-from torchcss.io.video import VideoReader
-from torchcss.marks import typical_sigma
-from torchcss.pipeline import scale_keypoints, track_frames
+from torchcss.pipeline import ViewStream, track_frames
 from torchcss.presets import PRESETS
 from torchcss.recorder import Recorder
 from torchcss.recovery import Recovery
@@ -34,6 +33,7 @@ from torchcss.settings import (
     make_extractor,
     make_settings_tracker,
 )
+from torchcss.view_files import OpenView, ViewFiles, open_view
 from torchcss.vision.camera import Camera
 
 
@@ -52,6 +52,7 @@ def track_video(
     normalised: bool = False,
     masks: Path | None = None,
     init: Path | None = None,
+    others: Sequence[ViewFiles] = (),
 ) -> dict[str, Any]:
     """Track a body through a video file.
 
@@ -71,6 +72,9 @@ def track_video(
         masks: Foreground of every frame, white or in shades of belief: a video or a folder of
             images, of the size and number of the video's frames.
         init: A body that `torchcss init` fitted to the first frame, to start from.
+        others: What further synchronised cameras of the same calibration recorded. Their videos may
+            be of another size; one that ends, or shows a single colour for a while, is left out as
+            long.
 
     Returns:
         The summary.
@@ -82,39 +86,41 @@ def track_video(
     out = Path(out)
     prepare_output_folder(out)
     fitted_path = out / FITTED_BODY_NAME
-    part = {"start": start, "stop": stop, "stride": stride}
-    reader = VideoReader(video, **part)
-    width, height = reader.info.width, reader.info.height
-    foreground = None if masks is None else VideoReader(masks, **part)
-    if foreground is not None and (foreground.info.width, foreground.info.height) != (
-        width,
-        height,
-    ):
-        raise VideoError(
-            f"{masks}: masks must have the video's size {width} x {height}, these have "
-            f"{foreground.info.width} x {foreground.info.height}"
-        )
-    loaded = read_camera(camera, camera_name=camera_name, video=video)
-    check_image_size(loaded.camera, width, height)
-    num_frames = reader.info.num_frames or reader.count_frames()
-    marks = read_keypoints(
-        keypoints,
-        image_size_wh=(width, height),
-        num_frames=num_frames,
+    files = ViewFiles(
+        video=Path(video),
+        keypoints=Path(keypoints),
+        camera_name=camera_name,
+        masks=masks,
         layout=layout,
         normalised=normalised,
-        first_frame=start,
     )
-    notes = [note for note in (loaded.units_note, *marks.report) if note]
+    view, *beside = (
+        open_view(each, camera, start=start, stop=stop, stride=stride) for each in (files, *others)
+    )
+    for each, opened in zip((files, *others), (view, *beside), strict=True):
+        if others and not opened.camera.metric:
+            raise CameraError(
+                f"{camera}: several cameras need their places in one world, in metres; that of "
+                f"{each.video} is not known so: give R and t"
+            )
+    reader, sigma, marks = view.reader, view.sigma, view.keypoints
+    assert marks is not None
     generator = torch.Generator().manual_seed(settings.seed)
     dtype, device = settings.torch_dtype, settings.device
-    eye = loaded.camera.to(dtype=dtype, device=device)
-    sigma = typical_sigma(marks.keypoints, marks.confidence)
+    notes = [note for opened in (view, *beside) for note in opened.notes]
+    eye = view.camera.camera.to(dtype=dtype, device=device)
     if init is not None:
         first = _first_pose_from_file(init, eye, settings)
     else:
         first = initialise_video(
-            video, marks, eye, settings, start=start, sigma=sigma, generator=generator
+            video,
+            marks,
+            eye,
+            settings,
+            start=start,
+            sigma=sigma,
+            generator=generator,
+            others=[_first_view(each, start, sigma, settings) for each in beside],
         )
     notes += first.report
     for note in notes:
@@ -124,17 +130,23 @@ def track_video(
         write_fitted_body(fitted_path, first, eye)
 
     extractor = make_extractor(settings)
-    working = extractor.working_shape(width, height)
-    scaled = scale_keypoints(marks.keypoints, (width, height), working).to(dtype).to(device)
-    confidence = marks.confidence.to(dtype).to(device)
+    working = extractor.working_shape(*view.size_wh)
+    factor = working[0] / view.size_wh[0]
 
-    def observe(index: int) -> JointObservation | None:
-        if settings.keypoints_use == "first" and index != start:
-            return None
-        return JointObservation(
-            first.body.joint_names, scaled[index], confidence[index], marks.joint_names
-        )
+    def stream(opened: OpenView) -> ViewStream:
+        size = extractor.working_shape(*opened.size_wh)
+        noise = opened.sigma * size[0] / opened.size_wh[0] / (sigma * factor)
+        look = opened.marks(first.body.joint_names, first.body.tie, relative_noise=noise)
 
+        def observe(index: int) -> JointObservation | None:
+            if settings.keypoints_use == "first" and index != start + opened.offset:
+                return None
+            return look(index, size)
+
+        masks = None if opened.masks is None else (mask.image for mask in opened.masks)
+        return ViewStream(opened.reader, opened.camera.camera, observe, masks)
+
+    main = stream(view)
     interval = stride / float(reader.info.frame_rate)
     tracker = make_settings_tracker(settings, first.body.motion_rate * interval)
     recorder = Recorder(
@@ -146,29 +158,42 @@ def track_video(
         notes=notes,
         extra={
             "video": str(video),
-            "camera": loaded.camera.name,
-            "world_is_metric": loaded.metric,
+            "camera": eye.name,
+            "other_views": [
+                {"video": str(each.video), "camera": opened.camera.camera.name}
+                for each, opened in zip(others, beside, strict=True)
+            ],
+            "world_is_metric": view.camera.metric,
             "body_lengths_m": first.body.lengths,
         },
     )
     tracked = track_frames(
-        reader,
+        main.frames,
         body=first.body,
         mixture=first.mixture,
-        camera=loaded.camera,
+        camera=main.camera,
         extractor=extractor,
         tracker=tracker,
-        choice=make_choice(settings, sigma * working[0] / width),
-        observe=observe,
+        choice=make_choice(settings, sigma * factor),
+        observe=main.observe,
         frame_interval=interval,
         generator=generator,
         boundary_emphasis=boundary_emphasis(settings),
         limits=PRESETS[settings.preset].limits,
         jumps_every=PRESETS[settings.preset].jumps_every,
         recovery=Recovery() if settings.recovery else None,
-        masks=None if foreground is None else (mask.image for mask in foreground),
+        masks=main.masks,
+        others=[stream(each) for each in beside],
     )
     return recorder.run(tracked, first.body, reader.num_selected)
+
+
+def _first_view(opened: OpenView, start: int, sigma: float, settings: Settings) -> View:
+    """What a further camera sees of the first frame, in the pixels of its video."""
+    camera = opened.camera.camera.to(dtype=settings.torch_dtype, device=settings.device)
+    body = load_body(settings.body, dtype=settings.torch_dtype, device=settings.device)
+    look = opened.marks(body.joint_names, body.tie, relative_noise=opened.sigma / sigma)
+    return View(camera=camera, observation=look(start + opened.offset, opened.size_wh))
 
 
 def _first_pose_from_file(path: Path, camera: Camera, settings: Settings) -> Initialisation:

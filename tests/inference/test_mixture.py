@@ -214,7 +214,7 @@ def separated_one_by_one(landmarks: torch.Tensor, distance: float, num: int) -> 
     modes = landmarks.tolist()
 
     def apart(a: int, b: int) -> float:
-        return sum(math.dist(p, q) for p, q in zip(modes[a], modes[b], strict=True)) / len(modes[a])
+        return max(math.dist(p, q) for p, q in zip(modes[a], modes[b], strict=True))
 
     best: list[int] = []
     for mode in range(len(modes)):

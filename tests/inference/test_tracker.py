@@ -262,7 +262,7 @@ class Comb(problems.AutogradCost):
 
 
 class CombWithLandmarks(Comb):
-    """The landmark is where the state is; a second one never moves, and halves the mean."""
+    """The landmark is where the state is; a second one never moves, and does not count."""
 
     def landmarks(self, x):
         return torch.stack([x, torch.zeros_like(x)], dim=-2)
@@ -277,14 +277,14 @@ def test_separation_keeps_modes_whose_landmarks_differ(generator):
         return (state.mixture.mean[:, 0] / 1.5).round().int().tolist()
 
     assert found(CombWithLandmarks(), 0.0, 5) == [0, 1, -1, 2, -2]
-    # Next neighbours' landmarks are 0.75 apart on average, every second one's 1.5.
-    assert found(CombWithLandmarks(), 0.7, 3) == [0, 1, -1]
-    assert found(CombWithLandmarks(), 1.4, 3) == [0, 2, -2]
+    # Next neighbours' landmarks are 1.5 apart, every second one's 3.
+    assert found(CombWithLandmarks(), 1.4, 3) == [0, 1, -1]
+    assert found(CombWithLandmarks(), 2.8, 3) == [0, 2, -2]
     # Places left go to the best of those alike; the order is that of the weights.
-    assert found(CombWithLandmarks(), 1.4, 4) == [0, 1, 2, -2]
+    assert found(CombWithLandmarks(), 2.8, 4) == [0, 1, 2, -2]
     assert found(CombWithLandmarks(), 50.0, 3) == [0, 1, -1]
     # A cost without landmarks is not concerned.
-    assert found(Comb(), 1.4, 3) == [0, 1, -1]
+    assert found(Comb(), 2.8, 3) == [0, 1, -1]
 
 
 def test_a_race_leaves_the_best_minima_and_takes_fewer_evaluations(generator):

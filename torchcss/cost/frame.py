@@ -9,9 +9,14 @@ the mode that it came from, and is the `CostFactory` that `Tracker.step` takes.
     costs = FrameCosts(body, camera, choice, frame_interval=1 / 25, boundary_emphasis=0.3)
     cost = costs(features, body=body, before=state.mixture.mean, observation=keypoints)
     state, info = tracker.step(state, cost.of_children, body.bounds)
+
+Several cameras have one `FrameCosts` each; `beside` makes one cost of what they give.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -71,7 +76,7 @@ class FrameCosts:
 
     def __call__(
         self,
-        features: FrameFeatures,
+        features: FrameFeatures | None,
         *,
         body: BodyModel,
         before: Float[Tensor, "k n"] | None = None,
@@ -82,35 +87,40 @@ class FrameCosts:
         """The cost of a frame; with modes before it, `of_children` has to follow.
 
         Args:
-            features: Features of the frame.
+            features: Features of the frame; None: the picture is missing, and says nothing.
             body: The body on this frame's base.
             before: The modes of the frame before, which the flow carries on; None: no flow.
             observation: Keypoints of the frame, in pixels of the features.
             appearance: What the body and its surroundings look like, see `learn`; None: not known.
             stopwatch: Where the time of evaluations is added up.
         """
-        edge_field = features.edge_field(boundary_emphasis=self.boundary_emphasis).to(body.tie)
-        direct = self.choice.edge_energy is not None
-        return TrackingCost(
+        cost = TrackingCost(
             body=body,
             camera=self.camera,
             choice=self.choice,
             predictor=self.predictor,
-            edge_field=edge_field,
-            energy=edge_energy_field(edge_field) if direct else None,
-            region=None if appearance is None else self._region(features, appearance),
             interior=self.interior,
-            targets=None if before is None else self._targets(features, body, before),
             observation=observation,
             pairs=self.pairs,
             deviation=self.deviation,
             stopwatch=stopwatch,
         )
+        if features is None:
+            return cost
+        edge_field = features.edge_field(boundary_emphasis=self.boundary_emphasis).to(body.tie)
+        direct = self.choice.edge_energy is not None
+        return replace(
+            cost,
+            edge_field=edge_field,
+            energy=edge_energy_field(edge_field) if direct else None,
+            region=None if appearance is None else self._region(features, appearance),
+            targets=None if before is None else self._targets(features, body, before),
+        )
 
     def learn(
         self,
         appearance: Appearance | None,
-        features: FrameFeatures,
+        features: FrameFeatures | None,
         body: BodyModel,
         state: Float[Tensor, " n"],
     ) -> Appearance | None:
@@ -122,8 +132,10 @@ class FrameCosts:
             body: The body on this frame's base.
             state: Its pose.
         """
-        if self.choice.region is None or features.colour is None:
+        if self.choice.region is None:
             return None
+        if features is None or features.colour is None:
+            return appearance
         if appearance is None:
             appearance = Appearance.unknown(self.num_layers, like=features.colour)
         inside, outside = region_masks(body, state, self.camera)
@@ -151,3 +163,13 @@ class FrameCosts:
             None if features.flow_outlier is None else features.flow_outlier.to(body.tie),
             visible_nodes(body, pose, self.camera.centre_world, points, part),
         )
+
+
+def beside(costs: Sequence[TrackingCost]) -> TrackingCost:
+    """The cost of a frame that several cameras see: the sum of what each sees, priors once.
+
+    Args:
+        costs: The cost of each camera's view, of the same body with the same choice of terms.
+    """
+    first, *others = costs
+    return replace(first, others=tuple(cost.alone for cost in others))

@@ -49,11 +49,13 @@ class JointObservation:
         keypoints: Detected positions, pixels, in the order of `keypoint_names`.
         confidence: Confidence in [0, 1]; 0 where there is none.
         keypoint_names: Names of the keypoints; those that the body lacks are left out.
+        relative_noise: Noise of these keypoints in multiples of `JointTerm.sigma`: views in which
+            the person is larger have more pixels of noise.
 
     Attributes:
         index: Joint centre of every correspondence.
         target: Where it should project, pixels.
-        weight: Confidence over squared spread.
+        weight: Confidence over squared spread, the latter in multiples of `JointTerm.sigma`.
     """
 
     def __init__(
@@ -62,6 +64,8 @@ class JointObservation:
         keypoints: Float[Tensor, "j 2"],
         confidence: Float[Tensor, " j"],
         keypoint_names: tuple[str, ...],
+        *,
+        relative_noise: float = 1.0,
     ) -> None:
         pairs = [
             (joint_names.index(name), column)
@@ -78,7 +82,8 @@ class JointObservation:
         known = (confidence > 0) & target.isfinite().all(-1)
         self.target: Float[Tensor, "m 2"] = torch.where(known[:, None], target, 0.0)
         weight = torch.where(known, confidence.clamp(0, 1), 0.0)
-        self.weight: Float[Tensor, " m"] = weight / keypoints.new_tensor(spread).square()
+        noise = relative_noise * keypoints.new_tensor(spread)
+        self.weight: Float[Tensor, " m"] = weight / noise.square()
 
 
 def _error(uv: Float[Tensor, "*batch m 2"], observation: JointObservation) -> Tensor:

@@ -2,7 +2,8 @@
 
     f(x) = sum_terms  weight_t / (N_t nu_t) sum_i e_i(x)  +  sum_priors f_p(x)
 
-Every term sees posed points, never x; its derivatives at the points are collected and lifted once.
+Every term sees posed points, never x; its derivatives at the points are collected and lifted once,
+over all views where several cameras look on.
 `value` and `local_model` find visibility and edge assignments fresh at x; the derivatives hold them
 fixed. Large batches are worked off in chunks, so memory does not grow with the number of samples.
 
@@ -26,9 +27,9 @@ temperature: the nats that a term contributes per nu of mean cost per node (desi
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -40,18 +41,17 @@ from torchcss.body.model import BodyModel, BodyPose
 from torchcss.cost.anthropometric import Anthropometric, proportion_columns
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.edge_energy import EdgeEnergyTerm
-from torchcss.cost.flow import FlowTargets, FlowTerm, InteriorNodes
+from torchcss.cost.flow import FlowTerm, InteriorNodes
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
-from torchcss.cost.joints import JointObservation, JointTerm
-from torchcss.cost.region import RegionImages, RegionTerm
+from torchcss.cost.joints import JointTerm
+from torchcss.cost.region import RegionTerm
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.temporal import MixtureDensity, MixturePrior, TemporalPrior
+from torchcss.cost.view import View
 from torchcss.cost.visibility import ContourPredictor, front_facing, visible_nodes
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.stopwatch import Stopwatch
 from torchcss.types import Curvature, LocalModel, PointCost
-from torchcss.vision.camera import Camera
-from torchcss.vision.spline import SplineField
 
 CHUNK = 512
 """Most samples evaluated at a time: enough to hide the overhead of calls."""
@@ -89,6 +89,8 @@ class CostChoice:
             little better, but where the flow misses a fast hand, as on the demo, it holds that
             back; at 20 the edges win.
         joint_weight: Factor on the joints' cost, whose nu is in nats already.
+        weights: Further factors by the name of a term or prior, one where none is given: what
+            `torchcss.inference.implicit` learns.
         curvature: Which Hessian the optimiser gets.
     """
 
@@ -107,6 +109,7 @@ class CostChoice:
     region_weight: float = 400.0
     flow_weight: float = 20.0
     joint_weight: float = 1.0
+    weights: Mapping[str, float] = field(default_factory=dict)
     curvature: Curvature = Curvature.EXACT
 
 
@@ -130,20 +133,17 @@ class _Prior(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackingCost:
+class TrackingCost(View):
     """The cost of one frame; a `CostFunction`.
 
+    It is itself the view of its (first) camera; see `View` for what that sees.
+
     Attributes:
+        others: What further cameras see at the same time; observations add up.
         body: The body, hung on its base.
-        camera: The camera of the image that the features were computed on.
         choice: Terms and weights.
         predictor: Contour predictor of the body; None switches contour, edge energy and region off.
-        edge_field: Edge energy times gradient direction; None switches the contour term off.
-        energy: The edge energy as a smooth function; None switches the edge-energy term off.
-        region: What the pixels look like, as smooth functions; None switches the region term off.
         interior: Interior nodes of the body, for the flow term; None switches it off.
-        targets: Where the flow carried the nodes of each sample's parent mode, `[b p 2]`.
-        observation: Keypoints of the frame, in that image's pixels; None if there are none.
         pairs: Pairs of parts that may collide; None switches the repulsion off.
         parent: State of each sample's parent mode, `[b n]` or `[n]`; None: no prior about it.
         deviation: Expected motion per frame of every parameter, for the prior about the parent.
@@ -152,20 +152,25 @@ class TrackingCost:
     """
 
     body: BodyModel
-    camera: Camera
     choice: CostChoice
+    others: tuple[View, ...] = ()
     predictor: ContourPredictor | None = None
-    edge_field: Float[Tensor, "2 h w"] | None = None
-    energy: SplineField | None = None
-    region: RegionImages | None = None
     interior: InteriorNodes | None = None
-    targets: FlowTargets | None = None
-    observation: JointObservation | None = None
     pairs: InterpenetrationPairs | None = None
     parent: Float[Tensor, "*b n"] | None = None
     deviation: Float[Tensor, " n"] | None = None
     previous: MixtureDensity | None = None
     stopwatch: Stopwatch | None = None
+
+    @property
+    def views(self) -> tuple[View, ...]:
+        """What each camera sees, the first one's view first."""
+        return (self, *self.others)
+
+    @property
+    def alone(self) -> View:
+        """What the first camera sees, without the body."""
+        return View(**{part.name: getattr(self, part.name) for part in fields(View)})
 
     def of_children(self, parent: Int[Tensor, " b"], prior: GaussianMixture) -> TrackingCost:
         """The cost for samples of a prior's modes: each is compared with the mode it came from.
@@ -176,19 +181,19 @@ class TrackingCost:
         """
         mixture = self.choice.temporal_mixture
         return replace(
-            self,
-            targets=None if self.targets is None else self.targets.take(parent),
+            self.of_parents(parent),
+            others=tuple(view.of_parents(parent) for view in self.others),
             parent=prior.mean[parent],
             previous=None if mixture is None else mixture.density(prior),
         )
 
     def take(self, items: Int[Tensor, " b"]) -> TrackingCost:
         """The cost restricted to some samples: each keeps its own parent."""
-        cost = self
-        if cost.parent is not None and cost.parent.dim() > 1:
-            cost = replace(cost, parent=cost.parent[items])
-        if cost.targets is not None and cost.targets.uv.dim() > 2:
-            cost = replace(cost, targets=cost.targets.take(items))
+        cost = self.of_samples(items)
+        if self.parent is not None and self.parent.dim() > 1:
+            cost = replace(cost, parent=self.parent[items])
+        if self.others:
+            cost = replace(cost, others=tuple(view.of_samples(items) for view in self.others))
         return cost
 
     def coarse(self) -> TrackingCost | None:
@@ -197,7 +202,7 @@ class TrackingCost:
         None in frames without keypoints.
         """
         joints = self.choice.joints
-        if joints is None or self.observation is None:
+        if joints is None or all(view.observation is None for view in self.views):
             return None
         wide = replace(joints, sigma=COARSE_SCALE * joints.sigma)
         return replace(self, choice=replace(self._without_images(), joints=wide))
@@ -238,6 +243,17 @@ class TrackingCost:
 
         return dict(zip(names, self._chunked(evaluate, x), strict=True)) if x.numel() else {}
 
+    def gradients(self, x: Float[Tensor, "*batch n"]) -> dict[str, Float[Tensor, "*batch n"]]:
+        """Gradient of every term and prior by name, visibility and assignments held fixed."""
+        names: list[str] = []
+
+        def evaluate(x: Tensor, part: TrackingCost) -> tuple[Tensor, ...]:
+            gradients = part._gradients(x)
+            names[:] = gradients
+            return tuple(gradients.values())
+
+        return dict(zip(names, self._chunked(evaluate, x), strict=True)) if x.numel() else {}
+
     def local_model(self, x: Float[Tensor, "*batch n"]) -> LocalModel:
         """Cost, gradient and Hessian, visibility and assignments found at x and held fixed."""
         return LocalModel(*self._chunked(lambda x, part: tuple(part._local_model(x)), x))
@@ -255,6 +271,7 @@ class TrackingCost:
             nodes += self.predictor.num_nodes
         if self.interior is not None and choice.flow:
             nodes += self.interior.num_nodes
+        nodes *= len(self.views)
         return max(1, min(CHUNK, CHUNK_NODES // nodes))
 
     def _chunked(
@@ -282,8 +299,20 @@ class TrackingCost:
                 values[prior.name] = prior.value()
         for term in self._observed(pose):
             with self._timed(term.name):
-                values[term.name] = term.scale * term.value().sum(-1)
+                value = term.scale * term.value().sum(-1)
+            values[term.name] = values.get(term.name, 0.0) + value
         return values or {"none": x.new_zeros(x.shape[:-1])}
+
+    def _gradients(self, x: Tensor) -> dict[str, Tensor]:
+        pose = self.body.pose(x)
+        gradients: dict[str, Tensor] = {
+            prior.name: prior.local_model().gradient for prior in self._priors(x, pose)
+        }
+        for term in self._observed(pose):
+            cost = PointCost(*(term.scale * part for part in term.point_cost()))
+            lifted = self.body.lift(pose, term.points, term.link, cost)
+            gradients[term.name] = gradients.get(term.name, 0.0) + lifted.gradient
+        return gradients or {"none": torch.zeros_like(x)}
 
     def _local_model(self, x: Tensor) -> LocalModel:
         with self._timed("pose"):
@@ -317,20 +346,27 @@ class TrackingCost:
         return total
 
     def _observed(self, pose: BodyPose) -> Iterator[_Observed]:
-        """The image terms that have what they need, at a batch of poses."""
-        choice, body, camera, predictor = self.choice, self.body, self.camera, self.predictor
-        matches = choice.contour is not None and self.edge_field is not None
-        direct = choice.edge_energy is not None and self.energy is not None
-        regions = choice.region is not None and self.region is not None
+        """The image terms of all views, at a batch of poses."""
+        weights = self.choice.weights
+        for view in self.views:
+            for term in self._seen_by(view, pose):
+                yield term._replace(scale=weights.get(term.name, 1.0) * term.scale)
+
+    def _seen_by(self, view: View, pose: BodyPose) -> Iterator[_Observed]:
+        """The image terms that have what they need in a view, at a batch of poses."""
+        choice, body, camera, predictor = self.choice, self.body, view.camera, self.predictor
+        matches = choice.contour is not None and view.edge_field is not None
+        direct = choice.edge_energy is not None and view.energy is not None
+        regions = choice.region is not None and view.region is not None
         if predictor is not None and (matches or direct or regions):
             with self._timed("visibility"):
                 nodes = predictor(body, pose, camera.centre_world)
             # None on a robot without flesh.
             num_nodes = max(predictor.num_nodes, 1)
             for name, term, image, weight in (
-                ("contour", choice.contour, self.edge_field, choice.contour_weight),
-                ("edge_energy", choice.edge_energy, self.energy, choice.edge_energy_weight),
-                ("region", choice.region, self.region, choice.region_weight),
+                ("contour", choice.contour, view.edge_field, choice.contour_weight),
+                ("edge_energy", choice.edge_energy, view.energy, choice.edge_energy_weight),
+                ("region", choice.region, view.region, choice.region_weight),
             ):
                 if term is not None and image is not None:
                     yield _Observed(
@@ -341,14 +377,14 @@ class TrackingCost:
                         partial(term.value, nodes, camera, image),  # type: ignore[arg-type]
                         partial(term.point_cost, nodes, camera, image),  # type: ignore[arg-type]
                     )
-        if choice.flow is not None and self.interior is not None and self.targets is not None:
+        if choice.flow is not None and self.interior is not None and view.targets is not None:
             term, interior = choice.flow, self.interior
             with self._timed("visibility"):
                 points, normals = interior(body, pose)
                 eye = camera.centre_world
                 facing = front_facing(points, normals, eye)
                 seen = visible_nodes(body, pose, eye, points, interior.node_part, wanted=facing)
-            arguments = (points, normals, seen, camera, self.targets)
+            arguments = (points, normals, seen, camera, view.targets)
             yield _Observed(
                 "flow",
                 points,
@@ -357,8 +393,8 @@ class TrackingCost:
                 partial(term.value, *arguments),
                 partial(term.point_cost, *arguments),
             )
-        if choice.joints is not None and self.observation is not None:
-            term, observation = choice.joints, self.observation
+        if choice.joints is not None and view.observation is not None:
+            term, observation = choice.joints, view.observation
             joints = pose.joints[..., observation.index, :]
             yield _Observed(
                 "joints",
@@ -371,6 +407,10 @@ class TrackingCost:
 
     def _priors(self, x: Tensor, pose: BodyPose) -> Iterator[_Prior]:
         """The priors that have what they need, at a batch of states."""
+        for prior in self._plain_priors(x, pose):
+            yield _weighed(prior, self.choice.weights.get(prior.name, 1.0))
+
+    def _plain_priors(self, x: Tensor, pose: BodyPose) -> Iterator[_Prior]:
         choice, body = self.choice, self.body
         lengths = list(proportion_columns(body).values())
         if choice.stabiliser is not None:
@@ -407,3 +447,13 @@ class TrackingCost:
 def _on_states(name: str, local_model: Callable[[], LocalModel]) -> _Prior:
     """A prior whose derivatives cost next to nothing."""
     return _Prior(name, lambda: local_model().value, local_model)
+
+
+def _weighed(prior: _Prior, weight: float) -> _Prior:
+    if weight == 1.0:
+        return prior
+    return _Prior(
+        prior.name,
+        lambda: weight * prior.value(),
+        lambda: LocalModel(*(weight * part for part in prior.local_model())),
+    )

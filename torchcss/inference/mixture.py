@@ -224,7 +224,7 @@ def separated(landmarks: Float[Tensor, "k m d"], distance: float, num: int) -> I
 
     Args:
         landmarks: Points of each mode, the best mode first.
-        distance: Mean distance of the landmarks below which two modes are alike.
+        distance: Two modes are alike if no landmark is this far from where it is in the other.
         num: How many to choose.
 
     Returns:
@@ -234,7 +234,7 @@ def separated(landmarks: Float[Tensor, "k m d"], distance: float, num: int) -> I
     chosen: list[int] = []
     alike: list[int] = []
     for mode, points in enumerate(landmarks):
-        apart = (landmarks[chosen] - points).norm(dim=-1).mean(-1)
+        apart = (landmarks[chosen] - points).norm(dim=-1).amax(-1)
         (chosen if bool((apart >= distance).all()) else alike).append(mode)
         if len(chosen) == num:
             break

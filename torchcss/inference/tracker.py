@@ -222,11 +222,11 @@ class Tracker:
             descend to the end, as in Fig. 6.
         standard_bhattacharyya: Match modes by the distance of the literature instead of the one
             printed (design decision 4).
-        separation: Modes whose landmarks are nearer to each other than this, on average, are one
-            explanation, of which only the best is kept as long as there are others; zero: the K
-            best modes are kept however alike they are, as in Fig. 6. Clutter makes many minima
-            within a hand's breadth, which crowd out all that differ. In the unit of the cost's
-            `landmarks(x)`; costs without that method are not concerned.
+        separation: Modes of which no landmark is this far apart are one explanation, of which only
+            the best is kept as long as there are others; zero: the K best modes are kept however
+            alike they are, as in Fig. 6. Clutter makes many minima within a hand's breadth, which
+            crowd out all that differ. In the unit of the cost's `landmarks(x)`; costs without that
+            method are not concerned.
     """
 
     proposal: Proposal

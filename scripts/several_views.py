@@ -1,0 +1,356 @@
+"""One camera against several: what a second view does to errors and to the depth that is unsure.
+
+    python scripts/several_views.py --data DIR --out J
+
+DIR is the folder of recordings. Two of them were filmed by synchronised, calibrated cameras:
+
+- `balance_beam_4cam`, a person, 2D joints of a detector in all frames: tracked by `track_video`
+  from each camera alone and from both, against triangulated joints.
+- `handheld_board`, a printed board with twelve corners, held in the hands before two webcams of six
+  frames per second: a rigid body with a free root, tracked from its corners.
+
+For each set of cameras: errors in millimetres, across the first camera's line of sight and along
+it, beside the standard deviations that the tracker states there, and how often the truth lies
+within the regions of 50 and 90 % that it states. Deviations shrink as they should if the errors
+shrink with them, and the shares stay. "tempered" are the regions of the covariance divided by
+`Preset.evidence`, the power by which the tracker weighs its modes.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+import tyro
+from evaluate_track import common_name, read_reference
+from jaxtyping import Float
+from torch import Tensor
+
+from torchcss.body.catalog import BodySpecification, MarkerSpecification, root_joints
+from torchcss.body.model import BodyModel
+from torchcss.body.root import move_base, root_pose
+from torchcss.body.uncertainty import joint_covariance
+from torchcss.cost.frame import beside
+from torchcss.cost.joints import JointObservation, JointTerm
+from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.errors import TorchcssError
+from torchcss.gross_marks import best_distinct
+from torchcss.inference.mixture import GaussianMixture
+from torchcss.inference.trust_region import TrustRegionNewton
+from torchcss.io.cameras import read_camera
+from torchcss.io.fitted_body import read_fitted_body
+from torchcss.io.safe_load import load_arrays
+from torchcss.io.track_body import body_of_track, pose_track
+from torchcss.io.tracks import load_track, prepare_output_folder, write_summary
+from torchcss.io.video import VideoReader
+from torchcss.linalg import squared_mahalanobis
+from torchcss.metrics import (
+    LIMB_JOINTS,
+    coverage,
+    probability_within,
+    track_errors,
+)
+from torchcss.pipeline import ViewStream, track_frames
+from torchcss.presets import PRESETS
+from torchcss.settings import Settings, make_extractor, make_settings_tracker
+from torchcss.track_files import track_video
+from torchcss.view_files import ViewFiles
+from torchcss.vision.camera import Camera
+
+BEAM, BOARD = "balance_beam_4cam", "handheld_board"
+CORNER_NOISE_PX = 1.2
+"""Reprojection error of the board's corners (its README), which have no other measure of noise."""
+REFERENCE_M = {BEAM: 0.02, BOARD: 0.0027}
+"""What the reference itself is good to, standard deviation in metres (the recordings' READMEs)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """Which recordings, and how long."""
+
+    data: Path
+    """Folder of the recordings."""
+    what: tuple[Literal["balance_beam_4cam", "handheld_board"], ...] = (BEAM, BOARD)
+    """Which of them."""
+    frames: int | None = None
+    """Frames from the start; all by default."""
+    keypoints_use: Literal["first", "all"] = "all"
+    """Keypoints of the person in every frame, or for the first pose only."""
+    samples: int | None = None
+    """Samples per frame; the preset's number by default."""
+    seed: int = 0
+    """Seed of all random numbers."""
+    tracks: Path = Path("out/several_views")
+    """Folder for the person's tracks."""
+    out: Path | None = None
+    """JSON file to write."""
+
+
+@dataclass
+class Sums:
+    """Errors and stated uncertainties, point by point.
+
+    Attributes:
+        error: Tracked minus true position, metres, in the axes of the first camera.
+        covariance: Stated, in the same axes.
+    """
+
+    error: list[Tensor] = field(default_factory=list)
+    covariance: list[Tensor] = field(default_factory=list)
+
+    def add(
+        self,
+        away: Float[Tensor, "j 3"],
+        covariance: Float[Tensor, "j 3 3"],
+        camera: Camera,
+    ) -> None:
+        """Take in the points of a frame, in the world's axes; those not known are NaN."""
+        turn = camera.R_camera_world.double()
+        known = away.isfinite().all(-1)
+        self.error.append(away[known] @ turn.T)
+        self.covariance.append(turn @ covariance[known] @ turn.T)
+
+    def report(self, reference_m: float, evidence: float) -> dict[str, Any]:
+        """The numbers of a row, millimetres."""
+        error, covariance = torch.cat(self.error), torch.cat(self.covariance)
+        stated = covariance.diagonal(dim1=-2, dim2=-1)
+        row = {
+            "across_mm": 1000 * float(error[:, :2].square().mean().sqrt()),
+            "along_mm": 1000 * float(error[:, 2].square().mean().sqrt()),
+            "stated_across_mm": 1000 * float(stated[:, :2].mean().sqrt()),
+            "stated_along_mm": 1000 * float(stated[:, 2].mean().sqrt()),
+        }
+        own = reference_m**2 * torch.eye(3, dtype=covariance.dtype)
+        for name, factor in (("", 1.0), ("_tempered", 1 / evidence)):
+            distance = squared_mahalanobis(error, factor * covariance + own)
+            shares = coverage(probability_within(distance.numpy(), 3), (0.5, 0.9))
+            row |= {f"inside_{round(100 * p)}{name}": share for p, share in shares.items()}
+        return row
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Track, measure, print, write; return what is written."""
+    report: dict[str, Any] = {}
+    for name, study in ((BEAM, person), (BOARD, board)):
+        if name in config.what:
+            report[name] = study(config, config.data / name)
+    for name, rows in report.items():
+        print_table(name, rows)
+    if config.out is not None:
+        prepare_output_folder(config.out.parent)
+        write_summary(config.out, report)
+    return report
+
+
+def person(config: Config, folder: Path) -> dict[str, Any]:
+    """The person on the beam, from each camera and from both."""
+    positions, names = read_reference(folder / "reference3d.npz", "joints")
+    evidence = PRESETS["css"].evidence
+    rows: dict[str, Any] = {}
+    for views in (("cam01",), ("cam03",), ("cam01", "cam03")):
+        files = [
+            ViewFiles(video=folder / f"{v}.mp4", keypoints=folder / f"keypoints2d_{v}.npz")
+            for v in views
+        ]
+        assert files[0].keypoints is not None
+        out = config.tracks / "+".join(views)
+        settings = Settings(
+            keypoints_use=config.keypoints_use, samples=config.samples, seed=config.seed
+        )
+        summary = track_video(
+            files[0].video, camera=folder / "cameras.json", keypoints=files[0].keypoints, out=out,
+            stop=config.frames, settings=settings, others=files[1:],
+        )  # fmt: skip
+        track = load_track(out)
+        tracked = [common_name(name) for name in track.joint_names]
+        common = [name for name in tracked if name in names]
+        wanted = [name for name in LIMB_JOINTS if name in common]
+        reference = positions[track.frames][:, [names.index(name) for name in common]]
+        joints = track.joints_world[:, :, [tracked.index(name) for name in common]]
+        errors = track_errors(
+            joints, reference, common, present=track.log_weight > -np.inf, compared=wanted
+        )
+        body = body_of_track(track, read_fitted_body(out / "body.npz").body)
+        pose = pose_track(
+            body, torch.from_numpy(track.state[:, 0]), torch.from_numpy(track.base_transform)
+        )
+        spread = joint_covariance(body, pose, torch.from_numpy(track.covariance[:, 0]))
+        # One camera's depth is wrong by the person's size; their shape is what can be compared.
+        column = [common.index(name) for name in wanted]
+        hips = [common.index(name) for name in ("l_hip", "r_hip")]
+        away = joints[:, 0] - reference
+        away = torch.from_numpy(away[:, column] - away[:, hips].mean(1, keepdims=True))
+        camera = read_camera(folder / "cameras.json", camera_name=views[0]).camera
+        sums = Sums()
+        for row, each in enumerate(away):
+            sums.add(each, spread[row, [tracked.index(name) for name in wanted]], camera)
+        rows[" + ".join(views)] = {
+            "absolute_mm": errors.absolute.mean_mm,
+            "root_aligned_mm": errors.root_aligned.mean_mm,
+            "root_aligned_best_of_modes_mm": errors.root_aligned_best_of_modes.mean_mm,
+            "pa_mm": errors.procrustes.mean_mm,
+            "frames": len(track.frames),
+            "frames_lost": int(errors.lost.sum()),
+            "seconds_per_frame": summary["seconds_per_frame"],
+            **sums.report(REFERENCE_M[BEAM], evidence),
+        }
+    return rows
+
+
+def board(config: Config, folder: Path) -> dict[str, Any]:
+    """The board, from each webcam and from both."""
+    reference = load_arrays(folder / "board_reference.npz", TorchcssError)
+    truth, corners = torch.from_numpy(reference["corners_world"]), reference["corners_board"]
+    body = board_body(corners)
+    text = json.loads((folder / "cameras.json").read_text())
+    marks = {
+        name: load_arrays(folder / f"corners2d_{name}.npz", TorchcssError)["corners_px"]
+        for name in ("cam_0", "cam_2")
+    }
+    times = text["cameras"]["cam_0"]["frame_times_s"]
+    interval = float(np.diff(times).mean())
+    start = next(
+        i for i in range(len(truth)) if all(np.isfinite(m[i]).all() for m in marks.values())
+    )
+    stop = len(truth) if config.frames is None else min(len(truth), start + config.frames)
+    rows: dict[str, Any] = {}
+    for views in (("cam_0",), ("cam_2",), ("cam_0", "cam_2")):
+        cameras = [read_camera(folder / "cameras.json", camera_name=v).camera for v in views]
+        settings = Settings(
+            body="board", terms=("joints", "temporal"), samples=config.samples or 40, modes=3,
+            working_size=1280, seed=config.seed,
+        )  # fmt: skip
+        streams = [
+            ViewStream(
+                VideoReader(folder / f"{view}.mp4", start=start, stop=stop),
+                camera,
+                corner_marks(body, marks[view]),
+            )
+            for view, camera in zip(views, cameras, strict=True)
+        ]
+        generator = torch.Generator().manual_seed(config.seed)
+        placed, mixture = place(body, streams, start, generator)
+        choice = CostChoice(
+            contour=None, stabiliser=None, anthropometric=None,
+            joints=JointTerm(sigma=CORNER_NOISE_PX),
+        )  # fmt: skip
+        sums, errors, frames = Sums(), [], 0
+        for tracked in track_frames(
+            streams[0].frames, body=placed, mixture=mixture, camera=streams[0].camera,
+            extractor=make_extractor(settings),
+            tracker=make_settings_tracker(settings, placed.motion_rate * interval),
+            choice=choice, observe=streams[0].observe, frame_interval=interval,
+            generator=generator, others=streams[1:],
+        ):  # fmt: skip
+            mode = tracked.state.mixture
+            joints = tracked.joints_world[0]
+            away = joints - truth[tracked.frame.index]
+            pose = tracked.body.pose(mode.mean[:1])
+            spread = joint_covariance(tracked.body, pose, mode.covariance[:1])[0]
+            sums.add(away, spread, cameras[0])
+            errors.append(float(away.norm(dim=-1).nanmean()))
+            frames += 1
+        rows[" + ".join(views)] = {
+            "absolute_mm": 1000 * float(np.nanmean(errors)),
+            "worst_frame_mm": 1000 * float(np.nanmax(errors)),
+            "frames": frames,
+            **sums.report(REFERENCE_M[BOARD], PRESETS["css"].evidence),
+        }
+    return rows
+
+
+def board_body(corners: Float[np.ndarray, "m 3"]) -> BodyModel:
+    """A rigid body whose joint centres are the corners of a board."""
+    joints = root_joints()
+    return BodyModel(
+        BodySpecification(
+            name="board",
+            joints=joints,
+            parts=(),
+            markers=tuple(
+                MarkerSpecification(
+                    name=f"corner_{i}", link=joints[-1].link, translation=tuple(place)
+                )
+                for i, place in enumerate(corners.tolist())
+            ),
+            ties={},
+            sticky={},
+            neighbours=(),
+            lengths={},
+        )
+    )
+
+
+def corner_marks(body: BodyModel, corners: Float[np.ndarray, "t m 2"]) -> Any:
+    """Corners of a frame as an observation."""
+
+    def observe(index: int) -> JointObservation:
+        place = torch.from_numpy(corners[index])
+        seen = place.isfinite().all(-1).double()
+        return JointObservation(body.joint_names, place, seen, body.joint_names)
+
+    return observe
+
+
+def place(
+    body: BodyModel, streams: Sequence[ViewStream], start: int, generator: torch.Generator
+) -> tuple[BodyModel, GaussianMixture]:
+    """Find the board in the first frame, from random turns before the first camera."""
+    first = streams[0]
+    observation = first.observe(start)
+    assert observation is not None
+    middle = observation.target[observation.weight > 0].mean(0)
+    # An arm's length away; how far exactly, the descent finds.
+    body = body.with_base(
+        torch.eye(3).double(), first.camera.unproject(middle, middle.new_tensor(0.8))
+    )
+    x = torch.zeros(300, body.num_parameters, dtype=torch.float64)
+    x[:, 3:] = 3.0 * torch.randn(300, 3, generator=generator, dtype=torch.float64).clamp(-1, 1)
+    modes = None
+    for scale in (30.0, 6.0, 1.0):
+        choice = CostChoice(
+            contour=None, stabiliser=None, anthropometric=None, temporal=None,
+            joints=JointTerm(sigma=scale * CORNER_NOISE_PX),
+        )  # fmt: skip
+        cost = beside(
+            [
+                TrackingCost(
+                    body=body, camera=s.camera, choice=choice, observation=s.observe(start)
+                )
+                for s in streams
+            ]
+        )
+        modes = TrustRegionNewton(max_steps=60, tolerance=1e-6).minimise(cost, x, body.bounds)
+        x = modes.mean
+    assert modes is not None
+    best = best_distinct(modes, 3)
+    body, mean, covariance = move_base(
+        body, *root_pose(body, best.mean[0]), best.mean, best.covariance
+    )
+    assert covariance is not None
+    return body, GaussianMixture(mean, covariance, torch.log_softmax(-best.cost, 0))
+
+
+def print_table(name: str, rows: dict[str, Any]) -> None:
+    """One line per set of cameras."""
+    columns = [column for column in next(iter(rows.values())) if column != "per_frame"]
+    print(f"\n{name}; millimetres")
+    width = max(map(len, columns))
+    print(" " * width + "".join(f"{views:>16}" for views in rows))
+    for column in columns:
+        cells = "".join(f"{row[column]:16.2f}" for row in rows.values())
+        print(f"{column:{width}}{cells}")
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Config, description=__doc__))
+    except TorchcssError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
