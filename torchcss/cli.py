@@ -8,6 +8,7 @@
 | `torchcss smooth TRACK` | makes one smooth trajectory of a track's modes |
 | `torchcss export TRACK` | writes a track for another program |
 | `torchcss view TRACK` | shows a track in space over its pictures (rerun) |
+| `torchcss plot TRACK` | draws its modes, trajectories and uncertainties as PNG files |
 
 Bad input ends with one line on standard error and exit status 2; Ctrl-C with status 130. What was
 tracked until then is on disk.
@@ -16,6 +17,7 @@ tracked until then is on disk.
 from __future__ import annotations
 
 import sys
+from contextlib import closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -25,9 +27,10 @@ import tyro
 from torchcss.cli_export import Export
 from torchcss.cli_init import Init
 from torchcss.cli_smooth import Smooth, report
-from torchcss.cli_view import View
+from torchcss.cli_view import Plot, View
 from torchcss.demo import run_demo
 from torchcss.errors import OutputError, TorchcssError
+from torchcss.live import LiveViewer
 from torchcss.settings import TERMS, Settings
 from torchcss.smooth import smooth_file
 from torchcss.smooth_video import smooth_video
@@ -128,6 +131,12 @@ class Track:
     """Write overlay.mp4."""
     recovery: bool = True
     """Tell from the costs when the track is lost, and search more widely then."""
+    live: bool = False
+    """Watch in the rerun viewer while tracking."""
+    live_connect: str | None = None
+    """Watch in a viewer that runs, by its address, such as rerun+http://127.0.0.1:9876/proxy."""
+    live_save: Path | None = None
+    """Write what would be watched as FILE.rrd, which grows while tracking."""
     smooth: bool = False
     """When done, write smooth.npz as well: one smooth trajectory through the modes of all frames,
     as torchcss smooth does."""
@@ -159,21 +168,31 @@ class Track:
             overlay=self.overlay,
             recovery=self.recovery,
         )
-        summary = track_video(
-            self.video,
-            camera=self.camera,
-            keypoints=self.keypoints,
-            out=self.out,
-            settings=settings,
-            camera_name=self.camera_name,
-            start=self.start,
-            stop=self.stop,
-            stride=self.stride,
-            layout=self.layout,
-            normalised=self.normalised,
-            masks=self.masks,
-            init=self.init,
-        )
+        live = None
+        if self.live or self.live_connect is not None or self.live_save is not None:
+            live = LiveViewer(
+                self.out.name,
+                save=self.live_save,
+                connect=self.live_connect,
+                spawn=self.live and self.live_connect is None,
+            )
+        with nullcontext() if live is None else closing(live):
+            summary = track_video(
+                self.video,
+                camera=self.camera,
+                keypoints=self.keypoints,
+                out=self.out,
+                settings=settings,
+                camera_name=self.camera_name,
+                start=self.start,
+                stop=self.stop,
+                stride=self.stride,
+                layout=self.layout,
+                normalised=self.normalised,
+                masks=self.masks,
+                init=self.init,
+                live=live,
+            )
         print(
             f"{summary['num_frames']} frames, {summary['seconds_per_frame']:.2f} s each; "
             f"track, summary and overlay are in {self.out}"
@@ -201,6 +220,7 @@ Verb = (
     | Annotated[Smooth, tyro.conf.subcommand("smooth")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[View, tyro.conf.subcommand("view")]
+    | Annotated[Plot, tyro.conf.subcommand("plot")]
 )
 
 

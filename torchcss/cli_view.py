@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from torchcss.io.plot_track import plot_track
 from torchcss.io.track_pictures import TrackFiles
 from torchcss.io.view_track import view_track
 
@@ -46,3 +47,37 @@ class View:
             print("without pictures: give --video (and --camera) to see what the modes explain")
         if self.save is not None:
             print(f"wrote {self.save}; open it with: rerun {self.save}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plot:
+    """Draw a track's modes, trajectories with uncertainties, and frames, as PNG files."""
+
+    track: Annotated[Path, tyro.conf.Positional]
+    """track.npz or smooth.npz, or the folder that the former is in."""
+    out: Path | None = None
+    """Folder for the figures; by default `plots` beside the track."""
+    video: Path | None = None
+    """The video that was tracked: draw the modes over it anew. By default the frames are those of
+    overlay.mp4 beside track.npz, if it is there."""
+    frame: int | None = None
+    """Frame that is seen from the side; by default the one with the most explanations."""
+    camera: Path | None = None
+    """Calibration, as for track; by default the one in summary.json."""
+    camera_name: str | None = None
+    """Camera in the file; by default the one of the video."""
+    body: Path | None = None
+    """The fitted body, body.npz; by default the one beside the track, if any."""
+
+    def run(self) -> None:
+        """Run the verb."""
+        files = TrackFiles.find(
+            self.track,
+            video=self.video,
+            camera=self.camera,
+            camera_name=self.camera_name,
+            body=self.body,
+        )
+        out = files.path.parent / "plots" if self.out is None else self.out
+        for path in plot_track(files, out, frame=self.frame):
+            print(f"wrote {path}")

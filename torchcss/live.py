@@ -11,21 +11,21 @@ from pathlib import Path
 import numpy as np
 
 from torchcss.io.export.selection import up_axis
-from torchcss.io.viewer import Viewer, open_recording, posed_frame
+from torchcss.io.viewer import Viewer, close_recording, open_recording, posed_frame
 from torchcss.pipeline import TrackedFrame
-from torchcss.recorder import Draw
-from torchcss.vision.camera import Camera
+from torchcss.recorder import Picture
 
 
 class LiveViewer:
     """Shows every frame as soon as it is tracked.
 
+    It is made before the run, so that what is missing is told before anything is computed.
+
     Args:
         name: What the viewer calls the run.
-        camera: Camera of the full-size images.
-        num_modes: Modes that the tracker keeps at most.
         save: A recording to write while tracking.
-        connect: Address of a viewer that runs. With neither, a viewer is opened.
+        connect: Address of a viewer that runs, see `torchcss.io.viewer.open_recording`.
+        spawn: Whether to open a viewer; by default if neither of the others is given.
 
     Raises:
         MissingExtraError: If rerun is not installed.
@@ -36,32 +36,24 @@ class LiveViewer:
     def __init__(
         self,
         name: str,
-        camera: Camera,
-        num_modes: int,
         *,
         save: Path | None = None,
         connect: str | None = None,
+        spawn: bool | None = None,
     ) -> None:
-        self._recording = open_recording(name, save=save, connect=connect)
-        self._camera, self._num_modes = camera, num_modes
+        self._recording = open_recording(name, save=save, connect=connect, spawn=spawn)
         self._viewer: Viewer | None = None
 
-    def add(self, frame: TrackedFrame, draw: Draw) -> None:
+    def add(self, frame: TrackedFrame, picture: Picture) -> None:
         """Show a frame.
 
         Args:
             frame: What the tracker found.
-            draw: Its picture.
+            picture: How it looks.
         """
         body, mixture = frame.body, frame.state.mixture
         if self._viewer is None:
-            self._viewer = Viewer(
-                self._recording,
-                body,
-                num_modes=self._num_modes,
-                camera=self._camera,
-                up=_up(frame),
-            )
+            self._viewer = Viewer(self._recording, body, camera=picture.camera, up=_up(frame))
         shown = posed_frame(
             frame.frame.index,
             frame.frame.time_s,
@@ -70,15 +62,14 @@ class LiveViewer:
             covariance=mixture.covariance,
             weight=mixture.weight,
             cost=frame.info.cost,
-            picture=draw(),
+            picture=picture.image,
             lost=frame.lost,
         )
         self._viewer.add(shown)
 
     def close(self) -> None:
-        """End the recording; the viewer stays open."""
-        if self._viewer is not None:
-            self._viewer.close()
+        """End the recording; a viewer stays open."""
+        close_recording(self._recording)
 
 
 def _up(frame: TrackedFrame) -> str:

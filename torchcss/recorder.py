@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import platform
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import asdict, dataclass, field
-from functools import cache, partial
+from functools import cached_property, partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Protocol
@@ -64,19 +64,32 @@ def draw_modes(
     return picture.numpy()
 
 
-Draw = Callable[[], UInt8[np.ndarray, "h w 3"]]
-"""Returns the frame with its modes drawn over it, drawn when it is asked for, and only once."""
+class Picture:
+    """The picture of a tracked frame with its modes: drawn when asked for, once for all sinks.
+
+    Attributes:
+        camera: Camera of the full-size image.
+    """
+
+    def __init__(self, frame: TrackedFrame, camera: Camera) -> None:
+        self.camera = camera
+        self._frame = frame
+
+    @cached_property
+    def image(self) -> UInt8[np.ndarray, "h w 3"]:
+        """The frame with its modes drawn over it."""
+        return draw_modes(self._frame, self.camera)
 
 
 class Sink(Protocol):
     """What wants to see the frames of a run as they come."""
 
-    def add(self, frame: TrackedFrame, draw: Draw) -> None:
+    def add(self, frame: TrackedFrame, picture: Picture) -> None:
         """Take the next frame.
 
         Args:
             frame: What the tracker found.
-            draw: Its picture, the same for all sinks.
+            picture: How it looks.
         """
         ...
 
@@ -96,9 +109,9 @@ class Film:
     def __init__(self, path: Path, frame_rate: float) -> None:
         self._writer = VideoWriter(path, frame_rate)
 
-    def add(self, frame: TrackedFrame, draw: Draw) -> None:
+    def add(self, frame: TrackedFrame, picture: Picture) -> None:
         """Append the picture."""
-        self._writer.write(draw())
+        self._writer.write(picture.image)
 
     def close(self) -> None:
         """Complete the file."""
@@ -158,9 +171,9 @@ class Recorder:
                 for frame in bar:
                     self._append(writer, frame)
                     drawn = time.perf_counter()
-                    draw = cache(partial(draw_modes, frame, self.camera))
+                    picture = Picture(frame, self.camera)
                     for sink in sinks:
-                        sink.add(frame, draw)
+                        sink.add(frame, picture)
                     totals.add(frame, overlay_s=time.perf_counter() - drawn)
                     bar.set_postfix(
                         cost=f"{float(frame.info.cost[0]):.1f}",

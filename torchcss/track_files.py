@@ -24,7 +24,7 @@ from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body, write_fi
 from torchcss.io.tracks import prepare_output_folder
 from torchcss.pipeline import ViewStream, track_frames
 from torchcss.presets import PRESETS
-from torchcss.recorder import Recorder
+from torchcss.recorder import Recorder, Sink
 from torchcss.recovery import Recovery
 from torchcss.settings import (
     Settings,
@@ -53,6 +53,7 @@ def track_video(
     masks: Path | None = None,
     init: Path | None = None,
     others: Sequence[ViewFiles] = (),
+    live: Sink | None = None,
 ) -> dict[str, Any]:
     """Track a body through a video file.
 
@@ -75,6 +76,8 @@ def track_video(
         others: What further synchronised cameras of the same calibration recorded. Their videos may
             be of another size; one that ends, or shows a single colour for a while, is left out as
             long.
+        live: What wants to see the frames while they are tracked, such as a
+            `torchcss.live.LiveViewer`; closed at the end.
 
     Returns:
         The summary.
@@ -166,6 +169,7 @@ def track_video(
             "world_is_metric": view.camera.metric,
             "body_lengths_m": first.body.lengths,
         },
+        sinks=() if live is None else (live,),
     )
     tracked = track_frames(
         main.frames,

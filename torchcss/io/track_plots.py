@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
@@ -130,7 +130,7 @@ def side_view_figure(
     front, side = figure.subplots(1, 2, sharey=True)
     for mode in reversed(range(count)):  # the best on top
         look = {
-            "color": _colour(mode),
+            "color": mode_colour(mode),
             "alpha": _FAINTEST + (1 - _FAINTEST) * float(weight[mode] / weight.max()),
             "lw": 2.6 if mode == 0 else 1.6,
             "zorder": 3 + (mode == 0),
@@ -140,7 +140,9 @@ def side_view_figure(
         _draw_bones(side, joints[mode][:, [2, 1]], bones, **look)
         for joint in moving:
             ellipse = _one_deviation(joints[mode, joint, [2, 1]], spread[mode, joint])
-            ellipse.set(fc=_colour(mode), ec=_darker(mode), alpha=look["alpha"], lw=0.9, zorder=5)
+            ellipse.set(
+                fc=mode_colour(mode), ec=_darker(mode), alpha=look["alpha"], lw=0.9, zorder=5
+            )
             side.add_patch(ellipse)
     if reference is not None:
         _draw_reference(front, side, body, bones, camera, reference, distance)
@@ -150,7 +152,7 @@ def side_view_figure(
     side.set_title("from the side; the camera is far to the left", fontsize=10)
     side.set_xlabel("metres from the camera", fontsize=9)
     for axes in (front, side):
-        _tidy(axes)
+        tidy(axes)
     _same_scale(figure, front, side)
     handles, labels = front.get_legend_handles_labels()
     figure.legend(
@@ -191,6 +193,17 @@ def count_apart(joints: Float[np.ndarray, "k j 3"], *, apart: float = APART) -> 
     return len(kept)
 
 
+def effective_number(track: Track) -> Float[np.ndarray, " t"]:
+    """By how many modes of equal weight each frame's belief is spread as far, `1 / sum w^2`.
+
+    Args:
+        track: The track.
+    """
+    weight = np.exp(track.log_weight)
+    weight /= weight.sum(axis=1, keepdims=True)
+    return 1 / np.square(weight).sum(axis=1)
+
+
 def modes_figure(track: Track, summary: Mapping[str, Any] | None = None) -> Figure:
     """Weights of the modes, number of explanations and cost of the best mode over time.
 
@@ -211,7 +224,7 @@ def modes_figure(track: Track, summary: Mapping[str, Any] | None = None) -> Figu
 
     share = np.exp(track.log_weight)
     weights.stackplot(
-        times, share.T, colors=[_colour(mode) for mode in range(share.shape[1])], lw=0,
+        times, share.T, colors=[mode_colour(mode) for mode in range(share.shape[1])], lw=0,
         step="mid" if len(times) > 1 else None,
     )  # fmt: skip
     weights.set_ylim(0, 1)
@@ -220,6 +233,10 @@ def modes_figure(track: Track, summary: Mapping[str, Any] | None = None) -> Figu
     number.step(
         times, num_explanations(track), where="mid", color=OKABE_ITO["black"], lw=1.6,
         label=f"of these {100 * APART:g} cm apart",
+    )  # fmt: skip
+    number.plot(
+        times, effective_number(track), color=OKABE_ITO["vermilion"], lw=1.3, ls="--",
+        label="effective number",
     )  # fmt: skip
     number.set_ylim(0, 1.15 * max(int(track.num_modes.max()), 1))
     number.yaxis.get_major_locator().set_params(integer=True)
@@ -244,7 +261,7 @@ def modes_figure(track: Track, summary: Mapping[str, Any] | None = None) -> Figu
     if events:
         cost.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
     for axes in (weights, number, cost):
-        _tidy(axes)
+        tidy(axes)
     if len(times) > 1:
         weights.set_xlim(times[0], times[-1])
     return figure
@@ -281,30 +298,57 @@ def contact_sheet(
     images: dict[int, tuple[float, np.ndarray]] = {}
     for frame in VideoReader(video, stop=max(*place.values(), 0) + 1):
         if frame.index in place.values():
-            height, width = frame.image.shape[:2]
-            if width > width_px:
-                size = (width_px, max(round(height * width_px / width), 1))
-                small = np.asarray(Image.fromarray(frame.image).resize(size))
-            else:
-                small = frame.image
             time = frame.time_s if track is None else float(track.times[frame.index])
-            images[frame.index] = time, small
+            images[frame.index] = time, shrunk(frame.image, width_px)
     if missing := [frame for frame, row in place.items() if row not in images]:
         raise ConfigurationError(f"{video}: no frames {missing}; choose others")
 
-    columns = columns or min(len(frames), 6)
-    rows = math.ceil(len(frames) / columns)
-    height, width = next(iter(images.values()))[1].shape[:2]
+    shown = [images[place[int(index)]] for index in frames]
+    titles = [
+        f"frame {index}, {time:.2f} s" for index, (time, _) in zip(frames, shown, strict=True)
+    ]
+    return sheet_of([image for _, image in shown], titles, columns=columns)
+
+
+def sheet_of(
+    images: Sequence[UInt8[np.ndarray, "h w 3"]],
+    titles: Sequence[str],
+    *,
+    columns: int | None = None,
+) -> Figure:
+    """Images of one size in a grid.
+
+    Args:
+        images: The images, at least one.
+        titles: What stands above each.
+        columns: Images in a row; all in one by default, up to six.
+    """
+    columns = columns or min(len(images), 6)
+    rows = math.ceil(len(images) / columns)
+    height, width = images[0].shape[:2]
     wide = 12.0 / columns
     figure = Figure(figsize=(12.0, rows * (wide * height / width + 0.3)), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes in grid.flat:
         axes.set_axis_off()
-    for axes, index in zip(grid.flat, frames, strict=False):
-        time, image = images[place[int(index)]]
+    for axes, image, title in zip(grid.flat, images, titles, strict=False):
         axes.imshow(image)
-        axes.set_title(f"frame {index}, {time:.2f} s", fontsize=9)
+        axes.set_title(title, fontsize=9)
     return figure
+
+
+def shrunk(image: UInt8[np.ndarray, "h w 3"], width_px: int = 360) -> UInt8[np.ndarray, "r s 3"]:
+    """An image reduced to a width, if it is wider.
+
+    Args:
+        image: The image.
+        width_px: The width.
+    """
+    height, width = image.shape[:2]
+    if width <= width_px:
+        return image
+    size = (width_px, max(round(height * width_px / width), 1))
+    return np.asarray(Image.fromarray(image).resize(size))
 
 
 def _row_of(track: Track, frame: int) -> int:
@@ -328,13 +372,14 @@ def _first_of_links(body: BodyModel) -> list[int]:
     return [links.index(link) for link in dict.fromkeys(links)]
 
 
-def _colour(mode: int) -> tuple[float, float, float]:
+def mode_colour(mode: int) -> tuple[float, float, float]:
+    """The colour of the mode of a rank, as in the overlay; red, green, blue from 0 to 1."""
     red, green, blue = PALETTE[mode % len(PALETTE)]
     return red / 255, green / 255, blue / 255
 
 
 def _darker(mode: int) -> tuple[float, ...]:
-    return tuple(0.5 * part for part in _colour(mode))
+    return tuple(0.5 * part for part in mode_colour(mode))
 
 
 def _seen(joints: np.ndarray, distance: float) -> np.ndarray:
@@ -409,7 +454,8 @@ def _draw_reference(
     _draw_bones(side, places[:, [2, 1]], rows, **look)
 
 
-def _tidy(axes: Axes) -> None:
+def tidy(axes: Axes) -> None:
+    """Give a panel the look of all figures: a faint grid, small numbers, two borders."""
     axes.grid(visible=True, color="0.92", lw=0.6)
     axes.set_axisbelow(True)
     axes.tick_params(labelsize=8)

@@ -16,7 +16,13 @@ from torchcss.io.atomic import prepare_output_folder, replace_file
 from torchcss.io.export.selection import up_axis
 from torchcss.io.track_body import pose_track
 from torchcss.io.track_pictures import TrackFiles, pictures_of
-from torchcss.io.viewer import PosedFrame, Viewer, open_recording, posed_frame
+from torchcss.io.viewer import (
+    PosedFrame,
+    Viewer,
+    close_recording,
+    open_recording,
+    posed_frame,
+)
 
 
 def view_track(files: TrackFiles, *, save: Path | None = None, connect: str | None = None) -> None:
@@ -76,16 +82,18 @@ def posed_frames(files: TrackFiles) -> Iterator[PosedFrame]:
 def _replay(files: TrackFiles, save: Path | None, connect: str | None) -> None:
     track = files.track
     up, _ = up_axis(track.joint_names, track.joints_world[:, 0], track.base_transform)
-    viewer = Viewer(
-        open_recording(files.path.resolve().parent.name, save=save, connect=connect),
-        files.body,
-        num_modes=int(track.num_modes.max()),
-        camera=files.camera,
-        up=up,
-    )
+    name = files.path.resolve().parent.name
+    recording = open_recording(name, save=save, connect=connect)
     try:
+        viewer = Viewer(
+            recording,
+            files.body,
+            camera=files.camera,
+            up=up,
+            events=bool(files.summary.get("events")),
+        )
         frames = posed_frames(files)
         for frame in tqdm(frames, total=len(track.frames), unit="frame", dynamic_ncols=True):
             viewer.add(frame)
     finally:
-        viewer.close()
+        close_recording(recording)

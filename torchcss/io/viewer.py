@@ -39,6 +39,7 @@ from torch import Tensor
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.errors import ConfigurationError
+from torchcss.io.atomic import prepare_output_folder
 from torchcss.io.overlay import PALETTE
 from torchcss.io.track_plots import bones_of, count_apart
 from torchcss.io.viewer_layout import layout, rerun, world_axes
@@ -56,12 +57,13 @@ APPLICATION = "torchcss"
 _COUNTS = {"number": "modes", "apart": "of these 5 cm apart", "effective": "effective number"}
 
 _RINGS, _MERIDIANS = 9, 14
-_FAINTEST, _FLESH, _MIST = 0.25, 0.6, 0.6
+_FAINTEST, _FLESH, _MIST = 0.25, 0.35, 0.9
 """Opacity of the lines of a mode that weighs nothing, and, relative to its lines, of the best
 mode's flesh and of ellipsoids."""
-_BONE_RADIUS = 0.006
+_BONE_RADIUS, _THREAD_RADIUS = 0.006, 0.0012
 _PLANE = 0.3
-"""Radius of the best mode's lines, metres; the frustum's length relative to the body's distance."""
+"""Radius of the best mode's lines and of those of ellipsoids, metres; length of the frustum,
+relative to the body's distance."""
 _LARGEST_PICTURE = 1280
 """Longer side, pixels, to which larger pictures are reduced."""
 _JPEG_QUALITY = 85
@@ -149,45 +151,67 @@ def has_display() -> bool:
 
 
 def open_recording(
-    name: str, *, save: Path | None = None, connect: str | None = None
+    name: str,
+    *,
+    save: Path | None = None,
+    connect: str | None = None,
+    spawn: bool | None = None,
 ) -> rr.RecordingStream:
-    """Start a recording that goes to a file, to a viewer that runs, or to one that is started.
+    """Start a recording that goes to a file, to a viewer, or to both.
 
     Args:
         name: What the viewer calls it.
         save: The file, usually `.rrd`; it grows as the recording does.
-        connect: Address of a viewer, such as `rerun+http://127.0.0.1:9876/proxy`; `rerun` prints
-            its own when it starts. With `save`, both get the recording.
+        connect: Address of a viewer that runs, such as `rerun+http://127.0.0.1:9876/proxy`; it
+            prints its own when it starts.
+        spawn: Whether to open a viewer here, or use the one that is open; by default if neither of
+            the others is given.
 
     Raises:
         MissingExtraError: If rerun is not installed.
-        ConfigurationError: If a viewer would have to be started where there is no display, or the
+        ConfigurationError: If a viewer would have to be opened where there is no display, or the
             address is none.
+        OutputError: If the file cannot be written.
     """
     package = rerun()
+    spawn = spawn if spawn is not None else save is None and connect is None
+    if spawn and not has_display():
+        raise ConfigurationError(
+            "there is no display here to open a viewer on; save a recording, and open it elsewhere "
+            "with: rerun FILE.rrd"
+        )
+    sinks = []
+    if save is not None:
+        prepare_output_folder(save.parent)
+        sinks.append(package.FileSink(str(save)))
+    if connect is not None:
+        sinks.append(_viewer_at(connect))
     # A file is read faster when rows come in large chunks; someone who watches wants them at once.
-    watched = save is None or connect is not None
+    watched = spawn or connect is not None
     chunks = None if watched else package.ChunkBatcherConfig(flush_tick=_FILE_CHUNKS_S)
     recording = package.RecordingStream(APPLICATION, batcher_config=chunks)
     # What a recording holds depends on the track alone.
     recording.set_log_time_enabled(False)
     recording.set_log_tick_enabled(False)
-    sinks = []
-    if save is not None:
-        sinks.append(package.FileSink(str(save)))
-    if connect is not None:
-        sinks.append(_viewer_at(connect))
-    if sinks:
-        recording.set_sinks(*sinks)
-    elif has_display():
-        recording.spawn()
-    else:
-        raise ConfigurationError(
-            "there is no display here to open a viewer on; save a recording (--save FILE.rrd), and "
-            "open it elsewhere with: rerun FILE.rrd"
-        )
+    if spawn:
+        recording.spawn(connect=False)
+        sinks.append(package.GrpcSink())
+    recording.set_sinks(*sinks)
     recording.send_recording_name(name)
     return recording
+
+
+def close_recording(recording: rr.RecordingStream, *, patience_s: float = 10.0) -> None:
+    """Hand over what was logged, and end a recording.
+
+    Args:
+        recording: What `open_recording` gave; it may have been closed already.
+        patience_s: How long to wait for a viewer that does not answer.
+    """
+    # A viewer that was closed before the end is no reason to fail.
+    with suppress(RuntimeError):
+        recording.flush(timeout_sec=patience_s)
+    recording.disconnect()
 
 
 def _viewer_at(address: str) -> object:
@@ -206,9 +230,9 @@ class Viewer:
     Args:
         recording: Where to, see `open_recording`.
         body: The body with its flesh, for the mesh; its base does not matter.
-        num_modes: Modes that a frame has at most.
         camera: The camera of the pictures; None: not known.
         up: Axis of the world that is up: x, y, z, -x, -y or -z.
+        events: Whether to leave room for losses.
     """
 
     def __init__(
@@ -216,19 +240,23 @@ class Viewer:
         recording: rr.RecordingStream,
         body: BodyModel,
         *,
-        num_modes: int,
         camera: Camera | None = None,
         up: str = "y",
+        events: bool = True,
     ) -> None:
         self._recording = recording
         self._body = body
         self._bones = np.array(bones_of(body), dtype=np.int64).reshape(-1, 2)
-        self._num_modes = num_modes
         self._camera = camera
         self._up = up
-        self._began = False
-        self._lost = False
+        self._events = events
+        surface = body.mesh(_RINGS, _MERIDIANS)
+        self._vertices = _array(surface.points.flatten(1, 2))
+        self._normals = _array(surface.normals.flatten(1, 2))
+        self._faces = grid_faces(_RINGS, _MERIDIANS).numpy()
+        self._known = 0
         self._shown = 0
+        self._lost = False
 
     def add(self, frame: PosedFrame) -> None:
         """Log a frame.
@@ -237,13 +265,16 @@ class Viewer:
             frame: The frame, later than the last.
         """
         package, log = rerun(), self._recording.log
-        if not self._began:
+        if not self._known:
             self._begin(frame)
         self._recording.set_time("frame", sequence=frame.number)
         self._recording.set_time("time", duration=frame.time_s)
         if frame.picture is not None:
             log("world/camera/picture", _jpeg(frame.picture))
         for mode in range(len(frame.weight)):
+            if mode == self._known:
+                self._introduce(mode)
+                self._known += 1
             self._log_mode(frame, mode)
         for mode in range(len(frame.weight), self._shown):
             self._hide_mode(mode)
@@ -257,49 +288,35 @@ class Viewer:
             log("events", package.TextLog(text, level=level))
         self._lost = frame.lost
 
-    def close(self, *, patience_s: float = 10.0) -> None:
-        """Hand over what was logged, and end the recording.
-
-        Args:
-            patience_s: How long to wait for a viewer that does not answer.
-        """
-        # A viewer that was closed before the track ended is no reason to fail.
-        with suppress(RuntimeError):
-            self._recording.flush(timeout_sec=patience_s)
-        self._recording.disconnect()
-
     def _begin(self, frame: PosedFrame) -> None:
         """Log what does not change, and how the viewer is to be laid out."""
         package, log = rerun(), self._recording.log
-        self._began = True
         log("world", world_axes(self._up), static=True)
         best = frame.joints[0]
         if self._camera is not None:
             self._log_camera(self._camera, best)
-        surface = self._body.mesh(_RINGS, _MERIDIANS)
-        vertices, normals = (
-            field.flatten(1, 2).float().cpu().numpy() for field in (surface.points, surface.normals)
-        )
-        faces = grid_faces(_RINGS, _MERIDIANS).numpy()
-        for mode in range(self._num_modes):
-            for part, name in enumerate(self._body.part_names):
-                mesh = package.Mesh3D(
-                    vertex_positions=vertices[part],
-                    vertex_normals=normals[part],
-                    triangle_indices=faces,
-                )
-                log(f"world/modes/{mode}/body/{name}", mesh, static=True)
-            line = package.SeriesLines(
-                colors=PALETTE[mode % len(PALETTE)],
-                names="best mode" if mode == 0 else f"mode {mode + 1}",
-                widths=2.5 if mode == 0 else 1.2,
-            )
-            for series in ("cost", "weight"):
-                log(f"{series}/{mode}", line, static=True)
         for (name, label), colour in zip(_COUNTS.items(), PALETTE, strict=False):
             line = package.SeriesLines(colors=colour, names=label, widths=2.0)
             log(f"modes/{name}", line, static=True)
-        self._recording.send_blueprint(layout(best, self._camera, self._up))
+        self._recording.send_blueprint(layout(best, self._camera, self._up, events=self._events))
+
+    def _introduce(self, mode: int) -> None:
+        """Log what does not change of a mode."""
+        package, log = rerun(), self._recording.log
+        for name, vertices, normals in zip(
+            self._body.part_names, self._vertices, self._normals, strict=True
+        ):
+            mesh = package.Mesh3D(
+                vertex_positions=vertices, vertex_normals=normals, triangle_indices=self._faces
+            )
+            log(f"world/modes/{mode}/body/{name}", mesh, static=True)
+        line = package.SeriesLines(
+            colors=PALETTE[mode % len(PALETTE)],
+            names="best mode" if mode == 0 else f"mode {mode + 1}",
+            widths=2.5 if mode == 0 else 1.2,
+        )
+        for series in ("cost", "weight"):
+            log(f"{series}/{mode}", line, static=True)
 
     def _log_camera(self, camera: Camera, joints: Float[np.ndarray, "j 3"]) -> None:
         package, log = rerun(), self._recording.log
@@ -329,13 +346,16 @@ class Viewer:
             joints[self._bones], colors=colour, radii=thickness * _BONE_RADIUS
         )
         log(f"{path}/skeleton", strips)
+        fill = package.components.FillMode
         half_sizes, quaternions = ellipsoids(frame.covariance[mode])
         shapes = package.Ellipsoids3D(
             centers=joints,
             half_sizes=half_sizes,
             quaternions=quaternions,
-            colors=(*colour[:3], round(colour[3] * _MIST)),
-            fill_mode=package.components.FillMode.Solid,
+            colors=(*colour[:3], round(255 * opacity)),
+            line_radii=_THREAD_RADIUS,
+            # A mode of little weight may be very uncertain: filled, it would hide all others.
+            fill_mode=fill.TransparentFillMajorWireframe if mode == 0 else fill.MajorWireframe,
         )
         log(f"{path}/uncertainty", shapes)
         flesh = package.Mesh3D.from_fields(

@@ -46,19 +46,22 @@ def world_axes(up: str) -> rr.ViewCoordinates:
     return getattr(rerun().ViewCoordinates, f"RIGHT_HAND_{_AXES[up]}")
 
 
-def layout(joints: Float[np.ndarray, "j 3"], camera: Camera | None, up: str) -> rrb.Blueprint:
+def layout(
+    joints: Float[np.ndarray, "j 3"], camera: Camera | None, up: str, *, events: bool
+) -> rrb.Blueprint:
     """Return the blueprint.
 
     Args:
         joints: Where the body is in the first frame, metres, world frame.
-        camera: The camera; None: not known, and there are no pictures.
+        camera: The camera; None: not known, and pictures have no place in space.
         up: Axis of the world that is up.
+        events: Whether there is room for losses.
     """
     blueprint = rerun().blueprint
     position, target, vertical = _eye(joints, camera, up)
     space = blueprint.Spatial3DView(
         origin="world",
-        contents=["$origin/**"],
+        contents=["$origin/**", *([] if camera is not None else ["- /world/camera/**"])],
         name="the modes in space",
         eye_controls=blueprint.EyeControls3D(
             kind=blueprint.Eye3DKind.Orbital,
@@ -70,7 +73,7 @@ def layout(joints: Float[np.ndarray, "j 3"], camera: Camera | None, up: str) -> 
     picture = blueprint.Spatial2DView(
         origin="world/camera/picture", name="the picture that they explain"
     )
-    plots = [
+    below = [
         blueprint.TimeSeriesView(
             origin=origin,
             name=name,
@@ -82,11 +85,12 @@ def layout(joints: Float[np.ndarray, "j 3"], camera: Camera | None, up: str) -> 
             ("modes", "how many modes", True),
         )
     ]
-    events = blueprint.TextLogView(origin="events", name="lost and found")
+    if events:
+        below.append(blueprint.TextLogView(origin="events", name="lost and found"))
     return blueprint.Blueprint(
         blueprint.Vertical(
             blueprint.Horizontal(picture, space, column_shares=[2, 3]),
-            blueprint.Horizontal(*plots, events, column_shares=[3, 3, 3, 2]),
+            blueprint.Horizontal(*below, column_shares=[3, 3, 3, 2][: len(below)]),
             row_shares=[5, 2],
         ),
         blueprint.BlueprintPanel(state="collapsed"),
@@ -113,4 +117,4 @@ def _eye(
     right = np.cross(vertical, towards)
     level = np.cos(_ASIDE) * towards + np.sin(_ASIDE) * right
     direction = np.cos(_ABOVE) * level + np.sin(_ABOVE) * vertical
-    return middle + 3.0 * max(radius, 0.3) * direction, middle, vertical
+    return middle + 2.6 * max(radius, 0.3) * direction, middle, vertical
