@@ -12,12 +12,14 @@ that lies some centimetres off is worse than a missing one. Two namings need car
 * `vc7` is the lowest neck vertebra, 5 to 7 cm above the shoulder line, what BODY_25B calls upper
   neck; `skullbase` is where the head turns on the neck; `skull_tip` is the top of the head.
 
-By default call `canonical_joint_name` for files with names and `ALIASES` for files without.
+By default call `canonical_joint_name` for files with names, `ALIASES` for files without, and
+`skeleton_joint_names` for the joints of an animator's or a robot's skeleton, whose names differ.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 _PAIRED = (
@@ -174,3 +176,68 @@ def layout_of_names(names: tuple[str, ...]) -> tuple[str | None, ...]:
         canonical = canonical_joint_name(name)
         found.append(None if canonical in found else canonical)
     return tuple(found)
+
+
+_LIMBS: Final[tuple[str, ...]] = ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")
+_SKELETONS: Final[tuple[dict[str, str], ...]] = tuple(
+    dict(zip(names, _LIMBS, strict=True))
+    for names in (
+        # MotionBuilder, Mixamo, the BVH conversions of the CMU database.
+        ("upleg", "leg", "foot", "arm", "forearm", "hand"),
+        # Acclaim's bones by their starts, as in models for MuJoCo.
+        ("femur", "tibia", "foot", "humerus", "radius", "hand"),
+        ("thigh", "shin", "foot", "upperarm", "lowerarm", "hand"),
+    )
+)
+"""What skeletons call the joint in which a limb's segment starts, without side and prefix."""
+
+_SKELETON_PLACES: Final[dict[str, str]] = {
+    "neck": "vt1",
+    "head": "skullbase",
+    "headend": "skull_tip",
+    "headtopend": "skull_tip",
+    "toebase": "midtarsal",
+    "toes": "midtarsal",
+    "toebaseend": "toe",
+    "toeend": "toe",
+}
+"""Other joints of skeletons that are places of ours; `head` is where it turns, not its top."""
+
+
+def skeleton_joint_names(names: Sequence[str]) -> tuple[str | None, ...]:
+    """Return which of the catalogue's joints the joints of a skeleton are.
+
+    A skeleton's joint is called after what it moves: `LeftArm` and `lhumerus` are shoulders, and
+    then `LeftShoulder` is the collar bone's joint. Which way of naming a file follows is what most
+    of its names fit; a file that follows none is read as by `canonical_joint_name`.
+
+    Args:
+        names: The skeleton's joint names.
+
+    Returns:
+        A member of `JOINT_NAMES`, each once, or `None`, for every joint.
+    """
+    candidates: list[list[str | None]] = [
+        [_skeleton_place(name, layout) for name in names] for layout in (*_SKELETONS, None)
+    ]
+    best = max(candidates, key=lambda found: len({name for name in found if name}))
+    return tuple(
+        name if name is not None and best.index(name) == index else None
+        for index, name in enumerate(best)
+    )
+
+
+def _skeleton_place(name: str, layout: Mapping[str, str] | None) -> str | None:
+    bare = re.sub(r"[^a-z]", "", name.lower().split(":")[-1].removeprefix("mixamorig"))
+    for side in ("left", "right", "l", "r", ""):
+        place = bare.removeprefix(side)
+        if side and place == bare:
+            # Blender's names end in the side: upper_arm.L.
+            words = re.split(r"[^a-z]+", name.lower().split(":")[-1])
+            place = "".join(words[:-1]) if words[-1] == side else bare
+            if place == bare:
+                continue
+        known = _SKELETON_PLACES.get(place) or (layout or {}).get(place)
+        if known is not None and (known in _PAIRED) == bool(side):
+            return f"{side[0]}_{known}" if side else known
+    return canonical_joint_name(name) if layout is None else None

@@ -234,7 +234,7 @@ THREE = LINKS + "<link name='c'/>" + joint("<limit lower='-1' upper='2'/>")
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        pytest.param("", "XML does not parse", id="empty file"),
+        pytest.param("", "the file is empty", id="empty file"),
         pytest.param("hello, world", "XML does not parse", id="not XML"),
         pytest.param("\x00\x01\x02", "XML does not parse", id="binary"),
         pytest.param("<?xml version='1.0' encoding='latin-17'?><robot/>", "parse", id="encoding"),
@@ -302,17 +302,22 @@ def test_bad_files_are_refused_in_one_line(tmp_path: Path, text: str, message: s
 
 
 def test_missing_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(BodyError, match="No such file"):
+    with pytest.raises(BodyError, match="there is no such file"):
         load_body(tmp_path / "nowhere.urdf")
     with pytest.raises(BodyError, match=r"no body .*arm7"):
         load_body("arm9")
-    with pytest.raises(BodyError, match="cannot read the URDF"):
+    with pytest.raises(BodyError, match=r"no body .* ends in \.urdf"):
         load_body(tmp_path)
+    (tmp_path / "folder.urdf").mkdir()
+    with pytest.raises(BodyError, match=r"folder\.urdf: expected a file, found a folder"):
+        load_body(tmp_path / "folder.urdf")
 
 
-def test_mjcf_of_the_shared_data_is_refused(shared_data: Path) -> None:
+def test_mjcf_is_no_urdf(shared_data: Path, tmp_path: Path) -> None:
+    robot = (shared_data / "robot_models" / "humanoid_gym.xml").read_text()
+    (tmp_path / "humanoid.urdf").write_text(robot)
     with pytest.raises(BodyError, match="found <mujoco>"):
-        load_body(shared_data / "robot_models" / "humanoid_gym.xml")
+        load_body(tmp_path / "humanoid.urdf")
 
 
 def test_what_urdf_leaves_out(tmp_path: Path, capfd: pytest.CaptureFixture) -> None:

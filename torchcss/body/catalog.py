@@ -177,6 +177,7 @@ class BodySpecification:
             3.2.2 [IJRR].
         neighbours: Pairs of parts that touch in every pose.
         lengths: The lengths that the body was built with, metres.
+        notes: What was assumed when it was read from a file, one line each.
     """
 
     name: str
@@ -187,6 +188,7 @@ class BodySpecification:
     sticky: Mapping[str, tuple[float, float]]
     neighbours: tuple[tuple[str, str], ...]
     lengths: Mapping[str, float]
+    notes: tuple[str, ...] = ()
 
 
 _DOWN = ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0))
@@ -407,7 +409,7 @@ def specification(
         BodyError: If the name or a length is unknown, or a length or the scale is not positive.
     """
     if name not in BODY_NAMES:
-        raise BodyError(f"no body {name!r}; the bodies are {', '.join(BODY_NAMES)}, or a URDF file")
+        raise BodyError(f"no body {name!r}; the bodies are {', '.join(BODY_NAMES)}")
     unknown = set(lengths or {}) - set(LENGTHS)
     if unknown:
         raise BodyError(f"unknown lengths {sorted(unknown)}; known are {', '.join(LENGTHS)}")
@@ -416,20 +418,17 @@ def specification(
         raise BodyError("lengths and scale must be positive and finite")
     build = _Builder(size, free_proportions)
     is_arm = name.startswith("arm")
-    link = build.joint("world", None)
     if free_root if free_root is not None else not is_arm:
-        for axis, letter in (((1.0, 0, 0), "x"), ((0, 1.0, 0), "y"), ((0, 0, 1.0), "z")):
-            link = build.joint(f"root_{letter}", link, (0, 0, 0), axis, kind="prismatic")
-        # The middle angle is the one that locks at a right angle: leaning forward, the rarest.
-        link = build.joint("root_yaw", link, (0, 0, 0), (0, 1, 0), (-360, 360))
-        link = build.joint("root_pitch", link, (0, 0, 0), (1, 0, 0), (-85, 85))
-        link = build.joint("root_roll", link, (0, 0, 0), (0, 0, 1), (-360, 360))
+        build.joints += root_joints()
+        link = build.joints[-1].link
+    else:
+        link = build.joint("world", None)
     if is_arm:
         clavicle = ("protraction",) if name == "arm8" else ()
         _arm(build, "r", link, -1.0, clavicle=clavicle, hand=True, chest=None)
     else:
         _torso(build, name, link)
-    return _scaled(
+    return scaled(
         BodySpecification(
             name=name,
             joints=tuple(build.joints),
@@ -442,6 +441,19 @@ def specification(
         ),
         scale,
     )
+
+
+def root_joints() -> tuple[JointSpecification, ...]:
+    """The world's link and the six joints by which a body moves in it (`torchcss.body.root`)."""
+    build = _Builder({}, free_proportions=False)
+    link = build.joint("world", None)
+    for axis, letter in (((1.0, 0, 0), "x"), ((0, 1.0, 0), "y"), ((0, 0, 1.0), "z")):
+        link = build.joint(f"root_{letter}", link, (0, 0, 0), axis, kind="prismatic")
+    # The middle angle is the one that locks at a right angle: leaning forward, the rarest.
+    link = build.joint("root_yaw", link, (0, 0, 0), (0, 1, 0), (-360, 360))
+    link = build.joint("root_pitch", link, (0, 0, 0), (1, 0, 0), (-85, 85))
+    build.joint("root_roll", link, (0, 0, 0), (0, 0, 1), (-360, 360))
+    return tuple(build.joints)
 
 
 def _torso(build: _Builder, name: str, root: str) -> None:
@@ -494,7 +506,8 @@ def _torso(build: _Builder, name: str, root: str) -> None:
         _leg(build, side, root, sign)
 
 
-def _scaled(body: BodySpecification, scale: float) -> BodySpecification:
+def scaled(body: BodySpecification, scale: float) -> BodySpecification:
+    """The same body with all lengths times `scale`."""
     if scale == 1.0:
         return body
 

@@ -26,6 +26,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchcss.body.model import BodyModel
+from torchcss.joint_names import JOINT_NAMES
 
 TRUNK_GROUPS = ("trunk", "hips", "shoulders", "head")
 """Groups of segments that are not limbs; both halves of hips and of shoulders flip as one."""
@@ -98,9 +99,11 @@ class Segments:
         moves = (body.tie.T != 0).to(body.tie) @ body.tree.ancestors[:, body.marker_link].to(
             body.tie
         )
-        self.limbs = tuple(
+        found = (
             Limb(name, groups, _own_columns(body, moves > 0, groups)) for name, groups in limbs
         )
+        # The limb of a body from a file may have no joint that turns.
+        self.limbs = tuple(limb for limb in found if limb.columns.numel())
 
     @property
     def trunk(self) -> tuple[str, ...]:
@@ -146,9 +149,14 @@ class Segments:
 def _own_columns(
     body: BodyModel, moves: Bool[Tensor, "n j"], joints: tuple[str, ...]
 ) -> Int[Tensor, " c"]:
-    """Parameters that move some of these joints and no joint elsewhere."""
+    """Parameters that move some of these joints and no joint elsewhere.
+
+    A body from a file has joints that have no name of ours, the fingers say: they do not count.
+    """
     side, place = joints[0].split("_", 1)
     limb = next(chain for chain in _LIMBS.values() if place in chain)
     own = [f"{side}_{name}" for name in (*limb, "heel", "midtarsal")]
     inside = torch.tensor([name in own for name in body.joint_names], device=moves.device)
-    return torch.nonzero(moves[:, inside].any(-1) & ~moves[:, ~inside].any(-1))[:, 0]
+    others = [name in JOINT_NAMES and name not in own for name in body.joint_names]
+    outside = torch.tensor(others, device=moves.device)
+    return torch.nonzero(moves[:, inside].any(-1) & ~moves[:, outside].any(-1))[:, 0]

@@ -28,6 +28,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from torchcss.errors import BodyError, ShapeError, check_shape
+from torchcss.reading import read_bytes
 from torchcss.types import Bounds
 
 _MOVING = ("revolute", "prismatic")
@@ -213,10 +214,7 @@ class KinematicTree(nn.Module):
                 freedom, duplicate names, or more than one root link.
         """
         path = Path(source)
-        try:
-            data = path.read_bytes()
-        except OSError as error:
-            raise BodyError(f"{path}: cannot read the URDF ({error.strerror})") from error
+        data = read_bytes(path, BodyError)
         return cls(_read_urdf(data, str(path)))
 
     @property

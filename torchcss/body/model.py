@@ -3,7 +3,7 @@
 A state x is a vector of named parameters. It drives the joints through a linear tie `q = q0 + E x`
 (left-right symmetry, mimic joints). `pose(x)` gives link poses and joint centres, `surface(pose)`
 the mesh nodes, and `lift` turns derivatives at 3D points into gradient and exact Hessian in x (see
-`torchcss.body.lift`). `torchcss.load_body` makes one by name or from a URDF file.
+`torchcss.body.lift`). `torchcss.load_body` makes one by name or from a URDF, MJCF or BVH file.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from torchcss.body.catalog import (
     DEFAULT_RATE,
     MOTION_RATES,
     BodySpecification,
-    MarkerSpecification,
     specification,
 )
 from torchcss.body.kinematics import KinematicTree, TreePose
 from torchcss.body.lift import lift_to_joints
+from torchcss.body.skeletons import BODY_SUFFIXES, Flesh, read_skeleton
 from torchcss.body.surface import SurfaceSample, angular_grid, surface_points
 from torchcss.errors import BodyError, ShapeError, check_shape
 from torchcss.types import Bounds, Curvature, LocalModel, PointCost
@@ -51,12 +51,13 @@ class BodyModel(nn.Module):
     """An articulated body with flesh, in the type and on the device of its buffers.
 
     Args:
-        body: Rows of the catalogue, or a specification made from a URDF.
+        body: Rows of the catalogue, or a specification made from a file.
         rings: Latitudes of the mesh of every part.
         meridians: Longitudes of the mesh of every part.
 
     Attributes:
-        name: Name of the body.
+        name: Name of the body, for a body from a file its path: `load_body(name)` makes it again.
+        notes: What was assumed when it was read from a file, one line each.
         state_names: Names of the parameters, the order of x.
         joint_names: Names of the joint centres, the order of `BodyPose.joints`.
         part_names: Names of the parts of flesh.
@@ -89,6 +90,7 @@ class BodyModel(nn.Module):
         self.lengths = dict(body.lengths)
         self.tree = KinematicTree(body.joints)
         self.neighbours = body.neighbours
+        self.notes = body.notes
         self._lay_out_state(body)
         real = torch.float64
         self.joint_names = tuple(marker.name for marker in body.markers)
@@ -385,25 +387,33 @@ def load_body(
     scale: float = 1.0,
     free_proportions: bool = False,
     free_root: bool | None = None,
+    flesh: Flesh = "file",
+    units: str | float | None = None,
     rings: int = 8,
     meridians: int = 12,
 ) -> BodyModel:
-    """Make a body: one that ships, or the kinematics of a URDF file.
+    """Make a body: one that ships, or that of a URDF, MJCF or BVH file.
 
     Args:
-        name_or_path: "arm7", "arm8", "body30", "body32", "body34", or the path of a URDF.
+        name_or_path: "arm7", "arm8", "body30", "body32", "body34", or the path of a file.
         dtype: Floating type.
         device: Where its tensors live.
-        lengths: Lengths that differ from the standard humanoid's, metres.
-        scale: Overall scale of the standard humanoid (stature 1.75 m).
-        free_proportions: Make the lengths parameters too (for fitting).
-        free_root: Six root parameters or none; by default bodies have them and arms do not.
+        lengths: Lengths that differ from the standard humanoid's, metres; not for files.
+        scale: Overall scale of the standard humanoid (stature 1.75 m), or of the file.
+        free_proportions: Make the lengths parameters too (for fitting). The lengths of a file stay
+            as they are.
+        free_root: Six root parameters or none; by default bodies have them and arms do not, and
+            bodies from files if the file lets them move freely.
+        flesh: Flesh of a body from a file: "file" for the solids that it describes, and along the
+            bones of links without; "bones" for all bones; "none".
+        units: Metres per unit of a BVH, or "m", "cm", "mm", "inch", "cmu"; by default guessed.
         rings: Latitudes of the mesh of each part.
         meridians: Longitudes of the mesh of each part.
 
     Raises:
-        BodyError: If there is no such body, or the URDF cannot be used.
+        BodyError: If there is no such body, or the file cannot be used.
     """
+    path = Path(name_or_path)
     if str(name_or_path) in BODY_NAMES:
         body = specification(
             str(name_or_path),
@@ -412,25 +422,17 @@ def load_body(
             free_proportions=free_proportions,
             free_root=free_root,
         )
-    elif Path(name_or_path).suffix.lower() in (".urdf", ".xml") or Path(name_or_path).exists():
-        body = _urdf_specification(Path(name_or_path))
+    elif path.suffix.lower() in BODY_SUFFIXES:
+        if lengths:
+            raise BodyError(f"{path}: a body from a file has its own lengths; use scale")
+        body = read_skeleton(path, flesh=flesh, free_root=free_root, scale=scale, units=units)
     else:
         raise BodyError(
             f"no body {str(name_or_path)!r}; expected one of {', '.join(BODY_NAMES)} or the path "
-            "of a URDF file"
+            f"of a file that ends in {', '.join(BODY_SUFFIXES)}"
         )
-    return BodyModel(body, rings=rings, meridians=meridians).to(dtype=dtype, device=device)
-
-
-def _urdf_specification(path: Path) -> BodySpecification:
-    tree = KinematicTree.from_urdf(path)
-    return BodySpecification(
-        name=path.stem,
-        joints=tree.specifications,
-        parts=(),
-        markers=tuple(MarkerSpecification(name=link, link=link) for link in tree.link_names),
-        ties={},
-        sticky={},
-        neighbours=(),
-        lengths={},
-    )
+    try:
+        model = BodyModel(body, rings=rings, meridians=meridians)
+    except BodyError as error:  # a tree that cannot be: only a file has one
+        raise BodyError(f"{path}: {error}") from error
+    return model.to(dtype=dtype, device=device)

@@ -33,6 +33,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from torchcss.body.bvh import UNITS, guess_units, rest_positions, skeleton_span
 from torchcss.body.bvh_text import Segment, parse_bvh
 from torchcss.errors import ConfigurationError, MotionCaptureError
 from torchcss.io.export.rotations import about
@@ -40,22 +41,8 @@ from torchcss.io.motion_parsers import parse_acclaim
 from torchcss.io.safe_load import shortened
 from torchcss.joint_names import canonical_joint_name
 
-UNITS: Final[dict[str, float]] = {
-    "m": 1.0,
-    "cm": 0.01,
-    "mm": 0.001,
-    "inch": 0.0254,
-    "cmu": 0.0254 / 0.45,
-}
-"""Metres per unit of the files, by name; "cmu" is the unit of the CMU database."""
-
 ACCLAIM_RATE = 120.0
 """Frames per second of an AMC, which does not say: those of the CMU database."""
-
-_PERSON_SPAN = 2.4
-"""Metres along the tree between the two joints farthest apart, from toes to fingertips."""
-_LEAST_PERSON, _LARGEST_PERSON = 0.5, 1.6
-"""Shares of that span that still are a person's: from a small child to an outsize figure."""
 
 _LIMBS = ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")
 LIMBS: Final[tuple[str, ...]] = tuple(f"{side}_{place}" for place in _LIMBS for side in "lr")
@@ -140,10 +127,10 @@ def read_motion_capture(
         rate, report = frame_rate, []
     report = [f"{len(values)} frames, {rate:g} per second", *report]
     with np.errstate(all="ignore"):  # whatever overflows is found below
-        rest = _rest(segments)
+        rest = rest_positions(segments)
         joints = _positions(segments, values)
         if scale is None:
-            scale, line = _guess_units(path, _span(rest, segments), stated)
+            scale, line = guess_units(path, skeleton_span(rest, segments), stated)
             report.append(line)
         rest, joints = scale * rest, scale * joints
     if not (np.isfinite(rest).all() and np.isfinite(joints).all()):
@@ -248,47 +235,6 @@ def _scale_of(units: str | float | None) -> float | None:
     if units is not None and not 0 < units < math.inf:
         raise ConfigurationError(f"units: expected a positive number of metres, got {units}")
     return units
-
-
-def _guess_units(path: Path, span: float, stated: float | None) -> tuple[float, str]:
-    """Metres per unit, and how that is known."""
-
-    def is_person(metres: float) -> bool:
-        return _LEAST_PERSON < span * metres / _PERSON_SPAN < _LARGEST_PERSON
-
-    if stated is not None and is_person(stated):
-        return stated, f"unit: {1000 * stated:.3f} mm, as the skeleton says"
-    if 0 < span < math.inf:
-        name = min(UNITS, key=lambda name: abs(math.log(span * UNITS[name] / _PERSON_SPAN)))
-        if is_person(UNITS[name]):
-            return UNITS[name], (
-                f"unit: {name} ({1000 * UNITS[name]:.3f} mm), guessed: the skeleton is then "
-                f"{span * UNITS[name]:.2f} m long from toes to fingertips"
-            )
-    raise MotionCaptureError(
-        f"{path}: the skeleton spans {span:.4g} units from end to end, which is no person's in any "
-        f"of {', '.join(UNITS)}; say the metres per unit"
-    )
-
-
-def _span(rest: Float[np.ndarray, "j 3"], segments: Sequence[Segment]) -> float:
-    """Greatest distance between two joints along the tree, whatever the pose."""
-    deepest = np.zeros(len(segments))
-    span = 0.0
-    for index in range(len(segments) - 1, 0, -1):
-        parent = segments[index].parent
-        reach = deepest[index] + float(np.linalg.norm(rest[index] - rest[parent]))
-        span = max(span, deepest[parent] + reach)
-        deepest[parent] = max(deepest[parent], reach)
-    return span
-
-
-def _rest(segments: Sequence[Segment]) -> Float[np.ndarray, "j 3"]:
-    """Joint positions in the zero pose, in the file's unit, root at the origin."""
-    rest = np.zeros((len(segments), 3))
-    for index, segment in enumerate(segments[1:], start=1):
-        rest[index] = rest[segment.parent] + segment.offset
-    return rest
 
 
 def _positions(
