@@ -310,8 +310,8 @@ def place(
     body = body.with_base(
         torch.eye(3).double(), first.camera.unproject(middle, middle.new_tensor(0.8))
     )
-    x = torch.zeros(300, body.num_parameters, dtype=torch.float64)
-    x[:, 3:] = 3.0 * torch.randn(300, 3, generator=generator, dtype=torch.float64).clamp(-1, 1)
+    x = torch.zeros(100, body.num_parameters, dtype=torch.float64)
+    x[:, 3:] = 3.0 * torch.randn(100, 3, generator=generator, dtype=torch.float64).clamp(-1, 1)
     modes = None
     for scale in (30.0, 6.0, 1.0):
         choice = CostChoice(

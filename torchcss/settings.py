@@ -6,7 +6,9 @@ and `make_settings_tracker` turn it into the three objects that `torchcss.pipeli
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import torch
@@ -61,6 +63,8 @@ class Settings:
         working_size: Longer side, in pixels, at which features are computed; larger images are
             reduced to it.
         contour_weight: Temperature of the contour term, see `CostChoice`.
+        weights: Further factors on terms and priors by name; `scripts/learn_weights.py` learns
+            some.
         boundary_emphasis: k of `W = 1 - k S_p`, for the term `motion_boundaries`.
         seed: Seed of all random numbers; the same seed gives the same track.
         device: Where to compute.
@@ -78,6 +82,7 @@ class Settings:
     terms: tuple[str, ...] = TERMS
     working_size: int = 640
     contour_weight: float = 150.0
+    weights: Mapping[str, float] = field(default_factory=dict)
     boundary_emphasis: float = 0.3
     seed: int = 0
     device: str = "cpu"
@@ -91,6 +96,13 @@ class Settings:
         unknown = sorted(set(self.terms) - set(ALL_TERMS))
         if unknown:
             raise ConfigurationError(f"unknown terms {unknown}; there are {', '.join(ALL_TERMS)}")
+        # Motion boundaries are no term of their own: `boundary_emphasis` weighs them.
+        weighed = [name for name in ALL_TERMS if name != "motion_boundaries"]
+        if strange := sorted(set(self.weights) - set(weighed)):
+            raise ConfigurationError(f"weights: no terms {strange}; there are {', '.join(weighed)}")
+        for name, weight in self.weights.items():
+            if not 0 <= weight < math.inf:
+                raise ConfigurationError(f"weights: {name}: expected at least 0, got {weight}")
         for name in ("samples", "modes", "working_size", "oversampling"):
             number = getattr(self, name)
             if number is not None and number < 1:
@@ -155,6 +167,7 @@ def make_choice(settings: Settings, sigma: float) -> CostChoice:
         temporal_mixture=MixturePrior() if has("temporal_mixture") and descends else None,
         interpenetration=Interpenetration() if repels else None,
         contour_weight=settings.contour_weight,
+        weights=dict(settings.weights),
         curvature=row.curvature,
     )
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchcss.cost.total import TrackingCost
 from torchcss.errors import ConfigurationError, ShapeError
-from torchcss.inference.implicit import TermWeights, differentiable_minimum
+from torchcss.inference.implicit import TermWeights, differentiable_minimum, weighted_minimum
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.types import Bounds, Modes, Status
 
@@ -77,6 +77,35 @@ def test_derivatives_are_those_of_the_constrained_minimum(name: str) -> None:
         assert torch.equal(ends[0].active, ends[1].active)
         expected = float((direction * (ends[0].mean - ends[1].mean)).sum() / (2 * step))
         assert float(gradient[term]) == pytest.approx(expected, rel=2e-4, abs=1e-6)
+
+
+def test_weights_are_learnt_from_where_the_minimum_should_be() -> None:
+    """Descent on the weights finds those that a minimum was made with."""
+    generator = torch.Generator().manual_seed(4)
+    cost = make_cost("arm8", replace(EVERYTHING, contour=None))
+    start = random_states(cost.body, 4, generator=generator)
+    true = {"joints": 1.0, "stabiliser": 5.0, "temporal": 0.2}
+    bounds = cost.body.bounds
+    wanted = OPTIMISER.minimise(cost.with_weights(true), start, bounds).mean
+    weights = TermWeights(("stabiliser", "temporal"))
+    descent = torch.optim.Adam(weights.parameters(), lr=0.2)
+    losses = []
+    for _ in range(40):
+        descent.zero_grad()
+        x = weighted_minimum(cost, weights, wanted, bounds)
+        loss = (x - wanted).square().sum()
+        loss.backward()
+        descent.step()
+        losses.append(float(loss.detach()))
+    assert losses[-1] < 0.02 * losses[0]
+    learnt = weights.factors()
+    assert learnt["stabiliser"] > 2.5
+    assert learnt["temporal"] < 0.5
+    # A term that the frame does not have is silent.
+    silent = TermWeights(("flow", "temporal"))
+    weighted_minimum(cost, silent, start, bounds).sum().backward()
+    assert silent.log_weight.grad is not None
+    assert float(silent.log_weight.grad[0]) == 0.0
 
 
 def test_the_gradients_by_term_add_up(generator: torch.Generator) -> None:

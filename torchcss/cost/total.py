@@ -167,6 +167,10 @@ class TrackingCost(View):
         """What each camera sees, the first one's view first."""
         return (self, *self.others)
 
+    def with_weights(self, weights: Mapping[str, float]) -> TrackingCost:
+        """The same cost with further factors on named terms and priors (`CostChoice.weights`)."""
+        return replace(self, choice=replace(self.choice, weights=dict(weights)))
+
     @property
     def alone(self) -> View:
         """What the first camera sees, without the body."""

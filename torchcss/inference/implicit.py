@@ -15,21 +15,38 @@ end at a minimum. For a cost that finds its matches in the image afresh the theo
 two changes of the matches, in the sense in which its gradient does.
 
     weights = TermWeights(("contour", "flow"))
-    x = differentiable_minimum(cost_of(weights.factors()), modes, gradients, weights())
+    x = weighted_minimum(cost, weights, start, bounds)
     loss(x).backward()
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol, Self
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from torchcss.errors import ConfigurationError, check_shape
+from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.linalg import symmetric_part
+from torchcss.types import Bounds, CostFunction
+
+OPTIMISER = TrustRegionNewton(max_steps=60, tolerance=1e-8)
+"""How `weighted_minimum` descends by default: to the end, where the theorem holds."""
+
+
+class WeighedCost(CostFunction, Protocol):
+    """A sum of named terms whose weights can be set; `torchcss.cost.total.TrackingCost` is one."""
+
+    def with_weights(self, weights: Mapping[str, float]) -> Self:
+        """The same with further factors on named terms, one where none is given."""
+        ...
+
+    def gradients(self, x: Float[Tensor, "*batch n"]) -> Mapping[str, Float[Tensor, "*batch n"]]:
+        """Gradient of every term by name, times its weight."""
+        ...
 
 
 class TermWeights(nn.Module):
@@ -68,6 +85,39 @@ class TermWeights(nn.Module):
     def factors(self) -> dict[str, float]:
         """The weights by name as plain numbers, for `CostChoice.weights`."""
         return dict(zip(self.names, self.forward().tolist(), strict=True))
+
+
+def weighted_minimum(
+    cost: WeighedCost,
+    weights: TermWeights,
+    x0: Float[Tensor, "b n"],
+    bounds: Bounds,
+    *,
+    optimiser: TrustRegionNewton = OPTIMISER,
+    scale: Float[Tensor, " n"] | None = None,
+) -> Float[Tensor, "b n"]:
+    """Descend on a weighted sum to a minimum that can be differentiated in its weights.
+
+    Args:
+        cost: The sum. Terms that `weights` does not name keep the weight that they have; named ones
+            that the cost does not have, as flow in a first frame, are silent.
+        weights: The weights.
+        x0: Where to start.
+        bounds: Box limits.
+        optimiser: How to descend.
+        scale: See `TrustRegionNewton.init`.
+    """
+    heavy = cost.with_weights(weights.factors())
+    modes = optimiser.minimise(heavy, x0, bounds, scale=scale)
+    x = modes.mean
+    plain = cost.with_weights(dict.fromkeys(weights.names, 1.0)).gradients(x)
+    return differentiable_minimum(
+        x,
+        heavy.local_model(x).hessian,
+        torch.stack([plain.get(name, torch.zeros_like(x)) for name in weights.names], dim=-2),
+        modes.active.bool(),
+        weights().to(x),
+    )
 
 
 def differentiable_minimum(

@@ -1,0 +1,37 @@
+"""Learning weights in small: it runs, repeats, and says what it did."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from torchcss.errors import ConfigurationError, TorchcssError
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
+import learn_weights as script
+
+SMALL = script.Config(frames=2, epochs=2, starts=2, working_size=160, track=True)
+
+
+def test_in_small(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    report = script.main(script.replace(SMALL, out=tmp_path / "j" / "report.json"))
+    assert set(report["weights_after"]) == set(script.LEARNT)
+    assert report["weights_after"] != report["weights_before"]
+    assert all(weight > 0 for weight in report["weights_after"].values())
+    assert len(report["train_mm"]) == 2
+    assert report["track_after_mm"]["best_of_modes"] <= report["track_after_mm"]["best_mode"]
+    written = json.loads((tmp_path / "j" / "report.json").read_text())
+    assert written["test_after_mm"] == pytest.approx(report["test_after_mm"])
+    assert "whole track" in capsys.readouterr().out
+    once = script.replace(SMALL, track=False, epochs=1)
+    assert script.main(once)["weights_after"] == script.main(once)["weights_after"]
+
+
+def test_bad_sequences_are_refused(tmp_path: Path):
+    with pytest.raises(TorchcssError, match="there is no such"):
+        script.main(script.replace(SMALL, test=str(tmp_path / "none")))
+    with pytest.raises(ConfigurationError, match="no terms"):
+        script.main(script.replace(SMALL, begin={"joints": 1.0}))
