@@ -18,7 +18,7 @@ import numpy as np
 from torchcss.errors import TorchcssError
 from torchcss.reading import one_line, read_bytes, shortened
 
-__all__ = ["load_arrays", "load_json", "one_line", "real_numbers", "shortened"]
+__all__ = ["load_array", "load_arrays", "load_json", "one_line", "real_numbers", "shortened"]
 
 
 def load_json(path: Path, error_class: type[TorchcssError]) -> Any:
@@ -53,6 +53,21 @@ def load_arrays(path: Path, error_class: type[TorchcssError]) -> Mapping[str, np
             else f"{one_line(error)}; get a complete copy"
         )
         raise error_class(f"{path}: cannot be read as an NPZ file: {reason}") from error
+
+
+def load_array(path: Path, error_class: type[TorchcssError]) -> np.ndarray:
+    """Return the array of an NPY file.
+
+    Raises:
+        error_class: If the file is missing, damaged, no NPY file, or holds pickled objects.
+    """
+    if not read_bytes(path, error_class, 6).startswith(b"\x93NUMPY"):
+        raise error_class(f"{path}: not an NPY file; expected what numpy.save writes")
+    try:
+        with path.open("rb") as stream:
+            return np.load(stream, allow_pickle=False)
+    except Exception as error:  # what a damaged header leads to
+        raise error_class(f"{path}: cannot be read as an NPY file: {one_line(error)}") from error
 
 
 def real_numbers(value: object, where: str, error_class: type[TorchcssError]) -> np.ndarray:
