@@ -1,10 +1,11 @@
-"""Cameras from calibration files: `cameras.json` and Pose2Sim's `Calib.toml`.
+"""Cameras from calibration files: `cameras.json`, Pose2Sim's `Calib.toml`, EasyMocap's pair.
 
 `cameras.json` holds `{"units": "metre, pixel", "cameras": {name: {...}}}`; each camera has `K`
 (3 x 3, pixels), `image_size_wh`, optionally `distortion` (k1 k2 p1 p2 k3), the world-to-camera `R`
 and `t`, and `video`, the name of the file that it took. Pose2Sim's file has one table per camera
 with `name`, `size`, `matrix`, `distortions`, `rotation` (Rodrigues vector) and `translation` in
-metres.
+metres. EasyMocap's `intri.yml` and `extri.yml` (`torchcss.io.easymocap`) often lack the image size,
+which is then the video's.
 
 Units are metres inside (design, decision 12). Where the extrinsics are in another unit, or absent,
 the camera is used in its own frame, x right, y down, z forward: one view needs no more than the
@@ -25,7 +26,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from torchcss.errors import CameraError
+from torchcss.io.easymocap import INTRINSICS, read_easymocap
 from torchcss.io.safe_load import load_json, one_line, real_numbers, shortened
+from torchcss.io.video import VideoReader
+from torchcss.reading import read_text
 from torchcss.vision.camera import Camera
 
 _METRES = frozenset({"m", "metre", "metres", "meter", "meters"})
@@ -58,6 +62,7 @@ class _Entry(NamedTuple):
     units: str | None
     video: str | None = None
     fisheye: bool = False
+    from_easymocap: bool = False
 
 
 def read_camera(
@@ -69,7 +74,8 @@ def read_camera(
     """Read one camera of a calibration file.
 
     Args:
-        path: A `.json` or Pose2Sim `.toml` file.
+        path: A `.json` or Pose2Sim `.toml` file, EasyMocap's `intri.yml` or the folder that it is
+            in.
         camera_name: Which camera. None: the one of `video`, or the only one.
         video: The video to be tracked; the camera whose `video`, or else whose name, is the name of
             this file is taken.
@@ -81,7 +87,7 @@ def read_camera(
         CameraError: If the file is missing or malformed, or which camera is meant is not clear.
     """
     path = Path(path)
-    entries = _read_pose2sim(path) if path.suffix.lower() == ".toml" else _read_json(path)
+    entries = _read_entries(path)
     name = _choose(path, entries, camera_name, None if video is None else Path(video))
     entry = entries[name]
     where = f"{path}: camera {name!r}"
@@ -90,6 +96,11 @@ def read_camera(
             f"{where}: a fisheye lens is not supported; undistort the video first and give the "
             "camera of the undistorted images"
         )
+    if entry.image_size_wh is None and entry.from_easymocap:
+        if video is None:
+            raise CameraError(f"{where}: EasyMocap does not say the image size; give the video")
+        info = VideoReader(video).info
+        entry = entry._replace(image_size_wh=[info.width, info.height])
     for key, value in (("K (matrix)", entry.K), ("image_size_wh (size)", entry.image_size_wh)):
         if value is None:
             raise CameraError(f"{where}: {key} is missing")
@@ -221,6 +232,24 @@ def _letters(name: str) -> str:
     return re.sub(r"[^a-z0-9]", "", name.lower())
 
 
+def _read_entries(path: Path) -> dict[str, _Entry]:
+    suffix = path.suffix.lower()
+    if suffix in (".yml", ".yaml") or (path.is_dir() and (path / INTRINSICS).is_file()):
+        return {
+            name: _Entry(
+                K=values["K"],
+                image_size_wh=values["size"],
+                distortion=values["dist"],
+                rotation=values["R"],
+                translation=values["T"],
+                units="metre",
+                from_easymocap=True,
+            )
+            for name, values in read_easymocap(path).items()
+        }
+    return _read_pose2sim(path) if suffix == ".toml" else _read_json(path)
+
+
 def _read_json(path: Path) -> dict[str, _Entry]:
     content = load_json(path, CameraError)
     cameras = content.get("cameras") if isinstance(content, dict) else None
@@ -251,10 +280,10 @@ def _read_json(path: Path) -> dict[str, _Entry]:
 
 def _read_pose2sim(path: Path) -> dict[str, _Entry]:
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise CameraError(f"{path}: there is no such file; check the path") from error
-    except (OSError, ValueError, RecursionError) as error:
+        content = tomllib.loads(read_text(path, CameraError))
+    except (ValueError, RecursionError) as error:
+        if isinstance(error, CameraError):
+            raise
         raise CameraError(f"{path}: cannot be read as TOML: {one_line(error)}") from error
     entries = {}
     for table, values in content.items():
