@@ -49,8 +49,10 @@ costs that compare a sample with the mode that it came from. The cost then has `
 `CostFunction`)."""
 
 
-_HEAT_STEPS = 3
-"""Steps of descent after which samples are compared."""
+_HEATS = ((1, 2.0), (3, 1.0))
+"""The race for the places of `Tracker.finalists`: steps of descent, and how many are left then, in
+multiples of the finalists. With 1000 samples of an arm this keeps the lowest twenty minima, takes
+0.6 of the time of two heats of three steps, and leaves more distinct minima (measured)."""
 
 
 class Particles(NamedTuple):
@@ -217,8 +219,8 @@ class Tracker:
         oversampling: How many times as many samples are drawn as descend: above one, the best
             `num_samples` are kept, by the cost's `screening()` if it has that cheaper self. Section
             4.2 [RR] scores sampled hypotheses by their edges alone.
-        finalists: With more samples than these, all descend a few steps, the better of them a few
-            more, and so many to the end: a sample that starts far up seldom overtakes. Zero: all
+        finalists: With more samples than these, all descend a step, the better of them a few more,
+            and so many to the end: a sample that starts far up seldom overtakes. Zero: all
             descend to the end, as in Fig. 6.
         standard_bhattacharyya: Match modes by the distance of the literature instead of the one
             printed (design decision 4).
@@ -383,8 +385,11 @@ class Tracker:
         steps = []
         count = len(samples.x)
         if self.finalists and count > self.finalists:
-            heat = replace(self.optimiser, max_steps=_HEAT_STEPS)
-            for size in (round((count * self.finalists) ** 0.5), self.finalists):
+            for max_steps, multiple in _HEATS:
+                size = round(multiple * self.finalists)
+                if len(samples.x) <= size:
+                    continue
+                heat = replace(self.optimiser, max_steps=max_steps)
                 modes = heat.minimise(cost, samples.x, bounds, scale=scale)
                 steps.append(modes.num_steps)
                 # Samples in one minimum count as one, or the best would take all places.
