@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
 
 from torchcss.body.model import BodyModel
-from torchcss.io.tracks import Track, TrackWriter
+from torchcss.io.tracks import SCHEMA_VERSION, Track, TrackWriter
 
 BEAM_UP = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)
 """Turns Y up into Z up: world (x, y, z) = body (z, x, y)."""
@@ -59,3 +60,11 @@ def make_track(
             base_transform=base,
         )
     return writer.track()
+
+
+def write_track(path: Path, track: Track) -> None:
+    """Save a track as the tracker does."""
+    arrays = track._asdict()
+    for name in ("state_names", "joint_names"):
+        arrays[name] = np.array(arrays[name], dtype=np.str_)
+    np.savez(path, schema_version=np.array(SCHEMA_VERSION), **arrays)

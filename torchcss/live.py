@@ -12,8 +12,10 @@ import numpy as np
 
 from torchcss.io.export.selection import up_axis
 from torchcss.io.viewer import Viewer, close_recording, open_recording, posed_frame
+from torchcss.io.viewer_layout import camera_up
 from torchcss.pipeline import TrackedFrame
 from torchcss.recorder import Picture
+from torchcss.vision.camera import Camera
 
 
 class LiveViewer:
@@ -53,7 +55,8 @@ class LiveViewer:
         """
         body, mixture = frame.body, frame.state.mixture
         if self._viewer is None:
-            self._viewer = Viewer(self._recording, body, camera=picture.camera, up=_up(frame))
+            up = _up(frame, picture.camera)
+            self._viewer = Viewer(self._recording, body, camera=picture.camera, up=up)
         shown = posed_frame(
             frame.frame.index,
             frame.frame.time_s,
@@ -72,9 +75,7 @@ class LiveViewer:
         close_recording(self._recording)
 
 
-def _up(frame: TrackedFrame) -> str:
+def _up(frame: TrackedFrame, camera: Camera) -> str:
     """Which axis of the world is up, as the first frame has it."""
-    base = np.eye(4)
-    base[:3, :3] = frame.body.base_rotation.cpu().numpy()
     joints = frame.joints_world[:1].double().cpu().numpy()
-    return up_axis(frame.body.joint_names, joints, base[None])[0]
+    return up_axis(frame.body.joint_names, joints, np.eye(4)[None], camera_up(camera))[0]

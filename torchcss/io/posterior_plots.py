@@ -255,7 +255,9 @@ def _draw(
             times[piece], (best - wide)[piece], (best + wide)[piece], color=mode_colour(0),
             alpha=0.45, lw=0, zorder=1,
         )  # fmt: skip
-        axes.plot(times[piece], best[piece], color=_LINE, lw=1.3, zorder=3)
+        # A line of one frame would not be seen.
+        marker = "." if len(piece) == 1 else None
+        axes.plot(times[piece], best[piece], color=_LINE, lw=1.3, ms=3, marker=marker, zorder=3)
     # The best mode fills the panel; what lies far from it would make it a line.
     low, high = float((best - wide).min()), float((best + wide).max())
     room = max(0.6 * float(np.ptp(best)), 0.15 * (high - low), 1e-3)

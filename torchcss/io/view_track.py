@@ -23,6 +23,7 @@ from torchcss.io.viewer import (
     open_recording,
     posed_frame,
 )
+from torchcss.io.viewer_layout import camera_up
 
 
 def view_track(files: TrackFiles, *, save: Path | None = None, connect: str | None = None) -> None:
@@ -81,7 +82,8 @@ def posed_frames(files: TrackFiles) -> Iterator[PosedFrame]:
 
 def _replay(files: TrackFiles, save: Path | None, connect: str | None) -> None:
     track = files.track
-    up, _ = up_axis(track.joint_names, track.joints_world[:, 0], track.base_transform)
+    best = track.joints_world[:, 0]
+    up, _ = up_axis(track.joint_names, best, track.base_transform, camera_up(files.camera))
     name = files.path.resolve().parent.name
     recording = open_recording(name, save=save, connect=connect)
     try:

@@ -38,9 +38,10 @@ from torch import Tensor
 
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.uncertainty import joint_covariance
-from torchcss.errors import ConfigurationError
+from torchcss.errors import ConfigurationError, OutputError
 from torchcss.io.atomic import prepare_output_folder
 from torchcss.io.overlay import PALETTE
+from torchcss.io.safe_load import one_line
 from torchcss.io.track_plots import bones_of, count_apart
 from torchcss.io.viewer_layout import layout, rerun, world_axes
 from torchcss.raster import grid_faces
@@ -196,7 +197,10 @@ def open_recording(
     if spawn:
         recording.spawn(connect=False)
         sinks.append(package.GrpcSink())
-    recording.set_sinks(*sinks)
+    try:
+        recording.set_sinks(*sinks)
+    except (RuntimeError, OSError) as error:
+        raise OutputError(f"{save}: cannot be written: {one_line(error)}") from error
     recording.send_recording_name(name)
     return recording
 
@@ -217,7 +221,7 @@ def close_recording(recording: rr.RecordingStream, *, patience_s: float = 10.0) 
 def _viewer_at(address: str) -> object:
     try:
         return rerun().GrpcSink(address)
-    except ValueError as error:
+    except (RuntimeError, ValueError) as error:
         raise ConfigurationError(
             f"{address}: not the address of a viewer; expected one such as "
             "rerun+http://127.0.0.1:9876/proxy"

@@ -46,6 +46,11 @@ def world_axes(up: str) -> rr.ViewCoordinates:
     return getattr(rerun().ViewCoordinates, f"RIGHT_HAND_{_AXES[up]}")
 
 
+def camera_up(camera: Camera | None) -> np.ndarray | None:
+    """The direction in the world that is up in the picture; None without a camera."""
+    return None if camera is None else -camera.R_camera_world[1].double().cpu().numpy()
+
+
 def layout(
     joints: Float[np.ndarray, "j 3"], camera: Camera | None, up: str, *, events: bool
 ) -> rrb.Blueprint:

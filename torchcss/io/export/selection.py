@@ -230,21 +230,23 @@ def up_axis(
     joint_names: Sequence[str],
     joints: Float[np.ndarray, "t j 3"],
     base: Float[np.ndarray, "t 4 4"],
+    otherwise: Float[np.ndarray, "3"] | None = None,
 ) -> tuple[str, float]:
     """Which axis of the world is up, and the cosine of its angle to the body's upward direction.
 
-    That is the mean direction from the hips to the head, or up the base where there are none.
+    That is the mean direction from the hips to the head, or, for a body without, the one given.
 
     Args:
         joint_names: Names of the joints.
         joints: Joint centres, world frame.
         base: World from the frame in which the root moves.
+        otherwise: What is up where the body does not tell, world frame; None: up the base.
     """
     names = list(joint_names)
     if {"HumanoidRoot", "skull_tip"} <= set(names):
         up = (joints[:, names.index("skull_tip")] - joints[:, names.index("HumanoidRoot")]).mean(0)
     else:
-        up = base[:, :3, 1].mean(0)
+        up = base[:, :3, 1].mean(0) if otherwise is None else otherwise
     length = float(np.linalg.norm(up))
     up = up / length if length > 0 else np.array([0.0, 1.0, 0.0])
     values = {name: float(np.array(_TO_Y_UP[name][1]) @ up) for name in UP_AXES}
