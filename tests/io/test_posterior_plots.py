@@ -44,13 +44,17 @@ def panel(figure: Figure, title: str) -> Axes:
 
 
 def lines(axes: Axes) -> list[np.ndarray]:
-    return [np.asarray(line.get_ydata()) for line in axes.get_lines() if line.get_ls() == "-"]
+    return [
+        np.asarray(line.get_ydata()) for line in axes.get_lines() if line.get_linestyle() == "-"
+    ]
 
 
 def band(axes: Axes) -> tuple[float, float]:
     """Lowest and highest place of the band."""
     bands = [c for c in axes.collections if isinstance(c, FillBetweenPolyCollection)]
-    heights = np.concatenate([path.vertices[:, 1] for c in bands for path in c.get_paths()])
+    heights = np.concatenate(
+        [np.asarray(path.vertices)[:, 1] for c in bands for path in c.get_paths()]
+    )
     return heights.min(), heights.max()
 
 
@@ -91,7 +95,7 @@ def test_parameters_in_degrees_with_their_limits(track: Track, body: BodyModel) 
     index = track.state_names.index("r_elbow_flexion")
     axes = panel(figure, "r elbow flexion (degrees)")
     np.testing.assert_allclose(lines(axes)[0], np.degrees(track.state[:, 0, index]))
-    limits = [line.get_ydata() for line in axes.get_lines() if line.get_ls() == ":"]
+    limits = [line.get_ydata() for line in axes.get_lines() if line.get_linestyle() == ":"]
     expected = np.degrees([body.lower[index].item(), body.upper[index].item()])
     assert {round(float(np.ravel(limit)[0])) for limit in limits} <= set(expected.round())
 

@@ -24,6 +24,7 @@ from torchcss.io.track_plots import bones_of, count_apart, effective_number
 from torchcss.io.tracks import TRACK_NAME, Track, write_summary
 from torchcss.io.video import VideoWriter
 from torchcss.io.view_track import posed_frames, view_track
+from torchcss.io.viewer_layout import _eye, layout, world_axes
 from torchcss.synthetic import look_at
 from torchcss.vision.camera import Camera
 
@@ -236,15 +237,15 @@ def test_large_pictures_are_reduced_with_their_camera(
 
 @pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z"])
 def test_what_is_up_stays_up(up: str, track: Track, body: BodyModel, camera: Camera) -> None:
-    pytest.importorskip("rerun")
-    from torchcss.io.viewer_layout import _eye, layout, world_axes
+    package = pytest.importorskip("rerun")
 
     for seen_by in (camera, None):
         position, target, vertical = _eye(track.joints_world[0, 0], seen_by, up)
         assert (position - target) @ vertical > 0  # looked at from above
         assert np.isfinite(position).all()
         layout(track.joints_world[0, 0], seen_by, up, events=seen_by is None)
-    assert world_axes(up).coordinates is not None
+    name = f"RIGHT_HAND_{up[-1].upper()}_{'DOWN' if up[0] == '-' else 'UP'}"
+    assert world_axes(up) is getattr(package.ViewCoordinates, name)
 
 
 def test_ellipsoids_of_mirrored_and_flat_covariances() -> None:
