@@ -14,15 +14,19 @@ from __future__ import annotations
 
 import argparse
 import ast
+import importlib
 import os
 import re
 import shutil
 import types
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import fields, is_dataclass
 from html.parser import HTMLParser
+from inspect import get_annotations
 from pathlib import Path
 from pkgutil import walk_packages
+from typing import get_type_hints
 from urllib.parse import unquote, urlsplit
 
 import nbformat
@@ -92,6 +96,7 @@ def build(out: Path, *, modules: Iterable[str] | None = None, execute: bool = Tr
     names = list(modules) if modules is not None else public_modules()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        resolve_inherited(names)
         everything = pages | {name: Module.from_name(name) for name in names}
         render.configure(docformat="google", template_directory=DOCS / "templates")
         render.env.globals["pages"] = {name: each.obj.title for name, each in pages.items()}
@@ -104,6 +109,21 @@ def build(out: Path, *, modules: Iterable[str] | None = None, execute: bool = Tr
         (out / "search.js").write_text(index, encoding="utf-8")
     if broken := list(broken_links(out)):
         raise SystemExit("\n".join(["links that lead nowhere:", *broken]))
+
+
+def resolve_inherited(names: Iterable[str]) -> None:
+    """Resolve the types of dataclass fields that a class has from a base in another module.
+
+    pdoc looks them up where the class is, but their names are those of the module of the base.
+    """
+    for name in names:
+        for cls in vars(importlib.import_module(name)).values():
+            if isinstance(cls, type) and is_dataclass(cls) and cls.__module__ == name:
+                own = get_annotations(cls)
+                taken = {field.name for field in fields(cls) if field.init} - own.keys()
+                if taken:
+                    hints = get_type_hints(cls)
+                    cls.__init__.__annotations__.update({each: hints[each] for each in taken})
 
 
 def public_modules() -> list[str]:
