@@ -7,6 +7,7 @@ of poses with covariances and weights (covariance scaled sampling, Sminchisescu 
 
 from torchcss.body.model import BodyModel, load_body
 from torchcss.initialise import Initialisation, initialise
+from torchcss.inverse_kinematics import Solutions, inverse_kinematics
 from torchcss.io.export import export_track
 from torchcss.io.tracks import Track, load_track
 from torchcss.pipeline import track_frames
@@ -21,9 +22,11 @@ __all__ = [
     "Camera",
     "Initialisation",
     "Settings",
+    "Solutions",
     "Track",
     "export_track",
     "initialise",
+    "inverse_kinematics",
     "load_body",
     "load_track",
     "smooth_file",

@@ -1,0 +1,182 @@
+"""Points of the body against known places in space: 3D observations, and poses of a link.
+
+For points p that are fixed in links, with known places t,
+
+    f(x) = 1/2 sum_p w_p |p(x) - t_p|^2 / sigma^2
+
+in nats. With markers or triangulated joints this is an observation; with four points around the
+origin of one link it is zero exactly where that link has a given position and orientation, which is
+what inverse kinematics asks for (`pose_targets`, `torchcss.inverse_kinematics`). Value, gradient
+and exact Hessian are in closed form (`torchcss.body.lift`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchcss.body.kinematics import TreePose
+from torchcss.body.lift import lift_to_joints
+from torchcss.body.model import BodyModel
+from torchcss.errors import ShapeError, check_shape
+from torchcss.types import LocalModel, PointCost
+
+_CORNERS = ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))
+"""A regular tetrahedron: seen from its middle, errors of orientation about all axes count alike."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointTargets:
+    """Squared distances of points from where they should be; a `CostFunction`.
+
+    Attributes:
+        body: The body, hung on its base.
+        link: The link that carries each point.
+        offset: The points in the frames of their links, metres.
+        target: Where they should be in the world, metres.
+        weight: Weight of each point, not negative.
+        sigma: Standard deviation of a coordinate of weight one, metres.
+        columns: The parameters that x consists of, in its order; the others stay at `held`.
+        held: A whole state of the body.
+    """
+
+    body: BodyModel
+    link: Int[Tensor, " p"]
+    offset: Float[Tensor, "p 3"]
+    target: Float[Tensor, "p 3"]
+    weight: Float[Tensor, " p"]
+    sigma: float
+    columns: Int[Tensor, " m"]
+    held: Float[Tensor, " n"]
+
+    def whole(self, x: Float[Tensor, "*batch m"]) -> Float[Tensor, "*batch n"]:
+        """States of the body: x, and what is held."""
+        check_shape("x", x, len(self.columns))
+        held = self.held.expand(*x.shape[:-1], len(self.held))
+        return held.index_copy(-1, self.columns, x)
+
+    def value(self, x: Float[Tensor, "*batch m"]) -> Float[Tensor, "*batch"]:
+        """Cost in nats."""
+        _, points = self._pose(x)
+        squared = (points - self.target[:, :, None]).square().sum(1)
+        return (0.5 / self.sigma**2 * (self.weight @ squared)).reshape(x.shape[:-1])
+
+    def local_model(self, x: Float[Tensor, "*batch m"]) -> LocalModel:
+        """Cost, gradient and exact Hessian."""
+        return self._local_model(x, None)
+
+    def blended_model(
+        self, x: Float[Tensor, "*batch m"], share: Float[Tensor, "*batch"]
+    ) -> LocalModel:
+        """The same with a Hessian between Gauss-Newton, never negative, and the exact one.
+
+        Args:
+            x: States.
+            share: Factor on the second derivatives of the kinematics; 1 is exact.
+        """
+        return self._local_model(x, share)
+
+    def errors(
+        self, x: Float[Tensor, "b m"]
+    ) -> tuple[Float[Tensor, "b p 3"], Float[Tensor, "b p 3 m"]]:
+        """By how much the points miss their targets, metres, and the derivatives of that in x."""
+        tree, points = self._pose(x)
+        place = points.movedim(-1, 0)[:, :, None]
+        turned = torch.linalg.cross(tree.omega[:, None].expand(-1, len(self.link), -1, -1), place)
+        carries = self.body.tree.ancestors[:, self.link].T[..., None]
+        moved = torch.where(carries, turned + tree.velocity[:, None], 0.0)
+        return place[:, :, 0] - self.target, moved.mT @ self.body.tie[:, self.columns]
+
+    def _pose(self, x: Float[Tensor, "*batch m"]) -> tuple[TreePose, Float[Tensor, "p 3 b"]]:
+        """The tree and the points, the batch flattened; of the links only the base is there."""
+        body = self.body
+        state = self.whole(x).reshape(x.shape[:-1].numel(), body.num_parameters)
+        q = state if body.is_untied else state @ body.tie.T + body.offset
+        frames = body.tree.frames(q, body.base_rotation, body.base_translation)
+        # The lift needs no more of the links than a place near the body.
+        parts = (frames[:1, :, :3], frames[:1, :, 3], *body.tree.twists(frames))
+        points = body.tree.points(frames, self.link, self.offset)
+        return TreePose(*(part.movedim(-1, 0) for part in parts)), points
+
+    def _local_model(
+        self, x: Float[Tensor, "*batch m"], share: Float[Tensor, "*batch"] | None
+    ) -> LocalModel:
+        tree, points = self._pose(x)
+        error = points - self.target[:, :, None]
+        strength = (self.weight / self.sigma**2)[:, None, None]
+        gradient = strength * error
+        hessian = strength * torch.eye(3, dtype=x.dtype, device=x.device)
+        cost = PointCost(
+            0.5 * (gradient * error).sum(1).T,
+            gradient.movedim(-1, 0),
+            hessian.expand(points.shape[-1], -1, -1, -1),
+        )
+        value, slope, curvature = lift_to_joints(
+            tree,
+            self.body.tree.ancestors,
+            self.body.tree.joint_ancestors,
+            points.movedim(-1, 0),
+            self.link,
+            cost,
+            second_order_kinematics=True if share is None else share.reshape(-1),
+        )
+        tie, batch, m = self.body.tie[:, self.columns], x.shape[:-1], x.shape[-1]
+        return LocalModel(
+            value.reshape(batch),
+            (slope @ tie).reshape(*batch, m),
+            (tie.T @ curvature @ tie).reshape(*batch, m, m),
+        )
+
+
+def pose_targets(
+    body: BodyModel,
+    link: str,
+    pose: Float[Tensor, "4 4"] | Float[Tensor, "3"],
+    *,
+    columns: Int[Tensor, " m"] | None = None,
+    held: Float[Tensor, " n"] | None = None,
+    arm: float = 0.25,
+    sigma: float = 0.1,
+) -> PointTargets:
+    """The cost of a link that should have a given pose.
+
+    Four points at the corners of a regular tetrahedron about the link's origin, in the mean:
+
+        f(x) = 1/2 (|t - t'|^2 + 2/3 arm^2 (1 - cos angle) 2) / sigma^2
+
+    with t the origin, and the angle that of the rotation between the orientations.
+
+    Args:
+        body: The body on its base.
+        link: The link.
+        pose: Its frame in the world, or the place of its origin alone, metres.
+        columns: The parameters to search; all of them by default.
+        held: Values of the others; the rest pose by default.
+        arm: Distance of the points from the origin, metres: a radian counts as much as this.
+        sigma: Scale of the errors, metres.
+
+    Raises:
+        BodyError: If the body has no such link.
+        ShapeError: If the pose is neither.
+    """
+    if pose.shape not in ((4, 4), (3,)):
+        raise ShapeError(f"pose: expected a frame [4, 4] or a place [3], got {list(pose.shape)}")
+    corners = arm / 3**0.5 * body.tie.new_tensor(_CORNERS if pose.dim() == 2 else [[0.0] * 3])
+    pose = pose.to(body.tie)
+    target = corners @ pose[:3, :3].T + pose[:3, 3] if pose.dim() == 2 else pose[None]
+    num = len(corners)
+    return PointTargets(
+        body=body,
+        link=torch.full((num,), body.tree.link_index(link), device=body.tie.device),
+        offset=corners,
+        target=target,
+        weight=corners.new_full((num,), 1 / num),
+        sigma=sigma,
+        columns=torch.arange(body.num_parameters, device=body.tie.device)
+        if columns is None
+        else columns,
+        held=body.rest if held is None else held,
+    )
