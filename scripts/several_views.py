@@ -56,11 +56,12 @@ from torchcss.metrics import (
     probability_within,
     track_errors,
 )
-from torchcss.pipeline import ViewStream, track_frames
+from torchcss.pipeline import track_frames
 from torchcss.presets import PRESETS
 from torchcss.settings import Settings, make_extractor, make_settings_tracker
 from torchcss.track_files import track_video
 from torchcss.view_files import ViewFiles
+from torchcss.views import ViewStream
 from torchcss.vision.camera import Camera
 
 BEAM, BOARD = "balance_beam_4cam", "handheld_board"

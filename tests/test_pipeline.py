@@ -71,14 +71,25 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     np.savez(
         folder / "keypoints.npz", keypoints=uv, confidence=np.ones(uv.shape[:2]), joint_names=names
     )
+    few = Settings(body="arm7", samples=2, modes=1, overlay=False, terms=("joints",))
+    track_video(
+        folder / "video.mp4",
+        camera=folder / "cameras.json",
+        keypoints=folder / "keypoints.npz",
+        out=folder / "first",
+        stop=1,
+        settings=few,
+    )
     return folder
 
 
 def run(clip: Path, out: Path, **settings) -> dict:
+    """Track the clip from a first pose that is found once."""
     return track_video(
         clip / "video.mp4",
         camera=clip / "cameras.json",
         keypoints=clip / "keypoints.npz",
+        init=clip / "first" / "body.npz",
         out=out,
         settings=Settings(body="arm7", samples=6, modes=2, overlay=False, **settings),
     )
@@ -204,6 +215,7 @@ def test_truncated_video_keeps_the_frames(clip: Path, tmp_path: Path):
     whole = (clip / "video.mp4").read_bytes()
     for name in ("cameras.json", "keypoints.npz"):
         (tmp_path / name).write_bytes((clip / name).read_bytes())
+    shutil.copytree(clip / "first", tmp_path / "first")
     (tmp_path / "video.mp4").write_bytes(whole[: int(0.8 * len(whole))])
     with pytest.raises(VideoError, match=r"video\.mp4"):
         run(tmp_path, tmp_path / "out")
@@ -283,6 +295,7 @@ def test_masks_are_read_along_with_the_video(clip: Path, tmp_path: Path):
                 out=tmp_path / "track",
                 settings=settings,
                 masks=masks,
+                init=clip / "first" / "body.npz",
             )
     assert torchcss.load_track(tmp_path / "track").frames.tolist() == [0, 1]
 

@@ -22,7 +22,8 @@ from torchcss.settings import Settings, make_choice, make_extractor
 from torchcss.synthetic import SyntheticSequence, arm_sequence
 
 ELSEWHERE = range(6, 8)
-"""Frames that show a grey wall."""
+"""Frames that show a wall. It has some grain: a picture of a single colour is a camera that is out,
+and says nothing."""
 SETTINGS = Settings(body="arm8", terms=("contour",), working_size=120, overlay=False)
 TRACKER = make_tracker("css", "arm8", num_samples=4, num_modes=2, motion=0.1)
 RECOVERY = Recovery(monitor=LossMonitor(burn_in=3, slack=2.5, threshold=4.0), samples=3, modes=2)
@@ -32,7 +33,7 @@ def track(
     sequence: SyntheticSequence, num_frames: int, recovery: Recovery | None, seed: int = 0
 ) -> list[TrackedFrame]:
     """Track from the true first pose; some frames show a wall."""
-    wall = np.full((480, 640, 3), 90, np.uint8)
+    wall = np.random.default_rng(0).integers(88, 93, (480, 640, 3), np.uint8)
     images = (wall if index in ELSEWHERE else image for index, image in enumerate(sequence.frames))
     mixture = GaussianMixture(
         sequence.states[:1], 0.01 * torch.eye(8).double()[None], torch.zeros(1).double()

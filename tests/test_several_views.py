@@ -16,12 +16,13 @@ from torchcss.errors import CameraError, VideoError
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.io.tracks import load_track
 from torchcss.io.video import Frame, VideoWriter
-from torchcss.pipeline import TrackedFrame, ViewStream, track_frames
+from torchcss.pipeline import TrackedFrame, track_frames
 from torchcss.presets import make_tracker
 from torchcss.settings import Settings, make_extractor
 from torchcss.synthetic import SyntheticSequence, arm_sequence
 from torchcss.track_files import track_video
 from torchcss.view_files import ViewFiles
+from torchcss.views import ViewStream
 from torchcss.vision.camera import Camera
 
 FRAMES = 5

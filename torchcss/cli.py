@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import sys
 from contextlib import closing, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -29,12 +29,13 @@ from torchcss.cli_init import Init
 from torchcss.cli_smooth import Smooth, report
 from torchcss.cli_view import Plot, View
 from torchcss.demo import run_demo
-from torchcss.errors import OutputError, TorchcssError
+from torchcss.errors import ConfigurationError, OutputError, TorchcssError
 from torchcss.live import LiveViewer
 from torchcss.settings import TERMS, Settings
 from torchcss.smooth import smooth_file
 from torchcss.smooth_video import smooth_video
 from torchcss.track_files import track_video
+from torchcss.view_files import ViewFiles
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,12 +124,22 @@ class Track:
     """Terms and priors of the cost."""
     contour_weight: float = Settings.contour_weight
     """Temperature of the contour term, nats."""
+    weights: dict[str, float] = field(default_factory=dict)
+    """Further factors on terms and priors, such as contour 2 flow 0.5."""
     boundary_emphasis: float = Settings.boundary_emphasis
     """k of the motion-boundary weights W = 1 - k S_p, for the term motion_boundaries."""
     masks: Path | None = None
     """Foreground of every frame: a video or a folder of images of the video's size."""
+    other_videos: tuple[Path, ...] = ()
+    """Videos of further synchronised cameras of the same calibration file."""
+    other_keypoints: tuple[Path, ...] = ()
+    """2D joints of each of them; none: their pictures speak alone."""
+    other_offsets: tuple[int, ...] = ()
+    """Frame of each of them at the time of the first video's frame 0, by default 0."""
+    other_cameras: tuple[str, ...] = ()
+    """Camera of each of them in the file; by default the one whose video it is."""
     overlay: bool = True
-    """Write overlay.mp4."""
+    """Write overlay.mp4, and overlay_2.mp4 and so on of further cameras."""
     recovery: bool = True
     """Tell from the costs when the track is lost, and search more widely then."""
     live: bool = False
@@ -161,6 +172,7 @@ class Track:
             terms=self.terms,
             working_size=self.working_size,
             contour_weight=self.contour_weight,
+            weights=self.weights,
             boundary_emphasis=self.boundary_emphasis,
             seed=self.seed,
             device=self.device,
@@ -168,6 +180,7 @@ class Track:
             overlay=self.overlay,
             recovery=self.recovery,
         )
+        others = self.others()
         live = None
         if self.live or self.live_connect is not None or self.live_save is not None:
             live = LiveViewer(
@@ -192,6 +205,7 @@ class Track:
                 masks=self.masks,
                 init=self.init,
                 live=live,
+                others=others,
             )
         print(
             f"{summary['num_frames']} frames, {summary['seconds_per_frame']:.2f} s each; "
@@ -207,10 +221,38 @@ class Track:
                 layout=self.layout,
                 normalised=self.normalised,
                 masks=self.masks,
+                others=others,
             )
             print(report(done))
         elif self.smooth:
             print(report(smooth_file(self.out)))
+
+    def others(self) -> list[ViewFiles]:
+        """What the further cameras recorded."""
+        count = len(self.other_videos)
+        for name in ("other_keypoints", "other_offsets", "other_cameras"):
+            if len(getattr(self, name)) not in (0, count):
+                raise ConfigurationError(
+                    f"--{name.replace('_', '-')}: expected one for each of the {count} other "
+                    f"videos, or none at all; got {len(getattr(self, name))}"
+                )
+        return [
+            ViewFiles(
+                video=video,
+                keypoints=keypoints,
+                camera_name=name,
+                layout=self.layout,
+                normalised=self.normalised,
+                offset=offset,
+            )
+            for video, keypoints, offset, name in zip(
+                self.other_videos,
+                self.other_keypoints or (None,) * count,
+                self.other_offsets or (0,) * count,
+                self.other_cameras or (None,) * count,
+                strict=True,
+            )
+        ]
 
 
 Verb = (

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,9 +25,7 @@ from torch import Tensor
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, has_root, move_base, root_pose
 from torchcss.cost.frame import FrameCosts, beside
-from torchcss.cost.joints import JointObservation
-from torchcss.cost.total import CostChoice, TrackingCost
-from torchcss.errors import VideoError
+from torchcss.cost.total import CostChoice
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.proposals import unbounded
 from torchcss.inference.tracker import SequenceTracker, TrackerInfo, TrackerState
@@ -35,9 +33,9 @@ from torchcss.io.video import Frame
 from torchcss.jumps import with_flips
 from torchcss.recovery import Recovery
 from torchcss.stopwatch import Stopwatch
-from torchcss.vision.appearance import Appearance
+from torchcss.views import Observe, ViewStream, Watcher
 from torchcss.vision.camera import Camera
-from torchcss.vision.features import FeatureExtractor, FrameFeatures
+from torchcss.vision.features import FeatureExtractor
 
 _PITCH_LIMIT = math.radians(55)
 """The base follows once the root's pitch exceeds this, well before it locks at 90 degrees."""
@@ -76,75 +74,6 @@ class TrackedFrame(NamedTuple):
     lost: bool = False
     loss_score: float = 0.0
     others: tuple[Frame | None, ...] = ()
-
-
-Observe = Callable[[int], JointObservation | None]
-"""Keypoints of a frame by its index, in pixels of the working image; None if there are none."""
-
-
-class ViewStream(NamedTuple):
-    """What a further camera sends, one image for each of the first camera's.
-
-    Attributes:
-        frames: The images, in order; where they end before the first camera's, the view is out.
-        camera: Camera of the full-size images, in the first one's world.
-        observe: Keypoints by this stream's frames.
-        masks: Foreground of each of the images, of their size; None: not known.
-    """
-
-    frames: Iterable[Frame]
-    camera: Camera
-    observe: Observe
-    masks: Iterable[np.ndarray | Tensor] | None = None
-
-
-class _Watcher:
-    """One camera's part of the loop: features, and what things look like in its images."""
-
-    def __init__(
-        self,
-        costs: FrameCosts,
-        extractor: FeatureExtractor,
-        observe: Observe,
-        masks: Iterable[np.ndarray | Tensor] | None,
-    ) -> None:
-        self.costs, self.extractor, self.observe = costs, extractor, observe
-        self.masks = None if masks is None else iter(masks)
-        self.last: np.ndarray | None = None
-        self.appearance: Appearance | None = None
-        self.index: int | None = None
-        self.features: FrameFeatures | None = None
-
-    def look(self, frame: Frame | None) -> None:
-        """Take in the next image; None, or one of a single colour, is a view that is out."""
-        self.index, self.features = None if frame is None else frame.index, None
-        if frame is None:
-            self.last = None
-            return
-        mask = None
-        if self.masks is not None and (mask := next(self.masks, None)) is None:
-            raise VideoError(f"the masks end before frame {frame.index}; give one for every frame")
-        # There is no flow out of or into a missing picture.
-        if frame.image.size and frame.image.min() == frame.image.max():
-            self.last = None
-            return
-        self.features = self.extractor(frame.image, self.last, mask)
-        self.last = frame.image
-
-    def cost(self, body: BodyModel, before: Tensor, stopwatch: Stopwatch) -> TrackingCost:
-        """The cost of the image taken in last."""
-        return self.costs(
-            self.features,
-            body=body,
-            before=before,
-            observation=None if self.index is None else self.observe(self.index),
-            appearance=self.appearance,
-            stopwatch=stopwatch,
-        )
-
-    def learn(self, body: BodyModel, state: Tensor) -> None:
-        """Take in what body and surroundings look like in that image."""
-        self.appearance = self.costs.learn(self.appearance, self.features, body, state)
 
 
 def track_frames(
@@ -193,7 +122,7 @@ def track_frames(
         A `TrackedFrame` for every frame.
     """
 
-    def watcher(camera: Camera, observe: Observe, masks: Iterable[Any] | None) -> _Watcher:
+    def watcher(camera: Camera, observe: Observe, masks: Iterable[Any] | None) -> Watcher:
         costs = FrameCosts(
             body,
             extractor.working_camera(camera),
@@ -201,7 +130,7 @@ def track_frames(
             frame_interval=frame_interval,
             boundary_emphasis=boundary_emphasis,
         )
-        return _Watcher(costs, extractor, observe, masks)
+        return Watcher(costs, extractor, observe, masks)
 
     watchers = [watcher(camera, observe, masks)]
     watchers += [watcher(other.camera, other.observe, other.masks) for other in others]
@@ -260,7 +189,7 @@ def track_frames(
         body, state = follow_with_base(body, state)
 
 
-def _per_view(terms: dict[str, float], watchers: Sequence[_Watcher]) -> dict[str, float]:
+def _per_view(terms: dict[str, float], watchers: Sequence[Watcher]) -> dict[str, float]:
     """What a frame costs a view: the sum falls when a view is out, and is no better for it."""
     seen = max(1, sum(each.features is not None for each in watchers))
     return {name: value / seen for name, value in terms.items()}

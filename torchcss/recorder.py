@@ -40,13 +40,19 @@ all of it, since a save replaces the last good file only when it is complete."""
 
 
 def draw_modes(
-    tracked: TrackedFrame, camera: Camera, *, rings: int = 16, meridians: int = 20
+    tracked: TrackedFrame,
+    camera: Camera,
+    *,
+    image: UInt8[np.ndarray, "h w 3"] | None = None,
+    rings: int = 16,
+    meridians: int = 20,
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Draw the best mode as a shaded body and the others as outlines over the frame.
 
     Args:
         tracked: A tracked frame.
         camera: Camera of the full-size image.
+        image: What that camera took; by default the first camera's image.
         rings: Latitudes of the drawn mesh.
         meridians: Longitudes of the drawn mesh.
     """
@@ -56,7 +62,7 @@ def draw_modes(
         f"frame {tracked.frame.index}   {len(modes)} modes   cost {float(tracked.info.cost[0]):.1f}"
     )
     picture = draw_overlay(
-        torch.from_numpy(np.ascontiguousarray(tracked.frame.image)),
+        torch.from_numpy(np.ascontiguousarray(tracked.frame.image if image is None else image)),
         modes,
         weights=mixture.weight,
         text=text,
@@ -112,6 +118,33 @@ class Film:
     def add(self, frame: TrackedFrame, picture: Picture) -> None:
         """Append the picture."""
         self._writer.write(picture.image)
+
+    def close(self) -> None:
+        """Complete the file."""
+        self._writer.close()
+
+
+class OtherFilm:
+    """The sink that writes the overlay of a further camera.
+
+    Args:
+        path: The file.
+        frame_rate: Frames per second.
+        camera: The camera of its full-size images.
+        place: Which of `TrackedFrame.others` it took.
+    """
+
+    def __init__(self, path: Path, frame_rate: float, camera: Camera, place: int) -> None:
+        self._writer = VideoWriter(path, frame_rate)
+        self._camera, self._place = camera, place
+
+    def add(self, frame: TrackedFrame, picture: Picture) -> None:
+        """Append the picture; a black one where the camera has ended."""
+        del picture
+        own = frame.others[self._place]
+        width, height = self._camera.image_size_wh
+        image = np.zeros((height, width, 3), np.uint8) if own is None else own.image
+        self._writer.write(draw_modes(frame, self._camera, image=image))
 
     def close(self) -> None:
         """Complete the file."""

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -27,8 +27,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchcss.body.model import BodyModel
-from torchcss.cost.frame import FrameCosts
-from torchcss.cost.joints import JointObservation
+from torchcss.cost.frame import FrameCosts, beside
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.errors import ConfigurationError, TrackFileError, VideoError
 from torchcss.inference.smoothing import refine_in_windows
@@ -36,7 +35,6 @@ from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body
 from torchcss.io.track_body import body_of_track
 from torchcss.io.tracks import SUMMARY_NAME, Track, read_summary
 from torchcss.io.video import Frame
-from torchcss.pipeline import Observe
 from torchcss.settings import Settings, boundary_emphasis, make_choice, make_extractor
 from torchcss.smooth import (
     SmoothedTrack,
@@ -51,6 +49,7 @@ from torchcss.smooth import (
 )
 from torchcss.types import Status
 from torchcss.view_files import ViewFiles, open_view
+from torchcss.views import Observe, ViewStream, Watcher
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor
 
@@ -71,6 +70,7 @@ def smooth_frames(
     choice: Smoothing | None = None,
     boundary_emphasis: float = 0.0,
     masks: Iterable[np.ndarray | Tensor] | None = None,
+    others: Sequence[ViewStream] = (),
 ) -> SmoothedTrack:
     """Smooth a track, and fit the result to the images again.
 
@@ -86,6 +86,7 @@ def smooth_frames(
         choice: How to smooth; `IMAGES` by default.
         boundary_emphasis: See `FrameFeatures.edge_field`.
         masks: Foreground of each of the images; None: not known.
+        others: What further cameras send, see `torchcss.pipeline.track_frames`.
 
     Raises:
         TorchcssError: As `smooth_track`; or if frames are missing.
@@ -97,16 +98,24 @@ def smooth_frames(
         torch.from_numpy(array) for array in (first.track.state[:, 0], track.base_transform)
     )
     changes = base_changes(body, bases)
-    make_cost = FrameCosts(
-        body,
-        extractor.working_camera(camera),
-        replace(cost, temporal=None, temporal_mixture=None),
-        boundary_emphasis=boundary_emphasis,
-    )
+    watchers = [
+        Watcher(
+            FrameCosts(
+                body,
+                extractor.working_camera(view.camera),
+                replace(cost, temporal=None, temporal_mixture=None),
+                boundary_emphasis=boundary_emphasis,
+            ),
+            extractor,
+            view.observe,
+            view.masks,
+        )
+        for view in (ViewStream(frames, camera, observe, masks), *others)
+    ]
+    streams = [iter(view.frames) for view in others]
     at_start: list[float] = []
 
     def costs() -> Iterator[TrackingCost]:
-        last, foregrounds = None, None if masks is None else iter(masks)
         images = iter(tqdm(frames, total=len(track.frames), unit="frame", dynamic_ncols=True))
         for row, index in enumerate(track.frames.tolist()):
             frame = next(images, None)
@@ -115,19 +124,14 @@ def smooth_frames(
                     f"the video has no frame {index} where the track expects it; give the video "
                     "that was tracked"
                 )
-            mask = None
-            if foregrounds is not None and (mask := next(foregrounds, None)) is None:
-                raise VideoError(f"the masks end before frame {index}; give one for every frame")
+            beside_it = [next(stream, None) for stream in streams]
+            for watcher, image in zip(watchers, (frame, *beside_it), strict=True):
+                watcher.look(image)
             before = start[row - 1 : row] if row else None
             if before is not None and row - 1 in changes:
                 before = changes[row - 1](before)
-            one = make_cost(
-                extractor(frame.image, last, mask),
-                body=body.with_base(bases[row, :3, :3], bases[row, :3, 3]),
-                before=before,
-                observation=observe(frame.index),
-            )
-            last = frame.image
+            there = body.with_base(bases[row, :3, :3], bases[row, :3, 3])
+            one = beside([watcher.cost(there, before) for watcher in watchers])
             at_start.append(float(one.value(start[row : row + 1])))
             yield one
 
@@ -168,6 +172,7 @@ def smooth_video(
     normalised: bool = False,
     masks: Path | None = None,
     body: Path | None = None,
+    others: Sequence[ViewFiles] = (),
 ) -> dict[str, Any]:
     """Smooth a track on disk with its video: `smooth.npz` and an entry in `summary.json`.
 
@@ -184,6 +189,7 @@ def smooth_video(
         masks: Foreground of every frame.
         body: The fitted body; by default `body.npz` beside the track if there is one, else the
             flesh of the standard humanoid on the lengths of the track.
+        others: What further cameras recorded, see `torchcss.track_video`.
 
     Returns:
         The entry of the summary.
@@ -206,30 +212,32 @@ def smooth_video(
         layout=layout,
         normalised=normalised,
     )
-    view = open_view(files, camera, start=first, stop=stop)
+    views = [open_view(each, camera, start=first, stop=stop) for each in (files, *others)]
     extractor = make_extractor(settings)
-    working = extractor.working_shape(*view.size_wh)
-    look = view.marks(found.joint_names, torch.zeros((), dtype=torch.float64))
-
-    def observe(index: int) -> JointObservation | None:
-        if settings.keypoints_use == "first" and index != first:
-            return None
-        return look(index, working)
-
-    wanted = set(found.frames.tolist())
+    noise = views[0].noise(extractor)
+    main, *beside_it = (
+        view.stream(
+            extractor,
+            found.joint_names,
+            torch.zeros((), dtype=torch.float64),
+            sigma=noise,
+            only_first=first if settings.keypoints_use == "first" else None,
+            frames=set(found.frames.tolist()),
+        )
+        for view in views
+    )
     done = smooth_frames(
         found,
-        (frame for frame in view.reader if frame.index in wanted),
+        main.frames,
         body=flesh,
-        camera=view.camera.camera,
+        camera=main.camera,
         extractor=extractor,
-        cost=make_choice(settings, view.sigma * working[0] / view.size_wh[0]),
-        observe=observe,
+        cost=make_choice(settings, noise),
+        observe=main.observe,
         choice=choice,
         boundary_emphasis=boundary_emphasis(settings),
-        masks=None
-        if view.masks is None
-        else (mask.image for mask in view.masks if mask.index in wanted),
+        masks=main.masks,
+        others=beside_it,
     )
     return write_smoothed(done, into, folder)
 

@@ -15,16 +15,15 @@ import torch
 from tqdm import tqdm
 
 from torchcss.body.model import load_body
-from torchcss.cost.joints import JointObservation
 from torchcss.cost.view import View
 from torchcss.errors import CameraError, ConfigurationError
 from torchcss.first_frame import initialise_video
 from torchcss.hypotheses import Initialisation
 from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body, write_fitted_body
 from torchcss.io.tracks import prepare_output_folder
-from torchcss.pipeline import ViewStream, track_frames
+from torchcss.pipeline import track_frames
 from torchcss.presets import PRESETS
-from torchcss.recorder import Recorder, Sink
+from torchcss.recorder import OtherFilm, Recorder, Sink
 from torchcss.recovery import Recovery
 from torchcss.settings import (
     Settings,
@@ -75,7 +74,7 @@ def track_video(
         init: A body that `torchcss init` fitted to the first frame, to start from.
         others: What further synchronised cameras of the same calibration recorded. Their videos may
             be of another size; one that ends, or shows a single colour for a while, is left out as
-            long.
+            long. Their overlays are `overlay_2.mp4` and so on.
         live: What wants to see the frames while they are tracked, such as a
             `torchcss.live.LiveViewer`; closed at the end.
 
@@ -133,25 +132,25 @@ def track_video(
         write_fitted_body(fitted_path, first, eye)
 
     extractor = make_extractor(settings)
-    working = extractor.working_shape(*view.size_wh)
-    factor = working[0] / view.size_wh[0]
-
-    def stream(opened: OpenView) -> ViewStream:
-        size = extractor.working_shape(*opened.size_wh)
-        noise = opened.sigma * size[0] / opened.size_wh[0] / (sigma * factor)
-        look = opened.marks(first.body.joint_names, first.body.tie, relative_noise=noise)
-
-        def observe(index: int) -> JointObservation | None:
-            if settings.keypoints_use == "first" and index != start + opened.offset:
-                return None
-            return look(index, size)
-
-        masks = None if opened.masks is None else (mask.image for mask in opened.masks)
-        return ViewStream(opened.reader, opened.camera.camera, observe, masks)
-
-    main = stream(view)
+    noise = view.noise(extractor)
+    streams = [
+        opened.stream(
+            extractor,
+            first.body.joint_names,
+            first.body.tie,
+            sigma=noise,
+            only_first=start if settings.keypoints_use == "first" else None,
+        )
+        for opened in (view, *beside)
+    ]
+    main = streams[0]
     interval = stride / float(reader.info.frame_rate)
     tracker = make_settings_tracker(settings, first.body.motion_rate * interval)
+    films = [
+        OtherFilm(out / f"overlay_{place + 2}.mp4", 1 / interval, opened.camera.camera, place)
+        for place, opened in enumerate(beside)
+        if settings.overlay
+    ]
     recorder = Recorder(
         folder=out,
         settings=settings,
@@ -169,7 +168,7 @@ def track_video(
             "world_is_metric": view.camera.metric,
             "body_lengths_m": first.body.lengths,
         },
-        sinks=() if live is None else (live,),
+        sinks=films if live is None else [*films, live],
     )
     tracked = track_frames(
         main.frames,
@@ -178,7 +177,7 @@ def track_video(
         camera=main.camera,
         extractor=extractor,
         tracker=tracker,
-        choice=make_choice(settings, sigma * factor),
+        choice=make_choice(settings, noise),
         observe=main.observe,
         frame_interval=interval,
         generator=generator,
@@ -187,7 +186,7 @@ def track_video(
         jumps_every=PRESETS[settings.preset].jumps_every,
         recovery=Recovery() if settings.recovery else None,
         masks=main.masks,
-        others=[stream(each) for each in beside],
+        others=streams[1:],
     )
     return recorder.run(tracked, first.body, reader.num_selected)
 
@@ -196,8 +195,14 @@ def _first_view(opened: OpenView, start: int, sigma: float, settings: Settings) 
     """What a further camera sees of the first frame, in the pixels of its video."""
     camera = opened.camera.camera.to(dtype=settings.torch_dtype, device=settings.device)
     body = load_body(settings.body, dtype=settings.torch_dtype, device=settings.device)
-    look = opened.marks(body.joint_names, body.tie, relative_noise=opened.sigma / sigma)
-    return View(camera=camera, observation=look(start + opened.offset, opened.size_wh))
+    marks = opened.marks(
+        start + opened.offset,
+        opened.size_wh,
+        body.joint_names,
+        body.tie,
+        relative_noise=opened.sigma / sigma,
+    )
+    return View(camera=camera, observation=marks)
 
 
 def _first_pose_from_file(path: Path, camera: Camera, settings: Settings) -> Initialisation:

@@ -5,20 +5,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Container, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-import torch
+from torch import Tensor
 
 from torchcss.cost.joints import JointObservation
 from torchcss.errors import VideoError
 from torchcss.io.cameras import LoadedCamera, check_image_size, read_camera
 from torchcss.io.keypoints import Keypoints, read_keypoints
-from torchcss.io.video import VideoReader
+from torchcss.io.video import Frame, VideoReader
 from torchcss.marks import typical_sigma
 from torchcss.pipeline import scale_keypoints
+from torchcss.views import ViewStream
+from torchcss.vision.features import FeatureExtractor
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,30 +78,71 @@ class OpenView(NamedTuple):
         said = () if self.keypoints is None else self.keypoints.report
         return [note for note in (self.camera.units_note, *said) if note]
 
+    def noise(self, extractor: FeatureExtractor) -> float:
+        """Noise of a keypoint in pixels of the features."""
+        return self.sigma * extractor.working_shape(*self.size_wh)[0] / self.size_wh[0]
+
     def marks(
-        self, joint_names: tuple[str, ...], like: torch.Tensor, *, relative_noise: float = 1.0
-    ) -> Callable[[int, tuple[int, int]], JointObservation | None]:
-        """A function from a frame of this video, and the size of picture wanted, to its keypoints.
+        self,
+        index: int,
+        size_wh: tuple[int, int],
+        joint_names: tuple[str, ...],
+        like: Tensor,
+        *,
+        relative_noise: float = 1.0,
+    ) -> JointObservation | None:
+        """The keypoints of a frame of this video; None where there are none.
 
         Args:
+            index: The frame.
+            size_wh: Size of the picture in whose pixels they are wanted.
             joint_names: The body's joint centres.
             like: A tensor of the body's type and device.
             relative_noise: See `JointObservation`.
         """
         keypoints = self.keypoints
+        if keypoints is None or not 0 <= index < len(keypoints.keypoints):
+            return None
+        return JointObservation(
+            joint_names,
+            scale_keypoints(keypoints.keypoints[index], self.size_wh, size_wh).to(like),
+            keypoints.confidence[index].to(like),
+            keypoints.joint_names,
+            relative_noise=relative_noise,
+        )
 
-        def observe(index: int, size_wh: tuple[int, int]) -> JointObservation | None:
-            if keypoints is None or not 0 <= index < len(keypoints.keypoints):
+    def stream(
+        self,
+        extractor: FeatureExtractor,
+        joint_names: tuple[str, ...],
+        like: Tensor,
+        *,
+        sigma: float,
+        only_first: int | None = None,
+        frames: Container[int] | None = None,
+    ) -> ViewStream:
+        """What the camera sends, for `torchcss.pipeline.track_frames`.
+
+        Args:
+            extractor: Makes the features.
+            joint_names: The body's joint centres.
+            like: A tensor of the body's type and device.
+            sigma: Noise that the joint term is told, pixels of the first camera's features.
+            only_first: The one frame whose keypoints are used; None: those of all.
+            frames: The frames to send; None: all. These are the first camera's numbers.
+        """
+        size, noise = extractor.working_shape(*self.size_wh), self.noise(extractor) / sigma
+
+        def sent(reader: VideoReader) -> Iterator[Frame]:
+            return (f for f in reader if frames is None or f.index - self.offset in frames)
+
+        def observe(index: int) -> JointObservation | None:
+            if only_first is not None and index != only_first + self.offset:
                 return None
-            return JointObservation(
-                joint_names,
-                scale_keypoints(keypoints.keypoints[index], self.size_wh, size_wh).to(like),
-                keypoints.confidence[index].to(like),
-                keypoints.joint_names,
-                relative_noise=relative_noise,
-            )
+            return self.marks(index, size, joint_names, like, relative_noise=noise)
 
-        return observe
+        masks = None if self.masks is None else (mask.image for mask in sent(self.masks))
+        return ViewStream(sent(self.reader), self.camera.camera, observe, masks)
 
 
 def open_view(
