@@ -32,6 +32,7 @@ from torchcss.reading import read_bytes
 from torchcss.types import Bounds
 
 _MOVING = ("revolute", "prismatic")
+_FAR = 1e6
 _URDF_TYPES = {
     "revolute": "revolute",
     "continuous": "revolute",
@@ -215,7 +216,11 @@ class KinematicTree(nn.Module):
         """
         path = Path(source)
         data = read_bytes(path, BodyError)
-        return cls(_read_urdf(data, str(path)))
+        specifications = _read_urdf(data, str(path))
+        try:
+            return cls(specifications)
+        except BodyError as error:
+            raise BodyError(f"{path}: {error}") from error
 
     @property
     def num_joints(self) -> int:
@@ -406,9 +411,12 @@ def _check_specifications(joints: Sequence[JointSpecification]) -> None:
                 "continuous, prismatic and fixed (split others into joints of one axis)"
             )
         numbers = np.concatenate([np.ravel(joint.rotation), joint.translation, joint.axis])
-        if not np.isfinite(numbers).all() or (joint.kind != "fixed" and not np.any(joint.axis)):
+        # Beyond this nothing is a body's, and squares would overflow.
+        far = not (np.abs(numbers) < _FAR).all()
+        if far or (joint.kind != "fixed" and np.linalg.norm(joint.axis) < 1 / _FAR):
             raise BodyError(
-                f"joint {joint.name!r}: origin and axis must be finite and the axis not zero"
+                f"joint {joint.name!r}: origin and axis must be finite, below {_FAR:g} metres, and "
+                "the axis not zero"
             )
         if not joint.lower <= joint.upper:
             raise BodyError(f"joint {joint.name!r}: lower limit {joint.lower} > {joint.upper}")

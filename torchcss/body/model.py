@@ -30,6 +30,7 @@ from torchcss.body.lift import lift_to_joints
 from torchcss.body.skeletons import BODY_SUFFIXES, Flesh, read_skeleton
 from torchcss.body.surface import SurfaceSample, angular_grid, surface_points
 from torchcss.errors import BodyError, ShapeError, check_shape
+from torchcss.reading import one_line
 from torchcss.types import Bounds, Curvature, LocalModel, PointCost
 
 
@@ -425,7 +426,10 @@ def load_body(
     elif path.suffix.lower() in BODY_SUFFIXES:
         if lengths:
             raise BodyError(f"{path}: a body from a file has its own lengths; use scale")
-        body = read_skeleton(path, flesh=flesh, free_root=free_root, scale=scale, units=units)
+        try:
+            body = read_skeleton(path, flesh=flesh, free_root=free_root, scale=scale, units=units)
+        except RecursionError as error:
+            raise BodyError(f"{path}: links hundreds deep; expected a body or a robot") from error
     else:
         raise BodyError(
             f"no body {str(name_or_path)!r}; expected one of {', '.join(BODY_NAMES)} or the path "
@@ -433,6 +437,6 @@ def load_body(
         )
     try:
         model = BodyModel(body, rings=rings, meridians=meridians)
-    except BodyError as error:  # a tree that cannot be: only a file has one
-        raise BodyError(f"{path}: {error}") from error
+    except (BodyError, RecursionError) as error:  # a tree that cannot be: only a file has one
+        raise BodyError(f"{path}: {one_line(error)}") from error
     return model.to(dtype=dtype, device=device)

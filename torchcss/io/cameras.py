@@ -314,11 +314,16 @@ def rotation_matrix(vector: np.ndarray, where: str = "rotation") -> np.ndarray:
         where: The place in the file, for the message.
 
     Raises:
-        CameraError: If it has another shape or is not finite.
+        CameraError: If it has another shape, is not finite, or seems to be in degrees.
     """
     if vector.shape != (3,) or not np.isfinite(vector).all():
         raise CameraError(
             f"{where}: expected a rotation vector of 3 numbers, found {shortened(vector.tolist())}"
+        )
+    if np.abs(vector).max() > 4 * np.pi:
+        raise CameraError(
+            f"{where}: a rotation vector of {shortened(vector.tolist())} turns more than twice "
+            "around; expected radians"
         )
     x, y, z = vector
     angle = float(np.linalg.norm(vector))

@@ -18,7 +18,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchcss.errors import FlowFileError, OutputError, ShapeError, check_shape
+from torchcss.errors import FlowFileError, ShapeError, check_shape
+from torchcss.io.atomic import replace_file
+from torchcss.reading import read_bytes
 
 _MAGIC = b"PIEH"
 _HEADER_BYTES = 12
@@ -45,10 +47,7 @@ def read_flow(path: str | os.PathLike[str]) -> FlowFile:
         FlowFileError: If the file is missing, is no flow file, or is not as long as it says.
     """
     path = Path(path)
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise FlowFileError(f"{path}: cannot read the flow file ({error.strerror})") from error
+    content = read_bytes(path, FlowFileError)
     if len(content) < _HEADER_BYTES or content[:4] != _MAGIC:
         raise FlowFileError(
             f"{path}: expected a .flo file, which starts with the bytes PIEH and a size, "
@@ -82,7 +81,7 @@ def write_flow(
 
     Raises:
         ShapeError: If the flow is not `[2, h, w]` with at least one pixel or `known` not `[h, w]`.
-        OutputError: If the file cannot be written.
+        OutputError: If the file cannot be written; an older one of this name is left as it is.
     """
     check_shape("flow", flow, 2, None, None)
     if flow.ndim != 3 or flow.numel() == 0:
@@ -101,7 +100,5 @@ def write_flow(
         usable &= known.cpu()
     values = torch.where(usable, values, _UNKNOWN_WRITTEN).movedim(0, -1).contiguous().numpy()
     header = _MAGIC + np.array([width, height], "<i4").tobytes()
-    try:
-        Path(path).write_bytes(header + values.astype("<f4").tobytes())
-    except OSError as error:
-        raise OutputError(f"{path}: cannot write the flow file ({error.strerror})") from error
+    with replace_file(Path(path)) as partial:
+        partial.write_bytes(header + values.astype("<f4").tobytes())

@@ -145,9 +145,10 @@ def in_pixels(
             raise KeypointError(
                 f"{path}: expected fractions of the image, as most are, found {sizes.max():.4g}"
             )
-        for frame in frames:
-            # From the image's corner; pixel centres are at integers.
-            frame[..., :2] = frame[..., :2] * np.array(image_size_wh) - 0.5
+        with np.errstate(all="ignore"):  # what is huge or missing has no confidence
+            for frame in frames:
+                # From the image's corner; pixel centres are at integers.
+                frame[..., :2] = frame[..., :2] * np.array(image_size_wh) - 0.5
         report.append("fractions of the image converted to pixels")
     elif len(sizes):
         report.append("coordinates are pixels already")

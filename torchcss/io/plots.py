@@ -22,7 +22,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from torchcss.body.root import ROOT_NAMES
-from torchcss.io.atomic import prepare_output_folder
+from torchcss.io.atomic import prepare_output_folder, replace_file
 from torchcss.slices import PROMINENCE, Line, Slice, find_minima
 
 OKABE_ITO: dict[str, str] = {
@@ -325,8 +325,9 @@ def save_figure(figure: Figure, path: Path, *, dpi: int = 130) -> Path:
         dpi: Pixels per inch.
 
     Raises:
-        OutputError: If the folder cannot be written.
+        OutputError: If it cannot be written.
     """
     prepare_output_folder(path.parent)
-    figure.savefig(path, dpi=dpi)
+    with replace_file(path) as partial:
+        figure.savefig(partial, dpi=dpi)
     return path

@@ -125,8 +125,8 @@ def read_sequence(folder: str | os.PathLike[str], *, view: str | None = None) ->
         keypoint_noise_px=noise,
         joint_names=names,
         joints_world=joints,
-        mask=_read_mask(mask_file, (num_frames, size[1], size[0])) if mask_file.is_file() else None,
-        truth=_read_truth(truth_file, num_frames) if truth_file.is_file() else None,
+        mask=_read_mask(mask_file, (num_frames, size[1], size[0])) if mask_file.exists() else None,
+        truth=_read_truth(truth_file, num_frames) if truth_file.exists() else None,
     )
 
 

@@ -260,9 +260,9 @@ class VideoReader:
                 images = [
                     entry
                     for entry in self.path.iterdir()
-                    if entry.suffix.lower() in IMAGE_SUFFIXES
-                    and not entry.name.startswith(".")
-                    and entry.is_file()
+                    # A folder or a broken link of such a name is an image missing: reading it says
+                    # so, where leaving it out would shift all frames after it.
+                    if entry.suffix.lower() in IMAGE_SUFFIXES and not entry.name.startswith(".")
                 ]
                 if not images:
                     raise VideoError(
