@@ -7,7 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchcss.joint_names import ALIASES, JOINT_NAMES, canonical_joint_name, layout_of_names
+from torchcss.joint_names import (
+    ALIASES,
+    JOINT_NAMES,
+    canonical_joint_name,
+    layout_of_names,
+    skeleton_joint_names,
+)
 
 
 def test_tables_hold_catalogue_names_once() -> None:
@@ -76,3 +82,38 @@ def test_names_of_the_real_file(shared_data) -> None:
     with np.load(shared_data / "balance_beam_4cam" / "keypoints2d_cam01.npz") as archive:
         names = tuple(str(name) for name in archive["joint_names"])
     assert layout_of_names(names) == ALIASES["BODY_25B"]
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (
+            ("Hips", "LeftUpLeg", "LeftLeg", "LeftFoot", "LeftToeBase", "LeftToeBase_end",
+             "LeftShoulder", "LeftArm", "LeftForeArm", "LeftHand", "Neck", "Head", "Head_end"),
+            (None, "l_hip", "l_knee", "l_ankle", "l_midtarsal", "l_toe",
+             None, "l_shoulder", "l_elbow", "l_wrist", "vt1", "skullbase", "skull_tip"),
+        ),
+        (
+            ("mixamorig:RightUpLeg", "mixamorig:RightLeg", "mixamorig:RightArm"),
+            ("r_hip", "r_knee", "r_shoulder"),
+        ),
+        (("lfemur", "ltibia", "lhumerus", "lradius"), ("l_hip", "l_knee", "l_shoulder", "l_elbow")),
+        (("right_thigh", "right_shin", "left_upper_arm", "left_lower_arm"),
+         ("r_hip", "r_knee", "l_shoulder", "l_elbow")),
+        (("thigh.L", "shin.L", "upper_arm.R"), ("l_hip", "l_knee", "r_shoulder")),
+        (("LeftHip", "LeftKnee", "LeftShoulder", "link3"),
+         ("l_hip", "l_knee", "l_shoulder", None)),
+        (("panda_link1", "panda_hand"), (None, None)),
+    ],
+)  # fmt: skip
+def test_skeletons_name_joints_by_what_they_move(
+    names: tuple[str, ...], expected: tuple[str | None, ...]
+) -> None:
+    assert skeleton_joint_names(names) == expected
+
+
+@given(st.lists(st.text(max_size=12), max_size=6))
+def test_any_skeleton_has_names_or_none(names: list[str]) -> None:
+    found = skeleton_joint_names(names)
+    assert len(found) == len(names)
+    assert len([name for name in found if name]) == len({name for name in found if name})

@@ -87,9 +87,10 @@ class Track:
     video: Annotated[Path, tyro.conf.Positional]
     """A video in any container, or a folder of images."""
     camera: Path
-    """Calibration: cameras.json, or a Pose2Sim .toml."""
+    """Calibration: cameras.json, a Pose2Sim .toml, or EasyMocap's intri.yml."""
     keypoints: Path
-    """2D joints: OpenPose folder, COCO or AlphaPose JSON, NPZ, or clicked joints as JSON."""
+    """2D joints: OpenPose folder, COCO, AlphaPose, MediaPipe or clicked joints as JSON, CSV (also
+    DeepLabCut's), NPZ (also VideoPose3D's: FILE.npz#SUBJECT/ACTION/CAMERA)."""
     out: Path = Path("out/track")
     """Output folder."""
     init: Path | None = None
@@ -97,7 +98,7 @@ class Track:
     camera_name: str | None = None
     """Camera in the file; by default the one whose video this is."""
     body: str = "body34"
-    """arm7, arm8, body30, body32 or body34."""
+    """arm7, arm8, body30, body32 or body34, or a file: URDF, MJCF or BVH."""
     keypoints_use: Literal["first", "all"] = "all"
     """Keypoints as an observation in every frame, or only to start, as the papers do."""
     layout: str | None = None

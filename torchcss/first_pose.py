@@ -75,7 +75,7 @@ def initialise_from_joints(
     """Fit place, pose and lengths of a body to the joints of one image: the first stage.
 
     Args:
-        name: Name of a body that ships, or the path of a URDF (which then must be `placed`).
+        name: Name of a body that ships, or the path of a URDF, MJCF or BVH file.
         camera: The camera; the keypoints are in its pixels.
         keypoints: Pixels.
         confidence: In [0, 1]; 0 where a joint is missing.
@@ -108,7 +108,7 @@ def initialise_from_joints(
         name, dtype=dtype, device=device, scale=scale, free_proportions=True, free_root=True
     )
     observation = JointObservation(free.joint_names, keypoints, confidence, keypoint_names)
-    warnings = check_joints(name, observation, free, camera, least_joints)
+    warnings = (*free.notes, *check_joints(name, observation, free, camera, least_joints))
     choice = CostChoice(
         contour=None,
         joints=joints,

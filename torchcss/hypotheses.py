@@ -198,6 +198,8 @@ def fitted_lengths(
 
 def scale_report(stature: float | None, lengths: Mapping[str, float], *, num_views: int = 1) -> str:
     """The line that says what sets the scale, and the lengths."""
+    if not lengths:
+        return "the lengths of the body are its file's, which set the scale"
     fitted = ", ".join(f"{name} {length:.3f} m" for name, length in lengths.items())
     if stature is not None:
         source = f"the known stature of {stature:g} m sets the scale"
