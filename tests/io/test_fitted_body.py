@@ -97,3 +97,23 @@ def test_damaged_files(
         np.savez(path, **arrays)
     with pytest.raises(BodyError, match=r"body\.npz"):
         read_fitted_body(path)
+
+
+def test_a_body_from_a_file_is_found_again(tmp_path: Path, generator: torch.Generator):
+    """A robot that was given a root for the fit; the file is its body's name."""
+    path = tmp_path / "robot.urdf"
+    path.write_text(
+        "<robot name='r'><link name='a'/><link name='b'/><link name='c'/>"
+        "<joint name='j' type='continuous'><parent link='a'/><child link='b'/></joint>"
+        "<joint name='k' type='fixed'><parent link='b'/><child link='c'/><origin xyz='0 0 1'/>"
+        "</joint></robot>"
+    )
+    body = load_body(path, free_root=True)
+    spread = torch.eye(7, dtype=torch.float64)[None]
+    mixture = GaussianMixture(body.rest[None], spread, torch.zeros(1).double())
+    found = Initialisation(body, mixture, torch.zeros(1).double(), ())
+    write_fitted_body(tmp_path / "body.npz", found, camera(generator))
+    back = read_fitted_body(tmp_path / "body.npz")
+    assert back.body.name == str(path)
+    assert back.body.state_names == body.state_names
+    assert back.body.part_names == ("b",)

@@ -29,6 +29,7 @@ import numpy as np
 import torch
 
 from torchcss.body.model import BodyModel, load_body
+from torchcss.body.root import ROOT_NAMES
 from torchcss.body.shape import with_shape
 from torchcss.errors import BodyError
 from torchcss.hypotheses import Initialisation
@@ -129,7 +130,9 @@ def read_fitted_body(
         names, lengths = arrays["length_names"].tolist(), arrays["lengths"].tolist()
         name, scale = str(arrays["body"]), float(arrays["scale"])
         bare = {name: length / scale for name, length in zip(names, lengths, strict=True)}
-        body = load_body(name, lengths=bare, scale=scale)
+        # A robot that stands fixed may have been fitted with a root.
+        rooted = set(ROOT_NAMES) <= set(arrays["state_names"].tolist())
+        body = load_body(name, lengths=bare, scale=scale, free_root=rooted)
         layout = {"state_names": body.state_names, "part_names": body.part_names}
         for key, expected in layout.items():
             if tuple(arrays[key].tolist()) != expected:
