@@ -172,6 +172,6 @@ def draw_row(
         torch.from_numpy(image),
         modes,
         weights=torch.from_numpy(np.exp(track.log_weight[row, :count])),
-        text=f"frame {track.frames[row]}   {count} modes{cost}",
+        text=f"frame {track.frames[row]}   {count} mode{'s' if count > 1 else ''}{cost}",
     )
     return picture.numpy()
