@@ -28,7 +28,6 @@ SIX = (
 def write_arm(path: Path, rows=SEVEN, tip: tuple[float, float, float] = (0, 0, 0.1)) -> Path:
     """Write an arm; its links are link0, link1, ... and tip, its joints joint1, joint2, ..."""
     lines = ['<robot name="arm"><link name="link0"/>']
-    strength = 'effort="1" velocity="1"'
     for number, (origin, turn, axis, limit) in enumerate(rows, 1):
         lines.append(
             f'<link name="link{number}"/>'

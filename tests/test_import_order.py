@@ -44,6 +44,7 @@ LAYERS = (
         "shape_fit",
         "random_person",
         "recovery",
+        "robots",
     },
     {"sampling_study"},
     {"settings"},

@@ -27,7 +27,7 @@ from torchcss.settings import (
     make_extractor,
     make_settings_tracker,
 )
-from torchcss.synthetic import arm_sequence
+from torchcss.synthetic import SyntheticSequence, arm_sequence
 
 KEYPOINT_NOISE_PX = 1.5
 
@@ -50,9 +50,30 @@ def run_demo(
         OutputError: If the folder cannot be written.
     """
     settings = settings or Settings(body="arm8", keypoints_use="first")
-    prepare_output_folder(out)
     generator = torch.Generator().manual_seed(settings.seed)
+    prepare_output_folder(out)
     sequence = arm_sequence(generator=generator, num_frames=num_frames)
+    return track_sequence(sequence, out, settings, generator=generator)
+
+
+def track_sequence(
+    sequence: SyntheticSequence, out: Path, settings: Settings, *, generator: torch.Generator
+) -> dict[str, Any]:
+    """Track the body of a rendered sequence from noisy joints in its first frame.
+
+    Args:
+        sequence: The sequence and its truth.
+        out: See `run_demo`.
+        settings: How to track; `keypoints_use` is "first" whatever they say.
+        generator: Source of the noise and of the samples.
+
+    Returns:
+        The summary, with the errors that `run_demo` names.
+
+    Raises:
+        OutputError: If the folder cannot be written.
+    """
+    prepare_output_folder(out)
     with VideoWriter(out / "video.mp4", sequence.frame_rate) as film:
         for image in sequence.frames:
             film.write(image)
@@ -68,7 +89,7 @@ def run_demo(
     camera_there = camera.to(dtype=dtype, device=device)
     joints = JointTerm(sigma=KEYPOINT_NOISE_PX)
     first = initialise_from_joints(
-        "arm8",
+        settings.body,
         camera_there,
         keypoints,
         confidence,
@@ -109,7 +130,7 @@ def run_demo(
         frame_rate=sequence.frame_rate,
         notes=list(first.report),
     )
-    summary = recorder.run(tracked, first.body, num_frames)
+    summary = recorder.run(tracked, first.body, len(sequence.frames))
     track = load_track(out)
     reference = truth.cpu().numpy()[track.frames]
     error = np.linalg.norm(track.joints_world - reference[:, None], axis=-1).mean(-1)
