@@ -18,6 +18,7 @@ import importlib
 import os
 import re
 import shutil
+import tempfile
 import types
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
@@ -57,9 +58,6 @@ _FORMULA = re.compile(
     r"(```.*?```|`[^`]*`)|\$\$(.+?)\$\$|\$(?=\S)([^$\n]+?)(?<=\S)\$", flags=re.DOTALL
 )
 """Code, which is left as it is, or a formula that stands by itself, or one in the text."""
-
-_KERNEL = Config({"KernelManager": {"transport": "ipc"}} if os.name == "posix" else {})
-"""Sockets of the file system: over TCP, Jupyter warns that anybody on the machine may listen."""
 
 
 def main() -> None:
@@ -174,9 +172,7 @@ def notebook_text(path: Path, pictures: Path, *, execute: bool) -> str:
     bare = not any(cell.get("outputs") for cell in notebook.cells)
     if bare and execute:
         print(f"executing {path.name}")
-        ExecutePreprocessor(timeout=None, config=_KERNEL).preprocess(
-            notebook, {"metadata": {"path": str(path.parent)}}
-        )
+        run(notebook, path.parent)
     notebook.metadata["language_info"] = {"name": "python"}  # else its code has no colours
     text, resources = MarkdownExporter().from_notebook_node(
         notebook, {"unique_key": path.stem, "output_files_dir": "pictures"}
@@ -184,6 +180,16 @@ def notebook_text(path: Path, pictures: Path, *, execute: bool) -> str:
     for name, data in resources["outputs"].items():
         (pictures / Path(name).name).write_bytes(data)
     return text
+
+
+def run(notebook: nbformat.NotebookNode, folder: Path) -> None:
+    """Execute a notebook in a folder; its outputs are put into it."""
+    with tempfile.TemporaryDirectory() as sockets:
+        # Over TCP, which is all that Windows has, Jupyter warns that others may listen.
+        own = {"transport": "ipc", "ip": f"{sockets}/kernel"} if os.name == "posix" else {}
+        ExecutePreprocessor(
+            timeout=None, startup_timeout=600, config=Config({"KernelManager": own})
+        ).preprocess(notebook, {"metadata": {"path": str(folder)}})
 
 
 def page(name: str, text: str) -> Module:

@@ -10,6 +10,7 @@ import warnings
 from pathlib import Path
 from types import ModuleType
 
+import nbformat
 import pytest
 
 with warnings.catch_warnings():  # theirs, and none of the build's
@@ -96,3 +97,15 @@ def test_folders_of_others_are_left_alone(builder: ModuleType, tmp_path: Path) -
     with pytest.raises(SystemExit, match="something other than a site"):
         builder.build(tmp_path, modules=(), execute=False)
     assert (tmp_path / "thesis.tex").exists()
+
+
+def test_bare_notebooks_are_executed(
+    builder: ModuleType, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    notebook = nbformat.v4.new_notebook(
+        cells=[nbformat.v4.new_code_cell("import os; print('in', os.path.basename(os.getcwd()))")]
+    )
+    nbformat.write(notebook, tmp_path / "small.ipynb")
+    text = builder.notebook_text(tmp_path / "small.ipynb", tmp_path, execute=True)
+    assert f"in {tmp_path.name}" in text
+    assert "WARNING" not in capfd.readouterr().err
