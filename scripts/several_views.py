@@ -12,8 +12,7 @@ DIR is the folder of recordings. Two of them were filmed by synchronised, calibr
 For each set of cameras: errors in millimetres, across the first camera's line of sight and along
 it, beside the standard deviations that the tracker states there, and how often the truth lies
 within the regions of 50 and 90 % that it states. Deviations shrink as they should if the errors
-shrink with them, and the shares stay. "tempered" are the regions of the covariance divided by
-`Preset.evidence`, the power by which the tracker weighs its modes.
+shrink with them, and the shares stay.
 """
 
 from __future__ import annotations
@@ -57,7 +56,6 @@ from torchcss.metrics import (
     track_errors,
 )
 from torchcss.pipeline import track_frames
-from torchcss.presets import PRESETS
 from torchcss.settings import Settings, make_extractor, make_settings_tracker
 from torchcss.track_files import track_video
 from torchcss.view_files import ViewFiles
@@ -117,7 +115,7 @@ class Sums:
         self.error.append(away[known] @ turn.T)
         self.covariance.append(turn @ covariance[known] @ turn.T)
 
-    def report(self, reference_m: float, evidence: float) -> dict[str, Any]:
+    def report(self, reference_m: float) -> dict[str, Any]:
         """The numbers of a row, millimetres."""
         error, covariance = torch.cat(self.error), torch.cat(self.covariance)
         stated = covariance.diagonal(dim1=-2, dim2=-1)
@@ -128,11 +126,9 @@ class Sums:
             "stated_along_mm": 1000 * float(stated[:, 2].mean().sqrt()),
         }
         own = reference_m**2 * torch.eye(3, dtype=covariance.dtype)
-        for name, factor in (("", 1.0), ("_tempered", 1 / evidence)):
-            distance = squared_mahalanobis(error, factor * covariance + own)
-            shares = coverage(probability_within(distance.numpy(), 3), (0.5, 0.9))
-            row |= {f"inside_{round(100 * p)}{name}": share for p, share in shares.items()}
-        return row
+        distance = squared_mahalanobis(error, covariance + own)
+        shares = coverage(probability_within(distance.numpy(), 3), (0.5, 0.9))
+        return row | {f"inside_{round(100 * p)}": share for p, share in shares.items()}
 
 
 def main(config: Config) -> dict[str, Any]:
@@ -152,7 +148,6 @@ def main(config: Config) -> dict[str, Any]:
 def person(config: Config, folder: Path) -> dict[str, Any]:
     """The person on the beam, from each camera and from both."""
     positions, names = read_reference(folder / "reference3d.npz", "joints")
-    evidence = PRESETS["css"].evidence
     rows: dict[str, Any] = {}
     for views in (("cam01",), ("cam03",), ("cam01", "cam03")):
         files = [
@@ -199,7 +194,7 @@ def person(config: Config, folder: Path) -> dict[str, Any]:
             "frames": len(track.frames),
             "frames_lost": int(errors.lost.sum()),
             "seconds_per_frame": summary["seconds_per_frame"],
-            **sums.report(REFERENCE_M[BEAM], evidence),
+            **sums.report(REFERENCE_M[BEAM]),
         }
     return rows
 
@@ -249,11 +244,10 @@ def board(config: Config, folder: Path) -> dict[str, Any]:
             choice=choice, observe=streams[0].observe, frame_interval=interval,
             generator=generator, others=streams[1:],
         ):  # fmt: skip
-            mode = tracked.state.mixture
             joints = tracked.joints_world[0]
             away = joints - truth[tracked.frame.index]
-            pose = tracked.body.pose(mode.mean[:1])
-            spread = joint_covariance(tracked.body, pose, mode.covariance[:1])[0]
+            pose = tracked.body.pose(tracked.state.mixture.mean[:1])
+            spread = joint_covariance(tracked.body, pose, tracked.covariance[:1])[0]
             sums.add(away, spread, cameras[0])
             errors.append(float(away.norm(dim=-1).nanmean()))
             frames += 1
@@ -261,7 +255,7 @@ def board(config: Config, folder: Path) -> dict[str, Any]:
             "absolute_mm": 1000 * float(np.nanmean(errors)),
             "worst_frame_mm": 1000 * float(np.nanmax(errors)),
             "frames": frames,
-            **sums.report(REFERENCE_M[BOARD], PRESETS["css"].evidence),
+            **sums.report(REFERENCE_M[BOARD]),
         }
     return rows
 

@@ -108,10 +108,8 @@ def test_a_second_view_shows_depth(sequence: SyntheticSequence, side: Camera):
     assert [each.others[0].index for each in two if each.others[0]] == list(range(FRAMES))
 
     def depth_variance(tracked: TrackedFrame) -> float:
-        mode = tracked.state.mixture
-        spread = joint_covariance(
-            tracked.body, tracked.body.pose(mode.mean[:1]), mode.covariance[:1]
-        )
+        mode = tracked.body.pose(tracked.state.mixture.mean[:1])
+        spread = joint_covariance(tracked.body, mode, tracked.covariance[:1])
         line = sequence.camera.R_camera_world[2].double()
         return float(torch.einsum("i,jik,k->j", line, spread[0], line).max())
 

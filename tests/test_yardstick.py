@@ -75,6 +75,7 @@ def tracked(
         body=body,
         state=SimpleNamespace(mixture=GaussianMixture(mean, covariance, weights.log())),
         info=info,
+        covariance=covariance,
         joints_world=body.pose(mean).joints,
         seconds={"features": 0.25, "search": 0.5},
     )

@@ -62,7 +62,7 @@ class LiveViewer:
             frame.frame.time_s,
             body,
             body.pose(mixture.mean),
-            covariance=mixture.covariance,
+            covariance=frame.covariance,
             weight=mixture.weight,
             cost=frame.info.cost,
             picture=picture.image,

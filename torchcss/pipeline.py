@@ -26,9 +26,10 @@ from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, has_root, move_base, root_pose
 from torchcss.cost.frame import FrameCosts, beside
 from torchcss.cost.total import CostChoice
-from torchcss.inference.mixture import GaussianMixture
+from torchcss.inference.mixture import GaussianMixture, tempered
 from torchcss.inference.proposals import unbounded
 from torchcss.inference.tracker import SequenceTracker, TrackerInfo, TrackerState
+from torchcss.inference.trust_region import default_prior_variance
 from torchcss.io.video import Frame
 from torchcss.jumps import with_flips
 from torchcss.recovery import Recovery
@@ -53,6 +54,9 @@ class TrackedFrame(NamedTuple):
         body: The body on this frame's base.
         state: The tracker's state, best mode first.
         info: What the step did.
+        covariance: Covariances of the modes with the likelihood to the power `Tracker.evidence`, as
+            it counts in their weights: what the tracker states. Those in the state are of the cost
+            as it is, by which it samples.
         joints_world: Joint centres of the modes, metres.
         terms: Cost of the best mode by term, nats.
         seconds: Wall time of the frame by stage.
@@ -67,6 +71,7 @@ class TrackedFrame(NamedTuple):
     body: BodyModel
     state: TrackerState
     info: TrackerInfo
+    covariance: Float[Tensor, "k n n"]
     joints_world: Float[Tensor, "k j 3"]
     terms: dict[str, float]
     seconds: dict[str, float]
@@ -175,6 +180,11 @@ def track_frames(
             body,
             state,
             info,
+            tempered(
+                state.mixture.covariance,
+                getattr(tracker, "evidence", 1.0),
+                default_prior_variance(bounds),
+            ),
             body.pose(mean).joints,
             terms,
             {

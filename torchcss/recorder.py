@@ -187,7 +187,10 @@ class Recorder:
             The summary.
         """
         writer = TrackWriter(
-            self.folder / "track.npz", state_names=body.state_names, joint_names=body.joint_names
+            self.folder / "track.npz",
+            state_names=body.state_names,
+            joint_names=body.joint_names,
+            evidence=getattr(self.tracker, "evidence", 1.0),
         )
         totals = _Totals()
         ended, began = "interrupted", time.perf_counter()
@@ -235,7 +238,7 @@ class Recorder:
             frame=frame.frame.index,
             time_s=frame.frame.time_s,
             state=mixture.mean,
-            covariance=mixture.covariance,
+            covariance=frame.covariance,
             log_weight=mixture.log_weight,
             cost=frame.info.cost,
             parent=frame.info.parent if len(writer) else torch.full_like(frame.info.parent, -1),

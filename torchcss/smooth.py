@@ -126,7 +126,8 @@ def smooth_track(
 
     path = best_path(
         state,
-        covariance,
+        # Between frames the modes count as they are; `choice.evidence` tempers their costs.
+        track.evidence * covariance,
         node,
         times,
         Transition(velocity=tuple(body.motion_rate.tolist())),
@@ -142,10 +143,12 @@ def smooth_track(
         times,
         motion_prior(body, choice),
         body.bounds,
-        evidence=choice.evidence,
+        # The covariances of the track have its power already.
+        evidence=choice.evidence / track.evidence,
         changes=changes,
     )
     result = track_of(track, body, smooth, cost=cost[everywhere, path.mode] + smooth.cost)
+    result = result._replace(evidence=choice.evidence)
     modes = path.mode.numpy()
     effect = {
         **asdict(choice),
@@ -238,7 +241,12 @@ def save_track(path: Path, track: Track) -> None:
     Raises:
         OutputError: If it cannot be written.
     """
-    writer = TrackWriter(path, state_names=track.state_names, joint_names=track.joint_names)
+    writer = TrackWriter(
+        path,
+        state_names=track.state_names,
+        joint_names=track.joint_names,
+        evidence=track.evidence,
+    )
     for index in range(len(track.frames)):
         k = int(track.num_modes[index])
         writer.append(

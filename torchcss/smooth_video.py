@@ -144,7 +144,7 @@ def smooth_frames(
         evidence=choice.evidence,
         changes=changes,
     )
-    result = track_of(track, body, refined, cost=refined.cost)
+    result = track_of(track, body, refined, cost=refined.cost)._replace(evidence=choice.evidence)
     effect = {
         **first.effect,
         **effect_of(track, first.modes, result),

@@ -288,7 +288,8 @@ class Yardstick:
             features_s: What its features took, seconds.
         """
         sequence, limits = self.sequence, self.thresholds
-        body, mixture, number = tracked.body, tracked.state.mixture, tracked.frame.index
+        body, number = tracked.body, tracked.frame.index
+        mixture = tracked.state.mixture._replace(covariance=tracked.covariance)
         count = len(self.compared)
         joints = tracked.joints_world[:, self._column].double().cpu().numpy()
         reference = self._reference[number]
@@ -330,6 +331,7 @@ class Yardstick:
     def _angle_deviations(self, tracked: TrackedFrame) -> np.ndarray:
         """Standard deviations per angle between each mode and the truth."""
         truth, body, mixture = self.sequence.truth, tracked.body, tracked.state.mixture
+        spread = tracked.covariance.double().cpu()
         if truth is None or truth.body.state_names != body.state_names:
             return np.full(len(mixture.mean), np.nan)
         x = truth.states[tracked.frame.index]
@@ -341,7 +343,7 @@ class Yardstick:
             angles = [body.state_index(name) for name in body.state_names if name not in _PLACE]
         away = (x - mixture.mean.double().cpu())[:, angles]
         away = torch.remainder(away + math.pi, 2 * math.pi) - math.pi
-        spread = mixture.covariance.double().cpu()[:, angles][:, :, angles]
+        spread = spread[:, angles][:, :, angles]
         return (squared_mahalanobis(away, spread) / len(angles)).sqrt().numpy()
 
 

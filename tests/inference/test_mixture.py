@@ -13,6 +13,7 @@ from torchcss.inference.mixture import (
     draw_components,
     match_to_prior,
     separated,
+    tempered,
 )
 
 
@@ -253,3 +254,25 @@ def test_separated_of_alike_modes_keeps_the_best():
     assert separated(landmarks, 1.0, 4).tolist() == [0, 1, 3, 5]
     assert separated(landmarks[:3], 1.0, 2).tolist() == [0, 1]
     assert separated(landmarks[:0], 1.0, 2).tolist() == []
+
+
+@settings(max_examples=30, deadline=None)
+@given(power=st.sampled_from([1e-3, 0.1, 0.7, 1.0]), seed=st.integers(0, 2**31))
+def test_tempered_is_the_mode_of_a_tempered_likelihood(power, seed):
+    """Likelihood to a power times the prior, by the precisions."""
+    drawn = torch.Generator().manual_seed(seed)
+    n = 4
+    prior = 0.1 + torch.rand(n, generator=drawn, dtype=torch.float64)
+    root = torch.randn(n, 2, generator=drawn, dtype=torch.float64)
+    # Two directions that the image sees, two that it does not.
+    likelihood = root @ root.T
+    precision = torch.diag(1 / prior)
+    covariance = (likelihood + precision).inverse()
+    expected = (power * likelihood + precision).inverse()
+    got = tempered(covariance.expand(3, n, n), power, prior)
+    torch.testing.assert_close(got, expected.expand(3, n, n), rtol=1e-8, atol=1e-10)
+    # Never narrower than before, never wider than the prior.
+    assert float(torch.linalg.eigvalsh(got[0] - covariance).min()) > -1e-10
+    assert float(torch.linalg.eigvalsh(torch.diag(prior) - got[0]).min()) > -1e-10
+    prior_alone = torch.diag(prior)
+    torch.testing.assert_close(tempered(prior_alone, power, prior), prior_alone)

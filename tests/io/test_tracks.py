@@ -103,6 +103,7 @@ def test_file_has_exactly_the_arrays_of_the_design(tmp_path: Path) -> None:
         "state": (3, 3, 3), "covariance": (3, 3, 3, 3), "log_weight": (3, 3), "cost": (3, 3),
         "parent": (3, 3), "joint_names": (2,), "joints_world": (3, 3, 2, 3),
         "base_transform": (3, 4, 4),
+        "evidence": (),
     }  # fmt: skip
 
 
@@ -327,7 +328,10 @@ def test_other_schema_version(tmp_path: Path) -> None:
         load_track(tmp_path / "b.npz")
 
 
-@pytest.mark.parametrize("name", [name for name in Track._fields if name != "base_transform"])
+OBLIGATORY = [name for name in Track._fields if name not in ("base_transform", "evidence")]
+
+
+@pytest.mark.parametrize("name", OBLIGATORY)
 def test_incomplete_and_misshapen(tmp_path: Path, name: str) -> None:
     write_track(tmp_path / "track.npz")
     arrays = arrays_of(tmp_path / "track.npz")
@@ -348,6 +352,25 @@ def test_nan_is_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "b.npz", **arrays)
     with pytest.raises(TrackFileError, match="state holds NaN"):
         load_track(tmp_path / "b.npz")
+
+
+def test_the_power_of_the_covariances_is_kept(tmp_path: Path) -> None:
+    path = tmp_path / "track.npz"
+    writer = TrackWriter(path, state_names=("a",), joint_names=("b",), evidence=0.1)
+    writer.append(
+        frame=0, time_s=0.0, state=[[0.0]], covariance=[[[1.0]]], log_weight=[0.0], cost=[1.0],
+        parent=[-1], joints_world=[[[0.0, 0.0, 0.0]]],
+    )  # fmt: skip
+    writer.save()
+    assert load_track(path).evidence == 0.1
+    arrays = dict(np.load(path))
+    np.savez(tmp_path / "bad.npz", **{**arrays, "evidence": np.array(0.0)})
+    with pytest.raises(TrackFileError, match="positive power, got 0"):
+        load_track(tmp_path / "bad.npz")
+    # A track of somebody else's need not say it.
+    del arrays["evidence"]
+    np.savez(tmp_path / "old.npz", **arrays)
+    assert load_track(tmp_path / "old.npz").evidence == 1.0
 
 
 def test_base_transform_is_optional(tmp_path: Path) -> None:

@@ -219,6 +219,32 @@ def distinct_modes(
     return torch.stack(kept) if kept else order
 
 
+def tempered(
+    covariance: Float[Tensor, "*batch n n"], power: float, prior_variance: Float[Tensor, " n"]
+) -> Float[Tensor, "*batch n n"]:
+    """Covariances of modes if the likelihood counts with a power below one.
+
+    A mode's covariance is that of likelihood and prior together, and never wider than the prior P
+    (`inverse_on_free`). With the likelihood to the power e it is
+
+        (e (C^-1 - P^-1) + P^-1)^-1  =  D S (e (1 - S) + S)^-1 D,   P = D^2,  C = D S D:
+
+    wider by 1 / e where the image says much, and as wide as the prior where it says nothing.
+
+    Args:
+        covariance: Covariances C of the modes.
+        power: e, as `Tracker.evidence`; at one they stay as they are.
+        prior_variance: Variance of each parameter before the image is seen.
+    """
+    if power == 1.0:
+        return covariance
+    deviation = prior_variance.to(covariance).sqrt()
+    units = torch.outer(deviation, deviation)
+    own = covariance / units
+    one = torch.eye(own.shape[-1]).to(own)
+    return symmetric_part(torch.linalg.solve(power * (one - own) + own, own)) * units
+
+
 def separated(landmarks: Float[Tensor, "k m d"], distance: float, num: int) -> Int[Tensor, " num"]:
     """Choose modes that are unlike each other, best first.
 

@@ -78,6 +78,7 @@ class Track(NamedTuple):
         joint_names: Names of the joints.
         joints_world: Joint centres of the modes, metres.
         base_transform: World from the frame in which the root moves.
+        evidence: Power with which the likelihood counts in the covariances, see `Tracker.evidence`.
     """
 
     frames: Int[np.ndarray, " t"]
@@ -91,6 +92,7 @@ class Track(NamedTuple):
     joint_names: tuple[str, ...]
     joints_world: Float[np.ndarray, "t k j 3"]
     base_transform: Float[np.ndarray, "t 4 4"]
+    evidence: float = 1.0
 
     @property
     def num_modes(self) -> Int[np.ndarray, " t"]:
@@ -119,6 +121,7 @@ class TrackWriter:
         path: The file, usually `track.npz` in the output folder.
         state_names: Names of the parameters.
         joint_names: Names of the joints.
+        evidence: Power with which the likelihood counts in the covariances.
     """
 
     def __init__(
@@ -127,10 +130,12 @@ class TrackWriter:
         *,
         state_names: Sequence[str],
         joint_names: Sequence[str],
+        evidence: float = 1.0,
     ) -> None:
         self.path = Path(path)
         self._state_names = tuple(state_names)
         self._joint_names = tuple(joint_names)
+        self._evidence = float(evidence)
         self._modes: list[_Modes] = []
         self._rank_of_parent = np.zeros(0, dtype=np.int64)
 
@@ -236,6 +241,7 @@ class TrackWriter:
             base_transform=np.array([modes.base_transform for modes in self._modes]).reshape(
                 -1, 4, 4
             ),
+            evidence=self._evidence,
         )
         for index, modes in enumerate(self._modes):
             for name in ("state", "covariance", "log_weight", "cost", "parent", "joints_world"):
@@ -283,7 +289,10 @@ def load_track(path: str | os.PathLike[str]) -> Track:
             f"{path}: has schema version {int(version)}, this program reads {SCHEMA_VERSION}; "
             "use the version of torchcss that wrote it, or track again"
         )
-    missing = [name for name in Track._fields if name not in arrays and name != "base_transform"]
+    # A track of somebody else's may be in the world frame, and of the cost as it is.
+    absent: dict[str, Any] = {"evidence": np.ones(())}
+    missing = [name for name in Track._fields if name not in arrays]
+    missing = [name for name in missing if name not in ("base_transform", *absent)]
     if missing:
         raise TrackFileError(f"{path}: not a complete track: {', '.join(missing)} missing")
     t, k = arrays["log_weight"].shape if arrays["log_weight"].ndim == 2 else (-1, -1)
@@ -292,13 +301,15 @@ def load_track(path: str | os.PathLike[str]) -> Track:
         "frames": (t,), "times": (t,), "state_names": (n,), "state": (t, k, n),
         "covariance": (t, k, n, n), "log_weight": (t, k), "cost": (t, k), "parent": (t, k),
         "joint_names": (j,), "joints_world": (t, k, j, 3), "base_transform": (t, 4, 4),
+        "evidence": (),
     }  # fmt: skip
+    absent["base_transform"] = np.tile(np.eye(4), (max(t, 0), 1, 1))
     kinds = {"frames": "iu", "parent": "iu", "state_names": "U", "joint_names": "U"}
     values: dict[str, Any] = {}
     for name in Track._fields:
         array = arrays.get(name)
         if array is None:
-            array = np.tile(np.eye(4), (t, 1, 1))  # a track of somebody else's, in the world frame
+            array = absent[name]
         if array.shape != shapes[name] or array.dtype.kind not in kinds.get(name, "f"):
             raise TrackFileError(
                 f"{path}: {name}: expected shape {list(shapes[name])}, "
@@ -310,6 +321,11 @@ def load_track(path: str | os.PathLike[str]) -> Track:
             values[name] = tuple(str(entry) for entry in array)
         else:
             values[name] = array.astype(np.float64 if array.dtype.kind == "f" else np.int64)
+    values["evidence"] = float(values["evidence"])
+    if not 0 < values["evidence"] < np.inf:
+        raise TrackFileError(
+            f"{path}: evidence: expected a positive power, got {values['evidence']:g}"
+        )
     return Track(**values)
 
 
