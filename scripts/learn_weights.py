@@ -53,7 +53,6 @@ from torchcss.vision.appearance import Appearance
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FrameFeatures
 
-LEARNT = ("contour", "region", "flow", "stabiliser", "temporal", "interpenetration")
 OPTIMISER = TrustRegionNewton(max_steps=30, tolerance=1e-6)
 PERSISTENCE = PRESETS["single"].persistence
 LOST_M = 0.15
@@ -81,6 +80,9 @@ class Config:
     largest: float = 0.02
     """Norm at which the gradient of a frame is cut off, metres: a minimum that is nearly flat along
     some direction moves very far along it, and says little."""
+    terms: tuple[str, ...] = ("contour", "region", "flow", "temporal")
+    """Terms and priors whose weights are learnt. What keeps a search from far-away poses, such as the
+    stabiliser, cannot be learnt from modes that stay near the truth."""
     begin: dict[str, float] | None = None
     """Weights to begin with by term; by default those of the tracker, which count as one."""
     working_size: int = 320
@@ -123,7 +125,7 @@ def main(config: Config) -> dict[str, Any]:
             f"{config.test}: has {test.body.name}, {config.train} has {train.body.name}; the "
             "weights of one body say little of another"
         )
-    weights = TermWeights(LEARNT, config.begin)
+    weights = TermWeights(config.terms, config.begin)
     before = weights.factors()
     exam, lesson = Lesson(test, settings), Lesson(train, settings)
     report: dict[str, Any] = {

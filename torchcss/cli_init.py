@@ -39,7 +39,7 @@ class Init:
     out: Path = Path("out/init")
     """Folder for body.npz, the overlays, side.png, proportions.csv and summary.json."""
     body: str = "body34"
-    """arm7, arm8, body30, body32 or body34."""
+    """arm7, arm8, body30, body32 or body34, or a URDF, MJCF or BVH file."""
     stature: float | None = None
     """Height of the standing person, metres; by default the prior sets the scale."""
     proportions: Literal["all", "papers"] = "all"

@@ -24,6 +24,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchcss.body.catalog import ARM_NAMES
 from torchcss.body.model import BodyModel, load_body
 from torchcss.body.root import has_root, move_base, root_pose
 from torchcss.cost.anthropometric import Anthropometric
@@ -151,7 +152,7 @@ def initialise_from_joints(
     starts = columns_of(free, body, candidates)
     body, starts, _ = move_base(body, *root_pose(body, starts[0]), starts)
     fits_held = refine(cost_of(body), starts, search)
-    if name.startswith("arm"):
+    if name in ARM_NAMES:
         # The root of the best fit becomes the arm's base, and only its angles are searched.
         arm = load().with_base(*root_pose(body, fits_held.mean[int(_order(fits_held)[0])]))
         fits_held = refine(cost_of(arm), columns_of(body, arm, fits_held.mean), search)

@@ -51,7 +51,7 @@ class Settings:
     """How to track; everything here is in `summary.json`.
 
     Attributes:
-        body: Body to track: arm7, arm8, body30, body32 or body34.
+        body: Body to track: arm7, arm8, body30, body32, body34, or a URDF, MJCF or BVH file.
         preset: Tracker, a name in `presets.PRESETS`.
         samples: Samples per frame; the preset's number by default.
         modes: Modes kept; the preset's number by default.

@@ -39,6 +39,7 @@ from torchcss.inference.smoothing import (
     best_path,
     refine,
 )
+from torchcss.io.fitted_body import body_beside
 from torchcss.io.track_body import body_of_track, pose_track
 from torchcss.io.tracks import (
     SUMMARY_NAME,
@@ -174,7 +175,8 @@ def smooth_file(
         track: `track.npz`, or the folder that it is in.
         out: Output folder; by default that of the track.
         choice: How to smooth.
-        body: The body, if it is none of the catalogue's.
+        body: The body; by default that of the `body.npz` beside the track, if there is one, else
+            one of the catalogue's.
 
     Returns:
         The entry of the summary.
@@ -183,6 +185,7 @@ def smooth_file(
         TorchcssError: With one line that says what was wrong.
     """
     found, folder, into = open_track(track, out)
+    body = body_beside(folder) if body is None else body
     return write_smoothed(smooth_track(found, body, choice=choice), into, folder)
 
 

@@ -31,7 +31,7 @@ from torchcss.cost.frame import FrameCosts, beside
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.errors import ConfigurationError, TrackFileError, VideoError
 from torchcss.inference.smoothing import refine_in_windows
-from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body
+from torchcss.io.fitted_body import body_beside, read_fitted_body
 from torchcss.io.track_body import body_of_track
 from torchcss.io.tracks import SUMMARY_NAME, Track, read_summary
 from torchcss.io.video import Frame
@@ -199,8 +199,7 @@ def smooth_video(
     """
     found, folder, into = open_track(track, out)
     settings = settings_of(folder, found)
-    fitted = folder / FITTED_BODY_NAME if body is None else Path(body)
-    flesh = read_fitted_body(fitted).body if body is not None or fitted.is_file() else None
+    flesh = body_beside(folder) if body is None else read_fitted_body(body).body
     if not len(found.frames):
         raise TrackFileError(f"{track}: the track has no frames, of which the video could show any")
     first, stop = int(found.frames[0]), int(found.frames[-1]) + 1

@@ -18,7 +18,7 @@ SMALL = script.Config(frames=2, epochs=2, starts=2, working_size=160, track=True
 
 def test_in_small(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     report = script.main(script.replace(SMALL, out=tmp_path / "j" / "report.json"))
-    assert set(report["weights_after"]) == set(script.LEARNT)
+    assert set(report["weights_after"]) == set(SMALL.terms)
     assert report["weights_after"] != report["weights_before"]
     assert all(weight > 0 for weight in report["weights_after"].values())
     assert len(report["train_mm"]) == 2

@@ -58,6 +58,8 @@ PROPORTION_RANGE = 0.10
 """Fitted lengths stay within this fraction of the standard humanoid (section 3.2.3 [IJRR])."""
 
 BODY_NAMES = ("arm7", "arm8", "body30", "body32", "body34")
+ARM_NAMES = tuple(name for name in BODY_NAMES if name.startswith("arm"))
+"""Those that are an arm on a place in the world; the others move about."""
 
 _SHOULDER_AXIS = (0.70, 0.35, -0.62)
 """First axis of the left shoulder. The three angles are singular where the arm points along it:
@@ -417,7 +419,7 @@ def specification(
     if not all(0 < value < math.inf for value in (*size.values(), scale)):
         raise BodyError("lengths and scale must be positive and finite")
     build = _Builder(size, free_proportions)
-    is_arm = name.startswith("arm")
+    is_arm = name in ARM_NAMES
     if free_root if free_root is not None else not is_arm:
         build.joints += root_joints()
         link = build.joints[-1].link

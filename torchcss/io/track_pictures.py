@@ -18,7 +18,7 @@ from jaxtyping import UInt8
 from torchcss.body.model import BodyModel
 from torchcss.errors import ConfigurationError, TrackFileError, VideoError
 from torchcss.io.cameras import check_image_size, read_camera
-from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body
+from torchcss.io.fitted_body import body_beside, read_fitted_body
 from torchcss.io.overlay import draw_overlay, project_body
 from torchcss.io.track_body import body_of_track
 from torchcss.io.tracks import SUMMARY_NAME, TRACK_NAME, Track, load_track, read_summary
@@ -79,8 +79,7 @@ class TrackFiles(NamedTuple):
         track, folder = load_track(file), file.parent
         if not len(track.frames):
             raise TrackFileError(f"{file}: the track has no frames; there is nothing to show")
-        fitted = folder / FITTED_BODY_NAME if body is None else body
-        known = read_fitted_body(fitted).body if body is not None or fitted.is_file() else None
+        known = body_beside(folder) if body is None else read_fitted_body(body).body
         own = folder / SUMMARY_NAME
         summary = read_summary(own) if own.is_file() else {}
         eye = None

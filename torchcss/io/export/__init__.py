@@ -32,6 +32,7 @@ from torchcss.io.export.selection import Selection, select
 from torchcss.io.export.smpl import smpl_arrays
 from torchcss.io.export.tables import csv_text, joint_covariances, npz_arrays
 from torchcss.io.export.trc import trc_text
+from torchcss.io.fitted_body import body_beside
 from torchcss.io.track_body import body_of_track
 from torchcss.io.tracks import TRACK_NAME, Track, load_track
 
@@ -97,7 +98,8 @@ def export_track(
             y-up for BVH, TRC and MOT.
         world_up: Which axis of the world is up (x, y, z, -x, -y or -z); "auto": the one nearest to
             the body's mean upward direction.
-        body: The body that was tracked, if it is none that ships.
+        body: The body that was tracked; by default that of the `body.npz` beside the track's file,
+            if there is one, else one that ships.
         rotation_order: BVH: order of the rotation channels.
         scale: BVH: units of the file per metre.
         t_pose_frame: BVH: begin with a frame of the T-pose.
@@ -129,6 +131,7 @@ def export_track(
     if not isinstance(track, Track):
         source = Path(track)
         track = load_track(source)
+        body = body_beside(source) if body is None else body
         source = source / TRACK_NAME if source.is_dir() else source
     selection = select(
         track,
