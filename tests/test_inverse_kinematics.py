@@ -20,7 +20,7 @@ from torchcss.inverse_kinematics import Search, inverse_kinematics, pose_errors
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from made_robots import SIX, planar_arm, write_arm
 
-QUICK = Search(num_samples=64, patience=2)
+QUICK = Search(num_samples=64, patience=2, spacing=0.2)
 
 
 def pose_of(body: BodyModel, link: str, x: Tensor) -> Tensor:

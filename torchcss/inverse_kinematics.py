@@ -44,11 +44,14 @@ from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.proposals import CovarianceScaled
 from torchcss.inference.trust_region import TrustRegionNewton, default_prior_variance
 from torchcss.linalg import inverse_on_free
-from torchcss.self_motion import Curve, SolutionSet
+from torchcss.self_motion import Curve, SolutionSet, distance_from
 from torchcss.types import Bounds
 
 _NEAR = 0.02
 """Metres by which a descent may miss the pose to be worth polishing."""
+
+_DESCENT = TrustRegionNewton(max_steps=20, tolerance=1e-4)
+"""What reaches the pose is near it after ten steps; polishing goes on from there."""
 
 _SAME = 1e-3
 """Radians or metres within which two isolated solutions are one."""
@@ -105,9 +108,9 @@ class Search:
             quarter of a metre.
     """
 
-    num_samples: int = 256
-    patience: int = 4
-    max_rounds: int = 200
+    num_samples: int = 512
+    patience: int = 2
+    max_rounds: int = 100
     deviation_scale: float = 8.0
     sigma: float = 0.1
     share: float = 0.5
@@ -166,6 +169,22 @@ def inverse_kinematics(
     whole = problem.states.cost.whole(x)
     position, angle = pose_errors(body, link, pose, whole)
     return Solutions(whole, branch, closed, position, angle, descents, rounds)
+
+
+def covered(solutions: Solutions, x: Float[Tensor, "k n"], distance: float) -> Bool[Tensor, " k"]:
+    """Which states of a body lie on the solutions found, to check a search by another one.
+
+    Args:
+        solutions: What was found.
+        x: States. Joints without limits are between minus and plus half a turn, as in `solutions`.
+        distance: From an isolated solution, or from the line through the points of a curve, at
+            which a state still counts, radians.
+    """
+    near = torch.full_like(x[:, 0], torch.inf)
+    for branch, closed in enumerate(solutions.closed.tolist()):
+        curve = Curve(solutions.x[solutions.branch == branch], closed)
+        near = torch.minimum(near, distance_from(curve, x))
+    return near <= distance
 
 
 def link_pose(
@@ -355,13 +374,7 @@ class _Curves:
 
     def _on(self, curve: Curve, x: Float[Tensor, "k m"]) -> Bool[Tensor, " k"]:
         """Which states lie on a curve, to a quarter of its spacing."""
-        ends = torch.cat([curve.x[1:], curve.x[:1] if curve.closed else curve.x[-1:]])
-        step = self.problem.states.apart(ends, curve.x)
-        offset = self.problem.states.apart(x[:, None], curve.x)
-        length = step.square().sum(-1)
-        share = (offset * step).sum(-1) / torch.where(length > 0, length, 1.0)
-        off = offset - share.clamp(0, 1)[..., None] * step
-        return off.norm(dim=-1).amin(-1) <= 0.25 * self.spacing
+        return distance_from(curve, x, self.problem.states.period) <= 0.25 * self.spacing
 
     def parents(self) -> Float[Tensor, "k m"]:
         """Points evenly along all curves."""

@@ -67,9 +67,7 @@ class SolutionSet(NamedTuple):
 
     def apart(self, x: Float[Tensor, "*a m"], y: Float[Tensor, "*b m"]) -> Float[Tensor, "*c m"]:
         """Difference of states, whole periods left out."""
-        difference = x - y
-        period = torch.where(self.period > 0, self.period, 1.0)
-        return difference - self.period * (difference / period).round()
+        return _less_periods(x - y, self.period)
 
     def wrapped(self, x: Float[Tensor, "*batch m"]) -> Float[Tensor, "*batch m"]:
         """Joints without limits brought within half a turn from zero."""
@@ -199,3 +197,27 @@ class SolutionSet(NamedTuple):
         away = (landed - x).norm(dim=-1)
         near = away <= 2 * move.norm(dim=-1)
         return landed, exact & near & (away > self.tolerance)
+
+
+def distance_from(
+    curve: Curve, x: Float[Tensor, "k m"], period: Float[Tensor, " m"] | None = None
+) -> Float[Tensor, " k"]:
+    """Distance of states from the line through the points of a curve.
+
+    Args:
+        curve: A curve, or a single point.
+        x: States.
+        period: See `SolutionSet`; by default no parameter has one.
+    """
+    period = x.new_zeros(x.shape[-1]) if period is None else period
+    ends = torch.cat([curve.x[1:], curve.x[:1] if curve.closed else curve.x[-1:]])
+    step = _less_periods(ends - curve.x, period)
+    offset = _less_periods(x[:, None] - curve.x, period)
+    length = step.square().sum(-1)
+    share = (offset * step).sum(-1) / torch.where(length > 0, length, 1.0)
+    return (offset - share.clamp(0, 1)[..., None] * step).norm(dim=-1).amin(-1)
+
+
+def _less_periods(difference: Float[Tensor, "*c m"], period: Float[Tensor, " m"]) -> Tensor:
+    whole = torch.where(period > 0, period, 1.0)
+    return difference - period * (difference / whole).round()
