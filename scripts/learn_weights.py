@@ -81,8 +81,8 @@ class Config:
     """Norm at which the gradient of a frame is cut off, metres: a minimum that is nearly flat along
     some direction moves very far along it, and says little."""
     terms: tuple[str, ...] = ("contour", "region", "flow", "temporal")
-    """Terms and priors whose weights are learnt. What keeps a search from far-away poses, such as the
-    stabiliser, cannot be learnt from modes that stay near the truth."""
+    """Terms and priors whose weights are learnt. What keeps a search from far-away poses, as the
+    stabiliser does, cannot be learnt from modes that stay near the truth."""
     begin: dict[str, float] | None = None
     """Weights to begin with by term; by default those of the tracker, which count as one."""
     working_size: int = 320

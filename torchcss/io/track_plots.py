@@ -80,6 +80,11 @@ def bones_of(body: BodyModel) -> tuple[tuple[int, int], ...]:
     return tuple(bones)
 
 
+_LEAST_WEIGHT = 0.01
+"""Weight from which a mode's uncertainty is drawn: one that is hardly believed may be unsure of
+everything, and would hide the rest."""
+
+
 def side_view_figure(
     track: Track,
     frame: int,
@@ -138,7 +143,7 @@ def side_view_figure(
         label = f"{100 * weight[mode]:.0f} %, cost {track.cost[row, mode]:.1f}"
         _draw_bones(front, seen[mode], bones, label=label, **look)
         _draw_bones(side, joints[mode][:, [2, 1]], bones, **look)
-        for joint in moving:
+        for joint in moving if weight[mode] >= _LEAST_WEIGHT else ():
             ellipse = _one_deviation(joints[mode, joint, [2, 1]], spread[mode, joint])
             ellipse.set(
                 fc=mode_colour(mode), ec=_darker(mode), alpha=look["alpha"], lw=0.9, zorder=5
@@ -160,7 +165,9 @@ def side_view_figure(
         fontsize=8, title_fontsize=9, frameon=False,
     )  # fmt: skip
     figure.suptitle(
-        f"frame {frame}, {track.times[row]:.2f} s; ellipses: one standard deviation", fontsize=10
+        f"frame {frame}, {track.times[row]:.2f} s; ellipses: one standard deviation, of the modes "
+        f"of {100 * _LEAST_WEIGHT:.0f} % or more",
+        fontsize=10,
     )
     return figure
 
