@@ -42,11 +42,7 @@ import torchcss
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 DOCS = REPOSITORY / "docs"
-README_PAGES = {
-    "figures": ("Figures", "Limitations"),
-    "contributing": ("Contributing",),
-    "changelog": ("Changelog",),
-}
+README_PAGES = {"contributing": "Contributing"}
 """Sections of the README that are pages of their own; all others make up the front page."""
 
 _JAXTYPING = re.compile(
@@ -135,18 +131,18 @@ def guide(out: Path, *, execute: bool) -> Iterator[tuple[str, str]]:
     readme = (REPOSITORY / "README.md").read_text(encoding="utf-8")
     front, sections = readme_sections(readme)
     shutil.copytree(REPOSITORY / "notebooks" / "pictures", out / "pictures", dirs_exist_ok=True)
-    apart = {heading for headings in README_PAGES.values() for heading in headings}
+    apart = set(README_PAGES.values())
     rest = "".join(text for heading, text in sections.items() if heading not in apart)
     yield "index", front + rest
     yield "mathematics", (DOCS / "mathematics.md").read_text(encoding="utf-8")
     for notebook in sorted((REPOSITORY / "notebooks").glob("*.ipynb")):
         yield notebook.stem, notebook_text(notebook, out / "pictures", execute=execute)
-    for name in ("from_the_papers_to_the_code", "decisions"):
+    for name in ("from_the_papers_to_the_code", "decisions", "figures"):
         yield name, (DOCS / f"{name}.md").read_text(encoding="utf-8")
     yield "scripts", scripts_text()
-    for name, headings in README_PAGES.items():
-        text = "".join(sections[heading] for heading in headings)
-        yield name, re.sub("^#(#+ )", r"\1", text, flags=re.MULTILINE)
+    for name, heading in README_PAGES.items():
+        yield name, re.sub("^#(#+ )", r"\1", sections[heading], flags=re.MULTILINE)
+    yield "changelog", (REPOSITORY / "CHANGELOG.md").read_text(encoding="utf-8")
 
 
 def readme_sections(readme: str) -> tuple[str, dict[str, str]]:
@@ -196,6 +192,7 @@ def page(name: str, text: str) -> Module:
     """A page of Markdown as a module for pdoc: its text is the docstring."""
     # As files of the repository refer to each other, and as pages of the site do.
     text = re.sub(r"\]\((?:\.\./)?notebooks/(pictures/[^)]*)\)", r"](\1)", text)
+    text = re.sub(r"\]\((?:\.\./)?README\.md\)", "](index.html)", text)
     text = re.sub(r"\]\((?:\.\./)?scripts/(\w+)\.py\)", r"](scripts.html#\1)", text)
     text = re.sub(r"\]\((?:\.\./|docs/)?(?:notebooks/)?(\w+)\.(?:md|ipynb)\)", r"](\1.html)", text)
     text = _FORMULA.sub(_set, text)

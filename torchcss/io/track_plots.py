@@ -36,8 +36,9 @@ from torchcss.io.video import VideoReader
 from torchcss.joint_names import canonical_joint_name
 from torchcss.vision.camera import Camera
 
-APART = 0.05
-"""Mean distance of the joint centres, metres, from which two modes are two explanations."""
+APART = 0.12
+"""Distance of some joint centre, metres, from which two modes are two explanations; the preset `css`
+keeps modes apart by it (`Tracker.separation`)."""
 
 _TRUNK = (
     ("l_shoulder", "r_shoulder"),
@@ -177,7 +178,7 @@ def num_explanations(track: Track, *, apart: float = APART) -> np.ndarray:
 
     Args:
         track: The track.
-        apart: Mean distance of the joint centres from which modes differ, metres.
+        apart: Distance of some joint centre from which modes differ, metres.
     """
     counts = [
         count_apart(joints[:num], apart=apart)
@@ -191,11 +192,11 @@ def count_apart(joints: Float[np.ndarray, "k j 3"], *, apart: float = APART) -> 
 
     Args:
         joints: Joint centres of the modes, the best first.
-        apart: Mean distance of the joint centres from which modes differ, metres.
+        apart: Distance of some joint centre from which modes differ, metres.
     """
     kept: list[np.ndarray] = []
     for own in joints:
-        if all(np.linalg.norm(own - other, axis=-1).mean() >= apart for other in kept):
+        if all(np.linalg.norm(own - other, axis=-1).max() >= apart for other in kept):
             kept.append(own)
     return len(kept)
 

@@ -42,7 +42,7 @@ from torchcss.errors import ConfigurationError, OutputError
 from torchcss.io.atomic import prepare_output_folder
 from torchcss.io.overlay import PALETTE
 from torchcss.io.safe_load import one_line
-from torchcss.io.track_plots import bones_of, count_apart
+from torchcss.io.track_plots import APART, bones_of, count_apart
 from torchcss.io.viewer_layout import layout, rerun, world_axes
 from torchcss.raster import grid_faces
 from torchcss.vision.camera import Camera
@@ -55,7 +55,7 @@ DEVIATIONS = 2.0
 
 APPLICATION = "torchcss"
 
-_COUNTS = {"number": "modes", "apart": "of these 5 cm apart", "effective": "effective number"}
+_COUNTS = {"number": "modes", "apart": f"of these {100 * APART:g} cm apart", "effective": "effective number"}
 
 _RINGS, _MERIDIANS = 9, 14
 _FAINTEST, _FLESH, _MIST = 0.25, 0.35, 0.9
