@@ -1,7 +1,7 @@
 """Learn how much each term of the cost should weigh, from a sequence whose truth is known.
 
     python scripts/learn_weights.py --train demo:0 --test demo:1 --out J
-    python scripts/learn_weights.py --train demo:0 --test DIR
+    python scripts/learn_weights.py --train demo:0 --test DIR --begin contour 0.1 region 0.1
 
 A few single modes are tracked through the sequence, each from noise about the true first pose: in
 every frame the optimiser descends on the cost from where the mode was and is going. The loss is how
@@ -17,6 +17,7 @@ A sequence is `demo:SEED`, the arm of `torchcss demo` in a room of its own, or a
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -239,11 +240,15 @@ def mean_error(lesson: Lesson, weights: TermWeights, config: Config) -> float:
 def learn(
     weights: TermWeights, lesson: Lesson, config: Config, generator: torch.Generator
 ) -> list[float]:
-    """Gradient descent on the weights, frame by frame; the mean loss of every epoch in mm."""
+    """Gradient descent on the weights, frame by frame; the mean loss of every epoch in mm.
+
+    The weights are left as they were before the best epoch, or after the last if that is better: a
+    mode that is lost on the way makes an epoch worse, and no derivative tells of that.
+    """
     descent = torch.optim.Adam(weights.parameters(), lr=config.rate)
-    history = []
+    history, best = [], (math.inf, weights.log_weight.detach().clone())
     for _ in tqdm(range(config.epochs), unit="epoch"):
-        losses = []
+        losses, before = [], weights.log_weight.detach().clone()
         for error in lesson.errors(weights, config, generator):
             descent.zero_grad()
             # Beyond where a mode counts as lost, how far it is says nothing.
@@ -253,6 +258,11 @@ def learn(
             descent.step()
             losses.append(1000 * float(loss.detach()))
         history.append(float(np.mean(losses)))
+        best = min(best, (history[-1], before), key=lambda pair: pair[0])
+    history.append(mean_error(lesson, weights, config))
+    if history[-1] > best[0]:
+        with torch.no_grad():
+            weights.log_weight.copy_(best[1])
     return history
 
 
@@ -288,7 +298,9 @@ def print_report(report: dict[str, Any]) -> None:
     for name, before in report["weights_before"].items():
         print(f"{name:>18}{before:10.3f}{report['weights_after'][name]:10.3f}")
     history = report["train_mm"]
-    print(f"one mode, train: {history[0]:.1f} mm in the first epoch, {history[-1]:.1f} in the last")
+    print(
+        f"one mode, train: {history[0]:.1f} mm in the first epoch, {min(history):.1f} in the best"
+    )
     print(f"one mode, test: {report['test_before_mm']:.1f} -> {report['test_after_mm']:.1f} mm")
     if "track_after_mm" in report:
         for kind in ("best_mode", "best_of_modes"):

@@ -21,7 +21,7 @@ def test_in_small(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert set(report["weights_after"]) == set(SMALL.terms)
     assert report["weights_after"] != report["weights_before"]
     assert all(weight > 0 for weight in report["weights_after"].values())
-    assert len(report["train_mm"]) == 2
+    assert len(report["train_mm"]) == 3
     assert report["track_after_mm"]["best_of_modes"] <= report["track_after_mm"]["best_mode"]
     written = json.loads((tmp_path / "j" / "report.json").read_text())
     assert written["test_after_mm"] == pytest.approx(report["test_after_mm"])

@@ -37,8 +37,8 @@ from torchcss.joint_names import canonical_joint_name
 from torchcss.vision.camera import Camera
 
 APART = 0.12
-"""Distance of some joint centre, metres, from which two modes are two explanations; the preset `css`
-keeps modes apart by it (`Tracker.separation`)."""
+"""Distance of some joint centre, metres, from which two modes are two explanations; the preset
+`css` keeps modes apart by it (`Tracker.separation`)."""
 
 _TRUNK = (
     ("l_shoulder", "r_shoulder"),

@@ -55,7 +55,11 @@ DEVIATIONS = 2.0
 
 APPLICATION = "torchcss"
 
-_COUNTS = {"number": "modes", "apart": f"of these {100 * APART:g} cm apart", "effective": "effective number"}
+_COUNTS = {
+    "number": "modes",
+    "apart": f"of these {100 * APART:g} cm apart",
+    "effective": "effective number",
+}
 
 _RINGS, _MERIDIANS = 9, 14
 _FAINTEST, _FLESH, _MIST = 0.25, 0.35, 0.9
