@@ -19,7 +19,7 @@ from torchcss.inference.mixture import GaussianMixture
 from torchcss.vision.camera import Camera
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-from test_total import EVERYTHING, FULL, JOINTS_ONLY, make_cost, make_full_cost, random_states
+from test_total import EVERYTHING, JOINTS_ONLY, make_cost, make_full_cost, random_states
 
 
 def from_the_side(camera: Camera, centre: Tensor, size_wh: tuple[int, int]) -> Camera:
