@@ -1,4 +1,4 @@
-"""Small robots written out as URDF: a planar arm, and arms of six and of seven joints."""
+"""Small robots written out as URDF: planar arms, arms of six and seven joints, a quadruped."""
 
 from __future__ import annotations
 
@@ -54,6 +54,30 @@ def planar_arm(path: Path, *lengths: float, limit: float | None = None) -> Path:
     origins = [(0.0, 0.0, 0.0), *((length, 0.0, 0.0) for length in lengths[:-1])]
     rows = tuple((origin, (0, 0, 0), (0, 0, 1), limit) for origin in origins)
     return write_arm(path, rows, (lengths[-1], 0.0, 0.0))
+
+
+def write_quadruped(path: Path) -> Path:
+    """Write a quadruped of ANYmal's names and about its size, Z up and facing +X."""
+    lines = ['<robot name="quadruped"><link name="base"/>']
+
+    def joint(name: str, parent: str, child: str, origin, axis=None) -> None:
+        kind = "fixed" if axis is None else "revolute"
+        lines.append(
+            f'<link name="{child}"/><joint name="{name}" type="{kind}"><parent link="{parent}"/>'
+            f'<child link="{child}"/><origin xyz={_text(origin)}/>'
+            + ("" if axis is None else f'<axis xyz={_text(axis)}/><limit lower="-9" upper="9"'
+               ' effort="1" velocity="1"/>')
+            + "</joint>"
+        )  # fmt: skip
+
+    for leg in ("LF", "RF", "LH", "RH"):
+        left, fore = 1 if leg[0] == "L" else -1, 1 if leg[1] == "F" else -1
+        joint(f"{leg}_HAA", "base", f"{leg}_HIP", (0.28 * fore, 0.12 * left, 0), (1, 0, 0))
+        joint(f"{leg}_HFE", f"{leg}_HIP", f"{leg}_THIGH", (0, 0.05 * left, 0), (0, 1, 0))
+        joint(f"{leg}_KFE", f"{leg}_THIGH", f"{leg}_SHANK", (0, 0.05 * left, -0.25), (0, 1, 0))
+        joint(f"{leg}_END", f"{leg}_SHANK", f"{leg}_FOOT", (0.05 * fore, 0, -0.32))
+    path.write_text("\n".join([*lines, "</robot>"]))
+    return path
 
 
 def _text(numbers) -> str:
