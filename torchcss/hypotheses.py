@@ -116,13 +116,29 @@ def hang_on_best(body: BodyModel, fits: Modes) -> tuple[BodyModel, Modes]:
     return body, Modes(*(field[keep] for field in fits._replace(mean=mean)))
 
 
-def columns_of(source: BodyModel, target: BodyModel, x: Tensor) -> Tensor:
-    """The parameters of one body out of the states of another that has them too."""
+def columns_of(
+    source: BodyModel, target: BodyModel, x: Float[Tensor, "b n"]
+) -> Float[Tensor, "b m"]:
+    """The parameters of one body out of the states of another that has them too.
+
+    Args:
+        source: The body of the states.
+        target: The body with fewer parameters.
+        x: States.
+    """
     return x[:, [source.state_index(name) for name in target.state_names]]
 
 
-def spread_to(source: BodyModel, target: BodyModel, x: Tensor) -> Tensor:
-    """States of a body as those of one with more parameters, which stay at zero."""
+def spread_to(
+    source: BodyModel, target: BodyModel, x: Float[Tensor, "b n"]
+) -> Float[Tensor, "b m"]:
+    """States of a body as those of one with more parameters, which stay at zero.
+
+    Args:
+        source: The body of the states.
+        target: The body with more parameters.
+        x: States.
+    """
     full = x.new_zeros(len(x), target.num_parameters)
     full[:, [target.state_index(name) for name in source.state_names]] = x
     return full
@@ -197,7 +213,13 @@ def fitted_lengths(
 
 
 def scale_report(stature: float | None, lengths: Mapping[str, float], *, num_views: int = 1) -> str:
-    """The line that says what sets the scale, and the lengths."""
+    """The line that says what sets the scale, and the lengths.
+
+    Args:
+        stature: Height that was given, metres; None: none was.
+        lengths: The fitted lengths, metres.
+        num_views: How many cameras saw the body.
+    """
     if not lengths:
         return "the lengths of the body are its file's, which set the scale"
     fitted = ", ".join(f"{name} {length:.3f} m" for name, length in lengths.items())

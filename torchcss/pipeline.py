@@ -228,6 +228,12 @@ def follow_with_base(body: BodyModel, state: TrackerState) -> tuple[BodyModel, T
 def scale_keypoints(
     keypoints: Float[Tensor, "*t j 2"], full: tuple[int, int], working: tuple[int, int]
 ) -> Float[Tensor, "*t j 2"]:
-    """Pixels of the full image to pixels of the working image (centres at integers)."""
+    """Pixels of the full image to pixels of the working image (centres at integers).
+
+    Args:
+        keypoints: Pixels of the full image.
+        full: Its width and height.
+        working: Width and height of the working image.
+    """
     factor = keypoints.new_tensor([working[0] / full[0], working[1] / full[1]])
     return (keypoints + 0.5) * factor - 0.5

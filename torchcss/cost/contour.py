@@ -182,7 +182,13 @@ class ContourTerm:
     def value(
         self, nodes: ContourNodes, camera: Camera, edge_field: Float[Tensor, "2 h w"]
     ) -> Float[Tensor, "*batch p"]:
-        """Cost of every node, in units of nu."""
+        """Cost of every node, in units of nu.
+
+        Args:
+            nodes: Nodes on the predicted contours, with what is seen of them.
+            camera: The camera of the image.
+            edge_field: Edge energy times gradient direction of the image.
+        """
         seen, index = seen_nodes(nodes)
         model = camera.project_with_derivatives(seen.points)
         normal = camera.image_normals(model, seen.normals)

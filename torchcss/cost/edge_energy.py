@@ -116,7 +116,13 @@ class EdgeEnergyTerm:
     def value(
         self, nodes: ContourNodes, camera: Camera, field: SplineField
     ) -> Float[Tensor, "*batch p"]:
-        """Cost of every node, in units of nu."""
+        """Cost of every node, in units of nu.
+
+        Args:
+            nodes: Nodes on the predicted contours, with what is seen of them.
+            camera: The camera of the image.
+            field: The edge energy as a smooth function of the image.
+        """
         projection = camera.project(nodes.points)
         energy = field.value(projection.uv) * projection.valid
         return self._compose(nodes, self.potential((1 - energy).clamp(min=0)).rho)

@@ -117,7 +117,12 @@ class JointTerm:
     def value(
         self, projection: Projection, observation: JointObservation
     ) -> Float[Tensor, "*batch m"]:
-        """Cost of every correspondence, nats."""
+        """Cost of every correspondence, nats.
+
+        Args:
+            projection: Where the joint centres of the observation project.
+            observation: The keypoints.
+        """
         error = _error(projection.uv, observation)
         squared = observation.weight * error.square().sum(-1)
         rho = self.potential(squared).rho
@@ -131,7 +136,14 @@ class JointTerm:
         *,
         gauss_newton: bool = False,
     ) -> PointCost:
-        """The same with first and second derivatives in the joint centres' positions."""
+        """The same with first and second derivatives in the joint centres' positions.
+
+        Args:
+            points_world: The joint centres of the observation, metres.
+            camera: The camera whose pixels the observation is in.
+            observation: The keypoints.
+            gauss_newton: Leave out the curvature of the projection, eq. 9 [RR].
+        """
         model = camera.project_with_derivatives(points_world)
         error = _error(model.uv, observation)
         weight = observation.weight

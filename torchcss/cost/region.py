@@ -138,7 +138,13 @@ class RegionTerm:
     def value(
         self, nodes: ContourNodes, camera: Camera, images: RegionImages
     ) -> Float[Tensor, "*batch p"]:
-        """Cost of every node."""
+        """Cost of every node.
+
+        Args:
+            nodes: Nodes on the predicted contours, with what is seen of them.
+            camera: The camera of the image.
+            images: What the pixels look like.
+        """
         seen, index = seen_nodes(nodes)
         layer = images.layer[index % len(images.layer)]
         model = camera.project_with_derivatives(seen.points)

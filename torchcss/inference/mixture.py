@@ -305,6 +305,11 @@ def match_to_prior(
     component is left is new; it takes the least weight of the prior, so that it is not favoured
     over any mode that has a past. (With a single prior component that is a factor of one: all the
     modes are its children.) Prior components of weight zero are not there.
+
+    Args:
+        posterior: The modes of this frame, in the order in which they choose.
+        prior: The modes of the frame before, one frame ahead.
+        standard: See `bhattacharyya`.
     """
     prior = prior.normalise()
     present = torch.nonzero(prior.log_weight > -torch.inf)[:, 0]

@@ -418,7 +418,15 @@ class Tracker:
         scale: Float[Tensor, " n"] | None = None,
         prior_variance: Float[Tensor, " n"] | None = None,
     ) -> Iterator[tuple[TrackerState, TrackerInfo]]:
-        """Step through a sequence, one cost a frame; yields what `step` returns."""
+        """Step through a sequence, one cost a frame; yields what `step` returns.
+
+        Args:
+            state: Where to begin.
+            costs: The frames' costs, or what makes them.
+            bounds: Box limits on the state.
+            scale: See `TrustRegionNewton.init`.
+            prior_variance: See `TrustRegionNewton.minimise`.
+        """
         for cost in costs:
             state, info = self.step(state, cost, bounds, scale=scale, prior_variance=prior_variance)
             yield state, info
