@@ -62,6 +62,15 @@ def test_an_elbow_bends_both_ways(tmp_path: Path, generator: torch.Generator) ->
     assert float(found.angle_error.abs().max()) == 0
 
 
+def test_single_precision(tmp_path: Path, generator: torch.Generator) -> None:
+    body = load_body(planar_arm(tmp_path / "arm.urdf", 1.0, 0.75), dtype=torch.float32)
+    place = torch.tensor([0.9, 0.7, 0.0])
+    found = inverse_kinematics(body, "tip", place, generator=generator, search=QUICK)
+    assert found.x.dtype == torch.float32
+    assert found.num_branches == 2
+    assert float(found.position_error.max()) < 2e-5
+
+
 @pytest.mark.parametrize(("distance", "branches"), [(0.6, 2), (2.0, 1)])
 def test_self_motions_of_three_equal_bars(
     distance: float, branches: int, tmp_path: Path, generator: torch.Generator

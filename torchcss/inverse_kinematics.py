@@ -105,7 +105,7 @@ class Search:
         share: Share of the samples that are drawn about known solutions.
         spacing: Distance between the points that a curve is returned as, radians.
         tolerance: Distance from the pose, metres, that a solution must reach; a radian counts as a
-            quarter of a metre.
+            quarter of a metre. In single precision, its rounding.
     """
 
     num_samples: int = 512
@@ -137,7 +137,7 @@ def inverse_kinematics(
     """Find all states that give a link its pose.
 
     Args:
-        body: The body on its base, float64 for errors below 1e-7.
+        body: The body on its base; float64 for errors of 1e-11, float32 has some 1e-6.
         link: The link.
         pose: Its frame in the world, or the place of its origin alone, metres.
         generator: Source of the samples, on the CPU.
@@ -249,8 +249,9 @@ class _Problem(NamedTuple):
             names = [body.state_names[int(i)] for i in columns[endless & ~turns]]
             raise ConfigurationError(f"{', '.join(names)}: a length without limits; fix it")
         period = 2 * math.pi * endless.to(bounds.lower)
+        rounding = 64 * torch.finfo(body.dtype).eps
         return _Problem(
-            SolutionSet(cost, bounds, period, search.tolerance),
+            SolutionSet(cost, bounds, period, max(search.tolerance, rounding)),
             torch.where(endless, -math.pi, bounds.lower),
             torch.where(endless, math.pi, bounds.upper),
             search,
@@ -304,9 +305,7 @@ class _Problem(NamedTuple):
 
     def solve(self, starts: Float[Tensor, "s m"]) -> Float[Tensor, "k m"]:
         """Descend and polish; what reaches the pose."""
-        modes = TrustRegionNewton(max_steps=60).minimise(
-            self.states.cost, starts, self.states.bounds
-        )
+        modes = _DESCENT.minimise(self.states.cost, starts, self.states.bounds)
         near = modes.cost <= 0.5 * (_NEAR / self.search.sigma) ** 2
         x, exact = self.states.polish(modes.mean[near])
         return self.states.wrapped(x[exact])
