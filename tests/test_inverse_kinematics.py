@@ -32,7 +32,9 @@ def pose_of(body: BodyModel, link: str, x: Tensor) -> Tensor:
 
 def poses_by_another_program(urdf: Path, x: Tensor) -> Tensor:
     chain = pk.build_serial_chain_from_urdf(urdf.read_bytes(), "tip").to(dtype=x.dtype)
-    return chain.forward_kinematics(x).get_matrix()
+    end = chain.forward_kinematics(x)
+    assert isinstance(end, pk.Transform3d)
+    return end.get_matrix()
 
 
 def restarts(body: BodyModel, pose: Tensor, num: int, generator: torch.Generator) -> Tensor:
