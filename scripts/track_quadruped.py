@@ -31,7 +31,7 @@ from torchcss.inference.tracker import CostFactory
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.io.tracks import prepare_output_folder, write_summary
 from torchcss.presets import make_tracker
-from torchcss.robots import trot
+from torchcss.robots import stand, trot
 from torchcss.synthetic import look_at
 from torchcss.types import Bounds, CostFunction
 
@@ -65,13 +65,13 @@ class Config:
 def load_quadruped(path: Path) -> BodyModel:
     """On a free root, its legs within a turn, standing as its usual pose."""
     body = load_body(path, free_root=True, flesh="none")
-    stand = trot(body, torch.zeros(1, dtype=torch.float64))[0]
+    usual = stand(body)
     legs = torch.tensor(["_" in n and not n.startswith("root") for n in body.state_names])
     # Three turns of freedom, as the file has them, are one pose of a leg three times.
-    body.lower = torch.where(legs, stand - math.pi / 2, body.lower)
-    body.upper = torch.where(legs, stand + math.pi / 2, body.upper)
-    body.sticky_mean = stand
-    body.sticky_deviation = torch.where(legs, 0.7, math.inf).to(stand)
+    body.lower = torch.where(legs, usual - math.pi / 2, body.lower)
+    body.upper = torch.where(legs, usual + math.pi / 2, body.upper)
+    body.sticky_mean = usual
+    body.sticky_deviation = torch.where(legs, 0.7, math.inf).to(usual)
     return body
 
 
@@ -126,10 +126,10 @@ def first_mixture(
     body: BodyModel, cost: CostFunction, generator: torch.Generator
 ) -> GaussianMixture:
     """Descents from about the standing pose; the best of them."""
-    stand = trot(body, torch.zeros(1, dtype=torch.float64))
-    noise = torch.randn(48, stand.shape[1], generator=generator, dtype=stand.dtype)
+    usual = stand(body)
+    noise = torch.randn(48, len(usual), generator=generator, dtype=usual.dtype)
     bounds = Bounds(body.lower, body.upper)
-    modes = TrustRegionNewton().minimise(cost, stand + 0.3 * noise, bounds)
+    modes = TrustRegionNewton().minimise(cost, usual + 0.3 * noise, bounds)
     best = modes.cost.argsort()[:3]
     return GaussianMixture(modes.mean[best], modes.covariance[best], -modes.cost[best])
 

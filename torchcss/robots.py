@@ -216,6 +216,20 @@ TROT_LEGS = (("LF", "RH"), ("RF", "LH"))
 """Diagonal pairs of legs, left and right, fore and hind."""
 
 
+def stand(body: BodyModel) -> Float[Tensor, " n"]:
+    """A quadruped on bent legs, at the origin: the middle of its trot, and no state of it.
+
+    Args:
+        body: See `trot`.
+    """
+    state = body.rest.clone()
+    for leg in (leg for pair in TROT_LEGS for leg in pair):
+        fore = 1.0 if leg[1] == "F" else -1.0
+        state[body.state_index(f"{leg}_HFE")] = 0.65 * fore
+        state[body.state_index(f"{leg}_KFE")] = -1.15 * fore
+    return state
+
+
 def trot(body: BodyModel, times: Float[Tensor, " t"]) -> Float[Tensor, "t n"]:
     """States of a quadruped that trots forwards, turning slowly to its left.
 
@@ -224,10 +238,10 @@ def trot(body: BodyModel, times: Float[Tensor, " t"]) -> Float[Tensor, "t n"]:
             `LF_HFE` and `LF_KFE` (hip and knee), and so on.
         times: Seconds.
     """
-    states = body.rest.expand(len(times), -1).clone()
+    states = stand(body).expand(len(times), -1).clone()
 
     def put(name: str, values: Tensor) -> None:
-        states[:, body.state_index(name)] = values.to(states)
+        states[:, body.state_index(name)] += values.to(states)
 
     turn = 2 * math.pi * 1.5 * times  # a stride and a half a second
     speed, curve = 0.5, 0.25  # metres and radians per second
@@ -244,7 +258,7 @@ def trot(body: BodyModel, times: Float[Tensor, " t"]) -> Float[Tensor, "t n"]:
             left = 1.0 if leg[0] == "L" else -1.0
             phase = turn + start
             put(f"{leg}_HAA", 0.06 * left + 0.03 * phase.sin())
-            put(f"{leg}_HFE", fore * 0.65 - 0.28 * phase.cos())
+            put(f"{leg}_HFE", -0.28 * phase.cos())
             # The knee bends while the leg swings forwards.
-            put(f"{leg}_KFE", -fore * (1.15 + 0.35 * phase.sin().clamp(min=0)))
+            put(f"{leg}_KFE", -0.35 * fore * phase.sin().clamp(min=0))
     return states
