@@ -117,6 +117,9 @@ def test_known_modes_are_recovered_whatever_the_threshold(distance, generator):
     assert which[kept].tolist() == [0, 1, 2, 3, 4]
     best = [float(cost[which == i].min()) for i in range(5)]
     assert cost[kept].tolist() == best
+    for most in (1, 3, 10):
+        few = distinct_modes(mean, covariance, cost, distance=distance, most=most)
+        assert torch.equal(few, kept[:most])
 
 
 def test_order_of_candidates_is_irrelevant(generator):

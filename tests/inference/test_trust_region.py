@@ -1,4 +1,5 @@
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -288,6 +289,33 @@ def test_step_limit_and_one_evaluation_a_step(generator):
     assert bool((modes.status == Status.STEP_LIMIT).all())
     assert calls == [7, 7, 7, 7]
     assert bool((modes.num_steps == 3).all())
+
+
+def test_what_the_first_step_promises(generator):
+    """On a bowl the promise is kept; elsewhere the step is the one that minimise tries first."""
+    hessian = torch.diag(torch.tensor([1.0, 2.0, 3.0, 4.0]).double())
+    bowl = problems.Bowl(hessian, torch.ones(4).double(), offset=-3.0)
+    x0, free = 1 + 0.1 * randn(6, 4, generator=generator), problems.unbounded(4)
+    promised, kept = NEWTON.promised(bowl, x0, free), NEWTON.minimise(bowl, x0, free)
+    torch.testing.assert_close(promised.mean, kept.mean, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(promised.cost, kept.cost)
+    torch.testing.assert_close(promised.covariance, kept.covariance)
+    calls = []
+
+    class Counted(problems.Rosenbrock):
+        def local_model(self, x):
+            calls.append(x)
+            return super().local_model(x)
+
+    bounds, x0 = problems.box(3, -1, 0.5), 2 * randn(9, 3, generator=generator)
+    promised = NEWTON.promised(Counted(), x0, bounds)
+    assert len(calls) == 1
+    replace(NEWTON, max_steps=1).minimise(Counted(), x0, bounds)
+    torch.testing.assert_close(promised.mean, calls[2])
+    assert bool((promised.cost <= problems.Rosenbrock().value(bounds.project(x0))).all())
+    broken = torch.tensor([[5.0, 5.0], [0.5, 0.5]]).double()
+    cost = NEWTON.promised(Broken(), broken, problems.unbounded(2)).cost
+    assert cost.isinf().tolist() == [True, False]
 
 
 def test_verbs_agree_with_minimise(generator):

@@ -191,6 +191,7 @@ def distinct_modes(
     cost: Float[Tensor, " s"],
     *,
     distance: float = 1.0,
+    most: int | None = None,
 ) -> Int[Tensor, " m"]:
     """Discard modes that have been found before, Fig. 6 step 2.3.
 
@@ -204,6 +205,7 @@ def distinct_modes(
         covariance: Their covariances.
         cost: Their costs, nats. A candidate whose cost is not finite is discarded.
         distance: Threshold in standard deviations.
+        most: Keep so many at most, those of least cost; by default all.
 
     Returns:
         Indices of the modes kept, by ascending cost.
@@ -211,12 +213,12 @@ def distinct_modes(
     order = cost.argsort(stable=True)
     order = order[cost[order].isfinite()]
     kept = []
-    while len(order):
+    while len(order) and len(kept) != most:
         best, order = order[0], order[1:]
         kept.append(best)
         whitened = (mean[order] - mean[best]) @ whitener(covariance[best]).mT
         order = order[whitened.square().sum(-1) > distance**2]
-    return torch.stack(kept) if kept else order
+    return torch.stack(kept) if kept else order[:0]
 
 
 def tempered(

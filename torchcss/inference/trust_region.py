@@ -314,17 +314,37 @@ class TrustRegionNewton:
                 items, state = items[kept], _take(state, kept)
             part = cost if restrict is None else restrict(items)
 
-        active = _held(result.x, result.model.gradient, bounds)
-        sound = result.status != Status.NON_FINITE
-        hessian = torch.where(sound[:, None, None], result.model.hessian, 0.0)
-        covariance = inverse_on_free(hessian, ~active, prior_variance)
-        return Modes(
-            mean=result.x.reshape(x0.shape),
-            covariance=covariance.reshape(*batch, n, n),
-            cost=result.model.value.reshape(batch),
-            active=active.reshape(x0.shape),
-            status=result.status.reshape(batch),
-            num_steps=result.num_steps.reshape(batch),
+        return _modes(result, bounds, prior_variance, x0.shape)
+
+    def promised(
+        self,
+        cost: CostFunction,
+        x0: Float[Tensor, "b n"],
+        bounds: Bounds,
+        *,
+        scale: Float[Tensor, " n"] | None = None,
+    ) -> Modes:
+        """Where the first step from every start would lead, by the quadratic model at the start.
+
+        It takes one evaluation per start, half of what one step of `minimise` does, and says well
+        enough which of many starts are worth a descent.
+
+        Args:
+            cost: What to minimise.
+            x0: Starts, moved into the bounds.
+            bounds: Box limits on the state.
+            scale: See `init`.
+
+        Returns:
+            The ends of the steps, with the costs that the model promises there (infinite for starts
+            with `Status.NON_FINITE`) and the model's covariances; nothing was evaluated there.
+        """
+        bounds = _like(bounds, x0)
+        state = self.init(cost, x0, bounds, scale=scale)
+        ends = bounds.project(state.x + state.step)
+        model = state.model._replace(value=state.model.value - state.predicted)
+        return _modes(
+            state._replace(x=ends, model=model), bounds, default_prior_variance(bounds), x0.shape
         )
 
     def _plan(
@@ -364,6 +384,25 @@ class TrustRegionNewton:
             predicted=torch.where(again, 0.0, predicted),
             status=torch.where(ends & exact, reason, state.status),
         )
+
+
+def _modes(
+    state: TrustRegionState, bounds: Bounds, prior_variance: Tensor, shape: torch.Size
+) -> Modes:
+    """What a state found, in the leading shape of the starts."""
+    batch, n = shape[:-1], shape[-1]
+    active = _held(state.x, state.model.gradient, bounds)
+    sound = state.status != Status.NON_FINITE
+    hessian = torch.where(sound[:, None, None], state.model.hessian, 0.0)
+    covariance = inverse_on_free(hessian, ~active, prior_variance)
+    return Modes(
+        mean=state.x.reshape(shape),
+        covariance=covariance.reshape(*batch, n, n),
+        cost=state.model.value.reshape(batch),
+        active=active.reshape(shape),
+        status=state.status.reshape(batch),
+        num_steps=state.num_steps.reshape(batch),
+    )
 
 
 class _Quadratic(NamedTuple):
