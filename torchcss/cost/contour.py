@@ -228,10 +228,7 @@ class ContourTerm:
         self, nodes: ContourNodes, depth: Float[Tensor, "*batch p"]
     ) -> Float[Tensor, "*batch p"]:
         matched = self.unmatched - depth
-        back_facing = self.fitted_level * self.nu
-        occluded = self.occlusion_factor * back_facing
-        seen = nodes.visible * matched + (1 - nodes.visible) * occluded
-        return nodes.exists * seen + (1 - nodes.exists) * back_facing
+        return nodes.cost(matched, self.fitted_level * self.nu, self.occlusion_factor)
 
 
 def seen_nodes(nodes: ContourNodes) -> tuple[ContourNodes, Int[Tensor, " k"]]:

@@ -154,7 +154,4 @@ class EdgeEnergyTerm:
         return camera.pull_back(model, value, gradient, hessian, gauss_newton=gauss_newton)
 
     def _compose(self, nodes: ContourNodes, rho: Tensor) -> Float[Tensor, "*batch p"]:
-        back_facing = self.fitted_level * self.nu
-        hidden = self.occlusion_factor * back_facing
-        seen = nodes.visible * 0.5 * rho + (1 - nodes.visible) * hidden
-        return nodes.exists * seen + (1 - nodes.exists) * back_facing
+        return nodes.cost(0.5 * rho, self.fitted_level * self.nu, self.occlusion_factor)

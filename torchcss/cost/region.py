@@ -186,8 +186,5 @@ class RegionTerm:
     def _compose(
         self, nodes: ContourNodes, contrast: Float[Tensor, "*batch p"]
     ) -> Float[Tensor, "*batch p"]:
-        back_facing = self.fitted_level * self.nu
-        hidden = self.occlusion_factor * back_facing
         found = 0.5 * self.nu * (1 - 0.5 * contrast)
-        seen = nodes.visible * found + (1 - nodes.visible) * hidden
-        return nodes.exists * seen + (1 - nodes.exists) * back_facing
+        return nodes.cost(found, self.fitted_level * self.nu, self.occlusion_factor)

@@ -89,6 +89,19 @@ class ContourNodes(NamedTuple):
     exists: Float[Tensor, "*batch p"]
     visible: Float[Tensor, "*batch p"]
 
+    def cost(
+        self, matched: Float[Tensor, "*batch p"], back_facing: float, occlusion_factor: float
+    ) -> Float[Tensor, "*batch p"]:
+        """Cost of every node, whether it is seen or not (eq. 5 [IJRR]).
+
+        Args:
+            matched: Cost of what the image has where the node is seen.
+            back_facing: `nu_bf`, cost of a node where there is no contour.
+            occlusion_factor: k of the cost `nu_occ = k nu_bf` of a node that is hidden.
+        """
+        seen = self.visible * matched + (1 - self.visible) * (occlusion_factor * back_facing)
+        return self.exists * seen + (1 - self.exists) * back_facing
+
 
 class ContourPredictor(nn.Module):
     """Finds the contour nodes of a body for any number of poses at once.
