@@ -52,7 +52,7 @@ costs that compare a sample with the mode that it came from. The cost then has `
 _HEATS = ((0, 2.0), (3, 1.0))
 """The race for the places of `Tracker.finalists`: steps of descent, and how many are left then, in
 multiples of the finalists. With 1000 samples of an arm this takes a fifth of the time of full
-descents and finds the lowest ten of their minima, and 15 to 20 of the lowest twenty (measured)."""
+descents and finds the lowest ten of their minima, and 14 to 20 of the lowest twenty (measured)."""
 
 
 class Particles(NamedTuple):
