@@ -148,3 +148,42 @@ def test_masks_of_a_posed_body_are_inside_and_around_its_parts() -> None:
             assert around[layer].any(), name
     thigh, shank = names.index("thigh"), names.index("shank")
     assert not (around[thigh] & (layer_map == shank)).any(), "the limb goes on there"
+
+
+def test_colours_are_taken_from_the_core_of_a_part_and_not_beside_it() -> None:
+    """A limb that is drawn some pixels off its place still learns its own colour."""
+    body = load_body("body34").with_base(
+        torch.eye(3, dtype=torch.float64), torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64)
+    )
+    K = [[450.0, 0.0, 239.5], [0.0, 450.0, 299.5], [0.0, 0.0, 1.0]]
+    camera = Camera(K, (480, 600)).to(torch.float64)
+    names, layer_of = part_layers(body)
+    inside, around = region_masks(body, body.rest, camera)
+    moved = body.rest.clone()
+    # Two pixels to the side.
+    moved[body.state_index("root_x")] += 2 * 3.0 / 450.0
+    there = torch.tensor((*layer_of, -1))[part_map(body, moved, camera)]
+    for name in ("thigh", "shank", "upper_arm", "forearm"):
+        layer = names.index(name)
+        strays = inside[layer] & (there == -1)
+        assert int(inside[layer].sum()) > 100, name
+        assert int(strays.sum()) < 0.02 * int(inside[layer].sum()), name
+        assert not (around[layer] & (there == layer)).any(), name
+
+
+def test_a_part_too_small_for_a_core_is_learned_whole() -> None:
+    body = load_body("body34").with_base(
+        torch.eye(3, dtype=torch.float64), torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64)
+    )
+    K = [[150.0, 0.0, 79.5], [0.0, 150.0, 99.5], [0.0, 0.0, 1.0]]
+    camera = Camera(K, (160, 200)).to(torch.float64)
+    names, layer_of = part_layers(body)
+    layers = torch.tensor((*layer_of, -1))
+    inside, _ = region_masks(body, body.rest, camera)
+    thin = layers[part_map(body, body.rest, camera, girth=0.6)]
+    small = [i for i in range(len(names)) if 0 < int((thin == i).sum()) < 60]
+    assert small
+    whole = layers[part_map(body, body.rest, camera)]
+    for layer in small:
+        assert int(inside[layer].sum()) < int((whole == layer).sum())
+        assert not (inside[layer] & (whole != layer)).any()

@@ -22,6 +22,7 @@ def part_map(
     *,
     rings: int = 12,
     meridians: int = 16,
+    girth: float = 1.0,
 ) -> Int[Tensor, "h w"]:
     """The part that each pixel sees, -1 where it sees none.
 
@@ -31,11 +32,13 @@ def part_map(
         camera: Camera of the image.
         rings: Latitudes of the mesh of each part.
         meridians: Longitudes of the mesh of each part.
+        girth: Factor on the cross-sections of all parts.
     """
     mesh = body.mesh(rings, meridians)
     faces = grid_faces(rings, meridians).to(mesh.points.device)
     rotation, centre = body.part_poses(body.pose(state))
-    vertices = mesh.points.flatten(1, 2) @ rotation.mT + centre[:, None]
+    points = mesh.points * mesh.points.new_tensor([girth, girth, 1.0])
+    vertices = points.flatten(1, 2) @ rotation.mT + centre[:, None]
     offsets = vertices.shape[1] * torch.arange(body.num_parts, device=faces.device)
     every = (faces + offsets[:, None, None]).flatten(0, 1)
     uv, depth, valid = camera.project(vertices.flatten(0, 1))
