@@ -5,9 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 from torch import Tensor
+from torch.nn import functional
 
-from torchcss.body.model import load_body
+from torchcss.body.model import BodyModel, load_body
 from torchcss.cost.region import (
+    _CORE,
+    _CORE_PIXELS,
     RegionImages,
     RegionTerm,
     part_layers,
@@ -125,12 +128,18 @@ def test_single_precision_and_no_nodes(dtype: torch.dtype, generator: torch.Gene
     assert term.value(none, camera, empty).shape == (4, 0)
 
 
-def test_masks_of_a_posed_body_are_inside_and_around_its_parts() -> None:
+def someone_at_three_metres(focal_px: float) -> tuple[BodyModel, Camera]:
+    """A body at rest, filling a picture whose size goes with the focal length."""
     body = load_body("body34").with_base(
         torch.eye(3, dtype=torch.float64), torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64)
     )
-    K = [[150.0, 0.0, 79.5], [0.0, 150.0, 99.5], [0.0, 0.0, 1.0]]
-    camera = Camera(K, (160, 200)).to(torch.float64)
+    width, height = round(16 / 15 * focal_px), round(4 / 3 * focal_px)
+    K = [[focal_px, 0.0, (width - 1) / 2], [0.0, focal_px, (height - 1) / 2], [0.0, 0.0, 1.0]]
+    return body, Camera(K, (width, height)).to(torch.float64)
+
+
+def test_masks_of_a_posed_body_are_inside_and_around_its_parts() -> None:
+    body, camera = someone_at_three_metres(150.0)
     names, layer_of = part_layers(body)
     assert len(names) < body.num_parts
     left, right = (body.part_names.index(f"{side}_forearm") for side in "lr")
@@ -152,11 +161,7 @@ def test_masks_of_a_posed_body_are_inside_and_around_its_parts() -> None:
 
 def test_colours_are_taken_from_the_core_of_a_part_and_not_beside_it() -> None:
     """A limb that is drawn some pixels off its place still learns its own colour."""
-    body = load_body("body34").with_base(
-        torch.eye(3, dtype=torch.float64), torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64)
-    )
-    K = [[450.0, 0.0, 239.5], [0.0, 450.0, 299.5], [0.0, 0.0, 1.0]]
-    camera = Camera(K, (480, 600)).to(torch.float64)
+    body, camera = someone_at_three_metres(450.0)
     names, layer_of = part_layers(body)
     inside, around = region_masks(body, body.rest, camera)
     moved = body.rest.clone()
@@ -167,23 +172,24 @@ def test_colours_are_taken_from_the_core_of_a_part_and_not_beside_it() -> None:
         layer = names.index(name)
         strays = inside[layer] & (there == -1)
         assert int(inside[layer].sum()) > 100, name
+        # Of all pixels but the outline's it would be 3 % or more.
         assert int(strays.sum()) < 0.02 * int(inside[layer].sum()), name
         assert not (around[layer] & (there == layer)).any(), name
 
 
-def test_a_part_too_small_for_a_core_is_learned_whole() -> None:
-    body = load_body("body34").with_base(
-        torch.eye(3, dtype=torch.float64), torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64)
-    )
-    K = [[150.0, 0.0, 79.5], [0.0, 150.0, 99.5], [0.0, 0.0, 1.0]]
-    camera = Camera(K, (160, 200)).to(torch.float64)
+def test_of_a_part_too_small_for_a_core_all_but_the_outline_is_learned() -> None:
+    body, camera = someone_at_three_metres(150.0)
     names, layer_of = part_layers(body)
     layers = torch.tensor((*layer_of, -1))
     inside, _ = region_masks(body, body.rest, camera)
-    thin = layers[part_map(body, body.rest, camera, girth=0.6)]
-    small = [i for i in range(len(names)) if 0 < int((thin == i).sum()) < 60]
-    assert small
-    whole = layers[part_map(body, body.rest, camera)]
-    for layer in small:
-        assert int(inside[layer].sum()) < int((whole == layer).sum())
-        assert not (inside[layer] & (whole != layer)).any()
+    thin, whole = (layers[part_map(body, body.rest, camera, girth=girth)] for girth in (_CORE, 1.0))
+    core = {name: (thin == i) & (whole == i) for i, name in enumerate(names)}
+    small = [name for name in names if 0 < int(core[name].sum()) < _CORE_PIXELS]
+    assert "hand" in small
+    assert "thigh" not in small
+    for layer, name in enumerate(names):
+        own = whole == layer
+        # Off the outline: the eight pixels around are the part's own too.
+        ring = functional.pad(own[None].float(), (1, 1, 1, 1), value=1.0)
+        within = own & (functional.avg_pool2d(ring, 3, 1)[0] > 0.99)
+        assert torch.equal(inside[layer], within if name in small else core[name]), name

@@ -95,7 +95,7 @@ def region_masks(
         reach: How far the surroundings go, pixels.
 
     Returns:
-        The core of each layer, and its surroundings, both `False` in the gap between them.
+        The core of each layer, and its surroundings; neither holds what lies between them.
     """
     width, height = camera.image_size_wh
     names, layer_of = part_layers(body)
