@@ -48,6 +48,8 @@ class Init:
     """How many hypotheses to keep: best, all, or a number."""
     contours: bool = True
     """Fit cross-sections and tapers to the picture's contours too."""
+    colours: bool = True
+    """Let these fits see the colours on either side of the outline too."""
     layout: str | None = None
     """Layout of a joints file that does not name its joints, e.g. BODY_25."""
     normalised: bool = False
@@ -84,6 +86,7 @@ class Init:
             stature=self.stature,
             num_modes=keep,  # type: ignore[arg-type]
             contours=self.contours,
+            colours=self.colours,
             layout=self.layout,
             normalised=self.normalised,
             sigma=self.sigma,

@@ -53,6 +53,7 @@ def initialise_video(
         generator=generator,
         sigma=sigma,
         contours="contour" in settings.terms,
+        colours="region" in settings.terms,
         working_size=settings.working_size,
         least_joints=LEAST_JOINTS,
         others=others,

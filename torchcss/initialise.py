@@ -24,7 +24,10 @@ from torchcss.body.model import BodyModel, load_body
 from torchcss.body.root import has_root
 from torchcss.body.shape import WHOLE_SHAPE, ShapeParameters, with_shape
 from torchcss.cost.anthropometric import Anthropometric
+from torchcss.cost.frame import FrameCosts
 from torchcss.cost.joints import JointObservation, JointTerm
+from torchcss.cost.region import RegionTerm
+from torchcss.cost.shaped import Outline
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.cost.view import View
 from torchcss.cost.visibility import ContourPredictor
@@ -53,6 +56,10 @@ DEFAULT_VIEW_DEGREES = 54.0
 """Field of view along the longer side of a picture from an unknown camera: that of a 35 mm lens on
 35 mm film, in the middle of what telephones and cameras have."""
 
+_BESIDE_COLOURS = 40.0
+"""Weight of the contours where colours tell the outline too. Clothes have edges all over, and the
+outline is in one place: edges draw limbs thin. Where colours tell nothing, edges still lead."""
+
 
 def initialise(
     image: UInt8[np.ndarray, "h w 3"] | Tensor | None,
@@ -68,6 +75,7 @@ def initialise(
     stature: float | None = None,
     num_modes: int | None = 8,
     contours: bool = True,
+    colours: bool = True,
     working_size: int = 640,
     search: Search | None = None,
     least_joints: int = 1,
@@ -92,6 +100,8 @@ def initialise(
         stature: Height of the standing person, metres, where it is known.
         num_modes: Most hypotheses; 1 for the best alone, None for all.
         contours: Run the second and third stage on the picture's contours.
+        colours: Let them see the colours on either side of the outline too, of what the first stage
+            takes for body and surroundings.
         working_size: Longer side of the picture on which contours are searched.
         search: How widely interpretations are looked for.
         least_joints: Fewest joints of the body that have to be marked.
@@ -134,25 +144,30 @@ def initialise(
     if image is None or not contours:
         return first
     kept = torch.tensor([name not in first.left_out for name in names]).to(confidence)
-    extractor = FeatureExtractor(working_size=working_size)
-    field = extractor(image).edge_field().to(first.body.tie)
-    working = extractor.working_camera(camera).to(dtype=dtype, device=device)
+    extractor = FeatureExtractor(working_size=working_size, colour=colours)
+    features = extractor.to(device=device)(image)
+    working = extractor.working_camera(camera)
     factor = working.image_size_wh[0] / camera.image_size_wh[0]
-    observation = JointObservation(
-        first.body.joint_names,
-        factor * (keypoints.to(first.body.tie) + 0.5) - 0.5,
-        (kept * confidence).to(first.body.tie),
-        names,
-    )
     choice = CostChoice(
+        region=RegionTerm() if colours else None,
+        contour_weight=_BESIDE_COLOURS if colours else CostChoice.contour_weight,
         joints=replace(joints, sigma=factor * joints.sigma),
         temporal=None,
         anthropometric=Anthropometric() if stature is None else Anthropometric(stature=0.0),
     )
-    cost = TrackingCost(
-        body=first.body, camera=working, choice=choice, edge_field=field, observation=observation,
-        others=tuple(view.of_keypoints(factor) for view in others),
-    )  # fmt: skip
+    costs = FrameCosts(first.body, working, choice)
+    cost = costs(
+        features,
+        body=first.body,
+        observation=JointObservation(
+            first.body.joint_names,
+            factor * (keypoints.to(first.body.tie) + 0.5) - 0.5,
+            (kept * confidence).to(first.body.tie),
+            names,
+        ),
+        appearance=costs.learn(None, features, first.body, first.mixture.mean[0]),
+    )
+    cost = replace(cost, others=tuple(view.of_keypoints(factor) for view in others))
     return _with_contours(first, cost, stature, search or Search(), num_modes)
 
 
@@ -178,11 +193,10 @@ def _with_contours(
     loose = load(first.lengths, free=True)
     state = spread_to(first.body, loose, first.mixture.mean[:1])[0]
     parameters = ShapeParameters(loose, WHOLE_SHAPE)
-    assert cost.edge_field is not None
-    base = replace(cost, body=loose, choice=replace(cost.choice, contour=None), edge_field=None)
+    bones = replace(cost.choice, contour=None, region=None)
     flesh, whole = fit_shape(
-        base, state, parameters, cost.edge_field, bounds=search.bounds(loose),
-        contour=cost.choice.contour, contour_weight=cost.choice.contour_weight,
+        replace(cost, body=loose, choice=bones), state, parameters, _outlines(cost),
+        bounds=search.bounds(loose),
     )  # fmt: skip
     lengths = {**first.lengths, **fitted_lengths(loose, whole.state, stature)}
 
@@ -224,6 +238,19 @@ def _with_contours(
         ),
         lengths=lengths,
         stages=(*first.stages, second, third),
+    )
+
+
+def _outlines(cost: TrackingCost) -> tuple[Outline, ...]:
+    choice = cost.choice
+    compared = (
+        (choice.contour, cost.edge_field, choice.contour_weight),
+        (choice.region, cost.region, choice.region_weight),
+    )
+    return tuple(
+        Outline(term, image, weight)
+        for term, image, weight in compared
+        if term is not None and image is not None
     )
 
 

@@ -52,6 +52,7 @@ def initialise_image(
     stature: float | None = None,
     num_modes: int | None = 8,
     contours: bool = True,
+    colours: bool = True,
     layout: str | None = None,
     normalised: bool = False,
     sigma: float | None = None,
@@ -74,6 +75,7 @@ def initialise_image(
         stature: Height of the standing person, metres.
         num_modes: Most hypotheses; None for all.
         contours: Fit shape to contours too.
+        colours: Let that fit see the colours on either side of the outline.
         layout: Layout of a joints file that does not name its joints.
         normalised: Joints are fractions of the image.
         sigma: Noise of a marked wrist, pixels.
@@ -119,6 +121,7 @@ def initialise_image(
         stature=stature,
         num_modes=num_modes,
         contours=contours,
+        colours=colours,
         search=search,
         dtype=dtype,
         device=device,

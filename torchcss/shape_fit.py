@@ -1,8 +1,9 @@
 """Stages two and three of initialisation: the flesh, then everything (section 5 [IJRR]).
 
 The second stage fits cross-sections and tapers of all parts, left and right tied, to joints and
-image contours while pose and lengths are held; the third fits all parameters to the same. Each is
-the bound-constrained robust optimisation of section 4.1 on `ShapedCost`, from the best fit so far.
+outlines in the image while pose and lengths are held; the third fits all parameters to the same.
+Each is the bound-constrained robust optimisation of section 4.1 on `ShapedCost`, from the best fit
+so far.
 """
 
 from __future__ import annotations
@@ -14,8 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.body.shape import CROSS_SECTIONS, ShapeParameters
-from torchcss.cost.contour import ContourTerm
-from torchcss.cost.shaped import ShapedCost
+from torchcss.cost.shaped import Outline, ShapedCost
 from torchcss.cost.total import TrackingCost
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.types import Bounds
@@ -39,11 +39,9 @@ def fit_shape(
     base: TrackingCost,
     state: Float[Tensor, " n"],
     parameters: ShapeParameters,
-    edge_field: Float[Tensor, "2 h w"],
+    outlines: tuple[Outline, ...],
     *,
     bounds: Bounds | None = None,
-    contour: ContourTerm | None = None,
-    contour_weight: float = 150.0,
     max_steps: int = 25,
 ) -> tuple[ShapeFit, ShapeFit]:
     """Run the second and the third stage.
@@ -52,22 +50,14 @@ def fit_shape(
         base: Joints and priors on the working image; its body has free lengths.
         state: The best fit of the first stage.
         parameters: Which shape numbers are free.
-        edge_field: Edge energy times gradient direction of the working image.
+        outlines: What of the working image the outline is compared with.
         bounds: Limits of the state; by default the body's.
-        contour: The contour term.
-        contour_weight: Nats per nu of the contour's mean cost per node.
         max_steps: Iterations of each stage.
 
     Returns:
         The fits after the second and after the third stage.
     """
-    cost = ShapedCost(
-        base=base,
-        parameters=parameters,
-        contour=contour or ContourTerm(),
-        edge_field=edge_field,
-        contour_weight=contour_weight,
-    )
+    cost = ShapedCost(base=base, parameters=parameters, outlines=outlines)
     optimiser = TrustRegionNewton(max_steps=max_steps, tolerance=1e-2)
     n = len(state)
     y = torch.cat([state, state.new_zeros(len(parameters.names))])[None]

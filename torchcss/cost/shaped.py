@@ -1,11 +1,12 @@
 """The cost of pose, lengths and shape together: stages two and three of section 5 [IJRR].
 
-    f(x, z) = joints(x) + priors(x) + contour(x, z) + 1/2 z^T P z
+    f(x, z) = joints(x) + priors(x) + outlines(x, z) + 1/2 z^T P z
 
 `x` is the state of a body (lengths included, if they are free), `z` its shape parameters
-(`torchcss.body.shape`), P the precision of their prior. Joints do not see the flesh; contours see
-both. Contour nodes and their edges are found fresh at every (x, z), and the derivatives hold them
-fixed, as everywhere: a node keeps its angles on the part's surface and moves with pose and shape.
+(`torchcss.body.shape`), P the precision of their prior. Joints do not see the flesh; outlines, by
+their edges and by the colours on either side, see both. Contour nodes and their edges are found
+fresh at every (x, z), and the derivatives hold them fixed, as everywhere: a node keeps its angles
+on the part's surface and moves with pose and shape.
 
 Every item has flesh of its own, so items are worked off one after another. Make a `ShapedCost` and
 give it to the optimiser; hold variables by bounds of no width.
@@ -14,6 +15,7 @@ give it to the optimiser; hold variables by bounds of no width.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -27,9 +29,24 @@ from torchcss.body.shape import (
     with_shape,
 )
 from torchcss.cost.contour import ContourTerm
+from torchcss.cost.region import RegionImages, RegionTerm
 from torchcss.cost.total import TrackingCost
 from torchcss.cost.visibility import ContourPredictor
 from torchcss.types import Bounds, LocalModel, PointCost
+
+
+class Outline(NamedTuple):
+    """What the outline is compared with.
+
+    Attributes:
+        term: How.
+        image: With what: edge energy times gradient direction, or colours.
+        weight: Nats per nu of the mean cost per node.
+    """
+
+    term: ContourTerm | RegionTerm
+    image: Float[Tensor, "2 h w"] | RegionImages
+    weight: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,16 +56,12 @@ class ShapedCost:
     Attributes:
         base: The terms that do not see the flesh; its body has the shape from which z counts.
         parameters: Which shape numbers are free.
-        contour: The contour term.
-        edge_field: Edge energy times gradient direction of the image.
-        contour_weight: Nats per nu of the contour's mean cost per node.
+        outlines: The terms that do.
     """
 
     base: TrackingCost
     parameters: ShapeParameters
-    contour: ContourTerm
-    edge_field: Float[Tensor, "2 h w"]
-    contour_weight: float
+    outlines: tuple[Outline, ...]
 
     @property
     def bounds(self) -> Bounds:
@@ -69,7 +82,8 @@ class ShapedCost:
         n = self.base.body.num_parameters
         state, z = x[:, :n], x[:, n:]
         plain = self.base.local_model(state)
-        flesh = [self._contour(state[item], z[item]) for item in range(len(x))]
+        items = range(len(x) if self.outlines else 0)
+        flesh = [self._outlines(state[item], z[item]) for item in items]
         pull = z @ self.parameters.precision
         prior = 0.5 * (pull * z).sum(-1)
         gradient = torch.cat([plain.gradient, pull], dim=-1)
@@ -83,15 +97,18 @@ class ShapedCost:
             plain.value + prior + seen.value, gradient + seen.gradient, hessian + seen.hessian
         )
 
-    def _contour(self, x: Float[Tensor, " n"], z: Float[Tensor, " z"]) -> LocalModel:
+    def _outlines(self, x: Float[Tensor, " n"], z: Float[Tensor, " z"]) -> LocalModel:
         camera, shape = self.base.camera, self.parameters.shape(z)
         body = with_shape(self.base.body, shape)
         predictor = ContourPredictor(body)
         pose = body.pose(x[None])
         nodes = predictor(body, pose, camera.centre_world)
-        scale = self.contour_weight / (max(predictor.num_nodes, 1) * self.contour.nu)
-        cost = self.contour.point_cost(nodes, camera, self.edge_field)
-        cost = PointCost(*(scale * field[0] for field in cost))
+        costs = []
+        for term, image, weight in self.outlines:
+            scale = weight / (max(predictor.num_nodes, 1) * term.nu)
+            cost = term.point_cost(nodes, camera, image)  # type: ignore[arg-type]
+            costs.append([scale * field[0] for field in cost])
+        cost = PointCost(*(sum(fields) for fields in zip(*costs, strict=True)))  # type: ignore[arg-type]
         pose, points, part = body.pose(x), nodes.points[0], predictor.node_part
         rotation, centre = body.part_poses(pose)
         local = ((points - centre[part])[:, None, :] @ rotation[part])[:, 0]
