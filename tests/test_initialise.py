@@ -12,6 +12,7 @@ import torchcss
 from torchcss.body.catalog import LENGTHS
 from torchcss.body.model import load_body
 from torchcss.cost.joints import JointTerm
+from torchcss.cost.silhouette import part_map
 from torchcss.errors import BodyError, CameraError, ConfigurationError, KeypointError
 from torchcss.first_pose import initialise_from_joints
 from torchcss.hypotheses import Initialisation, hang_on_best, stature_of
@@ -20,6 +21,7 @@ from torchcss.interpretations import PAPER_PROPORTIONS, SINGLE_START, Search
 from torchcss.marks import default_sigma, typical_sigma
 from torchcss.metrics import LIMB_JOINTS, pa_mpjpe_mm
 from torchcss.random_person import Person, coverage, random_person
+from torchcss.raster import Mesh, clutter_background, grid_faces, render_meshes
 from torchcss.types import Modes
 
 SMALL = Search(num_starts=16, num_trunks=2, num_flips=16, num_samples=4)
@@ -155,6 +157,60 @@ def test_known_stature_sets_the_scale(found: Initialisation):
     assert distances[0] / distances[1] == pytest.approx(statures[0] / statures[1], rel=0.05)
     with pytest.raises(BodyError, match="stature"):
         find(person(), stature=180)
+
+
+def test_colours_tell_the_outline_of_a_chequered_shirt():
+    """Edges all over draw limbs thin; what is on either side of the outline does not."""
+    someone = person()
+    size = 0.22  # 180 pixels tall
+    camera = someone.camera.scaled(size)
+    width, height = camera.image_size_wh
+    truth = render_meshes(
+        _in_squares(someone),
+        lambda points: tuple(camera.project(points)),  # type: ignore[arg-type]
+        height,
+        width,
+        background=clutter_background(height, width, generator=torch.Generator().manual_seed(1)),
+        eye_world=camera.centre_world,
+    )
+    marked = size * (someone.keypoints + 0.5) - 0.5
+    overlap, girth = [], []
+    for colours in (False, True):
+        found = initialise(
+            truth.image.numpy(), torch.cat([marked, someone.confidence[:, None]], dim=1), camera,
+            joint_names=someone.joint_names, generator=torch.Generator().manual_seed(0),
+            search=SMALL, num_modes=2, colours=colours,
+        )  # fmt: skip
+        drawn = part_map(found.body, found.mixture.mean[0], camera) >= 0
+        overlap.append(float((drawn & truth.mask).sum() / (drawn | truth.mask).sum()))
+        girth.append(float((found.body.part_shape / someone.body.part_shape)[:, :2].mean()))
+    assert overlap[0] < 0.91
+    assert overlap[1] > 0.93
+    assert abs(girth[1] - 1) < 0.05 < abs(girth[0] - 1)
+
+
+def _in_squares(someone: Person) -> list[Mesh]:
+    def squares(points: torch.Tensor) -> torch.Tensor:
+        return 0.35 + 0.65 * ((points * 40).floor().sum(-1, keepdim=True) % 2)
+
+    body, size = someone.body, 24
+    rotation, centre = body.part_poses(body.pose(someone.state))
+    mesh = body.mesh(size, size)
+    colours = {"thigh": (0.3, 0.3, 0.7), "shank": (0.3, 0.3, 0.7), "hand": (0.8, 0.6, 0.5)}
+    return [
+        Mesh(
+            points @ turn.T + place,
+            normals @ turn.T,
+            grid_faces(size, size),
+            torch.tensor(colours.get(name[2:], (0.9, 0.3, 0.3)), dtype=torch.float64),
+            points,
+            squares,
+        )
+        for name, turn, place, points, normals in zip(
+            body.part_names, rotation, centre, mesh.points.flatten(1, 2),
+            mesh.normals.flatten(1, 2), strict=True,
+        )
+    ]  # fmt: skip
 
 
 def test_few_joints_leave_the_prior_and_say_so():
