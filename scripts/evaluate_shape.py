@@ -1,0 +1,125 @@
+"""How well the first pose fills the true silhouette: by joints, by edges, by edges and colours.
+
+    python scripts/evaluate_shape.py --sequences DIR ... --out shape.json
+
+Each DIR is a sequence folder with masks (`torchcss.io.sequences`). In some of its frames
+`torchcss.initialise` fits pose, lengths and shape to the marked joints; then to edges too; then to
+the colours on either side of the outline as well. "overlap" is the share of the union of fitted and
+true silhouette that both have, "area" the fitted one's over the true one's, "root mm" the error of
+the best fit's joints with the mid-hips on each other (an arm's: the first joint), "of all" that of
+the nearest fit.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+
+from torchcss.errors import ConfigurationError, TorchcssError
+from torchcss.hypotheses import Initialisation
+from torchcss.initialise import initialise
+from torchcss.interpretations import Search
+from torchcss.io.sequences import RecordedSequence, read_sequence
+from torchcss.io.tracks import prepare_output_folder, write_summary
+from torchcss.io.video import VideoReader
+from torchcss.metrics import root_aligned_mpjpe_mm
+from torchcss.yardstick import silhouette
+
+COMPARED = {"joints": (False, False), "edges": (True, False), "edges, colours": (True, True)}
+"""Whether contours and colours are fitted."""
+
+FEW = Search(num_starts=8, num_trunks=2, num_flips=8, num_samples=2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """What is fitted."""
+
+    sequences: tuple[Path, ...]
+    """Sequence folders with masks."""
+    body: str = "body34"
+    """Body to fit."""
+    frames: int = 2
+    """Frames of each, evenly spread."""
+    seed: int = 0
+    """Seed of the starting poses."""
+    small: bool = False
+    """One frame and few starts, to see that it runs."""
+    out: Path | None = None
+    """JSON file to write."""
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Fit, print and write the table; return what is written."""
+    report: dict[str, Any] = {"setting": config, "rows": []}
+    print(f"{'':44}{'overlap':>9}{'area':>9}{'root mm':>9}{'of all':>9}")
+    for folder in config.sequences:
+        sequence = read_sequence(folder)
+        if sequence.mask is None:
+            raise ConfigurationError(f"{folder}: no masks; give a sequence with a mask.npz")
+        count = 1 if config.small else min(config.frames, sequence.num_frames)
+        for index in np.linspace(0, sequence.num_frames, count, endpoint=False).astype(int):
+            for name, (contours, colours) in COMPARED.items():
+                row = fit(sequence, int(index), config, contours, colours)
+                report["rows"].append(
+                    {"sequence": sequence.name, "frame": index, "by": name, **row}
+                )
+                cells = "".join(f"{value:9.2f}" for value in row.values())
+                print(f"{sequence.name:22}{index:6}  {name:14}{cells}", flush=True)
+    if config.out is not None:
+        prepare_output_folder(config.out.parent)
+        write_summary(config.out, report)
+    return report
+
+
+def fit(
+    sequence: RecordedSequence, index: int, config: Config, contours: bool, colours: bool
+) -> dict[str, float]:
+    """Fit one frame and measure."""
+    (frame,) = VideoReader(sequence.video, start=index, stop=index + 1)
+    marks = sequence.keypoints
+    found = initialise(
+        frame.image,
+        torch.cat([marks.keypoints[index], marks.confidence[index, :, None]], dim=-1),
+        sequence.camera,
+        config.body,
+        joint_names=marks.joint_names,
+        generator=torch.Generator().manual_seed(config.seed),
+        search=FEW if config.small else None,
+        contours=contours,
+        colours=colours,
+    )
+    assert sequence.mask is not None
+    true = sequence.mask[index]
+    drawn = silhouette(found.body, found.mixture.mean[0], sequence.camera)
+    errors = joint_errors(found, sequence, index)
+    return {
+        "overlap": float((drawn & true).sum() / (drawn | true).sum()),
+        "area": float(drawn.sum() / true.sum()),
+        "root_mm": float(errors[0]),
+        "of_all_mm": float(errors.min()),
+    }
+
+
+def joint_errors(found: Initialisation, sequence: RecordedSequence, index: int) -> np.ndarray:
+    """Root-aligned errors of the fits, over the joints whose truth is known."""
+    true = dict(zip(sequence.joint_names, sequence.joints_world[index], strict=True))
+    names = [n for n in found.body.joint_names if n in true and np.isfinite(true[n]).all()]
+    columns = [found.body.joint_index(name) for name in names]
+    joints = found.body.pose(found.mixture.mean).joints[:, columns].numpy()
+    root = None if "l_hip" in names else names[0]
+    reference = np.stack([true[name] for name in names])
+    return root_aligned_mpjpe_mm(joints, reference, names, root=root)
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Config))
+    except TorchcssError as error:
+        sys.exit(f"error: {error}")
