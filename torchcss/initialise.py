@@ -3,7 +3,8 @@
 The first stage fits pose and lengths to the marked joints (`torchcss.first_pose`). With a picture,
 the second fits cross-sections and tapers to joints and contours, pose and lengths held, and the
 third all parameters (`torchcss.shape_fit`); the fits are then refined on the body so found,
-contours included.
+contours included. Beside the edges of the papers, contours are compared with the colours on either
+side of them: of what the first stage's best pose covers, and of what surrounds it.
 
 Call `initialise`.
 """
@@ -57,8 +58,10 @@ DEFAULT_VIEW_DEGREES = 54.0
 35 mm film, in the middle of what telephones and cameras have."""
 
 _BESIDE_COLOURS = 40.0
-"""Weight of the contours where colours tell the outline too. Clothes have edges all over, and the
-outline is in one place: edges draw limbs thin. Where colours tell nothing, edges still lead."""
+"""Weight of the edges where colours tell the outline too: a quarter of what they have alone.
+Clothes have edges all over, the outline is in one place, and edges draw limbs thin. Where colours
+tell nothing, edges still lead. On a walker of 160 pixels the silhouettes overlap by 0.63 with edges
+alone; beside colours by 0.72 at full weight, 0.77 at a quarter, and 0.78 without edges."""
 
 
 def initialise(
@@ -100,8 +103,7 @@ def initialise(
         stature: Height of the standing person, metres, where it is known.
         num_modes: Most hypotheses; 1 for the best alone, None for all.
         contours: Run the second and third stage on the picture's contours.
-        colours: Let them see the colours on either side of the outline too, of what the first stage
-            takes for body and surroundings.
+        colours: Let them see the colours on either side too.
         working_size: Longer side of the picture on which contours are searched.
         search: How widely interpretations are looked for.
         least_joints: Fewest joints of the body that have to be marked.
