@@ -86,6 +86,15 @@ def test_writes_what_it_says(scene: Path, result: Path):
     assert any("sets the scale" in line for line in summary["report"])
 
 
+def test_with_edges_alone_if_asked(scene: Path, result: Path, tmp_path: Path):
+    camera = str(scene / "cameras.json")
+    assert init(scene, tmp_path, "--camera", camera, "--hypotheses", "3", "--no-colours") == 0
+    both, edges = (json.loads((p / "summary.json").read_text()) for p in (result, tmp_path))
+    assert (both["colours"], edges["colours"]) == (True, False)
+    for name, cost in both["stages"].items():
+        assert (cost == edges["stages"][name]) == (name == "pose and proportions from joints")
+
+
 def test_track_starts_from_it(scene: Path, result: Path, tmp_path: Path, capsys):
     given = [
         "track", str(scene / "video.mp4"), "--camera", str(scene / "cameras.json"),

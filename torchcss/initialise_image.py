@@ -142,6 +142,8 @@ def initialise_image(
         "camera": eye.name,
         "body": body,
         "seed": seed,
+        "contours": contours,
+        "colours": colours,
         "seconds": seconds,
         "report": found.report,
         "num_hypotheses": len(found.cost),
