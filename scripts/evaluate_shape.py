@@ -28,7 +28,7 @@ from torchcss.interpretations import Search
 from torchcss.io.sequences import RecordedSequence, read_sequence
 from torchcss.io.tracks import prepare_output_folder, write_summary
 from torchcss.io.video import VideoReader
-from torchcss.metrics import root_aligned_mpjpe_mm
+from torchcss.metrics import mask_overlap, root_aligned_mpjpe_mm
 from torchcss.yardstick import silhouette
 
 COMPARED = {"joints": (False, False), "edges": (True, False), "edges, colours": (True, True)}
@@ -100,7 +100,7 @@ def fit(
     drawn = silhouette(found.body, found.mixture.mean[0], sequence.camera)
     errors = joint_errors(found, sequence, index)
     return {
-        "overlap": float((drawn & true).sum() / (drawn | true).sum()),
+        "overlap": float(mask_overlap(drawn, true)),
         "area": float(drawn.sum() / true.sum()),
         "root_mm": float(errors[0]),
         "of_all_mm": float(errors.min()),

@@ -19,7 +19,7 @@ from torchcss.hypotheses import Initialisation, hang_on_best, stature_of
 from torchcss.initialise import DEFAULT_VIEW_DEGREES, default_camera, initialise
 from torchcss.interpretations import PAPER_PROPORTIONS, SINGLE_START, Search
 from torchcss.marks import default_sigma, typical_sigma
-from torchcss.metrics import LIMB_JOINTS, pa_mpjpe_mm
+from torchcss.metrics import LIMB_JOINTS, mask_overlap, pa_mpjpe_mm
 from torchcss.random_person import Person, coverage, random_person
 from torchcss.raster import Mesh, clutter_background, grid_faces, render_meshes
 from torchcss.types import Modes
@@ -182,7 +182,7 @@ def test_colours_tell_the_outline_of_a_chequered_shirt():
             search=SMALL, num_modes=2, colours=colours,
         )  # fmt: skip
         drawn = part_map(found.body, found.mixture.mean[0], camera) >= 0
-        overlap.append(float((drawn & truth.mask).sum() / (drawn | truth.mask).sum()))
+        overlap.append(float(mask_overlap(drawn, truth.mask)))
         girth.append(float((found.body.part_shape / someone.body.part_shape)[:, :2].mean()))
     assert overlap[0] < 0.91
     assert overlap[1] > 0.93
