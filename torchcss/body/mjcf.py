@@ -355,7 +355,8 @@ class _Reader:
             place = self._place(label, values)
             if "fromto" in values:
                 ends = self._numbers(label, values["fromto"], 6)
-                along = ends[3:] - ends[:3]
+                # MuJoCo has z point to the first end; of a box it tells how it is turned.
+                along = ends[:3] - ends[3:]
                 half = 0.5 * float(np.linalg.norm(along))
                 place = _Place(_turn_of_z(self._unit(label, along)), 0.5 * (ends[:3] + ends[3:]))
                 size = [size[0], half] if _SOLIDS[kind] == 2 else [*size[:2], half]
