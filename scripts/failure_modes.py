@@ -8,9 +8,10 @@ those kept, how often the truth is inside the regions that it states, impossible
 takes. Definitions are in `torchcss.yardstick`. Beside ours stand the paper's own failure times,
 which were measured on its sequences.
 
-The trackers run side by side through the video and share its features. The file OUT is written
+The trackers of a seed run side by side through the video and share its features; `--together 6`
+puts six runs side by side, of several seeds where a seed has fewer. The file OUT is written
 whenever a run ends, and `--resume` goes on from it: what it has is not repeated. A study that is
-interrupted loses the runs that were under way; `--together` bounds their number.
+interrupted loses the runs that were under way.
 """
 
 from __future__ import annotations
@@ -79,7 +80,7 @@ class Config:
     stop_when_lost: bool = False
     """End a run when the body is lost for good."""
     together: int | None = None
-    """How many trackers run side by side; all of one seed by default."""
+    """How many runs go side by side, of several seeds too; all of one seed by default."""
     small: bool = False
     """Four frames with few samples and small images, to see that it runs."""
     device: str = "cpu"
@@ -98,22 +99,24 @@ def main(config: Config) -> dict[str, Any]:
     """Run, print, draw, write; return what is written."""
     if unknown := sorted(set(config.presets) - set(PRESETS)):
         raise ConfigurationError(f"no trackers {unknown}; there are {', '.join(PRESETS)}")
+    if config.together is not None and config.together < 1:
+        raise ConfigurationError(f"--together: expected at least 1, got {config.together}")
     sequence = read_sequence(config.sequence, view=config.view)
     thresholds = Thresholds.of(sequence)
     study = study_of(config, sequence, thresholds)
     runs = earlier_runs(config, study)
     done = {(run["preset"], run["seed"]) for run in runs}
     report = write(config, study, runs)
-    for seed in range(config.first_seed, config.first_seed + config.seeds):
-        pending = [name for name in config.presets if (name, seed) not in done]
-        begin: Start | None = None
-        size = config.together or max(len(pending), 1)
-        for group in (pending[i : i + size] for i in range(0, len(pending), size)):
-            settings = [settings_of(config, study["body"], name, seed) for name in group]
-            begin = begin or find_start(sequence, settings[0], start=config.start)
-            for run in follow(config, sequence, settings, begin, thresholds):
-                runs.append(entry_of(run, thresholds, 1 / sequence.frame_rate))
-                report = write(config, study, runs)
+    starts: dict[int, Start] = {}
+    for group in groups_of(config, done):
+        settings = [settings_of(config, study["body"], name, seed) for name, seed in group]
+        for each in settings:
+            if each.seed not in starts:
+                starts[each.seed] = find_start(sequence, each, start=config.start)
+        together = [(each, starts[each.seed]) for each in settings]
+        for run in follow(config, sequence, together, thresholds):
+            runs.append(entry_of(run, thresholds, 1 / sequence.frame_rate))
+            report = write(config, study, runs)
     print_table(report["table"], sequence.name)
     if config.plot is not None and report["table"]:
         told = {row.preset: row.times_s for row in report["published"]}
@@ -124,6 +127,18 @@ def main(config: Config) -> dict[str, Any]:
         figure = failure_figure(times, curves, title=title, failed_mm=thresholds.lost_mm)
         save_figure(figure, config.plot)
     return report
+
+
+def groups_of(config: Config, done: set[tuple[str, int]]) -> Iterator[list[tuple[str, int]]]:
+    """Presets and seeds that are still to be run, in groups that run side by side."""
+    seeds = range(config.first_seed, config.first_seed + config.seeds)
+    of_seeds = [[(name, seed) for name in config.presets] for seed in seeds]
+    groups = [[run for run in group if run not in done] for group in of_seeds]
+    if config.together is not None:
+        pending = [run for group in groups for run in group]
+        starts = range(0, len(pending), config.together)
+        groups = [pending[start : start + config.together] for start in starts]
+    yield from (group for group in groups if group)
 
 
 def study_of(config: Config, sequence: RecordedSequence, thresholds: Thresholds) -> dict[str, Any]:
@@ -183,21 +198,24 @@ def settings_of(config: Config, body: str, preset: str, seed: int) -> Settings:
 
 
 def follow(
-    config: Config, sequence: RecordedSequence, settings: list[Settings], begin: Start,
+    config: Config,
+    sequence: RecordedSequence,
+    together: list[tuple[Settings, Start]],
     thresholds: Thresholds,
-) -> Iterator[Run]:  # fmt: skip
+) -> Iterator[Run]:
     """Run some trackers side by side, with a progress bar."""
     frames = 4 if config.small else config.frames or sequence.num_frames
     stop = min(config.start + frames, sequence.num_frames)
+    seeds = ",".join(str(seed) for seed in sorted({each.seed for each, _ in together}))
     with tqdm(total=stop - config.start, unit="frame", dynamic_ncols=True) as bar:
 
         def progress(_: int, left: int) -> None:
-            bar.set_postfix(seed=settings[0].seed, trackers=left)
+            bar.set_postfix(seeds=seeds, trackers=left)
             bar.update()
 
         yield from track_together(
-            sequence, [(each, begin) for each in settings], thresholds,
-            start=config.start, stop=stop, stop_when_lost=config.stop_when_lost, progress=progress,
+            sequence, together, thresholds, start=config.start, stop=stop,
+            stop_when_lost=config.stop_when_lost, progress=progress,
         )  # fmt: skip
 
 

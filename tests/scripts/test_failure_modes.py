@@ -54,9 +54,9 @@ def test_small_mode_and_resume(
     asked = []
     follow = script.follow
 
-    def spy(config, sequence, settings, begin, thresholds):
-        asked.append([(each.preset, each.seed) for each in settings])
-        return follow(config, sequence, settings, begin, thresholds)
+    def spy(config, sequence, together, thresholds):
+        asked.append([(each.preset, each.seed) for each, _ in together])
+        return follow(config, sequence, together, thresholds)
 
     monkeypatch.setattr(script, "follow", spy)
     script.main(script.Config(presets=presets, seeds=2, resume=True, together=1, **options))
@@ -87,6 +87,20 @@ def test_small_mode_and_resume(
 
     with pytest.raises(ConfigurationError, match="another study"):
         script.main(script.Config(resume=True, start=1, **options))
+    with pytest.raises(ConfigurationError, match="at least 1, got 0"):
+        script.main(script.Config(together=0, **options))
+
+    # Side by side, of several seeds, they do what they do alone.
+    asked.clear()
+    beside = {**options, "out": tmp_path / "beside.json", "plot": None}
+    again = script.main(script.Config(presets=presets, seeds=2, together=3, **beside))
+    assert asked == [
+        [("robust_single", 0), ("condensation", 0), ("robust_single", 1)],
+        [("condensation", 1)],
+    ]
+    found = {(run["preset"], run["seed"]): run["root_aligned_mm"] for run in again["runs"]}
+    for run in report["runs"]:
+        assert found[run["preset"], run["seed"]] == run["root_aligned_mm"]
 
 
 def test_a_lost_track_in_the_table(
