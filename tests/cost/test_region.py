@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchcss.body.model import BodyModel, load_body
+from torchcss.cost import region
 from torchcss.cost.region import (
     _CORE,
     _CORE_PIXELS,
@@ -193,3 +194,19 @@ def test_of_a_part_too_small_for_a_core_all_but_the_outline_is_learned() -> None
         ring = functional.pad(own[None].float(), (1, 1, 1, 1), value=1.0)
         within = own & (functional.avg_pool2d(ring, 3, 1)[0] > 0.99)
         assert torch.equal(inside[layer], within if name in small else core[name]), name
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.9, 0.3), (-0.5, -0.9), (0.3, 1.2), (9.0, 0.0)])
+def test_masks_are_those_of_the_whole_picture(
+    shift: tuple[float, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are found in a window about the body, be it at the border or out of the picture."""
+    body, camera = someone_at_three_metres(230.0)
+    state = body.rest.clone()
+    for name, metres in zip(("root_x", "root_y"), shift, strict=True):
+        state[body.state_index(name)] += metres
+    found = region_masks(body, state, camera, reach=22)
+    assert found[0].any() == found[1].any() == (shift[0] < 5)
+    monkeypatch.setattr(region, "_window", lambda *_: (..., slice(None), slice(None)))
+    for one, other in zip(found, region_masks(body, state, camera, reach=22), strict=True):
+        assert torch.equal(one, other)

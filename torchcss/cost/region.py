@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from types import EllipsisType
 from typing import NamedTuple
 
 import kornia
@@ -97,7 +98,6 @@ def region_masks(
     Returns:
         The core of each layer, and its surroundings; neither holds what lies between them.
     """
-    width, height = camera.image_size_wh
     names, layer_of = part_layers(body)
     # A last entry for pixels that see no part, whose index is -1.
     layer_of_part = torch.tensor((*layer_of, -1), device=body.tie.device)
@@ -106,20 +106,42 @@ def region_masks(
         seen = layer_of_part[part_map(body, state, camera, girth=girth)]
         return torch.stack([seen == layer for layer in range(len(names))])
 
-    own = pixels(1.0)
-    core = own & pixels(_CORE)
-    small = core.flatten(1).sum(1) < _CORE_PIXELS
-    core = torch.where(small[:, None, None], ~_grow(~own, 1), core)
+    whole = pixels(1.0)
+    core, around = torch.zeros_like(whole), torch.zeros_like(whole)
+    window = _window(whole.any(0), reach + _COARSE)
+    if window is None:
+        return core, around
+    own = whole[window]
+    inner = own & pixels(_CORE)[window]
+    small = inner.flatten(1).sum(1) < _CORE_PIXELS
+    core[window] = torch.where(small[:, None, None], ~_grow(~own, 1), inner)
     blocks = functional.max_pool2d(own.float(), _COARSE, ceil_mode=True) > 0
     blocks = _grow(blocks, reach // _COARSE)
     far = blocks.repeat_interleave(_COARSE, -1).repeat_interleave(_COARSE, -2)
-    around = far[:, :height, :width] & ~_grow(own, _GAP)
+    near = far[:, : own.shape[1], : own.shape[2]] & ~_grow(own, _GAP)
     for first, second in body.neighbours:
         i, j = (layer_of[body.part_names.index(name)] for name in (first, second))
         if i != j:
-            around[i] &= ~own[j]
-            around[j] &= ~own[i]
+            near[i] &= ~own[j]
+            near[j] &= ~own[i]
+    around[window] = near
     return core, around
+
+
+def _window(mask: Bool[Tensor, "h w"], margin: int) -> tuple[EllipsisType, slice, slice] | None:
+    """Rows and columns of what is within a margin of a mask, in whole blocks; None: it is empty.
+
+    A person fills a quarter of most pictures, and growing masks takes time by their pixels.
+    """
+    spans = []
+    for axis in (1, 0):
+        found = torch.nonzero(mask.any(axis))
+        if not len(found):
+            return None
+        start = max(int(found[0]) - margin, 0) // _COARSE * _COARSE
+        stop = -(-(int(found[-1]) + margin + 1) // _COARSE) * _COARSE
+        spans.append(slice(start, stop))
+    return (..., *spans)
 
 
 def _grow(masks: Bool[Tensor, "layers h w"], radius: int) -> Bool[Tensor, "layers h w"]:
