@@ -210,3 +210,20 @@ def test_masks_are_those_of_the_whole_picture(
     monkeypatch.setattr(region, "_window", lambda *_: (..., slice(None), slice(None)))
     for one, other in zip(found, region_masks(body, state, camera, reach=22), strict=True):
         assert torch.equal(one, other)
+
+
+def test_an_arm_learns_the_shade_along_its_outline() -> None:
+    """Its base and lengths are told, so that its pose is off by less than a body's."""
+    body = load_body("arm8")
+    K = [[300.0, 0.0, 159.5], [0.0, 300.0, 119.5], [0.0, 0.0, 1.0]]
+    turn = torch.diag(torch.tensor([1.0, -1.0, -1.0])).double()
+    away = turn @ -body.pose(body.rest).joints.mean(0) + torch.tensor([0.0, 0.0, 1.5])
+    camera = Camera(K, (320, 240), R_camera_world=turn, t_camera_world=away).to(torch.float64)
+    names, layer_of = part_layers(body)
+    inside, _ = region_masks(body, body.rest, camera)
+    own = torch.tensor((*layer_of, -1))[part_map(body, body.rest, camera)]
+    for layer, name in enumerate(names):
+        whole = own == layer
+        margin = functional.max_pool2d((~whole)[None].float(), 5, 1, 2)[0] > 0
+        assert not (whole & ~margin & ~inside[layer]).any(), name
+        assert int(whole.sum()) > int(inside[layer].sum()) > 0.5 * int(whole.sum()), name
