@@ -123,6 +123,8 @@ class FrameCosts:
         features: FrameFeatures | None,
         body: BodyModel,
         state: Float[Tensor, " n"],
+        *,
+        sure: bool = False,
     ) -> Appearance | None:
         """Take in what body and surroundings look like in a frame; None without a region term.
 
@@ -131,6 +133,7 @@ class FrameCosts:
             features: Features of the frame, with colours.
             body: The body on this frame's base.
             state: Its pose.
+            sure: The outline is known to two pixels, see `region_masks`.
         """
         if self.choice.region is None:
             return None
@@ -138,7 +141,7 @@ class FrameCosts:
             return appearance
         if appearance is None:
             appearance = Appearance.unknown(self.num_layers, like=features.colour)
-        inside, outside = region_masks(body, state, self.camera)
+        inside, outside = region_masks(body, state, self.camera, sure=sure)
         return appearance.learn(features.colour, inside, outside)
 
     def _region(self, features: FrameFeatures, appearance: Appearance) -> RegionImages | None:

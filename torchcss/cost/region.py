@@ -34,7 +34,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchcss.body.model import BodyModel
-from torchcss.body.root import has_root
 from torchcss.cost.contour import seen_nodes, spread
 from torchcss.cost.silhouette import part_map
 from torchcss.cost.visibility import ContourNodes
@@ -52,10 +51,9 @@ when the arm has gone. On rendered_upper_body with keypoints in the first frame 
 lost at 0.3 s when all pixels but the outline's were taken, and is at 2.4 s with the core."""
 
 _SURE = 2
-"""Pixels off its outline from which on an arm's colours are its own. Its base and lengths are told:
-its pose is off by less, and the core lacks the shade along the outline. With the core alone the
-rendered arm is 10 mm farther off in its first 42 frames and flips in three of three seeds, with
-these two pixels in none."""
+"""Pixels off a known outline from which on colours are the part's own: the core lacks the shade
+along the outline. With the core alone the rendered arm is 10 mm farther off in its first 42 frames
+and flips in three of three seeds, with these two pixels in none."""
 
 _CORE_PIXELS = 60
 """Fewest pixels that tell colours; of a part with a smaller core all but its outline are taken."""
@@ -92,7 +90,12 @@ def region_field(likeness: Float[Tensor, "layers h w"], *, smoothing: float = 3.
 
 
 def region_masks(
-    body: BodyModel, state: Float[Tensor, " n"], camera: Camera, *, reach: int = 30
+    body: BodyModel,
+    state: Float[Tensor, " n"],
+    camera: Camera,
+    *,
+    reach: int = 30,
+    sure: bool = False,
 ) -> tuple[Bool[Tensor, "layers h w"], Bool[Tensor, "layers h w"]]:
     """Pixels that are each layer's own for all that a pose may be off, and those around it.
 
@@ -101,6 +104,7 @@ def region_masks(
         state: Its pose.
         camera: Camera of the image.
         reach: How far the surroundings go, pixels.
+        sure: The outline is known to two pixels: all within that is own.
 
     Returns:
         The core of each layer, and its surroundings; neither holds what lies between them.
@@ -120,7 +124,7 @@ def region_masks(
         return core, around
     own = whole[window]
     inner = own & pixels(_CORE)[window]
-    if not has_root(body):
+    if sure:
         inner |= ~_grow(~own, _SURE)
     small = inner.flatten(1).sum(1) < _CORE_PIXELS
     core[window] = torch.where(small[:, None, None], ~_grow(~own, 1), inner)
