@@ -32,6 +32,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchcss.body.model import BodyModel
+from torchcss.body.root import has_root
 from torchcss.cost.frame import FrameCosts
 from torchcss.errors import ConfigurationError, TorchcssError
 from torchcss.inference.implicit import TermWeights, weighted_minimum
@@ -191,7 +192,11 @@ class Lesson:
         for index, image in enumerate(tqdm(truth.images, unit="frame", desc="features")):
             self.features.append(extractor(image, last))
             learnt = self.costs.learn(
-                self.appearance[-1], self.features[-1], body, truth.states[index]
+                self.appearance[-1],
+                self.features[-1],
+                body,
+                truth.states[index],
+                sure=not has_root(body),
             )
             self.appearance.append(learnt)
             last = image
