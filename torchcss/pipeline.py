@@ -168,6 +168,8 @@ def track_frames(
         searched, term_seconds = time.perf_counter(), dict(stopwatch.seconds)
         mean = state.mixture.mean
         values = cost.of_children(info.origin[:1], prior).terms(mean[:1])
+        if choice.segmentation is not None:
+            values["segmentation"] = cost.unsearched(mean[:1])
         terms = {name: float(value[0]) for name, value in values.items()}
         if recovery is not None and watch is not None:
             watch, lost = recovery.judge(watch, _per_view(terms, watchers))

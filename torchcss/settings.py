@@ -22,6 +22,7 @@ from torchcss.cost.flow import FlowTerm
 from torchcss.cost.interpenetration import Interpenetration
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.region import RegionTerm
+from torchcss.cost.segmentation import SegmentationTerm
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.temporal import MixturePrior, TemporalPrior
 from torchcss.cost.total import CostChoice
@@ -33,13 +34,13 @@ from torchcss.vision.features import FeatureExtractor
 from torchcss.vision.flow import TRACKING
 
 TERMS = (
-    *("contour", "motion_boundaries", "region", "flow", "joints"),
+    *("contour", "motion_boundaries", "region", "segmentation", "flow", "joints"),
     *("stabiliser", "anthropometric", "interpenetration", "temporal"),
 )
 """Terms and priors of the cost by default: all that do not stand in for one another."""
 
 ALL_TERMS = (
-    *("contour", "motion_boundaries", "edge_energy", "region", "flow", "joints"),
+    *("contour", "motion_boundaries", "edge_energy", "region", "segmentation", "flow", "joints"),
     *("stabiliser", "anthropometric", "interpenetration", "temporal", "temporal_mixture"),
 )
 """Terms and priors that can be chosen; see `torchcss.cost.total`. `motion_boundaries` weighs the
@@ -125,7 +126,9 @@ def make_extractor(settings: Settings) -> FeatureExtractor:
     moving = {"flow", "motion_boundaries"} & set(settings.terms)
     flow = TRACKING if moving else None
     extractor = FeatureExtractor(
-        working_size=settings.working_size, flow=flow, colour="region" in settings.terms
+        working_size=settings.working_size,
+        flow=flow,
+        colour=bool({"region", "segmentation"} & set(settings.terms)),
     )
     return extractor.to(dtype=settings.torch_dtype, device=settings.device)
 
@@ -159,6 +162,7 @@ def make_choice(settings: Settings, sigma: float) -> CostChoice:
         contour=replace(contour, fitted_level=level) if has("contour") else None,
         edge_energy=EdgeEnergyTerm(**potential) if has("edge_energy") else None,
         region=RegionTerm() if has("region") else None,
+        segmentation=SegmentationTerm() if has("segmentation") else None,
         flow=FlowTerm(**potential) if has("flow") else None,
         joints=JointTerm(sigma=sigma, **potential) if has("joints") else None,
         stabiliser=Stabiliser() if has("stabiliser") else None,

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -113,7 +114,7 @@ class FrameCosts:
             cost,
             edge_field=edge_field,
             energy=edge_energy_field(edge_field) if direct else None,
-            region=None if appearance is None else self._region(features, appearance),
+            **self._looks(features, body, before, appearance),
             targets=None if before is None else self._targets(features, body, before),
         )
 
@@ -126,7 +127,7 @@ class FrameCosts:
         *,
         sure: bool = False,
     ) -> Appearance | None:
-        """Take in what body and surroundings look like in a frame; None without a region term.
+        """Take in what body and surroundings look like in a frame; None without a term that asks.
 
         Args:
             appearance: What was known before; None: nothing.
@@ -135,7 +136,7 @@ class FrameCosts:
             state: Its pose.
             sure: The outline is known to two pixels, see `region_masks`.
         """
-        if self.choice.region is None:
+        if self.choice.region is None and self.choice.segmentation is None:
             return None
         if features is None or features.colour is None:
             return appearance
@@ -144,11 +145,29 @@ class FrameCosts:
         inside, outside = region_masks(body, state, self.camera, sure=sure)
         return appearance.learn(features.colour, inside, outside)
 
-    def _region(self, features: FrameFeatures, appearance: Appearance) -> RegionImages | None:
-        if self.choice.region is None or self.predictor is None or features.colour is None:
-            return None
-        field = region_field(appearance.likeness(features.colour))
-        return RegionImages(field, self.layer_of_part[self.predictor.node_part])
+    def _looks(
+        self,
+        features: FrameFeatures,
+        body: BodyModel,
+        before: Float[Tensor, "k n"] | None,
+        appearance: Appearance | None,
+    ) -> dict[str, Any]:
+        """What the pixels look like, for the terms that ask for it."""
+        if appearance is None or features.colour is None:
+            return {}
+        likeness, images = appearance.likeness(features.colour), {}
+        if self.choice.region is not None and self.predictor is not None:
+            layer = self.layer_of_part[self.predictor.node_part]
+            images["region"] = RegionImages(region_field(likeness), layer)
+        if self.choice.segmentation is not None and before is not None:
+            images["segmentation"] = self.choice.segmentation.images(
+                likeness,
+                self.layer_of_part,
+                self.camera,
+                body,
+                before.reshape(-1, before.shape[-1])[0],
+            )
+        return images
 
     def _targets(
         self, features: FrameFeatures, body: BodyModel, before: Float[Tensor, "k n"]

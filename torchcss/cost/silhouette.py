@@ -17,18 +17,18 @@ from torchcss.vision.camera import Camera
 
 def part_map(
     body: BodyModel,
-    state: Float[Tensor, " n"],
+    state: Float[Tensor, "*batch n"],
     camera: Camera,
     *,
     rings: int = 12,
     meridians: int = 16,
     girth: float = 1.0,
-) -> Int[Tensor, "h w"]:
+) -> Int[Tensor, "*batch h w"]:
     """The part that each pixel sees, -1 where it sees none.
 
     Args:
         body: The body on its base.
-        state: Its pose.
+        state: Its pose, or poses; they are drawn one after the other.
         camera: Camera of the image.
         rings: Latitudes of the mesh of each part.
         meridians: Longitudes of the mesh of each part.
@@ -38,10 +38,15 @@ def part_map(
     faces = grid_faces(rings, meridians).to(mesh.points.device)
     rotation, centre = body.part_poses(body.pose(state))
     points = mesh.points * mesh.points.new_tensor([girth, girth, 1.0])
-    vertices = points.flatten(1, 2) @ rotation.mT + centre[:, None]
-    offsets = vertices.shape[1] * torch.arange(body.num_parts, device=faces.device)
+    vertices = points.flatten(1, 2) @ rotation.mT + centre[..., None, :]
+    offsets = vertices.shape[-2] * torch.arange(body.num_parts, device=faces.device)
     every = (faces + offsets[:, None, None]).flatten(0, 1)
-    uv, depth, valid = camera.project(vertices.flatten(0, 1))
+    mesh_size = vertices.shape[-3] * vertices.shape[-2]
     width, height = camera.image_size_wh
-    face = rasterise(uv, depth, every, height, width, valid=valid).face
+    batch = vertices.shape[:-3]
+    face = every.new_full((batch.numel(), height, width), -1)
+    for index, each in enumerate(vertices.flatten(-3, -2).reshape(-1, mesh_size, 3)):
+        uv, depth, valid = camera.project(each)
+        face[index] = rasterise(uv, depth, every, height, width, valid=valid).face
+    face = face.reshape(*batch, height, width)
     return torch.where(face >= 0, face // len(faces), face)

@@ -15,6 +15,7 @@ temperature: the nats that a term contributes per nu of mean cost per node (desi
 | `contour` | edges along the normals of occluding contours | 3.1.2, eq. 8 |
 | `edge_energy` | the edge energy itself at the same nodes | 3.1 |
 | `region` | colours on either side of the same nodes | 8 |
+| `segmentation` | colours of all covered pixels; in the weights of modes only | 8 |
 | `flow` | displacement of interior nodes against the optical flow | 3.1.2, eq. 9 |
 | `joints` | 2D joint correspondences | 5 |
 | `anthropometric` | lengths of the limbs, where they are free | 3.2.1 |
@@ -45,6 +46,7 @@ from torchcss.cost.flow import FlowTerm, InteriorNodes
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.region import RegionTerm
+from torchcss.cost.segmentation import SegmentationTerm
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.temporal import MixtureDensity, MixturePrior, TemporalPrior
 from torchcss.cost.view import View
@@ -75,6 +77,7 @@ class CostChoice:
         contour: The edge term, or None.
         edge_energy: The direct edge-energy potential, or None.
         region: The term of the colours on either side of the contour, or None.
+        segmentation: The likeness of all covered pixels, for the weights of modes, or None.
         flow: The flow term, or None.
         joints: The keypoint term, or None.
         stabiliser: The sticky prior, or None.
@@ -85,6 +88,7 @@ class CostChoice:
         contour_weight: Nats per nu of the contour's mean cost per node.
         edge_energy_weight: Nats per nu of the edge energy's mean cost per node.
         region_weight: Nats per nu of the region term's mean cost per node.
+        segmentation_weight: Nats per share of the body's area, see `SegmentationTerm`.
         flow_weight: Nats per nu of the flow's mean cost per node. At 50 it holds real limbs a
             little better, but where the flow misses a fast hand, as on the demo, it holds that
             back; at 20 the edges win.
@@ -97,6 +101,7 @@ class CostChoice:
     contour: ContourTerm | None = field(default_factory=ContourTerm)
     edge_energy: EdgeEnergyTerm | None = None
     region: RegionTerm | None = None
+    segmentation: SegmentationTerm | None = None
     flow: FlowTerm | None = None
     joints: JointTerm | None = field(default_factory=JointTerm)
     stabiliser: Stabiliser | None = field(default_factory=Stabiliser)
@@ -107,6 +112,7 @@ class CostChoice:
     contour_weight: float = 150.0
     edge_energy_weight: float = 150.0
     region_weight: float = 400.0
+    segmentation_weight: float = 400.0
     flow_weight: float = 20.0
     joint_weight: float = 1.0
     weights: Mapping[str, float] = field(default_factory=dict)
@@ -246,6 +252,19 @@ class TrackingCost(View):
             return tuple(values.values())
 
         return dict(zip(names, self._chunked(evaluate, x), strict=True)) if x.numel() else {}
+
+    def unsearched(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+        """Cost of what has no derivatives, nats: it counts in the weights of modes, not in `value`.
+
+        That is the segmentation alone; zero where it is not known.
+        """
+        term, total = self.choice.segmentation, x.new_zeros(x.shape[:-1])
+        weight = self.choice.weights.get("segmentation", 1.0) * self.choice.segmentation_weight
+        for view in self.views:
+            if term is not None and view.segmentation is not None:
+                with self._timed("segmentation"):
+                    total = total + weight * term.value(self.body, x, view.segmentation)
+        return total
 
     def gradients(self, x: Float[Tensor, "*batch n"]) -> dict[str, Float[Tensor, "*batch n"]]:
         """Gradient of every term and prior by name, visibility and assignments held fixed."""

@@ -16,6 +16,7 @@ from torch import Tensor
 from torchcss.cost.flow import FlowTargets
 from torchcss.cost.joints import JointObservation
 from torchcss.cost.region import RegionImages
+from torchcss.cost.segmentation import SegmentationImages
 from torchcss.vision.camera import Camera
 from torchcss.vision.spline import SplineField
 
@@ -29,6 +30,7 @@ class View:
         edge_field: Edge energy times gradient direction; None switches the contour term off.
         energy: The edge energy as a smooth function; None switches the edge-energy term off.
         region: What the pixels look like, as smooth functions; None switches the region term off.
+        segmentation: What the pixels look like, for the weights of modes; None: not known.
         targets: Where the flow carried the nodes of each sample's parent mode, `[b p 2]`.
         observation: Keypoints of the frame, in that image's pixels; None if there are none.
     """
@@ -37,6 +39,7 @@ class View:
     edge_field: Float[Tensor, "2 h w"] | None = None
     energy: SplineField | None = None
     region: RegionImages | None = None
+    segmentation: SegmentationImages | None = None
     targets: FlowTargets | None = None
     observation: JointObservation | None = None
 

@@ -320,8 +320,11 @@ class Tracker:
             modes.mean, modes.covariance, energy, distance=self.duplicate_distance
         )
         if len(distinct):
-            # 3: weights by the likelihood at the modes.
-            log_weight = -self.evidence * energy[distinct]
+            # 3: weights by the likelihood at the modes, and by what descents cannot follow.
+            found = energy[distinct]
+            if (unsearched := getattr(cost, "unsearched", None)) is not None:
+                found = found + unsearched(modes.mean[distinct])
+            log_weight = -self.evidence * found
             if self.laplace_evidence:
                 log_weight = log_weight + 0.5 * log_determinant(modes.covariance[distinct])
             unpruned = GaussianMixture(

@@ -1,0 +1,177 @@
+"""The segmentation: poses that cover what looks like the body are told from those that do not."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchcss.body.model import BodyModel, load_body
+from torchcss.cost.region import part_layers
+from torchcss.cost.segmentation import SegmentationImages, SegmentationTerm
+from torchcss.cost.silhouette import part_map
+from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.inference.mixture import GaussianMixture
+from torchcss.inference.proposals import CovarianceScaled
+from torchcss.inference.tracker import Tracker
+from torchcss.types import Bounds, LocalModel
+from torchcss.vision.camera import Camera
+
+
+def a_body_before_a_camera(dtype: torch.dtype = torch.float64) -> tuple[BodyModel, Camera]:
+    body = load_body("body34").with_base(
+        torch.eye(3, dtype=torch.float64), torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64)
+    )
+    K = [[450.0, 0.0, 239.5], [0.0, 450.0, 299.5], [0.0, 0.0, 1.0]]
+    return body.to(dtype), Camera(K, (480, 600)).to(dtype)
+
+
+def layers(body: BodyModel) -> tuple[int, Tensor]:
+    names, layer = part_layers(body)
+    return len(names), torch.tensor(layer)
+
+
+def painted(body: BodyModel, camera: Camera, state: Tensor) -> Tensor:
+    """Likenesses of a picture whose colours tell the parts of a pose perfectly."""
+    count, layer = layers(body)
+    seen = torch.cat([layer, torch.tensor([-1])])[part_map(body, state, camera)]
+    return torch.stack([2.0 * (seen == index).to(state) - 1 for index in range(count)])
+
+
+def moved(body: BodyModel, angle: float) -> Tensor:
+    x = body.rest.clone()
+    x[body.state_index("r_shoulder_raising")] += angle
+    return x
+
+
+def plain_twin(
+    term: SegmentationTerm, body: BodyModel, x: Tensor, images: SegmentationImages
+) -> float:
+    parts = part_map(body, x, images.camera, rings=term.rings, meridians=term.meridians)
+    total = 0.0
+    for row, line in enumerate(parts.tolist()):
+        for column, part in enumerate(line):
+            if part >= 0:
+                total += float(images.likeness[images.layer[part], row, column])
+    return 1 - total / images.area
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("batch", [(), (3,), (2, 2), (0,)])
+def test_it_is_the_sum_of_the_covered_pixels(batch: tuple[int, ...], dtype: torch.dtype) -> None:
+    body, camera = a_body_before_a_camera(dtype)
+    generator = torch.Generator().manual_seed(0)
+    term = SegmentationTerm(reduction=12)
+    likeness = torch.rand(layers(body)[0], 600, 480, generator=generator).to(dtype) * 2 - 1
+    images = term.images(likeness, layers(body)[1], camera, body, body.rest)
+    x = body.rest + 0.3 * torch.randn(
+        *batch, len(body.rest), generator=generator, dtype=torch.float64
+    ).to(dtype)
+    got = term.value(body, x, images)
+    assert got.shape == batch
+    assert got.dtype == dtype
+    for value, state in zip(got.reshape(-1), x.reshape(-1, x.shape[-1]), strict=True):
+        assert float(value) == pytest.approx(plain_twin(term, body, state, images), abs=1e-5)
+
+
+def test_the_painted_pose_is_the_cheapest() -> None:
+    body, camera = a_body_before_a_camera()
+    term = SegmentationTerm()
+    truth = moved(body, 0.9)
+    images = term.images(painted(body, camera, truth), layers(body)[1], camera, body, truth)
+    angles = torch.tensor([0.0, 0.5, 0.7, 0.9, 1.1, 1.3])
+    values = term.value(body, torch.stack([moved(body, float(a)) for a in angles]), images)
+    assert 0.0 < float(values[3]) < 0.2, "nearly every pixel is what it looks like"
+    assert float(values.diff()[:3].max()) < 0 < float(values.diff()[3:].min())
+
+
+def test_a_limb_that_is_left_uncovered_counts() -> None:
+    """The pose of a body whose arm is over the leg covers nothing that looks like background."""
+    body, camera = a_body_before_a_camera()
+    term = SegmentationTerm()
+    truth, hidden = moved(body, 1.2), moved(body, 0.0)
+    likeness = painted(body, camera, truth).clamp(min=0)  # nothing looks like background
+    images = term.images(likeness, layers(body)[1], camera, body, truth)
+    values = term.value(body, torch.stack([truth, hidden]), images)
+    assert float(values[0]) < float(values[1]) - 0.05
+
+
+def test_out_of_the_picture_and_behind_the_camera_nothing_is_said() -> None:
+    body, camera = a_body_before_a_camera()
+    term = SegmentationTerm()
+    for place in ([9.0, 0.0, 3.0], [0.0, 0.0, -3.0]):
+        away = body.with_base(
+            torch.eye(3, dtype=torch.float64), torch.tensor(place, dtype=torch.float64)
+        )
+        count, layer = layers(away)
+        likeness = torch.ones(count, 600, 480, dtype=torch.float64)
+        images = term.images(likeness, layer, camera, away, away.rest)
+        assert images.area > 0
+        assert float(term.value(away, away.rest, images)) == 1.0
+
+
+@pytest.mark.parametrize("size", [(161, 203), (3, 2)])
+def test_pictures_of_odd_and_of_very_small_sizes(size: tuple[int, int]) -> None:
+    body, camera = a_body_before_a_camera()
+    odd = camera.resized(*size)
+    count, layer = layers(body)
+    likeness = torch.ones(count, size[1], size[0], dtype=torch.float64)
+    images = SegmentationTerm().images(likeness, layer, odd, body, body.rest)
+    assert images.likeness.shape[-2:] == images.camera.image_size_wh[::-1]
+    assert bool(SegmentationTerm().value(body, body.rest, images).isfinite())
+
+
+def test_the_whole_cost_leaves_it_out_and_adds_it_where_it_is_asked() -> None:
+    body, camera = a_body_before_a_camera()
+    term = SegmentationTerm()
+    truth = moved(body, 0.9)
+    images = term.images(painted(body, camera, truth), layers(body)[1], camera, body, truth)
+    choice = CostChoice(segmentation=term, contour=None, joints=None, interpenetration=None)
+    cost = TrackingCost(body=body, camera=camera, choice=choice, segmentation=images)
+    without = TrackingCost(body=body, camera=camera, choice=choice)
+    x = torch.stack([truth, moved(body, 0.2)])
+    torch.testing.assert_close(cost.value(x), without.value(x), rtol=0, atol=0)
+    assert not without.unsearched(x).any()
+    expected = choice.segmentation_weight * term.value(body, x, images)
+    torch.testing.assert_close(cost.unsearched(x), expected)
+    halved = cost.with_weights({"segmentation": 0.5})
+    torch.testing.assert_close(halved.unsearched(x), 0.5 * expected)
+    from_two = TrackingCost(
+        body=body, camera=camera, choice=choice, segmentation=images, others=(cost.alone,)
+    )
+    torch.testing.assert_close(from_two.unsearched(x), 2 * expected)
+
+
+class _TwoWells:
+    """Two wells of the same depth, of which something without derivatives prefers one."""
+
+    def value(self, x: Tensor) -> Tensor:
+        return self.local_model(x).value
+
+    def local_model(self, x: Tensor) -> LocalModel:
+        side = torch.where(x >= 0, 1.0, -1.0)
+        gap = x - side
+        hessian = 40.0 * torch.eye(x.shape[-1]).to(x).expand(*x.shape, x.shape[-1])
+        return LocalModel(20.0 * gap.square().sum(-1), 40.0 * gap, hessian)
+
+    def unsearched(self, x: Tensor) -> Tensor:
+        return torch.where(x[..., 0] > 0, 0.0, 3.0)
+
+
+def test_the_tracker_counts_it_among_modes() -> None:
+    tracker = Tracker(proposal=CovarianceScaled(covariance_scale=8.0), num_samples=30, num_modes=2)
+    mixture = GaussianMixture(
+        torch.zeros(1, 1, dtype=torch.float64),
+        torch.ones(1, 1, 1, dtype=torch.float64),
+        torch.zeros(1, dtype=torch.float64),
+    )
+    bounds = Bounds(*(torch.full((1,), side, dtype=torch.float64) for side in (-9.0, 9.0)))
+    start = tracker.init(mixture, generator=torch.Generator().manual_seed(0))
+    state, info = tracker.step(start, _TwoWells(), bounds)
+    torch.testing.assert_close(
+        state.mixture.mean[:, 0], torch.tensor([1.0, -1.0], dtype=torch.float64), atol=1e-3, rtol=0
+    )
+    difference = state.mixture.log_weight[0] - state.mixture.log_weight[1]
+    assert float(difference) == pytest.approx(3.0, abs=1e-3)
+    # What the optimiser saw is reported as it was.
+    torch.testing.assert_close(info.cost, torch.zeros(2, dtype=torch.float64), atol=1e-5, rtol=0)
