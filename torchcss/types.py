@@ -129,7 +129,8 @@ class CostFunction(Protocol):
 
     A cost whose items differ (each sample compared with its own parent mode, say) also has a
     method `take(items)` that returns the cost restricted to those items of the leading batch
-    dimension; the optimiser calls it when it drops finished items.
+    dimension; the optimiser calls it when it drops finished items. What has no derivatives and
+    counts among modes only is a method `unsearched(x)`, in nats.
     """
 
     def value(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:

@@ -9,8 +9,9 @@ tanh that keeps single pixels from deciding.
 
 It has no derivatives in the pose, and is dear. It therefore stays out of the descents, and is asked
 of the minima that they find, where the weights are made (step 3 of Fig. 6 [IJRR]):
-`TrackingCost.unsearched`. There is no such term in the papers; of the terms here it tells
-good modes from bad ones best (`docs/figures.md`).
+`TrackingCost.unsearched`. The papers have no such term, and name foreground against background in
+their section 8; here it tells good modes from bad ones better than the weights of all other terms
+do (`docs/figures.md`).
 
 What to call: `SegmentationTerm.images` once a frame, then `value` at any number of poses.
 """
