@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from torchcss.body.model import BodyModel, load_body
+from torchcss.cost.frame import FrameCosts
 from torchcss.cost.region import part_layers
 from torchcss.cost.segmentation import SegmentationImages, SegmentationTerm
 from torchcss.cost.silhouette import part_map
@@ -16,6 +17,7 @@ from torchcss.inference.proposals import CovarianceScaled
 from torchcss.inference.tracker import Tracker
 from torchcss.types import Bounds, LocalModel
 from torchcss.vision.camera import Camera
+from torchcss.vision.features import FeatureExtractor
 
 
 def a_body_before_a_camera(dtype: torch.dtype = torch.float64) -> tuple[BodyModel, Camera]:
@@ -140,6 +142,27 @@ def test_the_whole_cost_leaves_it_out_and_adds_it_where_it_is_asked() -> None:
         body=body, camera=camera, choice=choice, segmentation=images, others=(cost.alone,)
     )
     torch.testing.assert_close(from_two.unsearched(x), 2 * expected)
+
+
+def test_what_a_frame_taught_weighs_the_poses_of_the_next() -> None:
+    """From pictures to nats: learned at the true pose, and asked of two poses in the next frame."""
+    body, camera = a_body_before_a_camera()
+    truth, hidden = moved(body, 1.2), moved(body, 0.0)
+    seen = part_map(body, truth, camera) >= 0
+    image = torch.where(seen[..., None], torch.tensor([180, 60, 40]), torch.tensor([40, 90, 160]))
+    features = FeatureExtractor(working_size=600, colour=True)(image.to(torch.uint8).numpy())
+    choice = CostChoice(segmentation=SegmentationTerm(), contour=None, joints=None)
+    costs = FrameCosts(body, camera, choice)
+    unknown = costs(features, body=body, before=truth[None])
+    assert unknown.segmentation is None
+    appearance = costs.learn(None, features, body, truth)
+    cost = costs(features, body=body, before=truth[None], appearance=appearance)
+    right, wrong = cost.unsearched(torch.stack([truth, hidden])).tolist()
+    assert 0 < right < 0.4 * choice.segmentation_weight
+    assert right < wrong - 0.05 * choice.segmentation_weight
+    # A frame without a frame before it has no unit of area, and one without a picture says nothing.
+    assert costs(features, body=body, appearance=appearance).segmentation is None
+    assert costs(None, body=body, before=truth[None], appearance=appearance).segmentation is None
 
 
 class _TwoWells:

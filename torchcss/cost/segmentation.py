@@ -13,6 +13,9 @@ of the minima that they find, where the weights are made (step 3 of Fig. 6 [IJRR
 their section 8; here it tells good modes from bad ones better than the weights of all other terms
 do (`docs/figures.md`).
 
+It asks for a body that is modelled whole. Of an arm alone it would be led astray by the rest of
+the person, who wears the same shirt: `make_choice` gives arms none.
+
 What to call: `SegmentationTerm.images` once a frame, then `value` at any number of poses.
 """
 
