@@ -95,8 +95,8 @@ class TrackerInfo(NamedTuple):
     """What one step did.
 
     Attributes:
-        cost: Cost of each mode kept, nats; `inf` where a mode was carried over (no sample had a
-            finite cost).
+        cost: Cost of each mode kept, what is `unsearched` included, nats; `inf` where a mode was
+            carried over (no sample had a finite cost).
         parent: Prior mode matched with each mode (Fig. 6 step 5); -1 for none.
         origin: Prior mode whose sample descended to each mode.
         status_counts: How many samples ended with each `Status`, by its number.
@@ -338,7 +338,7 @@ class Tracker:
                 points = landmarks(unpruned.mean[order])
                 order = order[separated(points, self.separation, self.num_modes)]
             order = order[: self.num_modes]
-            pruned, kept = unpruned.take(order).normalise(), distinct[order]
+            pruned, kept, found = unpruned.take(order).normalise(), distinct[order], found[order]
 
             # 5, 6: multiply in the weights of the closest prior modes, and normalise.
             tempered = prior._replace(log_weight=self.memory * prior.normalise().log_weight)
@@ -346,7 +346,7 @@ class Tracker:
             best_first = matches.mixture.log_weight.argsort(descending=True, stable=True)
             mixture, parent = matches.mixture.take(best_first), matches.parent[best_first]
             kept = kept[best_first]
-            mode_cost, origin = modes.cost[kept], samples.parent[kept]
+            mode_cost, origin = found[best_first], samples.parent[kept]
             known = (parent >= 0)[:, None]
             moved = mixture.mean - state.mixture.mean[parent.clamp(min=0)]
             velocity = torch.where(known, moved, 0.0)
