@@ -394,6 +394,7 @@ def test_every_row_of_the_table_can_be_run_by_its_name(preset: str):
 
 def test_a_body_is_segmented_and_an_arm_alone_is_not():
     assert make_choice(Settings(body="body34"), 2.0).segmentation is not None
+    assert make_choice(Settings(body="body34", preset="condensation"), 2.0).segmentation is None
     assert make_choice(Settings(body="arm8"), 2.0).segmentation is None
     terms = tuple(name for name in ALL_TERMS if name != "segmentation")
     assert make_choice(Settings(body="body34", terms=terms), 2.0).segmentation is None

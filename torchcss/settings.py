@@ -145,9 +145,9 @@ def make_choice(settings: Settings, sigma: float) -> CostChoice:
     A particle filter gets no temporal prior: its particles are moved by `p(x_t | x_{t-1})` already,
     and weighed by `p(r_t | x_t)` alone (section 1.1 [IJRR]). The prior would count twice.
 
-    An arm gets no segmentation: what looks like it may be the rest of the person, who is not
-    modelled. On the rendered arm its best mode flips in four of five seeds with it, and in none
-    without.
+    Segmentation weighs what descents have found, which particles are not. An arm gets none either:
+    what looks like it may be the rest of the person, who is not modelled. On the rendered arm its
+    best mode flips in four of five seeds with it, and in none without.
 
     Args:
         settings: Which terms, and which tracker.
@@ -168,7 +168,7 @@ def make_choice(settings: Settings, sigma: float) -> CostChoice:
         contour=replace(contour, fitted_level=level) if has("contour") else None,
         edge_energy=EdgeEnergyTerm(**potential) if has("edge_energy") else None,
         region=RegionTerm() if has("region") else None,
-        segmentation=SegmentationTerm() if has("segmentation") and whole else None,
+        segmentation=SegmentationTerm() if has("segmentation") and whole and descends else None,
         flow=FlowTerm(**potential) if has("flow") else None,
         joints=JointTerm(sigma=sigma, **potential) if has("joints") else None,
         stabiliser=Stabiliser() if has("stabiliser") else None,

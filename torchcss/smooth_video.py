@@ -81,7 +81,8 @@ def smooth_frames(
             humanoid.
         camera: Camera of the full-size images.
         extractor: Makes the features, at its working size.
-        cost: Terms and weights; temporal terms are left out. Pixels are those of the working image.
+        cost: Terms and weights; temporal terms are left out, and the
+            segmentation, which tells modes apart. Pixels are those of the working image.
         observe: Keypoints by frame.
         choice: How to smooth; `IMAGES` by default.
         boundary_emphasis: See `FrameFeatures.edge_field`.
@@ -103,7 +104,7 @@ def smooth_frames(
             FrameCosts(
                 body,
                 extractor.working_camera(view.camera),
-                replace(cost, temporal=None, temporal_mixture=None),
+                replace(cost, temporal=None, temporal_mixture=None, segmentation=None),
                 boundary_emphasis=boundary_emphasis,
             ),
             extractor,
