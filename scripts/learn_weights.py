@@ -83,7 +83,8 @@ class Config:
     """Norm at which the gradient of a frame is cut off, metres: a minimum that is nearly flat along
     some direction moves very far along it, and says little."""
     terms: tuple[str, ...] = ("contour", "region", "flow", "temporal")
-    """Terms and priors whose weights are learnt. What keeps a search from far-away poses, as the
+    """Terms and priors whose weights are learnt; not segmentation, which has no derivatives and
+    moves no minimum. What keeps a search from far-away poses, as the
     stabiliser does, cannot be learnt from modes that stay near the truth."""
     begin: dict[str, float] | None = None
     """Weights to begin with by term; by default those of the tracker, which count as one."""
@@ -118,6 +119,10 @@ class Truth:
 
 def main(config: Config) -> dict[str, Any]:
     """Learn, measure, print, write; return what is written."""
+    if "segmentation" in config.terms:
+        raise ConfigurationError(
+            "terms: segmentation has no derivatives and moves no minimum; its weight is not learnt"
+        )
     settings = Settings(body="arm8", keypoints_use="first", working_size=config.working_size)
     generator = torch.Generator().manual_seed(config.seed)
     train, test = (load(name, config.frames) for name in (config.train, config.test))

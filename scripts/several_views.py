@@ -79,6 +79,8 @@ class Config:
     """Which of them."""
     frames: int | None = None
     """Frames from the start; all by default."""
+    beam_cameras: tuple[str, ...] = ("cam01", "cam03", "cam01+cam03")
+    """Cameras of the person, each entry tracked by itself."""
     keypoints_use: Literal["first", "all"] = "all"
     """Keypoints of the person in every frame, or for the first pose only."""
     samples: int | None = None
@@ -149,7 +151,8 @@ def person(config: Config, folder: Path) -> dict[str, Any]:
     """The person on the beam, from each camera and from both."""
     positions, names = read_reference(folder / "reference3d.npz", "joints")
     rows: dict[str, Any] = {}
-    for views in (("cam01",), ("cam03",), ("cam01", "cam03")):
+    for row_name in config.beam_cameras:
+        views = row_name.split("+")
         files = [
             ViewFiles(video=folder / f"{v}.mp4", keypoints=folder / f"keypoints2d_{v}.npz")
             for v in views

@@ -35,3 +35,5 @@ def test_bad_sequences_are_refused(tmp_path: Path):
         script.main(script.replace(SMALL, test=str(tmp_path / "none")))
     with pytest.raises(ConfigurationError, match="no terms"):
         script.main(script.replace(SMALL, begin={"joints": 1.0}))
+    with pytest.raises(ConfigurationError, match="segmentation has no derivatives"):
+        script.main(script.replace(SMALL, terms=("contour", "segmentation")))
