@@ -50,6 +50,8 @@ ROWS = {
     "contour + interpenetration": ("interpenetration", *EDGES),
     "edge energy for contour": ("edge_energy", *BASE),
 }
+SEQUENCES = ("demo", "cam01:all", "cam03:all", "cam01:first", "cam03:first")
+SMALL_SAMPLES = 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +60,7 @@ class Config:
 
     data: Path | None = None
     """Folder that holds balance_beam_4cam; without it only the demo runs."""
-    sequences: tuple[str, ...] = ("demo", "cam01:all", "cam03:all", "cam01:first", "cam03:first")
+    sequences: tuple[str, ...] = SEQUENCES
     """"demo", or a camera of the clip and where keypoints are used."""
     rows: tuple[str, ...] = tuple(ROWS)
     """Rows of the table."""
@@ -69,7 +71,7 @@ class Config:
     clip_frames: int = 100
     """Frames of the clips."""
     small: bool = False
-    """Four frames of the demo with few samples, to see that it runs."""
+    """Four frames of the demo, and two of a clip, with few samples, to see that it runs."""
     out: Path | None = None
     """JSON file to write."""
 
@@ -78,9 +80,13 @@ def main(config: Config) -> dict[str, Any]:
     """Track, print and write the table; return what is written."""
     if unknown := sorted(set(config.rows) - set(ROWS)):
         raise ConfigurationError(f"no rows {unknown}; there are {', '.join(ROWS)}")
+    if unknown := sorted(set(config.sequences) - set(SEQUENCES)):
+        raise ConfigurationError(f"no sequences {unknown}; there are {', '.join(SEQUENCES)}")
     sequences = config.sequences
-    if config.small or config.data is None:
+    if config.data is None:
         sequences = tuple(name for name in sequences if name == "demo")
+        if not sequences:
+            raise ConfigurationError("sequences: the clips need --data, the folder that holds them")
     print(f"{'mean over frames, mm':28}" + "".join(f"{name:>24}" for name in sequences))
     print(f"{'':28}" + f"{'best   of K  lost  s/fr':>24}" * len(sequences))
     rows: dict[str, dict[str, Any]] = {}
@@ -120,7 +126,7 @@ def demo(config: Config, terms: tuple[str, ...]) -> dict[str, Any]:
             keypoints_use="first",
             terms=terms,
             seed=seed,
-            samples=8 if config.small else None,
+            samples=SMALL_SAMPLES if config.small else None,
             overlay=False,
         )
         with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stderr(io.StringIO()):
@@ -143,7 +149,12 @@ def clip(config: Config, sequence: str, row: str) -> dict[str, Any]:
     camera, use = sequence.split(":")
     assert config.data is not None
     folder = config.data / "balance_beam_4cam"
-    settings = Settings(terms=ROWS[row], keypoints_use=use, overlay=False)  # type: ignore[arg-type]
+    settings = Settings(
+        terms=ROWS[row],
+        keypoints_use="first" if use == "first" else "all",
+        samples=SMALL_SAMPLES if config.small else None,
+        overlay=False,
+    )
     silent = io.StringIO()
     with (
         tempfile.TemporaryDirectory() as out,
@@ -156,7 +167,7 @@ def clip(config: Config, sequence: str, row: str) -> dict[str, Any]:
             keypoints=folder / f"keypoints2d_{camera}.npz",
             out=Path(out),
             settings=settings,
-            stop=config.clip_frames,
+            stop=2 if config.small else config.clip_frames,
         )
         errors = evaluate(Evaluation(track=Path(out), reference=folder / "reference3d.npz"))
     lost = np.asarray(errors["frames_lost"])
