@@ -133,6 +133,37 @@ def test_bending_turns_the_axis_into_a_circle_towards_the_direction() -> None:
     torch.testing.assert_close(tip.normals, towards)
 
 
+@pytest.mark.parametrize("bend", [0.0, 1e-9, 1e-6, 1e-5, 1e-3, 0.1, 0.4, -1e-5, 3.0])
+def test_bends_of_any_size_are_bent_in_float32(generator: torch.Generator, bend: float) -> None:
+    shapes = random_shapes(100, generator)
+    shapes[:, 7] = bend
+    shapes = shapes.float().double()
+    eta, omega = random_angles(100, generator)
+    expected = surface_points(shapes, eta, omega).points
+    points = surface_points(shapes.float(), eta.float(), omega.float()).points
+    torch.testing.assert_close(points.double(), expected, rtol=0, atol=5e-6)
+    torch.testing.assert_close(
+        straighten(shapes.float(), expected.float()).double(),
+        straighten(shapes, expected),
+        rtol=0,
+        atol=5e-6,
+    )
+
+
+@pytest.mark.parametrize("bend", [0.0, 1e-7, 0.3])
+def test_straightening_can_be_differentiated(generator: torch.Generator, bend: float) -> None:
+    shapes = random_shapes(8, generator)
+    shapes[:, 7] = bend
+    points = surface_points(shapes, *random_angles(8, generator)).points
+    bends = shapes[:, 7].clone().requires_grad_()
+
+    def straight(bends: Tensor, points: Tensor) -> Tensor:
+        return straighten(torch.cat([shapes[:, :7], bends[:, None], shapes[:, 8:]], -1), points)
+
+    points.requires_grad_()
+    assert torch.autograd.gradcheck(straight, (bends, points))
+
+
 def test_a_small_bend_joins_none_smoothly(generator: torch.Generator) -> None:
     shapes = random_shapes(50, generator)
     eta, omega = random_angles(50, generator)

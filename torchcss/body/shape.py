@@ -151,26 +151,6 @@ def surface_derivatives(
     )
 
 
-def surface_normal_derivatives(
-    shape: Float[Tensor, "p 9"], eta: Float[Tensor, " p"], omega: Float[Tensor, " p"]
-) -> Float[Tensor, "p 3 9"]:
-    """First derivatives of the unit outward normals in the shape numbers, at held angles.
-
-    Args:
-        shape: The shape numbers of each point's part.
-        eta: Latitudes.
-        omega: Longitudes.
-    """
-    with torch.enable_grad():
-        s = shape.detach().requires_grad_()
-        normals = surface_points(s, eta.detach(), omega.detach()).normals
-        rows = [
-            torch.autograd.grad(normals[:, axis].sum(), s, retain_graph=True)[0]
-            for axis in range(3)
-        ]
-    return torch.stack(rows, dim=-2)
-
-
 def surface_angles(
     shape: Float[Tensor, "*batch 9"], points: Float[Tensor, "*batch 3"]
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:

@@ -25,8 +25,8 @@ from torch import Tensor
 
 SHAPE_NAMES = ("a1", "a2", "a3", "e1", "e2", "taper_x", "taper_y", "bend", "bend_direction")
 
-_LEAST_BEND = 1e-6
-"""Curvature, per metre, below which the axis counts as straight."""
+_SMALL = 0.1
+"""Angle, radians, below which quotients by it are their series; these are then exact to 1e-13."""
 
 
 class SurfaceSample(NamedTuple):
@@ -98,29 +98,33 @@ def _bend(
     points: Tensor, normals: Tensor, bend: Tensor, direction: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Circular bending of the z axis towards `direction`; volume preserving at the axis."""
-    straight = bend.abs() < _LEAST_BEND
-    if bool(straight.all()):
-        return points, normals
-    curvature = torch.where(straight, torch.ones_like(bend), bend)
     c, s = direction.cos(), direction.sin()
     x, y, z = points.unbind(-1)
     r, across = c * x + s * y, c * y - s * x  # towards the bend, and beside it
-    angle = curvature * z
-    radius = 1 / curvature - r
-    bent_r, bent_z = 1 / curvature - angle.cos() * radius, angle.sin() * radius
+    angle = bend * z
+    # 1 / bend - cos(angle) (1 / bend - r), and sin(angle) (1 / bend - r), without the radius.
+    bent_r = angle.cos() * r + 0.5 * angle * z * _sinc(0.5 * angle).square()
+    bent_z = z * _sinc(angle) - angle.sin() * r
     nx, ny, nz = normals.unbind(-1)
     nr, n_across = c * nx + s * ny, c * ny - s * nx
-    stretch = curvature * radius  # length of d(point)/dz
+    stretch = 1 - bend * r  # length of d(point)/dz
     # J^-T det(J): the frame turns by `angle` about the axis beside the bend.
     nr, n_across, nz = nr * stretch, n_across * stretch, nz
     turned_r = angle.cos() * nr + angle.sin() * nz
     turned_z = -angle.sin() * nr + angle.cos() * nz
-    bent = torch.stack([c * bent_r - s * across, s * bent_r + c * across, bent_z], -1)
-    bent_normal = torch.stack(
-        [c * turned_r - s * n_across, s * turned_r + c * n_across, turned_z], -1
+    return (
+        torch.stack([c * bent_r - s * across, s * bent_r + c * across, bent_z], -1),
+        torch.stack([c * turned_r - s * n_across, s * turned_r + c * n_across, turned_z], -1),
     )
-    keep = straight[..., None]
-    return torch.where(keep, points, bent), torch.where(keep, normals, bent_normal)
+
+
+def _sinc(angle: Tensor) -> Tensor:
+    """`sin(a) / a`, with derivatives at zero."""
+    small = angle.abs() < _SMALL
+    square = angle.square()
+    safe = torch.where(small, torch.ones_like(angle), angle)
+    series = 1 - square / 6 * (1 - square / 20 * (1 - square / 42 * (1 - square / 72)))
+    return torch.where(small, series, safe.sin() / safe)
 
 
 def straighten(
@@ -133,19 +137,24 @@ def straighten(
         points: Points in the part's frame, metres.
     """
     _, _, a3, _, _, taper_x, taper_y, bend, direction = shape.unbind(-1)
-    straight = bend.abs() < _LEAST_BEND
     x, y, z = points.unbind(-1)
-    if not bool(straight.all()):
-        curvature = torch.where(straight, torch.ones_like(bend), bend)
-        c, s = direction.cos(), direction.sin()
-        r, across = c * x + s * y, c * y - s * x
-        toward = 1 - curvature * r
-        angle = torch.atan2(curvature * z, toward)
-        radius = torch.hypot(toward, curvature * z) / curvature.abs()
-        flat_r = 1 / curvature - curvature.sign() * radius
-        x = torch.where(straight, x, c * flat_r - s * across)
-        y = torch.where(straight, y, s * flat_r + c * across)
-        z = torch.where(straight, z, angle / curvature)
+    c, s = direction.cos(), direction.sin()
+    r, across = c * x + s * y, c * y - s * x
+    # In units of the radius of the bend, seen from its centre.
+    cosine, sine = 1 - bend * r, bend * z
+    # (1 - hypot) / bend, without the radius.
+    r = (2 * r - bend * (r.square() + z.square())) / (1 + torch.hypot(cosine, sine))
+    x, y = c * r - s * across, s * r + c * across
+    # atan2(sine, cosine) / bend, by its series in the tangent where that is small.
+    small = sine.abs() < _SMALL * cosine
+    of_axis = torch.where(small, cosine, torch.ones_like(cosine))
+    square = torch.where(small, sine / of_axis, torch.zeros_like(sine)).square()
+    series = torch.zeros_like(square)
+    for odd in (13, 11, 9, 7, 5, 3, 1):
+        series = 1 / odd - square * series
+    curvature = torch.where(small, torch.ones_like(bend), bend)
+    angle = torch.atan2(sine, torch.where(small, torch.ones_like(cosine), cosine))
+    z = torch.where(small, z / of_axis * series, angle / curvature)
     # Beyond the ends the taper is held, so that it never turns the section inside out.
     height = (z / a3).clamp(-1, 1)
     fx, fy = (1 + taper_x * height).clamp(min=1e-3), (1 + taper_y * height).clamp(min=1e-3)
