@@ -14,6 +14,7 @@ import torch
 
 import torchcss
 from torchcss.body.model import load_body
+from torchcss.cost.joints import JointObservation
 from torchcss.demo import run_demo
 from torchcss.errors import ConfigurationError, OutputError, VideoError
 from torchcss.inference.mixture import GaussianMixture
@@ -35,6 +36,7 @@ from torchcss.settings import (
 )
 from torchcss.synthetic import SyntheticSequence, arm_sequence
 from torchcss.track_files import track_video
+from torchcss.views import Observe
 from torchcss.vision.camera import Camera
 
 FRAMES = 4
@@ -318,8 +320,9 @@ def track(
     settings: Settings,
     camera: Camera | None = None,
     masks: list[np.ndarray] | None = None,
+    observe: Observe = lambda index: None,
 ) -> list[TrackedFrame]:
-    """Track from the true first pose, without keypoints, with few samples."""
+    """Track from the true first pose, by default without keypoints, with few samples."""
     mixture = GaussianMixture(
         sequence.states[:1], 0.01 * torch.eye(8, dtype=torch.float64)[None], torch.zeros(1).double()
     )
@@ -332,13 +335,37 @@ def track(
             extractor=make_extractor(settings),
             tracker=make_tracker("css", "arm8", num_samples=4, num_modes=2, motion=0.1),
             choice=make_choice(settings, 2.0),
-            observe=lambda index: None,
+            observe=observe,
             frame_interval=1 / 25,
             generator=torch.Generator().manual_seed(0),
             boundary_emphasis=boundary_emphasis(settings),
             masks=masks,
         )
     )
+
+
+def test_terms_of_the_best_mode_add_up_to_its_cost():
+    """In every frame: the priors are about the mixture that the search had, one frame ahead."""
+    sequence = arm_sequence(generator=torch.Generator().manual_seed(0), num_frames=4)
+    settings = Settings(body="arm8", keypoints_use="first", working_size=160)
+    for tracked in track(sequence.frames, sequence, settings):
+        assert sum(tracked.terms.values()) == pytest.approx(float(tracked.info.cost[0]), rel=1e-9)
+
+
+def test_frames_without_detections_have_no_term_of_joints():
+    """Detectors write such frames as zeros; they cost nothing, and are not what is usual."""
+    sequence = arm_sequence(generator=torch.Generator().manual_seed(0), num_frames=2)
+    settings = Settings(body="arm8", working_size=160, terms=("joints", "temporal"))
+    names = sequence.body.joint_names
+    marks = (
+        sequence.camera.project(sequence.joints_world).uv * 160 / sequence.camera.image_size_wh[0]
+    )
+
+    def observe(index: int) -> JointObservation:
+        return JointObservation(names, marks[index], torch.full((len(names),), 1.0 - index), names)
+
+    frames = track(sequence.frames, sequence, settings, observe=observe)
+    assert ["joints" in tracked.terms for tracked in frames] == [True, False]
 
 
 def awkward_frames(sequence: SyntheticSequence) -> dict[str, np.ndarray]:

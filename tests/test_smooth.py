@@ -166,12 +166,37 @@ def test_a_root_that_turns_beyond_half_a_turn():
     assert done.track.state[:, 0, yaw] == pytest.approx(wrapped, abs=0.1)
 
 
-def test_frames_without_evidence_follow_from_their_neighbours(body: BodyModel):
+def test_a_root_may_wind_up_beyond_its_limits():
+    """In a track its angles are wrapped; a smooth one turns on, past the limits of the body."""
+    body = load_body("body30")
+    track, _ = noisy_track(body, 40, others=0)
+    yaw = body.state_index("root_yaw")
+    wound = np.linspace(2.0, 2.0 + 6.0, 40)
+    assert wound.max() > float(body.upper[yaw])
+    track.state[:, 0, yaw] = np.remainder(wound + math.pi, 2 * math.pi) - math.pi
+    track.joints_world[:, 0] = body.pose(torch.from_numpy(track.state[:, 0])).joints.numpy()
+    done = smooth_track(track)
+    assert done.track.state[:, 0, yaw] == pytest.approx(wound, abs=0.1)
+
+
+def test_costs_are_nats_whatever_the_power_of_the_covariances(body: BodyModel):
+    """The same evidence, written with covariances that count it in full and by a tenth."""
+    full, _ = noisy_track(body)
+    tenth = full._replace(covariance=10 * full.covariance, evidence=0.1)
+    one, other = smooth_track(full), smooth_track(tenth)
+    assert other.track.state == pytest.approx(one.track.state, abs=1e-6)
+    assert other.track.cost == pytest.approx(one.track.cost, abs=1e-4)
+    assert (one.track.cost > full.cost[np.arange(len(one.modes)), one.modes][:, None]).all()
+
+
+def test_frames_without_evidence_follow_from_their_neighbours(body: BodyModel, tmp_path: Path):
     track, truth = noisy_track(body)
     lost = slice(10, 14)
     track.cost[lost] = np.inf
     track.state[lost], track.joints_world[lost] = track.state[9:10], track.joints_world[9:10]
     done = smooth_track(track)
+    save_track(tmp_path / "track.npz", done.track)
+    assert np.isinf(load_track(tmp_path).cost[lost]).all()
     assert done.effect["frames_without_evidence"].tolist() == [10, 11, 12, 13]
     carried = np.abs(track.state[lost, 0] - truth[lost].numpy()).mean()
     assert np.abs(done.track.state[lost, 0] - truth[lost].numpy()).mean() < 0.6 * carried

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -108,6 +109,18 @@ def test_images_correct_what_the_modes_say(setup: Setup, sequence: SyntheticSequ
     state = torch.from_numpy(done.track.state)
     assert torch.equal(bounds.project(state), state)
     assert np.linalg.eigvalsh(done.track.covariance[:, 0]).min() > 0
+
+
+def test_colours_are_learnt_for_the_region_term(setup: Setup, sequence: SyntheticSequence):
+    settings = replace(SETTINGS, terms=("region", "temporal"))
+    arguments = setup.arguments | {
+        "cost": make_choice(settings, 1.0),
+        "extractor": make_extractor(settings),
+    }
+    done = smooth_frames(setup.track, images(sequence), **arguments)
+    before = done.effect["mean_cost_before_images"]
+    assert before > 1
+    assert done.effect["mean_cost_after_images"] < before
 
 
 def test_lost_frames_get_their_evidence_back(setup: Setup, sequence: SyntheticSequence):

@@ -25,10 +25,10 @@ from torch import Tensor
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, has_root, move_base, root_pose
 from torchcss.cost.frame import FrameCosts, beside
-from torchcss.cost.total import CostChoice
+from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.inference.mixture import GaussianMixture, tempered
 from torchcss.inference.proposals import unbounded
-from torchcss.inference.tracker import SequenceTracker, TrackerInfo, TrackerState
+from torchcss.inference.tracker import CostFactory, SequenceTracker, TrackerInfo, TrackerState
 from torchcss.inference.trust_region import default_prior_variance
 from torchcss.io.video import Frame
 from torchcss.jumps import with_flips
@@ -161,13 +161,15 @@ def track_frames(
         featured = time.perf_counter()
         prior = state.mixture
         bounds = body.bounds if limits else unbounded(prior.mean)
-        state, info = searching.step(state, cost.of_children, bounds)
+        asked: list[GaussianMixture] = []
+        state, info = searching.step(state, _noting(cost, asked), bounds)
         if len(prior.mean) > num_prior:
             # A mode that was jumped to goes back to the best one, from which the jump was made.
             info = info._replace(parent=torch.where(info.parent < num_prior, info.parent, 0))
         searched, term_seconds = time.perf_counter(), dict(stopwatch.seconds)
         mean = state.mixture.mean
-        values = cost.of_children(info.origin[:1], prior).terms(mean[:1])
+        # About the prior that the search had, one frame ahead.
+        values = cost.of_children(info.origin[:1], asked[0]).terms(mean[:1])
         if choice.segmentation is not None:
             values["segmentation"] = cost.unsearched(mean[:1])
         terms = {name: float(value[0]) for name, value in values.items()}
@@ -199,6 +201,16 @@ def track_frames(
             beside_it,
         )
         body, state = follow_with_base(body, state)
+
+
+def _noting(cost: TrackingCost, priors: list[GaussianMixture]) -> CostFactory:
+    """`cost.of_children`, which puts down the priors that it is asked about."""
+
+    def of_children(parent: Tensor, prior: GaussianMixture) -> TrackingCost:
+        priors.append(prior)
+        return cost.of_children(parent, prior)
+
+    return of_children
 
 
 def _per_view(terms: dict[str, float], watchers: Sequence[Watcher]) -> dict[str, float]:

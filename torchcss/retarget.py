@@ -37,14 +37,14 @@ from torch import Tensor
 
 from torchcss.body.catalog import BODY_NAMES, LENGTHS, PROPORTION_RANGE
 from torchcss.body.model import BodyModel, load_body
-from torchcss.body.root import ROOT_NAMES, has_root, root_angles, root_rotation
+from torchcss.body.root import ROOT_NAMES, free_turns, has_root, root_angles, root_rotation
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.errors import ConfigurationError
 from torchcss.inference.smoothing import Transition, best_path, refine
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.io.motion_capture import MotionCapture, limb_positions
-from torchcss.types import Bounds, LocalModel, PointCost
+from torchcss.types import LocalModel, PointCost
 
 _STERNOCLAVICULAR = 0.03
 """Metres from the midline to where the body's shoulder width begins."""
@@ -525,14 +525,6 @@ def _points(
     )
 
 
-def _free_turns(body: BodyModel) -> Bounds:
-    """The body's limits, but none on yaw and roll of the root."""
-    lower, upper = body.lower.clone(), body.upper.clone()
-    turns = [body.state_index(name) for name in ("root_yaw", "root_roll")]
-    lower[turns], upper[turns] = -math.inf, math.inf
-    return Bounds(lower, upper)
-
-
 def _fit(
     body: BodyModel,
     points: Points,
@@ -543,7 +535,7 @@ def _fit(
 ) -> Float[Tensor, "t n"]:
     """States of all frames: several descents each, the best path through them, smoothing."""
     frames, k, n = len(root), choice.num_starts, body.num_parameters
-    bounds = _free_turns(body)
+    bounds = free_turns(body)
     noise = torch.randn(k, n, generator=generator, dtype=body.dtype)
     noise[0] = 0.0
     spread = torch.where(body.sticky_deviation.isfinite(), body.sticky_deviation, 0.0)

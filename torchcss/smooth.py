@@ -30,7 +30,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchcss.body.model import BodyModel
-from torchcss.body.root import ROOT_NAMES, has_root, move_base
+from torchcss.body.root import ROOT_NAMES, free_turns, has_root, move_base
 from torchcss.errors import ConfigurationError, TrackFileError
 from torchcss.inference.smoothing import (
     GaussianEvidence,
@@ -143,12 +143,14 @@ def smooth_track(
         chosen,
         times,
         motion_prior(body, choice),
-        body.bounds,
+        free_turns(body),
         # The covariances of the track have its power already.
         evidence=choice.evidence / track.evidence,
         changes=changes,
     )
-    result = track_of(track, body, smooth, cost=cost[everywhere, path.mode] + smooth.cost)
+    # The modes' covariances have the power `evidence`, their costs are full nats.
+    cost = cost[everywhere, path.mode] + smooth.cost / track.evidence
+    result = track_of(track, body, smooth, cost=cost)
     result = result._replace(evidence=choice.evidence)
     modes = path.mode.numpy()
     effect = {

@@ -27,6 +27,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchcss.body.model import BodyModel
+from torchcss.body.root import free_turns
 from torchcss.cost.frame import FrameCosts, beside
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.errors import ConfigurationError, TrackFileError, VideoError
@@ -81,8 +82,9 @@ def smooth_frames(
             humanoid.
         camera: Camera of the full-size images.
         extractor: Makes the features, at its working size.
-        cost: Terms and weights; temporal terms are left out, and the
-            segmentation, which tells modes apart. Pixels are those of the working image.
+        cost: Terms and weights; temporal terms are left out, and the segmentation, which tells
+            modes apart. Colours are learnt from the track that was smoothed without images. Pixels
+            are those of the working image.
         observe: Keypoints by frame.
         choice: How to smooth; `IMAGES` by default.
         boundary_emphasis: See `FrameFeatures.edge_field`.
@@ -134,6 +136,8 @@ def smooth_frames(
             there = body.with_base(bases[row, :3, :3], bases[row, :3, 3])
             one = beside([watcher.cost(there, before) for watcher in watchers])
             at_start.append(float(one.value(start[row : row + 1])))
+            for watcher in watchers:
+                watcher.learn(there, start[row])
             yield one
 
     refined = refine_in_windows(
@@ -141,7 +145,7 @@ def smooth_frames(
         start,
         torch.from_numpy(track.times),
         motion_prior(body, choice),
-        body.bounds,
+        free_turns(body),
         evidence=choice.evidence,
         changes=changes,
     )

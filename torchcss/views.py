@@ -92,11 +92,14 @@ class Watcher:
         self, body: BodyModel, before: Tensor | None, stopwatch: Stopwatch | None = None
     ) -> TrackingCost:
         """The cost of the image taken in last; `before` are the modes before it."""
+        observation = None if self.index is None else self.observe(self.index)
+        if observation is not None and observation.says_nothing:
+            observation = None
         return self.costs(
             self.features,
             body=body,
             before=before,
-            observation=None if self.index is None else self.observe(self.index),
+            observation=observation,
             appearance=self.appearance,
             stopwatch=stopwatch,
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -24,7 +25,14 @@ def judge(
     frames: Iterable[Mapping[str, float]], monitor: LossMonitor = MONITOR
 ) -> tuple[list[bool], list[MonitorState]]:
     """Whether each frame counts as lost, and what is known after it."""
-    state, lost, states = monitor.init(), [], []
+    return judge_on(monitor.init(), frames, monitor)
+
+
+def judge_on(
+    state: MonitorState, frames: Iterable[Mapping[str, float]], monitor: LossMonitor = MONITOR
+) -> tuple[list[bool], list[MonitorState]]:
+    """The same, from where another run left off."""
+    lost, states = [], []
     for costs in frames:
         state, now = monitor.update(state, costs)
         lost.append(now)
@@ -83,6 +91,24 @@ def test_terms_come_and_go():
         for _ in range(3):
             state, now = MONITOR.update(state, {name: 300.0})
         assert now
+
+
+@pytest.mark.parametrize("unknown", [{}, {"flow": 3.0}])
+def test_a_frame_of_which_nothing_is_known_finds_nothing(unknown: dict[str, float]):
+    _, states = judge(steady(60, 1, dict.fromkeys(range(40, 60), 200.0)))
+    lost, after = judge_on(states[-1], [unknown] * 3)
+    assert all(lost)
+    assert after[-1].total == states[-1].total
+    assert after[-1].history == states[-1].history
+
+
+@pytest.mark.parametrize("cost", [math.nan, math.inf])
+def test_costs_that_are_no_numbers_count_as_far_off_and_are_not_learnt(cost: float):
+    _, states = judge(steady(60))
+    lost, after = judge_on(states[-1], [{"contour": cost, "joints": 30.0}] * 3)
+    assert lost == [False, True, True]
+    assert after[-1].history == states[-1].history
+    assert after[-1].excess == states[-1].excess
 
 
 def test_nothing_is_judged_before_enough_is_known():

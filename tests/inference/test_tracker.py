@@ -229,7 +229,41 @@ def test_oversampling_descends_from_the_best_alone(generator, screened):
     _, info = many.step(state, cost, BOUNDS)
     assert int(info.num_samples) == 6
     first = next(x for x in starts if len(x) == 6)
+    # The mode that goes on from the last frame comes first, whatever it costs.
+    score[0] = -torch.inf
     torch.testing.assert_close(first, drawn[score.argsort()[:6].sort().values])
+
+
+@pytest.mark.parametrize("finalists", [0, 3])
+def test_oversampling_keeps_the_modes_of_the_last_frame(generator, finalists):
+    """A mode of little weight in the other well, where hardly a sample falls."""
+    well = problems.DoubleWell()
+    two = GaussianMixture(
+        well.minima, 0.01 * torch.eye(2).double().expand(2, 2, 2), torch.tensor([0.0, -9.0])
+    ).normalise()
+    tracker = replace(CSS, num_samples=8, oversampling=10, finalists=finalists)
+    state, _ = tracker.step(tracker.init(two, generator=generator), well, BOUNDS)
+    assert len(state.mixture.mean) == 2
+
+
+def test_modes_that_see_nothing_come_to_rest_inside_the_bounds(generator):
+    tracker = replace(CSS, dynamics=ConstantVelocity(persistence=0.5), num_modes=1)
+    five = GaussianMixture(
+        torch.tensor([[5.9, 0.0]]).double().expand(5, 2),
+        torch.eye(2).double().expand(5, 2, 2),
+        torch.zeros(5).double(),
+    )
+    state = tracker.init(five, generator=generator)
+    state = state._replace(velocity=torch.tensor([[0.4, -0.4]]).double().expand(5, 2))
+    for _ in range(12):
+        state, info = tracker.step(state, Nowhere(), BOUNDS)
+        assert len(state.mixture.mean) == len(info.cost) == 1
+        assert torch.equal(BOUNDS.project(state.mixture.mean), state.mixture.mean)
+    # 0.2 + 0.1 + ...: half of the velocity goes on each time.
+    torch.testing.assert_close(
+        state.mixture.mean[0], torch.tensor([6.0, -0.4]).double(), rtol=0, atol=1e-3
+    )
+    assert float(state.velocity.abs().max()) < 1e-3
 
 
 def test_evidence_is_the_power_of_the_likelihood(generator):

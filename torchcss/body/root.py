@@ -7,11 +7,14 @@ so that the angles never lock; means and covariances are mapped along. Call `mov
 
 from __future__ import annotations
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.body.model import BodyModel
+from torchcss.types import Bounds
 
 ROOT_NAMES = ("root_x", "root_y", "root_z", "root_yaw", "root_pitch", "root_roll")
 
@@ -45,6 +48,15 @@ def root_angles(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 
 def has_root(body: BodyModel) -> bool:
     """Whether the body has the six root parameters."""
     return set(ROOT_NAMES) <= set(body.state_names)
+
+
+def free_turns(body: BodyModel) -> Bounds:
+    """The body's limits, but none on a root's yaw and roll, which wind up over a long motion."""
+    lower, upper = body.lower.clone(), body.upper.clone()
+    if has_root(body):
+        turns = [body.state_index(name) for name in ("root_yaw", "root_roll")]
+        lower[turns], upper[turns] = -math.inf, math.inf
+    return Bounds(lower, upper)
 
 
 def root_pose(

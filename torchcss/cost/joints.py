@@ -85,6 +85,11 @@ class JointObservation:
         noise = relative_noise * keypoints.new_tensor(spread)
         self.weight: Float[Tensor, " m"] = weight / noise.square()
 
+    @property
+    def says_nothing(self) -> bool:
+        """Whether it has no keypoint of this body, as in a frame in which nobody was detected."""
+        return not bool((self.weight > 0).any())
+
 
 def _error(uv: Float[Tensor, "*batch m 2"], observation: JointObservation) -> Tensor:
     """Distance in the image; beyond all images it is cut off, lest its square overflow."""

@@ -17,6 +17,7 @@ Jumps to other poses that project alike are for whoever knows the body (`torchcs
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -80,7 +81,8 @@ class LossMonitor:
 
         Args:
             state: What the frames before left.
-            costs: What each observation of the frame costs at the best mode, nats.
+            costs: What each observation of the frame costs at the best mode, nats; one that the
+                frame does not have is left out.
 
         Returns:
             The next state, and whether the track is lost.
@@ -90,7 +92,12 @@ class LossMonitor:
             for name in costs
             if len(state.history.get(name, ())) >= self.burn_in
         }
-        score = total = 0.0
+        if not all(math.isfinite(cost) for cost in costs.values()):
+            # What costs nothing finite is far off, whatever it is, and teaches nothing.
+            total = min(state.total + self.most - self.slack, 2 * self.threshold)
+            return state._replace(total=total, score=self.most), total > self.threshold
+        # A frame of which nothing is known leaves the sum as it was.
+        score, total = 0.0, state.total
         excess = None
         if known:
             level = sum(known.values())

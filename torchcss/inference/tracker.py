@@ -26,7 +26,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Protocol
 
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from torchcss.errors import ConfigurationError, check_shape
@@ -194,6 +194,12 @@ def initial_state(mixture: GaussianMixture, *, generator: torch.Generator) -> Tr
     )
 
 
+def _unperturbed(samples: Samples, num_modes: int) -> Bool[Tensor, " s"]:
+    """The modes of the prior among its samples: they come first, and were not drawn at random."""
+    first = torch.arange(len(samples.x), device=samples.parent.device) < num_modes
+    return first & (samples.log_weight == -torch.inf)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Tracker:
     """The multiple-mode tracker of section 4.2 [IJRR].
@@ -278,8 +284,8 @@ class Tracker:
             prior_variance: See `TrustRegionNewton.minimise`.
 
         Returns:
-            The next state and what was done. If no sample has a finite cost, the prior is carried
-            over as it is.
+            The next state and what was done. If no sample has a finite cost, the best of the prior
+            are carried over, inside the bounds.
         """
         check_bounds(bounds, state.mixture.mean.shape[-1])
         generator = torch.Generator()
@@ -297,6 +303,7 @@ class Tracker:
         if self.oversampling > 1:
             score = getattr(cost, "screening", lambda cost=cost: cost)().value(samples.x)
             score = score.nan_to_num(torch.inf)
+            score[_unperturbed(samples, len(prior.mean))] = -torch.inf
             best = score.argsort(stable=True)[: self.num_samples].sort().values
             samples = Samples(*(part[best] for part in samples))
             cost = make_cost(samples.parent, prior)
@@ -352,9 +359,13 @@ class Tracker:
             velocity = torch.where(known, moved, 0.0)
             effective = (-(2 * unpruned.log_weight).logsumexp(0)).exp()
         else:
-            mixture, velocity = prior, state.velocity
-            mode_cost = torch.full_like(prior.log_weight, torch.inf)
-            parent = origin = torch.arange(len(prior.mean), device=prior.mean.device)
+            best = prior.log_weight.argsort(descending=True, stable=True)[: self.num_modes]
+            mixture = prior.take(best).normalise()
+            mixture = mixture._replace(mean=bounds.project(mixture.mean))
+            # What they move now they go on with, so that they come to rest.
+            velocity = mixture.mean - state.mixture.mean[best]
+            mode_cost = torch.full_like(mixture.log_weight, torch.inf)
+            parent = origin = best
             effective = torch.zeros_like(prior.log_weight[0])
 
         info = TrackerInfo(
@@ -386,7 +397,7 @@ class Tracker:
             taken.
         """
         steps = []
-        count = len(samples.x)
+        count, known_modes = len(samples.x), _unperturbed(samples, num_modes)
         if self.finalists and count > self.finalists:
             for max_steps, multiple in _HEATS:
                 size = round(multiple * self.finalists)
@@ -410,10 +421,11 @@ class Tracker:
                 )
                 rank[distinct] = modes.cost[distinct].nan_to_num(torch.inf)
                 # The modes that go on from the last frame come first, and are never dropped.
-                rank[:num_modes] = -torch.inf
+                rank[known_modes] = -torch.inf
                 kept = min(size, int((rank < torch.inf).sum()))
                 best = rank.argsort(stable=True)[:kept].sort().values
                 samples = Samples(*(part[best] for part in samples))
+                known_modes = known_modes[best]
                 restrict = getattr(cost, "take", None)
                 cost = cost if restrict is None else restrict(best)
         raced = torch.cat(steps) if steps else samples.parent.new_zeros(0)

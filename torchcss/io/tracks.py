@@ -73,7 +73,8 @@ class Track(NamedTuple):
         state: Means of the modes, best first, zero where there is none.
         covariance: Covariances of the modes.
         log_weight: Logarithm of the weights, `-inf` where there is no mode.
-        cost: Cost of the modes in nats, `inf` where there is none.
+        cost: Cost of the modes in nats, `inf` where there is none, and where the frame said
+            nothing.
         parent: Mode of the frame before, -1 where there is none.
         joint_names: Names of the joints.
         joints_world: Joint centres of the modes, metres.
@@ -166,7 +167,7 @@ class TrackWriter:
             state: `[k n]`.
             covariance: `[k n n]`.
             log_weight: `[k]`; modes with `-inf` are left out.
-            cost: `[k]`, nats.
+            cost: `[k]`, nats; infinite where the frame said nothing.
             parent: `[k]`, modes of the frame appended before, -1 for none.
             joints_world: `[k j 3]`, metres.
             base_transform: `[4 4]`; None: the identity.
@@ -184,7 +185,7 @@ class TrackWriter:
             _array("state", state, (k, num_parameters)),
             _array("covariance", covariance, (k, num_parameters, num_parameters)),
             weights,
-            _array("cost", cost, (k,)),
+            _array("cost", cost, (k,), finite=False),
             parents,
             _array("joints_world", joints_world, (k, num_joints, 3)),
             np.eye(4)
@@ -196,6 +197,8 @@ class TrackWriter:
                 f"frame {frame}: log_weight: expected at least one weight above -inf and none "
                 f"infinite or NaN, got {weights.tolist()}"
             )
+        if np.isnan(modes.cost).any() or (modes.cost == -np.inf).any():
+            raise ShapeError(f"frame {frame}: cost: expected numbers, got {modes.cost.tolist()}")
         if not math.isfinite(modes.time_s) or (self._modes and frame <= self._modes[-1].frame):
             raise ShapeError(
                 f"frame {frame} at {time_s} s: expected frames in rising order, at finite times"
