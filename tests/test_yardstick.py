@@ -28,6 +28,7 @@ from torchcss.yardstick import (
     FrameMeasures,
     Thresholds,
     Yardstick,
+    compared_joints,
     num_evaluations,
     number,
     over_seeds,
@@ -171,6 +172,33 @@ def test_true_joints_are_in_the_stated_regions_as_often_as_stated() -> None:
     assert (deviations**2).mean() == pytest.approx(1, abs=4 * (2 / 8 / count) ** 0.5)
 
 
+@pytest.mark.parametrize("name", ["arm7", "arm8", "body34"])
+@pytest.mark.parametrize("deviation", [0.03, 0.06])
+def test_exact_truths_are_in_the_stated_regions_as_often_as_stated(
+    name: str, deviation: float
+) -> None:
+    """Of joints on surfaces too, with an allowance that the truth does not use."""
+    count, body = 400, placed(name)
+    middle = body.bounds.project(body.rest) if name == "body34" else arm_and_states(1)[1][0]
+    middle = middle[-body.num_parameters :]
+    source = torch.Generator().manual_seed(2)
+    noise = torch.randn(count, len(middle), generator=source, dtype=torch.float64)
+    sequence = recorded(body, middle[None], mask=None)
+    compared = compared_joints(sequence, body)
+    assert ("r_shoulder" in compared) == (name != "arm7")
+    columns = [body.joint_index(joint) for joint in compared]
+    mixture = GaussianMixture(
+        middle.expand(count, -1),
+        (deviation**2 * torch.eye(len(middle)).double()).expand(count, -1, -1),
+        torch.zeros(count).double(),
+    )
+    truth = body.pose(middle + deviation * noise).joints[:, columns].numpy()
+    allowance = Thresholds.of(sequence).reference_m
+    within = region_probability(body, mixture, columns, truth, allowance, exact=True)
+    for level in (0.5, 0.9):
+        assert (within <= level).mean() == pytest.approx(level, abs=0.05)
+
+
 def test_a_body_is_measured_alike_on_any_base() -> None:
     body = placed("body34")
     generator = torch.Generator().manual_seed(0)
@@ -222,6 +250,20 @@ def test_what_cannot_be_measured() -> None:
     measures = partly(tracked(body, states[:1]), START, 0.0)
     assert np.isnan(measures.angle_deviations).all()
     assert not measures.failed
+
+
+def test_frames_without_a_reference_count_neither_way() -> None:
+    """The second mode is the near one wherever that can be told."""
+    known = [[300.0, 300.0], [20.0, 20.0]]
+    unknown = [[np.nan] * 2] * 2
+    measures = [measure(i, known if i % 2 else unknown, overlap=math.nan) for i in range(30)]
+    measures = [m._replace(failed=bool(i % 2) or None) for i, m in enumerate(measures)]
+    row = summarise(measures, Thresholds(), 0.04)
+    assert (row["lost"], row["lost_s"], row["failed_share"]) == (True, 0.04, 1.0)
+    row = summarise([m._replace(failed=None) for m in measures], Thresholds(), 0.04)
+    assert not row["lost"]
+    assert (row["true_mode_kept"], row["best_is_nearest"]) == (1.0, 0.0)
+    assert math.isnan(row["failed_share"])
 
 
 def test_limits_of_bodies_without_roots() -> None:

@@ -385,16 +385,16 @@ def mask_overlap(
 
 
 def probability_within(
-    squared_distance: Float[ArrayLike, "*batch"], dimensions: int
+    squared_distance: Float[ArrayLike, "*batch"], dimensions: Float[ArrayLike, "*batch"]
 ) -> Float[np.ndarray, "*batch"]:
     """Probability of the smallest region of a Gaussian that holds a point: chi-square's integral.
 
     Args:
         squared_distance: Squared Mahalanobis distance of the point; NaN stays NaN.
-        dimensions: Of the Gaussian.
+        dimensions: Of the Gaussian; need not be whole.
     """
     distance = torch.as_tensor(np.asarray(squared_distance, np.float64))
-    half = torch.full_like(distance, dimensions / 2)
+    half = torch.as_tensor(np.asarray(dimensions, np.float64)).expand_as(distance) / 2
     return torch.special.gammainc(half, distance / 2).numpy()
 
 

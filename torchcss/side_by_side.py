@@ -23,7 +23,6 @@ from torchcss.hypotheses import Initialisation
 from torchcss.io.sequences import RecordedSequence
 from torchcss.io.video import Frame, VideoReader
 from torchcss.marks import typical_sigma
-from torchcss.metrics import first_loss
 from torchcss.pipeline import TrackedFrame, scale_keypoints, track_frames
 from torchcss.presets import PRESETS
 from torchcss.recovery import Recovery
@@ -35,7 +34,7 @@ from torchcss.settings import (
     make_settings_tracker,
 )
 from torchcss.vision.features import FeatureExtractor, FrameFeatures
-from torchcss.yardstick import FrameMeasures, Thresholds, Yardstick
+from torchcss.yardstick import FrameMeasures, Thresholds, Yardstick, loss
 
 
 class Start(NamedTuple):
@@ -173,7 +172,7 @@ def track_together(
             except (TorchcssError, RuntimeError, ArithmeticError) as error:
                 # The others go on: a study takes hours. The table says that this one ended.
                 ended = f"error: {type(error).__name__}: {error}"
-            if ended is None and stop_when_lost and _is_lost(run.measures, thresholds):
+            if ended is None and stop_when_lost and loss(run.measures, thresholds) is not None:
                 ended = "lost"
             if ended is None:
                 left.append((run, tracked, yardstick))
@@ -225,8 +224,3 @@ def _follow(
         recovery=Recovery() if settings.recovery else None,
         jumps_every=PRESETS[settings.preset].jumps_every,
     )
-
-
-def _is_lost(measures: Sequence[FrameMeasures], thresholds: Thresholds) -> bool:
-    failed, times = [m.failed for m in measures], [m.time_s for m in measures]
-    return first_loss(failed, times, regain_s=thresholds.regain_s) is not None

@@ -112,7 +112,7 @@ class FrameMeasures(NamedTuple):
     Attributes:
         frame: Index in the video.
         time_s: Seconds since the first frame tracked.
-        failed: Whether the best mode does not follow the body.
+        failed: Whether the best mode does not follow the body; None where nothing is known.
         weight: Weights of the modes.
         absolute_mm: Errors of the compared joints; NaN where the reference is unknown.
         root_aligned_mm: The same with the roots on each other.
@@ -133,7 +133,7 @@ class FrameMeasures(NamedTuple):
 
     frame: int
     time_s: float
-    failed: bool
+    failed: bool | None
     weight: Float[np.ndarray, " k"]
     absolute_mm: Float[np.ndarray, "k j"]
     root_aligned_mm: Float[np.ndarray, "k j"]
@@ -204,8 +204,15 @@ def region_probability(
     joints: Sequence[int],
     reference_m: Float[np.ndarray, "*k j 3"],
     deviation_m: float,
+    *,
+    exact: bool = False,
 ) -> Float[np.ndarray, "k j"]:
     """Probability of the region that a mode states for a joint and that just holds the true one.
+
+    Where the deviation is an allowance and the reference does not err by it, the squared distance
+    of a truth from the stated Gaussian is `sum w_i z_i^2`, `w_i` the shares of the stated variances
+    in the sums along their axes: the joints of an arm move on surfaces, and the third `w` is zero.
+    Its law is taken as `g chi^2_h` with that mean and variance (Satterthwaite, Biometrics 2, 1946).
 
     Args:
         body: The body.
@@ -213,23 +220,31 @@ def region_probability(
         joints: Which joint centres.
         reference_m: Where they are, metres; NaN where unknown.
         deviation_m: Standard deviation of the reference per coordinate.
+        exact: The reference has no error of its own.
     """
     pose, joints = body.pose(mixture.mean), list(joints)
     spread = joint_covariance(body, pose, mixture.covariance)[:, joints].double().cpu()
-    spread = spread + deviation_m**2 * torch.eye(3, dtype=spread.dtype)
+    allowed = deviation_m**2
+    weight = torch.ones_like(spread[..., 0])
+    if exact:
+        stated = torch.linalg.eigvalsh(spread).clamp(min=0)
+        weight = stated / (stated + allowed)
+    spread = spread + allowed * torch.eye(3, dtype=spread.dtype)
     away = torch.from_numpy(reference_m) - pose.joints[:, joints].double().cpu()
     known = away.isfinite().all(-1)
     distance = squared_mahalanobis(away.nan_to_num(), spread)
-    return probability_within(torch.where(known, distance, torch.nan).numpy(), 3)
+    mean, square = weight.sum(-1), weight.square().sum(-1)
+    distance = torch.where(known, distance * mean / square, torch.nan)
+    return probability_within(distance.numpy(), (mean.square() / square).numpy())
 
 
 def compared_joints(sequence: RecordedSequence, body: BodyModel) -> tuple[str, ...]:
-    """The joints by which tracks are judged: of limbs, or all of an arm, that are mostly in view.
+    """The joints by which tracks are judged: of limbs, or all that an arm moves, mostly in view.
 
     Raises:
         ConfigurationError: If the sequence's reference has none of them.
     """
-    wanted = LIMB_JOINTS if has_root(body) else body.joint_names
+    wanted = LIMB_JOINTS if has_root(body) else _moved_joints(body)
     reference = torch.from_numpy(sequence.joints_world)
     known = reference.isfinite().all(-1)
     uv, _, valid = sequence.camera.project(reference.nan_to_num())
@@ -246,6 +261,15 @@ def compared_joints(sequence: RecordedSequence, body: BodyModel) -> tuple[str, .
             f"{', '.join(sequence.joint_names)}"
         )
     return chosen
+
+
+def _moved_joints(body: BodyModel) -> tuple[str, ...]:
+    """Names of the joint centres that any parameter moves."""
+    pose = body.pose(body.rest)
+    variance = torch.eye(body.num_parameters).to(body.rest)
+    variance = joint_covariance(body, pose, variance).diagonal(dim1=-2, dim2=-1).sum(-1)
+    moves = variance > 1e-6  # square metres per radian: more than rounding
+    return tuple(name for name, moved in zip(body.joint_names, moves, strict=True) if moved)
 
 
 class Yardstick:
@@ -301,17 +325,23 @@ class Yardstick:
         if sequence.mask is not None:
             drawn = silhouette(body, mixture.mean[0], sequence.camera)
             overlap = float(mask_overlap(drawn, sequence.mask[number]))
-        best = body.pose(mixture.mean[0])
+        best, error = body.pose(mixture.mean[0]), _mean(aligned[0])
+        failed = error > limits.lost_mm or overlap < limits.least_overlap
         return FrameMeasures(
             frame=number,
             time_s=tracked.frame.time_s - start.time_s,
-            failed=_mean(aligned[0]) > limits.lost_mm or overlap < limits.least_overlap,
+            failed=None if math.isnan(error) and math.isnan(overlap) else failed,
             weight=mixture.weight.double().cpu().numpy(),
             absolute_mm=absolute,
             root_aligned_mm=aligned,
             procrustes_mm=procrustes_errors_mm(joints[:, :count], reference[:count]),
             within=region_probability(
-                body, mixture, self._column[:count], reference[:count], limits.reference_m
+                body,
+                mixture,
+                self._column[:count],
+                reference[:count],
+                limits.reference_m,
+                exact=sequence.truth is not None,
             ),
             angle_deviations=self._angle_deviations(tracked),
             joints_m=joints[0, :count],
@@ -376,22 +406,22 @@ def summarise(
         interval_s: Seconds between the frames.
     """
     times = [m.time_s for m in measures]
-    lost = first_loss([m.failed for m in measures], times, regain_s=thresholds.regain_s)
+    lost = loss(measures, thresholds)
     held = measures if lost is None else measures[: max(lost, 1)]
     near = [_nearest(m) for m in held]
-    several = [(m, n) for m, n in zip(held, near, strict=True) if len(m.weight) > 1]
+    told = [
+        (m, n) for m, n in zip(held, near, strict=True) if not np.isnan(m.root_aligned_mm).all()
+    ]
+    several = [(m, n) for m, n in told if len(m.weight) > 1]
     row: dict[str, Any] = {
         "num_frames": len(measures),
         "lost": lost is not None,
         "lost_s": math.nan if lost is None else times[lost],
-        "failed_share": _mean([m.failed for m in measures]),
+        "failed_share": _mean([m.failed for m in measures if m.failed is not None]),
         "num_frames_held": len(held) if lost is None else lost,
         **_errors(held),
         "true_mode_kept": _mean(
-            [
-                _mean(m.root_aligned_mm[n]) < thresholds.true_mode_mm
-                for m, n in zip(held, near, strict=True)
-            ]
+            [_mean(m.root_aligned_mm[n]) < thresholds.true_mode_mm for m, n in told]
         ),
         "true_angles_kept": math.nan
         if np.isnan(held[0].angle_deviations).all()
@@ -431,6 +461,24 @@ def summarise(
         inside = np.stack([m.within[n] for m, n in zip(held, which, strict=True)])
         row |= {f"inside_{round(100 * p)}_{name}": s for p, s in coverage(inside).items()}
     return row
+
+
+def loss(measures: Sequence[FrameMeasures], thresholds: Thresholds) -> int | None:
+    """The frame in which a run was lost for good, see `first_loss`; None if it never was.
+
+    A frame of which nothing is known ends no stretch of failures and begins none.
+
+    Args:
+        measures: The frames of a run.
+        thresholds: How long failing has to last.
+    """
+    known = [index for index, m in enumerate(measures) if m.failed is not None]
+    first = first_loss(
+        [bool(measures[index].failed) for index in known],
+        [measures[index].time_s for index in known],
+        regain_s=thresholds.regain_s,
+    )
+    return None if first is None else known[first]
 
 
 def _nearest(measures: FrameMeasures) -> int:
