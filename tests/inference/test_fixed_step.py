@@ -135,6 +135,25 @@ def test_refilled_places_begin_anew(generator: torch.Generator) -> None:
     torch.testing.assert_close(mixed.x[fresh], new[fresh])
 
 
+def test_a_refilled_place_forgets_its_last_item() -> None:
+    """A start at which the cost is not finite stays, whoever was there before."""
+
+    class Walled(Bowl):
+        def local_model(self, x: Tensor) -> LocalModel:
+            model = super().local_model(x)
+            return model._replace(value=torch.where(x[:, 0] > 5, math.nan, model.value))
+
+    cost = Walled(2 * torch.eye(2, dtype=REAL), torch.zeros(2, dtype=REAL))
+    new = torch.tensor([[6.0, 4.0]], dtype=REAL)
+    before, _ = fixed_step(cost, start(torch.tensor([[3.0, 4.0]], dtype=REAL)), box(2))
+    state, begun = refill(before, torch.tensor([True]), new), start(new)
+    for part, anew in zip(state.model, begun.model, strict=True):
+        torch.testing.assert_close(part, anew)
+    state = iterate(cost, state, box(2), 3)
+    assert torch.equal(state.x, new)
+    assert float(state.model.value) == math.inf
+
+
 @pytest.mark.parametrize("scale", [2.0, torch.tensor(2.0, dtype=REAL)])
 def test_draws_have_the_scaled_covariance(
     scale: float | Tensor, generator: torch.Generator

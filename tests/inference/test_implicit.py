@@ -134,6 +134,22 @@ def test_flat_and_downward_directions_move_nothing() -> None:
     torch.testing.assert_close(weights.grad, torch.tensor([-0.5, 0.5]).double())
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_rounding_is_no_curvature(generator: torch.Generator, dtype: torch.dtype) -> None:
+    """Of a Hessian of rank 2, whose flat directions have curvatures of rounding alone."""
+    root = torch.randn(2, 6, generator=generator, dtype=torch.float64)
+    gradients = torch.randn(3, 6, generator=generator, dtype=torch.float64)
+    weights = torch.ones(3, dtype=dtype, requires_grad=True)
+    hessian, held = (root.mT @ root).to(dtype), torch.zeros(6, dtype=torch.bool)
+    x = differentiable_minimum(
+        torch.zeros(6, dtype=dtype), hessian, gradients.to(dtype), held, weights
+    )
+    x.sum().backward()
+    assert weights.grad is not None
+    expected = -gradients @ torch.linalg.pinv(root.mT @ root, rtol=1e-9).sum(-1)
+    torch.testing.assert_close(weights.grad, expected.to(dtype), rtol=1e-3, atol=1e-4)
+
+
 def test_weights_are_positive_and_named() -> None:
     weights = TermWeights(("flow", "contour"), {"flow": 3.0})
     assert weights.factors() == pytest.approx({"flow": 3.0, "contour": 1.0})

@@ -14,7 +14,7 @@ from torchcss.inference.minima import (
 from torchcss.inference.mixture import distinct_modes
 from torchcss.inference.proposals import CovarianceScaled
 from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.types import Modes, Status
+from torchcss.types import LocalModel, Modes, Status
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import problems
@@ -97,6 +97,28 @@ def test_saddles_slopes_and_failures_are_no_minima():
     ]  # fmt: skip
     stopped = modes._replace(status=torch.full_like(modes.status, int(Status.STEP_LIMIT)))
     assert not bool(is_minimum(stopped, well, FREE).all.any())
+
+
+def test_an_end_that_is_not_finite_is_tested_beside_the_others():
+    """The cost is not finite in the middle of the box either, where such ends are moved."""
+
+    class HalfSpace(problems.Bowl):
+        def local_model(self, x):
+            nowhere = torch.where(x[..., 0] < 0.5, torch.nan, 0.0)
+            value, gradient, hessian = super().local_model(x)
+            return LocalModel(
+                value + nowhere, gradient + nowhere[..., None], hessian + nowhere[..., None, None]
+            )
+
+    # Eigenvalues of smaller matrices do not raise.
+    bowl, bounds = HalfSpace(torch.eye(3), torch.ones(3)), problems.box(3, -5, 5)
+    x = torch.tensor([[1.5, 0.2, 0.0], [-1.0, 0.0, 0.0]]).double()
+    modes = TrustRegionNewton().minimise(bowl, x, bounds)
+    assert modes.status.tolist() == [Status.CONVERGED, Status.NON_FINITE]
+    tests = is_minimum(modes, bowl, bounds)
+    assert tests.all.tolist() == tests.upward.tolist() == [True, False]
+    claimed = modes._replace(status=torch.full_like(modes.status, int(Status.CONVERGED)))
+    assert is_minimum(claimed, bowl, bounds).all.tolist() == [True, False]
 
 
 def test_a_held_variable_may_curve_downwards():

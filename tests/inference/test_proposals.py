@@ -1,3 +1,4 @@
+import itertools
 import math
 import sys
 from pathlib import Path
@@ -24,6 +25,7 @@ from torchcss.inference.proposals import (
     Spherical,
     project_in_metric,
 )
+from torchcss.types import Bounds
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import problems
@@ -221,6 +223,39 @@ def test_projection_in_the_metric_is_the_nearest_admissible_state(generator):
     assert max(excess) < 1 + 1e-4
 
 
+def nearest_admissible(x, covariance, lower, upper):
+    """The best of all ways to hold parameters at their bounds."""
+    information = torch.linalg.inv(covariance)
+    least, best = torch.full_like(x[:, 0], torch.inf), x
+    for pattern in itertools.product((-1, 0, 1), repeat=x.shape[-1]):
+        at = torch.tensor(pattern)
+        free = at == 0
+        y = torch.where(free, x, torch.where(at < 0, lower, upper))
+        pull = (information @ (y - x)[..., None])[:, free]
+        y[:, free] -= torch.linalg.solve(information[:, free][..., free], pull)[..., 0]
+        distance = ((y - x) * (information @ (y - x)[..., None])[..., 0]).sum(-1)
+        outside = ((y < lower - 1e-9) | (y > upper + 1e-9)).any(-1)
+        better = ~outside & (distance < least)
+        least, best = torch.where(better, distance, least), torch.where(better[:, None], y, best)
+    return best
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("pinned", [[], [0, 2], [1], [0, 1, 2, 3]])
+def test_projection_is_the_best_of_all_ways_to_hold_parameters(pinned, dtype, generator):
+    """With equal bounds too, and bounds in float64 for states in float32."""
+    root = torch.randn(60, 4, 4, generator=generator, dtype=torch.float64)
+    covariance = root @ root.mT + 0.05 * torch.eye(4).double()
+    x = 3 * torch.randn(60, 4, generator=generator, dtype=torch.float64)
+    lower, upper = torch.rand(2, 4, generator=generator, dtype=torch.float64)
+    lower = -lower
+    lower[pinned] = upper[pinned]
+    got = project_in_metric(x.to(dtype), covariance.to(dtype), Bounds(lower, upper))
+    assert got.dtype == dtype
+    expected = nearest_admissible(x, covariance, lower, upper).to(dtype)
+    torch.testing.assert_close(got, expected, rtol=0, atol=1e-3 if dtype == torch.float32 else 1e-9)
+
+
 def test_projection_of_certain_parameters_moves_them_alone():
     singular = torch.diag(torch.tensor([1.0, 0.0]).double())[None]
     x = torch.tensor([[5.0, 7.0]]).double()
@@ -285,6 +320,38 @@ def test_a_cluster_does_not_take_all_samples_piecewise(generator):
         far[piecewise] = float((samples.parent == 9).double().mean())
     assert far[False] == pytest.approx(0.1, abs=5 * (0.1 * 0.9 / 4000) ** 0.5)
     assert far[True] == pytest.approx(0.5, abs=5 * 0.5 / 4000**0.5)
+
+
+@pytest.mark.parametrize("stratified", [False, True])
+def test_pieces_of_equal_mass_get_equal_shares(stratified, generator):
+    """Many draws are rejected, and what is left of the last round is cut off."""
+    equal = GaussianMixture(
+        torch.tensor([[0.0], [1.0]]).double(),
+        torch.ones(2, 1, 1).double(),
+        torch.zeros(2).double(),
+    )
+    proposal = ChamRehg(deviation=0.0, include_modes=False, stratified=stratified)
+    samples = proposal.sample(equal, 4000, problems.unbounded(1), generator=generator)
+    assert len(samples.x) == 4000
+    assert float(samples.parent.double().mean()) == pytest.approx(0.5, abs=5 * 0.5 / 4000**0.5)
+
+
+def test_members_project_their_samples_as_they_do_alone():
+    bounds = problems.box(2, -2.2, 7.0)
+    far = HeavyTailed(covariance_scale=2, include_modes=False)
+    got = {}
+    for correlated in (False, True):
+        near = CovarianceScaled(covariance_scale=4, correlated_projection=correlated)
+        members = MixtureOfProposals(proposals=(near, far))
+        again = torch.Generator().manual_seed(3)
+        alone = [member.sample(TWO, 20, bounds, generator=again) for member in (near, far)]
+        for proposal in (MixtureOfProposals(proposals=(members,)), members):
+            source = torch.Generator().manual_seed(3)
+            got[correlated] = proposal.sample(TWO, 40, bounds, generator=source)
+            assert torch.equal(got[correlated].x, torch.cat([part.x for part in alone]))
+    assert not torch.equal(got[True].x, got[False].x)
+    # Weights are those of where samples were drawn, wherever they are moved.
+    torch.testing.assert_close(got[True].log_weight, got[False].log_weight, rtol=0, atol=0)
 
 
 @settings(max_examples=30, deadline=None)

@@ -302,6 +302,18 @@ def test_equal_bounds_hold_frames(shape: tuple[int, ...]):
     assert not bool(found.active[2:5].any())
 
 
+def test_a_frame_held_by_equal_bounds_leaves_the_others_their_covariances():
+    t, n = 6, 3
+    evidence, start, motion = gaussian(t, n), draw(t, n, seed=9), Transition(velocity=9.0)
+    bounds = Bounds(*(torch.full((t, n), end, dtype=torch.float64) for end in (-8.0, 8.0)))
+    free = refine(evidence, start, uneven_times(t), motion, bounds)
+    bounds.lower[0] = bounds.upper[0] = start[0]
+    held = refine(evidence, start, uneven_times(t), motion, bounds)
+    far = slice(3, None)  # the frames next to it know where it is
+    torch.testing.assert_close(held.covariance[far], free.covariance[far], rtol=0.05, atol=1e-3)
+    torch.testing.assert_close(held.covariance[0], 16 * torch.eye(n).double())
+
+
 class Wells:
     """A cost per frame with many minima and saddles, whose Hessian is often indefinite."""
 

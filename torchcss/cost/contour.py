@@ -69,8 +69,8 @@ class ContourTerm:
     Attributes:
         sigma: Scale of the distance between model and image contour, pixels.
         nu: Level of the outliers of one node (its unit only: the sum is normalised by N nu).
-        window: Half length of the search line, pixels. With four sigmas and the Lorentzian, a
-            node without a match costs 1.4 nu.
+        window: Half length of the search line, pixels. Of 4.8 sigmas, as here, a node without a
+            match costs 1.6 nu with the Lorentzian.
         step: Distance between samples of the search line, pixels.
         fitted_level: Cost of a node where there is no contour, as a share of nu: the mean error per
             node of a fitted model: 0.5 to 0.8 on the demo, whose surface is the model's own, 0.9 on

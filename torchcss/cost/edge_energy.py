@@ -1,6 +1,6 @@
 """Edge-energy term: the robustified, normalised edge energy itself, without extracted features.
 
-Section 3.1 [IJRR] uses "direct image-based cost metrics such as robustified normalized edge energy"
+Section 2 [IJRR] uses "direct image-based cost metrics such as robustified normalized edge energy"
 beside the extracted features of eq. 8. The edge energy at the projection r of a contour node is a
 number E(r) in [0, 1], 1 on a perfect outline. What it lacks, s = 1 - E(r), grows with the square of
 the distance from an edge, and takes the place of the squared error:

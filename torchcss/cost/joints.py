@@ -4,7 +4,8 @@ For every joint centre that the detector names too, the cost is `1/2 rho(w |r_ba
 (eq. 5 and 8 [IJRR] with one assignment per node), `w` the keypoint's confidence times the inverse
 square of the joint's own spread: detectors place hips and toes less exactly than wrists. A joint
 without keypoint is constant zero; a joint that the camera cannot see (behind it) costs as much as
-one that is `OUTLIER_LENGTHS` scales away, so that no pose escapes by leaving the view.
+one that is `OUTLIER_LENGTHS` scales away: more than any that is well placed, though not more than
+one that lies farther off, since the Lorentzian grows without end.
 """
 
 from __future__ import annotations

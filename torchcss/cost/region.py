@@ -1,8 +1,9 @@
 """Region term: just inside its contour the image looks like the part, just outside it does not.
 
-Beside edges, which clutter has too, section 8 [IJRR] proposes statistics of foreground and
-background. The likeness L of a part (`torchcss.vision.appearance`), in -1..1, is looked up a few
-pixels to either side of every contour node r, along its outward normal m in the image:
+Clutter has edges too, and hidden limbs attach to them (section 8 [IJRR], which therefore weighs
+contours by foreground and background). Here colours are a term of their own. The likeness L of a
+part (`torchcss.vision.appearance`), in -1..1, is looked up a few pixels to either side of every
+contour node r, along its outward normal m in the image:
 
     e(r) = nu / 2 (1 - (L(r - d m) - L(r + d m)) / 2)
 

@@ -106,7 +106,12 @@ def refill(
     rows = fresh[:, None]
     return FixedStepState(
         x=torch.where(rows, x, state.x),
-        model=state.model._replace(value=torch.where(fresh, torch.inf, state.model.value)),
+        # A start that is not finite keeps these derivatives; those of the last item would move it.
+        model=LocalModel(
+            torch.where(fresh, torch.inf, state.model.value),
+            torch.where(rows, 0.0, state.model.gradient),
+            torch.where(rows[..., None], 0.0, state.model.hessian),
+        ),
         damping=torch.where(fresh, damping, state.damping),
         step=torch.where(rows, 0.0, state.step),
         predicted=torch.where(fresh, 0.0, state.predicted),

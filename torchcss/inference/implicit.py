@@ -165,7 +165,9 @@ class _Minimum(torch.autograd.Function):
         own = symmetric_part(hessian) * free[..., None] * free[..., None, :]
         value, direction = torch.linalg.eigh(own)
         # Held variables are directions of no curvature here, as are those of no minimum.
-        least = value.abs().amax(-1, keepdim=True) * _FLAT
+        # What eigenvalues are known to is no curvature: float32 resolves far less than `_FLAT`.
+        rounding = 8 * value.shape[-1] * torch.finfo(value.dtype).eps
+        least = value.abs().amax(-1, keepdim=True) * max(_FLAT, rounding)
         inverse = torch.where(value > least, 1.0 / value.clamp(min=least), 0.0)
         along = (direction.mT @ (free * outputs[0])[..., None])[..., 0]
         moved = (direction @ (inverse * along)[..., None])[..., 0] * free
@@ -174,4 +176,4 @@ class _Minimum(torch.autograd.Function):
 
 
 _FLAT = 1e-12
-"""Curvature relative to the largest below which a direction counts as flat."""
+"""Curvature relative to the largest below which a direction counts as flat, rounding aside."""

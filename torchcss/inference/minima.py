@@ -38,7 +38,8 @@ class MinimumTests(NamedTuple):
     Attributes:
         converged: The optimiser says so.
         inside: It satisfies the bounds.
-        upward: No negative curvature on the variables that no bound holds, to within rounding.
+        upward: No negative curvature on the variables that no bound holds, to within rounding;
+            False where the curvature is not finite.
     """
 
     converged: Bool[Tensor, "*batch"]
@@ -63,7 +64,10 @@ def is_minimum(modes: Modes, cost: CostFunction, bounds: Bounds) -> MinimumTests
     inside = ((x >= bounds.lower.to(x)) & (x <= bounds.upper.to(x))).all(-1)
     finite = modes.status != Status.NON_FINITE
     safe = torch.where(finite[..., None], x, bounds.project(torch.zeros_like(x)))
-    hessian = mask_free(cost.local_model(safe).hessian.detach(), ~modes.active.bool())
+    hessian = cost.local_model(safe).hessian.detach()
+    # `eigvalsh` raises for all items if one is not finite: such a one is tested as the identity.
+    finite = finite & hessian.flatten(-2).isfinite().all(-1)
+    hessian = mask_free(hessian, ~modes.active.bool() & finite[..., None])
     # In units in which every curvature is one at most: rounding is then the same for all.
     size = hessian.diagonal(dim1=-2, dim2=-1).abs().clamp(min=torch.finfo(x.dtype).tiny).sqrt()
     least = torch.linalg.eigvalsh(hessian / size[..., :, None] / size[..., None, :])[..., 0]

@@ -163,8 +163,11 @@ def project_in_metric(
         x: Any states.
         covariance: Positive semi-definite. Where it leaves parameters no choice, they are moved
             each for itself.
-        bounds: The box.
+        bounds: The box; equal bounds hold a parameter on one plane.
     """
+    # What is held is compared with its bound, so that the two must be rounded alike.
+    bounds = Bounds(bounds.lower.to(x), bounds.upper.to(x))
+    pinned = bounds.lower == bounds.upper
     scale = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=torch.finfo(x.dtype).tiny).sqrt()
     correlation = covariance / scale[:, :, None] / scale[:, None, :]
     target, held, moved = bounds.project(x), torch.zeros_like(x, dtype=torch.bool), x.clone()
@@ -191,8 +194,9 @@ def project_in_metric(
         shift = torch.where(some, gap, scale[items] * (part @ pull[..., None])[..., 0])
         sound = (failed == 0)[:, None] & shift.isfinite()
         moved[items] = x[items] + torch.where(sound, shift, gap)
-        # A bound may pull inwards only: downwards from an upper one, upwards from a lower one.
-        inwards = torch.where(target[items] >= bounds.upper, pull <= 0, pull >= 0)
+        # A bound may pull inwards only: downwards from an upper one, upwards from a lower one. One
+        # that is both may pull either way.
+        inwards = torch.where(target[items] >= bounds.upper, pull <= 0, pull >= 0) | pinned
         change[items] = torch.where(some, ~inwards, bounds.project(moved[items]) != moved[items])
     return bounds.project(moved)
 
@@ -224,8 +228,13 @@ class _Law(NamedTuple):
             return self._draw(num, stratified, generator)
         parts, found = [], 0
         for _ in range(_ROUNDS):
-            parts.append(self._take_own(self._draw(num, stratified, generator)))
-            found += len(parts[-1].x)
+            own = self._take_own(self._draw(num, stratified, generator))
+            if stratified and found + len(own.x) > num:
+                # These are in the order of the components: a cut would take the first ones' alone.
+                order = torch.randperm(len(own.x), generator=generator, device=generator.device)
+                own = MixtureSamples(*(field[order.to(field.device)] for field in own))
+            parts.append(own)
+            found += len(own.x)
             if found >= num:
                 break
         else:
@@ -280,8 +289,25 @@ class _Law(NamedTuple):
         return peak - 0.5 * (degrees + n) * tail + log_weight
 
 
+class _Projecting(ABC):
+    """A proposal with a rule of its own by which samples are moved onto the bounds."""
+
+    @abstractmethod
+    def draw(
+        self, mixture: GaussianMixture, num: int, bounds: Bounds, *, generator: torch.Generator
+    ) -> tuple[Samples, Float[Tensor, "s n"]]:
+        """Draw samples: as they were drawn, and their admissible states."""
+
+    def sample(
+        self, mixture: GaussianMixture, num: int, bounds: Bounds, *, generator: torch.Generator
+    ) -> Samples:
+        """Draw samples, projected onto the bounds."""
+        samples, admissible = self.draw(mixture, num, bounds, generator=generator)
+        return samples._replace(x=admissible)
+
+
 @dataclass(frozen=True, kw_only=True)
-class _RandomProposal(ABC):
+class _RandomProposal(_Projecting):
     """A proposal that draws independent samples from a law made of the mixture's modes.
 
     Attributes:
@@ -306,10 +332,10 @@ class _RandomProposal(ABC):
         """Log-density of what is drawn at random, before projection."""
         return self.law(mixture).log_density(x)
 
-    def sample(
+    def draw(
         self, mixture: GaussianMixture, num: int, bounds: Bounds, *, generator: torch.Generator
-    ) -> Samples:
-        """Draw samples, projected onto the bounds; the modes themselves first, the best of all."""
+    ) -> tuple[Samples, Float[Tensor, "s n"]]:
+        """Draw samples, the modes themselves first, the best of all; and project them."""
         law = self.law(mixture)
         own = mixture.log_weight[:0].long()
         if self.include_modes:
@@ -319,15 +345,16 @@ class _RandomProposal(ABC):
             log_weight = torch.zeros_like(x[:, 0])
         else:
             log_weight = mixture.log_density(x) - law.log_density(x)
+        samples = Samples(
+            torch.cat([mixture.mean[own], x]),
+            torch.cat([own, component]),
+            torch.cat([torch.full_like(mixture.mean[own, 0], -math.inf), log_weight]),
+        )
         if self.correlated_projection:
             parts = zip(x.split(_STATES_AT_ONCE), component.split(_STATES_AT_ONCE), strict=True)
             shapes = law.mixture.covariance
             x = torch.cat([project_in_metric(part, shapes[of], bounds) for part, of in parts])
-        return Samples(
-            bounds.project(torch.cat([mixture.mean[own], x])),
-            torch.cat([own, component]),
-            torch.cat([torch.full_like(mixture.mean[own, 0], -math.inf), log_weight]),
-        )
+        return samples, bounds.project(torch.cat([mixture.mean[own], x]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -567,12 +594,14 @@ class EigenDirectionGrid:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MixtureOfProposals:
+class MixtureOfProposals(_Projecting):
     """Several proposals in fixed shares: local and far samples, random and regular ones.
 
     Every random sample is weighed by the density of all members together, each by the number of
     samples that it drew, whichever of them drew this one: a member that is close to the prior then
-    bounds all the weights. Give `include_modes` to the first member only.
+    bounds all the weights. Members of this module project their samples as they do alone
+    (`correlated_projection`); those of a `Proposal` from elsewhere are projected each parameter for
+    itself. Give `include_modes` to the first member only.
 
     Attributes:
         proposals: The members.
@@ -626,17 +655,22 @@ class MixtureOfProposals:
         part = torch.tensor(random_shares, dtype=x.dtype, device=x.device)
         return (torch.stack(densities, -1) + (part / part.sum()).log()).logsumexp(-1)
 
-    def sample(
+    def draw(
         self, mixture: GaussianMixture, num: int, bounds: Bounds, *, generator: torch.Generator
-    ) -> Samples:
-        """Draw from the members one after another, and project onto the bounds."""
-        free = unbounded(mixture.mean)
-        drawn = [
-            proposal.sample(mixture, count, free, generator=generator)
-            for proposal, count in zip(self.proposals, self._counts(num), strict=True)
-        ]
+    ) -> tuple[Samples, Float[Tensor, "s n"]]:
+        """Draw from the members one after another; each projects its own."""
+        free, drawn, admissible = unbounded(mixture.mean), [], []
+        for proposal, count in zip(self.proposals, self._counts(num), strict=True):
+            if isinstance(proposal, _Projecting):
+                samples, inside = proposal.draw(mixture, count, bounds, generator=generator)
+            else:
+                samples = proposal.sample(mixture, count, free, generator=generator)
+                inside = bounds.project(samples.x)
+            drawn.append(samples)
+            admissible.append(inside)
         x, parent, log_weight = (torch.cat(field) for field in zip(*drawn, strict=True))
         random = log_weight > -math.inf
         counts = [int((part.log_weight > -math.inf).sum()) for part in drawn]
         joint = mixture.log_density(x) - self._joint_log_density(mixture, x, counts)
-        return Samples(bounds.project(x), parent, torch.where(random, joint, -math.inf))
+        samples = Samples(x, parent, torch.where(random, joint, -math.inf))
+        return samples, torch.cat(admissible)

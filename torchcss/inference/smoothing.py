@@ -266,7 +266,8 @@ def refine(
         scale: Length of each parameter that damping counts as one; ones by default.
         prior_variance: Variance of each parameter before any image is seen: of variables that a
             bound holds (design decision 9), and a weak prior on the others in the covariances,
-            not in the means. By default `default_prior_variance(bounds)`.
+            not in the means. By default `default_prior_variance` of the least box that holds those
+            of all frames.
         max_steps: Iterations, each one evaluation of all frames.
         tolerance: Expected decrease of the sum, nats, below which it is done.
 
@@ -496,8 +497,8 @@ def _refined(
 ) -> Refined:
     """The result, in the type that came in."""
     if prior_variance is None:
-        within = Bounds(limits.lower.amax(0), limits.upper.amin(0))
-        prior_variance = default_prior_variance(within)
+        # The box that holds those of all frames: a frame that is held says nothing of the others.
+        prior_variance = default_prior_variance(Bounds(limits.lower.amin(0), limits.upper.amax(0)))
     active = held_by(x, chain.gradient, limits)
     return Refined(
         mean=x.to(like),

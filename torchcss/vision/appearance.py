@@ -1,8 +1,9 @@
 """Colours of things and of what surrounds them, and how much a pixel looks like either.
 
-[IJRR] section 8 names foreground and background statistics as a likelihood worth adding. Here the
-colours of each thing (a layer) and of its surroundings are histograms, learned from frames in which
-it is known where the thing is, and forgotten by degrees. For a pixel of colour c,
+Section 8 [IJRR] weighs contours by a segmentation into foreground and background, and expects more
+of what looks at the person as a whole. Here the colours of each thing (a layer) and of its
+surroundings are histograms, learned from frames in which it is known where the thing is, and
+forgotten by degrees. For a pixel of colour c,
 
     likeness = tanh(1/2 log p(c | thing) / p(c | surroundings)) = P(thing | c) - P(surroundings | c)
 
