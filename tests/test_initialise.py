@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,8 +13,9 @@ import torch
 import torchcss
 from torchcss.body.catalog import LENGTHS
 from torchcss.body.model import load_body
-from torchcss.cost.joints import JointTerm
+from torchcss.cost.joints import JointObservation, JointTerm
 from torchcss.cost.silhouette import part_map
+from torchcss.cost.view import View
 from torchcss.errors import BodyError, CameraError, ConfigurationError, KeypointError
 from torchcss.first_pose import initialise_from_joints
 from torchcss.hypotheses import Initialisation, hang_on_best, stature_of
@@ -23,6 +26,7 @@ from torchcss.metrics import LIMB_JOINTS, mask_overlap, pa_mpjpe_mm
 from torchcss.random_person import Person, coverage, random_person
 from torchcss.raster import Mesh, clutter_background, grid_faces, render_meshes
 from torchcss.types import Modes
+from torchcss.vision.camera import Camera
 
 SMALL = Search(num_starts=16, num_trunks=2, num_flips=16, num_samples=4)
 
@@ -211,6 +215,30 @@ def _in_squares(someone: Person) -> list[Mesh]:
             mesh.normals.flatten(1, 2), strict=True,
         )
     ]  # fmt: skip
+
+
+def test_marks_keep_their_place_in_a_picture_whose_sides_are_rounded(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """Sides of 303 and 1000 pixels become 19 and 64: each has a factor of its own."""
+    module = import_module("torchcss.initialise")
+    monkeypatch.setattr(module, "_with_contours", lambda first, cost, *_: cost)
+    camera = Camera.pinhole(303, 1000, focal_px=600.0)
+    body = load_body("arm7").with_base(
+        torch.diag(torch.tensor([1.0, -1.0, -1.0])), torch.tensor([0.0, 0.0, 3.0])
+    )
+    uv = camera.project(body.pose(body.rest).joints).uv
+    known = torch.ones(len(uv)).double()
+    observed = JointObservation(body.joint_names, uv, known, body.joint_names)
+    cost: Any = initialise(
+        np.zeros((1000, 303, 3), np.uint8), uv, camera, "arm7", working_size=64,
+        joint_names=body.joint_names, generator=torch.Generator().manual_seed(0),
+        search=SINGLE_START, others=[View(camera=camera, observation=observed)],
+    )  # fmt: skip
+    for view in cost.views:
+        assert view.camera.image_size_wh == (19, 64)
+        place, expected = view.camera.undistort(view.observation.target), camera.undistort(uv)
+        torch.testing.assert_close(place[0], expected[0][view.observation.index])
 
 
 def test_few_joints_leave_the_prior_and_say_so():

@@ -149,7 +149,8 @@ def initialise(
     extractor = FeatureExtractor(working_size=working_size, colour=colours)
     features = extractor.to(device=device)(image)
     working = extractor.working_camera(camera)
-    factor = working.image_size_wh[0] / camera.image_size_wh[0]
+    # Of the longer side, which is not rounded: the shorter one has a factor of its own.
+    factor = max(working.image_size_wh) / max(camera.image_size_wh)
     choice = CostChoice(
         region=RegionTerm() if colours else None,
         contour_weight=_BESIDE_COLOURS if colours else CostChoice.contour_weight,
@@ -157,16 +158,18 @@ def initialise(
         temporal=None,
         anthropometric=Anthropometric() if stature is None else Anthropometric(stature=0.0),
     )
+    observation = JointObservation(
+        first.body.joint_names,
+        keypoints.to(first.body.tie),
+        (kept * confidence).to(first.body.tie),
+        names,
+    )
+    marked = View(camera=camera, observation=observation).of_keypoints(factor)
     costs = FrameCosts(first.body, working, choice)
     cost = costs(
         features,
         body=first.body,
-        observation=JointObservation(
-            first.body.joint_names,
-            factor * (keypoints.to(first.body.tie) + 0.5) - 0.5,
-            (kept * confidence).to(first.body.tie),
-            names,
-        ),
+        observation=marked.observation,
         appearance=costs.learn(None, features, first.body, first.mixture.mean[0]),
     )
     cost = replace(cost, others=tuple(view.of_keypoints(factor) for view in others))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 import torch
@@ -133,6 +134,32 @@ def test_scale_scales_everything(name: str, generator: torch.Generator) -> None:
     torch.testing.assert_close(large.upper, small.upper * factor)
     torch.testing.assert_close(large.sticky_mean, small.sticky_mean * factor)
     torch.testing.assert_close(large.sticky_deviation, small.sticky_deviation * factor)
+
+
+@pytest.mark.parametrize("driver", ["prismatic", "revolute"])
+@pytest.mark.parametrize("follower", ["prismatic", "revolute"])
+def test_scale_scales_what_follows_another_joint(
+    tmp_path: Path, driver: str, follower: str
+) -> None:
+    """Metres per radian, radians per metre, and where the follower is while the driver is zero."""
+    path = tmp_path / "robot.urdf"
+    path.write_text(
+        "<robot name='r'><link name='a'/><link name='b'/><link name='c'/><link name='d'/>"
+        f"<joint name='drive' type='{driver}'><parent link='a'/><child link='b'/>"
+        "<axis xyz='0 1 0'/><limit lower='-0.3' upper='0.3'/></joint>"
+        f"<joint name='follow' type='{follower}'><parent link='b'/><child link='c'/>"
+        "<origin xyz='0 0.1 0.4'/><axis xyz='1 0 0'/><limit lower='-1' upper='0.15'/>"
+        "<mimic joint='drive' multiplier='0.5' offset='0.1'/></joint>"
+        "<joint name='end' type='fixed'><parent link='c'/><child link='d'/>"
+        "<origin xyz='0 0 0.3'/></joint></robot>"
+    )
+    small, large = load_body(path), load_body(path, scale=2.0)
+    unit = 2.0 if driver == "prismatic" else 1.0
+    x = torch.tensor([[-0.2], [0.0], [0.1]], dtype=torch.float64)
+    torch.testing.assert_close(large.pose(unit * x).joints, 2 * small.pose(x).joints)
+    assert (float(small.lower), float(small.upper)) == pytest.approx((-0.3, 0.1))
+    torch.testing.assert_close(large.lower, unit * small.lower)
+    torch.testing.assert_close(large.upper, unit * small.upper)
 
 
 def test_proportions_stay_within_their_interval_of_the_standard() -> None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import copy
 import pickle
+from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 
-from torchcss.body.catalog import BODY_NAMES
+from torchcss.body.catalog import BODY_NAMES, specification
 from torchcss.body.model import BodyModel, differentiate_twice, load_body
 from torchcss.errors import BodyError, ShapeError
 
@@ -169,6 +170,14 @@ def test_bodies_can_be_copied_and_pickled(generator: torch.Generator) -> None:
 def test_bad_requests_are_refused(arguments: dict, message: str) -> None:
     with pytest.raises(BodyError, match=message):
         load_body(**arguments)
+
+
+def test_parts_have_names_of_their_own() -> None:
+    """Neighbours go by name."""
+    body = specification("arm7")
+    twice = replace(body, parts=(*body.parts, body.parts[0]))
+    with pytest.raises(BodyError, match=f"part names.*unique; repeated: {body.parts[0].name}$"):
+        BodyModel(twice)
 
 
 def test_differentiate_twice_of_functions_that_do_not_bend() -> None:

@@ -387,6 +387,18 @@ def test_primitives_of_a_urdf(tmp_path: Path) -> None:
     assert load_body(write(tmp_path / "a.xml", text)).state_names == ("j",)
 
 
+def test_solids_of_a_urdf_have_names_of_their_own(tmp_path: Path) -> None:
+    """The second solid of a link may not take the name of another link, wherever that stands."""
+    solid = "<visual><geometry><sphere radius='.05'/></geometry></visual>"
+    text = f"""<robot name="r"><link name="arm">{3 * solid}</link><link name="arm_2">{2 * solid}
+      </link><link name="arm_4"/><joint name="j" type="revolute"><parent link="arm"/>
+      <child link="arm_2"/><origin xyz="0 0 .5"/></joint><joint name="k" type="fixed">
+      <parent link="arm_2"/><child link="arm_4"/><origin xyz="0 0 .5"/></joint></robot>"""
+    body = load_body(write(tmp_path / "a.urdf", text))
+    assert body.part_names == ("arm", "arm_3", "arm_5", "arm_2", "arm_2_2")
+    assert ("arm", "arm_3") in body.neighbours
+
+
 def test_bones_hold_what_they_join() -> None:
     """A part along every bone, on the bone, on the link that carries it; a trunk between limbs."""
 
@@ -464,6 +476,7 @@ def test_solids_have_their_length_girth_and_volume(kind: str, size: tuple[float,
         ("a.xml", MJCF.replace("XYZ", "XYW"), "compiler: expected eulerseq"),
         ("a.xml", MJCF.replace("childclass=\"big\"", 'childclass="small"'), "a default class"),
         ("a.xml", MJCF.replace('size=".1 .05 .02"', 'size=".1 0 .02"'), "'arm': expected 3 pos"),
+        ("a.xml", MJCF.replace(' size=".05 .1"', ""), "'trunk': expected 2 positive numbers as si"),
         ("a.xml", MJCF.replace('type="box"', 'type="cone"', 1), "'arm': expected type sphere"),
         ("a.xml", MJCF.replace('name="slide"', 'name="turn"'), "a.xml: joint names must be unique"),
         ("a.xml", MJCF.replace("frame", "replicate"), "needs MuJoCo's compiler"),

@@ -286,6 +286,31 @@ def test_nodes_out_of_sight_at_the_parent_have_no_target(generator: torch.Genera
     assert (patchy.weight <= seen.weight + 1e-12).all()
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_unknown_flow_does_not_shorten_that_beside_it(
+    dtype: torch.dtype, generator: torch.Generator
+) -> None:
+    """A shift that is the same everywhere is that at the border of what is unknown too."""
+    body, camera = make_body(dtype), make_camera().to(dtype)
+    nodes = InteriorNodes(body)
+    x = random_poses(body, 2, 2, generator=generator)
+    shift = torch.tensor([20.0, -7.0], dtype=dtype)
+    flow = shift[:, None, None].repeat(1, HEIGHT, WIDTH)
+    flow[:, :, ::3] = math.inf
+    flow[:, ::4] = math.nan
+    flow[:, 10:20, 20:40] = 1e10
+    targets = flow_targets(nodes, body, x, camera, flow)
+    uv, known = camera.project(nodes(body, body.pose(x)).points).uv, targets.weight > 0
+    moved = targets.uv - uv
+    torch.testing.assert_close(
+        moved[known], shift.expand_as(moved[known]), rtol=0.0, atol=2e3 * torch.finfo(dtype).eps
+    )
+    assert 0 < float(targets.weight[known].min()) < 0.5 < float(targets.weight.max())
+    nothing = flow_targets(nodes, body, x, camera, torch.full_like(flow, math.inf))
+    assert torch.equal(nothing.uv, uv)
+    assert not nothing.weight.any()
+
+
 @pytest.mark.parametrize("sweep", ["turn", "leave", "approach"])
 def test_the_cost_is_continuous_where_nodes_come_and_go(
     sweep: str, generator: torch.Generator

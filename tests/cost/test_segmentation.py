@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
 from torch import Tensor
 
 from torchcss.body.model import BodyModel, load_body
+from torchcss.cost.flow import FlowTerm
 from torchcss.cost.frame import FrameCosts
-from torchcss.cost.region import part_layers
+from torchcss.cost.region import RegionTerm, part_layers
 from torchcss.cost.segmentation import SegmentationImages, SegmentationTerm
 from torchcss.cost.silhouette import part_map
 from torchcss.cost.total import CostChoice, TrackingCost
@@ -18,6 +21,7 @@ from torchcss.inference.tracker import Tracker
 from torchcss.types import Bounds, LocalModel
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor
+from torchcss.vision.flow import TRACKING
 
 
 def a_body_before_a_camera(dtype: torch.dtype = torch.float64) -> tuple[BodyModel, Camera]:
@@ -163,6 +167,32 @@ def test_what_a_frame_taught_weighs_the_poses_of_the_next() -> None:
     # A frame without a frame before it has no unit of area, and one without a picture says nothing.
     assert costs(features, body=body, appearance=appearance).segmentation is None
     assert costs(None, body=body, before=truth[None], appearance=appearance).segmentation is None
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_body_without_flesh_shows_nothing(tmp_path: Path, dtype: torch.dtype) -> None:
+    """Such as a robot of which a file has only meshes: its pictures say nothing, of all terms."""
+    path = tmp_path / "robot.urdf"
+    path.write_text(
+        "<robot name='r'><link name='a'/><link name='b'/><joint name='j' type='continuous'>"
+        "<parent link='a'/><child link='b'/><origin xyz='0 0 0.3'/></joint></robot>"
+    )
+    body = load_body(path, flesh="none", dtype=dtype)
+    body = body.with_base(torch.eye(3), torch.tensor([0.0, 0.0, 2.0]))
+    camera = Camera.pinhole(40, 30, focal_px=40.0)
+    x = torch.zeros(2, 3, 1, dtype=dtype)
+    assert torch.equal(part_map(body, x, camera), torch.full((2, 3, 30, 40), -1))
+    noise = torch.rand(30, 40, 3, generator=torch.Generator().manual_seed(0)).numpy()
+    features = FeatureExtractor(colour=True, flow=TRACKING)(noise, noise)
+    choice = CostChoice(region=RegionTerm(), segmentation=SegmentationTerm(), flow=FlowTerm())
+    costs = FrameCosts(body, camera, choice)
+    appearance = costs.learn(None, features, body, x[0, 0])
+    assert appearance is None
+    cost = costs(features, body=body, before=x[0, :1], appearance=appearance)
+    cost = cost.of_parents(torch.zeros(6, dtype=torch.long))
+    for part in (cost.value(x), cost.unsearched(x), *cost.local_model(x)):
+        assert part.dtype == dtype
+        assert not part.any()
 
 
 class _TwoWells:

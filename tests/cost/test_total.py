@@ -18,6 +18,7 @@ from torchcss.cost import total
 from torchcss.cost.anthropometric import proportion_columns
 from torchcss.cost.edge_energy import EdgeEnergyTerm, edge_energy_field
 from torchcss.cost.flow import FlowTerm, InteriorNodes, flow_targets
+from torchcss.cost.frame import FrameCosts
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
 from torchcss.cost.joints import JointObservation, JointTerm
 from torchcss.cost.temporal import MixturePrior
@@ -280,6 +281,22 @@ def test_terms_are_silent_without_their_data(generator: torch.Generator) -> None
     bare = replace(cost, observation=None, edge_field=None, parent=None)
     assert set(bare.terms(x)) == {"stabiliser"}
     assert torch.isfinite(bare.local_model(x).hessian).all()
+
+
+def test_frames_of_unknown_interval_have_no_temporal_prior() -> None:
+    """By default, of how far a state may move in no time: not NaN."""
+    body = load_body("arm8")
+    n = body.num_parameters
+    prior = GaussianMixture(
+        body.rest[None], torch.eye(n).double()[None], torch.zeros(1, dtype=torch.float64)
+    )
+    for options, is_known in (({}, False), ({"frame_interval": 1 / 25}, True)):
+        costs = FrameCosts(body, Camera.pinhole(64, 48, focal_px=60.0), CostChoice(), **options)
+        cost = costs(None, body=body).of_children(torch.tensor([0, 0]), prior)
+        x = torch.stack([body.rest, body.rest + 0.01])
+        assert ("temporal" in cost.terms(x)) == is_known
+        for part in (cost.value(x), *cost.local_model(x)):
+            assert torch.isfinite(part).all()
 
 
 def test_the_coarse_cost_is_the_keypoints_with_a_wide_scale(generator: torch.Generator) -> None:

@@ -516,13 +516,19 @@ def scaled(body: BodySpecification, scale: float) -> BodySpecification:
     def times(vector: Vector) -> Vector:
         return (vector[0] * scale, vector[1] * scale, vector[2] * scale)
 
+    unit = {joint.name: scale if joint.kind == "prismatic" else 1.0 for joint in body.joints}
+
     def scale_joint(joint: JointSpecification) -> JointSpecification:
-        stretch = scale if joint.kind == "prismatic" else 1.0
+        stretch, mimic = unit[joint.name], joint.mimic
+        if mimic is not None:
+            driver, factor, offset = mimic
+            mimic = driver, factor * stretch / unit.get(driver, 1.0), offset * stretch
         return replace(
             joint,
             translation=times(joint.translation),
             lower=joint.lower * stretch,
             upper=joint.upper * stretch,
+            mimic=mimic,
         )
 
     prismatic = {

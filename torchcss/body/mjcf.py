@@ -359,7 +359,7 @@ class _Reader:
                 along = ends[:3] - ends[3:]
                 half = 0.5 * float(np.linalg.norm(along))
                 place = _Place(_turn_of_z(self._unit(label, along)), 0.5 * (ends[:3] + ends[3:]))
-                size = [size[0], half] if _SOLIDS[kind] == 2 else [*size[:2], half]
+                size = [*size[:1], half] if _SOLIDS[kind] == 2 else [*size[:2], half]
             needed = _SOLIDS[kind]
             if len(size) < needed or not all(number > 1e-6 for number in size[:needed]):
                 raise self._bad(label, f"{needed} positive numbers as size", size)

@@ -96,6 +96,9 @@ class BodyModel(nn.Module):
         real = torch.float64
         self.joint_names = tuple(marker.name for marker in body.markers)
         self.part_names = tuple(part.name for part in body.parts)
+        repeated = sorted({name for name in self.part_names if self.part_names.count(name) > 1})
+        if repeated:
+            raise BodyError(f"part names must be unique; repeated: {', '.join(repeated)}")
         link_of = self.tree.link_index
 
         def register(name: str, value: Tensor) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ElementTree
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -36,8 +37,12 @@ def read_urdf_solids(path: Path, data: bytes) -> tuple[PartSpecification, ...]:
         BodyError: If a size or place is not of numbers.
     """
     parts: list[PartSpecification] = []
-    for link in ElementTree.fromstring(data).findall("link"):
+    links = ElementTree.fromstring(data).findall("link")
+    # A link's first solid has its name, also that of a link further on.
+    names = {link.get("name", "") for link in links}
+    for link in links:
         name = link.get("name", "")
+        free = (other for n in count(2) if (other := f"{name}_{n}") not in names)
         solids = [found for tag in ("visual", "collision") if (found := _solids(link, tag))]
         for number, (element, solid) in enumerate(solids[0] if solids else [], start=1):
             where = f"{path}: link {name!r}: <{solid.tag}>"
@@ -56,7 +61,7 @@ def read_urdf_solids(path: Path, data: bytes) -> tuple[PartSpecification, ...]:
             turn = _turn(_numbers(where, "rpy", values.get("rpy", "0 0 0"), 3))
             parts.append(
                 PartSpecification(
-                    name=name if number == 1 else f"{name}_{number}",
+                    name=name if number == 1 else next(free),
                     link=name,
                     translation=(x, y, z),
                     rotation=as_rows(turn),

@@ -163,22 +163,25 @@ def flow_targets(
     check_shape("flow", flow, 2, height, width)
     if flow.ndim != 3:
         raise ShapeError(f"flow: expected one flow [2, {height}, {width}], got {list(flow.shape)}")
-    known = flow.abs().amax(dim=0) < _UNKNOWN_FLOW
-    trust = known.to(flow)
+    is_known = flow.abs().amax(dim=0) < _UNKNOWN_FLOW
+    known = trust = is_known.to(flow)
     if outlier is not None:
         check_shape("outlier", outlier, height, width)
-        trust = trust * (1 - outlier.to(flow))
+        trust = known * (1 - outlier.to(flow))
     sample = nodes(body, body.pose(mean_prev))
     projection = camera.project(sample.points)
-    channels = torch.cat([torch.where(known, flow, 0.0), trust[None]])
+    channels = torch.cat([torch.where(is_known, flow, 0.0), known[None], trust[None]])
     values, inside = sample_bilinear(channels, projection.uv)
+    # The mean of the known pixels alone: the zeros in place of the others say nothing.
+    share = values[..., 2:3]
+    moved = values[..., :2] / torch.where(share > 0, share, 1.0)
     seen = front_facing(sample.points, sample.normals, camera.centre_world) * (
         inside & projection.valid
     )
-    weight = values[..., 2].clamp(0, 1) * seen
+    weight = values[..., 3].clamp(0, 1) * seen
     if visible is not None:
         weight = weight * visible
-    return FlowTargets(projection.uv + values[..., :2], weight)
+    return FlowTargets(projection.uv + moved, weight)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -44,13 +44,13 @@ class FrameCosts:
         body: The body; later it may hang on another base.
         camera: Camera of the features.
         choice: Terms and weights.
-        frame_interval: Seconds between frames, which scales the expected motion.
+        frame_interval: Seconds between frames, which scales the expected motion; 0: not known.
         boundary_emphasis: Weight of motion boundaries, see `FrameFeatures.edge_field`.
 
     Attributes:
         camera: Camera of the features, in the body's type and on its device.
         choice: Terms and weights.
-        deviation: Expected motion of every parameter from one frame to the next.
+        deviation: Expected motion of every parameter from one frame to the next; None: not known.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class FrameCosts:
     ) -> None:
         self.camera = camera.to(dtype=body.dtype, device=body.tie.device)
         self.choice = choice
-        self.deviation = body.motion_rate * frame_interval
+        self.deviation = body.motion_rate * frame_interval if frame_interval else None
         self.boundary_emphasis = boundary_emphasis
         outlines = (choice.contour, choice.edge_energy, choice.region)
         self.predictor = ContourPredictor(body) if any(outlines) else None
@@ -127,7 +127,9 @@ class FrameCosts:
         *,
         sure: bool = False,
     ) -> Appearance | None:
-        """Take in what body and surroundings look like in a frame; None without a term that asks.
+        """Take in what body and surroundings look like in a frame.
+
+        None without a term that asks for it, and of a body without flesh.
 
         Args:
             appearance: What was known before; None: nothing.
@@ -136,7 +138,8 @@ class FrameCosts:
             state: Its pose.
             sure: The outline is known to two pixels, see `region_masks`.
         """
-        if self.choice.region is None and self.choice.segmentation is None:
+        asked = self.choice.region is not None or self.choice.segmentation is not None
+        if not asked or body.num_parts == 0:
             return None
         if features is None or features.colour is None:
             return appearance

@@ -34,6 +34,9 @@ def part_map(
         meridians: Longitudes of the mesh of each part.
         girth: Factor on the cross-sections of all parts.
     """
+    width, height = camera.image_size_wh
+    if body.num_parts == 0:
+        return torch.full((*state.shape[:-1], height, width), -1, device=state.device)
     mesh = body.mesh(rings, meridians)
     faces = grid_faces(rings, meridians).to(mesh.points.device)
     rotation, centre = body.part_poses(body.pose(state))
@@ -42,7 +45,6 @@ def part_map(
     offsets = vertices.shape[-2] * torch.arange(body.num_parts, device=faces.device)
     every = (faces + offsets[:, None, None]).flatten(0, 1)
     mesh_size = vertices.shape[-3] * vertices.shape[-2]
-    width, height = camera.image_size_wh
     batch = vertices.shape[:-3]
     face = every.new_full((batch.numel(), height, width), -1)
     for index, each in enumerate(vertices.flatten(-3, -2).reshape(-1, mesh_size, 3)):

@@ -13,7 +13,7 @@ temperature: the nats that a term contributes per nu of mean cost per node (desi
 | name | term or prior | section of [IJRR] |
 |---|---|---|
 | `contour` | edges along the normals of occluding contours | 3.1.2, eq. 8 |
-| `edge_energy` | the edge energy itself at the same nodes | 3.1 |
+| `edge_energy` | the edge energy itself at the same nodes | 2 |
 | `region` | colours on either side of the same nodes | 8 |
 | `segmentation` | colours of all covered pixels; in the weights of modes only | 8 |
 | `flow` | displacement of interior nodes against the optical flow | 3.1.2, eq. 9 |
@@ -21,8 +21,8 @@ temperature: the nats that a term contributes per nu of mean cost per node (desi
 | `anthropometric` | lengths of the limbs, where they are free | 3.2.1 |
 | `stabiliser` | long-tailed priors on what is hard to see | 3.2.2 |
 | `interpenetration` | repulsion between parts | 3.2.4 |
-| `temporal` | near the sample's parent mode | 4.2, eq. 10 |
-| `temporal_mixture` | near any mode of the previous frame | 4.2, eq. 10 |
+| `temporal` | near the sample's parent mode | 3.4, eq. 10 |
+| `temporal_mixture` | near any mode of the previous frame | 3.4, eq. 10 |
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ class TrackingCost(View):
         interior: Interior nodes of the body, for the flow term; None switches it off.
         pairs: Pairs of parts that may collide; None switches the repulsion off.
         parent: State of each sample's parent mode, `[b n]` or `[n]`; None: no prior about it.
-        deviation: Expected motion per frame of every parameter, for the prior about the parent.
+        deviation: Expected motion per frame of every parameter; None: no prior about the parent.
         previous: The previous mixture, one frame ahead; None: no prior about it.
         stopwatch: Where the time of the evaluations is added up by term; None: not at all.
     """
@@ -447,8 +447,7 @@ class TrackingCost(View):
             )
         if choice.anthropometric is not None and lengths:
             yield _on_states("anthropometric", partial(choice.anthropometric.local_model, x, body))
-        if choice.temporal is not None and self.parent is not None:
-            assert self.deviation is not None
+        if choice.temporal is not None and self.parent is not None and self.deviation is not None:
             yield _on_states(
                 "temporal",
                 partial(choice.temporal.local_model, x, self.parent, self.deviation),
