@@ -99,12 +99,11 @@ def read_skeleton(
         # The world is no bone, nor is what carries the body in it or lies between its joints.
         bare = {joint.link for joint in joints} - set(skeleton.places)
         fleshy = frozenset(part.link for part in parts) | bare
-        taken = {part.name for part in parts}
-        grown = bone_parts(joints, landmarks, skip=fleshy)
-        parts += tuple(
-            replace(part, name=f"{part.name}_bone") if part.name in taken else part
-            for part in grown
-        )
+        for part in bone_parts(joints, landmarks, skip=fleshy):
+            name, taken = part.name, {other.name for other in parts}
+            while name in taken:
+                name += "_bone"
+            parts += (replace(part, name=name),)
     markers = [
         MarkerSpecification(name=landmarks.get(link, link), link=link) for link in skeleton.places
     ]
