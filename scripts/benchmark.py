@@ -45,6 +45,7 @@ from peers.autograd_cost import autograd_model, made_up_costs, made_up_frames
 from torch import Tensor
 
 from torchcss.cost.total import TrackingCost
+from torchcss.errors import TorchcssError
 from torchcss.io.tracks import prepare_output_folder, write_summary
 from torchcss.stopwatch import Stopwatch
 from torchcss.types import LocalModel
@@ -205,4 +206,8 @@ def print_table(report: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    try:
+        main(tyro.cli(Config, description=__doc__))
+    except TorchcssError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

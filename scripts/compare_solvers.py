@@ -29,6 +29,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -47,6 +48,7 @@ import torch
 import tyro
 from torch import Tensor
 
+from torchcss.errors import ConfigurationError, TorchcssError
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.io.tracks import prepare_output_folder, write_summary
 from torchcss.linalg import covariance_factor
@@ -182,6 +184,10 @@ def quality(problem: ReprojectionProblem, x0: Tensor, parts: list[dict[str, Any]
 
 def main(config: Config) -> dict[str, Any]:
     """Measure, print, write; return what is written."""
+    if unknown := sorted(set(config.solvers) - set(LIBRARY)):
+        raise ConfigurationError(f"no solvers {unknown}; there are {', '.join(LIBRARY)}")
+    if OURS not in config.solvers:
+        raise ConfigurationError(f"solvers: all are compared with {OURS}; name it too")
     names = [name for name in config.solvers if importlib.util.find_spec(LIBRARY[name])]
     problem = make_problem(config)
     x0 = make_starts(config, problem)
@@ -244,4 +250,8 @@ def print_table(report: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    try:
+        main(tyro.cli(Config, description=__doc__))
+    except TorchcssError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

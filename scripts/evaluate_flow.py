@@ -15,7 +15,7 @@ the Middlebury training set) is one pair. Per pair and method:
 from __future__ import annotations
 
 import importlib.util
-import json
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,8 +29,9 @@ import tyro
 from torch import Tensor
 from torch.nn import functional
 
-from torchcss.errors import FlowFileError
+from torchcss.errors import FlowFileError, TorchcssError
 from torchcss.io.flow_files import read_flow
+from torchcss.io.tracks import prepare_output_folder, write_summary
 from torchcss.robust import Quadratic
 from torchcss.vision.boundaries import flow_discontinuities, motion_boundaries
 from torchcss.vision.flow import ACCURATE, TRACKING, OpticalFlow, robust_flow
@@ -40,7 +41,7 @@ from torchcss.vision.flow import ACCURATE, TRACKING, OpticalFlow, robust_flow
 class Config:
     """What to score."""
 
-    data: Path = Path("../shared/data/flow_middlebury")
+    data: Path
     """Folder searched for pairs."""
     out: Path | None = None
     """Where to write the table as JSON."""
@@ -97,7 +98,8 @@ def main(config: Config) -> None:
     if config.out:
         setting = {key: getattr(config, key) for key in ("jump", "near", "tolerance", "small")}
         setting |= {"torch": torch.__version__, "threads": torch.get_num_threads()}
-        config.out.write_text(json.dumps({"setting": setting, "rows": rows}, indent=1) + "\n")
+        prepare_output_folder(config.out.parent)
+        write_summary(config.out, {"setting": setting, "rows": rows})
 
 
 def timed(method: Method, pair: Pair) -> tuple[OpticalFlow | Tensor, float]:
@@ -194,4 +196,8 @@ def widened(mask: Tensor, radius: int) -> Tensor:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    try:
+        main(tyro.cli(Config, description=__doc__))
+    except TorchcssError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

@@ -120,6 +120,6 @@ def joint_errors(found: Initialisation, sequence: RecordedSequence, index: int) 
 
 if __name__ == "__main__":
     try:
-        main(tyro.cli(Config))
+        main(tyro.cli(Config, description=__doc__))
     except TorchcssError as error:
         sys.exit(f"error: {error}")

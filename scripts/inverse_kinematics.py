@@ -24,6 +24,7 @@ of single exact states per second of descents.
 from __future__ import annotations
 
 import math
+import sys
 import time
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass, field
@@ -38,6 +39,7 @@ from torch import Tensor
 
 from torchcss.body.model import BodyModel, load_body
 from torchcss.cost.targets import pose_targets
+from torchcss.errors import ConfigurationError, TorchcssError
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.inverse_kinematics import Search, Solutions, covered, inverse_kinematics, link_pose
 from torchcss.io.tracks import prepare_output_folder, write_summary
@@ -277,6 +279,8 @@ def run_pose(config: Config, case: str, number: int) -> dict[str, Any]:
 
 
 def main(config: Config) -> dict[str, Any]:
+    if unknown := sorted(set(config.cases) - set(CASES)):
+        raise ConfigurationError(f"no cases {unknown}; there are {'; '.join(CASES)}")
     torch.set_num_threads(1)
     report: dict[str, Any] = {"config": config, "cases": {}}
     print(f"{'':>22} {'poses':>5} {'solutions':>10} {'checked':>8} {'recall':>7} {'error':>8}"
@@ -320,4 +324,8 @@ def print_row(case: str, total: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    try:
+        main(tyro.cli(Config, description=__doc__))
+    except TorchcssError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

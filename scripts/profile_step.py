@@ -32,6 +32,7 @@ Hessian, since a matrix that is only just definite passes its rounding on (1e-9 
 from __future__ import annotations
 
 import math
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -45,6 +46,7 @@ import tyro
 from matplotlib.figure import Figure
 from peers.tracker_step import Step, Work, compile_step, make_frames, profiled, tracker_step
 
+from torchcss.errors import TorchcssError
 from torchcss.io.tracks import prepare_output_folder, write_summary
 
 QUARTILES = {"lower_quartile": 0.25, "median": 0.5, "upper_quartile": 0.75}
@@ -189,4 +191,8 @@ def main(config: Config) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    try:
+        main(tyro.cli(Config, description=__doc__))
+    except TorchcssError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

@@ -15,6 +15,7 @@ sets it.
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from torch import Tensor
 
+from torchcss.errors import TorchcssError
 from torchcss.inference.mixture import GaussianMixture, distinct_modes
 from torchcss.inference.proposals import ChamRehg, Condensation, CovarianceScaled, Proposal
 from torchcss.inference.trust_region import TrustRegionNewton
@@ -165,4 +167,8 @@ def main(config: Config) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    try:
+        main(tyro.cli(Config, description=__doc__))
+    except TorchcssError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

@@ -15,8 +15,8 @@ the raw samples, and over the minima. `--figures DIR` draws Figs. 1, 5 and 13.
 
 from __future__ import annotations
 
-import json
 import math
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,8 +25,10 @@ import numpy as np
 import torch
 import tyro
 
+from torchcss.errors import ConfigurationError, TorchcssError
 from torchcss.inference.proposals import CovarianceScaled, Spherical
 from torchcss.io import study_plots
+from torchcss.io.safe_load import load_json, real_numbers
 from torchcss.io.tracks import prepare_output_folder, write_summary
 from torchcss.reprojection import ReprojectionProblem
 from torchcss.sampling_study import TABLE1, SamplerRun, run_sampler, spectrum, study_problem
@@ -86,10 +88,19 @@ class Config:
     """JSON file to write."""
 
 
+def read_pose(path: Path) -> dict[str, float]:
+    """Parameter names and values."""
+    pose = load_json(path, ConfigurationError)
+    if not isinstance(pose, dict):
+        raise ConfigurationError(f"{path}: expected an object of parameter names and values")
+    real_numbers(list(pose.values()), str(path), ConfigurationError)
+    return pose
+
+
 def make_problem(config: Config, seed: int, body: str) -> ReprojectionProblem:
     """The problem of one seed, with its start mode."""
     given = config.pose if body == config.body else None
-    pose = None if given is None else json.loads(given.read_text(encoding="utf-8"))
+    pose = None if given is None else read_pose(given)
     return study_problem(
         body, generator=torch.Generator().manual_seed(seed), pixel_noise=config.pixel_noise,
         prior_scale=config.prior_scale, widest=config.widest, limits=config.limits,
@@ -197,4 +208,8 @@ def main(config: Config) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    try:
+        main(tyro.cli(Config, description=__doc__))
+    except TorchcssError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

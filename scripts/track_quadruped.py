@@ -12,6 +12,7 @@ links' origins, marked or not, against the exact truth, and of the base's place,
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -26,6 +27,7 @@ from torchcss.cost.joints import JointObservation, JointTerm
 from torchcss.cost.targets import PointTargets
 from torchcss.cost.temporal import TemporalPrior
 from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.errors import TorchcssError
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.tracker import CostFactory
 from torchcss.inference.trust_region import TrustRegionNewton
@@ -172,4 +174,8 @@ def main(config: Config) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    try:
+        main(tyro.cli(Config, description=__doc__))
+    except TorchcssError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

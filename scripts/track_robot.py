@@ -18,6 +18,7 @@ optical flow alone, if at all. The table tells the joints apart.
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from torch import Tensor
 
 from torchcss.body.model import BodyModel
 from torchcss.demo import track_sequence
-from torchcss.errors import ConfigurationError
+from torchcss.errors import ConfigurationError, TorchcssError
 from torchcss.inverse_kinematics import link_pose, pose_errors
 from torchcss.io.tracks import load_track, prepare_output_folder, write_summary
 from torchcss.robots import robot_arm, robot_sequence
@@ -177,4 +178,8 @@ def print_table(rows: list[dict[str, Any]]) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    try:
+        main(tyro.cli(Config, description=__doc__))
+    except TorchcssError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

@@ -29,6 +29,7 @@ def test_tables_hold_catalogue_names_once() -> None:
     [
         ("BODY_25", 25), ("BODY_25B", 25), ("COCO-17", 17), ("COCO-18", 18),
         ("MediaPipe-33", 33), ("H36M-17", 17), ("SMPL-24", 24), ("H-Anim", len(JOINT_NAMES)),
+        ("Halpe-26", 26), ("Halpe-136", 136),
     ],
 )  # fmt: skip
 def test_sizes_and_symmetry(layout: str, size: int) -> None:

@@ -39,6 +39,16 @@ JOINT_NAMES: Final[tuple[str, ...]] = (
 )  # fmt: skip
 """Every joint and landmark that the bodies of this package name."""
 
+# AlphaPose's body with feet: COCO's order, then MPII's head top, upper neck and hips' middle, then
+# big toes, small toes and heels. Face and hands follow in the layout of 136.
+_HALPE_26: Final[tuple[str | None, ...]] = (
+    "nose", "l_eye", "r_eye", "l_ear", "r_ear",
+    "l_shoulder", "r_shoulder", "l_elbow", "r_elbow", "l_wrist", "r_wrist",
+    "l_hip", "r_hip", "l_knee", "r_knee", "l_ankle", "r_ankle",
+    "skull_tip", "vc7", "HumanoidRoot",
+    "l_toe", "r_toe", None, None, "l_heel", "r_heel",
+)  # fmt: skip
+
 ALIASES: Final[dict[str, tuple[str | None, ...]]] = {
     # OpenPose's default: 1 Neck, 8 MidHip, 19 to 24 the feet (big toe, small toe, heel).
     "BODY_25": (
@@ -67,6 +77,8 @@ ALIASES: Final[dict[str, tuple[str | None, ...]]] = {
         "r_hip", "r_knee", "r_ankle", "l_hip", "l_knee", "l_ankle",
         "r_eye", "l_eye", "r_ear", "l_ear",
     ),
+    "Halpe-26": _HALPE_26,
+    "Halpe-136": (*_HALPE_26, *(None,) * 110),
     # The eyes' inner and outer corners, the mouth and the knuckles are no joints of ours.
     "MediaPipe-33": (
         "nose", None, "l_eye", None, None, "r_eye", None, "l_ear", "r_ear", None, None,

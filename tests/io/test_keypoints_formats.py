@@ -99,6 +99,23 @@ def test_mediapipe_frames_without_a_person(tmp_path: Path) -> None:
     assert read(path, num_frames=3).keypoints.shape == (3, 33, 2)  # the end is often left out
 
 
+def test_mediapipe_frames_that_count_from_one(tmp_path: Path) -> None:
+    path = tmp_path / "pose.json"
+    entries = [{"frame": i, "landmarks": pose} for i, pose in enumerate(POSES, start=1)]
+    for content in (entries, {str(entry["frame"]): entry["landmarks"] for entry in entries}):
+        path.write_text(json.dumps(content))
+        found = read(path, num_frames=FRAMES)
+        check(found, MARKS, "MediaPipe-33")
+        assert any("frame 1 is the first frame" in line for line in found.report)
+    # Without the last frame nothing tells the two ways of counting apart.
+    path.write_text(json.dumps(entries[:-1]))
+    with pytest.raises(KeypointError, match=r"somebody is 1: start there, or number .* from 0"):
+        read(path, num_frames=FRAMES)
+    path.write_text(json.dumps([{"frame": 0, "landmarks": POSES[0]}, *entries]))
+    with pytest.raises(KeypointError, match=f"expected {FRAMES} frames"):
+        read(path, num_frames=FRAMES)
+
+
 @pytest.mark.parametrize("name", ["landmarks", "arr_0", "anything"])
 @pytest.mark.parametrize("shape", [(FRAMES, 33, 4), (FRAMES, 132)])
 def test_mediapipe_arrays(tmp_path: Path, name: str, shape: tuple[int, ...]) -> None:

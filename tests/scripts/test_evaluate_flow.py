@@ -45,9 +45,10 @@ def test_made_up_pair(
     truth = torch.zeros(2, 64, 64)
     truth[0] = 2.0
     write_flow(folder / "flow10.flo", truth)
-    script.main(script.Config(data=tmp_path / "data", out=tmp_path / "flow.json", repeats=1))
+    out = tmp_path / "new" / "flow.json"
+    script.main(script.Config(data=tmp_path / "data", out=out, repeats=1))
     printed = capsys.readouterr().out
-    table = json.loads((tmp_path / "flow.json").read_text())
+    table = json.loads(out.read_text())
     rows = {row["method"]: row for row in table["rows"]}
     assert all(name in printed for name in (*rows, "near_aepe", "tiles, 64 x 64"))
     assert {"accurate", "tracking", "accurate-quadratic"} <= rows.keys()

@@ -81,10 +81,12 @@ def read_landmarks(
         places = [_place_of(path, entry, index) for index, entry in enumerate(entries)]
     if len(set(places)) < len(places):
         raise KeypointError(f"{path}: the same frame number twice; expected each frame once")
-    total = max(places, default=-1) + 1
+    # Some count from 1, which shows where the number of the last frame is that of all frames.
+    origin = 1 if places and 0 not in places and max(places) == num_frames else 0
+    total = max(places, default=-1) + 1 - origin
     if num_frames is not None:
         # Frames at the end in which nobody is seen are often left out.
-        total = max(total, num_frames) if max(places, default=-1) < num_frames else total
+        total = max(total, num_frames)
     if total > _MOST_FRAMES:
         raise KeypointError(f"{path}: frame {total - 1} is not a frame number")
     frames = [np.zeros((0, 0, 3)) for _ in range(total)]
@@ -94,9 +96,10 @@ def read_landmarks(
             _triples(where, person, index)
             for index, person in enumerate(_people_of(where, _landmarks_of(entry)))
         ]
-        frames[place] = stack(path, people)
+        frames[place - origin] = stack(path, people)
     check_counts(path, frames)
-    return in_pixels(path, frames, image_size_wh, ["format: MediaPipe landmarks"])
+    report = [f"format: MediaPipe landmarks, frame {origin} is the first frame"]
+    return in_pixels(path, frames, image_size_wh, report)
 
 
 def read_landmark_array(
