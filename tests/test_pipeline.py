@@ -17,10 +17,11 @@ from torchcss.body.model import load_body
 from torchcss.cost.joints import JointObservation
 from torchcss.demo import run_demo
 from torchcss.errors import ConfigurationError, OutputError, VideoError
+from torchcss.hypotheses import Initialisation
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.tracker import Tracker, TrackerState
 from torchcss.io import tracks
-from torchcss.io.fitted_body import read_fitted_body
+from torchcss.io.fitted_body import read_fitted_body, write_fitted_body
 from torchcss.io.track_body import body_of_track
 from torchcss.io.video import Frame, VideoWriter
 from torchcss.pipeline import TrackedFrame, follow_with_base, scale_keypoints, track_frames
@@ -35,7 +36,7 @@ from torchcss.settings import (
     make_settings_tracker,
 )
 from torchcss.synthetic import SyntheticSequence, arm_sequence
-from torchcss.track_files import track_video
+from torchcss.track_files import _first_pose_from_file, track_video
 from torchcss.views import Observe
 from torchcss.vision.camera import Camera
 
@@ -194,6 +195,29 @@ def test_float32_tracks_too(clip: Path, tmp_path: Path):
     assert np.isfinite(torchcss.load_track(tmp_path).joints_world).all()
 
 
+def test_a_new_run_replaces_what_belongs_to_the_last_one(clip: Path, tmp_path: Path):
+    """And what fails before its first frame replaces nothing."""
+    out = tmp_path / "out"
+    run(clip, out)
+    for other in ("smooth.npz", "overlay.mp4", "overlay_2.mp4", "overlay_of_mine.mp4"):
+        (out / other).write_bytes(b"old")
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    with pytest.raises(ConfigurationError, match="descend"):
+        run(clip, out, preset="condensation", oversampling=2)
+    (tmp_path / "empty.mp4").write_bytes(b"")
+    with pytest.raises(VideoError):
+        track_video(
+            tmp_path / "empty.mp4", camera=clip / "cameras.json", keypoints=clip / "keypoints.npz",
+            out=out, settings=Settings(body="arm7"),
+        )  # fmt: skip
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+    run(clip, out, seed=3)
+    assert sorted(path.name for path in out.iterdir()) == [
+        "body.npz", "overlay_of_mine.mp4", "summary.json", "track.npz",
+    ]  # fmt: skip
+    assert (out / "track.npz").read_bytes() != before["track.npz"]
+
+
 @pytest.mark.parametrize("trouble", [KeyboardInterrupt(), OutputError("disk full")])
 def test_interruption_keeps_the_frames(
     clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trouble: BaseException
@@ -230,6 +254,47 @@ def test_truncated_video_keeps_the_frames(clip: Path, tmp_path: Path):
 def test_bad_settings(bad: dict):
     with pytest.raises(ConfigurationError):
         Settings(**bad)
+
+
+@pytest.mark.parametrize(
+    ("name", "bad", "good"),
+    [
+        ("contour_weight", (-1.0, float("nan"), float("inf")), (0.0, 300.0)),
+        ("boundary_emphasis", (-0.1, 1.1, float("nan")), (0.0, 1.0)),
+        ("seed", (-1, 2**63), (0, 2**63 - 1)),
+        ("terms", ((), ("motion_boundaries",), ("temporal", "stabiliser")), (("joints",),)),
+    ],
+)
+def test_settings_out_of_range_are_refused_by_name(name: str, bad: tuple, good: tuple):
+    for value in bad:
+        with pytest.raises(ConfigurationError, match=name):
+            Settings(**{name: value})
+    for value in good:
+        assert getattr(Settings(**{name: value}), name) == value
+
+
+def test_a_body_from_a_file_is_the_same_by_any_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "robots").mkdir()
+    robot = tmp_path / "robots" / "robot.urdf"
+    robot.write_text(
+        "<robot name='r'><link name='a'/><link name='b'/><joint name='j' type='continuous'>"
+        "<parent link='a'/><child link='b'/></joint></robot>"
+    )
+    body = load_body(robot, free_root=True)
+    mixture = GaussianMixture(
+        body.rest[None], torch.eye(7, dtype=torch.float64)[None], torch.zeros(1).double()
+    )
+    eye = Camera([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], (640, 480))
+    found = Initialisation(body, mixture, torch.zeros(1).double(), ())
+    write_fitted_body(tmp_path / "body.npz", found, eye)
+    monkeypatch.chdir(tmp_path / "robots")
+    for name in (str(robot), "robot.urdf", "../robots/robot.urdf"):
+        first = _first_pose_from_file(tmp_path, eye, Settings(body=name))
+        assert first.body.state_names == body.state_names
+    with pytest.raises(ConfigurationError, match=r"give the body .*robot\.urdf"):
+        _first_pose_from_file(tmp_path, eye, Settings(body="other.urdf"))
 
 
 def test_scale_keypoints_maps_pixel_centres():
@@ -272,6 +337,12 @@ def test_demo_in_small(tmp_path: Path):
     assert tracks.read_summary(tmp_path)["mpjpe_mm"] == pytest.approx(summary["mpjpe_mm"])
     assert (tmp_path / "overlay.mp4").stat().st_size > 0
     assert replace(settings, seed=1).seed == 1
+
+
+@pytest.mark.parametrize("number", [0, -3])
+def test_a_demo_without_frames_is_refused(tmp_path: Path, number: int):
+    with pytest.raises(ConfigurationError, match="num_frames must be at least 1"):
+        run_demo(tmp_path, num_frames=number)
 
 
 def write_masks(path: Path, width: int, height: int, num_frames: int = FRAMES) -> Path:

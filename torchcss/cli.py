@@ -30,6 +30,7 @@ from torchcss.cli_smooth import Smooth, report
 from torchcss.cli_view import Plot, View
 from torchcss.demo import run_demo
 from torchcss.errors import ConfigurationError, OutputError, TorchcssError
+from torchcss.io.keypoints import Scale
 from torchcss.live import LiveViewer
 from torchcss.settings import TERMS, Settings
 from torchcss.smooth import smooth_file
@@ -103,8 +104,8 @@ class Track:
     """Keypoints as an observation in every frame, or only to start, as the papers do."""
     layout: str | None = None
     """Layout of a keypoint file that does not name its joints, e.g. BODY_25."""
-    normalised: bool = False
-    """Keypoints are fractions of the image instead of pixels."""
+    normalised: Scale = "pixels"
+    """Whether keypoints are pixels, or fractions of the image from 0 to 1 or from -1 to 1."""
     start: int = 0
     """First frame."""
     stop: int | None = None
@@ -210,7 +211,7 @@ class Track:
             )
         print(
             f"{summary['num_frames']} frames, {summary['seconds_per_frame']:.2f} s each; "
-            f"track, summary and overlay are in {self.out}"
+            f"track, summary{' and overlay' if self.overlay else ''} are in {self.out}"
         )
         if self.smooth_images:
             done = smooth_video(

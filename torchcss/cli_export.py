@@ -36,7 +36,8 @@ class Export:
     """world: the track's world as it is; y-up: turned so that Y is up. By default y-up for bvh, trc
     and mot, else world."""
     world_up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
-    """Which axis of the world is up; auto: the one nearest to the body's mean upward direction."""
+    """Which axis of the world is up; auto: the one nearest to the body's mean upward direction, or,
+    for an arm or a robot, to that of the pictures."""
     rotation_order: Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"] = "ZXY"
     """bvh: order of the rotation channels."""
     scale: float = 1.0

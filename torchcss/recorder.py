@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import platform
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import asdict, dataclass, field
 from functools import cached_property, partial
@@ -25,12 +25,14 @@ from tqdm import tqdm
 
 from torchcss.body.model import BodyModel
 from torchcss.inference.tracker import SequenceTracker
+from torchcss.io.atomic import output_error
 from torchcss.io.cameras import camera_entry
 from torchcss.io.overlay import draw_overlay, project_body
 from torchcss.io.tracks import TrackWriter, write_summary
 from torchcss.io.video import VideoWriter
 from torchcss.pipeline import TrackedFrame
 from torchcss.settings import Settings
+from torchcss.smooth import SMOOTH_NAME
 from torchcss.types import Status
 from torchcss.vision.camera import Camera
 
@@ -164,6 +166,7 @@ class Recorder:
         notes: Lines for the user, also in the summary.
         extra: Further entries of the summary.
         sinks: What sees the frames besides; closed at the end of the run.
+        on_first_frame: Writes what else belongs to the run, when its first frame is saved.
     """
 
     folder: Path
@@ -174,6 +177,7 @@ class Recorder:
     notes: list[str] = field(default_factory=list)
     extra: dict[str, Any] = field(default_factory=dict)
     sinks: Sequence[Sink] = ()
+    on_first_frame: Callable[[], None] | None = None
 
     def run(self, frames: Iterator[TrackedFrame], body: BodyModel, total: int | None) -> dict:
         """Track to the end, or to an interruption, which is recorded and raised again.
@@ -206,6 +210,9 @@ class Recorder:
             try:
                 for frame in bar:
                     self._append(writer, frame)
+                    if len(writer) == 1:
+                        writer.save()
+                        self._replace_last_run()
                     drawn = time.perf_counter()
                     picture = Picture(frame, self.camera)
                     for sink in sinks:
@@ -228,6 +235,17 @@ class Recorder:
                     summary = self._summary(ended, len(writer), wall, totals)
                     write_summary(self.folder, summary)
         return summary
+
+    def _replace_last_run(self) -> None:
+        """Remove what belongs to another track, now that there is one in its place."""
+        for old in (self.folder / SMOOTH_NAME, *self.folder.glob("overlay*.mp4")):
+            if old.stem in ("smooth", "overlay") or old.stem.removeprefix("overlay_").isdigit():
+                try:
+                    old.unlink(missing_ok=True)
+                except OSError as error:
+                    raise output_error(old, error) from error
+        if self.on_first_frame is not None:
+            self.on_first_frame()
 
     def _append(self, writer: TrackWriter, frame: TrackedFrame) -> None:
         base = np.eye(4)

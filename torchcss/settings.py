@@ -47,6 +47,9 @@ ALL_TERMS = (
 """Terms and priors that can be chosen; see `torchcss.cost.total`. `motion_boundaries` weighs the
 edges of `contour` and `edge_energy` by the motion boundaries, `W = 1 - k S_p`."""
 
+_SEEING = ("contour", "edge_energy", "region", "segmentation", "flow", "joints")
+"""Terms that see the picture or its joints; priors alone say nothing about a video."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
@@ -98,6 +101,11 @@ class Settings:
         unknown = sorted(set(self.terms) - set(ALL_TERMS))
         if unknown:
             raise ConfigurationError(f"unknown terms {unknown}; there are {', '.join(ALL_TERMS)}")
+        if not set(self.terms) & set(_SEEING):
+            raise ConfigurationError(
+                f"terms: expected at least one of {', '.join(_SEEING)}, which see the picture or "
+                f"its joints; got {', '.join(self.terms) or 'none'}"
+            )
         # Motion boundaries are no term of their own: `boundary_emphasis` weighs them.
         weighed = [name for name in ALL_TERMS if name != "motion_boundaries"]
         if strange := sorted(set(self.weights) - set(weighed)):
@@ -105,10 +113,23 @@ class Settings:
         for name, weight in self.weights.items():
             if not 0 <= weight < math.inf:
                 raise ConfigurationError(f"weights: {name}: expected at least 0, got {weight}")
+        if not 0 <= self.contour_weight < math.inf:
+            raise ConfigurationError(
+                f"contour_weight must be at least 0 and finite, got {self.contour_weight}"
+            )
+        if not 0 <= self.boundary_emphasis <= 1:
+            raise ConfigurationError(
+                f"boundary_emphasis must lie in 0..1, got {self.boundary_emphasis}"
+            )
+        check_seed(self.seed)
         for name in ("samples", "modes", "working_size", "oversampling"):
             number = getattr(self, name)
             if number is not None and number < 1:
                 raise ConfigurationError(f"{name} must be at least 1, got {number}")
+        if self.oversampling > 1 and PRESETS[self.preset].particles is not None:
+            raise ConfigurationError(
+                f"oversampling: {self.preset} does not descend from samples; leave it at 1"
+            )
         try:
             torch.empty(0, device=self.device)
         except (RuntimeError, AssertionError) as error:  # the latter without CUDA
@@ -120,6 +141,16 @@ class Settings:
     def torch_dtype(self) -> torch.dtype:
         """The floating type."""
         return torch.float32 if self.dtype == "float32" else torch.float64
+
+
+def check_seed(seed: int) -> None:
+    """Refuse a seed that not every generator of random numbers takes.
+
+    Raises:
+        ConfigurationError: If it is none.
+    """
+    if not 0 <= seed < 2**63:
+        raise ConfigurationError(f"seed must lie in 0..{2**63 - 1}, got {seed}")
 
 
 def make_extractor(settings: Settings) -> FeatureExtractor:
@@ -201,8 +232,5 @@ def make_settings_tracker(settings: Settings, motion: Float[Tensor, " n"]) -> Se
     )
     if settings.oversampling == 1:
         return tracker
-    if not isinstance(tracker, Tracker):
-        raise ConfigurationError(
-            f"oversampling: {settings.preset} does not descend from samples; leave it at 1"
-        )
+    assert isinstance(tracker, Tracker)  # `Settings` has refused the others
     return replace(tracker, oversampling=settings.oversampling)

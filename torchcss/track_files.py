@@ -8,6 +8,7 @@ stopped run keeps what it has.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from torchcss.errors import CameraError, ConfigurationError
 from torchcss.first_frame import initialise_video
 from torchcss.hypotheses import Initialisation
 from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body, write_fitted_body
+from torchcss.io.keypoints import Scale
 from torchcss.io.tracks import prepare_output_folder
 from torchcss.pipeline import track_frames
 from torchcss.presets import PRESETS
@@ -48,7 +50,7 @@ def track_video(
     stop: int | None = None,
     stride: int = 1,
     layout: str | None = None,
-    normalised: bool = False,
+    normalised: bool | Scale = False,
     masks: Path | None = None,
     init: Path | None = None,
     others: Sequence[ViewFiles] = (),
@@ -68,7 +70,8 @@ def track_video(
         stop: Frame before which to end.
         stride: Every how many frames to track.
         layout: Layout of a keypoint file that does not name its joints.
-        normalised: Whether keypoints are fractions of the image.
+        normalised: Whether keypoints are fractions of the image, and which, see
+            `torchcss.io.keypoints.Scale`.
         masks: Foreground of every frame, white or in shades of belief: a video or a folder of
             images, of the size and number of the video's frames.
         init: A body that `torchcss init` fitted to the first frame, to start from.
@@ -128,8 +131,7 @@ def track_video(
     for note in notes:
         tqdm.write(note)
     # What it was read from stays as it is, be it in the same folder.
-    if init is None or Path(init).resolve() not in (out.resolve(), fitted_path.resolve()):
-        write_fitted_body(fitted_path, first, eye)
+    own = init is None or Path(init).resolve() not in (out.resolve(), fitted_path.resolve())
 
     extractor = make_extractor(settings)
     noise = view.noise(extractor)
@@ -169,6 +171,7 @@ def track_video(
             "body_lengths_m": first.body.lengths,
         },
         sinks=films if live is None else [*films, live],
+        on_first_frame=partial(write_fitted_body, fitted_path, first, eye) if own else None,
     )
     tracked = track_frames(
         main.frames,
@@ -210,7 +213,8 @@ def _first_pose_from_file(path: Path, camera: Camera, settings: Settings) -> Ini
     fitted = read_fitted_body(
         path, camera=camera, dtype=settings.torch_dtype, device=settings.device
     )
-    if fitted.body.name != settings.body:
+    # A body from a file is named by its path, which can be written in several ways.
+    if Path(fitted.body.name).resolve() != Path(settings.body).resolve():
         raise ConfigurationError(
             f"{path}: the fitted body is {fitted.body.name}, to be tracked is {settings.body}; "
             f"give the body {fitted.body.name}"

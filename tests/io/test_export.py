@@ -10,8 +10,12 @@ import pytest
 
 from torchcss import Track, cli, export_track, load_body
 from torchcss.errors import ConfigurationError, OutputError, TrackFileError
+from torchcss.io.cameras import camera_entry
 from torchcss.io.export import FORMATS
 from torchcss.io.export.selection import DEFAULT_RATE, UP_AXES, select
+from torchcss.io.tracks import write_summary
+from torchcss.smooth import save_track
+from torchcss.vision.camera import Camera
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from made_tracks import make_track
@@ -74,6 +78,22 @@ def test_following_the_parents(track: Track):
     assert select(orphan, mode=1, follow=True).rank[:, 0].tolist() == [-1, -1, -1, 1]
     with pytest.raises(ConfigurationError, match="no chosen frame has it"):
         select(track, mode=2, follow=True, stop=7)
+
+
+def test_an_arm_stands_as_the_pictures_do(tmp_path: Path):
+    """Its base may lie as it likes; the camera of the summary tells what is up."""
+    track = make_track(BODY, counts=(1, 1))
+    assert select(track, y_up=True).report[-1].startswith("the world's y axis")  # the base's
+    save_track(tmp_path / "track.npz", track)
+    # Right, down and forward of a camera that looks along the world's y axis, z up.
+    camera = Camera(
+        [[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], (640, 480),
+        R_camera_world=[[1.0, 0, 0], [0, 0, -1], [0, 1, 0]],
+    )  # fmt: skip
+    entry = {"units": "metre, pixel", "cameras": {"one": camera_entry(camera)}}
+    write_summary(tmp_path, entry)
+    done = export_track(tmp_path, to="trc")
+    assert any("z axis is taken for up (the picture's upward" in line for line in done.report)
 
 
 @pytest.mark.parametrize("axis", UP_AXES)

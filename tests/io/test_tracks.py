@@ -158,6 +158,7 @@ def test_saving_again_and_again(tmp_path: Path) -> None:
         ({"log_weight": [-np.inf, -np.inf]}, "log_weight"),
         ({"log_weight": np.zeros(0)}, "."),
         ({"cost": [np.inf, 0.0]}, "cost"),
+        ({"cost": [np.nan, np.nan]}, "cost"),
         ({"parent": [0, 7]}, "parent"),
         ({"parent": [-2, 0]}, "parent"),
         ({"joints_world": np.zeros((2, 3, 3))}, "joints_world"),

@@ -167,7 +167,7 @@ class TrackWriter:
             state: `[k n]`.
             covariance: `[k n n]`.
             log_weight: `[k]`; modes with `-inf` are left out.
-            cost: `[k]`, nats; infinite where the frame said nothing.
+            cost: `[k]`, nats; infinite for all of them where the frame said nothing.
             parent: `[k]`, modes of the frame appended before, -1 for none.
             joints_world: `[k j 3]`, metres.
             base_transform: `[4 4]`; None: the identity.
@@ -197,8 +197,11 @@ class TrackWriter:
                 f"frame {frame}: log_weight: expected at least one weight above -inf and none "
                 f"infinite or NaN, got {weights.tolist()}"
             )
-        if np.isnan(modes.cost).any() or (modes.cost == -np.inf).any():
-            raise ShapeError(f"frame {frame}: cost: expected numbers, got {modes.cost.tolist()}")
+        if not (np.isfinite(modes.cost).all() or (modes.cost == np.inf).all()):
+            raise ShapeError(
+                f"frame {frame}: cost: expected finite numbers, or inf for all modes of a frame "
+                f"that said nothing, got {modes.cost.tolist()}"
+            )
         if not math.isfinite(modes.time_s) or (self._modes and frame <= self._modes[-1].frame):
             raise ShapeError(
                 f"frame {frame} at {time_s} s: expected frames in rising order, at finite times"

@@ -17,14 +17,16 @@ Each format is a module of its own that makes the content; only this one touches
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from torchcss.body.model import BodyModel
-from torchcss.errors import ConfigurationError
+from torchcss.errors import ConfigurationError, TorchcssError
 from torchcss.io.atomic import prepare_output_folder, replace_file
+from torchcss.io.cameras import read_camera
 from torchcss.io.export.bvh import bvh_text
 from torchcss.io.export.c3d import write_c3d
 from torchcss.io.export.mot import mot_text
@@ -34,7 +36,9 @@ from torchcss.io.export.tables import csv_text, joint_covariances, npz_arrays
 from torchcss.io.export.trc import trc_text
 from torchcss.io.fitted_body import body_beside
 from torchcss.io.track_body import body_of_track
-from torchcss.io.tracks import TRACK_NAME, Track, load_track
+from torchcss.io.tracks import SUMMARY_NAME, TRACK_NAME, Track, load_track
+from torchcss.io.viewer_layout import camera_up
+from torchcss.vision.camera import Camera
 
 __all__ = ["FORMATS", "Export", "export_track"]
 
@@ -97,7 +101,7 @@ def export_track(
         frame: "world", the track's world as it is, or "y-up", turned so that Y is up; by default
             y-up for BVH, TRC and MOT.
         world_up: Which axis of the world is up (x, y, z, -x, -y or -z); "auto": the one nearest to
-            the body's mean upward direction.
+            the body's mean upward direction, or, for an arm or a robot, to that of the pictures.
         body: The body that was tracked; by default that of the `body.npz` beside the track's file,
             if there is one, else one that ships.
         rotation_order: BVH: order of the rotation channels.
@@ -127,12 +131,13 @@ def export_track(
     idle = [name for name, value in given.items() if value != _BVH_DEFAULTS[name]]
     if idle and to != "bvh":
         raise ConfigurationError(f"{', '.join(idle)}: only for bvh, not for {to}; leave it out")
-    source = None
+    source = picture_up = None
     if not isinstance(track, Track):
         source = Path(track)
         track = load_track(source)
         body = body_beside(source) if body is None else body
         source = source / TRACK_NAME if source.is_dir() else source
+        picture_up = camera_up(_own_camera(source.parent))
     selection = select(
         track,
         mode=mode,
@@ -142,6 +147,7 @@ def export_track(
         stride=stride,
         y_up=frame == "y-up" or (frame is None and to in _Y_UP),
         world_up=world_up,
+        picture_up=picture_up,
     )
     if body is not None or to not in _BODILESS:
         body = body_of_track(track, body)
@@ -170,6 +176,13 @@ def export_track(
                 report += [note for note in notes if note not in report]
         _write_text(path, text)
     return Export(tuple(paths), tuple(report))
+
+
+def _own_camera(folder: Path) -> Camera | None:
+    """The camera in the summary beside a track, if there is one that can be read."""
+    with suppress(TorchcssError):
+        return read_camera(folder / SUMMARY_NAME).camera
+    return None
 
 
 def _write_table(path: Path, to: str, selection: Selection, body: BodyModel) -> None:

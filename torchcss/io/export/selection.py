@@ -95,6 +95,7 @@ def select(
     stride: int = 1,
     y_up: bool = False,
     world_up: str = "auto",
+    picture_up: Float[np.ndarray, "3"] | None = None,
 ) -> Selection:
     """Choose modes and frames, and turn them into the file's frame of reference.
 
@@ -108,6 +109,7 @@ def select(
         y_up: Turn the world so that Y is up.
         world_up: Which axis of the world is up, one of `UP_AXES`, or "auto": the one nearest to
             the body's mean upward direction.
+        picture_up: What is up in the pictures, world frame, for a body that does not tell.
 
     Raises:
         ConfigurationError: If an option makes no sense, or no frame or mode is left.
@@ -145,7 +147,7 @@ def select(
         missing = int((column < 0).sum())
         if missing:
             report.append(f"{label or 'best mode'}: absent in {missing} of {len(kept)} frames")
-    turn, upright = _frame_of_file(track, kept, y_up, world_up, report)
+    turn, upright = _frame_of_file(track, kept, y_up, world_up, picture_up, report)
     rate = _rate(track.times[kept], report)
 
     present = ranks >= 0
@@ -206,24 +208,35 @@ def _nearest_present(present: np.ndarray) -> np.ndarray:
 
 
 def _frame_of_file(
-    track: Track, kept: np.ndarray, y_up: bool, world_up: str, report: list[str]
+    track: Track,
+    kept: np.ndarray,
+    y_up: bool,
+    world_up: str,
+    picture_up: np.ndarray | None,
+    report: list[str],
 ) -> tuple[np.ndarray, np.ndarray]:
     """The file's frame from the world's, and a standing body's orientation in it."""
     axis = world_up
     if world_up == "auto":
         axis, agreement = up_axis(
-            track.joint_names, track.joints_world[kept, 0], track.base_transform[kept]
+            track.joint_names, track.joints_world[kept, 0], track.base_transform[kept], picture_up
         )
+        tells = set(_UPRIGHT) <= set(track.joint_names)
+        what = "body's mean" if tells else "base's" if picture_up is None else "picture's upward"
         angle = np.degrees(np.arccos(min(agreement, 1.0)))
         if y_up:
             report.append(
-                f"the world's {axis} axis is taken for up (the body's mean direction is "
-                f"{angle:.0f} degrees from it); set the axis with world_up"
+                f"the world's {axis} axis is taken for up (the {what} direction is "
+                f"{angle:.0f} degrees from it); set the axis with --world-up (world_up)"
             )
     matrix = np.array(_TO_Y_UP[axis], dtype=np.float64)
     if y_up:
         return matrix, np.eye(3)
     return np.eye(3), matrix.T
+
+
+_UPRIGHT = ("HumanoidRoot", "skull_tip")
+"""Joints of which the second is above the first in a standing body."""
 
 
 def up_axis(
@@ -243,8 +256,9 @@ def up_axis(
         otherwise: What is up where the body does not tell, world frame; None: up the base.
     """
     names = list(joint_names)
-    if {"HumanoidRoot", "skull_tip"} <= set(names):
-        up = (joints[:, names.index("skull_tip")] - joints[:, names.index("HumanoidRoot")]).mean(0)
+    low, high = _UPRIGHT
+    if low in names and high in names:
+        up = (joints[:, names.index(high)] - joints[:, names.index(low)]).mean(0)
     else:
         up = base[:, :3, 1].mean(0) if otherwise is None else otherwise
     length = float(np.linalg.norm(up))
