@@ -125,6 +125,23 @@ def test_bad_options(files: Path, options: tuple[str, ...], capsys: pytest.Captu
     assert capsys.readouterr().err.strip().splitlines()[-1].startswith("torchcss: ")
 
 
+def test_start_is_checked_before_the_offset(files: Path, capsys: pytest.CaptureFixture[str]):
+    assert track(files, "--start", "-1") == 2
+    assert "start must be at least 0, got -1" in capsys.readouterr().err
+
+
+def test_the_advice_about_fractions_can_be_followed(
+    files: Path, capsys: pytest.CaptureFixture[str]
+):
+    for kind in ("zero-one", "plus-minus-one"):
+        assert track(files, "--normalised", kind) == 2
+        assert "expected fractions of the image" in capsys.readouterr().err
+    points = np.load(files / "keypoints.npz")["keypoints"]
+    spoil_keypoints(files, keypoints=points / (63, 47))
+    assert track(files) == 2
+    assert "set normalised to zero-one or plus-minus-one" in capsys.readouterr().err
+
+
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may write everywhere")
 def test_unwritable_folder(files: Path, capsys: pytest.CaptureFixture[str]):
     files.chmod(0o500)

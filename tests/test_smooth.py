@@ -16,8 +16,12 @@ from torchcss import cli, load_body, load_track
 from torchcss.body.model import BodyModel
 from torchcss.body.root import move_base
 from torchcss.errors import ConfigurationError, TrackFileError
+from torchcss.hypotheses import Initialisation
+from torchcss.inference.mixture import GaussianMixture
+from torchcss.io.fitted_body import write_fitted_body
 from torchcss.io.tracks import Track, TrackWriter, read_summary, write_summary
 from torchcss.smooth import Smoothing, save_track, smooth_file, smooth_track
+from torchcss.vision.camera import Camera
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from made_tracks import make_track
@@ -292,6 +296,36 @@ def test_files_stay_and_the_summary_says_what_was_done(tmp_path: Path, body: Bod
 def test_one_line_for_a_missing_track(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert cli.main(["smooth", str(tmp_path / "nothing")]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_body_is_used_without_a_video_too(
+    tmp_path: Path, body: BodyModel, capsys: pytest.CaptureFixture[str]
+):
+    found, truth = noisy_track(body)
+    save_track(tmp_path / "track.npz", found)
+    n = body.num_parameters
+    mixture = GaussianMixture(truth[:1], torch.eye(n)[None].double(), torch.zeros(1).double())
+    eye = Camera([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], (640, 480))
+    longer = load_body(body.name, lengths={"forearm": 1.1 * body.lengths["forearm"]})
+    for name, one in (("own", body), ("longer", longer)):
+        lengths = dict(one.lengths)
+        fitted = Initialisation(one, mixture, torch.zeros(1).double(), (), lengths)
+        write_fitted_body(tmp_path / f"{name}.npz", fitted, eye)
+    given = ["smooth", str(tmp_path), "--body"]
+    assert cli.main([*given, str(tmp_path / "own.npz")]) == 0
+    assert cli.main([*given, str(tmp_path / "longer.npz")]) == 2
+    assert "misses the joints of the track" in capsys.readouterr().err
+
+
+def test_options_of_images_need_a_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    options = {
+        "--camera": "a", "--keypoints": "b", "--camera-name": "c", "--layout": "BODY_25",
+        "--normalised": "zero-one", "--masks": "d",
+    }  # fmt: skip
+    words = [word for pair in options.items() for word in pair]
+    assert cli.main(["smooth", str(tmp_path), *words]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert all(option in line for option in (*options, "--video"))
 
 
 def test_track_smooths_when_it_is_done(files: Path, capsys: pytest.CaptureFixture[str]):  # noqa: F811

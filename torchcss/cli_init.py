@@ -15,6 +15,7 @@ from torchcss.interpretations import PAPER_PROPORTIONS, Search
 from torchcss.io.atomic import prepare_output_folder
 from torchcss.io.click import click_joints, write_clicked
 from torchcss.io.joints_file import Joints
+from torchcss.io.keypoints import Scale
 from torchcss.io.video import read_image
 
 
@@ -52,8 +53,8 @@ class Init:
     """Let these fits see the colours on either side of the outline too."""
     layout: str | None = None
     """Layout of a joints file that does not name its joints, e.g. BODY_25."""
-    normalised: bool = False
-    """Joints are fractions of the picture instead of pixels."""
+    normalised: Scale = "pixels"
+    """Whether joints are pixels, or fractions of the picture from 0 to 1 or from -1 to 1."""
     sigma: float | None = None
     """Noise of a marked wrist, pixels; by default 0.6 % of the person's size."""
     seed: int = 0

@@ -13,6 +13,8 @@ from typing import Annotated, Any
 import tyro
 
 from torchcss.errors import ConfigurationError
+from torchcss.io.fitted_body import read_fitted_body
+from torchcss.io.keypoints import Scale
 from torchcss.smooth import Smoothing, smooth_file
 from torchcss.smooth_video import IMAGES, smooth_video
 
@@ -40,8 +42,8 @@ class Smooth:
     """Camera in the file; by default the one whose video this is."""
     layout: str | None = None
     """Layout of a keypoint file that does not name its joints, e.g. BODY_25."""
-    normalised: bool = False
-    """Keypoints are fractions of the image instead of pixels."""
+    normalised: Scale = "pixels"
+    """Whether keypoints are pixels, or fractions of the image from 0 to 1 or from -1 to 1."""
     masks: Path | None = None
     """Foreground of every frame: a video or a folder of images of the video's size."""
     body: Path | None = None
@@ -54,7 +56,9 @@ class Smooth:
         if self.agility is not None:
             choice = replace(choice, agility=self.agility)
         if self.video is None:
-            print(report(smooth_file(self.track, out=self.out, choice=choice)))
+            self._refuse_options_of_images()
+            body = None if self.body is None else read_fitted_body(self.body).body
+            print(report(smooth_file(self.track, out=self.out, choice=choice, body=body)))
             return
         if self.camera is None or self.keypoints is None:
             raise ConfigurationError(
@@ -75,6 +79,22 @@ class Smooth:
             body=self.body,
         )
         print(report(done))
+
+    def _refuse_options_of_images(self) -> None:
+        """Without a video, what tells of its images would be ignored."""
+        given = {
+            "--camera": self.camera is not None,
+            "--keypoints": self.keypoints is not None,
+            "--camera-name": self.camera_name is not None,
+            "--layout": self.layout is not None,
+            "--normalised": self.normalised != Smooth.normalised,
+            "--masks": self.masks is not None,
+        }
+        if idle := [option for option, there in given.items() if there]:
+            raise ConfigurationError(
+                f"{', '.join(idle)}: of use only with --video, whose images are fitted then; give "
+                "the video, or leave them out"
+            )
 
 
 def report(effect: dict[str, Any]) -> str:

@@ -47,6 +47,7 @@ def run_demo(
         `mpjpe_best_of_modes_mm`.
 
     Raises:
+        ConfigurationError: If there is to be no frame.
         OutputError: If the folder cannot be written.
     """
     settings = settings or Settings(body="arm8", keypoints_use="first")

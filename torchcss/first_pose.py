@@ -31,7 +31,7 @@ from torchcss.cost.anthropometric import Anthropometric
 from torchcss.cost.joints import JointObservation, JointTerm
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.cost.view import View
-from torchcss.errors import CameraError
+from torchcss.errors import CameraError, ConfigurationError
 from torchcss.gross_marks import best_distinct, explain, refine
 from torchcss.hypotheses import (
     STANDARD_STATURE,
@@ -98,7 +98,10 @@ def initialise_from_joints(
             place.
         CameraError: If the camera looks away from a placed body.
         BodyError: If the stature is no person's.
+        ConfigurationError: If no fit is to be kept.
     """
+    if num_modes is not None and num_modes < 1:
+        raise ConfigurationError(f"expected at least 1 hypothesis to be kept, got {num_modes}")
     keypoints = keypoints.to(dtype=dtype, device=device)
     confidence = confidence.to(dtype=dtype, device=device)
     joints = joints or JointTerm(sigma=default_sigma(keypoints[confidence > 0]))

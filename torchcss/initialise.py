@@ -116,6 +116,7 @@ def initialise(
         KeypointError: If fewer joints of the body are marked, or all are at one place.
         CameraError: If the camera is of another image size, or there is neither picture nor camera.
         BodyError: If the stature is no person's.
+        ConfigurationError: If no hypothesis is to be kept.
     """
     names, keypoints, confidence = keypoint_table(joints_2d, joint_names)
     notes: list[str] = []

@@ -31,8 +31,10 @@ from torchcss.io.cameras import check_image_size, read_camera
 from torchcss.io.fitted_body import FITTED_BODY_NAME, write_fitted_body
 from torchcss.io.initialisation_views import draw_fit, draw_hypotheses, proportion_table
 from torchcss.io.joints_file import Joints, read_joints
+from torchcss.io.keypoints import Scale
 from torchcss.io.tracks import write_summary
 from torchcss.io.video import read_image
+from torchcss.settings import check_seed
 from torchcss.vision.camera import Camera
 
 NUM_DRAWN = 7
@@ -54,7 +56,7 @@ def initialise_image(
     contours: bool = True,
     colours: bool = True,
     layout: str | None = None,
-    normalised: bool = False,
+    normalised: bool | Scale = False,
     sigma: float | None = None,
     search: Search | None = None,
     seed: int = 0,
@@ -77,7 +79,8 @@ def initialise_image(
         contours: Fit shape to contours too.
         colours: Let that fit see the colours on either side of the outline.
         layout: Layout of a joints file that does not name its joints.
-        normalised: Joints are fractions of the image.
+        normalised: Whether joints are fractions of the image, and which, see
+            `torchcss.io.keypoints.Scale`.
         sigma: Noise of a marked wrist, pixels.
         search: How widely interpretations are looked for.
         seed: Seed of all random numbers.
@@ -90,6 +93,7 @@ def initialise_image(
     Raises:
         TorchcssError: With one line that says what was wrong, for any bad input.
     """
+    check_seed(seed)
     picture = read_image(image)
     height, width = picture.shape[:2]
     prepare_output_folder(out)

@@ -33,6 +33,7 @@ from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.errors import ConfigurationError, TrackFileError, VideoError
 from torchcss.inference.smoothing import refine_in_windows
 from torchcss.io.fitted_body import body_beside, read_fitted_body
+from torchcss.io.keypoints import Scale
 from torchcss.io.track_body import body_of_track
 from torchcss.io.tracks import SUMMARY_NAME, Track, read_summary
 from torchcss.io.video import Frame
@@ -174,7 +175,7 @@ def smooth_video(
     choice: Smoothing | None = None,
     camera_name: str | None = None,
     layout: str | None = None,
-    normalised: bool = False,
+    normalised: bool | Scale = False,
     masks: Path | None = None,
     body: Path | None = None,
     others: Sequence[ViewFiles] = (),
@@ -190,7 +191,8 @@ def smooth_video(
         choice: How to smooth; `IMAGES` by default.
         camera_name: Which camera of the file; by default the one of this video.
         layout: Layout of a keypoint file that does not name its joints.
-        normalised: Whether keypoints are fractions of the image.
+        normalised: Whether keypoints are fractions of the image, and which, see
+            `torchcss.io.keypoints.Scale`.
         masks: Foreground of every frame.
         body: The fitted body; by default `body.npz` beside the track if there is one, else the
             flesh of the standard humanoid on the lengths of the track.

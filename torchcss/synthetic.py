@@ -113,7 +113,12 @@ def arm_sequence(
         generator: Source of the room, the textures and the sensor noise.
         num_frames: Number of frames.
         frame_rate: Frames per second.
+
+    Raises:
+        ConfigurationError: If there is to be no frame.
     """
+    if num_frames < 1:
+        raise ConfigurationError(f"num_frames must be at least 1, got {num_frames}")
     width, height = 640, 480
     body = load_body("arm8")
     # World: Y up, the camera at its origin looking along -Z. The body faces the camera.

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchcss.cost.joints import JointObservation
 from torchcss.errors import VideoError
 from torchcss.io.cameras import LoadedCamera, check_image_size, read_camera
-from torchcss.io.keypoints import Keypoints, read_keypoints
+from torchcss.io.keypoints import Keypoints, Scale, read_keypoints
 from torchcss.io.video import Frame, VideoReader
 from torchcss.marks import typical_sigma
 from torchcss.pipeline import scale_keypoints
@@ -35,7 +35,8 @@ class ViewFiles:
         masks: Foreground of every frame, white or in shades of belief: a video or a folder of
             images, of the size and number of the video's frames.
         layout: Layout of a keypoint file that does not name its joints.
-        normalised: Whether keypoints are fractions of the image.
+        normalised: Whether keypoints are fractions of the image, and which, see
+            `torchcss.io.keypoints.Scale`.
         offset: This video's frame at the time of the first camera's frame 0.
     """
 
@@ -44,7 +45,7 @@ class ViewFiles:
     camera_name: str | None = None
     masks: Path | None = None
     layout: str | None = None
-    normalised: bool = False
+    normalised: bool | Scale = False
     offset: int = 0
 
 
@@ -160,6 +161,8 @@ def open_view(
     Raises:
         TorchcssError: If a file cannot be read, or two of them do not belong together.
     """
+    if start < 0:
+        raise VideoError(f"{files.video}: start must be at least 0, got {start}")
     start, stop = start + files.offset, None if stop is None else stop + files.offset
     if start < 0:
         raise VideoError(

@@ -99,21 +99,52 @@ def test_damaged_files(
         read_fitted_body(path)
 
 
-def test_a_body_from_a_file_is_found_again(tmp_path: Path, generator: torch.Generator):
+ROBOT = (
+    "<robot name='r'><link name='a'/><link name='b'/><link name='c'/>"
+    "<joint name='j' type='continuous'><parent link='a'/><child link='b'/></joint>"
+    "<joint name='k' type='fixed'><parent link='b'/><child link='c'/><origin xyz='0 0 1'/>"
+    "</joint></robot>"
+)
+
+
+def fitted_robot(path: Path) -> Initialisation:
     """A robot that was given a root for the fit; the file is its body's name."""
-    path = tmp_path / "robot.urdf"
-    path.write_text(
-        "<robot name='r'><link name='a'/><link name='b'/><link name='c'/>"
-        "<joint name='j' type='continuous'><parent link='a'/><child link='b'/></joint>"
-        "<joint name='k' type='fixed'><parent link='b'/><child link='c'/><origin xyz='0 0 1'/>"
-        "</joint></robot>"
-    )
+    path.write_text(ROBOT)
     body = load_body(path, free_root=True)
     spread = torch.eye(7, dtype=torch.float64)[None]
     mixture = GaussianMixture(body.rest[None], spread, torch.zeros(1).double())
-    found = Initialisation(body, mixture, torch.zeros(1).double(), ())
+    return Initialisation(body, mixture, torch.zeros(1).double(), ())
+
+
+def test_a_body_from_a_file_is_found_again(tmp_path: Path, generator: torch.Generator):
+    path = tmp_path / "robot.urdf"
+    found = fitted_robot(path)
+    body = found.body
     write_fitted_body(tmp_path / "body.npz", found, camera(generator))
     back = read_fitted_body(tmp_path / "body.npz")
     assert back.body.name == str(path)
     assert back.body.state_names == body.state_names
     assert back.body.part_names == ("b",)
+
+
+def test_the_file_of_a_body_is_found_from_anywhere(
+    tmp_path: Path, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch
+):
+    made, elsewhere, moved = (tmp_path / name for name in ("made", "elsewhere", "moved"))
+    for folder in (made / "robots", elsewhere, moved / "robots"):
+        folder.mkdir(parents=True)
+    monkeypatch.chdir(made)
+    given = Path("robots/robot.urdf")
+    write_fitted_body("body.npz", fitted_robot(given), camera(generator))
+    (moved / "body.npz").write_bytes((made / "body.npz").read_bytes())
+    monkeypatch.chdir(elsewhere)
+    assert read_fitted_body(made).body.name == str(made / given)
+    assert read_fitted_body(moved).body.name == str(made / given)
+    # Gone from where it was: it lies as before relative to the fitted body, or just beside it.
+    (made / given).rename(moved / given)
+    assert read_fitted_body(moved).body.name == str(moved / given)
+    (moved / given).rename(moved / "robot.urdf")
+    assert read_fitted_body(moved).body.name == str(moved / "robot.urdf")
+    (moved / "robot.urdf").unlink()
+    with pytest.raises(BodyError, match=r"tried .*made/robots.*, .*moved/robots.*, .*moved/robot"):
+        read_fitted_body(moved)

@@ -10,6 +10,7 @@ import pytest
 
 from torchcss.errors import KeypointError
 from torchcss.io.joints_file import read_joints
+from torchcss.io.keypoints_mediapipe import NAMES
 from torchcss.joint_names import ALIASES
 
 SIZE = (640, 480)
@@ -34,6 +35,7 @@ def test_csv_with_and_without_heading(tmp_path: Path):
         ("l_wrist,1,2\ntentacle,1,2\n", "row 2: unknown joint"),
         ("l_wrist,1\n", "row 1"),
         ("l_wrist,1,2\nr_wrist,1,x\n", "row 2"),
+        ("l_wrist,1O,2\nr_wrist,1,2\n", "row 1: expected joint, u, v"),
         ("l_wrist,1,inf\n", "row 1"),
         ("l_wrist,1,2\nleft_wrist,1,2\n", "twice"),
     ],
@@ -42,6 +44,43 @@ def test_spoilt_csv(tmp_path: Path, text: str, message: str):
     (tmp_path / "joints.csv").write_text(text)
     with pytest.raises(KeypointError, match=message):
         read_joints(tmp_path / "joints.csv", image_size_wh=SIZE)
+
+
+DEEPLABCUT = (
+    "scorer,net,net,net,net,net,net\n"
+    "bodyparts,l_hip,l_hip,l_hip,r_knee,r_knee,r_knee\n"
+    "coords,x,y,likelihood,x,y,likelihood\n"
+    "0,100,200,0.9,300,400,0.5\n"
+)
+WIDE = "frame,l_hip_x,l_hip_y,l_hip_conf,r_knee_x,r_knee_y,r_knee_conf\n0,100,200,0.9,300,400,0.5\n"
+
+
+@pytest.mark.parametrize("text", [DEEPLABCUT, WIDE])
+def test_other_csv_goes_to_its_reader(tmp_path: Path, text: str):
+    path = tmp_path / "joints.csv"
+    path.write_text(text)
+    found = read_joints(path, image_size_wh=SIZE)
+    assert found.joint_names == ("l_hip", "r_knee")
+    assert found.keypoints.tolist() == [[100, 200], [300, 400]]
+    assert found.confidence.tolist() == [0.9, 0.5]
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_csv_of_landmarks(tmp_path: Path, named: bool):
+    """A row for each of MediaPipe's, of which the catalogue knows some."""
+    path = tmp_path / "joints.csv"
+    rows = [f"{name if named else i},0.5,0.25,-0.1,0.8" for i, name in enumerate(NAMES)]
+    path.write_text("\n".join(["landmark,x,y,z,visibility", *rows]))
+    found = read_joints(path, image_size_wh=SIZE)
+    assert len(found.joint_names) == len(NAMES)
+    assert found.keypoints[found.joint_names.index("l_wrist")].tolist() == [319.5, 119.5]
+
+
+def test_rows_of_joints_are_pixels(tmp_path: Path):
+    path = tmp_path / "joints.csv"
+    path.write_text("l_wrist,0.5,0.5\n")
+    with pytest.raises(KeypointError, match="leave normalised out"):
+        read_joints(path, image_size_wh=SIZE, normalised="zero-one")
 
 
 def test_mediapipe(tmp_path: Path):

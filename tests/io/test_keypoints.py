@@ -119,6 +119,18 @@ def test_detections(tmp_path: Path, image: str | None) -> None:
     check(read(path), frames, "COCO-17")
 
 
+@pytest.mark.parametrize("layout", ["Halpe-26", "Halpe-136"])
+def test_detections_with_feet(tmp_path: Path, layout: str) -> None:
+    """AlphaPose's larger models: COCO's joints, then head top, neck, hips' middle and feet."""
+    frames = moving(layout)
+    path = write_json(tmp_path / "a.json", detections([[p] for p in frames], "{}.jpg"))
+    found = read(path, num_frames=5)
+    check(found, frames, layout)
+    assert found.joint_names[:17] == ALIASES["COCO-17"]
+    assert found.joint_names[17:22] == ("skull_tip", "vc7", "HumanoidRoot", "l_toe", "r_toe")
+    assert found.joint_names[24:26] == ("l_heel", "r_heel")
+
+
 def test_detections_that_count_from_one(tmp_path: Path) -> None:
     frames = moving()
     path = write_json(tmp_path / "a.json", detections([[], *([person] for person in frames)]))

@@ -5,7 +5,8 @@ One NPZ file, schema version 1. K hypotheses, n parameters, P parts, L lengths:
 | array | shape | meaning |
 |---|---|---|
 | `schema_version` | | 1 |
-| `body` | | name of the body |
+| `body` | | name of the body; of one from a file, its path as it was given |
+| `body_file` | | the absolute path of that file; empty for a body that ships |
 | `scale` | | of the standard humanoid |
 | `length_names`, `lengths` | L | fitted lengths, metres |
 | `part_names`, `part_shape` | P, P 9 | shape numbers of the parts |
@@ -31,6 +32,7 @@ import torch
 from torchcss.body.model import BodyModel, load_body
 from torchcss.body.root import ROOT_NAMES
 from torchcss.body.shape import with_shape
+from torchcss.body.skeletons import BODY_SUFFIXES
 from torchcss.errors import BodyError
 from torchcss.hypotheses import Initialisation
 from torchcss.inference.mixture import GaussianMixture
@@ -75,6 +77,7 @@ def write_fitted_body(path: str | os.PathLike[str], found: Initialisation, camer
     arrays = {
         "schema_version": np.array(SCHEMA_VERSION),
         "body": np.array(body.name),
+        "body_file": np.array(os.path.abspath(body.name) if _is_file(body.name) else ""),
         "scale": np.array(found.scale),
         "length_names": np.array(list(found.lengths), dtype=np.str_),
         "lengths": np.array(list(found.lengths.values()), dtype=np.float64),
@@ -146,6 +149,8 @@ def read_fitted_body(
         bare = {name: length / scale for name, length in zip(names, lengths, strict=True)}
         # A robot that stands fixed may have been fitted with a root.
         rooted = set(ROOT_NAMES) <= set(arrays["state_names"].tolist())
+        if _is_file(name):
+            name = _file_of_body(name, str(arrays.get("body_file", "")), path)
         body = load_body(name, lengths=bare, scale=scale, free_root=rooted)
         layout = {"state_names": body.state_names, "part_names": body.part_names}
         for key, expected in layout.items():
@@ -185,3 +190,32 @@ def read_fitted_body(
         if isinstance(error, BodyError):
             raise
         raise BodyError(f"{path}: not a fitted body: {error}") from error
+
+
+def _is_file(name: str) -> bool:
+    """Whether a body of this name is one from a file."""
+    return Path(name).suffix.lower() in BODY_SUFFIXES
+
+
+def _file_of_body(given: str, absolute: str, fitted: Path) -> str:
+    """Where the file of a body is now, be it that folders moved or that this is another machine.
+
+    Args:
+        given: Its path as it was given, perhaps from another folder than this.
+        absolute: Its absolute path then; empty if it is not known.
+        fitted: The file of the fitted body, beside which it may have been put.
+
+    Raises:
+        BodyError: If it is at none of the places.
+    """
+    folder = fitted.parent
+    places = (absolute, given, str(folder / given), str(folder / Path(given).name))
+    tried = [place for place in dict.fromkeys(places) if place]
+    # Unlike `Path.is_file`, this also answers for what cannot be a path.
+    for place in tried:
+        if os.path.isfile(place):
+            return place
+    raise BodyError(
+        f"{fitted}: the file of its body is missing; tried {', '.join(tried)}; put it beside "
+        f"{fitted.name}"
+    )

@@ -4,7 +4,8 @@
 |---|---|
 | CSV | suffix `.csv`: rows `joint, u, v[, confidence]`, with or without a heading |
 | MediaPipe | JSON: a list of 33 landmarks `{"x", "y", "visibility"}`, or it under `landmarks` |
-| OpenPose, COCO, clicked, NPZ | see `torchcss.io.keypoints` |
+| other CSV | a first row that names the columns otherwise, as DeepLabCut's or `l_hip_x` |
+| these, OpenPose, COCO, clicked, NPZ | see `torchcss.io.keypoints` |
 
 Missing joints are simply missing. Call `read_joints`.
 """
@@ -23,7 +24,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.errors import KeypointError
-from torchcss.io.keypoints import read_keypoints
+from torchcss.io.keypoints import Scale, read_keypoints
 from torchcss.io.safe_load import load_json
 from torchcss.joint_names import ALIASES, JOINT_NAMES, canonical_joint_name
 
@@ -49,7 +50,7 @@ def read_joints(
     *,
     image_size_wh: tuple[int, int],
     layout: str | None = None,
-    normalised: bool = False,
+    normalised: bool | Scale = False,
     frame: int = 0,
 ) -> Joints:
     """Read the joints of one picture.
@@ -58,7 +59,8 @@ def read_joints(
         path: A file, or OpenPose's folder.
         image_size_wh: Size of the picture.
         layout: Layout of a file that does not name its joints.
-        normalised: Coordinates are fractions of the image (MediaPipe's always are).
+        normalised: Whether coordinates are fractions of the image, and which, see
+            `torchcss.io.keypoints.Scale` (MediaPipe's always are, rows of joints never).
         frame: Which frame of a file that has several.
 
     Raises:
@@ -66,7 +68,13 @@ def read_joints(
     """
     path = Path(path)
     if path.suffix.lower() == ".csv":
-        return _read_csv(path)
+        rows = _csv_rows(path)
+        if _are_joints(rows):
+            if normalised not in (False, "pixels"):
+                raise KeypointError(
+                    f"{path}: rows joint, u, v[, confidence] are in pixels; leave normalised out"
+                )
+            return _read_csv(path, rows)
     if path.suffix.lower() == ".json":
         content = load_json(path, KeypointError)
         if isinstance(content, dict) and "landmarks" in content:
@@ -90,12 +98,37 @@ def _frame_of_single_image(content: object, otherwise: int) -> int:
     return int(digits[-1]) if digits else otherwise
 
 
-def _read_csv(path: Path) -> Joints:
+def _csv_rows(path: Path) -> list[list[str]]:
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = [[cell.strip() for cell in row] for row in csv.reader(file) if any(row)]
+            return [[cell.strip() for cell in row] for row in csv.reader(file) if any(row)]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise KeypointError(f"{path}: cannot be read as CSV: {error}") from error
+
+
+def _is_heading(row: list[str]) -> bool:
+    """Whether a first row names the columns: it is of no joint, and holds words."""
+    if canonical_joint_name(row[0]) is not None:
+        return False
+    try:
+        [float(cell) for cell in row[1:4] if cell]
+    except ValueError:
+        return True
+    return False
+
+
+def _are_joints(rows: list[list[str]]) -> bool:
+    """Whether these are rows `joint, u, v[, confidence]` and not another table with a heading."""
+    if len(rows) < 2 or not _is_heading(rows[0]):
+        return True
+    # MediaPipe's landmarks are a row each too, with a depth or under their own word.
+    names = [cell.lower() for cell in rows[0]]
+    if "z" in names or "landmark" in names[0]:
+        return False
+    return any(canonical_joint_name(row[0]) for row in rows[1:])
+
+
+def _read_csv(path: Path, rows: list[list[str]]) -> Joints:
     table: dict[str, list[float]] = {}
     for number, row in enumerate(rows):
         where = f"{path}: row {number + 1}"
@@ -103,8 +136,8 @@ def _read_csv(path: Path) -> Joints:
         try:
             values = [float(cell) for cell in row[1:4] if cell]
         except ValueError:
-            if number == 0:
-                continue  # the heading
+            if number == 0 and _is_heading(row):
+                continue
             raise KeypointError(
                 f"{where}: expected joint, u, v[, confidence], found {row}"
             ) from None

@@ -54,7 +54,10 @@ Scale = Literal["pixels", "zero-one", "plus-minus-one"]
 
 # Which layout a number of unnamed joints means; the first is the default.
 _LAYOUTS_BY_COUNT: dict[int, tuple[str, ...]] = {}
-for _name in ("COCO-17", "COCO-18", "BODY_25", "BODY_25B", "MediaPipe-33", "SMPL-24", "H36M-17"):
+for _name in (
+    "COCO-17", "COCO-18", "BODY_25", "BODY_25B", "MediaPipe-33", "SMPL-24", "H36M-17",
+    "Halpe-26", "Halpe-136",
+):  # fmt: skip
     _LAYOUTS_BY_COUNT.setdefault(len(ALIASES[_name]), ())
     _LAYOUTS_BY_COUNT[len(ALIASES[_name])] += (_name,)
 
@@ -260,6 +263,8 @@ def _check_somebody(path: Path, people: People, first_frame: int) -> None:
         if later is not None
         else "there is none later either"
     )
+    if first_frame == 0 and later == 1:
+        advice += ", or number the frames from 0, if the file counts them from 1"
     raise KeypointError(
         f"{path}: nobody in the first frame ({first_frame}), where tracking starts; {advice}"
     )
@@ -283,7 +288,8 @@ def _to_pixels(
         if fractions:
             raise KeypointError(
                 f"{path}: expected pixels, but all coordinates lie between {points.min():.3g} and "
-                f"{points.max():.3g}: they seem to be fractions of the image; if so, set normalised"
+                f"{points.max():.3g}: they seem to be fractions of the image; if so, "
+                "set normalised to zero-one or plus-minus-one"
             )
         return
     if not fractions:
