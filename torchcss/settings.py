@@ -30,6 +30,7 @@ from torchcss.cost.total import CostChoice
 from torchcss.errors import ConfigurationError
 from torchcss.inference.tracker import SequenceTracker, Tracker
 from torchcss.presets import PRESETS, make_tracker
+from torchcss.recovery import OBSERVATIONS
 from torchcss.robust import Quadratic
 from torchcss.vision.features import FeatureExtractor
 from torchcss.vision.flow import TRACKING
@@ -46,9 +47,6 @@ ALL_TERMS = (
 )
 """Terms and priors that can be chosen; see `torchcss.cost.total`. `motion_boundaries` weighs the
 edges of `contour` and `edge_energy` by the motion boundaries, `W = 1 - k S_p`."""
-
-_SEEING = ("contour", "edge_energy", "region", "segmentation", "flow", "joints")
-"""Terms that see the picture or its joints; priors alone say nothing about a video."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,10 +99,10 @@ class Settings:
         unknown = sorted(set(self.terms) - set(ALL_TERMS))
         if unknown:
             raise ConfigurationError(f"unknown terms {unknown}; there are {', '.join(ALL_TERMS)}")
-        if not set(self.terms) & set(_SEEING):
+        if not set(self.terms) & set(OBSERVATIONS):
             raise ConfigurationError(
-                f"terms: expected at least one of {', '.join(_SEEING)}, which see the picture or "
-                f"its joints; got {', '.join(self.terms) or 'none'}"
+                f"terms: expected at least one of {', '.join(OBSERVATIONS)}, which compare a pose "
+                f"with the image; got {', '.join(self.terms) or 'none'}"
             )
         # Motion boundaries are no term of their own: `boundary_emphasis` weighs them.
         weighed = [name for name in ALL_TERMS if name != "motion_boundaries"]
