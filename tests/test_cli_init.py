@@ -16,7 +16,7 @@ from torchcss.initialise_image import write_png
 from torchcss.interpretations import Search
 from torchcss.io.joints_file import Joints
 from torchcss.io.tracks import load_track
-from torchcss.io.video import VideoWriter, read_image
+from torchcss.io.video import VideoReader, VideoWriter, read_image
 from torchcss.synthetic import arm_sequence
 
 
@@ -151,3 +151,39 @@ def test_clicked_joints_are_used_and_kept(
     assert summary["num_hypotheses"] == 1
     focal = 0.5 * 640 / math.tan(math.radians(27))
     assert f"focal length {focal:.0f} px" in summary["report"][0]
+
+
+def test_from_a_frame_of_a_video(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """What is marked in a later frame is of that frame, for `track --start` too."""
+    marks = json.loads((scene / "joints.json").read_text())["joints"]
+    places = torch.tensor(list(marks.values()), dtype=torch.float64)
+    clicked = Joints(places, torch.ones(len(places)).double(), tuple(marks), ("clicked",))
+    seen = []
+    small = Search(num_starts=8, num_flips=8, num_samples=0)
+    plain = cli_init.initialise_image
+    monkeypatch.setattr(
+        cli_init, "initialise_image", lambda *a, **k: plain(*a, **{**k, "search": small})
+    )
+    monkeypatch.setattr(cli_init, "click_joints", lambda picture: seen.append(picture) or clicked)
+    quick = [
+        "--camera", str(scene / "cameras.json"), "--no-contours", "--hypotheses", "best",
+        "--body", "arm8",
+    ]  # fmt: skip
+    video = ["init", str(scene / "video.mp4"), "--frame", "1", *quick]
+    assert cli.main([*video, "--click", "--out", str(tmp_path / "a")]) == 0
+    second = list(VideoReader(scene / "video.mp4"))[1].image
+    assert (seen[0] == second).all()
+    made = tmp_path / "a" / "joints.json"
+    assert list(json.loads(made.read_text())["frames"]) == ["1"]
+    for number, joints in enumerate((made, scene / "keypoints.npz", scene / "joints.json")):
+        out = tmp_path / str(number)
+        assert cli.main([*video, "--joints", str(joints), "--out", str(out)]) == 0
+        assert json.loads((out / "summary.json").read_text())["frame"] == 1
+    assert cli.main([*video[:3], "7", *quick, "--joints", str(made), "--out", str(tmp_path)]) == 2
+    given = [
+        "track", str(scene / "video.mp4"), "--camera", str(scene / "cameras.json"), "--start", "1",
+        "--keypoints", str(made), "--init", str(tmp_path / "a"), "--keypoints-use", "first",
+        "--samples", "4", "--modes", "2", "--no-overlay", "--out", str(tmp_path / "track"),
+    ]  # fmt: skip
+    assert cli.main([*given, "--body", "arm8"]) == 0
+    assert list(load_track(tmp_path / "track").frames) == [1]

@@ -1,4 +1,4 @@
-"""The verb `torchcss init`: a body from one picture."""
+"""The verb `torchcss init`: a body from one picture, or from one frame of a video."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchcss.io.atomic import prepare_output_folder
 from torchcss.io.click import click_joints, write_clicked
 from torchcss.io.joints_file import Joints
 from torchcss.io.keypoints import Scale
-from torchcss.io.video import read_image
+from torchcss.io.video import read_frame
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +24,9 @@ class Init:
     """Fit pose, proportions and shape to one picture with marked joints."""
 
     image: Annotated[Path, tyro.conf.Positional]
-    """The picture."""
+    """The picture, or a video."""
+    frame: int = 0
+    """Which frame of the video, from 0; `torchcss track --start` takes the same number."""
     joints: Path | None = None
     """Marked joints: clicked JSON, CSV, OpenPose, COCO, MediaPipe or NPZ."""
     click: bool = False
@@ -70,15 +72,17 @@ class Init:
             raise KeypointError("give a file with --joints, or --click to mark the joints")
         joints: Path | Joints | None = self.joints
         if joints is None:
-            picture = read_image(self.image)
+            picture = read_frame(self.image, self.frame)
             joints = click_joints(picture)
             prepare_output_folder(self.out)
-            write_clicked(self.out / "joints.json", joints, (picture.shape[1], picture.shape[0]))
+            size = (picture.shape[1], picture.shape[0])
+            write_clicked(self.out / "joints.json", joints, size, frame=self.frame)
         keep = {"best": 1, "all": None}.get(str(self.hypotheses), self.hypotheses)
         found, summary = initialise_image(
             self.image,
             joints=joints,
             out=self.out,
+            frame=self.frame,
             camera=self.camera,
             camera_name=self.camera_name,
             focal_px=self.focal_px,

@@ -33,7 +33,7 @@ from torchcss.io.initialisation_views import draw_fit, draw_hypotheses, proporti
 from torchcss.io.joints_file import Joints, read_joints
 from torchcss.io.keypoints import Scale
 from torchcss.io.tracks import write_summary
-from torchcss.io.video import read_image
+from torchcss.io.video import read_frame
 from torchcss.settings import check_seed
 from torchcss.vision.camera import Camera
 
@@ -46,6 +46,7 @@ def initialise_image(
     *,
     joints: Path | Joints,
     out: Path,
+    frame: int = 0,
     camera: Path | None = None,
     camera_name: str | None = None,
     focal_px: float | None = None,
@@ -66,9 +67,10 @@ def initialise_image(
     """Initialise from a picture and write the results.
 
     Args:
-        image: The picture.
+        image: The picture, or a video.
         joints: File of the marked joints, or the joints.
         out: Output folder.
+        frame: Which frame of the video.
         camera: Calibration file; None: a pinhole camera.
         camera_name: Camera in the file.
         focal_px: Focal length of the pinhole camera, pixels.
@@ -94,7 +96,7 @@ def initialise_image(
         TorchcssError: With one line that says what was wrong, for any bad input.
     """
     check_seed(seed)
-    picture = read_image(image)
+    picture = read_frame(image, frame)
     height, width = picture.shape[:2]
     prepare_output_folder(out)
     if camera is None:
@@ -111,7 +113,11 @@ def initialise_image(
         notes = [f"camera: {eye.name}", *([loaded.units_note] if loaded.units_note else [])]
     if not isinstance(joints, Joints):
         joints = read_joints(
-            joints, image_size_wh=(width, height), layout=layout, normalised=normalised
+            joints,
+            image_size_wh=(width, height),
+            layout=layout,
+            normalised=normalised,
+            frame=frame,
         )
     began = time.perf_counter()
     found = initialise(
@@ -143,6 +149,7 @@ def initialise_image(
         writer.writerows(rows)
     summary: dict[str, Any] = {
         "image": image,
+        "frame": frame,
         "camera": eye.name,
         "body": body,
         "seed": seed,

@@ -225,7 +225,7 @@ def click_joints(image: UInt8[np.ndarray, "h w 3"], names: tuple[str, ...] = CLI
 
 
 def write_clicked(
-    path: str | os.PathLike[str], joints: Joints, image_size_wh: tuple[int, int]
+    path: str | os.PathLike[str], joints: Joints, image_size_wh: tuple[int, int], *, frame: int = 0
 ) -> None:
     """Write joints as a clicked file.
 
@@ -233,6 +233,7 @@ def write_clicked(
         path: JSON file.
         joints: The joints.
         image_size_wh: Size of the picture.
+        frame: Which frame of a video it is.
 
     Raises:
         OutputError: If it cannot be written.
@@ -241,7 +242,8 @@ def write_clicked(
         name: [round(number, 2) for number in place]
         for name, place in zip(joints.joint_names, joints.keypoints.tolist(), strict=True)
     }
-    content = {"image_size_wh": list(image_size_wh), "joints": places}
+    marked = {"joints": places} if frame == 0 else {"frames": {str(frame): places}}
+    content = {"image_size_wh": list(image_size_wh), **marked}
     with replace_file(Path(path)) as partial:
         partial.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 

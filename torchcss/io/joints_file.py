@@ -61,7 +61,7 @@ def read_joints(
         layout: Layout of a file that does not name its joints.
         normalised: Whether coordinates are fractions of the image, and which, see
             `torchcss.io.keypoints.Scale` (MediaPipe's always are, rows of joints never).
-        frame: Which frame of a file that has several.
+        frame: Which frame of a file that has several; a file of one picture is of that picture.
 
     Raises:
         KeypointError: If the file is missing, damaged or of unknown format.
@@ -82,6 +82,8 @@ def read_joints(
         rows = content if isinstance(content, list) else []
         if rows and isinstance(rows[0], dict) and {"x", "y"} <= set(rows[0]):
             return _read_mediapipe(path, rows, image_size_wh)
+        if isinstance(content, dict) and content.keys() & {"joints", "people"}:
+            frame = 0
         frame = _frame_of_single_image(content, frame)
     marks = read_keypoints(
         path, image_size_wh=image_size_wh, layout=layout, normalised=normalised, first_frame=frame

@@ -465,6 +465,20 @@ def read_image(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "h w 3"]:
         ) from error
 
 
+def read_frame(path: str | os.PathLike[str], index: int = 0) -> UInt8[np.ndarray, "h w 3"]:
+    """Read one frame of a video, or one image.
+
+    Args:
+        path: What `VideoReader` takes.
+        index: Place of the frame in the video, from 0.
+
+    Raises:
+        VideoError: If it cannot be read, or the video ends before it.
+    """
+    with VideoReader(path, start=index, stop=index + 1) as frames:
+        return next(iter(frames)).image
+
+
 def natural_order(name: str) -> tuple[tuple[int, int | str], ...]:
     """Return a sorting key in which numbers inside names count as numbers: 2 before 10."""
     # `[0-9]` and not `\d`: the latter takes signs such as superscripts that `int` refuses.
