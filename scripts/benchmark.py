@@ -37,7 +37,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-import matplotlib.image
 import numpy as np
 import torch
 import tyro
@@ -47,6 +46,7 @@ from torch import Tensor
 from torchcss.cost.total import TrackingCost
 from torchcss.errors import TorchcssError
 from torchcss.io.tracks import prepare_output_folder, write_summary
+from torchcss.io.video import read_image
 from torchcss.stopwatch import Stopwatch
 from torchcss.types import LocalModel
 from torchcss.vision.features import FeatureExtractor
@@ -149,6 +149,9 @@ def main(config: Config) -> dict[str, Any]:
     if config.memory_of is not None:
         print(json.dumps(memory := measure_memory(config, config.memory_of)))
         return memory
+    pair: Any = made_up_frames(config.size_wh)
+    if config.frames is not None:
+        pair = [read_image(path) for path in config.frames]
     ways, full = make_ways(config)
     # First of all the memory: on Linux a process starts with the peak of the one that starts it.
     memory = {name: memory_in_own_process(config, name) for name in ways}
@@ -163,9 +166,6 @@ def main(config: Config) -> dict[str, Any]:
     watches = {"full_value": Stopwatch(), "full_closed": Stopwatch()}
     replace(full, stopwatch=watches["full_value"]).value(ways["full_value"][1])
     replace(full, stopwatch=watches["full_closed"]).local_model(ways["full_closed"][1])
-    pair: Any = made_up_frames(config.size_wh)
-    if config.frames is not None:
-        pair = [np.asarray(matplotlib.image.imread(path)) for path in config.frames]
     extractor = FeatureExtractor(flow=TRACKING, working_size=640)
     extract = [seconds_of(lambda frame: extractor(frame, pair[0]), pair[1]) for _ in rounds]
     metrics = {

@@ -22,7 +22,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-import matplotlib.image
 import numpy as np
 import torch
 import tyro
@@ -32,6 +31,7 @@ from torch.nn import functional
 from torchcss.errors import FlowFileError, TorchcssError
 from torchcss.io.flow_files import read_flow
 from torchcss.io.tracks import prepare_output_folder, write_summary
+from torchcss.io.video import read_image
 from torchcss.robust import Quadratic
 from torchcss.vision.boundaries import flow_discontinuities, motion_boundaries
 from torchcss.vision.flow import ACCURATE, TRACKING, OpticalFlow, robust_flow
@@ -160,10 +160,8 @@ def read_pairs(config: Config) -> list[Pair]:
 
 
 def read_grey(path: Path) -> Tensor:
-    image = torch.from_numpy(np.asarray(matplotlib.image.imread(path), np.float32))
-    if image.ndim == 2:
-        return image
-    return image[..., :3] @ image.new_tensor([0.299, 0.587, 0.114])
+    image = torch.from_numpy(read_image(path)).float() / 255
+    return image @ image.new_tensor([0.299, 0.587, 0.114])
 
 
 def errors(flow: Tensor, pair: Pair, near: Tensor) -> dict[str, float | None]:

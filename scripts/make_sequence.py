@@ -84,5 +84,5 @@ if __name__ == "__main__":
     try:
         print(json.dumps(main(tyro.cli(Config, description=__doc__)), indent=1))
     except TorchcssError as error:
-        print(error, file=sys.stderr)
+        print(f"error: {error}", file=sys.stderr)
         sys.exit(2)

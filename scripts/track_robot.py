@@ -151,6 +151,10 @@ def main(config: Config) -> dict[str, Any]:
         path, link, middle = config.urdf, config.link, None
         if link is None:
             raise ConfigurationError("--urdf: name its end effector with --link")
+    if not path.is_file():
+        raise ConfigurationError(
+            f"{path}: there is no such file; --data or --urdf says where it is"
+        )
     prepare_output_folder(config.out)
     pose = None if middle is None else torch.tensor(middle, dtype=torch.float64)
     rows = [run_seed(config, path, link, pose, seed) for seed in config.seeds]

@@ -34,6 +34,7 @@ def test_every_script_prints_its_errors_and_explains_itself(path: Path) -> None:
         ("sampler_slices", {"body": "foo"}, "no body 'foo'; expected one of"),
         ("compare_solvers", {"solvers": ("foo",)}, r"no solvers \['foo'\]; there are torchcss"),
         ("compare_solvers", {"solvers": ("scipy trf",)}, "all are compared with torchcss"),
+        ("benchmark", {"frames": (NOWHERE / "a.png", NOWHERE / "b.png")}, "a.png: not an image"),
         ("evaluate_flow", {"data": NOWHERE}, "no folder in it holds flow10.flo"),
     ],
 )
