@@ -16,6 +16,7 @@ from torchcss.raster import (
     clutter_background,
     interpolate,
     join_faces,
+    nearest_faces,
     random_texture,
     rasterise,
     render_meshes,
@@ -119,6 +120,21 @@ def test_small_chunks_change_nothing(generator, monkeypatch):
     monkeypatch.setattr(raster, "_PIXELS_AT_ONCE", 37)
     for a, b in zip(whole, rasterise(uv, depth, faces, 50, 40), strict=True):
         assert torch.equal(a, b)
+
+
+def test_many_pictures_at_once_are_those_one_by_one(generator):
+    """What lies outside of one picture must not show up in the next."""
+    uv, depth, faces = soup(generator, size=40.0)
+    many = torch.stack([uv + shift for shift in (0.0, -30.0, 25.0, 1e4)])
+    depths = depth + torch.tensor([[0.0], [1.0], [-1.0], [0.0]])
+    valid = torch.rand(depths.shape, generator=generator) > 0.1
+    found = nearest_faces(many, depths, faces, 37, 43, valid=valid)
+    for seen, places, behind, use in zip(found, many, depths, valid, strict=True):
+        assert torch.equal(seen, rasterise(places, behind, faces, 37, 43, valid=use).face)
+    none = nearest_faces(many[:0], depths[:0], faces, 3, 4, valid=valid[:0])
+    assert none.shape == (0, 3, 4)
+    with pytest.raises(ShapeError, match="valid"):
+        nearest_faces(many, depths, faces, 3, 4, valid=valid[:1])
 
 
 def test_order_of_faces_and_corners_does_not_matter(generator):

@@ -244,20 +244,12 @@ def rasterise(
             f"faces: expected vertex indices from 0 to {uv.shape[0] - 1}, got "
             f"{int(faces.min())} to {int(faces.max())}; does the mesh belong to these vertices?"
         )
+    if valid is not None:
+        check_shape("valid", valid, uv.shape[0])
     uv, depth, faces = uv.detach(), depth.detach(), faces.long()
     # float64, so that neither large coordinates nor thin triangles open cracks.
     place, distance = uv.double(), depth.double()
-    usable = (
-        (place.abs() < _FARTHEST_PIXEL).all(-1)
-        & (distance > _NEAREST_DEPTH)
-        & torch.isfinite(distance)
-    )
-    if valid is not None:
-        check_shape("valid", valid, uv.shape[0])
-        usable = usable & valid
-    area = _twice_area(place, faces)
-    drawn = torch.nonzero(usable[faces].all(-1) & (area.abs() > _LEAST_AREA))[:, 0]
-
+    drawn, area = _drawn(place, distance, faces, valid)
     nearest = _nearest_faces(place, distance, faces, drawn, height, width)
     pixel = torch.nonzero(nearest >= 0)[:, 0]
     face = nearest[pixel]
@@ -286,6 +278,59 @@ def rasterise(
     )
 
 
+def nearest_faces(
+    uv: Float[Tensor, "b v 2"],
+    depth: Float[Tensor, "b v"],
+    faces: Int[Tensor, "f 3"],
+    height: int,
+    width: int,
+    *,
+    valid: Bool[Tensor, "b v"],
+) -> Int[Tensor, "b h w"]:
+    """Only the `face` of `rasterise`, of many pictures of one mesh at once.
+
+    Args:
+        uv: Projected vertices of each picture, pixels.
+        depth: Their depths.
+        faces: Corner indices of the triangles, the same in every picture.
+        height: Rows of a picture.
+        width: Columns of a picture.
+        valid: Vertices that may be used.
+
+    Raises:
+        ShapeError: If a shape is wrong.
+    """
+    check_shape("depth", depth, None, None)
+    check_shape("uv", uv, *depth.shape, 2)
+    check_shape("valid", valid, *depth.shape)
+    pictures, vertices = depth.shape
+    place, distance = uv.detach().double().flatten(0, 1), depth.detach().double().flatten()
+    first = vertices * torch.arange(pictures, device=uv.device)
+    every = (faces.long() + first[:, None, None]).flatten(0, 1)
+    drawn, _ = _drawn(place, distance, every, valid.flatten())
+    nearest = _nearest_faces(place, distance, every, drawn, height, width, pictures=pictures)
+    nearest = nearest.view(pictures, height, width)
+    return torch.where(nearest >= 0, nearest % len(faces), nearest)
+
+
+def _drawn(
+    place: Float[Tensor, "v 2"],
+    distance: Float[Tensor, " v"],
+    faces: Int[Tensor, "f 3"],
+    valid: Bool[Tensor, " v"] | None,
+) -> tuple[Int[Tensor, " d"], Float[Tensor, " f"]]:
+    """Which triangles can be drawn, and the doubled areas of all."""
+    usable = (
+        (place.abs() < _FARTHEST_PIXEL).all(-1)
+        & (distance > _NEAREST_DEPTH)
+        & torch.isfinite(distance)
+    )
+    if valid is not None:
+        usable = usable & valid
+    area = _twice_area(place, faces)
+    return torch.nonzero(usable[faces].all(-1) & (area.abs() > _LEAST_AREA))[:, 0], area
+
+
 def _twice_area(place: Float[Tensor, "v 2"], faces: Int[Tensor, "f 3"]) -> Float[Tensor, " f"]:
     """Signed area of the projected triangles, doubled."""
     first, second, third = place[faces].unbind(1)
@@ -300,8 +345,13 @@ def _nearest_faces(
     drawn: Int[Tensor, " d"],
     height: int,
     width: int,
-) -> Int[Tensor, " hw"]:
-    """Index of the nearest of the `drawn` faces for every pixel, -1 where there is none."""
+    *,
+    pictures: int = 1,
+) -> Int[Tensor, " bhw"]:
+    """Index of the nearest of the `drawn` faces for every pixel, -1 where there is none.
+
+    Of several pictures each has as many of the `faces`, one after the other.
+    """
     corner, inverse = place[faces[drawn]], 1 / distance[faces[drawn]]
     order = corner[..., 1].argsort(-1)
     inverse = inverse.gather(-1, order)
@@ -335,11 +385,14 @@ def _nearest_faces(
     slope = ((stop - start) / (length - 1).clamp_min(1)).float()
     plane = torch.stack((start.float(), slope))
     first_pixel = row * width + left.long()
+    if pictures > 1:
+        picture = drawn[triangle] // (faces.shape[0] // pictures)
+        first_pixel = first_pixel + picture * (height * width)
 
     # Rows to pixels. A positive float orders like its bits, so one integer maximum over
     # (inverse depth, reversed face index) finds the nearest face and settles ties.
     name = torch.stack((first_pixel, faces.shape[0] - 1 - drawn[triangle]))
-    best = torch.full((height * width,), -1, dtype=torch.long, device=place.device)
+    best = torch.full((pictures * height * width,), -1, dtype=torch.long, device=place.device)
     for chunk in _chunks(length):
         span, offset = _expand(length[chunk])
         near, rise = plane[:, chunk].index_select(1, span)
