@@ -128,7 +128,7 @@ def arm_scenes(
     for index in frames:
         features = extractor(sequence.frames[index], sequence.frames[index - 1])
         previous, before = states[index - 1], extractor(sequence.frames[index - 1])
-        appearance = costs.learn(None, before, body, previous, sure=True)
+        appearance = costs.learn(None, before, body, previous)
         cost = costs(features, body=body, before=previous, appearance=appearance)
         cost = replace(cost, parent=previous)
         image, truth = sequence.frames[index], states[index]

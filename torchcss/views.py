@@ -13,7 +13,6 @@ import numpy as np
 from torch import Tensor
 
 from torchcss.body.model import BodyModel
-from torchcss.body.root import has_root
 from torchcss.cost.frame import FrameCosts
 from torchcss.cost.joints import JointObservation
 from torchcss.cost.total import TrackingCost
@@ -105,10 +104,5 @@ class Watcher:
         )
 
     def learn(self, body: BodyModel, state: Tensor) -> None:
-        """Take in what body and surroundings look like in that image.
-
-        An arm hangs on a base that is told, and its outline is known better than a body's.
-        """
-        self.appearance = self.costs.learn(
-            self.appearance, self.features, body, state, sure=not has_root(body)
-        )
+        """Take in what body and surroundings look like in that image."""
+        self.appearance = self.costs.learn(self.appearance, self.features, body, state)

@@ -212,17 +212,26 @@ def test_masks_are_those_of_the_whole_picture(
         assert torch.equal(one, other)
 
 
-def test_of_a_known_outline_all_but_two_pixels_is_own() -> None:
-    body = load_body("arm8")
-    K = [[300.0, 0.0, 159.5], [0.0, 300.0, 119.5], [0.0, 0.0, 1.0]]
-    turn = torch.diag(torch.tensor([1.0, -1.0, -1.0])).double()
-    away = turn @ -body.pose(body.rest).joints.mean(0) + torch.tensor([0.0, 0.0, 1.5])
-    camera = Camera(K, (320, 240), R_camera_world=turn, t_camera_world=away).to(torch.float64)
+@pytest.mark.parametrize(("name", "margin"), [("arm8", 2), ("body34", 4)])
+def test_what_is_off_the_outline_is_own(name: str, margin: int) -> None:
+    """By two pixels on an arm, whose base is told, by four on a body."""
+    body = load_body(name)
+    if name == "arm8":
+        K = [[300.0, 0.0, 159.5], [0.0, 300.0, 119.5], [0.0, 0.0, 1.0]]
+        turn = torch.diag(torch.tensor([1.0, -1.0, -1.0])).double()
+        away = turn @ -body.pose(body.rest).joints.mean(0) + torch.tensor([0.0, 0.0, 1.5])
+        camera = Camera(K, (320, 240), R_camera_world=turn, t_camera_world=away)
+    else:
+        body, camera = someone_at_three_metres(900.0)
     names, layer_of = part_layers(body)
-    inside, _ = region_masks(body, body.rest, camera, sure=True)
-    own = torch.tensor((*layer_of, -1))[part_map(body, body.rest, camera)]
-    for layer, name in enumerate(names):
+    inside, _ = region_masks(body, body.rest, camera.to(torch.float64))
+    own = torch.tensor((*layer_of, -1))[part_map(body, body.rest, camera.to(torch.float64))]
+    wide = 0
+    for layer, part in enumerate(names):
         whole = own == layer
-        margin = functional.max_pool2d((~whole)[None].float(), 5, 1, 2)[0] > 0
-        assert not (whole & ~margin & ~inside[layer]).any(), name
-        assert int(whole.sum()) > int(inside[layer].sum()) > 0.5 * int(whole.sum()), name
+        border = functional.max_pool2d((~whole)[None].float(), 2 * margin + 1, 1, margin)[0] > 0
+        assert not (whole & ~border & ~inside[layer]).any(), part
+        assert not (inside[layer] & ~whole).any(), part
+        assert int(whole.sum()) > int(inside[layer].sum()), part
+        wide += bool((whole & ~border).any())
+    assert wide >= 2

@@ -124,8 +124,6 @@ class FrameCosts:
         features: FrameFeatures | None,
         body: BodyModel,
         state: Float[Tensor, " n"],
-        *,
-        sure: bool = False,
     ) -> Appearance | None:
         """Take in what body and surroundings look like in a frame.
 
@@ -136,7 +134,6 @@ class FrameCosts:
             features: Features of the frame, with colours.
             body: The body on this frame's base.
             state: Its pose.
-            sure: The outline is known to two pixels, see `region_masks`.
         """
         asked = self.choice.region is not None or self.choice.segmentation is not None
         if not asked or body.num_parts == 0:
@@ -145,7 +142,7 @@ class FrameCosts:
             return appearance
         if appearance is None:
             appearance = Appearance.unknown(self.num_layers, like=features.colour)
-        inside, outside = region_masks(body, state, self.camera, sure=sure)
+        inside, outside = region_masks(body, state, self.camera)
         return appearance.learn(features.colour, inside, outside)
 
     def _looks(

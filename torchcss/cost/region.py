@@ -35,6 +35,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchcss.body.model import BodyModel
+from torchcss.body.root import has_root
 from torchcss.cost.contour import seen_nodes, spread
 from torchcss.cost.silhouette import part_map
 from torchcss.cost.visibility import ContourNodes
@@ -48,13 +49,14 @@ _COARSE = 4
 _CORE = 0.6
 """Share of a part's girth within which colours are taken for its own. A pose is off by some pixels,
 which is half of a thin limb: of the wall beside it the limb then learns the colour, and stays there
-when the arm has gone. On rendered_upper_body with keypoints in the first frame only, the track was
-lost at 0.3 s when all pixels but the outline's were taken, and is at 2.4 s with the core."""
+when the arm has gone."""
 
-_SURE = 2
-"""Pixels off a known outline from which on colours are the part's own: the core lacks the shade
-along the outline. With the core alone the rendered arm is 10 mm farther off in its first 42 frames
-and flips in three of three seeds, with these two pixels in none."""
+_BODY_MARGIN = 4
+_ARM_MARGIN = 2
+"""Pixels off the outline from which on colours are taken for the part's own too: of a wide part the
+core lacks the shade along the outline. The outline of an arm is known better, since it hangs on a
+base that is told. `docs/figures.md` has what other margins, and the core alone, do to the tracks.
+"""
 
 _CORE_PIXELS = 60
 """Fewest pixels that tell colours; of a part with a smaller core all but its outline are taken."""
@@ -96,7 +98,6 @@ def region_masks(
     camera: Camera,
     *,
     reach: int = 30,
-    sure: bool = False,
 ) -> tuple[Bool[Tensor, "layers h w"], Bool[Tensor, "layers h w"]]:
     """Pixels that are each layer's own for all that a pose may be off, and those around it.
 
@@ -105,10 +106,9 @@ def region_masks(
         state: Its pose.
         camera: Camera of the image.
         reach: How far the surroundings go, pixels.
-        sure: The outline is known to two pixels: all within that is own.
 
     Returns:
-        The core of each layer, and its surroundings; neither holds what lies between them.
+        What is sure of each layer, and its surroundings; neither holds what lies between them.
     """
     names, layer_of = part_layers(body)
     # A last entry for pixels that see no part, whose index is -1.
@@ -125,8 +125,7 @@ def region_masks(
         return core, around
     own = whole[window]
     inner = own & pixels(_CORE)[window]
-    if sure:
-        inner |= ~_grow(~own, _SURE)
+    inner |= ~_grow(~own, _BODY_MARGIN if has_root(body) else _ARM_MARGIN)
     small = inner.flatten(1).sum(1) < _CORE_PIXELS
     core[window] = torch.where(small[:, None, None], ~_grow(~own, 1), inner)
     blocks = functional.max_pool2d(own.float(), _COARSE, ceil_mode=True) > 0
