@@ -32,7 +32,6 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchcss.body.model import BodyModel
-from torchcss.body.root import has_root
 from torchcss.cost.frame import FrameCosts
 from torchcss.errors import ConfigurationError, TorchcssError
 from torchcss.inference.implicit import TermWeights, weighted_minimum
@@ -201,7 +200,6 @@ class Lesson:
                 self.features[-1],
                 body,
                 truth.states[index],
-                sure=not has_root(body),
             )
             self.appearance.append(learnt)
             last = image

@@ -171,7 +171,7 @@ def initialise(
         features,
         body=first.body,
         observation=marked.observation,
-        appearance=costs.learn(None, features, first.body, first.mixture.mean[0]),
+        appearance=costs.learn(None, features, first.body, first.mixture.mean[0], fitted=False),
     )
     cost = replace(cost, others=tuple(view.of_keypoints(factor) for view in others))
     return _with_contours(first, cost, stature, search or Search(), num_modes)

@@ -226,6 +226,8 @@ def test_what_is_off_the_outline_is_own(name: str, margin: int) -> None:
     names, layer_of = part_layers(body)
     inside, _ = region_masks(body, body.rest, camera.to(torch.float64))
     own = torch.tensor((*layer_of, -1))[part_map(body, body.rest, camera.to(torch.float64))]
+    core, _ = region_masks(body, body.rest, camera.to(torch.float64), fitted=False)
+    assert not (core & ~inside).any()
     wide = 0
     for layer, part in enumerate(names):
         whole = own == layer

@@ -124,6 +124,8 @@ class FrameCosts:
         features: FrameFeatures | None,
         body: BodyModel,
         state: Float[Tensor, " n"],
+        *,
+        fitted: bool = True,
     ) -> Appearance | None:
         """Take in what body and surroundings look like in a frame.
 
@@ -134,6 +136,7 @@ class FrameCosts:
             features: Features of the frame, with colours.
             body: The body on this frame's base.
             state: Its pose.
+            fitted: Whether its girths are the person's, see `region_masks`.
         """
         asked = self.choice.region is not None or self.choice.segmentation is not None
         if not asked or body.num_parts == 0:
@@ -142,7 +145,7 @@ class FrameCosts:
             return appearance
         if appearance is None:
             appearance = Appearance.unknown(self.num_layers, like=features.colour)
-        inside, outside = region_masks(body, state, self.camera)
+        inside, outside = region_masks(body, state, self.camera, fitted=fitted)
         return appearance.learn(features.colour, inside, outside)
 
     def _looks(

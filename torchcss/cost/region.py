@@ -53,10 +53,10 @@ when the arm has gone."""
 
 _BODY_MARGIN = 4
 _ARM_MARGIN = 2
-"""Pixels off the outline from which on colours are taken for the part's own too: of a wide part the
-core lacks the shade along the outline. The outline of an arm is known better, since it hangs on a
-base that is told. `docs/figures.md` has what other margins, and the core alone, do to the tracks.
-"""
+"""Pixels off the outline of a tracked body from which on colours are taken for the part's own too:
+of a wide part the core lacks the shade along the outline. The outline of an arm is known better,
+since it hangs on a base that is told. `docs/figures.md` has what other margins, and the core alone,
+do to the tracks."""
 
 _CORE_PIXELS = 60
 """Fewest pixels that tell colours; of a part with a smaller core all but its outline are taken."""
@@ -98,6 +98,7 @@ def region_masks(
     camera: Camera,
     *,
     reach: int = 30,
+    fitted: bool = True,
 ) -> tuple[Bool[Tensor, "layers h w"], Bool[Tensor, "layers h w"]]:
     """Pixels that are each layer's own for all that a pose may be off, and those around it.
 
@@ -106,6 +107,7 @@ def region_masks(
         state: Its pose.
         camera: Camera of the image.
         reach: How far the surroundings go, pixels.
+        fitted: The girths are the person's; else only the core of a part counts as its own.
 
     Returns:
         What is sure of each layer, and its surroundings; neither holds what lies between them.
@@ -125,7 +127,8 @@ def region_masks(
         return core, around
     own = whole[window]
     inner = own & pixels(_CORE)[window]
-    inner |= ~_grow(~own, _BODY_MARGIN if has_root(body) else _ARM_MARGIN)
+    if fitted:
+        inner |= ~_grow(~own, _BODY_MARGIN if has_root(body) else _ARM_MARGIN)
     small = inner.flatten(1).sum(1) < _CORE_PIXELS
     core[window] = torch.where(small[:, None, None], ~_grow(~own, 1), inner)
     blocks = functional.max_pool2d(own.float(), _COARSE, ceil_mode=True) > 0
