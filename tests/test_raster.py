@@ -133,6 +133,7 @@ def test_many_pictures_at_once_are_those_one_by_one(generator):
         assert torch.equal(seen, rasterise(places, behind, faces, 37, 43, valid=use).face)
     none = nearest_faces(many[:0], depths[:0], faces, 3, 4, valid=valid[:0])
     assert none.shape == (0, 3, 4)
+    assert (nearest_faces(many, depths, faces[:0], 3, 4, valid=valid) == -1).all()
     with pytest.raises(ShapeError, match="valid"):
         nearest_faces(many, depths, faces, 3, 4, valid=valid[:1])
 

@@ -304,6 +304,8 @@ def nearest_faces(
     check_shape("uv", uv, *depth.shape, 2)
     check_shape("valid", valid, *depth.shape)
     pictures, vertices = depth.shape
+    if not len(faces):
+        return faces.new_full((pictures, height, width), -1)
     place, distance = uv.detach().double().flatten(0, 1), depth.detach().double().flatten()
     first = vertices * torch.arange(pictures, device=uv.device)
     every = (faces.long() + first[:, None, None]).flatten(0, 1)

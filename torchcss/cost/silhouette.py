@@ -15,7 +15,7 @@ from torchcss.raster import grid_faces, nearest_faces
 from torchcss.vision.camera import Camera
 
 _POSES_AT_ONCE = 16
-"""Poses drawn together: more save no time, and take memory."""
+"""Poses drawn together: it bounds the memory."""
 
 
 def part_map(
