@@ -51,12 +51,13 @@ _CORE = 0.6
 which is half of a thin limb: of the wall beside it the limb then learns the colour, and stays there
 when the arm has gone."""
 
-_BODY_MARGIN = 4
+_BODY_MARGIN = 12
 _ARM_MARGIN = 2
 """Pixels off the outline of a tracked body from which on colours are taken for the part's own too:
-of a wide part the core lacks the shade along the outline. The outline of an arm is known better,
-since it hangs on a base that is told. `docs/figures.md` has what other margins, and the core alone,
-do to the tracks."""
+of a wide part the core lacks the shade along the outline. A pose is off by less than these, and
+only the trunk of a person seen close is wide enough to have them. The outline of an arm is known
+better, since it hangs on a base that is told. `docs/figures.md` has what other margins, and the
+core alone, do to the tracks."""
 
 _CORE_PIXELS = 60
 """Fewest pixels that tell colours; of a part with a smaller core all but its outline are taken."""
