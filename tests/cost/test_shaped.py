@@ -89,7 +89,7 @@ def problem(thicker: float, by: str) -> tuple[ShapedCost, torch.Tensor, ShapePar
         outline = Outline(ContourTerm(), features.edge_field().double(), 150.0)
     else:
         costs = FrameCosts(body, camera, CostChoice(contour=None, region=RegionTerm()))
-        known = costs.learn(None, features, body, x)
+        known = costs.learn(None, features, body, x, fitted=False)
         images = costs(features, body=body, appearance=known).region
         assert images is not None
         outline = Outline(RegionTerm(), images, 400.0)
