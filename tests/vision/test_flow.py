@@ -109,7 +109,11 @@ def test_solver_reaches_the_dense_solution(generator: torch.Generator) -> None:
 
 
 @pytest.mark.parametrize("radius", [1, 2, 3])
-def test_median_is_the_median(radius: int, generator: torch.Generator) -> None:
+@pytest.mark.parametrize("strip_values", [1, 4 * 4 * 13, 65_536])
+def test_median_is_the_median(
+    radius: int, strip_values: int, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_STRIP_VALUES", strip_values)
     images = torch.randn(2, 2, 9, 13, generator=generator).round(decimals=1)
     padded = functional.pad(images, (radius,) * 4, mode="replicate")
     side = 2 * radius + 1
