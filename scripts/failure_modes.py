@@ -48,6 +48,7 @@ COLUMNS = {
     "nearest": ("inside_90_nearest", 100, 0),
     "limits %": ("outside_share", 100, 0),
     "deep %": ("deep_share", 100, 0),
+    "of K %": ("deep_modes_share", 100, 0),
     "m/s^2": ("acceleration_error", 1, 1),
     "evals": ("evaluations_per_frame", 1, 0),
     "s/frame": ("search_s_per_frame", 1, 2),

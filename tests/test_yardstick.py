@@ -102,7 +102,8 @@ def test_the_truth_has_no_error() -> None:
     np.testing.assert_allclose(measures.within, 0, atol=1e-9)
     np.testing.assert_allclose(measures.angle_deviations, 0, atol=1e-9)
     assert measures.overlap == 1.0
-    assert measures.outside_degrees == measures.penetration_m == 0.0
+    assert measures.outside_degrees == 0.0
+    np.testing.assert_array_equal(measures.penetration_m, [0.0])
     assert (measures.samples, measures.evaluations) == (5, 10)
     assert measures.seconds == {"features": 0.125, "cost": 0.25, "search": 0.5}
 
@@ -124,6 +125,7 @@ def test_an_arm_is_measured_where_it_is_and_modes_one_by_one() -> None:
     np.testing.assert_allclose(measures.angle_deviations, [3 / 8**0.5, 0], atol=1e-9)
     assert 0.3 < measures.overlap < 1
     np.testing.assert_allclose(measures.weight, [0.8, 0.2])
+    assert measures.penetration_m.shape == (2,)
     assert num_evaluations(SimpleNamespace(  # a filter's
         num_steps=torch.zeros(9, dtype=torch.long), num_samples=torch.tensor(90)
     )) == 90  # type: ignore[arg-type]  # fmt: skip
@@ -317,8 +319,9 @@ def measure(
         frame=index, time_s=index / 25, failed=failed, weight=np.full(k, 1 / k), absolute_mm=2 * mm,
         root_aligned_mm=mm, procrustes_mm=mm / 2, within=np.full((k, j), 0.7),
         angle_deviations=np.linspace(4, 2, k), joints_m=np.zeros((j, 3)),
-        reference_m=np.zeros((j, 3)), overlap=0.8, outside_degrees=0.0, penetration_m=0.0,
-        samples=10, evaluations=100, seconds={"features": 1.0, "cost": 0.1, "search": 0.5},
+        reference_m=np.zeros((j, 3)), overlap=0.8, outside_degrees=0.0,
+        penetration_m=np.zeros(k), samples=10, evaluations=100,
+        seconds={"features": 1.0, "cost": 0.1, "search": 0.5},
     )._replace(**changes)  # fmt: skip
 
 
@@ -327,7 +330,9 @@ def test_a_run_is_summed_up_until_it_is_lost() -> None:
     bad = [[400.0, 400.0], [300.0, 300.0]]
     measures = [measure(i, good) for i in range(10)]
     measures[3] = measure(3, [[300.0, 300.0], [90.0, 90.0]], failed=True, outside_degrees=5.0)
-    measures[4] = measure(4, [[120.0, 120.0], [110.0, 110.0]], penetration_m=0.03, overlap=0.4)
+    deep = np.array([0.03, 0.05])
+    measures[4] = measure(4, [[120.0, 120.0], [110.0, 110.0]], penetration_m=deep, overlap=0.4)
+    measures[5] = measure(5, good, penetration_m=np.array([0.01, 0.04]))
     measures += [measure(i, bad, failed=True) for i in range(10, 24)]
     row = summarise(measures, Thresholds(), 0.04)
     assert (row["lost"], row["lost_s"], row["num_frames"], row["num_frames_held"]) == (
@@ -343,7 +348,8 @@ def test_a_run_is_summed_up_until_it_is_lost() -> None:
     assert (row["best_weight"], row["best_is_nearest"]) == (0.5, 0.0)
     assert row["overlap"] == pytest.approx(0.76)
     assert (row["outside_share"], row["deep_share"]) == pytest.approx((0.1, 0.1))
-    assert row["penetration_mm"] == 30
+    assert row["deep_modes_share"] == pytest.approx(3 / 20)
+    assert (row["penetration_mm"], row["penetration_modes_mm"]) == (30, 50)
     assert (row["inside_50_best"], row["inside_90_nearest"]) == (0.0, 1.0)
     assert row["acceleration_error"] == 0.0
     assert (row["samples_per_frame"], row["evaluations_per_frame"]) == (10, 100)

@@ -124,7 +124,7 @@ class FrameMeasures(NamedTuple):
         reference_m: Where they should be; NaN where unknown.
         overlap: Of the best mode's silhouette with the true one; NaN if that is not known.
         outside_degrees: How far the best mode's worst angle is beyond its limit.
-        penetration_m: How deep the best mode's deepest node is inside another part, metres.
+        penetration_m: How deep the deepest node of every mode is inside another part, metres.
         samples: Samples drawn.
         evaluations: Evaluations of the cost: with two derivatives for each iteration of a
             descending sample, or the value alone for each weighing of a particle.
@@ -144,7 +144,7 @@ class FrameMeasures(NamedTuple):
     reference_m: Float[np.ndarray, "j 3"]
     overlap: float
     outside_degrees: float
-    penetration_m: float
+    penetration_m: Float[np.ndarray, " k"]
     samples: int
     evaluations: int
     seconds: dict[str, float]
@@ -325,7 +325,7 @@ class Yardstick:
         if sequence.mask is not None:
             drawn = silhouette(body, mixture.mean[0], sequence.camera)
             overlap = float(mask_overlap(drawn, sequence.mask[number]))
-        best, error = body.pose(mixture.mean[0]), _mean(aligned[0])
+        poses, error = body.pose(mixture.mean), _mean(aligned[0])
         failed = error > limits.lost_mm or overlap < limits.least_overlap
         return FrameMeasures(
             frame=number,
@@ -348,7 +348,7 @@ class Yardstick:
             reference_m=reference[:count],
             overlap=overlap,
             outside_degrees=_outside(body, mixture.mean[0]),
-            penetration_m=float(penetration_depth(body, best, self._pairs, self._surface)),
+            penetration_m=penetration_depth(body, poses, self._pairs, self._surface).cpu().numpy(),
             samples=int(tracked.info.num_samples),
             evaluations=num_evaluations(tracked.info),
             seconds={
@@ -398,7 +398,7 @@ def summarise(
 
     Means are over the frames before the loss, while the tracker still had the body, since a run
     that is stopped when it is lost has no others; samples and seconds are of all frames. Shares
-    are of frames, calibration is of joints in frames.
+    are of frames (`deep_modes_share`: of the modes in them), calibration is of joints in frames.
 
     Args:
         measures: All frames of the run, at least one.
@@ -413,6 +413,8 @@ def summarise(
         (m, n) for m, n in zip(held, near, strict=True) if not np.isnan(m.root_aligned_mm).all()
     ]
     several = [(m, n) for m, n in told if len(m.weight) > 1]
+    depth = np.concatenate([m.penetration_m for m in held])
+    first = np.concatenate([np.arange(len(m.weight)) == 0 for m in held])
     row: dict[str, Any] = {
         "num_frames": len(measures),
         "lost": lost is not None,
@@ -438,9 +440,11 @@ def summarise(
             interval_s,
         ),
         "outside_share": _mean([m.outside_degrees > thresholds.outside_degrees for m in held]),
-        "deep_share": _mean([m.penetration_m > thresholds.deep_m for m in held]),
+        "deep_share": _mean(depth[first] > thresholds.deep_m),
+        "deep_modes_share": _mean(depth > thresholds.deep_m),
         "outside_degrees": max(m.outside_degrees for m in held),
-        "penetration_mm": 1000 * max(m.penetration_m for m in held),
+        "penetration_mm": 1000 * float(depth[first].max()),
+        "penetration_modes_mm": 1000 * float(depth.max()),
         "samples_per_frame": _mean([m.samples for m in measures]),
         "evaluations_per_frame": _mean([m.evaluations for m in measures]),
         **{
