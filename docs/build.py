@@ -134,10 +134,11 @@ def guide(out: Path, *, execute: bool) -> Iterator[tuple[str, str]]:
     apart = set(README_PAGES.values())
     rest = "".join(text for heading, text in sections.items() if heading not in apart)
     yield "index", front + rest
-    yield "mathematics", (DOCS / "mathematics.md").read_text(encoding="utf-8")
+    for name in ("guide", "mathematics"):
+        yield name, (DOCS / f"{name}.md").read_text(encoding="utf-8")
     for notebook in sorted((REPOSITORY / "notebooks").glob("*.ipynb")):
         yield notebook.stem, notebook_text(notebook, out / "pictures", execute=execute)
-    for name in ("from_the_papers_to_the_code", "decisions", "figures"):
+    for name in ("results", "figures", "from_the_papers_to_the_code", "decisions"):
         yield name, (DOCS / f"{name}.md").read_text(encoding="utf-8")
     yield "scripts", scripts_text()
     for name, heading in README_PAGES.items():
@@ -194,7 +195,9 @@ def page(name: str, text: str) -> Module:
     text = re.sub(r"\]\((?:\.\./)?notebooks/(pictures/[^)]*)\)", r"](\1)", text)
     text = re.sub(r"\]\((?:\.\./)?README\.md\)", "](index.html)", text)
     text = re.sub(r"\]\((?:\.\./)?scripts/(\w+)\.py\)", r"](scripts.html#\1)", text)
-    text = re.sub(r"\]\((?:\.\./|docs/)?(?:notebooks/)?(\w+)\.(?:md|ipynb)\)", r"](\1.html)", text)
+    text = re.sub(
+        r"\]\((?:\.\./|docs/)?(?:notebooks/)?(\w+)\.(?:md|ipynb)(#[\w-]+)?\)", r"](\1.html\2)", text
+    )
     text = _FORMULA.sub(_set, text)
     module = types.ModuleType(name, text)
     heading = re.search(r"^# (.+)$", text, flags=re.MULTILINE)

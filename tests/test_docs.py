@@ -47,7 +47,8 @@ def test_pages(site: Path) -> None:
     names = {path.stem for path in site.glob("*.html")}
     notebooks = {path.stem for path in (REPOSITORY / "notebooks").glob("*.ipynb")}
     assert notebooks
-    guide = {"index", "mathematics", "from_the_papers_to_the_code", "scripts", "contributing"}
+    written = {path.stem for path in (REPOSITORY / "docs").glob("*.md")}
+    guide = {"index", "scripts", "contributing", "changelog"} | written
     assert names >= guide | notebooks
     assert (site / "search.js").stat().st_size > 0
 
