@@ -101,7 +101,7 @@ def body() -> BodyModel:
 
 def test_smoothing_takes_the_other_mode_and_the_noise_away(body: BodyModel):
     track, truth = noisy_track(body)
-    done = smooth_track(track, choice=Smoothing(evidence=0.5))
+    done = smooth_track(track, choice=Smoothing(evidence=0.5, persistence=2.0))
     # Every fifth frame's best mode was the other pose.
     right = [1 if index % 5 == 2 else 0 for index in range(30)]
     assert done.modes.tolist() == right
@@ -123,17 +123,17 @@ def test_smoothing_takes_the_other_mode_and_the_noise_away(body: BodyModel):
     assert np.median(values) < DEVIATION**2
 
 
-def test_the_agility_and_the_evidence_do_what_they_say(body: BodyModel):
+def test_the_agility_and_the_persistence_do_what_they_say(body: BodyModel):
     track, _ = noisy_track(body)
     jitters = [
         smooth_track(track, choice=Smoothing(agility=agility)).effect["jitter_after_m_per_s2"]
         for agility in (2.0, 10.0, 50.0)
     ]
     assert jitters == sorted(jitters)
-    # Once the modes are chosen, the evidence scales covariances and moves nothing.
-    some, all_ = (smooth_track(track, choice=Smoothing(evidence=power)) for power in (0.5, 1.0))
+    # The persistence scales covariances and moves nothing.
+    some, all_ = (smooth_track(track, choice=Smoothing(persistence=p)) for p in (2.0, 1.0))
     assert some.track.state == pytest.approx(all_.track.state, abs=1e-8)
-    # (A variable at its limit has the prior's variance, whatever the evidence.)
+    # (A variable at its limit has the prior's variance, whatever the persistence.)
     sizes = [np.diagonal(one.track.covariance[:, 0], axis1=-2, axis2=-1) for one in (some, all_)]
     free = sizes[0] < 1e-2
     assert free.mean() > 0.9
@@ -263,6 +263,8 @@ def test_bad_choices_and_tracks_are_refused(body: BodyModel):
         Smoothing(agility=0.0)
     with pytest.raises(ConfigurationError, match="evidence"):
         Smoothing(evidence=math.inf)
+    with pytest.raises(ConfigurationError, match="persistence"):
+        Smoothing(persistence=-1.0)
     with pytest.raises(TrackFileError, match="times"):
         smooth_track(track._replace(times=track.times[::-1].copy()))
     empty = TrackWriter("unused", state_names=body.state_names, joint_names=body.joint_names)

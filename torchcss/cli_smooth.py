@@ -28,7 +28,10 @@ class Smooth:
     out: Path | None = None
     """Folder for smooth.npz and summary.json; by default the track's folder."""
     evidence: float = Smoothing.evidence
-    """Power of each frame's evidence; below 1 because errors of images persist over frames."""
+    """Power of each frame's evidence when modes are chosen; below 1 because errors of images
+    persist over frames."""
+    persistence: float = Smoothing.persistence
+    """How many frames say as much, in the covariances, as one that is independent."""
     agility: float | None = None
     """Expected accelerations over expected velocities, 1/s; lower is smoother. 10 by default, 20
     with a video."""
@@ -52,7 +55,11 @@ class Smooth:
 
     def run(self) -> None:
         """Run the verb."""
-        choice = replace(Smoothing() if self.video is None else IMAGES, evidence=self.evidence)
+        choice = replace(
+            Smoothing() if self.video is None else IMAGES,
+            evidence=self.evidence,
+            persistence=self.persistence,
+        )
         if self.agility is not None:
             choice = replace(choice, agility=self.agility)
         if self.video is None:

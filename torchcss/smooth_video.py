@@ -147,10 +147,11 @@ def smooth_frames(
         torch.from_numpy(track.times),
         motion_prior(body, choice),
         free_turns(body),
-        evidence=choice.evidence,
+        evidence=1 / choice.persistence,
         changes=changes,
     )
-    result = track_of(track, body, refined, cost=refined.cost)._replace(evidence=choice.evidence)
+    result = track_of(track, body, refined, cost=refined.cost)
+    result = result._replace(evidence=1 / choice.persistence)
     effect = {
         **first.effect,
         **effect_of(track, first.modes, result),
