@@ -63,7 +63,7 @@ class Smoothing:
     Attributes:
         evidence: Power of each frame's likelihood when modes of several frames are weighed against
             the motion between them. It is below one because errors of images persist over frames
-            (see `Tracker.memory`). Chosen on clips of three people.
+            (see `Tracker.memory`). Chosen on four clips.
         agility: Standard deviation of accelerations over that of velocities, 1/s. The higher, the
             closer the result stays to the modes. Chosen on one view of a man who balances.
         persistence: How many frames say as much, in the covariances, as one that is independent.
