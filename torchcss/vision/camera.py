@@ -24,7 +24,8 @@ Then the division: in the camera's frame da = (1, 0, -a) / z and db = (0, 1, -b)
     hessian  = [f'' and the third row and column that follow from it and from f'] / z^2
 
 A few multiplications per point, and one rotation to the world's axes. The Jacobian of (u, v) and
-the Hessians of u and v are never formed.
+the Hessians of u and v are never formed. Without distortion D is the identity, d2a' and d2b' are
+zero, and none of them is computed.
 
 A point is *valid* where the model means anything: farther than the near plane, and within the
 radius up to which the distortion polynomial grows. High-order terms of real calibrations fold the
@@ -117,6 +118,7 @@ class Camera(nn.Module):
         near: Points nearer than this depth (metres) are invalid.
 
     Attributes:
+        has_distortion: Whether any coefficient of the distortion differs from zero.
         maximum_radius: Distance from the axis at unit depth up to which the distortion can be
             undone; points farther out are invalid.
 
@@ -165,6 +167,7 @@ class Camera(nn.Module):
         self.image_size_wh: tuple[int, int] = (width, height)
         self.name: str = name
         self.near: float = float(near)
+        self.has_distortion: bool = bool((coefficients != 0).any())
         self.register_buffer("K", _checked_intrinsics(name, K))
         self.register_buffer("distortion", coefficients)
         self.register_buffer("R_camera_world", _nearest_rotation(name, rotation))
@@ -239,9 +242,10 @@ class Camera(nn.Module):
             ShapeError: If the last dimension is not 3.
         """
         a, b, _, depth, valid = self._normalise(points_world)
-        distortion = self.distortion.to(a)
-        distorted = _distort(a, b, _radial_factors(a, b, distortion), distortion)
-        return Projection(self._to_pixels(*distorted, valid), depth, valid)
+        if self.has_distortion:
+            distortion = self.distortion.to(a)
+            a, b = _distort(a, b, _radial_factors(a, b, distortion), distortion)
+        return Projection(self._to_pixels(a, b, valid), depth, valid)
 
     def project_with_derivatives(
         self, points_world: Float[Tensor, "*batch p 3"]
@@ -255,18 +259,17 @@ class Camera(nn.Module):
             ShapeError: If the last dimension is not 3.
         """
         a, b, inverse_depth, depth, valid = self._normalise(points_world)
-        distortion = self.distortion.to(a)
-        factors = _radial_factors(a, b, distortion)
-        distorted = _distort(a, b, factors, distortion)
-        return ProjectionModel(
-            self._to_pixels(*distorted, valid),
-            depth,
-            valid,
-            a,
-            b,
-            torch.where(valid, inverse_depth, 0.0),
-            *_distortion_jacobian(a, b, factors, distortion),
-        )
+        if self.has_distortion:
+            distortion = self.distortion.to(a)
+            factors = _radial_factors(a, b, distortion)
+            distorted = _distort(a, b, factors, distortion)
+            lens = _distortion_jacobian(a, b, factors, distortion)
+        else:
+            one, zero = a.new_ones(()).expand_as(a), a.new_zeros(()).expand_as(a)
+            distorted, lens = (a, b), (one, zero, one)
+        inverse_depth = torch.where(valid, inverse_depth, 0.0)
+        uv = self._to_pixels(*distorted, valid)
+        return ProjectionModel(uv, depth, valid, a, b, inverse_depth, *lens)
 
     def pull_back(
         self,
@@ -290,7 +293,6 @@ class Camera(nn.Module):
             The same cost as a function of the 3D point; its derivatives are zero at invalid points.
         """
         a, b, w = model.a, model.b, model.inverse_depth
-        aa, ab, bb = model.lens_aa, model.lens_ab, model.lens_bb
         focal_u, focal_v = self._focal(a)
         e_a, e_b = focal_u * gradient_uv[..., 0], focal_v * gradient_uv[..., 1]
         h_aa, h_ab, h_bb = (
@@ -300,18 +302,18 @@ class Camera(nn.Module):
             )
         )  # fmt: skip
         # Through the lens: derivatives in a and b.
-        f_a, f_b = e_a * aa + e_b * ab, e_a * ab + e_b * bb
-        along_a = h_aa * aa + h_ab * ab, h_ab * aa + h_bb * ab
-        along_b = h_aa * ab + h_ab * bb, h_ab * ab + h_bb * bb
-        f_aa, f_ab = aa * along_a[0] + ab * along_a[1], ab * along_a[0] + bb * along_a[1]
-        f_bb = ab * along_b[0] + bb * along_b[1]
-        if not gauss_newton:
-            distortion = self.distortion.to(a)
-            factors = _radial_factors(a, b, distortion)
-            aaa, aab, abb, bbb = _distortion_hessian(a, b, factors, distortion)
-            f_aa = f_aa + e_a * aaa + e_b * aab
-            f_ab = f_ab + e_a * aab + e_b * abb
-            f_bb = f_bb + e_a * abb + e_b * bbb
+        if self.has_distortion:
+            lens, hessian = (model.lens_aa, model.lens_ab, model.lens_bb), (h_aa, h_ab, h_bb)
+            f_a, f_b, f_aa, f_ab, f_bb = _through_lens(e_a, e_b, hessian, lens)
+            if not gauss_newton:
+                distortion = self.distortion.to(a)
+                factors = _radial_factors(a, b, distortion)
+                aaa, aab, abb, bbb = _distortion_hessian(a, b, factors, distortion)
+                f_aa = f_aa + e_a * aaa + e_b * aab
+                f_ab = f_ab + e_a * aab + e_b * abb
+                f_bb = f_bb + e_a * abb + e_b * bbb
+        else:
+            f_a, f_b, f_aa, f_ab, f_bb = e_a, e_b, h_aa, h_ab, h_bb
         # Through the division: derivatives in the camera's frame.
         x, y, z = a * f_aa + b * f_ab, a * f_ab + b * f_bb, a * f_a + b * f_b
         zz = a * x + b * y
@@ -342,18 +344,19 @@ class Camera(nn.Module):
             normals_world: The surfaces' normals at the points.
         """
         a, b = model.a, model.b
-        aa, ab, bb = model.lens_aa, model.lens_ab, model.lens_bb
         focal_u, focal_v = self._focal(a)
         x, y, z = _turned(self.R_camera_world, normals_world).unbind(-1)
         # J = F D [I, -(a b)^T] R / z. The inverses of J J^T's factors as adjugates, scaled lest
         # products overflow: grazing rays have large coordinates and larger derivatives.
         x, y = x - a * z, y - b * z
         x, y = (1 + b * b) * x - a * b * y, (1 + a * a) * y - a * b * x
-        largest = torch.maximum(torch.maximum(aa.abs(), bb.abs()), ab.abs())
-        scale = torch.where(largest > 0, largest, 1.0).reciprocal()
-        aa, ab, bb = scale * aa, scale * ab, scale * bb
-        turn = (aa * bb - ab * ab).sign()
-        x, y = turn * (bb * x - ab * y), turn * (aa * y - ab * x)
+        if self.has_distortion:
+            aa, ab, bb = model.lens_aa, model.lens_ab, model.lens_bb
+            largest = torch.maximum(torch.maximum(aa.abs(), bb.abs()), ab.abs())
+            scale = torch.where(largest > 0, largest, 1.0).reciprocal()
+            aa, ab, bb = scale * aa, scale * ab, scale * bb
+            turn = (aa * bb - ab * ab).sign()
+            x, y = turn * (bb * x - ab * y), turn * (aa * y - ab * x)
         x, y = x / focal_u, y / focal_v
         length = torch.hypot(x, y)
         some = length > 0
@@ -577,6 +580,22 @@ def _distort(
     )
 
 
+def _through_lens(
+    e_a: Tensor, e_b: Tensor, hessian: tuple[Tensor, Tensor, Tensor], lens: tuple[Tensor, ...]
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Return D e and the entries aa, ab, bb of D H D, from e, H and D, both symmetric."""
+    (h_aa, h_ab, h_bb), (aa, ab, bb) = hessian, lens
+    along_a = h_aa * aa + h_ab * ab, h_ab * aa + h_bb * ab
+    along_b = h_aa * ab + h_ab * bb, h_ab * ab + h_bb * bb
+    return (
+        e_a * aa + e_b * ab,
+        e_a * ab + e_b * bb,
+        aa * along_a[0] + ab * along_a[1],
+        ab * along_a[0] + bb * along_a[1],
+        ab * along_b[0] + bb * along_b[1],
+    )
+
+
 def _distortion_jacobian(
     a: Tensor, b: Tensor, factors: tuple[Tensor, Tensor, Tensor], distortion: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -608,11 +627,10 @@ def _distortion_hessian(
 
 def _congruence(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "6 9"]:
     """Return the matrix that maps (xx, xy, yy, xz, yz, zz) of S to the nine entries of R^T S R."""
-    rows = []
-    for i, j in ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2)):
-        outer = torch.outer(rotation[i], rotation[j])
-        rows.append((outer if i == j else outer + outer.mT).flatten())
-    return torch.stack(rows)
+    i, j = (0, 0, 1, 0, 1, 2), (0, 1, 1, 2, 2, 2)
+    outer = rotation[i, :, None] * rotation[j, None, :]
+    once = torch.eye(3, dtype=torch.bool, device=rotation.device)[i, j]
+    return torch.where(once[:, None, None], outer, outer + outer.mT).flatten(1)
 
 
 def _within_radius(point: Float[Tensor, "*batch 2"], limit: Tensor) -> Float[Tensor, "*batch 2"]:
