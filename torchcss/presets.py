@@ -75,7 +75,7 @@ class Preset:
         evidence: See `Tracker`. On the rendered arm 0.1 (with a memory of 0.98) takes the best
             mode's error from 128 to 59 mm: of two poses that look alike the one that was right so
             far stays the best.
-        finalists: See `Tracker`; it matters with many samples only.
+        finalists_arm, finalists_body: See `Tracker.finalists`; they matter with many samples only.
         proposal_arm: Where samples go for an arm, if elsewhere than for a body.
         persistence: Share of its last motion that a mode goes on with: 0 is driftless diffusion, 1
             constant velocity. The papers' trackers have 0. With 0.8 a mode does not lag behind a
@@ -104,7 +104,8 @@ class Preset:
     modes_body: int = 7
     memory: float = 1.0
     evidence: float = 1.0
-    finalists: int = 0
+    finalists_arm: int = 0
+    finalists_body: int = 0
     proposal_arm: Proposal | None = None
     persistence: float = 0.0
     noise: float = 1.0
@@ -145,7 +146,8 @@ _CSS = Preset(
     samples_body=60,
     memory=0.98,
     evidence=0.1,
-    finalists=60,
+    finalists_arm=40,
+    finalists_body=60,
     persistence=_PERSISTENCE,
     separation=0.12,
     jumps_every=3,
@@ -199,7 +201,8 @@ PRESETS: dict[str, Preset] = {
         what="css as printed: weights multiplied, minima however alike, no jumps to flips",
         memory=1.0,
         evidence=1.0,
-        finalists=0,
+        finalists_arm=0,
+        finalists_body=0,
         separation=0.0,
         jumps_every=0,
     ),
@@ -317,10 +320,10 @@ def make_tracker(
         proposal=proposal,
         num_samples=num_samples,
         num_modes=num_modes,
-        optimiser=TrustRegionNewton(max_steps=20, tolerance=1e-2),
+        optimiser=TrustRegionNewton(max_steps=20, tolerance=1e-2, initial_radius=2.0),
         memory=row.memory,
         evidence=row.evidence,
-        finalists=row.finalists,
+        finalists=row.finalists_arm if arm else row.finalists_body,
         dynamics=dynamics,
         separation=row.separation,
     )

@@ -13,7 +13,7 @@ from torchcss.inference.dynamics import ConstantVelocity, Diffusion
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.proposals import CovarianceScaled, EigenDirectionGrid, Samples
 from torchcss.inference.tracker import Tracker
-from torchcss.types import LocalModel, Status
+from torchcss.types import Bounds, LocalModel, Status
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import problems
@@ -90,6 +90,40 @@ def test_a_step_is_a_pure_function_of_the_state(generator):
     b, _ = CSS.step(state, problems.DoubleWell(), BOUNDS)
     assert torch.equal(a.mixture.mean, b.mixture.mean)
     assert torch.equal(generator.get_state(), state.generator_state)
+
+
+class InUnits:
+    """A cost of the same state in other units: `x = y * unit`."""
+
+    def __init__(self, cost, unit):
+        self.cost, self.unit = cost, unit
+
+    def value(self, y):
+        return self.cost.value(y * self.unit)
+
+    def local_model(self, y):
+        value, gradient, hessian = self.cost.local_model(y * self.unit)
+        return LocalModel(
+            value, gradient * self.unit, hessian * self.unit[:, None] * self.unit[None]
+        )
+
+
+def test_units_of_the_state_do_not_matter(generator):
+    """The trust region is counted in the prior's deviations."""
+    unit = torch.tensor([64.0, 2**-10]).double()
+    well, prior = problems.DoubleWell(tilt=0.4), single()
+    state, info = CSS.step(CSS.init(prior, generator=generator), well, BOUNDS)
+    other = prior._replace(
+        mean=prior.mean / unit, covariance=prior.covariance / (unit[:, None] * unit[None])
+    )
+    bounds = Bounds(BOUNDS.lower / unit, BOUNDS.upper / unit)
+    start = CSS.init(other, generator=generator)
+    scaled, scaled_info = CSS.step(start, InUnits(well, unit), bounds)
+    torch.testing.assert_close(scaled.mixture.mean * unit, state.mixture.mean)
+    assert torch.equal(info.num_steps, scaled_info.num_steps)
+    # In metres and radians as they are it takes many more.
+    _, plain_info = CSS.step(start, InUnits(well, unit), bounds, scale=torch.ones(2).double())
+    assert int(plain_info.num_steps.sum()) > int(info.num_steps.sum())
 
 
 class Shuffled:
@@ -332,6 +366,63 @@ def test_a_race_leaves_the_best_minima_and_takes_fewer_evaluations(generator):
     assert int(info.num_samples) == int(all_of_them.num_samples) == 200
     assert int(info.status_counts.sum()) <= 20
     assert int(info.num_steps.sum()) < 0.8 * int(all_of_them.num_steps.sum())
+
+
+class Crowded(problems.AutogradCost):
+    """Nine narrow minima within 9 cm about 0, and three shallower ones, farther apart."""
+
+    PLACES = (*(0.01 * k for k in range(-4, 5)), -2.0, 2.0, 3.0)
+    DEPTHS = (*(9.0 - 0.1 * abs(k) for k in range(-4, 5)), 5.0, 4.0, 3.0)
+
+    def __init__(self):
+        places, depths = torch.tensor(self.PLACES).double(), torch.tensor(self.DEPTHS).double()
+        width = torch.tensor([0.004] * 9 + [0.3] * 3).double()
+
+        def value(x):
+            wells = depths * torch.exp(-0.5 * ((x[0] - places) / width).square())
+            return 10 - wells.sum() + 2 * x[1] ** 2
+
+        super().__init__(value)
+
+    def landmarks(self, x):
+        return x[..., None, :]
+
+
+class FromThePlaces:
+    """A proposal that starts near every minimum."""
+
+    def sample(self, mixture, num, bounds, *, generator):
+        x = torch.tensor(Crowded.PLACES).double()[:, None] * torch.tensor([1.0, 0.0]).double()
+        zero = torch.zeros(len(x)).double()
+        return Samples(x + 0.001, zero.long(), zero)
+
+    def log_density(self, mixture, x):
+        return torch.zeros_like(x[..., 0])
+
+
+def test_a_race_leaves_what_is_unlike(generator):
+    """Four places: the crowd of the best minima alone would fill them."""
+
+    def found(separation: float) -> list[float]:
+        tracker = replace(CSS, proposal=FromThePlaces(), num_samples=12, num_modes=4)
+        tracker = replace(tracker, finalists=4, separation=separation)
+        start = tracker.init(single((0.0, 0.0), (1e-4, 0.1)), generator=generator)
+        state, _ = tracker.step(start, Crowded(), problems.box(2, -3.7, 3.7))
+        return sorted(state.mixture.mean[:, 0].mul(100).round().int().tolist())
+
+    assert max(map(abs, found(0.0))) <= 4
+    assert found(0.5) == [-200, 0, 200, 300]
+
+
+def test_a_race_never_drops_modes_for_being_alike(generator):
+    near = torch.tensor([[0.01, 0.0], [-0.02, 0.0], [0.03, 0.0]]).double()
+    three = GaussianMixture(
+        near, 1e-4 * torch.eye(2).double().expand(3, 2, 2), torch.zeros(3).double()
+    )
+    tracker = replace(CSS, num_samples=30, num_modes=6, finalists=4, separation=0.5)
+    _, info = tracker.step(tracker.init(three, generator=generator), Crowded(), BOUNDS)
+    assert int(info.status_counts.sum()) == 4
+    assert {0, 1, 2} <= set(info.origin.tolist())
 
 
 def test_a_race_never_drops_the_modes_that_go_on(generator):

@@ -259,15 +259,17 @@ def separated(landmarks: Float[Tensor, "k m d"], distance: float, num: int) -> I
         Indices of the modes: of those alike only the best, and the best of the others only if that
         leaves places; in the order given.
     """
+    left = torch.ones(len(landmarks), dtype=torch.bool, device=landmarks.device)
     chosen: list[int] = []
-    alike: list[int] = []
-    for mode, points in enumerate(landmarks):
-        apart = (landmarks[chosen] - points).norm(dim=-1).amax(-1)
-        (chosen if bool((apart >= distance).all()) else alike).append(mode)
-        if len(chosen) == num:
-            break
-    chosen = sorted(chosen + alike[: num - len(chosen)])
-    return torch.tensor(chosen, device=landmarks.device, dtype=torch.long)
+    while len(chosen) < num and bool(left.any()):
+        best = int(left.int().argmax())
+        chosen.append(best)
+        left[best] = False
+        left &= (landmarks - landmarks[best]).norm(dim=-1).amax(-1) >= distance
+    taken = torch.zeros_like(left)
+    taken[chosen] = True
+    alike = (~taken).nonzero()[: num - len(chosen), 0]
+    return torch.cat([taken.nonzero()[:, 0], alike]).sort().values
 
 
 def bhattacharyya(
