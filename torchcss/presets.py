@@ -320,7 +320,7 @@ def make_tracker(
         proposal=proposal,
         num_samples=num_samples,
         num_modes=num_modes,
-        optimiser=TrustRegionNewton(max_steps=20, tolerance=1e-2, initial_radius=2.0),
+        optimiser=TrustRegionNewton(max_steps=16, tolerance=1e-2, initial_radius=2.0),
         memory=row.memory,
         evidence=row.evidence,
         finalists=row.finalists_arm if arm else row.finalists_body,
