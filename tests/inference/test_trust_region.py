@@ -296,7 +296,8 @@ def test_what_the_first_step_promises(generator):
     hessian = torch.diag(torch.tensor([1.0, 2.0, 3.0, 4.0]).double())
     bowl = problems.Bowl(hessian, torch.ones(4).double(), offset=-3.0)
     x0, free = 1 + 0.1 * randn(6, 4, generator=generator), problems.unbounded(4)
-    promised, kept = NEWTON.promised(bowl, x0, free), NEWTON.minimise(bowl, x0, free)
+    kept = NEWTON.minimise(bowl, x0, free)
+    promised = NEWTON.promised(NEWTON.init(bowl, x0, free), free)
     torch.testing.assert_close(promised.mean, kept.mean, rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(promised.cost, kept.cost)
     torch.testing.assert_close(promised.covariance, kept.covariance)
@@ -308,14 +309,38 @@ def test_what_the_first_step_promises(generator):
             return super().local_model(x)
 
     bounds, x0 = problems.box(3, -1, 0.5), 2 * randn(9, 3, generator=generator)
-    promised = NEWTON.promised(Counted(), x0, bounds)
+    promised = NEWTON.promised(NEWTON.init(Counted(), x0, bounds), bounds)
     assert len(calls) == 1
     replace(NEWTON, max_steps=1).minimise(Counted(), x0, bounds)
     torch.testing.assert_close(promised.mean, calls[2])
     assert bool((promised.cost <= problems.Rosenbrock().value(bounds.project(x0))).all())
     broken = torch.tensor([[5.0, 5.0], [0.5, 0.5]]).double()
-    cost = NEWTON.promised(Broken(), broken, problems.unbounded(2)).cost
+    free = problems.unbounded(2)
+    cost = NEWTON.promised(NEWTON.init(Broken(), broken, free), free).cost
     assert cost.isinf().tolist() == [True, False]
+
+
+@pytest.mark.parametrize("pool_size", [None, 4])
+def test_a_descent_goes_on_where_it_stopped(generator, pool_size):
+    """In one go, or a few steps at first and the rest later, of some items only: the same."""
+    newton = replace(NEWTON, pool_size=pool_size)
+    cost, bounds = problems.Rosenbrock(), problems.box(3, -2, 2)
+    x0 = 2 * randn(9, 3, generator=generator)
+    whole = newton.minimise(cost, x0, bounds)
+    begun = replace(newton, max_steps=3).descend(cost, newton.init(cost, x0, bounds), bounds)
+    assert bool((begun.num_steps <= 3).all())
+    before = [part.clone() for part in (begun.x, *begun.model, *begun[2:])]
+    some = torch.tensor([7, 2, 5])
+    rest = newton.modes(newton.descend(cost, begun.take(some), bounds), bounds)
+    for ours, theirs in zip(rest, whole, strict=True):
+        torch.testing.assert_close(ours, theirs[some], rtol=1e-9, atol=1e-9)
+    newton.descend(cost, begun, bounds)
+    assert all(map(torch.equal, before, (begun.x, *begun.model, *begun[2:])))
+    # What has converged is not evaluated again.
+    state = newton.descend(cost, newton.start(x0), bounds)
+    assert bool((state.status == Status.CONVERGED).all())
+    again = newton.descend(Broken(), state, bounds)
+    assert torch.equal(again.x, state.x)
 
 
 def test_verbs_agree_with_minimise(generator):

@@ -39,7 +39,7 @@ from torchcss.inference.mixture import (
     separated,
 )
 from torchcss.inference.proposals import Proposal, Samples
-from torchcss.inference.trust_region import TrustRegionNewton, check_bounds
+from torchcss.inference.trust_region import TrustRegionNewton, TrustRegionState, check_bounds
 from torchcss.linalg import log_determinant
 from torchcss.types import Bounds, CostFunction, Modes, Status
 
@@ -103,8 +103,8 @@ class TrackerInfo(NamedTuple):
         parent: Prior mode matched with each mode (Fig. 6 step 5); -1 for none.
         origin: Prior mode whose sample descended to each mode.
         status_counts: How many samples ended with each `Status`, by its number.
-        num_steps: Optimiser iterations of every descent; a sample that goes on after a comparison
-            (`Tracker.finalists`) has several.
+        num_steps: Optimiser iterations of every descent, those that were given up
+            (`Tracker.finalists`) last.
         num_samples: Samples optimised, or weighed, a scalar.
         num_distinct: Distinct modes found before pruning, a scalar; 0 if modes were carried over.
         effective_sample_size: `1 / sum w^2` over the weights of the distinct modes, a scalar: how
@@ -331,12 +331,11 @@ class Tracker:
             samples = samples._replace(x=samples.x.index_copy(0, some, rough.mean))
 
         started = len(samples.x)
-        cost, samples, raced = self._race(cost, samples, len(prior.mean), bounds, scale)
+        cost, samples, descents, raced = self._race(cost, samples, len(prior.mean), bounds, scale)
 
         # 2.3: descend from every sample, and discard minima found before.
-        modes = self.optimiser.minimise(
-            cost, samples.x, bounds, scale=scale, prior_variance=prior_variance
-        )
+        descents = self.optimiser.descend(cost, descents, bounds, scale=scale)
+        modes = self.optimiser.modes(descents, bounds, prior_variance=prior_variance)
         energy = torch.where(modes.status == Status.NON_FINITE, torch.inf, modes.cost)
         distinct = distinct_modes(
             modes.mean, modes.covariance, energy, distance=self.duplicate_distance
@@ -404,34 +403,36 @@ class Tracker:
         num_modes: int,
         bounds: Bounds,
         scale: Float[Tensor, " n"] | None,
-    ) -> tuple[CostFunction, Samples, Int[Tensor, " r"]]:
+    ) -> tuple[CostFunction, Samples, TrustRegionState, Int[Tensor, " r"]]:
         """Drop what falls behind in descending, until the finalists are left.
 
         Returns:
-            The cost of the finalists, the finalists where they have got to, and the steps that were
-            taken.
+            The cost of the finalists, their samples, where they have got to, and the steps that the
+            others took.
         """
-        steps = []
-        count, known_modes = len(samples.x), _unperturbed(samples, num_modes)
-        if self.finalists and count > self.finalists:
-            for max_steps, multiple in _HEATS:
-                size = round(multiple * self.finalists)
-                if len(samples.x) <= size:
-                    continue
-                if max_steps:
-                    heat = replace(self.optimiser, max_steps=max_steps)
-                    modes = heat.minimise(cost, samples.x, bounds, scale=scale)
-                    samples = samples._replace(x=modes.mean)
-                else:
-                    modes = self.optimiser.promised(cost, samples.x, bounds, scale=scale)
-                steps.append(modes.num_steps)
-                best = self._promising(cost, modes, known_modes, size)
-                samples = Samples(*(part[best] for part in samples))
-                known_modes = known_modes[best]
-                restrict = getattr(cost, "take", None)
-                cost = cost if restrict is None else restrict(best)
-        raced = torch.cat(steps) if steps else samples.parent.new_zeros(0)
-        return cost, samples, raced
+        optimiser, dropped = self.optimiser, [samples.parent[:0]]
+        known_modes = _unperturbed(samples, num_modes)
+        if not self.finalists or len(samples.x) <= self.finalists:
+            return cost, samples, optimiser.start(samples.x), dropped[0]
+        descents = optimiser.init(cost, samples.x, bounds, scale=scale)
+        for max_steps, multiple in _HEATS:
+            size = round(multiple * self.finalists)
+            if len(samples.x) <= size:
+                continue
+            if max_steps:
+                heat = replace(optimiser, max_steps=min(max_steps, optimiser.max_steps))
+                descents = heat.descend(cost, descents, bounds, scale=scale)
+                modes = optimiser.modes(descents, bounds)
+            else:
+                modes = optimiser.promised(descents, bounds)
+            best = self._promising(cost, modes, known_modes, size)
+            others = torch.ones_like(known_modes).index_fill(0, best, False)
+            dropped.append(descents.num_steps[others])
+            descents, known_modes = descents.take(best), known_modes[best]
+            samples = Samples(*(part[best] for part in samples))
+            restrict = getattr(cost, "take", None)
+            cost = cost if restrict is None else restrict(best)
+        return cost, samples, descents, torch.cat(dropped)
 
     def _promising(
         self, cost: CostFunction, modes: Modes, known: Bool[Tensor, " s"], size: int

@@ -81,6 +81,13 @@ class TrustRegionState(NamedTuple):
     status: Int[Tensor, " b"]
     num_steps: Int[Tensor, " b"]
 
+    def take(self, items: Int[Tensor, " m"]) -> TrustRegionState:
+        """Some of the items, as a copy."""
+        x, model, *rest = self
+        return TrustRegionState(
+            x[items], LocalModel(*(part[items] for part in model)), *(part[items] for part in rest)
+        )
+
 
 class TrustRegionInfo(NamedTuple):
     """What one iteration did.
@@ -167,10 +174,10 @@ class TrustRegionNewton:
         Returns:
             A state whose non-finite items have `Status.NON_FINITE` and the start as given.
         """
-        state, _ = self.step(cost, self._start(x0), bounds, scale=scale)
+        state, _ = self.step(cost, self.start(x0), bounds, scale=scale)
         return state
 
-    def _start(self, x0: Float[Tensor, "b n"]) -> TrustRegionState:
+    def start(self, x0: Float[Tensor, "b n"]) -> TrustRegionState:
         """Items that wait for their first evaluation, which is not counted as a step."""
         b, n = x0.shape
         zero = x0.new_zeros(b)
@@ -288,64 +295,86 @@ class TrustRegionNewton:
         if prior_variance is None:
             prior_variance = default_prior_variance(bounds)
 
-        starts = x0.reshape(batch.numel(), n)
-        result = self._start(starts)
-        size = self.pool_size or (_POOL_SIZE if starts.device.type == "cpu" else len(starts))
-        items = torch.arange(len(starts), device=starts.device)
-        items, queue = items[:size], items[size:]
-        state = self._start(starts[items])
+        starts = self.start(x0.reshape(batch.numel(), n))
+        result = self.descend(cost, starts, bounds, scale=scale)
+        return _modes(result, bounds, prior_variance, x0.shape)
+
+    def descend(
+        self,
+        cost: CostFunction,
+        state: TrustRegionState,
+        bounds: Bounds,
+        *,
+        scale: Float[Tensor, " n"] | None = None,
+    ) -> TrustRegionState:
+        """Go on from a state until every item stops.
+
+        Args:
+            cost: What is minimised, one item per row of the state; see `minimise`.
+            state: From `start`, `init` or a descent before; it stays as it is. What stopped at a
+                lower step limit goes on.
+            bounds: Box limits on the state.
+            scale: See `init`.
+        """
+        bounds = _like(bounds, state.x)
+        limited = (state.status == Status.STEP_LIMIT) & (state.num_steps < self.max_steps)
+        status = torch.where(limited, int(Status.RUNNING), state.status)
+        result = state._replace(status=status).take(torch.arange(len(status)).to(status))
+        size = self.pool_size or (_POOL_SIZE if status.device.type == "cpu" else len(status))
+        queue = torch.nonzero(status == Status.RUNNING)[:, 0]
+        items, queue = queue[:size], queue[size:]
+        pool = result.take(items)
         restrict = getattr(cost, "take", None)
-        part = cost if restrict is None or not len(queue) else restrict(items)
+        part = cost if restrict is None or len(items) == len(status) else restrict(items)
         while len(items):
-            state, _ = self.step(part, state, bounds, scale=scale)
-            done = torch.nonzero(state.status != Status.RUNNING)[:, 0]
+            pool, _ = self.step(part, pool, bounds, scale=scale)
+            done = torch.nonzero(pool.status != Status.RUNNING)[:, 0]
             if not len(done):
                 continue
-            _write(result, items[done], _take(state, done))
+            _write(result, items[done], pool.take(done))
             # Waiting items take the places of finished ones; when none waits the pool shrinks.
             new, queue = queue[: len(done)], queue[len(done) :]
             places, left = done[: len(new)], done[len(new) :]
             if len(new):
-                _write(state, places, self._start(starts[new]))
+                _write(pool, places, result.take(new))
                 items = items.index_copy(0, places, new)
             if len(left):
                 kept = torch.ones_like(items, dtype=torch.bool).index_fill(0, left, False)
                 kept = torch.nonzero(kept)[:, 0]
-                items, state = items[kept], _take(state, kept)
+                items, pool = items[kept], pool.take(kept)
             part = cost if restrict is None else restrict(items)
+        return result
 
-        return _modes(result, bounds, prior_variance, x0.shape)
-
-    def promised(
+    def modes(
         self,
-        cost: CostFunction,
-        x0: Float[Tensor, "b n"],
+        state: TrustRegionState,
         bounds: Bounds,
         *,
-        scale: Float[Tensor, " n"] | None = None,
+        prior_variance: Float[Tensor, " n"] | None = None,
     ) -> Modes:
-        """Where the first step from every start would lead, by the quadratic model at the start.
+        """Where the items of a state stand, with the covariances there; see `minimise`."""
+        bounds = _like(bounds, state.x)
+        if prior_variance is None:
+            prior_variance = default_prior_variance(bounds)
+        return _modes(state, bounds, prior_variance, state.x.shape)
 
-        It takes one evaluation per start, half of what one step of `minimise` does, and says well
-        enough which of many starts are worth a descent.
+    def promised(self, state: TrustRegionState, bounds: Bounds) -> Modes:
+        """Where the next step from every item would lead, by the quadratic model.
+
+        After `init` it says well enough which of many starts are worth a descent.
 
         Args:
-            cost: What to minimise.
-            x0: Starts, moved into the bounds.
+            state: From `init`, or later.
             bounds: Box limits on the state.
-            scale: See `init`.
 
         Returns:
             The ends of the steps, with the costs that the model promises there (infinite for starts
             with `Status.NON_FINITE`) and the model's covariances; nothing was evaluated there.
         """
-        bounds = _like(bounds, x0)
-        state = self.init(cost, x0, bounds, scale=scale)
-        ends = bounds.project(state.x + state.step)
+        bounds = _like(bounds, state.x)
         model = state.model._replace(value=state.model.value - state.predicted)
-        return _modes(
-            state._replace(x=ends, model=model), bounds, default_prior_variance(bounds), x0.shape
-        )
+        ends = bounds.project(state.x + state.step)
+        return self.modes(state._replace(x=ends, model=model), bounds)
 
     def _plan(
         self,
@@ -702,14 +731,6 @@ def _held(
 ) -> Bool[Tensor, "b n"]:
     """Variables at a bound that the cost pushes against it."""
     return ((x <= bounds.lower) & (gradient > 0)) | ((x >= bounds.upper) & (gradient < 0))
-
-
-def _take(state: TrustRegionState, items: Int[Tensor, " m"]) -> TrustRegionState:
-    """Some items of a state."""
-    x, model, *rest = state
-    return TrustRegionState(
-        x[items], LocalModel(*(part[items] for part in model)), *(part[items] for part in rest)
-    )
 
 
 def _write(result: TrustRegionState, items: Int[Tensor, " m"], part: TrustRegionState) -> None:
