@@ -13,7 +13,7 @@ from torchcss.inference.dynamics import ConstantVelocity, Diffusion
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.proposals import CovarianceScaled, EigenDirectionGrid, Samples
 from torchcss.inference.tracker import Tracker
-from torchcss.types import Bounds, LocalModel, Status
+from torchcss.types import LocalModel, Status
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import problems
@@ -90,40 +90,6 @@ def test_a_step_is_a_pure_function_of_the_state(generator):
     b, _ = CSS.step(state, problems.DoubleWell(), BOUNDS)
     assert torch.equal(a.mixture.mean, b.mixture.mean)
     assert torch.equal(generator.get_state(), state.generator_state)
-
-
-class InUnits:
-    """A cost of the same state in other units: `x = y * unit`."""
-
-    def __init__(self, cost, unit):
-        self.cost, self.unit = cost, unit
-
-    def value(self, y):
-        return self.cost.value(y * self.unit)
-
-    def local_model(self, y):
-        value, gradient, hessian = self.cost.local_model(y * self.unit)
-        return LocalModel(
-            value, gradient * self.unit, hessian * self.unit[:, None] * self.unit[None]
-        )
-
-
-def test_units_of_the_state_do_not_matter(generator):
-    """The trust region is counted in the prior's deviations."""
-    unit = torch.tensor([64.0, 2**-10]).double()
-    well, prior = problems.DoubleWell(tilt=0.4), single()
-    state, info = CSS.step(CSS.init(prior, generator=generator), well, BOUNDS)
-    other = prior._replace(
-        mean=prior.mean / unit, covariance=prior.covariance / (unit[:, None] * unit[None])
-    )
-    bounds = Bounds(BOUNDS.lower / unit, BOUNDS.upper / unit)
-    start = CSS.init(other, generator=generator)
-    scaled, scaled_info = CSS.step(start, InUnits(well, unit), bounds)
-    torch.testing.assert_close(scaled.mixture.mean * unit, state.mixture.mean)
-    assert torch.equal(info.num_steps, scaled_info.num_steps)
-    # In metres and radians as they are it takes many more.
-    _, plain_info = CSS.step(start, InUnits(well, unit), bounds, scale=torch.ones(2).double())
-    assert int(plain_info.num_steps.sum()) > int(info.num_steps.sum())
 
 
 class Shuffled:

@@ -55,7 +55,7 @@ multiples of the finalists."""
 _CROWDED = 0.5
 """Share of `Tracker.separation` within which all but the best go on only if places are left. What
 descends from 1000 samples ends in a few minima, the lowest of them again and again: without this,
-60 finalists of an arm end in 3 to 5 of the lowest twenty minima, and with it 40 in 6 to 10."""
+60 finalists of an arm end in 3 to 5 of the lowest twenty minima, and with it 40 in 9 to 11."""
 
 
 class Particles(NamedTuple):
@@ -203,13 +203,6 @@ def _unperturbed(samples: Samples, num_modes: int) -> Bool[Tensor, " s"]:
     return first & (samples.log_weight == -torch.inf)
 
 
-def _deviations(mixture: GaussianMixture) -> Float[Tensor, " n"]:
-    """Root mean square deviation of every parameter within the modes; 1 where it has none."""
-    variance = mixture.covariance.diagonal(dim1=-2, dim2=-1)
-    mean = mixture.weight.to(variance) @ variance
-    return torch.where(mean > 0, mean, 1.0).sqrt()
-
-
 @dataclass(frozen=True, kw_only=True)
 class Tracker:
     """The multiple-mode tracker of section 4.2 [IJRR].
@@ -291,9 +284,7 @@ class Tracker:
             state: Where the last frame left off.
             cost: The frame's cost, or what makes it from the samples' parents and the prior.
             bounds: Box limits on the state.
-            scale: See `TrustRegionNewton.init`; by default the standard deviations of the prior's
-                modes. What moves much in the image has small ones there: a trust region of so many
-                metres and radians is too wide for a root and too narrow for a forearm's twist.
+            scale: See `TrustRegionNewton.init`.
             prior_variance: See `TrustRegionNewton.minimise`.
 
         Returns:
@@ -306,8 +297,6 @@ class Tracker:
 
         # 1: the prior, one frame ahead; the proposal inflates it.
         prior = self.dynamics.predict(state.mixture, state.velocity)
-        if scale is None:
-            scale = _deviations(prior)
 
         # 2.1, 2.2: choose components and sample them, inside the bounds.
         drawn = self.num_samples * self.oversampling
