@@ -75,7 +75,8 @@ class Preset:
         evidence: See `Tracker`. On the rendered arm 0.1 (with a memory of 0.98) takes the best
             mode's error from 128 to 59 mm: of two poses that look alike the one that was right so
             far stays the best.
-        finalists_arm, finalists_body: See `Tracker.finalists`; they matter with many samples only.
+        finalists_arm: `Tracker.finalists` for an arm; they matter with many samples only.
+        finalists_body: The same for a body.
         proposal_arm: Where samples go for an arm, if elsewhere than for a body.
         persistence: Share of its last motion that a mode goes on with: 0 is driftless diffusion, 1
             constant velocity. The papers' trackers have 0. With 0.8 a mode does not lag behind a
@@ -141,7 +142,7 @@ _PERSISTENCE = 0.8
 
 _FIRST_RADIUS = 1 / 16
 """Metres and radians that a first step may go. The edges are searched for some 20 pixels to either
-side: of first steps of a radian, a half and a quarter nearly all are rejected (measured; 17 steps
+side: of first steps of a radian, a half and a quarter most are rejected (measured; 17 steps
 end where 20 from a radian on did)."""
 
 _CSS = Preset(

@@ -399,10 +399,10 @@ class Tracker:
             The cost of the finalists, their samples, where they have got to, and the steps that the
             others took.
         """
-        optimiser, dropped = self.optimiser, [samples.parent[:0]]
-        known_modes = _unperturbed(samples, num_modes)
+        optimiser, nobody = self.optimiser, samples.parent[:0]
         if not self.finalists or len(samples.x) <= self.finalists:
-            return cost, samples, optimiser.start(samples.x), dropped[0]
+            return cost, samples, optimiser.start(samples.x), nobody
+        known_modes, dropped = _unperturbed(samples, num_modes), [nobody]
         descents = optimiser.init(cost, samples.x, bounds, scale=scale)
         for max_steps, multiple in _HEATS:
             size = round(multiple * self.finalists)
