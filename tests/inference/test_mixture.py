@@ -12,6 +12,7 @@ from torchcss.inference.mixture import (
     distinct_modes,
     draw_components,
     match_to_prior,
+    representatives,
     separated,
     tempered,
 )
@@ -248,6 +249,22 @@ def test_separated_is_its_definition(k, points, num, distance, single_precision,
     assert len(chosen) == min(k, num)
     # The best is always among them.
     assert int(chosen[0]) == 0
+
+
+def test_representatives_are_the_best_members():
+    landmarks = torch.tensor([0.0, 0.9, 1.8, 3.0, 3.1, 9.0])[:, None, None]
+    chosen = torch.tensor([0, 3, 5])
+    # The second is like the first alone; the third like none of those chosen, and stands for none.
+    score = torch.tensor([-2.0, -1.0, 7.0, -1.0, -2.0, -3.0])
+    assert representatives(landmarks, 1.0, chosen, score).tolist() == [1, 3, 5]
+    assert representatives(landmarks, 1.0, chosen, -score).tolist() == [0, 4, 5]
+    # What is like two of them belongs to the first.
+    assert representatives(landmarks, 2.0, chosen, score).tolist() == [2, 3, 5]
+    # Modes that were chosen stand for themselves, however alike they are.
+    assert representatives(landmarks, 2.0, torch.tensor([0, 1, 2]), score).tolist() == [0, 1, 2]
+    # The worst of all scores is still a score.
+    worst = torch.full((6,), -torch.inf)
+    assert representatives(landmarks, 0.5, chosen, worst).tolist() == [0, 3, 5]
 
 
 def test_separated_of_alike_modes_keeps_the_best():

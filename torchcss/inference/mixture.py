@@ -272,6 +272,31 @@ def separated(landmarks: Float[Tensor, "k m d"], distance: float, num: int) -> I
     return torch.cat([taken.nonzero()[:, 0], alike]).sort().values
 
 
+def representatives(
+    landmarks: Float[Tensor, "k m d"],
+    distance: float,
+    chosen: Int[Tensor, " c"],
+    score: Float[Tensor, " k"],
+) -> Int[Tensor, " c"]:
+    """The member of highest score of each explanation that `separated` chose.
+
+    Args:
+        landmarks: Points of each mode, as for `separated`.
+        distance: As for `separated`.
+        chosen: What that chose. Every other mode belongs to the first of these that it is like.
+        score: Of each mode.
+
+    Returns:
+        Indices of the modes, one for each that was chosen, in that order.
+    """
+    apart = (landmarks[:, None] - landmarks[chosen]).norm(dim=-1).amax(-1)
+    member = apart < distance
+    member &= member.int().cumsum(-1) == 1
+    member[chosen] = torch.eye(len(chosen), dtype=torch.bool, device=chosen.device)
+    score = score.clamp(min=torch.finfo(score.dtype).min)  # even the worst is more than nobody
+    return torch.where(member, score[:, None], -torch.inf).argmax(0)
+
+
 def bhattacharyya(
     first: GaussianMixture, second: GaussianMixture, *, standard: bool = False
 ) -> Float[Tensor, "k m"]:

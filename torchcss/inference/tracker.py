@@ -34,8 +34,10 @@ from torchcss.inference.dynamics import Diffusion, Dynamics
 from torchcss.inference.importance import Survival, survival
 from torchcss.inference.mixture import (
     GaussianMixture,
+    bhattacharyya,
     distinct_modes,
     match_to_prior,
+    representatives,
     separated,
 )
 from torchcss.inference.proposals import Proposal, Samples
@@ -234,11 +236,11 @@ class Tracker:
             the end, as in Fig. 6.
         standard_bhattacharyya: Match modes by the distance of the literature instead of the one
             printed (design decision 4).
-        separation: Modes of which no landmark is this far apart are one explanation, of which only
-            the best is kept as long as there are others; zero: the K best modes are kept however
-            alike they are, as in Fig. 6. Clutter makes many minima within a hand's breadth, which
-            crowd out all that differ. In the unit of the cost's `landmarks(x)`; costs without that
-            method are not concerned.
+        separation: Modes of which no landmark is this far apart are one explanation, of which one
+            alone is kept as long as there are others: the best in the light of the past. Zero: the
+            K best modes are kept however alike they are, as in Fig. 6. Clutter makes many minima
+            within a hand's breadth, which crowd out all that differ. In the unit of the cost's
+            `landmarks(x)`; costs without that method are not concerned.
     """
 
     proposal: Proposal
@@ -334,24 +336,32 @@ class Tracker:
             found = energy[distinct]
             if (unsearched := getattr(cost, "unsearched", None)) is not None:
                 found = found + unsearched(modes.mean[distinct])
-            log_weight = -self.evidence * found
+            volume = torch.zeros_like(found)
             if self.laplace_evidence:
-                log_weight = log_weight + 0.5 * log_determinant(modes.covariance[distinct])
+                volume = 0.5 * log_determinant(modes.covariance[distinct])
             unpruned = GaussianMixture(
-                modes.mean[distinct], modes.covariance[distinct], log_weight
+                modes.mean[distinct], modes.covariance[distinct], volume - self.evidence * found
             ).normalise()
 
             # 4: keep the best K.
+            tempered = prior._replace(log_weight=self.memory * prior.normalise().log_weight)
             order = unpruned.log_weight.argsort(descending=True, stable=True)
             landmarks = getattr(cost, "landmarks", None)
             if self.separation and landmarks is not None:
                 points = landmarks(unpruned.mean[order])
-                order = order[separated(points, self.separation, self.num_modes)]
+                chosen = separated(points, self.separation, self.num_modes)
+                # Of modes alike the heir of the better past stands for all: were it the cheapest,
+                # a nat could hand a good mode's past to whatever is far enough from both.
+                past = bhattacharyya(
+                    unpruned.take(order), prior, standard=self.standard_bhattacharyya
+                ).argmin(-1)
+                score = (volume - found)[order] + tempered.log_weight[past]
+                chosen = representatives(points, self.separation, chosen, score)
+                order = order[chosen]
             order = order[: self.num_modes]
             pruned, kept, found = unpruned.take(order).normalise(), distinct[order], found[order]
 
             # 5, 6: multiply in the weights of the closest prior modes, and normalise.
-            tempered = prior._replace(log_weight=self.memory * prior.normalise().log_weight)
             matches = match_to_prior(pruned, tempered, standard=self.standard_bhattacharyya)
             best_first = matches.mixture.log_weight.argsort(descending=True, stable=True)
             mixture, parent = matches.mixture.take(best_first), matches.parent[best_first]
