@@ -14,6 +14,8 @@ from torchcss.cost.joints import JointObservation, JointTerm
 from torchcss.cost.total import CostChoice
 from torchcss.errors import CameraError, VideoError
 from torchcss.inference.mixture import GaussianMixture
+from torchcss.io.cameras import read_camera
+from torchcss.io.track_pictures import TrackFiles
 from torchcss.io.tracks import load_track
 from torchcss.io.video import Frame, VideoWriter
 from torchcss.pipeline import TrackedFrame, track_frames
@@ -176,6 +178,18 @@ def test_from_files(folder: Path, tmp_path: Path, sequence: SyntheticSequence):
         out=tmp_path, settings=settings, others=[other],
     )  # fmt: skip
     assert summary["other_views"] == [{"video": str(folder / "side.mp4"), "camera": "side"}]
+    # The summary is a camera file of both.
+    for name in ("front", "side"):
+        known = read_camera(tmp_path / "summary.json", video=folder / f"{name}.mp4").camera
+        given = read_camera(folder / "cameras.json", camera_name=name).camera
+        for part in ("K", "R_camera_world", "t_camera_world"):
+            torch.testing.assert_close(getattr(known, part), getattr(given, part))
+    shown = TrackFiles.find(tmp_path).camera
+    assert shown is not None
+    assert shown.name == "front"
+    over = TrackFiles.find(tmp_path, video=folder / "side.mp4").camera
+    assert over is not None
+    assert over.name == "side"
     assert any("2 views set the scale" in note for note in summary["notes"])
     track = load_track(tmp_path)
     away = track.joints_world[:, 0] - sequence.joints_world.numpy()

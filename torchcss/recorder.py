@@ -26,7 +26,7 @@ from tqdm import tqdm
 from torchcss.body.model import BodyModel
 from torchcss.inference.tracker import SequenceTracker
 from torchcss.io.atomic import output_error
-from torchcss.io.cameras import camera_entry
+from torchcss.io.cameras import calibration
 from torchcss.io.overlay import draw_overlay, project_body
 from torchcss.io.tracks import TrackWriter, write_summary
 from torchcss.io.video import VideoWriter
@@ -163,6 +163,8 @@ class Recorder:
         tracker: The tracker that the settings made, for its numbers.
         camera: Camera of the full-size images, for the overlay.
         frame_rate: Frames per second of the overlay.
+        video: What that camera took, if it was read from a file.
+        others: Further cameras and their videos.
         notes: Lines for the user, also in the summary.
         extra: Further entries of the summary.
         sinks: What sees the frames besides; closed at the end of the run.
@@ -174,6 +176,8 @@ class Recorder:
     tracker: SequenceTracker
     camera: Camera
     frame_rate: float
+    video: Path | None = None
+    others: Sequence[tuple[Camera, Path]] = ()
     notes: list[str] = field(default_factory=list)
     extra: dict[str, Any] = field(default_factory=dict)
     sinks: Sequence[Sink] = ()
@@ -282,8 +286,7 @@ class Recorder:
             **totals.summary(num_frames),
             "notes": self.notes,
             # As in a camera file, so that this file is one.
-            "units": "metre, pixel",
-            "cameras": {self.camera.name: camera_entry(self.camera)},
+            **calibration((self.camera, self.video), *self.others),
             **self.extra,
         }
 

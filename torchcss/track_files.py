@@ -159,6 +159,10 @@ def track_video(
         tracker=tracker,
         camera=eye,
         frame_rate=1 / interval,
+        video=video,
+        others=[
+            (opened.camera.camera, each.video) for each, opened in zip(others, beside, strict=True)
+        ],
         notes=notes,
         extra={
             "video": str(video),

@@ -153,6 +153,20 @@ def camera_entry(camera: Camera) -> dict[str, Any]:
     }
 
 
+def calibration(*cameras: tuple[Camera, str | os.PathLike[str] | None]) -> dict[str, Any]:
+    """Return what a camera file in JSON holds.
+
+    Args:
+        cameras: Cameras, their world in metres, and the video of each, if known.
+    """
+    entries = {}
+    for camera, video in cameras:
+        entries[camera.name] = camera_entry(camera)
+        if video is not None:
+            entries[camera.name]["video"] = Path(video).name
+    return {"units": "metre, pixel", "cameras": entries}
+
+
 def check_image_size(camera: Camera, width: int, height: int) -> None:
     """Make sure that a camera belongs to images of this size.
 

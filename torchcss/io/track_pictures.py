@@ -67,7 +67,8 @@ class TrackFiles(NamedTuple):
             path: `track.npz`, `smooth.npz`, or the folder of the former.
             video: The video that was tracked; it needs a camera.
             camera: Its calibration; by default the one in `summary.json`.
-            camera_name: Which camera of the file; by default the one of the video.
+            camera_name: Which camera of the file; by default the one of the video, or the one that
+                was tracked with.
             body: The fitted body; by default the `body.npz` beside the track, if any, else the
                 standard humanoid's flesh on the track's lengths.
 
@@ -86,7 +87,9 @@ class TrackFiles(NamedTuple):
         if camera is not None:
             eye = read_camera(camera, camera_name=camera_name, video=video).camera
         elif "cameras" in summary:
-            eye = read_camera(own, camera_name=camera_name).camera
+            if camera_name is None and video is None:
+                camera_name = summary.get("camera")  # the one that was tracked with
+            eye = read_camera(own, camera_name=camera_name, video=video).camera
         if video is not None and eye is None:
             raise ConfigurationError(
                 "--video: the modes can be drawn only where its camera is known; give --camera"
