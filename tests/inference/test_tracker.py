@@ -321,26 +321,36 @@ def test_separation_keeps_modes_whose_landmarks_differ(generator):
     assert found(Comb(), 2.8, 3) == [0, 1, -1]
 
 
-def test_of_modes_alike_the_heir_of_the_better_past_stands_for_all(generator):
-    """The favoured mode meets a rival that is a tenth of a nat cheaper.
-
-    Were it to yield, its past would go to the next explanation, 3.
-    """
-    tracker = replace(CSS, num_samples=60, num_modes=2, separation=1.6)
+def step_of_rivals(generator, log_weights: list[float], evidence: float):
+    """The first of two modes meets a rival that is a tenth of a nat cheaper, and alike."""
+    tracker = replace(CSS, num_samples=60, num_modes=2, separation=1.6, evidence=evidence)
     past = GaussianMixture(
         torch.tensor([[1.5, 0.0], [0.0, 0.0]]).double(),
         torch.tensor([[0.36, 0.0], [0.0, 0.01]]).double().expand(2, 2, 2),
-        torch.tensor([0.0, -18.0]).double(),
+        torch.tensor(log_weights).double(),
     )
     state = tracker.init(past, generator=generator)
     state, info = tracker.step(state, CombWithLandmarks(), problems.box(2, -3.7, 3.7))
-    assert (state.mixture.mean[:, 0] / 1.5).round().int().tolist() == [1, 2]
+    return (state.mixture.mean[:, 0] / 1.5).round().int().tolist(), state, info
+
+
+def test_of_modes_alike_the_heir_of_the_better_past_stands_for_all(generator):
+    """Were it to yield, its past would go to the next explanation, 3."""
+    places, state, info = step_of_rivals(generator, [0.0, -18.0], 1.0)
+    assert places == [1, 2]
     assert int(info.parent[0]) == 0
-    # Not if it is much dearer than the rival.
-    past = past._replace(log_weight=torch.tensor([0.0, -0.05]).double())
-    state = tracker.init(past, generator=generator)
-    state, _ = tracker.step(state, CombWithLandmarks(), problems.box(2, -3.7, 3.7))
-    assert int((state.mixture.mean[0, 0] / 1.5).round()) == 0
+    assert float(state.mixture.log_weight[0]) > -0.1
+
+
+@pytest.mark.parametrize(("log_weights", "evidence"), [([0.0, -18.0], 1e-3), ([0.0, -0.05], 1.0)])
+def test_the_cheapest_of_modes_alike_has_the_best_past_of_them(generator, log_weights, evidence):
+    """Where the past says too little to change the pose it is handed on all the same."""
+    places, state, info = step_of_rivals(generator, log_weights, evidence)
+    assert places[0] == 0
+    assert int(info.parent[0]) == 0
+    assert float(state.mixture.log_weight[0]) > float(state.mixture.log_weight[1])
+    # It did not jump: its motion is that since the mode next to it.
+    assert float(state.velocity[0, 0].abs()) < 0.1
 
 
 def test_a_race_leaves_the_best_minima_and_takes_fewer_evaluations(generator):

@@ -326,7 +326,11 @@ def bhattacharyya(
 
 
 def match_to_prior(
-    posterior: GaussianMixture, prior: GaussianMixture, *, standard: bool = False
+    posterior: GaussianMixture,
+    prior: GaussianMixture,
+    *,
+    heirs: GaussianMixture | None = None,
+    standard: bool = False,
 ) -> Matches:
     """Multiply each mode's weight by that of the closest prior component, Fig. 6 step 5 and 6.
 
@@ -338,12 +342,13 @@ def match_to_prior(
     Args:
         posterior: The modes of this frame, in the order in which they choose.
         prior: The modes of the frame before, one frame ahead.
+        heirs: For each mode the one by whose distances it is matched; by default itself.
         standard: See `bhattacharyya`.
     """
     prior = prior.normalise()
     present = torch.nonzero(prior.log_weight > -torch.inf)[:, 0]
     prior = prior.take(present)
-    distance = bhattacharyya(posterior, prior, standard=standard)
+    distance = bhattacharyya(posterior if heirs is None else heirs, prior, standard=standard)
     parent = torch.full_like(posterior.log_weight, -1, dtype=torch.long)
     factor = prior.log_weight.min().repeat(len(parent))
     unused = torch.ones_like(present, dtype=torch.bool)

@@ -59,6 +59,9 @@ _CROWDED = 0.5
 descends from 1000 samples ends in a few minima, the lowest of them again and again: without this,
 60 finalists of an arm end in 3 to 5 of the lowest twenty minima, and with it 40 in 9 to 11."""
 
+_TIE = 1e-6
+"""Weight of a nat of cost where pasts are compared: it decides between modes of one past."""
+
 
 class Particles(NamedTuple):
     """A posterior as weighted states, for trackers that weigh instead of descend.
@@ -237,8 +240,8 @@ class Tracker:
         standard_bhattacharyya: Match modes by the distance of the literature instead of the one
             printed (design decision 4).
         separation: Modes of which no landmark is this far apart are one explanation, of which one
-            alone is kept as long as there are others: the best in the light of the past. Zero: the
-            K best modes are kept however alike they are, as in Fig. 6. Clutter makes many minima
+            alone is kept as long as there are others, with the best past of them all. Zero: the K
+            best modes are kept however alike they are, as in Fig. 6. Clutter makes many minima
             within a hand's breadth, which crowd out all that differ. In the unit of the cost's
             `landmarks(x)`; costs without that method are not concerned.
     """
@@ -345,30 +348,24 @@ class Tracker:
 
             # 4: keep the best K.
             tempered = prior._replace(log_weight=self.memory * prior.normalise().log_weight)
-            order = unpruned.log_weight.argsort(descending=True, stable=True)
-            landmarks = getattr(cost, "landmarks", None)
-            if self.separation and landmarks is not None:
-                points = landmarks(unpruned.mean[order])
-                chosen = separated(points, self.separation, self.num_modes)
-                # Of modes alike the heir of the better past stands for all: were it the cheapest,
-                # a nat could hand a good mode's past to whatever is far enough from both.
-                past = bhattacharyya(
-                    unpruned.take(order), prior, standard=self.standard_bhattacharyya
-                ).argmin(-1)
-                score = (volume - found)[order] + tempered.log_weight[past]
-                chosen = representatives(points, self.separation, chosen, score)
-                order = order[chosen]
-            order = order[: self.num_modes]
+            order, heirs = self._explanations(cost, unpruned, volume - found, tempered)
             pruned, kept, found = unpruned.take(order).normalise(), distinct[order], found[order]
 
             # 5, 6: multiply in the weights of the closest prior modes, and normalise.
-            matches = match_to_prior(pruned, tempered, standard=self.standard_bhattacharyya)
+            matches = match_to_prior(
+                pruned,
+                tempered,
+                heirs=unpruned.take(heirs),
+                standard=self.standard_bhattacharyya,
+            )
+            closest = self._closest(pruned, tempered)
+            before = torch.where(order == heirs, matches.parent, closest)
             best_first = matches.mixture.log_weight.argsort(descending=True, stable=True)
             mixture, parent = matches.mixture.take(best_first), matches.parent[best_first]
             kept = kept[best_first]
             mode_cost, origin = found[best_first], samples.parent[kept]
             known = (parent >= 0)[:, None]
-            moved = mixture.mean - state.mixture.mean[parent.clamp(min=0)]
+            moved = mixture.mean - state.mixture.mean[before[best_first].clamp(min=0)]
             velocity = torch.where(known, moved, 0.0)
             effective = (-(2 * unpruned.log_weight).logsumexp(0)).exp()
         else:
@@ -394,6 +391,38 @@ class Tracker:
         )
         state = TrackerState(mixture, velocity, generator.get_state(), state.frame + 1)
         return state, info
+
+    def _closest(self, mixture: GaussianMixture, prior: GaussianMixture) -> Int[Tensor, " k"]:
+        """Of each mode, the prior mode next to it."""
+        return bhattacharyya(mixture, prior, standard=self.standard_bhattacharyya).argmin(-1)
+
+    def _explanations(
+        self,
+        cost: CostFunction,
+        modes: GaussianMixture,
+        log_likelihood: Float[Tensor, " m"],
+        prior: GaussianMixture,
+    ) -> tuple[Int[Tensor, " k"], Int[Tensor, " k"]]:
+        """Choose the modes that are kept, best first, and for each the one whose past it has.
+
+        Modes alike are one explanation, with one pose and one past: were that of the cheapest its
+        own alone, a nat could hand a good mode's past to whatever is far enough from both. The best
+        past of them all is the explanation's; and of poses that hardly differ in cost its heir's
+        is kept.
+        """
+        order = modes.log_weight.argsort(descending=True, stable=True)
+        landmarks = getattr(cost, "landmarks", None)
+        if not self.separation or landmarks is None:
+            return order[: self.num_modes], order[: self.num_modes]
+        points = landmarks(modes.mean[order])
+        chosen = separated(points, self.separation, self.num_modes)
+        past = prior.log_weight[self._closest(modes.take(order), prior)]
+        score = log_likelihood[order] + self.evidence * past
+        best, heirs = (
+            order[representatives(points, self.separation, chosen, each)]
+            for each in (score, past + _TIE * score)
+        )
+        return best, heirs
 
     def _race(
         self,
