@@ -190,6 +190,11 @@ def squared_mahalanobis(
         covariance: Positive semi-definite. Along a direction of no variance the distance is very
             large, as it ought to be, but finite as long as the dtype can hold it.
     """
+    deviation, correlation = _standardised(covariance)
+    resolution = deviation.new_tensor(covariance.shape[-1] * torch.finfo(covariance.dtype).eps)
+    factor, found = damped_cholesky(correlation, resolution)
+    if bool(found.all()):
+        return solve_lower(factor, difference / deviation).square().sum(-1)
     return (whitener(covariance) @ difference[..., None])[..., 0].square().sum(-1)
 
 

@@ -12,6 +12,7 @@ from torchcss.inference.mixture import (
     distinct_modes,
     draw_components,
     match_to_prior,
+    prior_at,
     representatives,
     separated,
     tempered,
@@ -296,3 +297,69 @@ def test_tempered_is_the_mode_of_a_tempered_likelihood(power, seed):
     assert float(torch.linalg.eigvalsh(torch.diag(prior) - got[0]).min()) > -1e-10
     prior_alone = torch.diag(prior)
     torch.testing.assert_close(tempered(prior_alone, power, prior), prior_alone)
+
+
+def prior_at_one_by_one(posterior: GaussianMixture, prior: GaussianMixture) -> list[float]:
+    """The definition, mode by mode."""
+    n = posterior.mean.shape[-1]
+    logs = []
+    for mean, covariance in zip(posterior.mean, posterior.covariance, strict=True):
+        total = 0.0
+        for pi, centre, spread in zip(prior.weight, prior.mean, prior.covariance, strict=True):
+            apart = mean - centre
+            squared = float(apart @ torch.linalg.solve(covariance + spread, apart))
+            total += float(pi) * math.exp(-min(squared / 2, n))
+        logs.append(math.log(total))
+    return logs
+
+
+@settings(max_examples=40, deadline=None)
+@given(k=st.integers(1, 6), m=st.integers(1, 6), n=st.integers(1, 5), seed=st.integers(0, 2**31))
+def test_prior_at_is_its_definition(k, m, n, seed):
+    drawn = torch.Generator().manual_seed(seed)
+    posterior = random_mixture(k, n, generator=drawn)
+    prior = random_mixture(m, n, generator=drawn)
+    past = prior_at(posterior, prior)
+    expected = torch.tensor(prior_at_one_by_one(posterior, prior)).double()
+    torch.testing.assert_close(past.log_weight, expected, rtol=1e-6, atol=1e-6)
+    # Modes do not compete: what one inherits does not depend on the others, or on any order.
+    order = torch.randperm(k, generator=drawn)
+    again = prior_at(posterior.take(order), prior.take(torch.arange(m).flip(0)))
+    torch.testing.assert_close(again.log_weight, past.log_weight[order])
+    near = past.parent[order] >= 0
+    assert torch.equal(again.parent >= 0, near)
+    assert torch.equal(m - 1 - again.parent[near], past.parent[order][near])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_prior_at_of_what_goes_on_and_of_what_is_new(dtype):
+    prior = GaussianMixture(
+        torch.tensor([[0.0, 0.0], [4.0, 0.0], [50.0, 0.0]], dtype=dtype),
+        torch.diag(torch.tensor([0.1, 0.0], dtype=dtype)).expand(3, 2, 2),
+        torch.tensor([0.0, -3.0, -torch.inf], dtype=dtype),
+    )
+    log_total = prior.log_weight.logsumexp(0)
+    posterior = GaussianMixture(
+        torch.tensor([[0.0, 0.0], [0.0, 0.0], [4.0, 0.0], [50.0, 0.0], [2.0, 0.0]], dtype=dtype),
+        torch.zeros(5, 2, 2, dtype=dtype),
+        torch.zeros(5, dtype=dtype),
+    )
+    past = prior_at(posterior, prior)
+    # The second parameter is held: it does not vary, and says nothing.
+    assert past.parent.tolist() == [0, 0, 1, 2, -1]
+    expected = torch.stack(
+        [
+            torch.tensor([0.0, -5.0], dtype=dtype).logsumexp(0),
+            torch.tensor([0.0, -5.0], dtype=dtype).logsumexp(0),
+            torch.tensor([-2.0, -3.0], dtype=dtype).logsumexp(0),
+            log_total - 2,  # who has no weight gives none
+            log_total - 2,
+        ]
+    )
+    torch.testing.assert_close(past.log_weight, expected - log_total)
+    # A prior without any weight is one of equal weights.
+    empty = prior._replace(log_weight=torch.full((3,), -torch.inf, dtype=dtype))
+    assert bool(prior_at(posterior, empty).log_weight.isfinite().all())
+    # Where it does vary, a held parameter that moves is very far.
+    moved = posterior._replace(mean=posterior.mean + torch.tensor([0.0, 0.1], dtype=dtype))
+    assert prior_at(moved, prior).parent.tolist() == [-1] * 5

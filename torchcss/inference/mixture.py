@@ -8,8 +8,9 @@ Weights are kept as logarithms: the product over frames of Fig. 6, step 5, would
 Covariances may be singular, huge or tiny (see `torchcss.linalg`).
 
 What to call: `GaussianMixture.prune` to keep the best modes, `distinct_modes` to discard modes
-found before (step 2.3; `torchcss.inference.minima` counts them more strictly), `match_to_prior` for
-step 5, `GaussianMixture.merge` where components overlap and their moments are to be kept.
+found before (step 2.3; `torchcss.inference.minima` counts them more strictly), `match_to_prior` or
+`prior_at` for step 5, `GaussianMixture.merge` where components overlap and their moments are to be
+kept.
 """
 
 from __future__ import annotations
@@ -22,7 +23,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchcss.errors import ShapeError
-from torchcss.linalg import covariance_factor, log_determinant, symmetric_part, whitener
+from torchcss.linalg import (
+    covariance_factor,
+    log_determinant,
+    squared_mahalanobis,
+    symmetric_part,
+    whitener,
+)
 
 _STATES_AT_ONCE = 1024
 """States whose differences from all components are held in memory together."""
@@ -141,6 +148,18 @@ class Matches(NamedTuple):
     """
 
     mixture: GaussianMixture
+    parent: Int[Tensor, " k"]
+
+
+class Past(NamedTuple):
+    """What modes inherit from the prior.
+
+    Attributes:
+        log_weight: The prior's weight at the place of each mode.
+        parent: The prior component next to each mode; -1 for a mode that none is near.
+    """
+
+    log_weight: Float[Tensor, " k"]
     parent: Int[Tensor, " k"]
 
 
@@ -326,11 +345,7 @@ def bhattacharyya(
 
 
 def match_to_prior(
-    posterior: GaussianMixture,
-    prior: GaussianMixture,
-    *,
-    heirs: GaussianMixture | None = None,
-    standard: bool = False,
+    posterior: GaussianMixture, prior: GaussianMixture, *, standard: bool = False
 ) -> Matches:
     """Multiply each mode's weight by that of the closest prior component, Fig. 6 step 5 and 6.
 
@@ -342,13 +357,12 @@ def match_to_prior(
     Args:
         posterior: The modes of this frame, in the order in which they choose.
         prior: The modes of the frame before, one frame ahead.
-        heirs: For each mode the one by whose distances it is matched; by default itself.
         standard: See `bhattacharyya`.
     """
     prior = prior.normalise()
     present = torch.nonzero(prior.log_weight > -torch.inf)[:, 0]
     prior = prior.take(present)
-    distance = bhattacharyya(posterior if heirs is None else heirs, prior, standard=standard)
+    distance = bhattacharyya(posterior, prior, standard=standard)
     parent = torch.full_like(posterior.log_weight, -1, dtype=torch.long)
     factor = prior.log_weight.min().repeat(len(parent))
     unused = torch.ones_like(present, dtype=torch.bool)
@@ -359,3 +373,31 @@ def match_to_prior(
         unused[closest] = False
     weighted = posterior._replace(log_weight=posterior.log_weight + factor)
     return Matches(weighted.normalise(), parent)
+
+
+def prior_at(posterior: GaussianMixture, prior: GaussianMixture) -> Past:
+    """The prior's weight at the place of each mode: Fig. 6 step 5, without a choice.
+
+    A mode (mu, Sigma) inherits from every prior component (pi_j, mu_j, Sigma_j), by how near it is,
+
+        sum_j  pi_j exp(-min(d_j, n)),    d_j = (mu - mu_j)^T (Sigma + Sigma_j)^-1 (mu - mu_j) / 2,
+
+    which for small d is p(x_t | R_{t-1}) of eq. 10 [IJRR] smoothed by the mode, but for the
+    components' volumes. In n dimensions d is n / 2 on average for a mode that moved as the prior
+    expects. What is twice as far from all components is new, at e^-n: unlikely, and not impossible.
+    Other than in `match_to_prior`, no mode can take a component's weight from another, and none is
+    handed the weight of a component that merely was left over.
+
+    Args:
+        posterior: The modes of this frame.
+        prior: The modes of the frame before, one frame ahead.
+    """
+    apart = posterior.mean[:, None] - prior.mean[None, :]
+    both = posterior.covariance[:, None] + prior.covariance[None, :]
+    n = apart.shape[-1]
+    distance = (0.5 * squared_mahalanobis(apart, both)).clamp(max=n)
+    nearest = distance.min(-1)
+    return Past(
+        (prior.normalise().log_weight - distance).logsumexp(-1),
+        torch.where(nearest.values < n, nearest.indices, -1),
+    )

@@ -119,7 +119,7 @@ class LossMonitor:
 def widened(
     tracker: SequenceTracker, *, samples: int = 4, modes: int = 2, scale: float = 2.0
 ) -> SequenceTracker:
-    """The same tracker with a wider search.
+    """The same tracker with a wider search, that forgets: no pose is too far from the lost ones.
 
     Args:
         tracker: Any of the package.
@@ -141,4 +141,5 @@ def widened(
         num_samples=samples * tracker.num_samples,
         num_modes=modes * tracker.num_modes,
         memory=0.0,
+        soft_matching=False,
     )

@@ -34,9 +34,10 @@ from torchcss.inference.dynamics import Diffusion, Dynamics
 from torchcss.inference.importance import Survival, survival
 from torchcss.inference.mixture import (
     GaussianMixture,
-    bhattacharyya,
+    Past,
     distinct_modes,
     match_to_prior,
+    prior_at,
     representatives,
     separated,
 )
@@ -58,9 +59,6 @@ _CROWDED = 0.5
 """Share of `Tracker.separation` within which all but the best go on only if places are left. What
 descends from 1000 samples ends in a few minima, the lowest of them again and again: without this,
 60 finalists of an arm end in 3 to 5 of the lowest twenty minima, and with it 40 in 9 to 11."""
-
-_TIE = 1e-6
-"""Weight of a nat of cost where pasts are compared: it decides between modes of one past."""
 
 
 class Particles(NamedTuple):
@@ -105,7 +103,8 @@ class TrackerInfo(NamedTuple):
     Attributes:
         cost: Cost of each mode kept, what is `unsearched` included, nats; `inf` where a mode was
             carried over (no sample had a finite cost).
-        parent: Prior mode matched with each mode (Fig. 6 step 5); -1 for none.
+        parent: Prior mode matched with each mode (Fig. 6 step 5), or next to it where matching is
+            soft; -1 for none.
         origin: Prior mode whose sample descended to each mode.
         status_counts: How many samples ended with each `Status`, by its number.
         num_steps: Optimiser iterations of every descent, those that were given up
@@ -239,11 +238,15 @@ class Tracker:
             the end, as in Fig. 6.
         standard_bhattacharyya: Match modes by the distance of the literature instead of the one
             printed (design decision 4).
+        soft_matching: In step 5, multiply in the prior's weight at the place of each mode, see
+            `prior_at`, instead of that of the closest prior mode, which Fig. 6 gives to one mode
+            only: a mode far from all of the prior may then be handed the best past there is, and
+            the pose that had it goes on with another's.
         separation: Modes of which no landmark is this far apart are one explanation, of which one
-            alone is kept as long as there are others, with the best past of them all. Zero: the K
-            best modes are kept however alike they are, as in Fig. 6. Clutter makes many minima
-            within a hand's breadth, which crowd out all that differ. In the unit of the cost's
-            `landmarks(x)`; costs without that method are not concerned.
+            alone is kept as long as there are others. Zero: the K best modes are kept however
+            alike they are, as in Fig. 6. Clutter makes many minima within a hand's breadth, which
+            crowd out all that differ. In the unit of the cost's `landmarks(x)`; costs without that
+            method are not concerned.
     """
 
     proposal: Proposal
@@ -259,6 +262,7 @@ class Tracker:
     oversampling: int = 1
     finalists: int = 0
     standard_bhattacharyya: bool = False
+    soft_matching: bool = False
     separation: float = 0.0
 
     def __post_init__(self) -> None:
@@ -346,27 +350,24 @@ class Tracker:
                 modes.mean[distinct], modes.covariance[distinct], volume - self.evidence * found
             ).normalise()
 
-            # 4: keep the best K.
+            # 4: keep the best K. 5, 6: multiply in the prior's weights, and normalise.
             tempered = prior._replace(log_weight=self.memory * prior.normalise().log_weight)
-            order, heirs = self._explanations(cost, unpruned, volume - found, tempered)
+            past = prior_at(unpruned, tempered) if self.soft_matching else None
+            order = self._explanations(cost, unpruned, volume - found, past)
             pruned, kept, found = unpruned.take(order).normalise(), distinct[order], found[order]
-
-            # 5, 6: multiply in the weights of the closest prior modes, and normalise.
-            matches = match_to_prior(
-                pruned,
-                tempered,
-                heirs=unpruned.take(heirs),
-                standard=self.standard_bhattacharyya,
-            )
-            closest = self._closest(pruned, tempered)
-            before = torch.where(order == heirs, matches.parent, closest)
-            best_first = matches.mixture.log_weight.argsort(descending=True, stable=True)
-            mixture, parent = matches.mixture.take(best_first), matches.parent[best_first]
-            kept = kept[best_first]
+            if past is None:
+                mixture, parent = match_to_prior(
+                    pruned, tempered, standard=self.standard_bhattacharyya
+                )
+            else:
+                weighted = pruned.log_weight + past.log_weight[order]
+                mixture = pruned._replace(log_weight=weighted).normalise()
+                parent = past.parent[order]
+            best_first = mixture.log_weight.argsort(descending=True, stable=True)
+            mixture, parent, kept = mixture.take(best_first), parent[best_first], kept[best_first]
             mode_cost, origin = found[best_first], samples.parent[kept]
-            known = (parent >= 0)[:, None]
-            moved = mixture.mean - state.mixture.mean[before[best_first].clamp(min=0)]
-            velocity = torch.where(known, moved, 0.0)
+            moved = mixture.mean - state.mixture.mean[parent.clamp(min=0)]
+            velocity = torch.where((parent >= 0)[:, None], moved, 0.0)
             effective = (-(2 * unpruned.log_weight).logsumexp(0)).exp()
         else:
             best = prior.log_weight.argsort(descending=True, stable=True)[: self.num_modes]
@@ -392,37 +393,28 @@ class Tracker:
         state = TrackerState(mixture, velocity, generator.get_state(), state.frame + 1)
         return state, info
 
-    def _closest(self, mixture: GaussianMixture, prior: GaussianMixture) -> Int[Tensor, " k"]:
-        """Of each mode, the prior mode next to it."""
-        return bhattacharyya(mixture, prior, standard=self.standard_bhattacharyya).argmin(-1)
-
     def _explanations(
         self,
         cost: CostFunction,
         modes: GaussianMixture,
         log_likelihood: Float[Tensor, " m"],
-        prior: GaussianMixture,
-    ) -> tuple[Int[Tensor, " k"], Int[Tensor, " k"]]:
-        """Choose the modes that are kept, best first, and for each the one whose past it has.
+        past: Past | None,
+    ) -> Int[Tensor, " k"]:
+        """Choose the modes that are kept, best first.
 
-        Modes alike are one explanation, with one pose and one past: were that of the cheapest its
-        own alone, a nat could hand a good mode's past to whatever is far enough from both. The best
-        past of them all is the explanation's; and of poses that hardly differ in cost its heir's
-        is kept.
+        Of modes alike, which are one explanation, the cheapest is kept, but for what their pasts
+        say: of poses that hardly differ in cost, that of the better past.
         """
         order = modes.log_weight.argsort(descending=True, stable=True)
         landmarks = getattr(cost, "landmarks", None)
         if not self.separation or landmarks is None:
-            return order[: self.num_modes], order[: self.num_modes]
+            return order[: self.num_modes]
         points = landmarks(modes.mean[order])
         chosen = separated(points, self.separation, self.num_modes)
-        past = prior.log_weight[self._closest(modes.take(order), prior)]
-        score = log_likelihood[order] + self.evidence * past
-        best, heirs = (
-            order[representatives(points, self.separation, chosen, each)]
-            for each in (score, past + _TIE * score)
-        )
-        return best, heirs
+        if past is None:
+            return order[chosen]
+        score = (log_likelihood + self.evidence * past.log_weight)[order]
+        return order[representatives(points, self.separation, chosen, score)]
 
     def _race(
         self,
