@@ -71,6 +71,21 @@ def test_numbers_and_noise_reach_the_tracker():
     assert isinstance(heap_hogg.proposal, Condensation)
 
 
+def test_weights_of_css_and_of_figure_6():
+    """An arm may count evidence otherwise than a body; as printed there is no such choice."""
+    arm, body = (make_tracker("css", name) for name in ("arm8", "body34"))
+    assert isinstance(arm, Tracker)
+    assert isinstance(body, Tracker)
+    assert (arm.evidence, body.evidence) == (0.05, 0.1)
+    assert arm.soft_matching
+    assert body.soft_matching
+    for name in ("arm8", "body34"):
+        printed = make_tracker("css_figure_6", name)
+        assert isinstance(printed, Tracker)
+        assert (printed.evidence, printed.memory) == (1.0, 1.0)
+        assert not printed.soft_matching
+
+
 def test_the_reports_numbers_of_hypotheses():
     """Section 6 [RR]: three for the arm, seven for the body, from one mode."""
     for body, expected in [("arm7", 3), ("body30", 7)]:
