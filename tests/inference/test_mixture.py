@@ -363,3 +363,10 @@ def test_prior_at_of_what_goes_on_and_of_what_is_new(dtype):
     # Where it does vary, a held parameter that moves is very far.
     moved = posterior._replace(mean=posterior.mean + torch.tensor([0.0, 0.1], dtype=dtype))
     assert prior_at(moved, prior).parent.tolist() == [-1] * 5
+
+
+@pytest.mark.parametrize("compare", [prior_at, match_to_prior])
+def test_mixtures_over_different_states_are_told(compare, generator):
+    two, three = (random_mixture(2, n, generator=generator) for n in (2, 3))
+    with pytest.raises(ShapeError, match="same state, got 2 and 3 parameters"):
+        compare(two, three)

@@ -316,6 +316,17 @@ def representatives(
     return torch.where(member, score[:, None], -torch.inf).argmax(0)
 
 
+def _same_state(name: str, first: GaussianMixture, second: GaussianMixture) -> int:
+    """Number of parameters of both."""
+    n, other = first.mean.shape[-1], second.mean.shape[-1]
+    if n != other:
+        raise ShapeError(
+            f"{name}: expected mixtures over the same state, got {n} and {other} parameters; map "
+            "one onto the other first"
+        )
+    return n
+
+
 def bhattacharyya(
     first: GaussianMixture, second: GaussianMixture, *, standard: bool = False
 ) -> Float[Tensor, "k m"]:
@@ -328,12 +339,7 @@ def bhattacharyya(
             `d^T S^-1 d + log(|A + B| / sqrt(|A| |B|)) / 2` with `S = (A + B) / 2`; True for that of
             the literature, `d^T S^-1 d / 8 + log(|S| / sqrt(|A| |B|)) / 2` (design decision 4).
     """
-    n = first.mean.shape[-1]
-    if second.mean.shape[-1] != n:
-        raise ShapeError(
-            f"bhattacharyya: expected mixtures over the same state, got {n} and "
-            f"{second.mean.shape[-1]} parameters; map one onto the other first"
-        )
+    n = _same_state("bhattacharyya", first, second)
     between = 0.5 * (first.covariance[:, None] + second.covariance[None, :])
     apart = first.mean[:, None] - second.mean[None, :]
     squared = (whitener(between) @ apart[..., None])[..., 0].square().sum(-1)
@@ -391,10 +397,13 @@ def prior_at(posterior: GaussianMixture, prior: GaussianMixture) -> Past:
     Args:
         posterior: The modes of this frame.
         prior: The modes of the frame before, one frame ahead.
+
+    Raises:
+        ShapeError: If the mixtures are over different states.
     """
+    n = _same_state("prior_at", posterior, prior)
     apart = posterior.mean[:, None] - prior.mean[None, :]
     both = posterior.covariance[:, None] + prior.covariance[None, :]
-    n = apart.shape[-1]
     distance = (0.5 * squared_mahalanobis(apart, both)).clamp(max=n)
     nearest = distance.min(-1)
     return Past(
