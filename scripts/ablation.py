@@ -4,8 +4,9 @@
 
 The demo (seeds 0 to 2), and, with `--data`, the clips of DIR/balance_beam_4cam from either camera,
 with keypoints in all frames and in the first frame only. Every row tracks with the terms of the row
-before it and one more, or with one exchanged; the demo's arm has no segmentation. A clip with
-reference is measured as `scripts/evaluate_track.py` does; the demo against its own truth.
+before it and one more, or with one exchanged; the demo's arm has neither segmentation nor
+background. A clip with reference is measured as `scripts/evaluate_track.py` does; the demo against
+its own truth.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ FLOW = ("flow", *BOUNDARIES)
 BODY = ("interpenetration", *FLOW)
 REGION = ("region", *BODY)
 SEGMENTATION = ("segmentation", *REGION)
+BACKGROUND = ("background", *SEGMENTATION)
 ROWS = {
     "joints and priors only": BASE,
     "+ contour": EDGES,
@@ -44,8 +46,9 @@ ROWS = {
     "+ interpenetration": BODY,
     "+ region": REGION,
     "+ segmentation": SEGMENTATION,
-    "+ edge energy": ("edge_energy", *SEGMENTATION),
-    "+ previous mixture": ("temporal_mixture", *SEGMENTATION),
+    "+ background": BACKGROUND,
+    "+ edge energy": ("edge_energy", *BACKGROUND),
+    "+ previous mixture": ("temporal_mixture", *BACKGROUND),
     "contour + flow": ("flow", *EDGES),
     "contour + interpenetration": ("interpenetration", *EDGES),
     "edge energy for contour": ("edge_energy", *BASE),

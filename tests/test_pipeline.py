@@ -180,8 +180,10 @@ def test_same_seed_same_track(clip: Path, tmp_path: Path):
 
 def test_all_terms_track(clip: Path, tmp_path: Path):
     summary = run(clip, tmp_path, terms=ALL_TERMS, working_size=160)
-    # Weights of edges are no term; lengths are not free while tracking; an arm is not segmented.
-    names = set(ALL_TERMS) - {"motion_boundaries", "anthropometric", "segmentation"}
+    # Weights of edges and the background are no terms; lengths are not free while tracking; an arm
+    # is not segmented.
+    without = {"motion_boundaries", "background", "anthropometric", "segmentation"}
+    names = set(ALL_TERMS) - without
     assert set(summary["best_mode_cost_by_term"]) == set(summary["share_of_cost_by_term"]) == names
     times = summary["share_of_search_time_by_term"]
     assert set(times) == names | {"pose", "visibility", "lift", "optimiser"}

@@ -178,7 +178,7 @@ def track_frames(
             num_lost = num_lost + 1 if lost else 0
         if not lost:
             for each in watchers:
-                each.learn(body, mean[0])
+                each.learn(body, mean, state.mixture.log_weight)
         yield TrackedFrame(
             frame,
             body,

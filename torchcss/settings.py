@@ -36,17 +36,22 @@ from torchcss.vision.features import FeatureExtractor
 from torchcss.vision.flow import TRACKING
 
 TERMS = (
-    *("contour", "motion_boundaries", "region", "segmentation", "flow", "joints"),
+    *("contour", "motion_boundaries", "region", "segmentation", "background", "flow", "joints"),
     *("stabiliser", "anthropometric", "interpenetration", "temporal"),
 )
 """Terms and priors of the cost by default: all that do not stand in for one another."""
 
 ALL_TERMS = (
-    *("contour", "motion_boundaries", "edge_energy", "region", "segmentation", "flow", "joints"),
-    *("stabiliser", "anthropometric", "interpenetration", "temporal", "temporal_mixture"),
+    *("contour", "motion_boundaries", "edge_energy", "region", "segmentation", "background"),
+    *("flow", "joints", "stabiliser", "anthropometric", "interpenetration", "temporal"),
+    "temporal_mixture",
 )
 """Terms and priors that can be chosen; see `torchcss.cost.total`. `motion_boundaries` weighs the
-edges of `contour` and `edge_energy` by the motion boundaries, `W = 1 - k S_p`."""
+edges of `contour` and `edge_energy` by the motion boundaries, `W = 1 - k S_p`. `background` tells
+`region` and `segmentation` what a camera that stands still sees behind the body."""
+
+_NO_TERMS = ("motion_boundaries", "background")
+"""Of these: what has no cost of its own."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,8 +109,7 @@ class Settings:
                 f"terms: expected at least one of {', '.join(OBSERVATIONS)}, which compare a pose "
                 f"with the image; got {', '.join(self.terms) or 'none'}"
             )
-        # Motion boundaries are no term of their own: `boundary_emphasis` weighs them.
-        weighed = [name for name in ALL_TERMS if name != "motion_boundaries"]
+        weighed = [name for name in ALL_TERMS if name not in _NO_TERMS]
         if strange := sorted(set(self.weights) - set(weighed)):
             raise ConfigurationError(f"weights: no terms {strange}; there are {', '.join(weighed)}")
         for name, weight in self.weights.items():
@@ -176,7 +180,8 @@ def make_choice(settings: Settings, sigma: float) -> CostChoice:
 
     Segmentation weighs what descents have found, which particles are not. An arm gets none either:
     what looks like it may be the rest of the person, who is not modelled. On the rendered arm its
-    best mode flips in four of five seeds with it, and in none without.
+    best mode flips in four of five seeds with it, and in none without. Nor does an arm know a
+    background, which the rest of the person would be taken for.
 
     Args:
         settings: Which terms, and which tracker.
@@ -198,6 +203,7 @@ def make_choice(settings: Settings, sigma: float) -> CostChoice:
         edge_energy=EdgeEnergyTerm(**potential) if has("edge_energy") else None,
         region=RegionTerm() if has("region") else None,
         segmentation=SegmentationTerm() if has("segmentation") and whole and descends else None,
+        background=has("background") and whole,
         flow=FlowTerm(**potential) if has("flow") else None,
         joints=JointTerm(sigma=sigma, **potential) if has("joints") else None,
         stabiliser=Stabiliser() if has("stabiliser") else None,

@@ -138,7 +138,7 @@ def smooth_frames(
             one = beside([watcher.cost(there, before) for watcher in watchers])
             at_start.append(float(one.value(start[row : row + 1])))
             for watcher in watchers:
-                watcher.learn(there, start[row])
+                watcher.learn(there, start[row : row + 1])
             yield one
 
     refined = refine_in_windows(

@@ -20,6 +20,7 @@ from torchcss.errors import VideoError
 from torchcss.io.video import Frame
 from torchcss.stopwatch import Stopwatch
 from torchcss.vision.appearance import Appearance
+from torchcss.vision.background import Background
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor, FrameFeatures
 
@@ -55,6 +56,7 @@ class Watcher:
     Attributes:
         features: Those of the image taken in last; None if the view is out.
         appearance: What body and surroundings look like; None: not known yet.
+        background: What is behind the body; None: not known yet, or not asked for.
     """
 
     def __init__(
@@ -68,6 +70,7 @@ class Watcher:
         self.masks = None if masks is None else iter(masks)
         self.last: np.ndarray | None = None
         self.appearance: Appearance | None = None
+        self.background: Background | None = None
         self.index: int | None = None
         self.features: FrameFeatures | None = None
 
@@ -84,8 +87,10 @@ class Watcher:
         if frame.image.size and frame.image.min() == frame.image.max():
             self.last = None
             return
-        self.features = self.extractor(frame.image, self.last, mask)
-        self.last = frame.image
+        features = self.extractor(frame.image, self.last, mask)
+        self.features, self.last, colour = features, frame.image, features.colour
+        if self.background is not None and colour is not None and not self.background.holds(colour):
+            self.background = None
 
     def cost(
         self, body: BodyModel, before: Tensor | None, stopwatch: Stopwatch | None = None
@@ -100,9 +105,23 @@ class Watcher:
             before=before,
             observation=observation,
             appearance=self.appearance,
+            background=self.background,
             stopwatch=stopwatch,
         )
 
-    def learn(self, body: BodyModel, state: Tensor) -> None:
-        """Take in what body and surroundings look like in that image."""
-        self.appearance = self.costs.learn(self.appearance, self.features, body, state)
+    def learn(self, body: BodyModel, modes: Tensor, log_weight: Tensor | None = None) -> None:
+        """Take in what body, surroundings and background look like in that image.
+
+        Args:
+            body: The body on this frame's base.
+            modes: Poses that it may have, `[k n]`, the best first.
+            log_weight: Their weights; None: all the same.
+        """
+        self.appearance = self.costs.learn(self.appearance, self.features, body, modes[0])
+        self.background = self.costs.learn_background(
+            self.background,
+            self.features,
+            body,
+            modes,
+            modes.new_zeros(len(modes)) if log_weight is None else log_weight,
+        )

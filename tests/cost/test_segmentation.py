@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -13,12 +14,14 @@ from torchcss.cost.flow import FlowTerm
 from torchcss.cost.frame import FrameCosts
 from torchcss.cost.region import RegionTerm, part_layers
 from torchcss.cost.segmentation import SegmentationImages, SegmentationTerm
-from torchcss.cost.silhouette import part_map
+from torchcss.cost.silhouette import bare_pixels, part_map
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.proposals import CovarianceScaled
 from torchcss.inference.tracker import Tracker
+from torchcss.io.video import Frame
 from torchcss.types import Bounds, LocalModel
+from torchcss.views import Watcher
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor
 from torchcss.vision.flow import TRACKING
@@ -167,6 +170,70 @@ def test_what_a_frame_taught_weighs_the_poses_of_the_next() -> None:
     # A frame without a frame before it has no unit of area, and one without a picture says nothing.
     assert costs(features, body=body, appearance=appearance).segmentation is None
     assert costs(None, body=body, before=truth[None], appearance=appearance).segmentation is None
+
+
+def before_a_wall(body: BodyModel, camera: Camera, state: Tensor) -> np.ndarray:
+    """A body before a wall with stripes of its own colour, but for where its arm will be."""
+    seen = part_map(body, state, camera) >= 0
+    skin, blue = torch.tensor([180, 60, 40]), torch.tensor([40, 90, 160])
+    stripes = (torch.arange(seen.shape[1]) // 24 % 2 == 0).expand(seen.shape)
+    there = part_map(body, torch.stack([moved(body, 0.0), moved(body, 1.2)]), camera) >= 0
+    image = torch.where((seen | (stripes & ~(there[1] & ~there[0])))[..., None], skin, blue)
+    image = image.double()
+    image += 4 * torch.randn(image.shape, generator=torch.Generator().manual_seed(0))
+    return image.clamp(0, 255).to(torch.uint8).numpy()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_camera_that_stands_still_knows_what_was_behind(dtype: torch.dtype) -> None:
+    """A limb moves before a wall of its own colour: pictures, background, nats."""
+    body, camera = a_body_before_a_camera(dtype)
+    before, after = moved(body, 0.0), moved(body, 1.2)
+    gaps = {}
+    for asked in (False, True):
+        choice = CostChoice(
+            region=RegionTerm(), segmentation=SegmentationTerm(), background=asked, joints=None
+        )
+        costs = FrameCosts(body, camera, choice)
+        extractor = FeatureExtractor(colour=True).to(dtype)
+        watcher = Watcher(costs, extractor, lambda _: None, None)
+        for index in range(2):
+            watcher.look(Frame(index, 0.0, before_a_wall(body, camera, before)))
+            watcher.learn(body, before[None])
+        watcher.look(Frame(2, 0.0, before_a_wall(body, camera, after)))
+        assert (watcher.background is not None) == asked
+        cost = watcher.cost(body, before[None])
+        where = torch.zeros(2, dtype=torch.long)
+        prior = GaussianMixture(before[None], torch.eye(len(before))[None].to(before), before[:1])
+        both = torch.stack([after, before])
+        cost = cost.of_children(where, prior)
+        shown = cost.unsearched(both) + cost.terms(both)["region"]
+        assert shown.dtype == dtype
+        gaps[asked] = float(shown[1] - shown[0])
+    assert gaps[True] > gaps[False] + 20
+    # A cut, and a picture that is missing.
+    watcher.look(None)
+    watcher.learn(body, before[None])
+    assert watcher.background is not None
+    watcher.look(Frame(3, 0.0, 255 - before_a_wall(body, camera, after)))
+    assert watcher.background is None
+
+
+def test_pixels_are_bare_where_no_likely_pose_is_near() -> None:
+    body, camera = a_body_before_a_camera()
+    modes = torch.stack([moved(body, 0.0), moved(body, 1.2)])
+    seen = part_map(body, modes, camera) >= 0
+    raised = seen[1] & ~seen[0]
+    alike = bare_pixels(body, modes, torch.tensor([-3.0, -3.0]).double(), camera)
+    assert alike.shape == (600, 480)
+    assert not (alike & seen.any(0)).any()
+    assert alike[:, :20].all()
+    unlikely = bare_pixels(body, modes, torch.tensor([0.0, -5.0]).double(), camera)
+    assert float(unlikely[raised].double().mean()) > 0.8
+    assert not (unlikely & seen[0]).any()
+    # Nor within four pixels of a body that is likely: eight, on a grid of four, of a coarse mesh.
+    grown = torch.nn.functional.max_pool2d(seen[0][None].double(), 9, 1, 4)[0] > 0
+    assert not (unlikely & grown).any()
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

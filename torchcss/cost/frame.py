@@ -29,10 +29,12 @@ from torchcss.cost.flow import FlowTargets, InteriorNodes, flow_targets
 from torchcss.cost.interpenetration import InterpenetrationPairs
 from torchcss.cost.joints import JointObservation
 from torchcss.cost.region import RegionImages, part_layers, region_field, region_masks
+from torchcss.cost.silhouette import bare_pixels
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.cost.visibility import ContourPredictor, visible_nodes
 from torchcss.stopwatch import Stopwatch
 from torchcss.vision.appearance import Appearance
+from torchcss.vision.background import Background
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FrameFeatures
 
@@ -83,6 +85,7 @@ class FrameCosts:
         before: Float[Tensor, "k n"] | None = None,
         observation: JointObservation | None = None,
         appearance: Appearance | None = None,
+        background: Background | None = None,
         stopwatch: Stopwatch | None = None,
     ) -> TrackingCost:
         """The cost of a frame; with modes before it, `of_children` has to follow.
@@ -93,6 +96,7 @@ class FrameCosts:
             before: The modes of the frame before, which the flow carries on; None: no flow.
             observation: Keypoints of the frame, in pixels of the features.
             appearance: What the body and its surroundings look like, see `learn`; None: not known.
+            background: What is behind the body, see `learn_background`; None: not known.
             stopwatch: Where the time of evaluations is added up.
         """
         cost = TrackingCost(
@@ -114,7 +118,7 @@ class FrameCosts:
             cost,
             edge_field=edge_field,
             energy=edge_energy_field(edge_field) if direct else None,
-            **self._looks(features, body, before, appearance),
+            **self._looks(features, body, before, appearance, background),
             targets=None if before is None else self._targets(features, body, before),
         )
 
@@ -148,17 +152,46 @@ class FrameCosts:
         inside, outside = region_masks(body, state, self.camera, fitted=fitted)
         return appearance.learn(features.colour, inside, outside)
 
+    def learn_background(
+        self,
+        background: Background | None,
+        features: FrameFeatures | None,
+        body: BodyModel,
+        modes: Float[Tensor, "k n"],
+        log_weight: Float[Tensor, " k"],
+    ) -> Background | None:
+        """Take in what a frame shows where the body is not.
+
+        None where the choice does not ask for it.
+
+        Args:
+            background: What was known before; None: nothing.
+            features: Features of the frame, with colours.
+            body: The body on this frame's base.
+            modes: Poses that it may have.
+            log_weight: Their weights.
+        """
+        if not self.choice.background or body.num_parts == 0:
+            return None
+        if features is None or features.colour is None:
+            return background
+        if background is None:
+            background = Background.unknown(features.colour)
+        bare = bare_pixels(body, modes, log_weight, self.camera)
+        return background.learn(features.colour, bare, features.flow)
+
     def _looks(
         self,
         features: FrameFeatures,
         body: BodyModel,
         before: Float[Tensor, "k n"] | None,
         appearance: Appearance | None,
+        background: Background | None,
     ) -> dict[str, Any]:
         """What the pixels look like, for the terms that ask for it."""
         if appearance is None or features.colour is None:
             return {}
-        likeness, images = appearance.likeness(features.colour), {}
+        likeness, images = appearance.likeness(features.colour, background), {}
         if self.choice.region is not None and self.predictor is not None:
             layer = self.layer_of_part[self.predictor.node_part]
             images["region"] = RegionImages(region_field(likeness), layer)

@@ -1,4 +1,4 @@
-"""Which part of a posed body each pixel sees, by rasterising its surface.
+"""Which part of a posed body each pixel sees, by rasterising its surface, and which see none.
 
 For masks, for colours, for the overlap of silhouettes. The costs do not use it: for thousands of
 samples visibility is found node by node (`torchcss.cost.visibility`).
@@ -7,8 +7,9 @@ samples visibility is found node by node (`torchcss.cost.visibility`).
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn import functional
 
 from torchcss.body.model import BodyModel
 from torchcss.raster import grid_faces, nearest_faces
@@ -16,6 +17,15 @@ from torchcss.vision.camera import Camera
 
 _POSES_AT_ONCE = 16
 """Poses drawn together: it bounds the memory."""
+
+_COARSE = 4
+_MARGIN = 2
+"""Pixels of the image, along each side, to one that is looked at for what is bare, and how many of
+these a body may be off its pose."""
+
+_COVERED = 0.3
+"""Posterior probability of being covered from which a pixel is not bare. A mode that is all but
+ruled out would hide the background from the one that is right."""
 
 
 def part_map(
@@ -55,3 +65,25 @@ def part_map(
         face = nearest_faces(uv, depth, every, height, width, valid=valid)
         seen[first : first + len(some)] = torch.where(face >= 0, face // len(faces), face)
     return seen.reshape(*batch, height, width)
+
+
+def bare_pixels(
+    body: BodyModel,
+    modes: Float[Tensor, "k n"],
+    log_weight: Float[Tensor, " k"],
+    camera: Camera,
+) -> Bool[Tensor, "h w"]:
+    """Pixels that no likely pose covers, nor comes near.
+
+    Args:
+        body: The body on its base.
+        modes: Its poses.
+        log_weight: Their weights, not necessarily normalised.
+        camera: Camera of the image.
+    """
+    width, height = camera.image_size_wh
+    covered = part_map(body, modes, camera.scaled(1 / _COARSE), rings=6, meridians=10) >= 0
+    share = (covered * log_weight.softmax(0)[:, None, None]).sum(0)
+    near = (share > _COVERED)[None, None].to(modes)
+    near = functional.max_pool2d(near, 2 * _MARGIN + 1, 1, _MARGIN)
+    return functional.interpolate(near, size=(height, width))[0, 0] == 0

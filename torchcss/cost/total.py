@@ -16,6 +16,7 @@ temperature: the nats that a term contributes per nu of mean cost per node (desi
 | `edge_energy` | the edge energy itself at the same nodes | 2 |
 | `region` | colours on either side of the same nodes | 8 |
 | `segmentation` | colours of all covered pixels; in the weights of modes only | 8 |
+| `background` | what is behind the body, for these two; no cost of its own | 8 |
 | `flow` | displacement of interior nodes against the optical flow | 3.1.2, eq. 9 |
 | `joints` | 2D joint correspondences | 5 |
 | `anthropometric` | lengths of the limbs, where they are free | 3.2.1 |
@@ -78,6 +79,8 @@ class CostChoice:
         edge_energy: The direct edge-energy potential, or None.
         region: The term of the colours on either side of the contour, or None.
         segmentation: The likeness of all covered pixels, for the weights of modes, or None.
+        background: Whether `region` and `segmentation` know what is behind the body, see
+            `torchcss.vision.background`.
         flow: The flow term, or None.
         joints: The keypoint term, or None.
         stabiliser: The sticky prior, or None.
@@ -102,6 +105,7 @@ class CostChoice:
     edge_energy: EdgeEnergyTerm | None = None
     region: RegionTerm | None = None
     segmentation: SegmentationTerm | None = None
+    background: bool = False
     flow: FlowTerm | None = None
     joints: JointTerm | None = field(default_factory=JointTerm)
     stabiliser: Stabiliser | None = field(default_factory=Stabiliser)

@@ -8,19 +8,24 @@ forgotten by degrees. For a pixel of colour c,
     likeness = tanh(1/2 log p(c | thing) / p(c | surroundings)) = P(thing | c) - P(surroundings | c)
 
 with equal prior odds: 1 where only the thing has that colour, -1 where only the surroundings have,
-0 where both or neither do.
+0 where both or neither do. Where it is known what a pixel looks like with nobody before it
+(`torchcss.vision.background`), that density takes the place of the surroundings' as far as it is
+trusted.
 
 By default: `Appearance.unknown`, then per frame `likeness`, and `learn` once the thing is found.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
+
+from torchcss.vision.background import Background
 
 BINS = 12
 """Bins per colour channel."""
@@ -78,17 +83,34 @@ class Appearance(NamedTuple):
             _mix(self.outside, bins, outside, outside_rate),
         )
 
-    def likeness(self, colour: Float[Tensor, "3 h w"]) -> Float[Tensor, "layers h w"]:
-        """How much each pixel looks like each thing, in -1..1; 0 for a thing never seen.
+    def likeness(
+        self, colour: Float[Tensor, "3 h w"], background: Background | None = None
+    ) -> Float[Tensor, "layers h w"]:
+        """How much each pixel looks like each thing, in -1..1.
+
+        Where no background is known, 0 for a thing never seen; of such a thing every colour is as
+        likely as any other.
 
         Args:
             colour: Red, green, blue in 0..1.
+            background: What the pixels look like with nobody before them; None: not known.
         """
         bins = colour_bins(colour)
         known = (self.inside.sum(-1) > 0) & (self.outside.sum(-1) > 0)
-        ratio = (_smooth(self.inside) + _FLOOR).log() - (_smooth(self.outside) + _FLOOR).log()
-        ratio = torch.where(known[:, None], ratio, 0.0)
-        return (0.5 * ratio).tanh()[:, bins]
+        inside, outside = (
+            torch.where(known[:, None], (_smooth(part) + _FLOOR).log() + math.log(BINS**3), 0.0)
+            for part in (self.inside, self.outside)
+        )
+        if background is None:
+            return (0.5 * (inside - outside)).tanh()[:, bins]
+        inside, outside = inside[:, bins], outside[:, bins]
+        trust = background.confidence
+        behind = background.log_density(colour) + trust.log()
+        either = torch.logaddexp(behind, outside + (1 - trust).log())
+        likeness = (0.5 * (inside - either)).tanh()
+        # Who stands still looks the same too: a guess may silence the colours, not overrule them.
+        blind = (0.5 * (inside - outside)).tanh()
+        return torch.where(background.sure, likeness, likeness.maximum(blind.clamp(max=0)))
 
 
 def colour_bins(colour: Float[Tensor, "3 h w"]) -> Int[Tensor, "h w"]:
