@@ -37,7 +37,6 @@ FLOW = ("flow", *BOUNDARIES)
 BODY = ("interpenetration", *FLOW)
 REGION = ("region", *BODY)
 SEGMENTATION = ("segmentation", *REGION)
-BACKGROUND = ("background", *SEGMENTATION)
 ROWS = {
     "joints and priors only": BASE,
     "+ contour": EDGES,
@@ -46,9 +45,9 @@ ROWS = {
     "+ interpenetration": BODY,
     "+ region": REGION,
     "+ segmentation": SEGMENTATION,
-    "+ background": BACKGROUND,
-    "+ edge energy": ("edge_energy", *BACKGROUND),
-    "+ previous mixture": ("temporal_mixture", *BACKGROUND),
+    "+ background": ("background", *SEGMENTATION),
+    "+ edge energy": ("edge_energy", *SEGMENTATION),
+    "+ previous mixture": ("temporal_mixture", *SEGMENTATION),
     "contour + flow": ("flow", *EDGES),
     "contour + interpenetration": ("interpenetration", *EDGES),
     "edge energy for contour": ("edge_energy", *BASE),

@@ -36,15 +36,16 @@ from torchcss.vision.features import FeatureExtractor
 from torchcss.vision.flow import TRACKING
 
 TERMS = (
-    *("contour", "motion_boundaries", "region", "segmentation", "background", "flow", "joints"),
+    *("contour", "motion_boundaries", "region", "segmentation", "flow", "joints"),
     *("stabiliser", "anthropometric", "interpenetration", "temporal"),
 )
-"""Terms and priors of the cost by default: all that do not stand in for one another."""
+"""Terms and priors of the cost by default: all that do not stand in for one another, but for
+`background`, which takes dark clothes before a dark wall for the wall."""
 
 ALL_TERMS = (
-    *("contour", "motion_boundaries", "edge_energy", "region", "segmentation", "background"),
-    *("flow", "joints", "stabiliser", "anthropometric", "interpenetration", "temporal"),
-    "temporal_mixture",
+    *("contour", "motion_boundaries", "edge_energy", "region", "segmentation", "flow", "joints"),
+    *("stabiliser", "anthropometric", "interpenetration", "temporal", "temporal_mixture"),
+    "background",
 )
 """Terms and priors that can be chosen; see `torchcss.cost.total`. `motion_boundaries` weighs the
 edges of `contour` and `edge_energy` by the motion boundaries, `W = 1 - k S_p`. `background` tells
