@@ -97,13 +97,14 @@ class Appearance(NamedTuple):
         """
         bins = colour_bins(colour)
         known = (self.inside.sum(-1) > 0) & (self.outside.sum(-1) > 0)
-        inside, outside = (
-            torch.where(known[:, None], (_smooth(part) + _FLOOR).log() + math.log(BINS**3), 0.0)
-            for part in (self.inside, self.outside)
-        )
+        inside, outside = ((_smooth(part) + _FLOOR).log() for part in (self.inside, self.outside))
         if background is None:
-            return (0.5 * (inside - outside)).tanh()[:, bins]
-        inside, outside = inside[:, bins], outside[:, bins]
+            return (0.5 * torch.where(known[:, None], inside - outside, 0.0)).tanh()[:, bins]
+        # Densities over the unit cube of colours, as the background's.
+        inside, outside = (
+            torch.where(known[:, None], part + math.log(BINS**3), 0.0)[:, bins]
+            for part in (inside, outside)
+        )
         trust = background.confidence
         behind = background.log_density(colour) + trust.log()
         either = torch.logaddexp(behind, outside + (1 - trust).log())
