@@ -11,8 +11,10 @@ background with density
 where D is the same colour in shadow: darker by any factor down to `_DARKEST`, hue kept. A person's
 own shadow moves along and is no part of the body.
 
-Nothing is known of places that were covered so far, and nothing is kept when the camera moves
-(`learn`) or most of the picture changes (`holds`): a wrong background is worse than none.
+Of places that were covered so far there is only a guess: what does not change may be background.
+Nothing is kept when the camera moves (`learn`) or most of the picture changes (`holds`): a wrong
+background is worse than none. Clothes that look like the wall behind them are taken for it, so that
+in the dark a body is tracked worse than without (`docs/figures.md`).
 
 By default: `Background.unknown`, then per frame `Appearance.likeness(colour, background)`, and
 `learn` once the body is found; `torchcss.views.Watcher` does it.
