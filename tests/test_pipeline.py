@@ -496,6 +496,9 @@ def test_a_body_is_segmented_and_an_arm_alone_is_not():
     assert make_choice(Settings(body="body34"), 2.0).segmentation is not None
     assert make_choice(Settings(body="body34", preset="condensation"), 2.0).segmentation is None
     assert make_choice(Settings(body="arm8"), 2.0).segmentation is None
+    assert not make_choice(Settings(body="body34"), 2.0).background
+    assert make_choice(Settings(body="body34", terms=ALL_TERMS), 2.0).background
+    assert not make_choice(Settings(body="arm8", terms=ALL_TERMS), 2.0).background
     terms = tuple(name for name in ALL_TERMS if name != "segmentation")
     assert make_choice(Settings(body="body34", terms=terms), 2.0).segmentation is None
 

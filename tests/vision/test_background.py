@@ -98,6 +98,33 @@ def test_what_comes_before_it_looks_like_the_body_in_the_colours_of_the_wall() -
     assert float(strange[block(5, 40)].mean()) < -0.8
 
 
+def test_what_never_was_bare_and_does_not_change_is_a_guess() -> None:
+    picture, hidden = room(), block(5, 5)
+    picture[:, hidden] = torch.tensor([0.7, 0.4, 0.3], dtype=torch.float64)[:, None]
+    looks = Appearance.unknown(1, like=picture).learn(picture, hidden[None], ~hidden[None])
+    known = Background.unknown(picture)
+    for frame in range(4):
+        assert float(known.confidence[hidden].max()) == (0.1 if frame >= 3 else 0.0)
+        known = known.learn(picture, ~hidden)
+    # Who stands still is not taken for the wall, but his colours count for less.
+    blind, seeing = looks.likeness(picture)[0][hidden], looks.likeness(picture, known)[0][hidden]
+    assert float(blind.min()) > 0.9
+    assert float(seeing.min()) >= 0
+    assert float(seeing.max()) < float(blind.min()) - 0.05
+    # What has moved counts as before.
+    moved = picture.clone()
+    moved[:, hidden] = 1 - picture[:, hidden]
+    strange = Appearance.unknown(1, like=moved).learn(moved, hidden[None], ~hidden[None])
+    again = strange.likeness(moved, known)[0][hidden]
+    torch.testing.assert_close(again, strange.likeness(moved)[0][hidden], atol=0.12, rtol=0)
+    # Once it is bare what it showed before is forgotten.
+    bare = known.learn(moved, everywhere())
+    torch.testing.assert_close(bare.mean[:, hidden], moved[:, hidden])
+    assert float(bare.frames[hidden].max()) == 1.0
+    assert not bare.squares[hidden].any()
+    assert bare.sure.all()
+
+
 def test_a_camera_that_moves_has_no_background() -> None:
     wide = torch.rand(3, HEIGHT, 200, generator=torch.Generator().manual_seed(3)).double()
     known = Background.unknown(wide[..., :WIDTH])

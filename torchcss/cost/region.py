@@ -37,7 +37,7 @@ from torch.nn import functional
 from torchcss.body.model import BodyModel
 from torchcss.body.root import has_root
 from torchcss.cost.contour import seen_nodes, spread
-from torchcss.cost.silhouette import part_map
+from torchcss.cost.silhouette import grow, part_map
 from torchcss.cost.visibility import ContourNodes
 from torchcss.types import PointCost
 from torchcss.vision.camera import Camera
@@ -129,13 +129,13 @@ def region_masks(
     own = whole[window]
     inner = own & pixels(_CORE)[window]
     if fitted:
-        inner |= ~_grow(~own, _BODY_MARGIN if has_root(body) else _ARM_MARGIN)
+        inner |= ~grow(~own, _BODY_MARGIN if has_root(body) else _ARM_MARGIN)
     small = inner.flatten(1).sum(1) < _CORE_PIXELS
-    core[window] = torch.where(small[:, None, None], ~_grow(~own, 1), inner)
+    core[window] = torch.where(small[:, None, None], ~grow(~own, 1), inner)
     blocks = functional.max_pool2d(own.float(), _COARSE, ceil_mode=True) > 0
-    blocks = _grow(blocks, reach // _COARSE)
+    blocks = grow(blocks, reach // _COARSE)
     far = blocks.repeat_interleave(_COARSE, -1).repeat_interleave(_COARSE, -2)
-    near = far[:, : own.shape[1], : own.shape[2]] & ~_grow(own, _GAP)
+    near = far[:, : own.shape[1], : own.shape[2]] & ~grow(own, _GAP)
     for first, second in body.neighbours:
         i, j = (layer_of[body.part_names.index(name)] for name in (first, second))
         if i != j:
@@ -159,12 +159,6 @@ def _window(mask: Bool[Tensor, "h w"], margin: int) -> tuple[EllipsisType, slice
         stop = -(-(int(found[-1]) + margin + 1) // _COARSE) * _COARSE
         spans.append(slice(start, stop))
     return (..., *spans)
-
-
-def _grow(masks: Bool[Tensor, "layers h w"], radius: int) -> Bool[Tensor, "layers h w"]:
-    size = 2 * radius + 1
-    rows = functional.max_pool2d(masks.float(), (1, size), 1, (0, radius))
-    return functional.max_pool2d(rows, (size, 1), 1, (radius, 0)) > 0
 
 
 class RegionImages(NamedTuple):

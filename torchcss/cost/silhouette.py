@@ -67,6 +67,18 @@ def part_map(
     return seen.reshape(*batch, height, width)
 
 
+def grow(masks: Bool[Tensor, "layers h w"], radius: int) -> Bool[Tensor, "layers h w"]:
+    """Masks and all that is within a square of so many pixels about them.
+
+    Args:
+        masks: The masks.
+        radius: Half the side of the square, pixels.
+    """
+    size = 2 * radius + 1
+    rows = functional.max_pool2d(masks.float(), (1, size), 1, (0, radius))
+    return functional.max_pool2d(rows, (size, 1), 1, (radius, 0)) > 0
+
+
 def bare_pixels(
     body: BodyModel,
     modes: Float[Tensor, "k n"],
@@ -84,6 +96,5 @@ def bare_pixels(
     width, height = camera.image_size_wh
     covered = part_map(body, modes, camera.scaled(1 / _COARSE), rings=6, meridians=10) >= 0
     share = (covered * log_weight.softmax(0)[:, None, None]).sum(0)
-    near = (share > _COVERED)[None, None].to(modes)
-    near = functional.max_pool2d(near, 2 * _MARGIN + 1, 1, _MARGIN)
+    near = grow((share > _COVERED)[None], _MARGIN)[None].to(modes)
     return functional.interpolate(near, size=(height, width))[0, 0] == 0

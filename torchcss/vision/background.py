@@ -30,8 +30,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 _DEVIATION = 0.05
-"""Standard deviation of a colour channel before anything is learnt: grain, compression, and the
-width of the bins that the things' colours are told by, with which this one has to compare."""
+"""Standard deviation of a colour channel before anything is learnt: grain and compression."""
 
 _PRIOR_FRAMES = 4.0
 """Frames that this counts for."""
@@ -98,8 +97,8 @@ class Background(NamedTuple):
     @property
     def confidence(self) -> Float[Tensor, "h w"]:
         """Probability that a pixel without the body shows what it showed before."""
-        guess = torch.where(self.frames >= _STILL_FRAMES, _GUESS, 0.0).to(self.frames)
-        return torch.where(self.sure, _SURE, guess)
+        guess = _GUESS * (self.frames >= _STILL_FRAMES).to(self.frames)
+        return guess.masked_fill(self.sure, _SURE)
 
     @property
     def variance(self) -> Float[Tensor, "h w"]:
@@ -136,7 +135,7 @@ class Background(NamedTuple):
         old = torch.where(bare & ~before.sure, 0.0, before.frames)
         squares = torch.where(old > 0, before.squares, 0.0)
         sure, taken = before.sure | bare, bare | ~before.sure
-        memory = torch.where(sure, _MEMORY, _SHORT_MEMORY)
+        memory = torch.full_like(old, _SHORT_MEMORY).masked_fill(sure, _MEMORY)
         full = taken & (old > memory - 1)
         frames = torch.where(taken, old.minimum(memory - 1) + 1, old)
         offset = torch.where(taken, colour - before.mean, 0.0)
