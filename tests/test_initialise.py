@@ -14,7 +14,7 @@ import torchcss
 from torchcss.body.catalog import LENGTHS
 from torchcss.body.model import load_body
 from torchcss.cost.joints import JointObservation, JointTerm
-from torchcss.cost.silhouette import part_map
+from torchcss.cost.part_map import part_map
 from torchcss.cost.view import View
 from torchcss.errors import BodyError, CameraError, ConfigurationError, KeypointError
 from torchcss.first_pose import initialise_from_joints

@@ -181,8 +181,8 @@ def test_same_seed_same_track(clip: Path, tmp_path: Path):
 def test_all_terms_track(clip: Path, tmp_path: Path):
     summary = run(clip, tmp_path, terms=ALL_TERMS, working_size=160)
     # Weights of edges and the background are no terms; lengths are not free while tracking; an arm
-    # is not segmented.
-    without = {"motion_boundaries", "background", "anthropometric", "segmentation"}
+    # is not segmented and has no silhouette.
+    without = {"motion_boundaries", "background", "anthropometric", "segmentation", "silhouette"}
     names = set(ALL_TERMS) - without
     assert set(summary["best_mode_cost_by_term"]) == set(summary["share_of_cost_by_term"]) == names
     times = summary["share_of_search_time_by_term"]
@@ -499,6 +499,9 @@ def test_a_body_is_segmented_and_an_arm_alone_is_not():
     assert not make_choice(Settings(body="body34"), 2.0).background
     assert make_choice(Settings(body="body34", terms=ALL_TERMS), 2.0).background
     assert not make_choice(Settings(body="arm8", terms=ALL_TERMS), 2.0).background
+    assert make_choice(Settings(body="body34"), 2.0).silhouette is None
+    assert make_choice(Settings(body="body34", terms=ALL_TERMS), 2.0).silhouette is not None
+    assert make_choice(Settings(body="arm8", terms=ALL_TERMS), 2.0).silhouette is None
     terms = tuple(name for name in ALL_TERMS if name != "segmentation")
     assert make_choice(Settings(body="body34", terms=terms), 2.0).segmentation is None
 

@@ -24,6 +24,7 @@ from torchcss.cost.interpenetration import Interpenetration
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.region import RegionTerm
 from torchcss.cost.segmentation import SegmentationTerm
+from torchcss.cost.silhouette import SilhouetteTerm
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.temporal import MixturePrior, TemporalPrior
 from torchcss.cost.total import CostChoice
@@ -45,11 +46,12 @@ TERMS = (
 ALL_TERMS = (
     *("contour", "motion_boundaries", "edge_energy", "region", "segmentation", "flow", "joints"),
     *("stabiliser", "anthropometric", "interpenetration", "temporal", "temporal_mixture"),
-    "background",
+    *("background", "silhouette"),
 )
 """Terms and priors that can be chosen; see `torchcss.cost.total`. `motion_boundaries` weighs the
 edges of `contour` and `edge_energy` by the motion boundaries, `W = 1 - k S_p`. `background` tells
-`region` and `segmentation` what a camera that stands still sees behind the body."""
+`region` and `segmentation` what a camera that stands still sees behind the body; `silhouette` asks
+for it, or for masks."""
 
 _NO_TERMS = ("motion_boundaries", "background")
 """Of these: what has no cost of its own."""
@@ -163,7 +165,7 @@ def make_extractor(settings: Settings) -> FeatureExtractor:
     extractor = FeatureExtractor(
         working_size=settings.working_size,
         flow=flow,
-        colour=bool({"region", "segmentation"} & set(settings.terms)),
+        colour=bool({"region", "segmentation", "silhouette"} & set(settings.terms)),
     )
     return extractor.to(dtype=settings.torch_dtype, device=settings.device)
 
@@ -205,6 +207,7 @@ def make_choice(settings: Settings, sigma: float) -> CostChoice:
         region=RegionTerm() if has("region") else None,
         segmentation=SegmentationTerm() if has("segmentation") and whole and descends else None,
         background=has("background") and whole,
+        silhouette=SilhouetteTerm() if has("silhouette") and whole else None,
         flow=FlowTerm(**potential) if has("flow") else None,
         joints=JointTerm(sigma=sigma, **potential) if has("joints") else None,
         stabiliser=Stabiliser() if has("stabiliser") else None,

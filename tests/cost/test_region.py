@@ -9,6 +9,7 @@ from torch.nn import functional
 
 from torchcss.body.model import BodyModel, load_body
 from torchcss.cost import region
+from torchcss.cost.part_map import part_map
 from torchcss.cost.region import (
     _CORE,
     _CORE_PIXELS,
@@ -18,7 +19,6 @@ from torchcss.cost.region import (
     region_field,
     region_masks,
 )
-from torchcss.cost.silhouette import part_map
 from torchcss.cost.visibility import ContourNodes
 from torchcss.types import PointCost
 from torchcss.vision.camera import Camera

@@ -12,9 +12,9 @@ from torch import Tensor
 from torchcss.body.model import BodyModel, load_body
 from torchcss.cost.flow import FlowTerm
 from torchcss.cost.frame import FrameCosts
+from torchcss.cost.part_map import bare_pixels, part_map
 from torchcss.cost.region import RegionTerm, part_layers
 from torchcss.cost.segmentation import SegmentationImages, SegmentationTerm
-from torchcss.cost.silhouette import bare_pixels, part_map
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.proposals import CovarianceScaled

@@ -28,8 +28,9 @@ from torchcss.cost.edge_energy import edge_energy_field
 from torchcss.cost.flow import FlowTargets, InteriorNodes, flow_targets
 from torchcss.cost.interpenetration import InterpenetrationPairs
 from torchcss.cost.joints import JointObservation
+from torchcss.cost.part_map import bare_pixels, part_map
 from torchcss.cost.region import RegionImages, part_layers, region_field, region_masks
-from torchcss.cost.silhouette import bare_pixels
+from torchcss.cost.silhouette import SilhouetteImages
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.cost.visibility import ContourPredictor, visible_nodes
 from torchcss.stopwatch import Stopwatch
@@ -73,7 +74,8 @@ class FrameCosts:
         layers, layer_of_part = part_layers(body)
         self.num_layers = len(layers)
         self.layer_of_part = torch.tensor(layer_of_part, device=body.tie.device)
-        self.interior = InteriorNodes(body) if choice.flow is not None else None
+        inside = (choice.flow, choice.silhouette)
+        self.interior = InteriorNodes(body) if any(inside) else None
         repels = choice.interpenetration is not None
         self.pairs = InterpenetrationPairs(body) if repels else None
 
@@ -142,8 +144,8 @@ class FrameCosts:
             state: Its pose.
             fitted: Whether its girths are the person's, see `region_masks`.
         """
-        asked = self.choice.region is not None or self.choice.segmentation is not None
-        if not asked or body.num_parts == 0:
+        coloured = (self.choice.region, self.choice.segmentation, self.choice.silhouette)
+        if not any(coloured) or body.num_parts == 0:
             return None
         if features is None or features.colour is None:
             return appearance
@@ -171,7 +173,8 @@ class FrameCosts:
             modes: Poses that it may have.
             log_weight: Their weights.
         """
-        if not self.choice.background or body.num_parts == 0:
+        asked = self.choice.background or self.choice.silhouette is not None
+        if not asked or body.num_parts == 0:
             return None
         if features is None or features.colour is None:
             return background
@@ -189,9 +192,13 @@ class FrameCosts:
         background: Background | None,
     ) -> dict[str, Any]:
         """What the pixels look like, for the terms that ask for it."""
+        images: dict[str, Any] = {}
+        if self.choice.silhouette is not None and before is not None:
+            images["silhouette"] = self._silhouette(features, body, before, appearance, background)
         if appearance is None or features.colour is None:
-            return {}
-        likeness, images = appearance.likeness(features.colour, background), {}
+            return images
+        behind = background if self.choice.background else None
+        likeness = appearance.likeness(features.colour, behind)
         if self.choice.region is not None and self.predictor is not None:
             layer = self.layer_of_part[self.predictor.node_part]
             images["region"] = RegionImages(region_field(likeness), layer)
@@ -204,6 +211,36 @@ class FrameCosts:
                 before.reshape(-1, before.shape[-1])[0],
             )
         return images
+
+    def _silhouette(
+        self,
+        features: FrameFeatures,
+        body: BodyModel,
+        before: Float[Tensor, "k n"],
+        appearance: Appearance | None,
+        background: Background | None,
+    ) -> SilhouetteImages | None:
+        """What is before the background: by the mask if there is one, else by the colours."""
+        term = self.choice.silhouette
+        if term is None or self.interior is None or self.interior.num_nodes == 0:
+            return None
+        if features.mask is not None:
+            foreground, known = features.mask, torch.ones_like(features.mask, dtype=torch.bool)
+        elif None not in (appearance, background, features.colour):
+            likeness = appearance.likeness(features.colour, background)
+            foreground, known = likeness.amax(0).clamp(min=0), background.sure
+        else:
+            return None
+        small = self.camera.scaled(1 / term.reduction)
+        best = before.reshape(-1, before.shape[-1])[0]
+        parts = part_map(body, best, small, rings=6, meridians=10)
+        return term.images(
+            foreground.to(body.tie),
+            known,
+            self.camera,
+            self.interior(body, body.pose(before)).points.flatten(0, -2),
+            float((parts >= 0).sum()) * term.reduction**2,
+        )
 
     def _targets(
         self, features: FrameFeatures, body: BodyModel, before: Float[Tensor, "k n"]

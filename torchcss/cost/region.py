@@ -37,7 +37,7 @@ from torch.nn import functional
 from torchcss.body.model import BodyModel
 from torchcss.body.root import has_root
 from torchcss.cost.contour import seen_nodes, spread
-from torchcss.cost.silhouette import grow, part_map
+from torchcss.cost.part_map import grow, part_map
 from torchcss.cost.visibility import ContourNodes
 from torchcss.types import PointCost
 from torchcss.vision.camera import Camera

@@ -29,7 +29,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchcss.body.model import BodyModel
-from torchcss.cost.silhouette import part_map
+from torchcss.cost.part_map import part_map
 from torchcss.vision.camera import Camera
 
 _FEWEST_PIXELS = 20

@@ -1,100 +1,208 @@
-"""Which part of a posed body each pixel sees, by rasterising its surface, and which see none.
+"""Silhouette term: what has come before the background is covered, and the body is nowhere else.
 
-For masks, for colours, for the overlap of silhouettes. The costs do not use it: for thousands of
-samples visibility is found node by node (`torchcss.cost.visibility`).
+The terms of the contour look a few pixels to either side of it. A limb that is farther from where
+it should be than that feels nothing, though where the background is known the missing limb stands
+out as plain as day. Section 8 [IJRR] hopes for help of silhouettes. Here both have to agree. Let
+u_m be points of the silhouette and g_m, in 0..1, how sure it is of them; r_p nodes all over the
+surface, hidden ones too, seen at pi(r_p); N the points that the expected body would have; P the
+number of nodes. Then
+
+    e(x) = 1/N sum_m g_m phi(s_m) + beta/P sum_p D(pi(r_p))
+    s_m = sum_p exp(-|u_m - pi(r_p)|^2 / (2 sigma^2))
+    phi(s) = log((1 + epsilon) / (1 + epsilon - exp(-s))) / log((1 + epsilon) / epsilon)
+
+phi falls from 1, where no node is near, to 0, where many are; it is the logarithm of a distance far
+off and does not count what is nowhere near anything: another person, a shadow. D is the distance to
+the nearest pixel that may be the body, as a share of `reach` and no more than 1.
+
+A pixel says nothing where it is not known what is behind it. The term has no depth and tells
+nothing of what lies inside the silhouette; both are left to the others.
+
+The gradient is exact. In the Hessian the shares in which the nodes cover a point are held fixed, as
+edges are to their nodes in the contour term; it is positive semidefinite but for D's part.
+
+By default: `SilhouetteTerm().images(...)` once a frame, then `point_cost`; `torchcss.cost.frame`
+does it.
 """
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import kornia
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from torchcss.body.model import BodyModel
-from torchcss.raster import grid_faces, nearest_faces
+from torchcss.cost.part_map import grow
+from torchcss.types import PointCost
 from torchcss.vision.camera import Camera
+from torchcss.vision.spline import SplineField, spline_field
 
-_POSES_AT_ONCE = 16
-"""Poses drawn together: it bounds the memory."""
-
-_COARSE = 4
-_MARGIN = 2
-"""Pixels of the image, along each side, to one that is looked at for what is bare, and how many of
-these a body may be off its pose."""
-
-_COVERED = 0.3
-"""Posterior probability of being covered from which a pixel is not bare. A mode that is all but
-ruled out would hide the background from the one that is right."""
+_FEWEST_POINTS = 5.0
+"""A body that is expected to have fewer counts as if it had so many."""
 
 
-def part_map(
-    body: BodyModel,
-    state: Float[Tensor, "*batch n"],
-    camera: Camera,
-    *,
-    rings: int = 12,
-    meridians: int = 16,
-    girth: float = 1.0,
-) -> Int[Tensor, "*batch h w"]:
-    """The part that each pixel sees, -1 where it sees none.
+class SilhouetteImages(NamedTuple):
+    """The silhouette of a frame, in a reduced image.
 
-    Args:
-        body: The body on its base.
-        state: Its pose, or poses.
-        camera: Camera of the image.
-        rings: Latitudes of the mesh of each part.
-        meridians: Longitudes of the mesh of each part.
-        girth: Factor on the cross-sections of all parts.
+    Attributes:
+        camera: Camera of the reduced image.
+        points: Points of the silhouette in that image, pixels.
+        weight: How much each counts, as a share of all points that the body would have.
+        bare: D, the distance from what may be the body, as a smooth function.
     """
-    width, height = camera.image_size_wh
-    if body.num_parts == 0:
-        return torch.full((*state.shape[:-1], height, width), -1, device=state.device)
-    mesh = body.mesh(rings, meridians)
-    faces = grid_faces(rings, meridians).to(mesh.points.device)
-    rotation, centre = body.part_poses(body.pose(state))
-    points = mesh.points * mesh.points.new_tensor([girth, girth, 1.0])
-    vertices = points.flatten(1, 2) @ rotation.mT + centre[..., None, :]
-    offsets = vertices.shape[-2] * torch.arange(body.num_parts, device=faces.device)
-    every = (faces + offsets[:, None, None]).flatten(0, 1)
-    batch = vertices.shape[:-3]
-    vertices = vertices.flatten(-3, -2).reshape(-1, vertices.shape[-3] * vertices.shape[-2], 3)
-    seen = every.new_empty(len(vertices), height, width)
-    for first in range(0, len(vertices), _POSES_AT_ONCE):
-        uv, depth, valid = camera.project(some := vertices[first : first + _POSES_AT_ONCE])
-        face = nearest_faces(uv, depth, every, height, width, valid=valid)
-        seen[first : first + len(some)] = torch.where(face >= 0, face // len(faces), face)
-    return seen.reshape(*batch, height, width)
+
+    camera: Camera
+    points: Float[Tensor, "m 2"]
+    weight: Float[Tensor, " m"]
+    bare: SplineField
 
 
-def grow(masks: Bool[Tensor, "layers h w"], radius: int) -> Bool[Tensor, "layers h w"]:
-    """Masks and all that is within a square of so many pixels about them.
+@dataclass(frozen=True, kw_only=True)
+class SilhouetteTerm:
+    """The disagreement of the body with the silhouette.
 
-    Args:
-        masks: The masks.
-        radius: Half the side of the square, pixels.
+    Attributes:
+        sigma: How far from a node a point is covered, pixels. Points feel nodes within about three
+            times as much.
+        epsilon: The least that a point counts as covered.
+        beta: How much a node that is far out counts against a point that nothing covers.
+        reach: Distance from what may be the body beyond which a node is as far out as can be,
+            pixels.
+        near: Points farther than this from all poses before are no limbs, pixels.
+        least: Degree of foreground from which a pixel may be the body.
+        reduction: Pixels of the image, along each side, to one that is looked at.
+        spacing: Of these, along each side, to one point.
+        nu: Level of the cost (its unit only).
     """
-    size = 2 * radius + 1
-    rows = functional.max_pool2d(masks.float(), (1, size), 1, (0, radius))
-    return functional.max_pool2d(rows, (size, 1), 1, (radius, 0)) > 0
 
+    sigma: float = 16.0
+    epsilon: float = 0.01
+    beta: float = 0.5
+    reach: float = 40.0
+    near: float = 100.0
+    least: float = 0.3
+    reduction: int = 4
+    spacing: int = 2
+    nu: float = 1.0
 
-def bare_pixels(
-    body: BodyModel,
-    modes: Float[Tensor, "k n"],
-    log_weight: Float[Tensor, " k"],
-    camera: Camera,
-) -> Bool[Tensor, "h w"]:
-    """Pixels that no likely pose covers, nor comes near.
+    def images(
+        self,
+        foreground: Float[Tensor, "h w"],
+        known: Bool[Tensor, "h w"],
+        camera: Camera,
+        expected: Float[Tensor, "p 3"],
+        area: float,
+    ) -> SilhouetteImages:
+        """Prepare a frame.
 
-    Args:
-        body: The body on its base.
-        modes: Its poses.
-        log_weight: Their weights, not necessarily normalised.
-        camera: Camera of the image.
-    """
-    width, height = camera.image_size_wh
-    covered = part_map(body, modes, camera.scaled(1 / _COARSE), rings=6, meridians=10) >= 0
-    share = (covered * log_weight.softmax(0)[:, None, None]).sum(0)
-    near = grow((share > _COVERED)[None], _MARGIN)[None].to(modes)
-    return functional.interpolate(near, size=(height, width))[0, 0] == 0
+        Args:
+            foreground: How sure it is that something is before the background, 0 to 1.
+            known: Where that is known at all.
+            camera: Camera of the image.
+            expected: Nodes of the poses that the body may have had before, metres.
+            area: Pixels that it covered.
+        """
+        small = camera.scaled(1 / self.reduction)
+        width, height = small.image_size_wh
+        # The border of odd sizes is shared out among the reduced pixels.
+        degree = foreground * known
+        degree = functional.adaptive_avg_pool2d(degree[None].to(expected), (height, width))[0]
+        unknown = functional.adaptive_max_pool2d((~known)[None].to(expected), (height, width))[0]
+        points, weight = self._points(degree, small.project(expected).uv)
+        unit = (self.reduction * self.spacing) ** 2
+        weight = weight / max(area / unit, float(weight.sum()), _FEWEST_POINTS)
+        bare = self._distance((degree > self.least) | (unknown > 0), expected)
+        return SilhouetteImages(small, points, weight, spline_field(bare[None]))
+
+    def value(
+        self, points: Float[Tensor, "*batch p 3"], images: SilhouetteImages
+    ) -> Float[Tensor, "*batch p"]:
+        """Cost in units of nu, shared out among the nodes: only the sum has a meaning.
+
+        Args:
+            points: Nodes of the posed body, metres.
+            images: What `images` made of the frame.
+        """
+        uv, _, valid = images.camera.project(points)
+        _, covered, _ = self._cover(uv, valid, images)
+        outside = self._outside(points) * valid * images.bare.value(uv)
+        return outside + covered[..., None] / points.shape[-2]
+
+    def point_cost(
+        self,
+        points: Float[Tensor, "*batch p 3"],
+        images: SilhouetteImages,
+        *,
+        gauss_newton: bool = False,
+    ) -> PointCost:
+        """The same with first and second derivatives in the nodes' positions.
+
+        Args:
+            points: Nodes of the posed body, metres.
+            images: What `images` made of the frame.
+            gauss_newton: Leave the curvature of the projection out.
+        """
+        model = images.camera.project_with_derivatives(points)
+        uv = model.uv
+        share, covered, slope = self._cover(uv, model.valid, images)
+        # Shares of a point's cost are springs to it: their stiffness, and their pull.
+        ones = torch.ones_like(images.points[:, :1])
+        targets = slope[..., None] * torch.cat([ones, images.points], dim=-1)
+        springs = share @ targets
+        stiffness = springs[..., 0]
+        sample, outside = images.bare.sample(uv), self._outside(points) * model.valid
+        gradient = uv * stiffness[..., None] - springs[..., 1:]
+        gradient = gradient + outside[..., None] * sample.gradient
+        hessian = torch.diag_embed(stiffness[..., None].expand(uv.shape))
+        hessian = hessian + outside[..., None, None] * sample.hessian
+        value = outside * sample.value + covered[..., None] / points.shape[-2]
+        return images.camera.pull_back(model, value, gradient, hessian, gauss_newton=gauss_newton)
+
+    def _outside(self, points: Tensor) -> Tensor:
+        return points.new_tensor(self.nu * self.beta / max(points.shape[-2], 1))
+
+    def _cover(
+        self, uv: Tensor, valid: Tensor, images: SilhouetteImages
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Share of each node in covering each point, the cost of all, and the points' slopes.
+
+        The derivative of the cost by `uv` of node p is `sum_m share[p, m] slope[m] (uv - u_m)`.
+        """
+        scale = math.sqrt(2) * self.sigma / self.reduction
+        # Where a node cannot be seen it is far away.
+        node = torch.where(valid[..., None], uv / scale, 1e4)
+        target = images.points / scale
+        level = -node.square().sum(-1)[..., None] - target.square().sum(-1)
+        share = (level + 2 * node @ target.mT).clamp(max=0).exp()
+        missed = (-share.sum(-2)).exp()
+        left = 1 + self.epsilon - missed
+        unit = self.nu * images.weight / math.log((1 + self.epsilon) / self.epsilon)
+        covered = (unit * ((1 + self.epsilon) / left).log()).sum(-1)
+        slope = unit * missed / left * (self.reduction / self.sigma) ** 2
+        return share, covered, slope
+
+    def _points(self, degree: Tensor, nodes: Tensor) -> tuple[Tensor, Tensor]:
+        """Points of the silhouette near any of some nodes, and how sure they are."""
+        blocks = functional.avg_pool2d(degree[None], self.spacing, ceil_mode=True)[0]
+        row, column = torch.nonzero(blocks > self.least, as_tuple=True)
+        points = torch.stack([column, row], dim=-1).to(degree) * self.spacing
+        points = points + (self.spacing - 1) / 2
+        near = torch.cdist(points, nodes).amin(-1) < self.near / self.reduction
+        return points[near], blocks[row, column][near]
+
+    def _distance(self, free: Tensor, like: Tensor) -> Tensor:
+        """Distance from a mask along the farther axis, as a share of the reach, blurred."""
+        steps = max(round(self.reach / self.reduction), 1)
+        out = [~free]
+        for _ in range(steps - 1):
+            free = grow(free[None], 1)[0]
+            out.append(~free)
+        distance = torch.stack(out).to(like).mean(0)
+        return kornia.filters.gaussian_blur2d(
+            distance[None, None], (5, 5), (1.0, 1.0), border_type="replicate"
+        )[0, 0]

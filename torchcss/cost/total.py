@@ -17,6 +17,7 @@ temperature: the nats that a term contributes per nu of mean cost per node (desi
 | `region` | colours on either side of the same nodes | 8 |
 | `segmentation` | colours of all covered pixels; in the weights of modes only | 8 |
 | `background` | what is behind the body, for these two; no cost of its own | 8 |
+| `silhouette` | what is before the background is covered, and nothing else | 8 |
 | `flow` | displacement of interior nodes against the optical flow | 3.1.2, eq. 9 |
 | `joints` | 2D joint correspondences | 5 |
 | `anthropometric` | lengths of the limbs, where they are free | 3.2.1 |
@@ -48,6 +49,7 @@ from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPai
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.region import RegionTerm
 from torchcss.cost.segmentation import SegmentationTerm
+from torchcss.cost.silhouette import SilhouetteTerm
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.temporal import MixtureDensity, MixturePrior, TemporalPrior
 from torchcss.cost.view import View
@@ -62,6 +64,9 @@ CHUNK = 512
 CHUNK_NODES = 65_536
 """Most nodes evaluated at a time. With arrays of more than these the allocator keeps handing memory
 back to the system, and fetching it again costs as much as half of the arithmetic (measured)."""
+
+_PAIRS = 64
+"""Pairs of a node and a point of the silhouette that take as much memory as one node."""
 
 COARSE_SCALE = 6.0
 """How much wider the keypoints' scale is in the coarse cost: a missed limb is then no outlier."""
@@ -81,6 +86,7 @@ class CostChoice:
         segmentation: The likeness of all covered pixels, for the weights of modes, or None.
         background: Whether `region` and `segmentation` know what is behind the body, see
             `torchcss.vision.background`.
+        silhouette: The silhouette term, or None. It needs a background or masks.
         flow: The flow term, or None.
         joints: The keypoint term, or None.
         stabiliser: The sticky prior, or None.
@@ -92,6 +98,7 @@ class CostChoice:
         edge_energy_weight: Nats per nu of the edge energy's mean cost per node.
         region_weight: Nats per nu of the region term's mean cost per node.
         segmentation_weight: Nats per share of the body's area, see `SegmentationTerm`.
+        silhouette_weight: Nats per nu, for a body of which nothing is covered.
         flow_weight: Nats per nu of the flow's mean cost per node. At 50 it holds real limbs a
             little better, but where the flow misses a fast hand, as on the demo, it holds that
             back; at 20 the edges win.
@@ -106,6 +113,7 @@ class CostChoice:
     region: RegionTerm | None = None
     segmentation: SegmentationTerm | None = None
     background: bool = False
+    silhouette: SilhouetteTerm | None = None
     flow: FlowTerm | None = None
     joints: JointTerm | None = field(default_factory=JointTerm)
     stabiliser: Stabiliser | None = field(default_factory=Stabiliser)
@@ -117,6 +125,7 @@ class CostChoice:
     edge_energy_weight: float = 150.0
     region_weight: float = 400.0
     segmentation_weight: float = 400.0
+    silhouette_weight: float = 800.0
     flow_weight: float = 20.0
     joint_weight: float = 1.0
     weights: Mapping[str, float] = field(default_factory=dict)
@@ -153,7 +162,7 @@ class TrackingCost(View):
         body: The body, hung on its base.
         choice: Terms and weights.
         predictor: Contour predictor of the body; None switches contour, edge energy and region off.
-        interior: Interior nodes of the body, for the flow term; None switches it off.
+        interior: Interior nodes of the body, for flow and silhouette; None switches them off.
         pairs: Pairs of parts that may collide; None switches the repulsion off.
         parent: State of each sample's parent mode, `[b n]` or `[n]`; None: no prior about it.
         deviation: Expected motion per frame of every parameter; None: no prior about the parent.
@@ -287,7 +296,13 @@ class TrackingCost(View):
 
     def _without_images(self) -> CostChoice:
         return replace(
-            self.choice, contour=None, edge_energy=None, region=None, flow=None, joints=None
+            self.choice,
+            contour=None,
+            edge_energy=None,
+            region=None,
+            silhouette=None,
+            flow=None,
+            joints=None,
         )
 
     @property
@@ -299,6 +314,10 @@ class TrackingCost(View):
         if self.interior is not None and choice.flow:
             nodes += self.interior.num_nodes
         nodes *= len(self.views)
+        for view in self.views:
+            if self.interior is not None and choice.silhouette and view.silhouette is not None:
+                pairs = self.interior.num_nodes * len(view.silhouette.points)
+                nodes += math.ceil(pairs / _PAIRS)
         return max(1, min(CHUNK, CHUNK_NODES // nodes))
 
     def _chunked(
@@ -404,6 +423,20 @@ class TrackingCost(View):
                         partial(term.value, nodes, camera, image),  # type: ignore[arg-type]
                         partial(term.point_cost, nodes, camera, image),  # type: ignore[arg-type]
                     )
+        if (
+            choice.silhouette is not None
+            and self.interior is not None
+            and view.silhouette is not None
+        ):
+            term, surface = choice.silhouette, self.interior(body, pose).points
+            yield _Observed(
+                "silhouette",
+                surface,
+                self.interior.node_link,
+                choice.silhouette_weight / term.nu,
+                partial(term.value, surface, view.silhouette),
+                partial(term.point_cost, surface, view.silhouette),
+            )
         if choice.flow is not None and self.interior is not None and view.targets is not None:
             term, interior = choice.flow, self.interior
             with self._timed("visibility"):

@@ -17,6 +17,7 @@ from torchcss.cost.flow import FlowTargets
 from torchcss.cost.joints import JointObservation
 from torchcss.cost.region import RegionImages
 from torchcss.cost.segmentation import SegmentationImages
+from torchcss.cost.silhouette import SilhouetteImages
 from torchcss.vision.camera import Camera
 from torchcss.vision.spline import SplineField
 
@@ -31,6 +32,7 @@ class View:
         energy: The edge energy as a smooth function; None switches the edge-energy term off.
         region: What the pixels look like, as smooth functions; None switches the region term off.
         segmentation: What the pixels look like, for the weights of modes; None: not known.
+        silhouette: What is before the background; None: not known.
         targets: Where the flow carried the nodes of each sample's parent mode, `[b p 2]`.
         observation: Keypoints of the frame, in that image's pixels; None if there are none.
     """
@@ -40,6 +42,7 @@ class View:
     energy: SplineField | None = None
     region: RegionImages | None = None
     segmentation: SegmentationImages | None = None
+    silhouette: SilhouetteImages | None = None
     targets: FlowTargets | None = None
     observation: JointObservation | None = None
 

@@ -1,0 +1,100 @@
+"""Which part of a posed body each pixel sees, by rasterising its surface, and which see none.
+
+For masks, for colours, for the overlap of silhouettes. The costs do not use it: for thousands of
+samples visibility is found node by node (`torchcss.cost.visibility`).
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn import functional
+
+from torchcss.body.model import BodyModel
+from torchcss.raster import grid_faces, nearest_faces
+from torchcss.vision.camera import Camera
+
+_POSES_AT_ONCE = 16
+"""Poses drawn together: it bounds the memory."""
+
+_COARSE = 4
+_MARGIN = 2
+"""Pixels of the image, along each side, to one that is looked at for what is bare, and how many of
+these a body may be off its pose."""
+
+_COVERED = 0.3
+"""Posterior probability of being covered from which a pixel is not bare. A mode that is all but
+ruled out would hide the background from the one that is right."""
+
+
+def part_map(
+    body: BodyModel,
+    state: Float[Tensor, "*batch n"],
+    camera: Camera,
+    *,
+    rings: int = 12,
+    meridians: int = 16,
+    girth: float = 1.0,
+) -> Int[Tensor, "*batch h w"]:
+    """The part that each pixel sees, -1 where it sees none.
+
+    Args:
+        body: The body on its base.
+        state: Its pose, or poses.
+        camera: Camera of the image.
+        rings: Latitudes of the mesh of each part.
+        meridians: Longitudes of the mesh of each part.
+        girth: Factor on the cross-sections of all parts.
+    """
+    width, height = camera.image_size_wh
+    if body.num_parts == 0:
+        return torch.full((*state.shape[:-1], height, width), -1, device=state.device)
+    mesh = body.mesh(rings, meridians)
+    faces = grid_faces(rings, meridians).to(mesh.points.device)
+    rotation, centre = body.part_poses(body.pose(state))
+    points = mesh.points * mesh.points.new_tensor([girth, girth, 1.0])
+    vertices = points.flatten(1, 2) @ rotation.mT + centre[..., None, :]
+    offsets = vertices.shape[-2] * torch.arange(body.num_parts, device=faces.device)
+    every = (faces + offsets[:, None, None]).flatten(0, 1)
+    batch = vertices.shape[:-3]
+    vertices = vertices.flatten(-3, -2).reshape(-1, vertices.shape[-3] * vertices.shape[-2], 3)
+    seen = every.new_empty(len(vertices), height, width)
+    for first in range(0, len(vertices), _POSES_AT_ONCE):
+        uv, depth, valid = camera.project(some := vertices[first : first + _POSES_AT_ONCE])
+        face = nearest_faces(uv, depth, every, height, width, valid=valid)
+        seen[first : first + len(some)] = torch.where(face >= 0, face // len(faces), face)
+    return seen.reshape(*batch, height, width)
+
+
+def grow(masks: Bool[Tensor, "layers h w"], radius: int) -> Bool[Tensor, "layers h w"]:
+    """Masks and all that is within a square of so many pixels about them.
+
+    Args:
+        masks: The masks.
+        radius: Half the side of the square, pixels.
+    """
+    size = 2 * radius + 1
+    rows = functional.max_pool2d(masks.float(), (1, size), 1, (0, radius))
+    return functional.max_pool2d(rows, (size, 1), 1, (radius, 0)) > 0
+
+
+def bare_pixels(
+    body: BodyModel,
+    modes: Float[Tensor, "k n"],
+    log_weight: Float[Tensor, " k"],
+    camera: Camera,
+) -> Bool[Tensor, "h w"]:
+    """Pixels that no likely pose covers, nor comes near.
+
+    Args:
+        body: The body on its base.
+        modes: Its poses.
+        log_weight: Their weights, not necessarily normalised.
+        camera: Camera of the image.
+    """
+    width, height = camera.image_size_wh
+    covered = part_map(body, modes, camera.scaled(1 / _COARSE), rings=6, meridians=10) >= 0
+    share = (covered * log_weight.softmax(0)[:, None, None]).sum(0)
+    near = grow((share > _COVERED)[None], _MARGIN)[None].to(modes)
+    return functional.interpolate(near, size=(height, width))[0, 0] == 0
