@@ -5,8 +5,8 @@
 The demo (seeds 0 to 2), and, with `--data`, the clips of DIR/balance_beam_4cam from either camera,
 with keypoints in all frames and in the first frame only. Every row tracks with the terms of the row
 before it and one more, or with one exchanged; the demo's arm has neither segmentation nor
-background. A clip with reference is measured as `scripts/evaluate_track.py` does; the demo against
-its own truth.
+background nor silhouette. A clip with reference is measured as `scripts/evaluate_track.py` does;
+the demo against its own truth.
 """
 
 from __future__ import annotations
@@ -46,6 +46,7 @@ ROWS = {
     "+ region": REGION,
     "+ segmentation": SEGMENTATION,
     "+ background": ("background", *SEGMENTATION),
+    "+ silhouette": ("silhouette", "background", *SEGMENTATION),
     "+ edge energy": ("edge_energy", *SEGMENTATION),
     "+ previous mixture": ("temporal_mixture", *SEGMENTATION),
     "contour + flow": ("flow", *EDGES),

@@ -44,9 +44,7 @@ def the_silhouette_of(
     body: BodyModel, camera: Camera, truth: Tensor, before: Tensor, term: SilhouetteTerm
 ) -> SilhouetteImages:
     drawn = part_map(body, truth, camera) >= 0
-    return term.images(
-        drawn.to(truth), torch.ones_like(drawn), camera, nodes(body, before), float(drawn.sum())
-    )
+    return term.images(2 * drawn.to(truth) - 1, camera, nodes(body, before), float(drawn.sum()))
 
 
 def plain_twin(term: SilhouetteTerm, points: Tensor, images: SilhouetteImages) -> float:
@@ -130,12 +128,10 @@ def test_derivatives_are_those_of_autograd(place: str) -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_an_empty_picture_pushes_the_body_nowhere(dtype: torch.dtype) -> None:
     body, camera = a_body_before_a_camera(dtype)
-    nothing = torch.zeros(600, 480, dtype=dtype)
     points = nodes(body, body.rest)
-    for known, level in ((False, 0.0), (True, 0.5)):
-        images = SilhouetteTerm().images(
-            nothing, torch.full_like(nothing, known, dtype=torch.bool), camera, points, 0.0
-        )
+    for likeness, level in ((math.nan, 0.0), (-0.5, 0.0), (-1.0, 0.5)):
+        everywhere = torch.full((600, 480), likeness, dtype=dtype)
+        images = SilhouetteTerm().images(everywhere, camera, points, 0.0)
         assert len(images.points) == 0
         cost = SilhouetteTerm().point_cost(points, images)
         assert float(cost.value.sum()) == pytest.approx(level, abs=1e-5)
@@ -147,7 +143,7 @@ def test_pictures_of_odd_and_of_very_small_sizes(size: tuple[int, int]) -> None:
     body, camera = a_body_before_a_camera()
     odd, full = camera.resized(*size), torch.ones(size[1], size[0], dtype=torch.float64)
     points = nodes(body, body.rest)
-    images = SilhouetteTerm().images(full, full > 0, odd, points, 100.0)
+    images = SilhouetteTerm().images(full, odd, points, 100.0)
     cost = SilhouetteTerm().point_cost(points, images)
     assert all(bool(part.isfinite().all()) for part in cost)
 
@@ -187,11 +183,11 @@ def raising_force(
 def test_what_is_near_no_pose_does_not_count() -> None:
     body, camera = a_body_before_a_camera()
     drawn = part_map(body, body.rest, camera) >= 0
-    points, known, area = nodes(body, body.rest), torch.ones_like(drawn), float(drawn.sum())
-    alone = SilhouetteTerm().images(drawn.double(), known, camera, points, area)
+    points, area = nodes(body, body.rest), float(drawn.sum())
+    alone = SilhouetteTerm().images(2.0 * drawn.double() - 1, camera, points, area)
     other = drawn.clone()
     other[:60, :40] = True
-    beside = SilhouetteTerm().images(other.double(), known, camera, points, area)
+    beside = SilhouetteTerm().images(2.0 * other.double() - 1, camera, points, area)
     torch.testing.assert_close(alone.points, beside.points)
     torch.testing.assert_close(alone.weight, beside.weight)
 

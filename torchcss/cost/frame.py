@@ -225,18 +225,17 @@ class FrameCosts:
         if term is None or self.interior is None or self.interior.num_nodes == 0:
             return None
         if features.mask is not None:
-            foreground, known = features.mask, torch.ones_like(features.mask, dtype=torch.bool)
-        elif None not in (appearance, background, features.colour):
-            likeness = appearance.likeness(features.colour, background)
-            foreground, known = likeness.amax(0).clamp(min=0), background.sure
-        else:
+            likeness = 2 * features.mask - 1
+        elif appearance is None or background is None or features.colour is None:
             return None
+        else:
+            likeness = appearance.likeness(features.colour, background).amax(0)
+            likeness = likeness.masked_fill(~background.sure, torch.nan)
         small = self.camera.scaled(1 / term.reduction)
         best = before.reshape(-1, before.shape[-1])[0]
         parts = part_map(body, best, small, rings=6, meridians=10)
         return term.images(
-            foreground.to(body.tie),
-            known,
+            likeness.to(body.tie),
             self.camera,
             self.interior(body, body.pose(before)).points.flatten(0, -2),
             float((parts >= 0).sum()) * term.reduction**2,

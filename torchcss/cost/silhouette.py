@@ -1,11 +1,10 @@
 """Silhouette term: what has come before the background is covered, and the body is nowhere else.
 
-The terms of the contour look a few pixels to either side of it. A limb that is farther from where
-it should be than that feels nothing, though where the background is known the missing limb stands
-out as plain as day. Section 8 [IJRR] hopes for help of silhouettes. Here both have to agree. Let
-u_m be points of the silhouette and g_m, in 0..1, how sure it is of them; r_p nodes all over the
-surface, hidden ones too, seen at pi(r_p); N the points that the expected body would have; P the
-number of nodes. Then
+The terms of the contour look a few pixels to either side of it. A limb that is farther off than
+that feels nothing, though before a known background the true one stands out. Section 8 [IJRR] hopes
+for help of silhouettes. Here body and silhouette have to agree. Let u_m be points of the silhouette
+and g_m, in 0..1, how sure it is that they are the body's; r_p nodes all over the surface, hidden
+ones too, seen at pi(r_p); N the points that the expected body would have, P the number of nodes:
 
     e(x) = 1/N sum_m g_m phi(s_m) + beta/P sum_p D(pi(r_p))
     s_m = sum_p exp(-|u_m - pi(r_p)|^2 / (2 sigma^2))
@@ -13,9 +12,10 @@ number of nodes. Then
 
 phi falls from 1, where no node is near, to 0, where many are; it is the logarithm of a distance far
 off and does not count what is nowhere near anything: another person, a shadow. D is the distance to
-the nearest pixel that may be the body, as a share of `reach` and no more than 1.
+the nearest pixel that may be the body, as a share of `reach` and no more than 1. A pixel may be the
+body unless it looks like what is behind it and like no part of the body by far.
 
-A pixel says nothing where it is not known what is behind it. The term has no depth and tells
+Where it is not known what is behind it a pixel says nothing. The term has no depth and tells
 nothing of what lies inside the silhouette; both are left to the others.
 
 The gradient is exact. In the Hessian the shares in which the nodes cover a point are held fixed, as
@@ -33,7 +33,7 @@ from typing import NamedTuple
 
 import kornia
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
@@ -74,7 +74,9 @@ class SilhouetteTerm:
         reach: Distance from what may be the body beyond which a node is as far out as can be,
             pixels.
         near: Points farther than this from all poses before are no limbs, pixels.
-        least: Degree of foreground from which a pixel may be the body.
+        least: Degree g from which a pixel is of the silhouette.
+        surely: Likeness, negated, from which a pixel is bare. Dark clothes before a dark wall look
+            like either.
         reduction: Pixels of the image, along each side, to one that is looked at.
         spacing: Of these, along each side, to one point.
         nu: Level of the cost (its unit only).
@@ -86,14 +88,14 @@ class SilhouetteTerm:
     reach: float = 40.0
     near: float = 100.0
     least: float = 0.3
+    surely: float = 0.9
     reduction: int = 4
     spacing: int = 2
     nu: float = 1.0
 
     def images(
         self,
-        foreground: Float[Tensor, "h w"],
-        known: Bool[Tensor, "h w"],
+        likeness: Float[Tensor, "h w"],
         camera: Camera,
         expected: Float[Tensor, "p 3"],
         area: float,
@@ -101,8 +103,8 @@ class SilhouetteTerm:
         """Prepare a frame.
 
         Args:
-            foreground: How sure it is that something is before the background, 0 to 1.
-            known: Where that is known at all.
+            likeness: How much more each pixel looks like the body than like what is behind it,
+                -1..1; NaN where that is not known.
             camera: Camera of the image.
             expected: Nodes of the poses that the body may have had before, metres.
             area: Pixels that it covered.
@@ -110,13 +112,14 @@ class SilhouetteTerm:
         small = camera.scaled(1 / self.reduction)
         width, height = small.image_size_wh
         # The border of odd sizes is shared out among the reduced pixels.
-        degree = foreground * known
-        degree = functional.adaptive_avg_pool2d(degree[None].to(expected), (height, width))[0]
-        unknown = functional.adaptive_max_pool2d((~known)[None].to(expected), (height, width))[0]
+        degree, may = (
+            functional.adaptive_avg_pool2d(part[None].to(expected), (height, width))[0]
+            for part in (likeness.nan_to_num(0.0).clamp(min=0), likeness.nan_to_num(1.0))
+        )
         points, weight = self._points(degree, small.project(expected).uv)
         unit = (self.reduction * self.spacing) ** 2
         weight = weight / max(area / unit, float(weight.sum()), _FEWEST_POINTS)
-        bare = self._distance((degree > self.least) | (unknown > 0), expected)
+        bare = self._distance(may > -self.surely, expected)
         return SilhouetteImages(small, points, weight, spline_field(bare[None]))
 
     def value(
