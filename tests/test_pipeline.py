@@ -206,6 +206,8 @@ def test_a_new_run_replaces_what_belongs_to_the_last_one(clip: Path, tmp_path: P
     before = {path.name: path.read_bytes() for path in out.iterdir()}
     with pytest.raises(ConfigurationError, match="descend"):
         run(clip, out, preset="condensation", oversampling=2)
+    with pytest.raises(ConfigurationError, match="no modes to weigh"):
+        run(clip, out, preset="condensation", evidence=0.5)
     (tmp_path / "empty.mp4").write_bytes(b"")
     with pytest.raises(VideoError):
         track_video(

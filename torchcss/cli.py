@@ -122,6 +122,9 @@ class Track:
     """Modes kept; the preset's number by default."""
     oversampling: int = 1
     """Draw so many times as many samples; those with the best edges descend."""
+    evidence: float | None = None
+    """How much one frame counts in the weights of modes, above 0 and at most 1; the preset's number
+    by default."""
     terms: tuple[str, ...] = TERMS
     """Terms and priors of the cost."""
     contour_weight: float = Settings.contour_weight
@@ -170,6 +173,7 @@ class Track:
             samples=self.samples,
             modes=self.modes,
             oversampling=self.oversampling,
+            evidence=self.evidence,
             keypoints_use=self.keypoints_use,
             terms=self.terms,
             working_size=self.working_size,

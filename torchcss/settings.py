@@ -68,6 +68,8 @@ class Settings:
         modes: Modes kept; the preset's number by default.
         oversampling: How many times as many samples are drawn; those with the best edges descend,
             see `Tracker`.
+        evidence: Power of a frame's likelihood in the weights of modes, above 0 and at most 1, see
+            `Tracker`; the preset's by default.
         keypoints_use: "all": keypoints are observations in every frame; "first": they only
             give the first pose, as in the papers.
         terms: Terms and priors of the cost; see `make_choice` for what the preset changes.
@@ -89,6 +91,7 @@ class Settings:
     samples: int | None = None
     modes: int | None = None
     oversampling: int = 1
+    evidence: float | None = None
     keypoints_use: Literal["first", "all"] = "all"
     terms: tuple[str, ...] = TERMS
     working_size: int = 640
@@ -135,6 +138,15 @@ class Settings:
             raise ConfigurationError(
                 f"oversampling: {self.preset} does not descend from samples; leave it at 1"
             )
+        if self.evidence is not None:
+            if not 0 < self.evidence <= 1:
+                raise ConfigurationError(
+                    f"evidence must lie above 0 and at most at 1, got {self.evidence}"
+                )
+            if PRESETS[self.preset].particles is not None:
+                raise ConfigurationError(
+                    f"evidence: the particles of {self.preset} have no modes to weigh; leave it out"
+                )
         try:
             torch.empty(0, device=self.device)
         except (RuntimeError, AssertionError) as error:  # the latter without CUDA
@@ -229,7 +241,7 @@ def make_settings_tracker(settings: Settings, motion: Float[Tensor, " n"]) -> Se
         motion: Standard deviation of every parameter's motion per frame.
 
     Raises:
-        ConfigurationError: If the preset's tracker cannot be oversampled.
+        ConfigurationError: If there is no such preset.
     """
     tracker = make_tracker(
         settings.preset,
@@ -238,7 +250,12 @@ def make_settings_tracker(settings: Settings, motion: Float[Tensor, " n"]) -> Se
         num_modes=settings.modes,
         motion=tuple(motion.tolist()),
     )
-    if settings.oversampling == 1:
+    asked: dict[str, Any] = {}
+    if settings.oversampling != 1:
+        asked["oversampling"] = settings.oversampling
+    if settings.evidence is not None:
+        asked["evidence"] = settings.evidence
+    if not asked:
         return tracker
     assert isinstance(tracker, Tracker)  # `Settings` has refused the others
-    return replace(tracker, oversampling=settings.oversampling)
+    return replace(tracker, **asked)

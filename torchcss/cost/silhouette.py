@@ -12,11 +12,10 @@ ones too, seen at pi(r_p); N the points that the expected body would have, P the
 
 phi falls from 1, where no node is near, to 0, where many are; it is the logarithm of a distance far
 off and does not count what is nowhere near anything: another person, a shadow. D is the distance to
-the nearest pixel that may be the body, as a share of `reach` and no more than 1. A pixel may be the
-body unless it looks like what is behind it and like no part of the body by far.
+the nearest pixel that may be the body, as a share of `reach` and no more than 1.
 
-Where it is not known what is behind it a pixel says nothing. The term has no depth and tells
-nothing of what lies inside the silhouette; both are left to the others.
+A pixel of which it is not known what is behind it says nothing: it may be the body, and need not.
+The term knows no depth, and nothing of what lies inside the silhouette; both are left to others.
 
 The gradient is exact. In the Hessian the shares in which the nodes cover a point are held fixed, as
 edges are to their nodes in the contour term; it is positive semidefinite but for D's part.
@@ -74,9 +73,7 @@ class SilhouetteTerm:
         reach: Distance from what may be the body beyond which a node is as far out as can be,
             pixels.
         near: Points farther than this from all poses before are no limbs, pixels.
-        least: Degree g from which a pixel is of the silhouette.
-        surely: Likeness, negated, from which a pixel is bare. Dark clothes before a dark wall look
-            like either.
+        least: Likeness from which a pixel is of the silhouette; it is bare below.
         reduction: Pixels of the image, along each side, to one that is looked at.
         spacing: Of these, along each side, to one point.
         nu: Level of the cost (its unit only).
@@ -88,7 +85,6 @@ class SilhouetteTerm:
     reach: float = 40.0
     near: float = 100.0
     least: float = 0.3
-    surely: float = 0.9
     reduction: int = 4
     spacing: int = 2
     nu: float = 1.0
@@ -112,14 +108,14 @@ class SilhouetteTerm:
         small = camera.scaled(1 / self.reduction)
         width, height = small.image_size_wh
         # The border of odd sizes is shared out among the reduced pixels.
-        degree, may = (
+        degree, may_be = (
             functional.adaptive_avg_pool2d(part[None].to(expected), (height, width))[0]
-            for part in (likeness.nan_to_num(0.0).clamp(min=0), likeness.nan_to_num(1.0))
+            for part in (likeness.nan_to_num(0.0).clamp(min=0), ~(likeness <= self.least))
         )
         points, weight = self._points(degree, small.project(expected).uv)
         unit = (self.reduction * self.spacing) ** 2
         weight = weight / max(area / unit, float(weight.sum()), _FEWEST_POINTS)
-        bare = self._distance(may > -self.surely, expected)
+        bare = self._distance(may_be >= 0.5, expected)
         return SilhouetteImages(small, points, weight, spline_field(bare[None]))
 
     def value(
