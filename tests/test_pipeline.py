@@ -29,11 +29,13 @@ from torchcss.presets import PRESETS, make_tracker
 from torchcss.robust import Quadratic
 from torchcss.settings import (
     ALL_TERMS,
+    TERMS,
     Settings,
     boundary_emphasis,
     make_choice,
     make_extractor,
     make_settings_tracker,
+    named_terms,
 )
 from torchcss.synthetic import SyntheticSequence, arm_sequence
 from torchcss.track_files import _first_pose_from_file, track_video
@@ -499,6 +501,8 @@ def test_a_body_is_segmented_and_an_arm_alone_is_not():
     assert make_choice(Settings(body="body34", preset="condensation"), 2.0).segmentation is None
     assert make_choice(Settings(body="arm8"), 2.0).segmentation is None
     assert not make_choice(Settings(body="body34"), 2.0).background
+    assert named_terms(["default", "background", "contour"]) == (*TERMS, "background")
+    assert named_terms(["joints"]) == ("joints",)
     assert make_choice(Settings(body="body34", terms=ALL_TERMS), 2.0).background
     assert not make_choice(Settings(body="arm8", terms=ALL_TERMS), 2.0).background
     assert make_choice(Settings(body="body34"), 2.0).silhouette is None

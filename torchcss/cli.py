@@ -32,7 +32,7 @@ from torchcss.demo import run_demo
 from torchcss.errors import ConfigurationError, OutputError, TorchcssError
 from torchcss.io.keypoints import Scale
 from torchcss.live import LiveViewer
-from torchcss.settings import TERMS, Settings
+from torchcss.settings import TERMS, Settings, named_terms
 from torchcss.smooth import smooth_file
 from torchcss.smooth_video import smooth_video
 from torchcss.track_files import track_video
@@ -54,7 +54,7 @@ class Demo:
     samples: int | None = None
     """Samples per frame; the preset's number by default."""
     terms: tuple[str, ...] = TERMS
-    """Terms and priors of the cost."""
+    """Terms and priors of the cost; `default` stands for the default ones."""
     device: str = "cpu"
     """Where to compute."""
     dtype: Literal["float64", "float32"] = "float64"
@@ -67,7 +67,7 @@ class Demo:
             preset=self.preset,
             samples=self.samples,
             keypoints_use="first",
-            terms=self.terms,
+            terms=named_terms(self.terms),
             seed=self.seed,
             device=self.device,
             dtype=self.dtype,
@@ -126,7 +126,7 @@ class Track:
     """How much one frame counts in the weights of modes, above 0 and at most 1; the preset's number
     by default."""
     terms: tuple[str, ...] = TERMS
-    """Terms and priors of the cost."""
+    """Terms and priors of the cost; `default` stands for the default ones."""
     contour_weight: float = Settings.contour_weight
     """Temperature of the contour term, nats."""
     weights: dict[str, float] = field(default_factory=dict)
@@ -175,7 +175,7 @@ class Track:
             oversampling=self.oversampling,
             evidence=self.evidence,
             keypoints_use=self.keypoints_use,
-            terms=self.terms,
+            terms=named_terms(self.terms),
             working_size=self.working_size,
             contour_weight=self.contour_weight,
             weights=self.weights,

@@ -7,7 +7,7 @@ and `make_settings_tracker` turn it into the three objects that `torchcss.pipeli
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -41,7 +41,7 @@ TERMS = (
     *("stabiliser", "anthropometric", "interpenetration", "temporal"),
 )
 """Terms and priors of the cost by default: all that do not stand in for one another, but for
-`background`, which takes dark clothes before a dark wall for the wall."""
+`background` and `silhouette`, which take dark clothes before a dark wall for the wall."""
 
 ALL_TERMS = (
     *("contour", "motion_boundaries", "edge_energy", "region", "segmentation", "flow", "joints"),
@@ -55,6 +55,16 @@ for it, or for masks."""
 
 _NO_TERMS = ("motion_boundaries", "background")
 """Of these: what has no cost of its own."""
+
+
+def named_terms(names: Iterable[str]) -> tuple[str, ...]:
+    """Terms by name, where `default` stands for all of `TERMS`; each comes once.
+
+    Args:
+        names: Names as a user gives them.
+    """
+    every = [term for name in names for term in (TERMS if name == "default" else (name,))]
+    return tuple(dict.fromkeys(every))
 
 
 @dataclass(frozen=True, kw_only=True)
