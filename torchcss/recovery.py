@@ -19,7 +19,8 @@ from torchcss.jumps import with_flips
 from torchcss.vision.camera import Camera
 
 OBSERVATIONS = ("contour", "edge_energy", "region", "flow", "joints")
-"""The terms of the cost that compare with the image; the rest are priors."""
+"""The terms of the cost that compare with the image in the same way in every frame. What looks at
+the silhouette changes with what is known of the background; the rest are priors."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -244,7 +244,7 @@ class FrameCosts:
     def _targets(
         self, features: FrameFeatures, body: BodyModel, before: Float[Tensor, "k n"]
     ) -> FlowTargets | None:
-        if self.interior is None or features.flow is None:
+        if self.choice.flow is None or self.interior is None or features.flow is None:
             return None
         pose = body.pose(before)
         points, part = self.interior(body, pose).points, self.interior.node_part
