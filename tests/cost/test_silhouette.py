@@ -51,12 +51,12 @@ def plain_twin(term: SilhouetteTerm, points: Tensor, images: SilhouetteImages) -
     """The formula of the module, point by point and node by node."""
     uv, _, valid = images.camera.project(points)
     full = math.log((1 + term.epsilon) / term.epsilon)
-    sigma, total = term.sigma / term.reduction, 0.0
+    total = 0.0
     for point, weight in zip(images.points, images.weight, strict=True):
         covered = 0.0
         for node, seen in zip(uv, valid, strict=True):
             if seen:
-                covered += math.exp(-float((node - point).square().sum()) / (2 * sigma**2))
+                covered += math.exp(-float((node - point).square().sum()) / (2 * images.sigma**2))
         phi = math.log((1 + term.epsilon) / (1 + term.epsilon - math.exp(-covered))) / full
         total += float(weight) * phi
     out = images.bare.value(uv) * valid
@@ -67,7 +67,7 @@ def plain_twin(term: SilhouetteTerm, points: Tensor, images: SilhouetteImages) -
 @pytest.mark.parametrize("batch", [(), (2,), (2, 1), (0,)])
 def test_it_is_the_sum_over_points_and_nodes(batch: tuple[int, ...], dtype: torch.dtype) -> None:
     body, camera = a_body_before_a_camera(dtype)
-    term = SilhouetteTerm(spacing=6, nu=2.0)
+    term = SilhouetteTerm(spacing=1.5, nu=2.0)
     images = the_silhouette_of(body, camera, moved(body, 0.9), body.rest, term)
     assert len(images.points) > 20
     generator = torch.Generator().manual_seed(0)
@@ -101,7 +101,7 @@ def places(body: BodyModel) -> dict[str, Tensor]:
 @pytest.mark.parametrize("place", places(a_body_before_a_camera()[0]))
 def test_derivatives_are_those_of_autograd(place: str) -> None:
     body, camera = a_body_before_a_camera()
-    term = SilhouetteTerm(spacing=4)
+    term = SilhouetteTerm(spacing=1.0)
     images = the_silhouette_of(body, camera, moved(body, 0.9), body.rest, term)
     points = places(body)[place]
     cost = term.point_cost(points, images)
@@ -178,6 +178,27 @@ def raising_force(
         body=body, camera=camera, choice=choice, interior=InteriorNodes(body), silhouette=images
     )
     return -float(cost.gradients(x)["silhouette"][body.state_index("r_shoulder_raising")])
+
+
+def test_it_costs_the_same_however_large_the_body_is_seen() -> None:
+    """The same scene by a lens three times as long, and a body just before the camera or behind."""
+    body, camera = a_body_before_a_camera()
+    K = camera.K * torch.tensor([[3.0], [3.0], [1.0]])
+    K[:2, 2] = torch.tensor([719.5, 899.5], dtype=K.dtype)
+    long = Camera(K.tolist(), (1440, 1800)).to(torch.float64)
+    term, truth = SilhouetteTerm(), moved(body, 0.9)
+    x = torch.stack([truth, moved(body, 0.2), moved(body, 1.5)])
+    near, far = (
+        term.value(nodes(body, x), the_silhouette_of(body, seen, truth, truth, term)).sum(-1)
+        for seen in (long, camera)
+    )
+    torch.testing.assert_close(near, far, rtol=0.15, atol=0.01)
+    drawn = torch.ones(600, 480, dtype=torch.float64)
+    points = nodes(body, body.rest)
+    for shift in (-3.0, -2.0, -30.0):
+        moved_to = points + points.new_tensor([0.0, 0.0, shift])
+        cost = term.point_cost(moved_to, term.images(drawn, camera, moved_to, 1000.0))
+        assert all(bool(part.isfinite().all()) for part in cost)
 
 
 def test_what_is_near_no_pose_does_not_count() -> None:

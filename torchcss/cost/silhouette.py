@@ -53,12 +53,14 @@ class SilhouetteImages(NamedTuple):
         points: Points of the silhouette in that image, pixels.
         weight: How much each counts, as a share of all points that the body would have.
         bare: D, the distance from what may be the body, as a smooth function.
+        sigma: How far from a node a point is covered, pixels of that image.
     """
 
     camera: Camera
     points: Float[Tensor, "m 2"]
     weight: Float[Tensor, " m"]
     bare: SplineField
+    sigma: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,27 +68,27 @@ class SilhouetteTerm:
     """The disagreement of the body with the silhouette.
 
     Attributes:
-        sigma: How far from a node a point is covered, pixels. Points feel nodes within about three
-            times as much.
+        sigma: How far from a node a point is covered, metres at the body's distance: of who is seen
+            close the nodes are farther apart. Points feel nodes within three times as much.
         epsilon: The least that a point counts as covered.
         beta: How much a node that is far out counts against a point that nothing covers.
         reach: Distance from what may be the body beyond which a node is as far out as can be,
-            pixels.
-        near: Points farther than this from all poses before are no limbs, pixels.
+            metres likewise.
+        near: Points farther than this from all poses before are no limbs, metres likewise.
         least: Likeness from which a pixel is of the silhouette; it is bare below.
         reduction: Pixels of the image, along each side, to one that is looked at.
-        spacing: Of these, along each side, to one point.
+        spacing: Distance of the points, as a share of sigma.
         nu: Level of the cost (its unit only).
     """
 
-    sigma: float = 16.0
+    sigma: float = 0.11
     epsilon: float = 0.01
     beta: float = 0.5
-    reach: float = 40.0
-    near: float = 100.0
+    reach: float = 0.28
+    near: float = 0.7
     least: float = 0.3
     reduction: int = 4
-    spacing: int = 2
+    spacing: float = 0.5
     nu: float = 1.0
 
     def images(
@@ -112,11 +114,15 @@ class SilhouetteTerm:
             functional.adaptive_avg_pool2d(part[None].to(expected), (height, width))[0]
             for part in (likeness.nan_to_num(0.0).clamp(min=0), ~(likeness <= self.least))
         )
-        points, weight = self._points(degree, small.project(expected).uv)
-        unit = (self.reduction * self.spacing) ** 2
-        weight = weight / max(area / unit, float(weight.sum()), _FEWEST_POINTS)
-        bare = self._distance(may_be >= 0.5, expected)
-        return SilhouetteImages(small, points, weight, spline_field(bare[None]))
+        uv, depth, valid = small.project(expected)
+        # Of a body that is all behind the camera nothing is seen, in whatever unit.
+        metre = float(small.K[0, 0] / depth[valid].median()) if bool(valid.any()) else 1.0
+        step = min(max(round(self.spacing * self.sigma * metre), 1), width, height)
+        points, weight = self._points(degree, uv[valid], step, self.near * metre)
+        full = area / (self.reduction * step) ** 2
+        weight = weight / max(full, float(weight.sum()), _FEWEST_POINTS)
+        bare = spline_field(self._distance(may_be >= 0.5, expected, self.reach * metre)[None])
+        return SilhouetteImages(small, points, weight, bare, self.sigma * metre)
 
     def value(
         self, points: Float[Tensor, "*batch p 3"], images: SilhouetteImages
@@ -172,7 +178,7 @@ class SilhouetteTerm:
 
         The derivative of the cost by `uv` of node p is `sum_m share[p, m] slope[m] (uv - u_m)`.
         """
-        scale = math.sqrt(2) * self.sigma / self.reduction
+        scale = math.sqrt(2) * images.sigma
         # Where a node cannot be seen it is far away.
         node = torch.where(valid[..., None], uv / scale, 1e4)
         target = images.points / scale
@@ -182,21 +188,22 @@ class SilhouetteTerm:
         left = 1 + self.epsilon - missed
         unit = self.nu * images.weight / math.log((1 + self.epsilon) / self.epsilon)
         covered = (unit * ((1 + self.epsilon) / left).log()).sum(-1)
-        slope = unit * missed / left * (self.reduction / self.sigma) ** 2
+        slope = unit * missed / left / images.sigma**2
         return share, covered, slope
 
-    def _points(self, degree: Tensor, nodes: Tensor) -> tuple[Tensor, Tensor]:
+    def _points(
+        self, degree: Tensor, nodes: Tensor, step: int, near: float
+    ) -> tuple[Tensor, Tensor]:
         """Points of the silhouette near any of some nodes, and how sure they are."""
-        blocks = functional.avg_pool2d(degree[None], self.spacing, ceil_mode=True)[0]
+        blocks = functional.avg_pool2d(degree[None], step, ceil_mode=True)[0]
         row, column = torch.nonzero(blocks > self.least, as_tuple=True)
-        points = torch.stack([column, row], dim=-1).to(degree) * self.spacing
-        points = points + (self.spacing - 1) / 2
-        near = torch.cdist(points, nodes).amin(-1) < self.near / self.reduction
-        return points[near], blocks[row, column][near]
+        points = torch.stack([column, row], dim=-1).to(degree) * step + (step - 1) / 2
+        close = (torch.cdist(points, nodes) < near).any(-1)
+        return points[close], blocks[row, column][close]
 
-    def _distance(self, free: Tensor, like: Tensor) -> Tensor:
+    def _distance(self, free: Tensor, like: Tensor, reach: float) -> Tensor:
         """Distance from a mask along the farther axis, as a share of the reach, blurred."""
-        steps = max(round(self.reach / self.reduction), 1)
+        steps = min(max(round(reach), 1), max(free.shape))
         out = [~free]
         for _ in range(steps - 1):
             free = grow(free[None], 1)[0]
