@@ -4,7 +4,8 @@ The terms of the contour look a few pixels to either side of it. A limb that is 
 that feels nothing, though before a known background the true one stands out. Section 8 [IJRR] hopes
 for help of silhouettes. Here body and silhouette have to agree. Let u_m be points of the silhouette
 and g_m, in 0..1, how sure it is that they are the body's; r_p nodes all over the surface, hidden
-ones too, seen at pi(r_p); N the points that the expected body would have, P the number of nodes:
+ones too, seen at pi(r_p); N the points that the expected body would have, or the sum of g_m if that
+is more; P the number of nodes:
 
     e(x) = 1/N sum_m g_m phi(s_m) + beta/P sum_p D(pi(r_p))
     s_m = sum_p exp(-|u_m - pi(r_p)|^2 / (2 sigma^2))
@@ -65,7 +66,7 @@ class SilhouetteImages(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class SilhouetteTerm:
-    """The disagreement of the body with the silhouette.
+    """The disagreement of the body with the silhouette. Lengths are for a person.
 
     Attributes:
         sigma: How far from a node a point is covered, metres at the body's distance: of who is seen
