@@ -193,12 +193,19 @@ class FrameCosts:
     ) -> dict[str, Any]:
         """What the pixels look like, for the terms that ask for it."""
         images: dict[str, Any] = {}
-        if self.choice.silhouette is not None and before is not None:
-            images["silhouette"] = self._silhouette(features, body, before, appearance, background)
-        if appearance is None or features.colour is None:
+        colour, likeness, silhouette = features.colour, None, None
+        if appearance is not None and colour is not None:
+            likeness = appearance.likeness(colour, background if self.choice.background else None)
+            if self.choice.silhouette is not None and background is not None:
+                known = self.choice.background
+                silhouette = likeness if known else appearance.likeness(colour, background)
+                silhouette = silhouette.amax(0).masked_fill(~background.sure, torch.nan)
+        if features.mask is not None:
+            silhouette = 2 * features.mask - 1
+        if silhouette is not None and before is not None:
+            images["silhouette"] = self._silhouette(silhouette, body, before)
+        if likeness is None:
             return images
-        behind = background if self.choice.background else None
-        likeness = appearance.likeness(features.colour, behind)
         if self.choice.region is not None and self.predictor is not None:
             layer = self.layer_of_part[self.predictor.node_part]
             images["region"] = RegionImages(region_field(likeness), layer)
@@ -214,23 +221,14 @@ class FrameCosts:
 
     def _silhouette(
         self,
-        features: FrameFeatures,
+        likeness: Float[Tensor, "h w"],
         body: BodyModel,
         before: Float[Tensor, "k n"],
-        appearance: Appearance | None,
-        background: Background | None,
     ) -> SilhouetteImages | None:
-        """What is before the background: by the mask if there is one, else by the colours."""
+        """The silhouette, of what looks like the body; None if it is not asked for."""
         term = self.choice.silhouette
         if term is None or self.interior is None or self.interior.num_nodes == 0:
             return None
-        if features.mask is not None:
-            likeness = 2 * features.mask - 1
-        elif appearance is None or background is None or features.colour is None:
-            return None
-        else:
-            likeness = appearance.likeness(features.colour, background).amax(0)
-            likeness = likeness.masked_fill(~background.sure, torch.nan)
         small = self.camera.scaled(1 / term.reduction)
         best = before.reshape(-1, before.shape[-1])[0]
         parts = part_map(body, best, small, rings=6, meridians=10)
