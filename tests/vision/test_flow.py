@@ -278,6 +278,95 @@ def test_double_agrees_with_single_precision() -> None:
     torch.testing.assert_close(single.flow.double(), double.flow, atol=1e-2, rtol=0)
 
 
+# Carrying on
+
+
+def striped(height: int, width: int, shift: float) -> Tensor:
+    """A window onto stripes eight pixels apart that run behind it, as on a shirt that turns."""
+    u, v = grid(height, width)
+    window = ((u - width / 2).abs() < 0.3 * width) & ((v - height / 2).abs() < 0.3 * height)
+    stripes = 0.5 + 0.25 * torch.cos(2 * math.pi * (u - shift) / 8) + 0.05 * torch.cos(v - 0.5 * u)
+    return torch.where(window, stripes, texture(u, v, 3)).float()
+
+
+def in_the_window(flow: Tensor) -> Tensor:
+    height, width = flow.shape[-2:]
+    rows = slice(int(0.35 * height), int(0.65 * height))
+    return flow[..., 0, rows, int(0.35 * width) : int(0.65 * width)]
+
+
+def test_what_repeats_moves_on_as_it_moved_before() -> None:
+    frames = [striped(96, 128, shift) for shift in (0.0, 3.0, 8.0)]
+    first = robust_flow(frames[0], frames[1], TRACKING)
+    assert abs(float(in_the_window(first.flow).median()) - 3) < 0.3
+    # Five pixels to the right are three to the left, to the next stripe.
+    alone = robust_flow(frames[1], frames[2], TRACKING)
+    assert abs(float(in_the_window(alone.flow).median()) + 3) < 0.5
+    last = (first.flow, torch.zeros(96, 128))
+    carried = robust_flow(frames[1], frames[2], TRACKING, before=last)
+    assert abs(float(in_the_window(carried.flow).median()) - 5) < 0.5
+
+
+def test_a_flow_before_that_does_not_fit_is_dropped() -> None:
+    first, second = shifted(60, 80, 2.0, 1.0)
+    alone = robust_flow(first, second, TRACKING)
+    wrong = (torch.full((2, 60, 80), 20.0), torch.zeros(60, 80))
+    other = robust_flow(first, second, TRACKING, before=wrong)
+    apart = (other.flow - alone.flow).norm(dim=0)[8:-8, 8:-8]
+    assert float((apart < 0.2).float().mean()) > 0.95
+
+
+def test_a_flow_before_in_doubt_says_nothing() -> None:
+    """With nothing to carry on the second start is no motion."""
+    first, second = striped(48, 64, 0.0), striped(48, 64, 1.0)
+    doubted = (torch.randn(2, 48, 64), torch.ones(48, 64))
+    still = (torch.zeros(2, 48, 64), torch.zeros(48, 64))
+    results = [robust_flow(first, second, TRACKING, before=one) for one in (doubted, still)]
+    torch.testing.assert_close(results[0].flow, results[1].flow)
+
+
+def test_flow_carried_on_against_plain_twin(generator: torch.Generator) -> None:
+    flow = 3.0 * torch.randn(2, 2, 9, 11, generator=generator)
+    doubt = torch.rand(2, 9, 11, generator=generator)
+    found = module._carried_on(flow, doubt)
+    for item in range(2):
+        best: dict[tuple[int, int], Tensor] = {}
+        for row in range(9):
+            for column in range(11):
+                step = flow[item, :, row, column]
+                to = int((row + step[1]).round()), int((column + step[0]).round())
+                if doubt[item, row, column] >= 0.5 or not (0 <= to[0] < 9 and 0 <= to[1] < 11):
+                    continue
+                if to not in best or step.square().sum() > best[to].square().sum():
+                    best[to] = step
+        for row in range(9):
+            for column in range(11):
+                window = [
+                    step
+                    for (y, x), step in best.items()
+                    if abs(y - row) <= 2 and abs(x - column) <= 2
+                ]
+                want = torch.stack(window).mean(0) if window else torch.zeros(2)
+                want = best.get((row, column), want)
+                torch.testing.assert_close(found[item, :, row, column], want)
+
+
+def test_carrying_on_keeps_batch_and_dtype() -> None:
+    first, second = (frame.expand(2, 3, 24, 30).double() for frame in shifted(24, 30, 1.0, 0.5))
+    before = (torch.zeros(2, 3, 2, 24, 30).double(), torch.zeros(2, 3, 24, 30).double())
+    result = robust_flow(first, second, TRACKING, before=before)
+    assert result.flow.shape == (2, 3, 2, 24, 30)
+    assert result.flow.dtype == torch.float64
+
+
+@pytest.mark.parametrize("shapes", [((2, 20, 21), (20, 20)), ((2, 20, 20), (19, 20))])
+def test_a_flow_before_of_another_shape_is_refused(shapes: tuple[tuple[int, ...], ...]) -> None:
+    first, second = shifted(20, 20, 1.0, 0.0)
+    before = torch.zeros(shapes[0]), torch.zeros(shapes[1])
+    with pytest.raises(ShapeError, match="flow before"):
+        robust_flow(first, second, TRACKING, before=before)
+
+
 def test_frames_that_require_gradients_are_fine() -> None:
     first, second = shifted(20, 20, 1.0, 0.0)
     assert not robust_flow(first.requires_grad_(), second, TRACKING).flow.requires_grad
