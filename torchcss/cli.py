@@ -120,6 +120,9 @@ class Track:
     """Samples per frame; the preset's number by default."""
     modes: int | None = None
     """Modes kept; the preset's number by default."""
+    prediction: Literal["velocity", "flow"] = "velocity"
+    """Where the trunk of a mode is expected: where its own last motion leads, or where the flow has
+    carried it, for a person who begins to turn."""
     oversampling: int = 1
     """Draw so many times as many samples; those with the best edges descend."""
     evidence: float | None = None
@@ -172,6 +175,7 @@ class Track:
             preset=self.preset,
             samples=self.samples,
             modes=self.modes,
+            prediction=self.prediction,
             oversampling=self.oversampling,
             evidence=self.evidence,
             keypoints_use=self.keypoints_use,

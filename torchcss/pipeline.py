@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,11 +25,18 @@ from torch import Tensor
 
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, has_root, move_base, root_pose
+from torchcss.carry import Displaced, carried
 from torchcss.cost.frame import FrameCosts, beside
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.inference.mixture import GaussianMixture, tempered
 from torchcss.inference.proposals import unbounded
-from torchcss.inference.tracker import CostFactory, SequenceTracker, TrackerInfo, TrackerState
+from torchcss.inference.tracker import (
+    CostFactory,
+    SequenceTracker,
+    Tracker,
+    TrackerInfo,
+    TrackerState,
+)
 from torchcss.inference.trust_region import default_prior_variance
 from torchcss.io.video import Frame
 from torchcss.jumps import with_flips
@@ -98,6 +106,7 @@ def track_frames(
     masks: Iterable[np.ndarray | Tensor] | None = None,
     recovery: Recovery | None = None,
     jumps_every: int = 0,
+    carries: bool = False,
     others: Sequence[ViewStream] = (),
 ) -> Iterator[TrackedFrame]:
     """Track a body through a sequence of images.
@@ -121,6 +130,8 @@ def track_frames(
         jumps_every: Every how many frames the flips of the best mode join the search, see
             `torchcss.jumps`; 0: never. Not where several cameras look on: to them a flip looks
             different.
+        carries: Whether the flow tells where each mode's trunk is expected, see `torchcss.carry`,
+            and carries itself on from frame to frame. Not for particle filters.
         others: What further cameras send.
 
     Yields:
@@ -135,7 +146,7 @@ def track_frames(
             frame_interval=frame_interval,
             boundary_emphasis=boundary_emphasis,
         )
-        return Watcher(costs, extractor, observe, masks)
+        return Watcher(costs, extractor, observe, masks, carry_flow=carries)
 
     watchers = [watcher(camera, observe, masks)]
     watchers += [watcher(other.camera, other.observe, other.masks) for other in others]
@@ -161,6 +172,8 @@ def track_frames(
         featured = time.perf_counter()
         prior = state.mixture
         bounds = body.bounds if limits else unbounded(prior.mean)
+        if carries and isinstance(searching, Tracker):
+            searching = _carried(searching, state, cost)
         asked: list[GaussianMixture] = []
         state, info = searching.step(state, _noting(cost, asked), bounds)
         if len(prior.mean) > num_prior:
@@ -201,6 +214,14 @@ def track_frames(
             beside_it,
         )
         body, state = follow_with_base(body, state)
+
+
+def _carried(tracker: Tracker, state: TrackerState, cost: TrackingCost) -> Tracker:
+    """The tracker that expects the trunk of each mode where the flow has carried it."""
+    mean = state.mixture.mean
+    expected = tracker.dynamics.predict(state.mixture, state.velocity).mean
+    moved = carried(cost, mean, expected) - mean
+    return replace(tracker, dynamics=Displaced(tracker.dynamics, moved))
 
 
 def _noting(cost: TrackingCost, priors: list[GaussianMixture]) -> CostFactory:

@@ -76,6 +76,9 @@ class Settings:
         preset: Tracker, a name in `presets.PRESETS`.
         samples: Samples per frame; the preset's number by default.
         modes: Modes kept; the preset's number by default.
+        prediction: "velocity": a mode is expected where its own last motion leads; "flow": its
+            trunk is where the flow has carried it, and the flow goes on from the frame before, see
+            `torchcss.carry`. For trackers that descend from samples.
         oversampling: How many times as many samples are drawn; those with the best edges descend,
             see `Tracker`.
         evidence: Power of a frame's likelihood in the weights of modes, above 0 and at most 1, see
@@ -100,6 +103,7 @@ class Settings:
     preset: str = "css"
     samples: int | None = None
     modes: int | None = None
+    prediction: Literal["velocity", "flow"] = "velocity"
     oversampling: int = 1
     evidence: float | None = None
     keypoints_use: Literal["first", "all"] = "all"
@@ -148,6 +152,17 @@ class Settings:
             raise ConfigurationError(
                 f"oversampling: {self.preset} does not descend from samples; leave it at 1"
             )
+        if self.prediction not in ("velocity", "flow"):
+            raise ConfigurationError(
+                f"prediction must be velocity or flow, got {self.prediction!r}"
+            )
+        if self.prediction == "flow":
+            if PRESETS[self.preset].particles is not None:
+                raise ConfigurationError(
+                    f"prediction: {self.preset} moves particles, not modes; leave it at velocity"
+                )
+            if "flow" not in self.terms:
+                raise ConfigurationError('prediction "flow" needs the term flow')
         if self.evidence is not None:
             if not 0 < self.evidence <= 1:
                 raise ConfigurationError(

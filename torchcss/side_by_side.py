@@ -223,4 +223,5 @@ def _follow(
         limits=PRESETS[settings.preset].limits,
         recovery=Recovery() if settings.recovery else None,
         jumps_every=PRESETS[settings.preset].jumps_every,
+        carries=settings.prediction == "flow",
     )

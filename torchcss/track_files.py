@@ -191,6 +191,7 @@ def track_video(
         boundary_emphasis=boundary_emphasis(settings),
         limits=PRESETS[settings.preset].limits,
         jumps_every=PRESETS[settings.preset].jumps_every,
+        carries=settings.prediction == "flow",
         recovery=Recovery() if settings.recovery else None,
         masks=main.masks,
         others=streams[1:],

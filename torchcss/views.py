@@ -52,6 +52,7 @@ class Watcher:
         extractor: Makes the features.
         observe: Keypoints by frame.
         masks: Foreground of each of the images; None: not known.
+        carry_flow: Whether the flow of each image starts from that of the one before too.
 
     Attributes:
         features: Those of the image taken in last; None if the view is out.
@@ -65,7 +66,10 @@ class Watcher:
         extractor: FeatureExtractor,
         observe: Observe,
         masks: Iterable[np.ndarray | Tensor] | None,
+        *,
+        carry_flow: bool = False,
     ) -> None:
+        self.carry_flow = carry_flow
         self.costs, self.extractor, self.observe = costs, extractor, observe
         self.masks = None if masks is None else iter(masks)
         self.last: np.ndarray | None = None
@@ -76,6 +80,7 @@ class Watcher:
 
     def look(self, frame: Frame | None) -> None:
         """Take in the next image; None, or one of a single colour, is a view that is out."""
+        before = self.features if self.carry_flow else None
         self.index, self.features = None if frame is None else frame.index, None
         if frame is None:
             self.last = None
@@ -87,7 +92,7 @@ class Watcher:
         if frame.image.size and frame.image.min() == frame.image.max():
             self.last = None
             return
-        features = self.extractor(frame.image, self.last, mask)
+        features = self.extractor(frame.image, self.last, mask, before=before)
         self.features, self.last, colour = features, frame.image, features.colour
         if self.background is not None and colour is not None and not self.background.holds(colour):
             self.background = None
