@@ -21,6 +21,7 @@ LAYERS = (
     {"inference"},
     {"cost"},
     {
+        "carry",
         "presets",
         "first_pose",
         "gross_marks",

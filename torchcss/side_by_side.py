@@ -98,14 +98,16 @@ class SharedFeatures(FeatureExtractor):
         self.to(dtype=extractor.luma.dtype, device=extractor.luma.device)
         self._last: tuple[tuple[Any, ...], FrameFeatures] | None = None
 
-    def forward(self, frame: Any, previous: Any = None, mask: Any = None) -> FrameFeatures:
+    def forward(
+        self, frame: Any, previous: Any = None, mask: Any = None, *, before: Any = None
+    ) -> FrameFeatures:
         """See `FeatureExtractor`; the same objects as last time give the same features."""
-        asked = (frame, previous, mask)
+        asked = (frame, previous, mask, before)
         if self._last is not None and all(
             have is want for have, want in zip(self._last[0], asked, strict=True)
         ):
             return self._last[1]
-        self._last = (asked, super().forward(*asked))
+        self._last = (asked, super().forward(frame, previous, mask, before=before))
         return self._last[1]
 
 
