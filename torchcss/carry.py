@@ -108,6 +108,7 @@ def carried(
         interpenetration=None,
         weights={},
     )
+    deviation = _SPREAD * cost.deviation
     start = before.index_copy(-1, columns, expected[:, columns])
     trunk = TrackingCost(
         body=body,
@@ -117,13 +118,13 @@ def carried(
         targets=first.targets,
         others=tuple(others),
         parent=start,
-        deviation=_SPREAD * cost.deviation,
+        deviation=deviation,
     )
     found = TrustRegionNewton().minimise(
         _Restricted(trunk, columns, start),
         start[:, columns],
         Bounds(body.lower[columns].to(before), body.upper[columns].to(before)),
-        scale=trunk.deviation[columns] if trunk.deviation is not None else None,
+        scale=deviation[columns],
     )
     return expected.index_copy(-1, columns, found.mean)
 
