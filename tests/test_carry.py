@@ -1,4 +1,4 @@
-"""The prediction by the flow: the trunk goes where the flow says, limbs hang on, nothing else."""
+"""The prediction by the flow: the trunk goes where the flow says, limbs and head hang on."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchcss.body.model import BodyModel, load_body
-from torchcss.carry import Displaced, carried, trunk_columns
+from torchcss.carry import Displaced, carried, trunk_of
 from torchcss.cost.flow import FlowTargets, FlowTerm, InteriorNodes
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.errors import ConfigurationError
@@ -27,6 +27,7 @@ from torchcss.settings import Settings, make_choice, make_extractor
 from torchcss.vision.camera import Camera
 
 YAW = 3
+TRUNK = ("pelvis", "chest")
 INTERVAL = 1 / 30
 
 
@@ -80,6 +81,17 @@ def turn_between(x: Tensor, other: Tensor) -> Tensor:
     return torch.rad2deg(torch.atan2(angle.sin(), angle.cos()))
 
 
+def misses(cost: TrackingCost, x: Tensor) -> Tensor:
+    """How far the visible nodes of the trunk are from where the flow has carried them, pixels."""
+    assert cost.targets is not None
+    assert cost.interior is not None
+    nodes = cost.interior(cost.body, cost.body.pose(x)).points
+    error = (cost.camera.project(nodes).uv - cost.targets.uv).norm(dim=-1)
+    names = cost.body.part_names
+    of_trunk = torch.tensor([names[part] in TRUNK for part in cost.interior.node_part])
+    return error[of_trunk & (cost.targets.weight > 0)]
+
+
 def turned(x: Tensor, degrees: float) -> Tensor:
     other = x.clone()
     other[..., YAW] += math.radians(degrees)
@@ -90,26 +102,31 @@ def turned(x: Tensor, degrees: float) -> Tensor:
 def test_trunk_turns_with_the_flow(dtype: torch.dtype) -> None:
     before = poses(3).to(dtype)
     after = turned(before, 12.0)
-    found = carried(a_cost(before, after, dtype=dtype), before, before)
+    cost = a_cost(before, after, dtype=dtype)
+    found = carried(cost, before, before)
     assert found.dtype == dtype
+    # Its nodes, two to three pixels off before, are at their targets. What is left of the angle is
+    # the prior's, which thinks of 23 degrees.
+    assert misses(cost, before).mean() > 2
+    assert misses(cost, found).max() < 0.5
     assert turn_between(before, after).abs().min() > 11
-    assert turn_between(found, after).abs().max() < 1
+    assert turn_between(found, after).abs().max() < 2
     limbs = torch.ones(before.shape[-1], dtype=torch.bool)
-    limbs[trunk_columns(the_body())] = False
+    limbs[trunk_of(the_body())[0]] = False
     assert torch.equal(found[:, limbs], before[:, limbs])
 
 
 def test_limbs_have_no_say() -> None:
-    """Arms that lie on the wall beside the true ones see no motion."""
+    """Arms that lie on the wall beside the true ones see no motion, nor does a head that is off."""
     before = poses()
     cost = a_cost(before, turned(before, 12.0))
     assert cost.targets is not None
     assert cost.interior is not None
-    names = cost.body.part_names
-    sided = torch.tensor([names[p].startswith(("l_", "r_")) for p in cost.interior.node_part])
+    limbs = {index for index, name in enumerate(cost.body.part_names) if name not in TRUNK}
+    outside = torch.tensor([int(part) in limbs for part in cost.interior.node_part])
     nodes = cost.interior(cost.body, cost.body.pose(before))
     still = cost.camera.project(nodes.points).uv
-    uv = torch.where(sided[:, None], still, cost.targets.uv)
+    uv = torch.where(outside[:, None], still, cost.targets.uv)
     misled = replace(cost, targets=FlowTargets(uv, cost.targets.weight))
     assert torch.equal(carried(misled, before, before), carried(cost, before, before))
 
@@ -120,7 +137,7 @@ def test_what_the_last_motion_expects_is_where_it_starts() -> None:
     expected[:, -1] += 0.1
     cost = a_cost(before, turned(before, 12.0))
     found = carried(cost, before, expected)
-    assert float(turn_between(found, turned(before, 12.0)).abs()) < 1
+    assert float(turn_between(found, turned(before, 12.0)).abs()) < 2
     assert torch.equal(found[:, -1], expected[:, -1])
     assert cost.targets is not None
     blind = FlowTargets(cost.targets.uv, torch.zeros_like(cost.targets.weight))
@@ -148,7 +165,7 @@ def test_two_cameras_agree() -> None:
     cost = a_cost(before, turned(before, 12.0))
     both = replace(cost, others=(cost.alone,))
     found = carried(both, before, before)
-    assert float(turn_between(found, turned(before, 12.0)).abs()) < 1
+    assert float(turn_between(found, turned(before, 12.0)).abs()) < 2
 
 
 def test_limits_hold() -> None:
@@ -174,13 +191,15 @@ def test_what_is_not_known_says_nothing(lacks: str) -> None:
 
 
 def test_only_a_body_with_a_root_has_a_trunk() -> None:
-    body: BodyModel = load_body("arm8")
-    assert len(trunk_columns(body)) == 0
-    names = [the_body().state_names[i] for i in trunk_columns(the_body())]
-    assert "root_yaw" in names
-    assert "lumbar_twist" in names
-    assert "neck_flexion" in names
-    assert not any(name.startswith(("l_", "r_")) for name in names)
+    columns, parts = trunk_of(load_body("arm8"))
+    assert len(columns) == 0
+    assert not parts.any()
+    columns, parts = trunk_of(the_body())
+    names = [the_body().state_names[i] for i in columns]
+    assert {"root_x", "root_yaw", "lumbar_flexion", "lumbar_twist"} <= set(names)
+    assert not any(name.startswith(("l_", "r_", "neck")) for name in names)
+    carrying = {name for name, held in zip(the_body().part_names, parts, strict=True) if held}
+    assert carrying == {"pelvis", "chest"}
 
 
 def test_displaced_dynamics_spread_as_the_others() -> None:

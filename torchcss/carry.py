@@ -8,10 +8,11 @@ before the search, from where its last motion leads:
 
     min_z  sum_j 1/2 rho(W_j |target_j - r_j(z)|^2)  +  1/2 sum_i ((z_i - z'_i) / (s d_i))^2
 
-over the parameters z of root, spine and neck, with the nodes j on trunk, neck and head, targets and
-weights of the flow term (`torchcss.cost.flow`) but a wider rho, z' what the last motion expects and
-d the motion expected in a frame. The limbs come along as they hang. The papers' trackers follow the
-flow in the cost alone (section 3.1.2 [IJRR]).
+over the parameters z of root and spine, with the nodes j on the trunk, targets and weights of the
+flow term (`torchcss.cost.flow`) but a wider rho, z' what the last motion expects and d the motion
+expected in a frame. Limbs, neck and head come along as they hang: what is small is soon off its
+nodes, and the wall beside it stands still. The papers' trackers follow the flow in the cost alone
+(section 3.1.2 [IJRR]).
 
 What to call: `carried`, once a frame, and `Displaced` for the tracker's dynamics.
 """
@@ -21,7 +22,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchcss.body.catalog import PROPORTIONS
@@ -83,12 +84,11 @@ def carried(
         expected (`FrameCosts`), and for bodies without root, trunk or flesh.
     """
     body, interior, term = cost.body, cost.interior, cost.choice.flow
-    columns = trunk_columns(body)
+    columns, parts = trunk_of(body)
     told = [view for view in cost.views if view.targets is not None]
     if interior is None or term is None or cost.deviation is None or not told or not len(columns):
         return expected
-    of_trunk = torch.tensor([not _sided(name) for name in body.part_names], device=before.device)
-    nodes = of_trunk[interior.node_part].to(before)
+    nodes = parts[interior.node_part].to(before)
 
     def alone(view: View) -> View:
         targets = view.targets
@@ -129,17 +129,26 @@ def carried(
     return expected.index_copy(-1, columns, found.mean)
 
 
-def trunk_columns(body: BodyModel) -> Int[Tensor, " m"]:
-    """Parameters of root, spine and neck: those of a body with a root that belong to no side."""
-    names = body.state_names if has_root(body) and body.num_parts else ()
-    columns = [
-        index for index, name in enumerate(names) if not _sided(name) and name not in PROPORTIONS
+def trunk_of(body: BodyModel) -> tuple[Int[Tensor, " m"], Bool[Tensor, " parts"]]:
+    """What limbs of both sides hang on: the parameters that move these, and the parts between.
+
+    Neither has entries for a body without root, or without sides.
+
+    Args:
+        body: The body.
+    """
+    sides = [
+        torch.tensor([name.startswith(side) for name in body.part_names], device=body.tie.device)
+        for side in ("l_", "r_")
     ]
-    return torch.tensor(columns, dtype=torch.long, device=body.tie.device)
-
-
-def _sided(name: str) -> bool:
-    return name.startswith(("l_", "r_"))
+    # Which parameter moves which part.
+    moves = (body.tie != 0).mT.double() @ body.tree.ancestors[:, body.part_link].double() > 0
+    # Lengths move parts as well, but not in time.
+    angles = torch.tensor([name not in PROPORTIONS for name in body.state_names]).to(moves)
+    both = (moves & sides[0]).any(-1) & (moves & sides[1]).any(-1)
+    shared = both & angles & has_root(body)
+    parts = ~moves[angles & ~shared].any(0) & shared.any()
+    return torch.nonzero(shared)[:, 0], parts
 
 
 @dataclass(frozen=True)
