@@ -68,8 +68,8 @@ def poses(count: int = 1, seed: int = 0) -> Tensor:
 
 def shoulders(x: Tensor) -> Tensor:
     """Heading of the line from one shoulder to the other, radians."""
-    body = the_body().to(x.dtype)
-    joints = body.pose(x).joints
+    body = the_body()
+    joints = body.pose(x.double()).joints
     left, right = (body.joint_names.index(name) for name in ("l_shoulder", "r_shoulder"))
     line = joints[..., left, :] - joints[..., right, :]
     return torch.atan2(line[..., 2], line[..., 0])
