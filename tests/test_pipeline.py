@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 from collections.abc import Iterable
 from dataclasses import replace
@@ -318,15 +319,35 @@ def test_base_follows_a_body_that_leans_over(generator: torch.Generator):
     mixture = GaussianMixture(
         x, 0.01 * torch.eye(30, dtype=torch.float64).expand(3, 30, 30), torch.zeros(3).double()
     )
-    state = TrackerState(
-        mixture, torch.zeros_like(x), generator.get_state(), torch.zeros((), dtype=torch.long)
-    )
+    step = 0.05 * torch.randn(3, 30, generator=generator, dtype=torch.float64)
+    state = TrackerState(mixture, step, generator.get_state(), torch.zeros((), dtype=torch.long))
     moved, after = follow_with_base(body, state)
     angles = after.mixture.mean[0, [moved.state_index(f"root_{a}") for a in ("yaw", "pitch")]]
     torch.testing.assert_close(angles, torch.zeros(2, dtype=torch.float64), atol=1e-9, rtol=0)
     torch.testing.assert_close(moved.pose(after.mixture.mean).joints, body.pose(x).joints)
+    last = x - state.velocity
+    torch.testing.assert_close(
+        moved.pose(after.mixture.mean - after.velocity).joints, body.pose(last).joints
+    )
     upright = replace_pitch(state, body, 0.3)
     assert follow_with_base(body, upright)[0] is body
+
+
+def test_base_keeps_the_motion_of_a_body_that_turns(generator: torch.Generator):
+    body = load_body("body30")
+    yaw = body.state_index("root_yaw")
+    x = body.rest.expand(2, 30).clone()
+    # One mode turns as well, but is seen from the new base half a turn away.
+    x[:, yaw] = x.new_tensor([4.75, 4.75 - math.pi + 0.1])
+    step = torch.zeros_like(x)
+    step[:, yaw] = 0.3
+    mixture = GaussianMixture(
+        x, 0.01 * torch.eye(30, dtype=torch.float64).expand(2, 30, 30), torch.zeros(2).double()
+    )
+    state = TrackerState(mixture, step, generator.get_state(), torch.zeros((), dtype=torch.long))
+    moved, after = follow_with_base(body, state)
+    assert moved is not body
+    torch.testing.assert_close(after.velocity, step)
 
 
 def replace_pitch(state: TrackerState, body, pitch: float) -> TrackerState:

@@ -248,15 +248,18 @@ def follow_with_base(body: BodyModel, state: TrackerState) -> tuple[BodyModel, T
     angles = best[[body.state_index(name) for name in ROOT_NAMES[3:]]]
     if float(angles[1].abs()) < _PITCH_LIMIT and float(angles.abs().max()) < math.radians(270):
         return body, state
-    mixture = state.mixture
-    body, mean, covariance = move_base(
-        body, *root_pose(body, best), mixture.mean, mixture.covariance
-    )
+    mixture, base = state.mixture, root_pose(body, best)
+    _, last, _ = move_base(body, *base, mixture.mean - state.velocity)
+    body, mean, covariance = move_base(body, *base, mixture.mean, mixture.covariance)
     assert covariance is not None
-    moved = mixture._replace(mean=mean, covariance=covariance)
+    velocity = mean - last
+    turned = [body.state_index(name) for name in ROOT_NAMES[3:]]
+    velocity[:, turned] = torch.remainder(velocity[:, turned] + math.pi, 2 * math.pi) - math.pi
     # Particles belong to the old base; a filter draws new ones from the mixture.
     return body, state._replace(
-        mixture=moved, velocity=torch.zeros_like(state.velocity), particles=None
+        mixture=mixture._replace(mean=mean, covariance=covariance),
+        velocity=velocity,
+        particles=None,
     )
 
 
