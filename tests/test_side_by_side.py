@@ -70,9 +70,9 @@ def test_features_are_computed_once_per_frame(
     asked = []
     forward = FeatureExtractor.forward
 
-    def spy(self: FeatureExtractor, *arguments: object, **others: object) -> object:
+    def spy(self: FeatureExtractor, *arguments: object) -> object:
         asked.append(arguments)
-        return forward(self, *arguments, **others)  # type: ignore[arg-type]
+        return forward(self, *arguments)  # type: ignore[arg-type]
 
     monkeypatch.setattr(FeatureExtractor, "forward", spy)
     together(sequence, begin, "condensation", "condensation_inflated", stop=3)

@@ -1,49 +1,58 @@
-"""Where the flow has carried the trunk: a prediction from the image instead of from the past.
+"""Where the picture has carried the trunk: a prediction from the image instead of from the past.
 
 A search looks about where a mode is expected, which is where it was, or where its own last motion
 leads (`ConstantVelocity`). Who begins to turn is farther on by some degrees in every frame; the
-flow on the shirt tells, but its term forgives what is off by pixels, and the arms that hang on the
-trunk are off by tens. Here each mode's trunk, taken alone, is fitted to the flow at its nodes
-before the search, from where its last motion leads:
+costs hardly tell a trunk turned by ten degrees from another, so that the modes fall behind until
+none can catch up. Here each mode's trunk, taken alone, is fitted before the search to what its
+surface looked like in the frame before, from where its last motion leads:
 
-    min_z  sum_j 1/2 rho(W_j |target_j - r_j(z)|^2)  +  1/2 sum_i ((z_i - z'_i) / (s d_i))^2
+    min_z  nats / sum_j w_j  sum_j e_j(z)  +  1/2 sum_i ((z_i - z'_i) / (s_i d_i))^2
 
-over the parameters z of root and spine, with the nodes j on the trunk, targets and weights of the
-flow term (`torchcss.cost.flow`) but a wider rho, z' what the last motion expects and d the motion
-expected in a frame. Limbs, neck and head come along as they hang: what is small is soon off its
-nodes, and the wall beside it stands still. The papers' trackers follow the flow in the cost alone
-(section 3.1.2 [IJRR]).
+over the parameters z of root and spine, with e_j and w_j the costs and weights of the nodes on the
+trunk (`torchcss.cost.surface`), z' what the last motion leads to and d the motion expected in a
+frame. Limbs, neck and head come along as they hang: what is small
+is soon off its nodes, and the wall beside it stands still. The papers' trackers follow motion in
+the cost alone (section 3.1.2 [IJRR]); trackers of one mode that live on it are older (Bregler and
+Malik, 1998).
 
-What to call: `carried`, once a frame, and `Displaced` for the tracker's dynamics.
+What to call: `Carrier(body)`, once, and in every frame `carrier(...)`; `Displaced` for the dynamics
+of the tracker.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchcss.body.catalog import PROPORTIONS
-from torchcss.body.model import BodyModel
-from torchcss.body.root import has_root
-from torchcss.cost.temporal import TemporalPrior
-from torchcss.cost.total import TrackingCost
-from torchcss.cost.view import View
+from torchcss.body.model import BodyModel, BodyPose
+from torchcss.body.root import ROOT_NAMES, has_root
+from torchcss.cost.flow import InteriorNodes
+from torchcss.cost.surface import SurfaceTargets, SurfaceTerm, surface_targets
+from torchcss.cost.visibility import visible_nodes
 from torchcss.inference.dynamics import Dynamics
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.types import Bounds, CostFunction, LocalModel
+from torchcss.types import Bounds, Curvature, LocalModel, PointCost
+from torchcss.vision.camera import Camera
+from torchcss.vision.spline import SplineField
 
-_SIGMA = 3.0
-"""Scale of the flow's error, pixels: what the expected trunk is off by, not what the flow is."""
+_NATS = 30.0
+"""What the surface weighs: nats per nu of mean cost per node seen."""
 
-_SPREAD = 8.0
-"""s: how many times the motion expected in a frame the flow may add to the last motion."""
+_SPREAD_POSITION = 0.5
+_SPREAD_ANGLE = 6.0
+"""s: how many times the motion expected in a frame the trunk may be off its last motion. A surface
+that turns moves to the side as well; where positions are as free as angles, a step is found that is
+half a turn (figures)."""
 
-_QUADRATIC = 1e6
-"""Tails so high, nats, that the prior on the motion has none."""
+_FEW_NODES = 10.0
+"""Nodes seen below which the surface weighs less."""
 
 
 @dataclass(frozen=True)
@@ -69,64 +78,204 @@ class Displaced:
         return spread._replace(mean=mixture.mean + self.displacement)
 
 
-def carried(
-    cost: TrackingCost, before: Float[Tensor, "k n"], expected: Float[Tensor, "k n"]
-) -> Float[Tensor, "k n"]:
-    """Poses with the trunk where the flow has carried it.
+class Sight(NamedTuple):
+    """What one camera has for the fit.
+
+    Attributes:
+        camera: The camera, at the size of the pictures.
+        before: Local contrast of the frame before; None if there was no picture.
+        now: Local contrast of this frame; None if there is no picture.
+    """
+
+    camera: Camera
+    before: SplineField | None
+    now: SplineField | None
+
+
+class Carrier:
+    """Fits the trunk of modes to where its surface has gone.
 
     Args:
-        cost: The frame's, with a flow target for the nodes of every mode.
-        before: The modes of the frame before.
-        expected: Where they are expected in this frame.
+        body: The body; later it may hang on another base.
 
-    Returns:
-        The expected poses, the trunk moved; as they are without flow, without a motion that is
-        expected (`FrameCosts`), and for bodies without root, trunk or flesh.
+    Attributes:
+        columns: Parameters that are fitted.
+        spread: s of each of them.
+        nodes: Nodes on the body's surface.
+        on_trunk: Those on the trunk.
+        knows: Whether there is anything to fit: not of a body without root, sides or flesh.
     """
-    body, interior, term = cost.body, cost.interior, cost.choice.flow
-    columns, parts = trunk_of(body)
-    told = [view for view in cost.views if view.targets is not None]
-    if interior is None or term is None or cost.deviation is None or not told or not len(columns):
-        return expected
-    nodes = parts[interior.node_part].to(before)
 
-    def alone(view: View) -> View:
-        targets = view.targets
-        if targets is not None:
-            targets = targets._replace(weight=targets.weight * nodes)
-        return View(camera=view.camera, targets=targets)
+    def __init__(self, body: BodyModel) -> None:
+        self.columns, parts = trunk_of(body)
+        steps = [name in ROOT_NAMES[:3] for name in body.state_names]
+        free = torch.where(torch.tensor(steps), _SPREAD_POSITION, _SPREAD_ANGLE)
+        self.spread = free.to(body.tie)[self.columns]
+        self.nodes = InteriorNodes(body, rings=12, meridians=16)
+        self.on_trunk = torch.nonzero(parts[self.nodes.node_part])[:, 0]
+        self.knows = bool(len(self.columns)) and bool(len(self.on_trunk))
 
-    first, *others = (alone(view) for view in cost.views)
-    choice = replace(
-        cost.choice.without_images(),
-        flow=replace(term, sigma=_SIGMA),
-        flow_weight=term.nu * interior.num_nodes,
-        temporal=TemporalPrior(nu=_QUADRATIC),
-        temporal_mixture=None,
-        stabiliser=None,
-        anthropometric=None,
-        interpenetration=None,
-        weights={},
-    )
-    deviation = _SPREAD * cost.deviation
-    start = before.index_copy(-1, columns, expected[:, columns])
-    trunk = TrackingCost(
-        body=body,
-        camera=first.camera,
-        choice=choice,
-        interior=interior,
-        targets=first.targets,
-        others=tuple(others),
-        parent=start,
-        deviation=deviation,
-    )
-    found = TrustRegionNewton().minimise(
-        _Restricted(trunk, columns, start),
-        start[:, columns],
-        Bounds(body.lower[columns].to(before), body.upper[columns].to(before)),
-        scale=deviation[columns],
-    )
-    return expected.index_copy(-1, columns, found.mean)
+    def __call__(
+        self,
+        body: BodyModel,
+        sights: Sequence[Sight],
+        *,
+        before: Float[Tensor, "k n"],
+        velocity: Float[Tensor, "k n"],
+        expected: Float[Tensor, "k n"],
+        deviation: Float[Tensor, " n"] | None,
+    ) -> Float[Tensor, "k n"]:
+        """Poses with the trunk where the pictures have carried it.
+
+        Args:
+            body: The body on this frame's base.
+            sights: What each camera has seen.
+            before: The modes of the frame before.
+            velocity: How far each moved into that frame.
+            expected: Where they are expected in this frame.
+            deviation: Motion expected in a frame; None: not known.
+
+        Returns:
+            The expected poses, the trunk moved; as they are without two pictures of one camera,
+            without a motion that is expected, and for bodies without root, sides or flesh.
+        """
+        columns = self.columns
+        views = self.views(body, sights, before) if self.knows else ()
+        if not views or deviation is None:
+            return expected
+        lower, upper = (bound[columns].to(before) for bound in (body.lower, body.upper))
+        start = (before + velocity)[:, columns].clamp(lower, upper)
+        spread = self.spread.to(before) * deviation[columns].to(before)
+        cost = SurfaceCost(
+            body=body,
+            nodes=self.nodes,
+            chosen=self.on_trunk,
+            views=views,
+            columns=columns,
+            held=expected,
+            expected=start,
+            deviation=spread,
+        )
+        found = TrustRegionNewton().minimise(cost, start, Bounds(lower, upper), scale=spread)
+        return expected.index_copy(-1, columns, found.mean)
+
+    def views(
+        self, body: BodyModel, sights: Sequence[Sight], before: Float[Tensor, "k n"]
+    ) -> tuple[SurfaceView, ...]:
+        """What the cameras that have two pictures tell of the trunk.
+
+        Args:
+            body: The body on this frame's base.
+            sights: What each camera has seen.
+            before: The modes of the frame before.
+        """
+        pose = body.pose(before)
+        surface, part = self.nodes(body, pose), self.nodes.node_part
+        points, normals = (each[..., self.on_trunk, :] for each in surface)
+        views = []
+        for camera, last, now in sights:
+            if last is None or now is None:
+                continue
+            eye = camera.centre_world
+            visible = visible_nodes(body, pose, eye, surface.points, part)[..., self.on_trunk]
+            views.append(
+                SurfaceView(camera, now, surface_targets(points, normals, visible, camera, last))
+            )
+        return tuple(views)
+
+
+class SurfaceView(NamedTuple):
+    """What one camera tells of the surface.
+
+    Attributes:
+        camera: The camera, at the size of the picture.
+        contrast: Local contrast of this frame.
+        targets: What the nodes of each item looked like in the frame before.
+    """
+
+    camera: Camera
+    contrast: SplineField
+    targets: SurfaceTargets
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceCost:
+    """The cost of the module's docstring, of some parameters; each item holds its others.
+
+    Attributes:
+        body: The body.
+        nodes: Nodes on its surface.
+        chosen: Those that are compared.
+        views: What each camera tells.
+        columns: The parameters.
+        held: All parameters of each item; those of `columns` do not count.
+        expected: Where the parameters are expected, z'.
+        deviation: How far off they may be, s d.
+        term: The cost of a node.
+    """
+
+    body: BodyModel
+    nodes: InteriorNodes
+    chosen: Int[Tensor, " p"]
+    views: tuple[SurfaceView, ...]
+    columns: Int[Tensor, " m"]
+    held: Float[Tensor, "b n"]
+    expected: Float[Tensor, "b m"]
+    deviation: Float[Tensor, " m"]
+    term: SurfaceTerm = field(default_factory=SurfaceTerm)
+
+    def take(self, items: Int[Tensor, " s"]) -> SurfaceCost:
+        """The cost restricted to some items."""
+        views = (view._replace(targets=view.targets.take(items)) for view in self.views)
+        held, expected = self.held[items], self.expected[items]
+        return replace(self, views=tuple(views), held=held, expected=expected)
+
+    def value(self, x: Float[Tensor, "b m"]) -> Float[Tensor, " b"]:
+        """Cost, nats."""
+        points, normals = self._surface(self.body.pose(self._whole(x)))
+        total = 0.5 * ((x - self.expected) / self.deviation).square().sum(-1)
+        for camera, contrast, targets in self.views:
+            nodes = self.term.value(points, normals, camera, contrast, targets)
+            total = total + (_share(targets) * nodes).sum(-1)
+        return total
+
+    def local_model(self, x: Float[Tensor, "b m"]) -> LocalModel:
+        """Cost, gradient and Gauss-Newton Hessian, facing held fixed."""
+        pose = self.body.pose(self._whole(x))
+        points, normals = self._surface(pose)
+        value, gradient, hessian = points.new_zeros(()), points.new_zeros(()), points.new_zeros(())
+        for view in self.views:
+            cost = self.term.point_cost(points, normals, *view, gauss_newton=True)
+            share = _share(view.targets)
+            value = value + share * cost.value
+            gradient = gradient + share[..., None] * cost.gradient
+            hessian = hessian + share[..., None, None] * cost.hessian
+        lifted = self.body.lift(
+            pose,
+            points,
+            self.nodes.node_link[self.chosen],
+            PointCost(value, gradient, hessian),
+            curvature=Curvature.GAUSS_NEWTON,
+        )
+        off, columns = (x - self.expected) / self.deviation, self.columns
+        prior = torch.diag(self.deviation.square().reciprocal())
+        return LocalModel(
+            lifted.value + 0.5 * off.square().sum(-1),
+            lifted.gradient[:, columns] + off / self.deviation,
+            lifted.hessian[:, columns[:, None], columns] + prior,
+        )
+
+    def _whole(self, x: Tensor) -> Tensor:
+        return self.held.index_copy(-1, self.columns, x)
+
+    def _surface(self, pose: BodyPose) -> tuple[Tensor, Tensor]:
+        points, normals = self.nodes(self.body, pose)
+        return points[..., self.chosen, :], normals[..., self.chosen, :]
+
+
+def _share(targets: SurfaceTargets) -> Float[Tensor, "b 1"]:
+    """Nats per nu that each node weighs."""
+    return _NATS / targets.weight.sum(-1, keepdim=True).clamp(min=_FEW_NODES)
 
 
 def trunk_of(body: BodyModel) -> tuple[Int[Tensor, " m"], Bool[Tensor, " parts"]]:
@@ -149,28 +298,3 @@ def trunk_of(body: BodyModel) -> tuple[Int[Tensor, " m"], Bool[Tensor, " parts"]
     shared = both & angles & has_root(body)
     parts = ~moves[angles & ~shared].any(0) & shared.any()
     return torch.nonzero(shared)[:, 0], parts
-
-
-@dataclass(frozen=True)
-class _Restricted:
-    """A cost of some parameters, the others held; each item has its own."""
-
-    cost: CostFunction
-    columns: Int[Tensor, " m"]
-    held: Float[Tensor, "b n"]
-
-    def take(self, items: Int[Tensor, " s"]) -> _Restricted:
-        return replace(self, cost=self.cost.take(items), held=self.held[items])  # type: ignore[attr-defined]
-
-    def value(self, x: Float[Tensor, "b m"]) -> Float[Tensor, " b"]:
-        return self.cost.value(self._whole(x))
-
-    def local_model(self, x: Float[Tensor, "b m"]) -> LocalModel:
-        value, gradient, hessian = self.cost.local_model(self._whole(x))
-        columns = self.columns
-        return LocalModel(
-            value, gradient[:, columns], hessian[:, columns[:, None], columns[None, :]]
-        )
-
-    def _whole(self, x: Tensor) -> Tensor:
-        return self.held.index_copy(-1, self.columns, x)

@@ -120,9 +120,9 @@ class Track:
     """Samples per frame; the preset's number by default."""
     modes: int | None = None
     """Modes kept; the preset's number by default."""
-    prediction: Literal["velocity", "flow"] = "velocity"
-    """Where the trunk of a mode is expected: where its own last motion leads, or where the flow has
-    carried it, for a person who begins to turn."""
+    prediction: Literal["velocity", "surface"] = "velocity"
+    """Where the trunk of a mode is expected: where its own last motion leads, or where its surface
+    has gone in the picture, for a person who turns."""
     oversampling: int = 1
     """Draw so many times as many samples; those with the best edges descend."""
     evidence: float | None = None

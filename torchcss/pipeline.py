@@ -25,7 +25,7 @@ from torch import Tensor
 
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, has_root, move_base, root_pose
-from torchcss.carry import Displaced, carried
+from torchcss.carry import Carrier, Displaced, Sight
 from torchcss.cost.frame import FrameCosts, beside
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.inference.mixture import GaussianMixture, tempered
@@ -130,8 +130,8 @@ def track_frames(
         jumps_every: Every how many frames the flips of the best mode join the search, see
             `torchcss.jumps`; 0: never. Not where several cameras look on: to them a flip looks
             different.
-        carries: Whether the flow tells where each mode's trunk is expected, see `torchcss.carry`,
-            and carries itself on from frame to frame. Not for particle filters.
+        carries: Whether the pictures tell where each mode's trunk is expected, see
+            `torchcss.carry`. Not for particle filters.
         others: What further cameras send.
 
     Yields:
@@ -146,12 +146,13 @@ def track_frames(
             frame_interval=frame_interval,
             boundary_emphasis=boundary_emphasis,
         )
-        return Watcher(costs, extractor, observe, masks, carry_flow=carries)
+        return Watcher(costs, extractor, observe, masks, carries=carries)
 
     watchers = [watcher(camera, observe, masks)]
     watchers += [watcher(other.camera, other.observe, other.masks) for other in others]
     streams = [iter(other.frames) for other in others]
     state = tracker.init(mixture, generator=generator)
+    carrier = Carrier(body) if carries else None
     lost, num_lost = False, 0
     watch = None if recovery is None else recovery.monitor.init()
     for frame in frames:
@@ -172,8 +173,22 @@ def track_frames(
         featured = time.perf_counter()
         prior = state.mixture
         bounds = body.bounds if limits else unbounded(prior.mean)
-        if carries and isinstance(searching, Tracker):
-            searching = _carried(searching, state, cost)
+        if carrier is not None and isinstance(searching, Tracker):
+            sights = [
+                Sight(view.camera, *each.contrasts)
+                for view, each in zip(cost.views, watchers, strict=True)
+            ]
+            mean = state.mixture.mean
+            expected = carrier(
+                body,
+                sights,
+                before=mean,
+                velocity=state.velocity,
+                expected=searching.dynamics.predict(state.mixture, state.velocity).mean,
+                deviation=cost.deviation,
+            )
+            dynamics = Displaced(searching.dynamics, expected - mean)
+            searching = replace(searching, dynamics=dynamics)
         asked: list[GaussianMixture] = []
         state, info = searching.step(state, _noting(cost, asked), bounds)
         if len(prior.mean) > num_prior:
@@ -214,14 +229,6 @@ def track_frames(
             beside_it,
         )
         body, state = follow_with_base(body, state)
-
-
-def _carried(tracker: Tracker, state: TrackerState, cost: TrackingCost) -> Tracker:
-    """The tracker that expects the trunk of each mode where the flow has carried it."""
-    mean = state.mixture.mean
-    expected = tracker.dynamics.predict(state.mixture, state.velocity).mean
-    moved = carried(cost, mean, expected) - mean
-    return replace(tracker, dynamics=Displaced(tracker.dynamics, moved))
 
 
 def _noting(cost: TrackingCost, priors: list[GaussianMixture]) -> CostFactory:

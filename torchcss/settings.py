@@ -76,9 +76,9 @@ class Settings:
         preset: Tracker, a name in `presets.PRESETS`.
         samples: Samples per frame; the preset's number by default.
         modes: Modes kept; the preset's number by default.
-        prediction: "velocity": a mode is expected where its own last motion leads; "flow": its
-            trunk is where the flow has carried it, and the flow goes on from the frame before, see
-            `torchcss.carry`. For trackers that descend from samples.
+        prediction: "velocity": a mode is expected where its own last motion leads; "surface": its
+            trunk is where its surface has gone in the picture, see `torchcss.carry`. For trackers
+            that descend from samples.
         oversampling: How many times as many samples are drawn; those with the best edges descend,
             see `Tracker`.
         evidence: Power of a frame's likelihood in the weights of modes, above 0 and at most 1, see
@@ -103,7 +103,7 @@ class Settings:
     preset: str = "css"
     samples: int | None = None
     modes: int | None = None
-    prediction: Literal["velocity", "flow"] = "velocity"
+    prediction: Literal["velocity", "surface"] = "velocity"
     oversampling: int = 1
     evidence: float | None = None
     keypoints_use: Literal["first", "all"] = "all"
@@ -152,17 +152,14 @@ class Settings:
             raise ConfigurationError(
                 f"oversampling: {self.preset} does not descend from samples; leave it at 1"
             )
-        if self.prediction not in ("velocity", "flow"):
+        if self.prediction not in ("velocity", "surface"):
             raise ConfigurationError(
-                f"prediction must be velocity or flow, got {self.prediction!r}"
+                f"prediction must be velocity or surface, got {self.prediction!r}"
             )
-        if self.prediction == "flow":
-            if PRESETS[self.preset].particles is not None:
-                raise ConfigurationError(
-                    f"prediction: {self.preset} moves particles, not modes; leave it at velocity"
-                )
-            if "flow" not in self.terms:
-                raise ConfigurationError('prediction "flow" needs the term flow')
+        if self.prediction == "surface" and PRESETS[self.preset].particles is not None:
+            raise ConfigurationError(
+                f"prediction: {self.preset} moves particles, not modes; leave it at velocity"
+            )
         if self.evidence is not None:
             if not 0 < self.evidence <= 1:
                 raise ConfigurationError(

@@ -98,16 +98,14 @@ class SharedFeatures(FeatureExtractor):
         self.to(dtype=extractor.luma.dtype, device=extractor.luma.device)
         self._last: tuple[tuple[Any, ...], FrameFeatures] | None = None
 
-    def forward(
-        self, frame: Any, previous: Any = None, mask: Any = None, *, before: Any = None
-    ) -> FrameFeatures:
+    def forward(self, frame: Any, previous: Any = None, mask: Any = None) -> FrameFeatures:
         """See `FeatureExtractor`; the same objects as last time give the same features."""
-        asked = (frame, previous, mask, before)
+        asked = (frame, previous, mask)
         if self._last is not None and all(
             have is want for have, want in zip(self._last[0], asked, strict=True)
         ):
             return self._last[1]
-        self._last = (asked, super().forward(frame, previous, mask, before=before))
+        self._last = (asked, super().forward(*asked))
         return self._last[1]
 
 
@@ -225,5 +223,5 @@ def _follow(
         limits=PRESETS[settings.preset].limits,
         recovery=Recovery() if settings.recovery else None,
         jumps_every=PRESETS[settings.preset].jumps_every,
-        carries=settings.prediction == "flow",
+        carries=settings.prediction == "surface",
     )

@@ -72,7 +72,6 @@ def smooth_frames(
     choice: Smoothing | None = None,
     boundary_emphasis: float = 0.0,
     masks: Iterable[np.ndarray | Tensor] | None = None,
-    carries: bool = False,
     others: Sequence[ViewStream] = (),
 ) -> SmoothedTrack:
     """Smooth a track, and fit the result to the images again.
@@ -91,7 +90,6 @@ def smooth_frames(
         choice: How to smooth; `IMAGES` by default.
         boundary_emphasis: See `FrameFeatures.edge_field`.
         masks: Foreground of each of the images; None: not known.
-        carries: Whether the flow carries itself on from frame to frame, as it was tracked.
         others: What further cameras send, see `torchcss.pipeline.track_frames`.
 
     Raises:
@@ -115,7 +113,6 @@ def smooth_frames(
             extractor,
             view.observe,
             view.masks,
-            carry_flow=carries,
         )
         for view in (ViewStream(frames, camera, observe, masks), *others)
     ]
@@ -247,7 +244,6 @@ def smooth_video(
         choice=choice,
         boundary_emphasis=boundary_emphasis(settings),
         masks=main.masks,
-        carries=settings.prediction == "flow",
         others=beside_it,
     )
     return write_smoothed(done, into, folder)

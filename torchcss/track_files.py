@@ -191,7 +191,7 @@ def track_video(
         boundary_emphasis=boundary_emphasis(settings),
         limits=PRESETS[settings.preset].limits,
         jumps_every=PRESETS[settings.preset].jumps_every,
-        carries=settings.prediction == "flow",
+        carries=settings.prediction == "surface",
         recovery=Recovery() if settings.recovery else None,
         masks=main.masks,
         others=streams[1:],

@@ -22,7 +22,9 @@ from torchcss.stopwatch import Stopwatch
 from torchcss.vision.appearance import Appearance
 from torchcss.vision.background import Background
 from torchcss.vision.camera import Camera
+from torchcss.vision.contrast import local_contrast
 from torchcss.vision.features import FeatureExtractor, FrameFeatures
+from torchcss.vision.spline import SplineField, spline_field
 
 Observe = Callable[[int], JointObservation | None]
 """Keypoints of a frame by its index, in pixels of the working image; None if there are none."""
@@ -52,12 +54,14 @@ class Watcher:
         extractor: Makes the features.
         observe: Keypoints by frame.
         masks: Foreground of each of the images; None: not known.
-        carry_flow: Whether the flow of each image starts from that of the one before too.
+        carries: Whether the image tells where the trunk is expected, see `torchcss.carry`.
 
     Attributes:
         features: Those of the image taken in last; None if the view is out.
         appearance: What body and surroundings look like; None: not known yet.
         background: What is behind the body; None: not known yet, or not asked for.
+        contrasts: Local contrast of the image before and of the one taken in last; None where there
+            is no picture, or nobody asks.
     """
 
     def __init__(
@@ -67,9 +71,9 @@ class Watcher:
         observe: Observe,
         masks: Iterable[np.ndarray | Tensor] | None,
         *,
-        carry_flow: bool = False,
+        carries: bool = False,
     ) -> None:
-        self.carry_flow = carry_flow
+        self.carries = carries
         self.costs, self.extractor, self.observe = costs, extractor, observe
         self.masks = None if masks is None else iter(masks)
         self.last: np.ndarray | None = None
@@ -77,10 +81,11 @@ class Watcher:
         self.background: Background | None = None
         self.index: int | None = None
         self.features: FrameFeatures | None = None
+        self.contrasts: tuple[SplineField | None, SplineField | None] = (None, None)
 
     def look(self, frame: Frame | None) -> None:
         """Take in the next image; None, or one of a single colour, is a view that is out."""
-        before = self.features if self.carry_flow else None
+        self.contrasts = (self.contrasts[1], None)
         self.index, self.features = None if frame is None else frame.index, None
         if frame is None:
             self.last = None
@@ -92,8 +97,12 @@ class Watcher:
         if frame.image.size and frame.image.min() == frame.image.max():
             self.last = None
             return
-        features = self.extractor(frame.image, self.last, mask, before=before)
+        features = self.extractor(frame.image, self.last, mask)
         self.features, self.last, colour = features, frame.image, features.colour
+        if self.carries:
+            # Single precision is far finer than what is compared, and twice as fast.
+            contrast = local_contrast(features.grey.float()).to(features.grey)
+            self.contrasts = (self.contrasts[0], spline_field(contrast))
         if self.background is not None and colour is not None and not self.background.holds(colour):
             self.background = None
 

@@ -131,18 +131,6 @@ class CostChoice:
     weights: Mapping[str, float] = field(default_factory=dict)
     curvature: Curvature = Curvature.EXACT
 
-    def without_images(self) -> CostChoice:
-        """The priors alone, and what only weighs modes."""
-        return replace(
-            self,
-            contour=None,
-            edge_energy=None,
-            region=None,
-            silhouette=None,
-            flow=None,
-            joints=None,
-        )
-
 
 class _Observed(NamedTuple):
     """One image term at one batch of poses: where its points are, and how to evaluate it there."""
@@ -240,12 +228,12 @@ class TrackingCost(View):
         if joints is None or all(view.observation is None for view in self.views):
             return None
         wide = replace(joints, sigma=COARSE_SCALE * joints.sigma)
-        return replace(self, choice=replace(self.choice.without_images(), joints=wide))
+        return replace(self, choice=replace(self._without_images(), joints=wide))
 
     def screening(self) -> TrackingCost:
         """The edges alone, by which [RR] section 4.2 scores sampled hypotheses for speed."""
         edges = replace(
-            self.choice.without_images(),
+            self._without_images(),
             contour=self.choice.contour,
             edge_energy=self.choice.edge_energy,
             region=self.choice.region,
@@ -305,6 +293,17 @@ class TrackingCost(View):
     def local_model(self, x: Float[Tensor, "*batch n"]) -> LocalModel:
         """Cost, gradient and Hessian, visibility and assignments found at x and held fixed."""
         return LocalModel(*self._chunked(lambda x, part: tuple(part._local_model(x)), x))
+
+    def _without_images(self) -> CostChoice:
+        return replace(
+            self.choice,
+            contour=None,
+            edge_energy=None,
+            region=None,
+            silhouette=None,
+            flow=None,
+            joints=None,
+        )
 
     @property
     def _chunk(self) -> int:

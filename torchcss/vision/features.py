@@ -167,8 +167,6 @@ class FeatureExtractor(nn.Module):
         frame: Frame | np.ndarray,
         previous: Frame | np.ndarray | None = None,
         mask: Bool[Tensor, "h w"] | Float[Tensor, "h w"] | np.ndarray | None = None,
-        *,
-        before: FrameFeatures | None = None,
     ) -> FrameFeatures:
         """Extract the features of one frame.
 
@@ -178,8 +176,6 @@ class FeatureExtractor(nn.Module):
             previous: The frame before, of the same size; None, or an extractor without flow
                 configuration: no features of motion.
             mask: Foreground of the frame, of the same size: boolean, or in the types of `frame`.
-            before: Features of the frame before, whose flow is carried on, see `robust_flow`; None:
-                the flow is found from these two frames alone.
 
         Raises:
             ShapeError: If a picture is of another shape or type, empty, or outside 0..1 or not
@@ -206,24 +202,17 @@ class FeatureExtractor(nn.Module):
         if previous is None or self.flow is None:
             return features
         return self._with_motion(
-            features, self._resized(self._grey("previous", previous)), self.flow, before
+            features, self._resized(self._grey("previous", previous)), self.flow
         )
 
     def _with_motion(
-        self,
-        features: FrameFeatures,
-        previous: Float[Tensor, "h w"],
-        choice: FlowConfiguration,
-        before: FrameFeatures | None,
+        self, features: FrameFeatures, previous: Float[Tensor, "h w"], choice: FlowConfiguration
     ) -> FrameFeatures:
         """Add flow, outlier map and motion boundaries."""
         grey = features.grey
         if not _is_flat(previous) and not _is_flat(grey):
             # Single precision is far finer than the flow's error, and twice as fast.
-            last = None
-            if before is not None and before.flow is not None and before.flow_outlier is not None:
-                last = before.flow.float(), before.flow_outlier.float()
-            flow = robust_flow(previous.float(), grey.float(), choice, before=last)
+            flow = robust_flow(previous.float(), grey.float(), choice)
             if float(flow.data_outlier.mean()) < _CUT_SHARE:
                 doubt = _DISCONTINUITY_DOUBT * flow.smoothness_outlier
                 held = (1.0 - flow.data_outlier) * (1.0 - doubt)

@@ -1,0 +1,133 @@
+"""The surface term: plain twin, derivatives on awkward input, what is not seen says nothing."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchcss.cost.surface import SurfaceTargets, SurfaceTerm, surface_targets
+from torchcss.cost.visibility import front_facing
+from torchcss.robust import Leclerc
+from torchcss.vision.camera import Camera
+from torchcss.vision.spline import SplineField, spline_field
+
+WIDTH, HEIGHT = 64, 48
+
+
+def make_camera(distortion: list[float] | None = None) -> Camera:
+    return Camera(
+        [[60.0, 0.0, 31.0], [0.0, 58.0, 24.0], [0.0, 0.0, 1.0]],
+        (WIDTH, HEIGHT),
+        distortion=distortion,
+    )
+
+
+def a_field(generator: torch.Generator) -> SplineField:
+    return spline_field(torch.randn(1, HEIGHT, WIDTH, generator=generator, dtype=torch.float64))
+
+
+def some_nodes(generator: torch.Generator, *, count: int = 40) -> tuple[Tensor, Tensor]:
+    """Nodes in the image, beside it, and behind the camera; some of them turned away."""
+    points = torch.randn(2, count, 3, generator=generator, dtype=torch.float64)
+    points[..., 2] = points[..., 2].abs() + 1.5
+    points[:, 0, :2] = 4.0
+    points[:, 1, 2] = -1.0
+    normals = torch.randn(2, count, 3, generator=generator, dtype=torch.float64)
+    return points, torch.nn.functional.normalize(normals, dim=-1)
+
+
+def some_targets(generator: torch.Generator, *, count: int = 40) -> SurfaceTargets:
+    level = torch.randn(2, count, generator=generator, dtype=torch.float64)
+    weight = torch.rand(2, count, generator=generator, dtype=torch.float64)
+    weight[:, 5] = 0
+    return SurfaceTargets(level, weight)
+
+
+def test_value_is_the_docstring(generator: torch.Generator) -> None:
+    camera, field, term = make_camera(), a_field(generator), SurfaceTerm(sigma=0.7)
+    (points, normals), targets = some_nodes(generator), some_targets(generator)
+    value = term.value(points, normals, camera, field, targets)
+    facing = front_facing(points, normals, camera.centre_world)
+    for item in range(2):
+        for node in range(points.shape[1]):
+            uv = camera.project(points[item, node][None]).uv
+            residual = float(field.value(uv)) - float(targets.level[item, node])
+            rho = 1 - math.exp(-((residual / 0.7) ** 2))
+            f, w = float(facing[item, node]), float(targets.weight[item, node])
+            expected = w * (f * 0.5 * rho + (1 - f) * term.fitted_level)
+            assert float(value[item, node]) == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize("distortion", [None, [-0.33, 0.046, -0.0043, 0.0041, 0.067]])
+def test_derivatives_are_those_of_autograd(
+    generator: torch.Generator, distortion: list[float] | None
+) -> None:
+    camera, field, term = make_camera(distortion), a_field(generator), SurfaceTerm()
+    (points, normals), targets = some_nodes(generator), some_targets(generator)
+    facing = front_facing(points, normals, camera.centre_world)
+    cost = term.point_cost(points, normals, camera, field, targets)
+    torch.testing.assert_close(cost.value, term.value(points, normals, camera, field, targets))
+
+    def total(at: Tensor) -> Tensor:
+        error = field.value(camera.project(at).uv) - targets.level
+        rho = Leclerc(nu=term.nu, sigma=term.sigma)(error.square()).rho
+        return (targets.weight * facing * 0.5 * rho).sum()
+
+    at = points.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(total(at), at, create_graph=True)
+    torch.testing.assert_close(cost.gradient, gradient.detach())
+    rows = [
+        torch.autograd.grad(gradient[..., axis].sum(), at, retain_graph=True)[0]
+        for axis in range(3)
+    ]
+    torch.testing.assert_close(cost.hessian, torch.stack(rows, dim=-2), atol=1e-9, rtol=1e-7)
+    # Beside the image and behind the camera there is nothing to go by.
+    assert torch.equal(cost.gradient[:, :2], torch.zeros_like(cost.gradient[:, :2]))
+    assert torch.equal(cost.value[:, 5], torch.zeros_like(cost.value[:, 5]))
+
+
+def test_gauss_newton_has_no_negative_eigenvalue(generator: torch.Generator) -> None:
+    camera, field, term = make_camera(), a_field(generator), SurfaceTerm()
+    (points, normals), targets = some_nodes(generator), some_targets(generator)
+    exact = term.point_cost(points, normals, camera, field, targets)
+    model = term.point_cost(points, normals, camera, field, targets, gauss_newton=True)
+    assert torch.equal(model.value, exact.value)
+    assert torch.equal(model.gradient, exact.gradient)
+    assert torch.linalg.eigvalsh(exact.hessian).min() < -0.1
+    assert torch.linalg.eigvalsh(model.hessian).min() > -1e-10
+    # Where the two pictures agree it is the Hessian.
+    agreed = targets._replace(level=field.value(camera.project(points).uv))
+    exact = term.point_cost(points, normals, camera, field, agreed)
+    model = term.point_cost(points, normals, camera, field, agreed, gauss_newton=True)
+    torch.testing.assert_close(model.hessian, exact.hessian, atol=1e-9, rtol=1e-9)
+
+
+def test_where_the_surface_was_it_costs_nothing(generator: torch.Generator) -> None:
+    camera, field, term = make_camera(), a_field(generator), SurfaceTerm()
+    points, _ = some_nodes(generator)
+    towards = torch.nn.functional.normalize(camera.centre_world - points, dim=-1)
+    visible = torch.ones(points.shape[:-1], dtype=torch.float64)
+    visible[:, 7] = 0
+    targets = surface_targets(points, towards, visible, camera, field)
+    assert torch.equal(term.value(points, towards, camera, field, targets), 0 * visible)
+    hidden = targets.weight == 0
+    assert hidden[:, [0, 1, 7]].all()
+    uv, valid = camera.project(points).uv, camera.project(points).valid
+    inside = ((uv >= 0) & (uv <= uv.new_tensor([WIDTH - 1, HEIGHT - 1]))).all(-1) & valid
+    assert torch.equal(hidden, ~(inside & (visible > 0)))
+    away = surface_targets(points, -towards, visible, camera, field)
+    assert not away.weight.any()
+    assert torch.equal(targets.take(torch.tensor([1])).level, targets.level[1:])
+
+
+def test_turning_away_is_no_gain(generator: torch.Generator) -> None:
+    """A node that faces away costs as much as one that is found, not less."""
+    camera, field, term = make_camera(), a_field(generator), SurfaceTerm()
+    points, _ = some_nodes(generator)
+    towards = torch.nn.functional.normalize(camera.centre_world - points, dim=-1)
+    targets = surface_targets(points, towards, torch.ones(2, 40).double(), camera, field)
+    away = term.value(points, -towards, camera, field, targets)
+    torch.testing.assert_close(away, term.fitted_level * targets.weight)
