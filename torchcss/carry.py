@@ -10,10 +10,9 @@ surface looked like in the frame before, from where its last motion leads:
 
 over the parameters z of root and spine, with e_j and w_j the costs and weights of the nodes on the
 trunk (`torchcss.cost.surface`), z' what the last motion leads to and d the motion expected in a
-frame. Limbs, neck and head come along as they hang: what is small
-is soon off its nodes, and the wall beside it stands still. The papers' trackers follow motion in
-the cost alone (section 3.1.2 [IJRR]); trackers of one mode that live on it are older (Bregler and
-Malik, 1998).
+frame. Limbs, neck and head come along as they hang: what is small is soon off its nodes, and the
+wall beside it stands still. The papers' trackers follow motion in the cost alone (section 3.1.2
+[IJRR]); trackers of one mode that live on it are older (Bregler and Malik, 1998).
 
 What to call: `Carrier(body)`, once, and in every frame `carrier(...)`; `Displaced` for the dynamics
 of the tracker.
@@ -48,8 +47,8 @@ _NATS = 30.0
 _SPREAD_POSITION = 0.5
 _SPREAD_ANGLE = 6.0
 """s: how many times the motion expected in a frame the trunk may be off its last motion. A surface
-that turns moves to the side as well; where positions are as free as angles, a step is found that is
-half a turn (figures)."""
+that turns moves to the side as well; were positions as free as angles, half of a turn would be
+taken for a step to the side."""
 
 _FEW_NODES = 10.0
 """Nodes seen below which the surface weighs less."""
@@ -169,18 +168,15 @@ class Carrier:
             sights: What each camera has seen.
             before: The modes of the frame before.
         """
-        pose = body.pose(before)
-        surface, part = self.nodes(body, pose), self.nodes.node_part
-        points, normals = (each[..., self.on_trunk, :] for each in surface)
+        pose, part = body.pose(before), self.nodes.node_part[self.on_trunk]
+        points, normals = (each[..., self.on_trunk, :] for each in self.nodes(body, pose))
         views = []
         for camera, last, now in sights:
             if last is None or now is None:
                 continue
-            eye = camera.centre_world
-            visible = visible_nodes(body, pose, eye, surface.points, part)[..., self.on_trunk]
-            views.append(
-                SurfaceView(camera, now, surface_targets(points, normals, visible, camera, last))
-            )
+            visible = visible_nodes(body, pose, camera.centre_world, points, part)
+            targets = surface_targets(points, normals, visible, camera, last)
+            views.append(SurfaceView(camera, now, targets))
         return tuple(views)
 
 
