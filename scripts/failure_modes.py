@@ -33,7 +33,7 @@ from torchcss.io.sequences import RecordedSequence, read_sequence
 from torchcss.io.tracks import prepare_output_folder, read_summary, write_summary
 from torchcss.presets import PRESETS
 from torchcss.published import PUBLISHED
-from torchcss.settings import Settings
+from torchcss.settings import TERMS, Settings, named_terms
 from torchcss.side_by_side import Run, Start, find_start, track_together
 from torchcss.yardstick import Thresholds, over_seeds, summarise
 
@@ -74,6 +74,12 @@ class Config:
     """Body to track, where the sequence does not say which one moved."""
     keypoints_use: Literal["first", "all"] = "first"
     """Where keypoints are used: for the first pose only, as in the paper, or in all frames."""
+    prediction: Literal["velocity", "surface"] = "velocity"
+    """Where trunks are expected, see `torchcss.settings.Settings`; not for particle filters."""
+    terms: tuple[str, ...] = TERMS
+    """Terms and priors of the cost; `default` stands for the default ones."""
+    evidence: float | None = None
+    """How much one frame counts in the weights of modes; the presets' numbers by default."""
     start: int = 0
     """First frame."""
     frames: int | None = None
@@ -144,13 +150,15 @@ def groups_of(config: Config, done: set[tuple[str, int]]) -> Iterator[list[tuple
 
 def study_of(config: Config, sequence: RecordedSequence, thresholds: Thresholds) -> dict[str, Any]:
     """What all runs of a file have in common."""
-    shared = ("keypoints_use", "start", "frames", "stop_when_lost", "small", "dtype")
+    tracked = ("keypoints_use", "prediction", "evidence", "dtype")
+    shared = (*tracked, "start", "frames", "stop_when_lost", "small")
     return {
         "sequence": sequence.name,
         "num_frames": sequence.num_frames,
         "frame_rate": sequence.frame_rate,
         "body": config.body if sequence.truth is None else sequence.truth.body.name,
         "thresholds": asdict(thresholds),
+        "terms": list(named_terms(config.terms)),
         **{name: getattr(config, name) for name in shared},
     }
 
@@ -191,6 +199,7 @@ def settings_of(config: Config, body: str, preset: str, seed: int) -> Settings:
     """How one tracker runs."""
     settings = Settings(
         body=body, preset=preset, seed=seed, keypoints_use=config.keypoints_use,
+        prediction=config.prediction, terms=named_terms(config.terms), evidence=config.evidence,
         device=config.device, dtype=config.dtype, overlay=False,
     )  # fmt: skip
     if not config.small:

@@ -16,6 +16,7 @@ from torchcss.errors import ConfigurationError
 from torchcss.io.failure_plots import ErrorCurves, error_curves, failure_figure
 from torchcss.presets import PRESETS
 from torchcss.published import PUBLISHED
+from torchcss.settings import TERMS
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from made_sequences import write_arm
@@ -85,8 +86,9 @@ def test_small_mode_and_resume(
     assert "0/2" in text
     assert "never" in text
 
-    with pytest.raises(ConfigurationError, match="another study"):
-        script.main(script.Config(resume=True, start=1, **options))
+    for change in ({"start": 1}, {"terms": ("default", "background")}, {"prediction": "surface"}):
+        with pytest.raises(ConfigurationError, match="another study"):
+            script.main(script.Config(resume=True, **change, **options))
     with pytest.raises(ConfigurationError, match="at least 1, got 0"):
         script.main(script.Config(together=0, **options))
 
@@ -101,6 +103,16 @@ def test_small_mode_and_resume(
     found = {(run["preset"], run["seed"]): run["root_aligned_mm"] for run in again["runs"]}
     for run in report["runs"]:
         assert found[run["preset"], run["seed"]] == run["root_aligned_mm"]
+
+
+def test_how_trackers_are_set_up_can_be_chosen(script: ModuleType, arm: Path) -> None:
+    config = script.Config(
+        sequence=arm, terms=("default", "silhouette"), evidence=0.3, prediction="surface"
+    )
+    settings = script.settings_of(config, "body34", "css", 1)
+    assert settings.terms == (*TERMS, "silhouette")
+    assert (settings.evidence, settings.prediction, settings.seed) == (0.3, "surface", 1)
+    assert script.settings_of(script.Config(sequence=arm), "arm8", "css", 0).terms == TERMS
 
 
 def test_a_lost_track_in_the_table(
