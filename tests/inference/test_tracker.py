@@ -1,6 +1,6 @@
 import io
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -90,6 +90,56 @@ def test_a_step_is_a_pure_function_of_the_state(generator):
     b, _ = CSS.step(state, problems.DoubleWell(), BOUNDS)
     assert torch.equal(a.mixture.mean, b.mixture.mean)
     assert torch.equal(generator.get_state(), state.generator_state)
+
+
+@dataclass(frozen=True)
+class FarWells:
+    """Two wells that have moved ten widths away from the modes; the smoother self reaches them."""
+
+    width: float = 0.1
+
+    centres = torch.tensor([[-3.0, 0.0], [3.0, 0.0]]).double()
+
+    def _cost(self):
+        def function(x):
+            squared = (x - self.centres.to(x)).square().sum(-1)
+            return -20 * (-0.5 * squared / self.width**2).exp().sum()
+
+        return problems.AutogradCost(function)
+
+    def value(self, x):
+        return self._cost().value(x)
+
+    def local_model(self, x):
+        return self._cost().local_model(x)
+
+    def coarse(self):
+        return None if self.width > 1 else replace(self, width=2.0)
+
+
+@pytest.mark.parametrize("num_samples", [12, 3, 2])
+def test_every_mode_descends_on_the_smoother_cost(num_samples, generator):
+    """Also one that is hardly ever sampled; the modes descend as they are, too."""
+    mean = FarWells.centres + torch.tensor([0.0, 1.0]).double()
+    covariance = 1e-4 * torch.eye(2).double().expand(2, 2, 2)
+    mixture = GaussianMixture(mean, covariance, torch.tensor([0.0, -30.0]).double())
+    tracker = replace(CSS, num_samples=num_samples, num_modes=4, coarse_every=3)
+    state, info = tracker.step(tracker.init(mixture, generator=generator), FarWells(), BOUNDS)
+    found = torch.cdist(FarWells.centres, state.mixture.mean) < 1e-3
+    assert int(info.num_samples) == num_samples
+    if num_samples == 12:
+        assert found.any(1).tolist() == [True, True]
+        origin = info.origin[found.long().argmax(1)]
+        assert origin.tolist() == [0, 1]
+        # Those that were not so started are where they were.
+        assert int(info.num_distinct) >= 4
+    elif num_samples == 3:  # one is drawn, and the best mode begins
+        assert found.any(1).tolist() == [True, False]
+    else:  # nothing is drawn: the modes themselves begin
+        assert found.any(1).tolist() == [True, True]
+    never = replace(tracker, coarse_every=0)
+    state, _ = never.step(never.init(mixture, generator=generator), FarWells(), BOUNDS)
+    assert not (torch.cdist(FarWells.centres, state.mixture.mean) < 0.5).any()
 
 
 class Shuffled:

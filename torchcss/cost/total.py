@@ -69,7 +69,8 @@ _PAIRS = 64
 """Pairs of a node and a point of the silhouette that take as much memory as one node."""
 
 COARSE_SCALE = 6.0
-"""How much wider the keypoints' scale is in the coarse cost: a missed limb is then no outlier."""
+"""How much farther off a keypoint may be in the coarse cost before it counts as an outlier. Their
+noise stays what it is: were it so much wider, the temporal prior would hold every limb back."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -220,15 +221,15 @@ class TrackingCost(View):
         return cost
 
     def coarse(self) -> TrackingCost | None:
-        """The keypoints alone with a wide scale: what finds a limb that moved too fast for edges.
+        """The keypoints alone, none an outlier: what finds a limb that moved too fast for edges.
 
         None in frames without keypoints.
         """
         joints = self.choice.joints
         if joints is None or all(view.observation is None for view in self.views):
             return None
-        wide = replace(joints, sigma=COARSE_SCALE * joints.sigma)
-        return replace(self, choice=replace(self._without_images(), joints=wide))
+        trusting = replace(joints, nu=COARSE_SCALE**2 * joints.nu)
+        return replace(self, choice=replace(self._without_images(), joints=trusting))
 
     def screening(self) -> TrackingCost:
         """The edges alone, by which [RR] section 4.2 scores sampled hypotheses for speed."""

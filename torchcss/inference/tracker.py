@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
@@ -201,6 +201,11 @@ def initial_state(mixture: GaussianMixture, *, generator: torch.Generator) -> Tr
     )
 
 
+def _coarse(cost: CostFunction) -> Any:
+    """The smoother self of a cost, or None."""
+    return getattr(cost, "coarse", lambda: None)()
+
+
 def _unperturbed(samples: Samples, num_modes: int) -> Bool[Tensor, " s"]:
     """The modes of the prior among its samples: they come first, and were not drawn at random."""
     first = torch.arange(len(samples.x), device=samples.parent.device) < num_modes
@@ -228,7 +233,8 @@ class Tracker:
             frames then decide for good, or, where memory is short, each frame anew.
         coarse_every: If the cost has a method `coarse()` that returns a smoother cost (or None),
             every so many samples descend on that first, so that what moved farther than the cost's
-            own basin reaches is found again; 0 for never.
+            own basin reaches is found again; 0 for never. As many of them as there are modes begin
+            at the modes: one that is seldom sampled would else be left behind by a fast limb.
         oversampling: How many times as many samples are drawn as descend: above one, the best
             `num_samples` are kept, by the cost's `screening()` if it has that cheaper self. Section
             4.2 [RR] scores sampled hypotheses by their edges alone.
@@ -322,8 +328,10 @@ class Tracker:
             cost = make_cost(samples.parent, prior)
 
         # Before 2.3, if the cost has a smoother self, every so many samples descend on that first.
-        if self.coarse_every and (coarse := getattr(cost, "coarse", lambda: None)()) is not None:
-            some = torch.arange(0, len(samples.x), self.coarse_every, device=samples.x.device)
+        if self.coarse_every and _coarse(cost) is not None:
+            samples, some = self._modes_among(samples, prior)
+            cost = make_cost(samples.parent, prior)
+            coarse = _coarse(cost)
             part = coarse.take(some) if hasattr(coarse, "take") else coarse
             rough = self.optimiser.minimise(part, samples.x[some], bounds, scale=scale)
             samples = samples._replace(x=samples.x.index_copy(0, some, rough.mean))
@@ -392,6 +400,25 @@ class Tracker:
         )
         state = TrackerState(mixture, velocity, generator.get_state(), state.frame + 1)
         return state, info
+
+    def _modes_among(
+        self, samples: Samples, prior: GaussianMixture
+    ) -> tuple[Samples, Int[Tensor, " c"]]:
+        """Choose the samples that descend on the smoother cost, every mode's own copy among them.
+
+        They are taken from those that were drawn: the modes themselves descend as they are, too.
+        """
+        drawn = torch.nonzero(~_unperturbed(samples, len(prior.mean)))[:, 0]
+        if not len(drawn):
+            return samples, torch.arange(len(samples.x), device=samples.x.device)
+        some = drawn[:: self.coarse_every]
+        own = torch.arange(min(len(some), len(prior.mean)), device=some.device)
+        first = some[: len(own)]
+        return Samples(
+            samples.x.index_copy(0, first, prior.mean[own]),
+            samples.parent.index_copy(0, first, own),
+            samples.log_weight.index_fill(0, first, -torch.inf),
+        ), some
 
     def _explanations(
         self,
