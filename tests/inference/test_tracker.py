@@ -133,10 +133,8 @@ def test_every_mode_descends_on_the_smoother_cost(num_samples, generator):
         assert origin.tolist() == [0, 1]
         # Those that were not so started are where they were.
         assert int(info.num_distinct) >= 4
-    elif num_samples == 3:  # one is drawn, and the best mode begins
+    else:  # one is drawn, or none, and the best mode begins
         assert found.any(1).tolist() == [True, False]
-    else:  # nothing is drawn: the modes themselves begin
-        assert found.any(1).tolist() == [True, True]
     never = replace(tracker, coarse_every=0)
     state, _ = never.step(never.init(mixture, generator=generator), FarWells(), BOUNDS)
     assert not (torch.cdist(FarWells.centres, state.mixture.mean) < 0.5).any()

@@ -406,12 +406,13 @@ class Tracker:
     ) -> tuple[Samples, Int[Tensor, " c"]]:
         """Choose the samples that descend on the smoother cost, every mode's own copy among them.
 
-        They are taken from those that were drawn: the modes themselves descend as they are, too.
+        They are taken from those that were drawn, so that the modes descend as they are, too; where
+        none was drawn, from the modes.
         """
-        drawn = torch.nonzero(~_unperturbed(samples, len(prior.mean)))[:, 0]
-        if not len(drawn):
-            return samples, torch.arange(len(samples.x), device=samples.x.device)
-        some = drawn[:: self.coarse_every]
+        drawn = ~_unperturbed(samples, len(prior.mean))
+        if not bool(drawn.any()):
+            return samples, torch.nonzero(~drawn)[:: self.coarse_every, 0]
+        some = torch.nonzero(drawn)[:: self.coarse_every, 0]
         own = torch.arange(min(len(some), len(prior.mean)), device=some.device)
         first = some[: len(own)]
         return Samples(
