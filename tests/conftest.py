@@ -10,6 +10,12 @@ import torch
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
+# Side by side, each process has its share of the cores; what it starts has as well.
+WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+if WORKERS > 1:
+    torch.set_num_threads(max(1, (os.cpu_count() or 1) // WORKERS))
+    os.environ.setdefault("OMP_NUM_THREADS", str(torch.get_num_threads()))
+
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
