@@ -1,9 +1,9 @@
 """Pose, proportions, shape and first hypotheses from one picture (section 5 [IJRR]).
 
 The first stage fits pose and lengths to the marked joints (`torchcss.first_pose`). With a picture,
-the second fits cross-sections and tapers to joints and contours, pose and lengths held, and the
-third all parameters (`torchcss.shape_fit`); the fits are then refined on the body so found,
-contours included. Beside the edges of the papers, contours are compared with the colours on either
+the second fits cross-sections and tapers to joints and contours, pose and lengths held, to each of
+the poses that the joints do not tell apart, and the third all parameters from the cheapest
+(`torchcss.shape_fit`); the fits are then refined on the body so found, contours included. Beside the edges of the papers, contours are compared with the colours on either
 side of them: of what the first stage's best pose covers, and of what surrounds it.
 
 Call `initialise`.
@@ -62,6 +62,10 @@ _BESIDE_COLOURS = 40.0
 Clothes have edges all over, the outline is in one place, and edges draw limbs thin. Where colours
 tell nothing, edges still lead. On a walker of 160 pixels the silhouettes overlap by 0.63 with edges
 alone; beside colours by 0.72 at full weight, 0.77 at a quarter, and 0.78 without edges."""
+
+_RIVALS = 3.0
+"""By how much more than the best a pose may cost the joints, nats, and be given flesh of its own:
+odds of twenty to one. Flesh takes time, and changes what poses cost by less."""
 
 
 def initialise(
@@ -197,12 +201,12 @@ def _with_contours(
         return body.with_base(first.body.base_rotation, first.body.base_translation)
 
     loose = load(first.lengths, free=True)
-    state = spread_to(first.body, loose, first.mixture.mean[:1])[0]
+    rivals = first.mixture.mean[first.cost <= first.cost[0] + _RIVALS]
     parameters = ShapeParameters(loose, WHOLE_SHAPE)
     bones = replace(cost.choice, contour=None, region=None)
     flesh, whole = fit_shape(
-        replace(cost, body=loose, choice=bones), state, parameters, _outlines(cost),
-        bounds=search.bounds(loose),
+        replace(cost, body=loose, choice=bones), spread_to(first.body, loose, rivals), parameters,
+        _outlines(cost), bounds=search.bounds(loose),
     )  # fmt: skip
     lengths = {**first.lengths, **fitted_lengths(loose, whole.state, stature)}
 
@@ -229,7 +233,7 @@ def _with_contours(
     result = as_initialisation(body, kept, first.report)
     second = Stage(
         "cross-sections, with contours", shaped(first.body, flesh),
-        first.mixture.mean[0], flesh.cost,
+        first.mixture.mean[flesh.start], flesh.cost,
     )  # fmt: skip
     third = Stage("all parameters, with contours", body, kept.mean[0], float(kept.cost[0]))
     return first._replace(

@@ -2,8 +2,12 @@
 
 The second stage fits cross-sections and tapers of all parts, left and right tied, to joints and
 outlines in the image while pose and lengths are held; the third fits all parameters to the same.
-Each is the bound-constrained robust optimisation of section 4.1 on `ShapedCost`, from the best fit
-so far.
+Each is the bound-constrained robust optimisation of section 4.1 on `ShapedCost`.
+
+One camera leaves several poses open that cost the joints the same. Flesh fitted to one of them
+speaks for it: an arm believed to be too close to the camera is made thin, and whatever is compared
+with the image afterwards then prefers it there. So every pose gets flesh of its own first, and that
+of the cheapest is what the third stage goes on with.
 """
 
 from __future__ import annotations
@@ -26,29 +30,31 @@ class ShapeFit(NamedTuple):
 
     Attributes:
         state: State of the body with free lengths.
+        start: Which of the poses the flesh was fitted to.
         shape: Offsets of the shape parameters.
         cost: Nats.
     """
 
     state: Float[Tensor, " n"]
+    start: int
     shape: Float[Tensor, " z"]
     cost: float
 
 
 def fit_shape(
     base: TrackingCost,
-    state: Float[Tensor, " n"],
+    states: Float[Tensor, "k n"],
     parameters: ShapeParameters,
     outlines: tuple[Outline, ...],
     *,
     bounds: Bounds | None = None,
     max_steps: int = 25,
 ) -> tuple[ShapeFit, ShapeFit]:
-    """Run the second and the third stage.
+    """Run the second stage from all poses, and the third from the cheapest.
 
     Args:
         base: Joints and priors on the working image; its body has free lengths.
-        state: The best fit of the first stage.
+        states: Fits of the first stage that the joints do not tell apart.
         parameters: Which shape numbers are free.
         outlines: What of the working image the outline is compared with.
         bounds: Limits of the state; by default the body's.
@@ -59,14 +65,23 @@ def fit_shape(
     """
     cost = ShapedCost(base=base, parameters=parameters, outlines=outlines)
     optimiser = TrustRegionNewton(max_steps=max_steps, tolerance=1e-2)
-    n = len(state)
-    y = torch.cat([state, state.new_zeros(len(parameters.names))])[None]
+    n = states.shape[-1]
+    y = torch.cat([states, states.new_zeros(len(states), len(parameters.names))], dim=-1)
     volume = [name.endswith(CROSS_SECTIONS) for name in parameters.names]
-    own = torch.tensor(volume, device=state.device).to(state)
-    held = Bounds(*(torch.cat([state, own * bound]) for bound in parameters.bounds))
-    flesh = optimiser.minimise(cost, y, held)
+    own = torch.tensor(volume, device=states.device).to(states)
+    fleshes = [
+        optimiser.minimise(
+            cost,
+            start[None],
+            Bounds(*(torch.cat([start[:n], own * bound]) for bound in parameters.bounds)),
+        )
+        for start in y
+    ]
+    best = min(range(len(fleshes)), key=lambda k: float(fleshes[k].cost[0]))
+    flesh = fleshes[best]
     pairs = zip(bounds or base.body.bounds, parameters.bounds, strict=True)
     whole = optimiser.minimise(cost, flesh.mean, Bounds(*(torch.cat(pair) for pair in pairs)))
     return tuple(  # type: ignore[return-value]
-        ShapeFit(fit.mean[0, :n], fit.mean[0, n:], float(fit.cost[0])) for fit in (flesh, whole)
+        ShapeFit(fit.mean[0, :n], best, fit.mean[0, n:], float(fit.cost[0]))
+        for fit in (flesh, whole)
     )
