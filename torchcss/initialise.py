@@ -3,8 +3,9 @@
 The first stage fits pose and lengths to the marked joints (`torchcss.first_pose`). With a picture,
 the second fits cross-sections and tapers to joints and contours, pose and lengths held, to each of
 the poses that the joints do not tell apart, and the third all parameters from the cheapest
-(`torchcss.shape_fit`); the fits are then refined on the body so found, contours included. Beside the edges of the papers, contours are compared with the colours on either
-side of them: of what the first stage's best pose covers, and of what surrounds it.
+(`torchcss.shape_fit`); the fits are then refined on the body so found, contours included. Beside
+the edges of the papers, contours are compared with the colours on either side of them: of what the
+first stage's best pose covers, and of what surrounds it.
 
 Call `initialise`.
 """

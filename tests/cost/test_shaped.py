@@ -23,7 +23,9 @@ from torchcss.cost.shaped import Outline, ShapedCost
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.cost.visibility import ContourPredictor
 from torchcss.inference.trust_region import TrustRegionNewton
+from torchcss.jumps import flipped_poses
 from torchcss.raster import Mesh, grid_faces, render_meshes
+from torchcss.shape_fit import fit_shape
 from torchcss.types import Bounds
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor
@@ -120,6 +122,29 @@ def test_another_girth_is_found(by: str, thicker: float, least: float):
         assert least < grown / thicker < 1.5
     whole = TrustRegionNewton(max_steps=10, tolerance=1e-2).minimise(cost, fit.mean, cost.bounds)
     assert float(whole.cost[0]) <= float(fit.cost[0])
+
+
+@pytest.mark.parametrize("by", ["edges", "colours"])
+def test_flesh_goes_to_the_pose_that_the_picture_is_of(by: str):
+    """A forearm that comes too close is made thin, and still costs more than the true one."""
+    cost, start, parameters = problem(0.2, by)
+    body, n = cost.base.body, cost.base.body.num_parameters
+    other = flipped_poses(body, cost.base.camera, start[:n], num=1)
+    places = body.pose(torch.cat([start[None, :n], other])).joints
+    assert float((places[0] - places[1]).norm(dim=-1).max()) > 0.2
+    true = start[None, :n]
+
+    def fit(states: torch.Tensor):
+        return fit_shape(cost.base, states, parameters, cost.outlines, max_steps=10)
+
+    alone = fit(true)
+    for states, start_of_best in ((torch.cat([true, other]), 0), (torch.cat([other, true]), 1)):
+        for found, expected in zip(fit(states), alone, strict=True):
+            assert found.start == start_of_best
+            assert found.cost == expected.cost
+            assert torch.equal(found.state, expected.state)
+            assert torch.equal(found.shape, expected.shape)
+    assert fit(other)[0].cost > alone[0].cost + 3
 
 
 @pytest.mark.parametrize("by", ["edges", "colours"])
