@@ -30,6 +30,7 @@ LAYERS = (
         "inverse_kinematics",
         "interpretations",
         "jumps",
+        "limbs",
         "marks",
         "reprojection",
         "synthetic",

@@ -52,15 +52,35 @@ def with_flips(
         log_odds: Their weight against that of the best mode, nats. Low odds spend one sample on
             each, and make the image's evidence outweigh a jump before it leads.
     """
+    x = flipped_poses(body, camera, state.mixture.mean[0], num=num)
+    return with_modes(state, x, torch.zeros_like(x), log_odds=log_odds)
+
+
+def with_modes(
+    state: TrackerState,
+    mean: Float[Tensor, "s n"],
+    velocity: Float[Tensor, "s n"],
+    *,
+    log_odds: float,
+) -> TrackerState:
+    """A tracker's state with other poses among its modes, as uncertain as the best one.
+
+    Args:
+        state: Where the last frame left off, the best mode first.
+        mean: The poses; none leaves the state as it is.
+        velocity: How far each moved in the last frame.
+        log_odds: Their weight against that of the best mode, nats.
+    """
+    if not len(mean):
+        return state
     mixture = state.mixture
-    x = flipped_poses(body, camera, mixture.mean[0], num=num)
-    like = mixture.take(torch.zeros(len(x), dtype=torch.long, device=x.device))
+    like = mixture.take(torch.zeros(len(mean), dtype=torch.long, device=mean.device))
     joined = GaussianMixture(
-        torch.cat([mixture.mean, x]),
+        torch.cat([mixture.mean, mean]),
         torch.cat([mixture.covariance, like.covariance]),
         torch.cat([mixture.log_weight, like.log_weight + log_odds]),
     )
-    velocity = torch.cat([state.velocity, torch.zeros_like(x)])
+    velocity = torch.cat([state.velocity, velocity])
     # Particles are of the old modes; a filter draws new ones from the mixture.
     return state._replace(mixture=joined.normalise(), velocity=velocity, particles=None)
 

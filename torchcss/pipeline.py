@@ -40,6 +40,7 @@ from torchcss.inference.tracker import (
 from torchcss.inference.trust_region import default_prior_variance
 from torchcss.io.video import Frame
 from torchcss.jumps import with_flips
+from torchcss.limbs import with_limbs
 from torchcss.recovery import Recovery
 from torchcss.stopwatch import Stopwatch
 from torchcss.views import Observe, ViewStream, Watcher
@@ -106,6 +107,7 @@ def track_frames(
     masks: Iterable[np.ndarray | Tensor] | None = None,
     recovery: Recovery | None = None,
     jumps_every: int = 0,
+    limb_jumps: int = 0,
     carries: bool = False,
     others: Sequence[ViewStream] = (),
 ) -> Iterator[TrackedFrame]:
@@ -130,6 +132,8 @@ def track_frames(
         jumps_every: Every how many frames the flips of the best mode join the search, see
             `torchcss.jumps`; 0: never. Not where several cameras look on: to them a flip looks
             different.
+        limb_jumps: How many other poses of each limb that does not look like itself join the
+            search, see `torchcss.limbs`; 0: none. Not for particle filters.
         carries: Whether the pictures tell where each mode's trunk is expected, see
             `torchcss.carry`. Not for particle filters.
         others: What further cameras send.
@@ -170,9 +174,17 @@ def track_frames(
         jumped = time.perf_counter() - jumping
         stopwatch = Stopwatch()
         cost = beside([each.cost(body, state.mixture.mean, stopwatch) for each in watchers])
+        bounds = body.bounds if limits else unbounded(state.mixture.mean)
+        if limb_jumps and isinstance(searching, Tracker):
+            looking, known = time.perf_counter(), len(state.mixture.mean)
+            dynamics = searching.dynamics
+            state = with_limbs(state, body, cost, dynamics, bounds, num=limb_jumps)
+            if len(state.mixture.mean) > known:
+                modes = state.mixture.mean
+                cost = beside([each.cost(body, modes, stopwatch) for each in watchers])
+            jumped += time.perf_counter() - looking
         featured = time.perf_counter()
         prior = state.mixture
-        bounds = body.bounds if limits else unbounded(prior.mean)
         if carrier is not None and isinstance(searching, Tracker):
             sights = [
                 Sight(view.camera, *each.contrasts)

@@ -52,11 +52,13 @@ class Limb(NamedTuple):
     Attributes:
         name: "l_arm", "r_arm", "l_leg" or "r_leg".
         groups: Its segments' groups, from the trunk outwards.
+        joint: The joint by which it hangs on the trunk.
         columns: Parameters of the state that move this limb and nothing else.
     """
 
     name: str
     groups: tuple[str, ...]
+    joint: str
     columns: Int[Tensor, " c"]
 
 
@@ -76,7 +78,7 @@ class Segments:
         rows = {
             name: row for name, row in _TRUNK.items() if {name, row[0]} <= set(body.joint_names)
         }
-        limbs: list[tuple[str, tuple[str, ...]]] = []
+        limbs: list[tuple[str, tuple[str, ...], str]] = []
         for side in ("l", "r"):
             for limb, chain in _LIMBS.items():
                 names = [f"{side}_{place}" for place in chain]
@@ -84,7 +86,7 @@ class Segments:
                 if len(names) < 2:
                     continue
                 rows |= {child: (parent, child) for parent, child in pairwise(names)}
-                limbs.append((f"{side}_{limb}", tuple(names[1:])))
+                limbs.append((f"{side}_{limb}", tuple(names[1:]), names[0]))
         children = list(rows)
         names = [n for n in dict.fromkeys(p for p, _ in rows.values()) if n not in rows] + children
         self.joint: Int[Tensor, " m"] = torch.tensor(
@@ -100,7 +102,8 @@ class Segments:
             body.tie
         )
         found = (
-            Limb(name, groups, _own_columns(body, moves > 0, groups)) for name, groups in limbs
+            Limb(name, groups, joint, _own_columns(body, moves > 0, groups))
+            for name, groups, joint in limbs
         )
         # The limb of a body from a file may have no joint that turns.
         self.limbs = tuple(limb for limb in found if limb.columns.numel())
