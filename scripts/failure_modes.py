@@ -80,6 +80,8 @@ class Config:
     """Terms and priors of the cost; `default` stands for the default ones."""
     evidence: float | None = None
     """How much one frame counts in the weights of modes; the presets' numbers by default."""
+    limb_jumps: int | None = None
+    """Poses tried of each limb that does not look like itself; the presets' numbers by default."""
     start: int = 0
     """First frame."""
     frames: int | None = None
@@ -150,7 +152,7 @@ def groups_of(config: Config, done: set[tuple[str, int]]) -> Iterator[list[tuple
 
 def study_of(config: Config, sequence: RecordedSequence, thresholds: Thresholds) -> dict[str, Any]:
     """What all runs of a file have in common."""
-    tracked = ("keypoints_use", "prediction", "evidence", "dtype")
+    tracked = ("keypoints_use", "prediction", "evidence", "limb_jumps", "dtype")
     shared = (*tracked, "start", "frames", "stop_when_lost", "small")
     return {
         "sequence": sequence.name,
@@ -200,7 +202,7 @@ def settings_of(config: Config, body: str, preset: str, seed: int) -> Settings:
     settings = Settings(
         body=body, preset=preset, seed=seed, keypoints_use=config.keypoints_use,
         prediction=config.prediction, terms=named_terms(config.terms), evidence=config.evidence,
-        device=config.device, dtype=config.dtype, overlay=False,
+        limb_jumps=config.limb_jumps, device=config.device, dtype=config.dtype, overlay=False,
     )  # fmt: skip
     if not config.small:
         return settings

@@ -211,6 +211,8 @@ def test_a_new_run_replaces_what_belongs_to_the_last_one(clip: Path, tmp_path: P
         run(clip, out, preset="condensation", oversampling=2)
     with pytest.raises(ConfigurationError, match="no modes to weigh"):
         run(clip, out, preset="condensation", evidence=0.5)
+    with pytest.raises(ConfigurationError, match="no modes to jump from"):
+        run(clip, out, preset="condensation", limb_jumps=4)
     (tmp_path / "empty.mp4").write_bytes(b"")
     with pytest.raises(VideoError):
         track_video(
@@ -269,6 +271,7 @@ def test_bad_settings(bad: dict):
         ("contour_weight", (-1.0, float("nan"), float("inf")), (0.0, 300.0)),
         ("boundary_emphasis", (-0.1, 1.1, float("nan")), (0.0, 1.0)),
         ("seed", (-1, 2**63), (0, 2**63 - 1)),
+        ("limb_jumps", (-1,), (None, 0, 2)),
         ("terms", ((), ("motion_boundaries",), ("temporal", "stabiliser")), (("joints",),)),
     ],
 )

@@ -128,6 +128,9 @@ class Track:
     evidence: float | None = None
     """How much one frame counts in the weights of modes, above 0 and at most 1; the preset's number
     by default."""
+    limb_jumps: int | None = None
+    """Poses tried of each limb that lies where nothing looks like it, 0 for none; the preset's
+    number by default."""
     terms: tuple[str, ...] = TERMS
     """Terms and priors of the cost; `default` stands for the default ones."""
     contour_weight: float = Settings.contour_weight
@@ -178,6 +181,7 @@ class Track:
             prediction=self.prediction,
             oversampling=self.oversampling,
             evidence=self.evidence,
+            limb_jumps=self.limb_jumps,
             keypoints_use=self.keypoints_use,
             terms=named_terms(self.terms),
             working_size=self.working_size,
