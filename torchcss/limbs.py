@@ -1,13 +1,16 @@
-"""A limb that lies where nothing looks like it is looked for elsewhere.
+"""An arm that lies where nothing looks like it is looked for elsewhere.
 
-A limb that moves faster than flow and edges follow is left behind, on clutter that has edges too.
+An arm that moves faster than flow and edges follow is left behind, on clutter that has edges too.
 What tells is colour: the pixels that it covers look like its surroundings. But `segmentation`,
 which knows, has no derivatives, and samples about the mode, in all directions at once, do not reach
-what one limb of four has done meanwhile. So before a frame is searched, each limb of the best mode
-is asked whether it looks like itself where it is expected (`astray_limbs`). One that does not is
-put into other poses, all else as expected, and those that cost least join the search as modes
+what one limb has done meanwhile. So before a frame is searched, each arm of the best mode is asked
+whether it looks like itself where it is expected (`astray_limbs`). One that does not is put into
+other poses, all else as expected, and those that cost least join the search as modes
 (`with_limbs`). The image decides what remains: it is a jump as in `torchcss.jumps`, for another
 reason.
+
+Legs are left alone. Arms swing, but legs stand: where one is astray, the body has turned or gone,
+and a leg put elsewhere explains what the trunk has left uncovered (tried: `docs/figures.md`).
 """
 
 from __future__ import annotations
@@ -29,13 +32,16 @@ from torchcss.jumps import with_modes
 from torchcss.types import Bounds
 
 REACH = 0.2
-"""Seconds of everyday motion within which, as a standard deviation, a limb is looked for."""
+"""Seconds of everyday motion within which, as a standard deviation, an arm is looked for."""
 
 DRAWN = 128
-"""Poses of a limb that are looked at: 2 ms each on one core, in half the frames or fewer."""
+"""Poses of an arm that are looked at."""
 
 GAIN = 5.0
 """By how much less a pose has to cost to join the search, nats."""
+
+_SWINGING = ("arm",)
+"""Which limbs are looked for."""
 
 _APART = 0.15
 """Least distance of some joint, metres, at which two poses are two."""
@@ -55,7 +61,7 @@ def with_limbs(
     num: int,
     log_odds: float = -5.0,
 ) -> TrackerState:
-    """A tracker's state with other poses of the limbs that are astray among its modes.
+    """A tracker's state with other poses of the arms that are astray among its modes.
 
     Args:
         state: Where the last frame left off, the best mode first.
@@ -63,7 +69,7 @@ def with_limbs(
         cost: The cost of the frame to come, of any modes. Without `segmentation` nothing is done.
         dynamics: What happens between frames; the limb that is put elsewhere is at rest there.
         bounds: Limits of the state.
-        num: Most poses wanted of each limb.
+        num: Most poses wanted of each arm.
         log_odds: Their weight against that of the best mode, nats.
     """
     first = torch.zeros(1, dtype=torch.long, device=state.velocity.device)
@@ -82,7 +88,7 @@ def with_limbs(
 
 
 def astray_limbs(cost: TrackingCost, body: BodyModel, x: Float[Tensor, " n"]) -> list[Limb]:
-    """The limbs whose pixels, taken together, look more like the surroundings than like the limb.
+    """The arms whose pixels, taken together, look more like the surroundings than like the limb.
 
     Args:
         cost: The cost of a frame; none are astray where it does not know `segmentation`.
@@ -93,10 +99,10 @@ def astray_limbs(cost: TrackingCost, body: BodyModel, x: Float[Tensor, " n"]) ->
     if looks is None:
         return []
     likeness, area = looks
-    every = ((limb, _parts_of(body, limb)) for limb in Segments(body).limbs)
+    limbs = (limb for limb in Segments(body).limbs if limb.name.endswith(_SWINGING))
     return [
         limb
-        for limb, parts in every
+        for limb, parts in ((limb, _parts_of(body, limb)) for limb in limbs)
         if float(area[parts].sum()) >= _FEWEST and float(likeness[parts].sum()) < 0
     ]
 
