@@ -81,7 +81,7 @@ class Config:
     evidence: float | None = None
     """How much one frame counts in the weights of modes; the presets' numbers by default."""
     limb_jumps: int | None = None
-    """Poses tried of each arm that does not look like itself; the presets' numbers by default."""
+    """Most poses tried of an arm for which the colours do not speak; the presets' by default."""
     start: int = 0
     """First frame."""
     frames: int | None = None

@@ -147,15 +147,30 @@ def test_out_of_the_way_is_not_found():
 
 def test_what_cannot_be_seen_is_left_alone():
     body, cost = cost_of(raised(body_and_camera()[0], 1.3))
-    x = raised(body, 0.5)
-    x[body.state_index("root_x")] += 9.0
-    assert astray_limbs(cost, body, x) == []
-    x[body.state_index("root_x")] -= 9.0
-    x[body.state_index("root_z")] -= 9.0  # behind the camera
-    assert astray_limbs(cost, body, x) == []
+    state = state_at(body, raised(body, 0.5))
+    for column, shift in (("root_x", 9.0), ("root_z", -9.0)):  # beside and behind the camera
+        away = state._replace(mixture=state.mixture._replace(mean=state.mixture.mean.clone()))
+        away.mixture.mean[:, body.state_index(column)] += shift
+        assert names(astray_limbs(cost, body, away.mixture.mean[0])) == ["l_arm", "r_arm"]
+        assert with_limbs(away, body, cost, DYNAMICS, body.bounds, num=4) is away
     blind = replace(cost, choice=replace(cost.choice, segmentation=None))
     assert astray_limbs(blind, body, raised(body, 0.5)) == []
     assert astray_limbs(replace(cost, segmentation=None), body, raised(body, 0.5)) == []
+
+
+def test_an_arm_before_the_chest_is_found_where_it_is():
+    """There it covers nothing wrong, so that nothing else tells."""
+    body, cost = cost_of(raised(body_and_camera()[0], 0.9))
+    x = body.rest.clone()
+    x[body.state_index("r_shoulder_swing")] = -1.2
+    x[body.state_index("r_shoulder_twist")] = 1.2
+    x[body.state_index("r_elbow_flexion")] = 1.9
+    assert "r_arm" in names(astray_limbs(cost, body, x))
+    poses = find(cost, body, x, arm(body))
+    uv = [cost.camera.project(body.pose(each).joints).uv for each in (x, raised(body, 0.9))]
+    found = cost.camera.project(body.pose(poses[0]).joints).uv
+    wrist = body.joint_index("r_wrist")
+    assert float((found - uv[1])[wrist].norm()) < 0.5 * float((uv[0] - uv[1])[wrist].norm())
 
 
 def test_it_joins_the_search_at_rest():

@@ -129,8 +129,8 @@ class Track:
     """How much one frame counts in the weights of modes, above 0 and at most 1; the preset's number
     by default."""
     limb_jumps: int | None = None
-    """Poses tried of each arm that lies where nothing looks like it, 0 for none; the preset's
-    number by default."""
+    """Most other poses that join the search for an arm for which the colours do not speak, 0 for
+    none; the preset's number by default."""
     terms: tuple[str, ...] = TERMS
     """Terms and priors of the cost; `default` stands for the default ones."""
     contour_weight: float = Settings.contour_weight

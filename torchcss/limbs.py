@@ -1,16 +1,18 @@
-"""An arm that lies where nothing looks like it is looked for elsewhere.
+"""An arm for which the picture does not speak is looked for elsewhere.
 
 An arm that moves faster than flow and edges follow is left behind, on clutter that has edges too.
-What tells is colour: the pixels that it covers look like its surroundings. But `segmentation`,
-which knows, has no derivatives, and samples about the mode, in all directions at once, do not reach
-what one limb has done meanwhile. So before a frame is searched, each arm of the best mode is asked
-whether it looks like itself where it is expected (`astray_limbs`). One that does not is put into
-other poses, all else as expected, and those that cost least join the search as modes
-(`with_limbs`). The image decides what remains: it is a jump as in `torchcss.jumps`, for another
-reason.
+What tells is colour: with the arm where it is, the body looks no more like itself than without an
+arm. But `segmentation`, which knows, has no derivatives, and samples about the mode, in all
+directions at once, do not reach what one limb has done meanwhile. So before a frame is searched,
+each arm of the best mode is asked whether its colours speak for it where it is expected
+(`astray_limbs`). One for which they do not is put into other poses, all else as expected, and those
+that cost least, and in which it explains something, join the search as modes (`with_limbs`). The
+image decides what remains: it is a jump as in `torchcss.jumps`, for another reason.
 
-Legs are left alone. Arms swing, but legs stand: where one is astray, the body has turned or gone,
-and a leg put elsewhere explains what the trunk has left uncovered (tried: `docs/figures.md`).
+An arm that is hidden, or out of the picture, explains nothing either; it is found when it comes out
+elsewhere than expected. Legs are left alone. Arms swing, but legs stand: where one is astray, the
+body has turned or gone, and a leg put elsewhere explains what the trunk has left uncovered (tried:
+`docs/figures.md`).
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.body.flips import Limb, Segments
@@ -38,17 +40,14 @@ DRAWN = 128
 """Poses of an arm that are looked at."""
 
 GAIN = 5.0
-"""By how much less a pose has to cost to join the search, nats."""
+"""What an arm's colours have to be worth, against the same body without the arm, and by how much
+less a pose has to cost to join the search; nats."""
 
 _SWINGING = ("arm",)
 """Which limbs are looked for."""
 
 _APART = 0.15
 """Least distance of some joint, metres, at which two poses are two."""
-
-_FEWEST = 12
-"""Pixels of the segmentation's image below which a limb is hidden or out of the picture rather than
-astray."""
 
 
 def with_limbs(
@@ -88,23 +87,18 @@ def with_limbs(
 
 
 def astray_limbs(cost: TrackingCost, body: BodyModel, x: Float[Tensor, " n"]) -> list[Limb]:
-    """The arms whose pixels, taken together, look more like the surroundings than like the limb.
+    """The arms with which the body looks hardly more like itself than without: by less than `GAIN`.
 
     Args:
         cost: The cost of a frame; none are astray where it does not know `segmentation`.
         body: The body on this frame's base.
         x: A pose.
     """
-    looks = cost.looks_of_parts(x)
-    if looks is None:
+    if not cost.knows_segmentation:
         return []
-    likeness, area = looks
-    limbs = (limb for limb in Segments(body).limbs if limb.name.endswith(_SWINGING))
-    return [
-        limb
-        for limb, parts in ((limb, _parts_of(body, limb)) for limb in limbs)
-        if float(area[parts].sum()) >= _FEWEST and float(likeness[parts].sum()) < 0
-    ]
+    arms = (limb for limb in Segments(body).limbs if limb.name.endswith(_SWINGING))
+    looks = float(cost.unsearched(x))
+    return [arm for arm in arms if looks > _without(cost, body, arm, x) - GAIN]
 
 
 def other_poses(
@@ -122,8 +116,8 @@ def other_poses(
     They are of a low-discrepancy sequence (Sobol), so that nothing is random. What they cost is all
     that the frame knows but flow and the past, which were wrong about this limb, and half the
     squared distance in units of `REACH`. It has to be less by `GAIN` than that of the pose given;
-    and the limb's colours have to speak for the limb: one that is put before a shirt of its own
-    colour, or out of the picture, is out of the way, and not found.
+    and the colours have to speak for the limb, by `GAIN` as well: one that is put before a shirt of
+    its own colour, or out of the picture, is out of the way, and not found.
 
     Args:
         cost: The cost of the frame, of any modes.
@@ -147,8 +141,8 @@ def other_poses(
     colours = cost.unsearched(every)
     apart = (every - x)[:, columns] / deviation
     value = of_mode.value(every) + colours + 0.5 * apart.square().sum(-1)
-    without = replace(cost, body=_without(body, limb)).unsearched(x)
-    better = (value < value[0] - GAIN) & (colours < without - GAIN)
+    speak = colours < _without(cost, body, limb, x) - GAIN
+    better = (value < value[0] - GAIN) & speak
     order = value.argsort(stable=True)
     joints, chosen = body.pose(every).joints, []
     for item in order[better[order]].tolist():
@@ -158,15 +152,11 @@ def other_poses(
     return every[chosen]
 
 
-def _parts_of(body: BodyModel, limb: Limb) -> Bool[Tensor, " parts"]:
-    """The parts at or beyond the joint by which a limb hangs on the trunk."""
+def _without(cost: TrackingCost, body: BodyModel, limb: Limb, x: Float[Tensor, " n"]) -> float:
+    """What the colours cost with so little flesh on a limb that it covers nothing, nats."""
     ancestors = body.tree.ancestors
     hung = ancestors[:, body.marker_link[body.joint_index(limb.joint)]]
-    return (ancestors[:, body.part_link] >= hung[:, None]).all(0)
-
-
-def _without(body: BodyModel, limb: Limb) -> BodyModel:
-    """The body with so little flesh on a limb that it covers nothing."""
+    beyond = (ancestors[:, body.part_link] >= hung[:, None]).all(0)
     shape = body.part_shape.clone()
-    shape[_parts_of(body, limb), :3] = 1e-3
-    return with_shape(body, shape)
+    shape[beyond, :3] = 1e-3
+    return float(replace(cost, body=with_shape(body, shape)).unsearched(x))

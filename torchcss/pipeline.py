@@ -132,7 +132,7 @@ def track_frames(
         jumps_every: Every how many frames the flips of the best mode join the search, see
             `torchcss.jumps`; 0: never. Not where several cameras look on: to them a flip looks
             different.
-        limb_jumps: How many other poses of each arm that does not look like itself join the
+        limb_jumps: How many other poses of an arm for which the colours do not speak join the
             search, see `torchcss.limbs`; 0: none. Not for particle filters.
         carries: Whether the pictures tell where each mode's trunk is expected, see
             `torchcss.carry`. Not for particle filters.

@@ -97,7 +97,7 @@ class Preset:
         soft_matching: See `Tracker`.
         jumps_every: Every how many frames the flips of the best mode join the search, see
             `torchcss.jumps`; 0, as in the papers: never.
-        limb_jumps: How many other poses of each arm that does not look like itself join the
+        limb_jumps: How many other poses of an arm for which the colours do not speak join the
             search, see `torchcss.limbs`; 0, as in the papers: none.
     """
 

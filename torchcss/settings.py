@@ -83,7 +83,7 @@ class Settings:
             see `Tracker`.
         evidence: Power of a frame's likelihood in the weights of modes, above 0 and at most 1, see
             `Tracker`; the preset's by default.
-        limb_jumps: How many other poses of each arm that does not look like itself join the
+        limb_jumps: How many other poses of an arm for which the colours do not speak join the
             search, see `torchcss.limbs`; 0 for none, the preset's number by default.
         keypoints_use: "all": keypoints are observations in every frame; "first": they only
             give the first pose, as in the papers.

@@ -24,7 +24,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
@@ -111,23 +110,6 @@ class SegmentationTerm:
         batch, (height, width) = layer.shape[:-2], layer.shape[-2:]
         seen = images.likeness.expand(*batch, -1, height, width).gather(-3, layer[..., None, :, :])
         return 1 - seen.sum((-3, -2, -1)) / images.area
-
-    def looks_of_parts(
-        self, body: BodyModel, x: Float[Tensor, " n"], images: SegmentationImages
-    ) -> tuple[Float[Tensor, " parts"], Float[Tensor, " parts"]]:
-        """Likeness summed over the pixels that each part covers, and how many those are.
-
-        Args:
-            body: The body on this frame's base.
-            x: One pose.
-            images: What `images` made of the frame.
-        """
-        part = self._parts(body, x, images.camera)
-        seen = images.likeness.gather(0, images.layer[part][None])[0]
-        part = torch.where(part < 0, body.num_parts, part).flatten()
-        sums = seen.new_zeros(2, body.num_parts + 1)
-        sums.index_add_(1, part, torch.stack([seen.flatten(), torch.ones_like(seen).flatten()]))
-        return sums[0, :-1], sums[1, :-1]
 
     def _parts(self, body: BodyModel, x: Tensor, camera: Camera) -> Tensor:
         return part_map(body, x, camera, rings=self.rings, meridians=self.meridians)

@@ -267,6 +267,12 @@ class TrackingCost(View):
 
         return dict(zip(names, self._chunked(evaluate, x), strict=True)) if x.numel() else {}
 
+    @property
+    def knows_segmentation(self) -> bool:
+        """Whether `unsearched` tells poses apart."""
+        seen = any(view.segmentation is not None for view in self.views)
+        return seen and self.choice.segmentation is not None
+
     def unsearched(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
         """Cost of what has no derivatives, nats: it counts in the weights of modes, not in `value`.
 
@@ -279,18 +285,6 @@ class TrackingCost(View):
                 with self._timed("segmentation"):
                     total = total + weight * term.value(self.body, x, view.segmentation)
         return total
-
-    def looks_of_parts(
-        self, x: Float[Tensor, " n"]
-    ) -> tuple[Float[Tensor, " parts"], Float[Tensor, " parts"]] | None:
-        """See `SegmentationTerm.looks_of_parts`, over all views; None where that is not known."""
-        term = self.choice.segmentation
-        seen = [view.segmentation for view in self.views if view.segmentation is not None]
-        if term is None or not seen:
-            return None
-        looks = [term.looks_of_parts(self.body, x, images) for images in seen]
-        likeness, area = (torch.stack(parts).sum(0) for parts in zip(*looks, strict=True))
-        return likeness, area
 
     def gradients(self, x: Float[Tensor, "*batch n"]) -> dict[str, Float[Tensor, "*batch n"]]:
         """Gradient of every term and prior by name, visibility and assignments held fixed."""
