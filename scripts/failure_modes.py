@@ -80,8 +80,9 @@ class Config:
     """Terms and priors of the cost; `default` stands for the default ones."""
     evidence: float | None = None
     """How much one frame counts in the weights of modes; the presets' numbers by default."""
-    limb_jumps: int | None = None
-    """Most poses tried of an arm for which the colours do not speak; the presets' by default."""
+    limb_jumps: int = 0
+    """Most poses that join the search for an arm for which the colours do not speak; not for
+    particle filters."""
     start: int = 0
     """First frame."""
     frames: int | None = None

@@ -271,7 +271,7 @@ def test_bad_settings(bad: dict):
         ("contour_weight", (-1.0, float("nan"), float("inf")), (0.0, 300.0)),
         ("boundary_emphasis", (-0.1, 1.1, float("nan")), (0.0, 1.0)),
         ("seed", (-1, 2**63), (0, 2**63 - 1)),
-        ("limb_jumps", (-1,), (None, 0, 2)),
+        ("limb_jumps", (-1,), (0, 2)),
         ("terms", ((), ("motion_boundaries",), ("temporal", "stabiliser")), (("joints",),)),
     ],
 )

@@ -128,9 +128,8 @@ class Track:
     evidence: float | None = None
     """How much one frame counts in the weights of modes, above 0 and at most 1; the preset's number
     by default."""
-    limb_jumps: int | None = None
-    """Most other poses that join the search for an arm for which the colours do not speak, 0 for
-    none; the preset's number by default."""
+    limb_jumps: int = 0
+    """Most other poses that join the search for an arm for which the colours do not speak."""
     terms: tuple[str, ...] = TERMS
     """Terms and priors of the cost; `default` stands for the default ones."""
     contour_weight: float = Settings.contour_weight

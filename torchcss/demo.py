@@ -122,7 +122,7 @@ def track_sequence(
         limits=PRESETS[settings.preset].limits,
         recovery=Recovery() if settings.recovery else None,
         jumps_every=PRESETS[settings.preset].jumps_every,
-        limb_jumps=settings.num_limb_jumps,
+        limb_jumps=settings.limb_jumps,
         carries=settings.prediction == "surface",
     )
     recorder = Recorder(

@@ -97,8 +97,6 @@ class Preset:
         soft_matching: See `Tracker`.
         jumps_every: Every how many frames the flips of the best mode join the search, see
             `torchcss.jumps`; 0, as in the papers: never.
-        limb_jumps: How many other poses of an arm for which the colours do not speak join the
-            search, see `torchcss.limbs`; 0, as in the papers: none.
     """
 
     what: str
@@ -123,7 +121,6 @@ class Preset:
     separation: float = 0.0
     soft_matching: bool = False
     jumps_every: int = 0
-    limb_jumps: int = 0
 
     def __post_init__(self) -> None:
         if (self.proposal is None) == (self.particles is None):
@@ -167,7 +164,6 @@ _CSS = Preset(
     separation=0.12,
     soft_matching=True,
     jumps_every=3,
-    limb_jumps=4,
 )
 _SINGLE = Preset(
     what="one robust mode with joint limits, no search ([IJRR] section 6)",
@@ -215,7 +211,7 @@ PRESETS: dict[str, Preset] = {
     "css": _CSS,
     "css_figure_6": replace(
         _CSS,
-        what="css as printed: weights multiplied, minima however alike, no jumps",
+        what="css as printed: weights multiplied, minima however alike, no jumps to flips",
         memory=1.0,
         evidence=1.0,
         evidence_arm=None,
@@ -224,7 +220,6 @@ PRESETS: dict[str, Preset] = {
         separation=0.0,
         soft_matching=False,
         jumps_every=0,
-        limb_jumps=0,
     ),
     "css_heavy_tailed": replace(
         _CSS,
@@ -270,7 +265,6 @@ PRESETS: dict[str, Preset] = {
         separation=0.0,
         soft_matching=False,
         jumps_every=0,
-        limb_jumps=0,
     ),
     "cham_rehg": _CHAM_REHG,
     "cham_rehg_ssd": _least_squares(

@@ -84,7 +84,7 @@ class Settings:
         evidence: Power of a frame's likelihood in the weights of modes, above 0 and at most 1, see
             `Tracker`; the preset's by default.
         limb_jumps: How many other poses of an arm for which the colours do not speak join the
-            search, see `torchcss.limbs`; 0 for none, the preset's number by default.
+            search, see `torchcss.limbs`; 0 for none. For trackers that descend from samples.
         keypoints_use: "all": keypoints are observations in every frame; "first": they only
             give the first pose, as in the papers.
         terms: Terms and priors of the cost; see `make_choice` for what the preset changes.
@@ -108,7 +108,7 @@ class Settings:
     prediction: Literal["velocity", "surface"] = "velocity"
     oversampling: int = 1
     evidence: float | None = None
-    limb_jumps: int | None = None
+    limb_jumps: int = 0
     keypoints_use: Literal["first", "all"] = "all"
     terms: tuple[str, ...] = TERMS
     working_size: int = 640
@@ -172,25 +172,19 @@ class Settings:
                 raise ConfigurationError(
                     f"evidence: the particles of {self.preset} have no modes to weigh; leave it out"
                 )
-        if self.limb_jumps is not None:
-            if self.limb_jumps < 0:
-                raise ConfigurationError(f"limb_jumps must be at least 0, got {self.limb_jumps}")
-            if self.limb_jumps and PRESETS[self.preset].particles is not None:
-                raise ConfigurationError(
-                    f"limb_jumps: the particles of {self.preset} have no modes to jump from; leave "
-                    "it out"
-                )
+        if self.limb_jumps < 0:
+            raise ConfigurationError(f"limb_jumps must be at least 0, got {self.limb_jumps}")
+        if self.limb_jumps and PRESETS[self.preset].particles is not None:
+            raise ConfigurationError(
+                f"limb_jumps: the particles of {self.preset} have no modes to jump from; leave it "
+                "at 0"
+            )
         try:
             torch.empty(0, device=self.device)
         except (RuntimeError, AssertionError) as error:  # the latter without CUDA
             raise ConfigurationError(
                 f"device {self.device!r} is not available here; use cpu"
             ) from error
-
-    @property
-    def num_limb_jumps(self) -> int:
-        """`limb_jumps`, or the preset's."""
-        return PRESETS[self.preset].limb_jumps if self.limb_jumps is None else self.limb_jumps
 
     @property
     def torch_dtype(self) -> torch.dtype:

@@ -223,6 +223,6 @@ def _follow(
         limits=PRESETS[settings.preset].limits,
         recovery=Recovery() if settings.recovery else None,
         jumps_every=PRESETS[settings.preset].jumps_every,
-        limb_jumps=settings.num_limb_jumps,
+        limb_jumps=settings.limb_jumps,
         carries=settings.prediction == "surface",
     )

@@ -191,7 +191,7 @@ def track_video(
         boundary_emphasis=boundary_emphasis(settings),
         limits=PRESETS[settings.preset].limits,
         jumps_every=PRESETS[settings.preset].jumps_every,
-        limb_jumps=settings.num_limb_jumps,
+        limb_jumps=settings.limb_jumps,
         carries=settings.prediction == "surface",
         recovery=Recovery() if settings.recovery else None,
         masks=main.masks,
