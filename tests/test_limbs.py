@@ -1,8 +1,10 @@
-"""Arms that lie where nothing looks like them are found, and all else is left alone."""
+"""Arms for which the picture does not speak are found elsewhere, and all else is left alone."""
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -10,8 +12,6 @@ from torch import Tensor
 
 from torchcss.body.flips import Limb, Segments
 from torchcss.body.model import BodyModel, load_body
-from torchcss.cost.part_map import part_map
-from torchcss.cost.region import part_layers
 from torchcss.cost.segmentation import SegmentationTerm
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.inference.dynamics import ConstantVelocity
@@ -19,51 +19,32 @@ from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.proposals import CovarianceScaled
 from torchcss.inference.tracker import Tracker, TrackerState, initial_state
 from torchcss.limbs import astray_limbs, other_poses, with_limbs
-from torchcss.vision.camera import Camera
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+from painted import a_body_before_a_camera, layers, moved, painted
 
 DYNAMICS = ConstantVelocity(deviation=0.05, persistence=0.8)
 
 
-def body_and_camera(dtype: torch.dtype = torch.float64) -> tuple[BodyModel, Camera]:
-    body = load_body("body34").with_base(
-        torch.eye(3, dtype=torch.float64), torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64)
-    )
-    K = [[450.0, 0.0, 239.5], [0.0, 450.0, 299.5], [0.0, 0.0, 1.0]]
-    return body.to(dtype), Camera(K, (480, 600)).to(dtype)
-
-
-def raised(body: BodyModel, angle: float, side: str = "r") -> Tensor:
-    """Standing, one arm raised sideways."""
-    x = body.rest.clone()
-    x[body.state_index(f"{side}_shoulder_raising")] += angle
-    return x
-
-
 def cost_of(
-    truth: Tensor,
+    angle: float,
     dtype: torch.dtype = torch.float64,
     *,
-    shown: tuple[str, ...] | None = None,
+    missing: tuple[str, ...] = (),
     views: int = 1,
 ) -> tuple[BodyModel, TrackingCost]:
-    """The cost of a picture whose colours tell the layers of a pose perfectly.
+    """The cost of a person whose right arm is raised by so much.
 
     Args:
-        truth: The pose.
+        angle: Radians.
         dtype: Type of it all.
-        shown: The parts that the person has; None: all.
+        missing: Parts that the person lacks.
         views: How many cameras look on, all from one place.
     """
-    body, camera = body_and_camera(dtype)
-    names, layer = part_layers(body)
-    seen = part_map(body, truth.to(dtype), camera)
-    if shown is not None:
-        missing = [body.part_names.index(name) for name in body.part_names if name not in shown]
-        seen[torch.isin(seen, torch.tensor(missing))] = -1
-    painted = torch.tensor([*layer, -1])[seen]
-    likeness = torch.stack([2.0 * (painted == i).to(truth) - 1 for i in range(len(names))])
-    term = SegmentationTerm()
-    images = term.images(likeness, torch.tensor(layer), camera, body, truth.to(dtype))
+    body, camera = a_body_before_a_camera(dtype)
+    truth, term = moved(body, angle), SegmentationTerm()
+    likeness = painted(body, camera, truth, missing)
+    images = term.images(likeness, layers(body)[1], camera, body, truth)
     choice = CostChoice(segmentation=term, contour=None, joints=None, interpenetration=None)
     cost = TrackingCost(
         body=body,
@@ -101,19 +82,19 @@ def find(cost: TrackingCost, body: BodyModel, x: Tensor, limb: Limb, num: int = 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("views", [1, 2])
 def test_the_limb_that_is_astray_is_named(dtype: torch.dtype, views: int):
-    body, cost = cost_of(raised(body_and_camera()[0], 1.3), dtype, views=views)
-    assert names(astray_limbs(cost, body, raised(body, 1.3))) == []
-    assert names(astray_limbs(cost, body, raised(body, 0.5))) == ["r_arm"]
-    both = raised(body, 0.5) + raised(body, 0.7, "l") - body.rest
+    body, cost = cost_of(1.3, dtype, views=views)
+    assert names(astray_limbs(cost, body, moved(body, 1.3))) == []
+    assert names(astray_limbs(cost, body, moved(body, 0.5))) == ["r_arm"]
+    both = moved(body, 0.5) + moved(body, 0.7, "l") - body.rest
     assert names(astray_limbs(cost, body, both)) == ["l_arm", "r_arm"]
-    stepping = raised(body, 1.3)
+    stepping = moved(body, 1.3)
     stepping[body.state_index("l_hip_abduction")] = 0.7
     assert names(astray_limbs(cost, body, stepping)) == [], "legs stand"
 
 
 def test_it_is_found_where_it_looks_like_itself():
-    body, cost = cost_of(raised(body_and_camera()[0], 1.4))
-    x, truth = raised(body, 0.4), raised(body, 1.4)
+    body, cost = cost_of(1.4)
+    x, truth = moved(body, 0.4), moved(body, 1.4)
     poses = find(cost, body, x, arm(body))
     assert 1 <= len(poses) <= 4
     assert torch.equal(body.bounds.project(poses), poses)
@@ -135,10 +116,9 @@ def test_it_is_found_where_it_looks_like_itself():
 
 def test_out_of_the_way_is_not_found():
     """Before the trunk an arm covers nothing wrong; it explains nothing either."""
-    body, _ = body_and_camera()
-    trunk = tuple(name for name in body.part_names if not name.startswith("r_"))
-    body, cost = cost_of(raised(body, 0.8), shown=trunk)
-    x = raised(body, 0.8)
+    right = ("r_clavicle", "r_upper_arm", "r_forearm", "r_hand")
+    body, cost = cost_of(0.8, missing=right)
+    x = moved(body, 0.8)
     assert "r_arm" in names(astray_limbs(cost, body, x))
     assert len(find(cost, body, x, arm(body))) == 0
     state = state_at(body, x)
@@ -146,37 +126,37 @@ def test_out_of_the_way_is_not_found():
 
 
 def test_what_cannot_be_seen_is_left_alone():
-    body, cost = cost_of(raised(body_and_camera()[0], 1.3))
-    state = state_at(body, raised(body, 0.5))
+    body, cost = cost_of(1.3)
+    state = state_at(body, moved(body, 0.5))
     for column, shift in (("root_x", 9.0), ("root_z", -9.0)):  # beside and behind the camera
         away = state._replace(mixture=state.mixture._replace(mean=state.mixture.mean.clone()))
         away.mixture.mean[:, body.state_index(column)] += shift
         assert names(astray_limbs(cost, body, away.mixture.mean[0])) == ["l_arm", "r_arm"]
         assert with_limbs(away, body, cost, DYNAMICS, body.bounds, num=4) is away
     blind = replace(cost, choice=replace(cost.choice, segmentation=None))
-    assert astray_limbs(blind, body, raised(body, 0.5)) == []
-    assert astray_limbs(replace(cost, segmentation=None), body, raised(body, 0.5)) == []
+    assert astray_limbs(blind, body, moved(body, 0.5)) == []
+    assert astray_limbs(replace(cost, segmentation=None), body, moved(body, 0.5)) == []
 
 
 def test_an_arm_before_the_chest_is_found_where_it_is():
     """There it covers nothing wrong, so that nothing else tells."""
-    body, cost = cost_of(raised(body_and_camera()[0], 0.9))
+    body, cost = cost_of(0.9)
     x = body.rest.clone()
     x[body.state_index("r_shoulder_swing")] = -1.2
     x[body.state_index("r_shoulder_twist")] = 1.2
     x[body.state_index("r_elbow_flexion")] = 1.9
     assert "r_arm" in names(astray_limbs(cost, body, x))
     poses = find(cost, body, x, arm(body))
-    uv = [cost.camera.project(body.pose(each).joints).uv for each in (x, raised(body, 0.9))]
+    uv = [cost.camera.project(body.pose(each).joints).uv for each in (x, moved(body, 0.9))]
     found = cost.camera.project(body.pose(poses[0]).joints).uv
     wrist = body.joint_index("r_wrist")
     assert float((found - uv[1])[wrist].norm()) < 0.5 * float((uv[0] - uv[1])[wrist].norm())
 
 
 def test_it_joins_the_search_at_rest():
-    body, cost = cost_of(raised(body_and_camera()[0], 1.4))
-    x = raised(body, 0.4)
-    state = state_at(body, x, raised(body, 0.4, "l"))
+    body, cost = cost_of(1.4)
+    x = moved(body, 0.4)
+    state = state_at(body, x, moved(body, 0.4, "l"))
     joined = with_limbs(state, body, cost, DYNAMICS, body.bounds, num=3)
     new = len(joined.mixture.mean) - 2
     assert 1 <= new <= 3
@@ -193,21 +173,21 @@ def test_it_joins_the_search_at_rest():
     held[columns] = False
     torch.testing.assert_close(ahead[2:, held], ahead[:1, held].expand(new, -1))
     assert torch.equal(ahead[2:, columns], joined.mixture.mean[2:, columns])
-    at_rest = state_at(body, raised(body, 1.4))
+    at_rest = state_at(body, moved(body, 1.4))
     assert with_limbs(at_rest, body, cost, DYNAMICS, body.bounds, num=3) is at_rest
 
 
 def test_a_tracker_goes_on_with_the_arm_that_it_had_lost():
     """With it the mode that leads after two frames has the arm where it is, without it has not."""
-    body, cost = cost_of(raised(body_and_camera()[0], 1.4))
+    body, cost = cost_of(1.4)
     tracker = Tracker(
         proposal=CovarianceScaled(covariance_scale=1.0), num_samples=12, num_modes=4,
         dynamics=DYNAMICS, evidence=0.3, soft_matching=True, coarse_every=0,
     )  # fmt: skip
-    elbow, truth = body.joint_index("r_elbow"), raised(body, 1.4)
+    elbow, truth = body.joint_index("r_elbow"), moved(body, 1.4)
     missed = []
     for num in (0, 4):
-        state = state_at(body, raised(body, 0.4))
+        state = state_at(body, moved(body, 0.4))
         for _ in range(2):
             if num:
                 state = with_limbs(state, body, cost, DYNAMICS, body.bounds, num=num)
@@ -220,7 +200,7 @@ def test_a_tracker_goes_on_with_the_arm_that_it_had_lost():
 
 def test_an_arm_alone_has_no_colours_to_go_by():
     body = load_body("arm7")
-    _, camera = body_and_camera()
+    _, camera = a_body_before_a_camera()
     cost = TrackingCost(body=body, camera=camera, choice=CostChoice(contour=None, joints=None))
     state = state_at(body, body.rest)
     assert with_limbs(state, body, cost, DYNAMICS, body.bounds, num=4) is state

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import torchcss
-from torchcss.body.model import load_body
+from torchcss.body.model import BodyModel, load_body
 from torchcss.cost.joints import JointObservation
 from torchcss.demo import run_demo
 from torchcss.errors import ConfigurationError, OutputError, VideoError
@@ -25,6 +25,7 @@ from torchcss.io import tracks
 from torchcss.io.fitted_body import read_fitted_body, write_fitted_body
 from torchcss.io.track_body import body_of_track
 from torchcss.io.video import Frame, VideoWriter
+from torchcss.jumps import with_modes
 from torchcss.pipeline import TrackedFrame, follow_with_base, scale_keypoints, track_frames
 from torchcss.presets import PRESETS, make_tracker
 from torchcss.robust import Quadratic
@@ -422,6 +423,7 @@ def track(
     camera: Camera | None = None,
     masks: list[np.ndarray] | None = None,
     observe: Observe = lambda index: None,
+    limb_jumps: int = 0,
 ) -> list[TrackedFrame]:
     """Track from the true first pose, by default without keypoints, with few samples."""
     mixture = GaussianMixture(
@@ -441,8 +443,34 @@ def track(
             generator=torch.Generator().manual_seed(0),
             boundary_emphasis=boundary_emphasis(settings),
             masks=masks,
+            limb_jumps=limb_jumps,
         )
     )
+
+
+def test_poses_of_limbs_join_the_search(monkeypatch: pytest.MonkeyPatch):
+    """They are compared with the flow of their own, and what descends from them is the best's."""
+    sequence = arm_sequence(generator=torch.Generator().manual_seed(0), num_frames=3)
+    settings = Settings(body="arm8", keypoints_use="first", working_size=160)
+    asked = []
+
+    def aside(state: TrackerState, body: BodyModel, *_, num: int) -> TrackerState:
+        asked.append(num)
+        elsewhere = state.mixture.mean[:1].clone()
+        elsewhere[:, body.state_index("r_elbow_flexion")] += 0.1
+        return with_modes(state, elsewhere, torch.zeros_like(elsewhere), log_odds=20.0)
+
+    monkeypatch.setattr("torchcss.pipeline.with_limbs", aside)
+    plain = track(sequence.frames, sequence, settings)
+    assert asked == []
+    jumping = track(sequence.frames, sequence, settings, limb_jumps=4)
+    assert asked == [4, 4, 4]
+    assert int(jumping[0].info.origin.max()) == 1, "the pose was descended from"
+    known = 1
+    for with_jump, without in zip(jumping, plain, strict=True):
+        assert int(with_jump.info.parent.max()) < known
+        assert not torch.equal(with_jump.state.mixture.mean, without.state.mixture.mean)
+        known = len(with_jump.state.mixture.mean)
 
 
 def test_terms_of_the_best_mode_add_up_to_its_cost():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from torchcss.body.model import BodyModel, load_body
 from torchcss.cost.flow import FlowTerm
 from torchcss.cost.frame import FrameCosts
 from torchcss.cost.part_map import bare_pixels, part_map
-from torchcss.cost.region import RegionTerm, part_layers
+from torchcss.cost.region import RegionTerm
 from torchcss.cost.segmentation import SegmentationImages, SegmentationTerm
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.inference.mixture import GaussianMixture
@@ -26,31 +27,8 @@ from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor
 from torchcss.vision.flow import TRACKING
 
-
-def a_body_before_a_camera(dtype: torch.dtype = torch.float64) -> tuple[BodyModel, Camera]:
-    body = load_body("body34").with_base(
-        torch.eye(3, dtype=torch.float64), torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64)
-    )
-    K = [[450.0, 0.0, 239.5], [0.0, 450.0, 299.5], [0.0, 0.0, 1.0]]
-    return body.to(dtype), Camera(K, (480, 600)).to(dtype)
-
-
-def layers(body: BodyModel) -> tuple[int, Tensor]:
-    names, layer = part_layers(body)
-    return len(names), torch.tensor(layer)
-
-
-def painted(body: BodyModel, camera: Camera, state: Tensor) -> Tensor:
-    """Likenesses of a picture whose colours tell the parts of a pose perfectly."""
-    count, layer = layers(body)
-    seen = torch.cat([layer, torch.tensor([-1])])[part_map(body, state, camera)]
-    return torch.stack([2.0 * (seen == index).to(state) - 1 for index in range(count)])
-
-
-def moved(body: BodyModel, angle: float) -> Tensor:
-    x = body.rest.clone()
-    x[body.state_index("r_shoulder_raising")] += angle
-    return x
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from painted import a_body_before_a_camera, layers, moved, painted
 
 
 def plain_twin(
