@@ -91,7 +91,8 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(clip: Path, out: Path, **settings) -> dict:
-    """Track the clip from a first pose that is found once."""
+    """Track the clip from a first pose that is found once, in small images."""
+    settings = {"working_size": 160, **settings}
     return track_video(
         clip / "video.mp4",
         camera=clip / "cameras.json",
@@ -183,7 +184,7 @@ def test_same_seed_same_track(clip: Path, tmp_path: Path):
 
 
 def test_all_terms_track(clip: Path, tmp_path: Path):
-    summary = run(clip, tmp_path, terms=ALL_TERMS, working_size=160)
+    summary = run(clip, tmp_path, terms=ALL_TERMS)
     # Weights of edges and the background are no terms; lengths are not free while tracking; an arm
     # is not segmented and has no silhouette.
     without = {"motion_boundaries", "background", "anthropometric", "segmentation", "silhouette"}
@@ -566,7 +567,7 @@ def test_a_body_is_segmented_and_an_arm_alone_is_not():
 
 def test_a_particle_filter_weighs_by_the_observation_alone(clip: Path, tmp_path: Path):
     terms = ("joints", "stabiliser", "temporal", "temporal_mixture")
-    summary = run(clip, tmp_path, preset="condensation", terms=terms, working_size=160)
+    summary = run(clip, tmp_path, preset="condensation", terms=terms)
     assert set(summary["best_mode_cost_by_term"]) == {"joints", "stabiliser"}
     assert np.isfinite(torchcss.load_track(tmp_path).joints_world).all()
 
