@@ -32,7 +32,8 @@ the originals; the others share the robust cost and the limits of this package.
 
 The search noise of these rows is a multiple of the everyday motion of one frame (`noise`). It and
 the numbers of particles are ours, chosen before any comparison: the papers give none. A filter gets
-as many evaluations of the cost as a descending tracker may take, 20 per sample.
+as many evaluations of the cost as a descending tracker may take, 20 per sample that descends to
+the end.
 """
 
 from __future__ import annotations
@@ -67,7 +68,9 @@ class Preset:
         proposal: Where samples go, for trackers that descend from them; one that searches by
             dynamical noise gets its `deviation` from `noise`.
         particles: The particle filter instead; its numbers and dynamics are filled in.
-        samples_arm: Samples per frame for an arm.
+        samples_arm: Samples per frame for an arm. With 160 that race for 40 places instead of 40
+            (`finalists_arm`) css takes a fifth more evaluations; on the rendered arm none of five
+            seeds is lost, and with 40 two are.
         samples_body: Samples per frame for a body.
         modes_arm: Modes kept for an arm.
         modes_body: Modes kept for a body.
@@ -153,7 +156,7 @@ end where 20 from a radian on did)."""
 _CSS = Preset(
     what="covariance scaled sampling, [IJRR] Fig. 6 with s = 8, modes kept apart, and jumps",
     proposal=CovarianceScaled(covariance_scale=8.0, max_deviation=1.0),
-    samples_arm=40,
+    samples_arm=160,
     samples_body=60,
     memory=0.98,
     evidence=0.1,
@@ -215,6 +218,7 @@ PRESETS: dict[str, Preset] = {
         memory=1.0,
         evidence=1.0,
         evidence_arm=None,
+        samples_arm=40,
         finalists_arm=0,
         finalists_body=0,
         separation=0.0,
