@@ -70,7 +70,7 @@ class Preset:
         particles: The particle filter instead; its numbers and dynamics are filled in.
         samples_arm: Samples per frame for an arm. With 160 that race for 40 places instead of 40
             (`finalists_arm`) css takes a fifth more evaluations; on the rendered arm none of five
-            seeds is lost, and with 40 two are.
+            seeds is lost; with 40 two were.
         samples_body: Samples per frame for a body.
         modes_arm: Modes kept for an arm.
         modes_body: Modes kept for a body.

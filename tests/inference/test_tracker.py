@@ -394,8 +394,8 @@ def test_soft_matching_hands_no_past_to_who_is_far_from_it(generator):
     places, _, _ = step_of_rivals(generator, soft_matching=False)
     assert places == [2, 0]
     places, state, info = step_of_rivals(generator, soft_matching=True)
-    # Of modes alike that of the better past is kept, a tenth of a nat dearer.
-    assert places == [1, 2]
+    # Who has the past stays, a tenth of a nat dearer, and stands for both neighbours.
+    assert places == [1, -1]
     assert info.parent.tolist() == [0, -1]
     assert float(state.mixture.log_weight[0]) > -0.2
     # What is near no mode of the last frame did not move there: it is new.
@@ -403,14 +403,28 @@ def test_soft_matching_hands_no_past_to_who_is_far_from_it(generator):
     assert torch.equal(state.velocity[1], torch.zeros_like(state.velocity[1]))
 
 
-def test_with_soft_matching_the_cheapest_of_modes_alike_is_kept(generator):
-    """Where the past counts little for the choice of a pose it counts all the same for weights."""
-    places, state, info = step_of_rivals(generator, soft_matching=True, evidence=1e-3)
-    assert places == [0, 2]
-    assert int(info.parent[0]) == 1
-    # Neither is near the first mode: both are as good as new, at e^-2.
-    odds = state.mixture.log_weight[0] - state.mixture.log_weight[1]
-    assert 0 <= float(odds) < 1e-2
+@pytest.mark.parametrize("kept", [[2], [2, 0], [2, 1, 0]])
+def test_with_soft_matching_who_weighs_most_is_kept(kept, generator):
+    """At 3, where the past is; three poses are cheaper, by half a nat, and new."""
+    tracker = replace(
+        CSS, num_samples=80, num_modes=len(kept), separation=1.4, soft_matching=True, evidence=0.1
+    )
+    start = tracker.init(single((3.0, 0.0), (0.8, 0.1)), generator=generator)
+    state, info = tracker.step(start, CombWithLandmarks(), problems.box(2, -3.7, 3.7))
+    assert (state.mixture.mean[:, 0] / 1.5).round().int().tolist() == kept
+    assert int(info.parent[0]) == 0
+    assert int(info.num_distinct) >= 4
+    hard = replace(tracker, soft_matching=False)
+    state, _ = hard.step(start, CombWithLandmarks(), problems.box(2, -3.7, 3.7))
+    assert 2 not in (state.mixture.mean[:, 0] / 1.5).round().int().tolist()
+
+
+@pytest.mark.parametrize("soft_matching", [False, True])
+def test_of_new_modes_alike_the_cheapest_is_kept(soft_matching, generator):
+    """-1 and -2, alike, are both far from the past: -1 is the cheaper."""
+    places, _, _ = step_of_rivals(generator, soft_matching=soft_matching, evidence=1e-3)
+    assert -2 not in places
+    assert places == ([1, -1] if soft_matching else [2, 0])
 
 
 def test_a_race_leaves_the_best_minima_and_takes_fewer_evaluations(generator):

@@ -247,7 +247,8 @@ class Tracker:
         soft_matching: In step 5, multiply in the prior's weight at the place of each mode, see
             `prior_at`, instead of that of the closest prior mode, which Fig. 6 gives to one mode
             only: a mode far from all of the prior may then be handed the best past there is, and
-            the pose that had it goes on with another's.
+            the pose that had it goes on with another's. Step 4 then keeps the mode that weighs most
+            after step 5, however many are cheaper in this frame, if there is a `separation`.
         separation: Modes of which no landmark is this far apart are one explanation, of which one
             alone is kept as long as there are others. Zero: the K best modes are kept however
             alike they are, as in Fig. 6. Clutter makes many minima within a hand's breadth, which
@@ -428,20 +429,26 @@ class Tracker:
         log_likelihood: Float[Tensor, " m"],
         past: Past | None,
     ) -> Int[Tensor, " k"]:
-        """Choose the modes that are kept, best first.
+        """Choose the modes that are kept.
 
-        Of modes alike, which are one explanation, the cheapest is kept, but for what their pasts
-        say: of poses that hardly differ in cost, that of the better past.
+        First the one that will weigh most after step 5: one frame does not decide what it is worth,
+        since clutter may well be the cheaper fit K times, or a hand's breadth away. Then the
+        cheapest. Of modes alike, which are one explanation, the cheapest is kept, but for what
+        their pasts say: of poses that hardly differ in cost, that of the better past.
         """
         order = modes.log_weight.argsort(descending=True, stable=True)
         landmarks = getattr(cost, "landmarks", None)
         if not self.separation or landmarks is None:
             return order[: self.num_modes]
+        if past is not None:
+            heaviest = (modes.log_weight + past.log_weight).argmax()
+            order = torch.cat([heaviest[None], order[order != heaviest]])
         points = landmarks(modes.mean[order])
         chosen = separated(points, self.separation, self.num_modes)
         if past is None:
             return order[chosen]
         score = (log_likelihood + self.evidence * past.log_weight)[order]
+        score[0] = torch.inf
         return order[representatives(points, self.separation, chosen, score)]
 
     def _race(
