@@ -8,17 +8,20 @@ import signal
 import struct
 import subprocess
 import sys
+from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
 
 import av
 import numpy as np
 import pytest
+from av.container import InputContainer
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
 from torchcss.errors import ConfigurationError, OutputError, ShapeError, VideoError
+from torchcss.io import video
 from torchcss.io.video import Frame, VideoReader, VideoWriter, natural_order, read_image
 
 
@@ -92,6 +95,32 @@ def test_round_trip(tmp_path: Path, suffix: str) -> None:
             assert frame.image.shape == (48, 64, 3)
             assert abs(frame.image.astype(float).mean() - grey_level(frame.index)) < 3
     assert list(tmp_path.iterdir()) == [path]  # no temporary file is left
+
+
+@pytest.mark.parametrize(
+    ("written", "read"),
+    [
+        ([0, 0, 0, 0, 0], [0, 1, 2, 3, 4]),
+        ([0, 1, 1, 4, 5], [0, 1, 2, 4, 5]),
+        ([3, 2, 4, 4, 7], [0, 1, 2, 3, 4]),
+    ],
+)
+def test_times_rise(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: list[int], read: list[int]
+) -> None:
+    """Where the file's times do not, a frame is one interval after the last, from any start."""
+    path = film(tmp_path / "a.mp4", len(written))
+    decode = video._decode
+
+    def with_times(container: InputContainer) -> Iterator[av.VideoFrame]:
+        for picture, time in zip(decode(container), written, strict=False):
+            picture.time_base, picture.pts = Fraction(1, 30), time
+            yield picture
+
+    monkeypatch.setattr(video, "_decode", with_times)
+    times = [frame.time_s * 30 for frame in VideoReader(path)]
+    assert times == pytest.approx(read)
+    assert [frame.time_s * 30 for frame in VideoReader(path, start=2)] == pytest.approx(read[2:])
 
 
 @pytest.mark.parametrize("size_wh", [(63, 47), (64, 47), (63, 48), (1, 1), (2, 2)])

@@ -65,7 +65,8 @@ class Frame:
 
     Attributes:
         index: Place in the file, from 0, whatever part of the file is read.
-        time_s: Seconds since the file's first frame.
+        time_s: Seconds since the file's first frame. Where the file's own times do not rise from
+            one frame to the next, it is an interval of its frame rate after the last.
         image: Red, green, blue.
     """
 
@@ -203,6 +204,7 @@ class VideoReader:
     def _read_container(self) -> Generator[Frame]:
         num_read = 0
         origin: float | None = None
+        time: float | None = None
         damage: str | None = None
         try:
             with self._open() as container:
@@ -210,6 +212,7 @@ class VideoReader:
                     index, num_read = num_read, num_read + 1
                     if origin is None and picture.time is not None:
                         origin = picture.time
+                    time = self._time(picture, index, origin, time)
                     if self._stop is not None and index >= self._stop:
                         return
                     if index < self._start or (index - self._start) % self._stride:
@@ -221,7 +224,7 @@ class VideoReader:
                             f"pixels, the first has {self.info.width} x {self.info.height}; "
                             "all frames must have one size"
                         )
-                    yield Frame(index, self._time(picture, index, origin), image)
+                    yield Frame(index, time, image)
                 container_name = container.format.name
         except VideoError:
             raise
@@ -247,10 +250,15 @@ class VideoReader:
         if num_read <= self._start:
             raise self._beyond_the_end(num_read)
 
-    def _time(self, picture: av.VideoFrame, index: int, origin: float | None) -> float:
+    def _time(
+        self, picture: av.VideoFrame, index: int, origin: float | None, last: float | None
+    ) -> float:
         if picture.time is None or origin is None:
-            return float(index / self.info.frame_rate)
-        return float(picture.time - origin)
+            time = float(index / self.info.frame_rate)
+        else:
+            time = float(picture.time - origin)
+        # Some writers give every frame the same time; velocities and smoothing need one that rises.
+        return time if last is None or time > last else last + float(1 / self.info.frame_rate)
 
     # Images.
 
