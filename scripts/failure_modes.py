@@ -77,7 +77,8 @@ class Config:
     prediction: Literal["velocity", "surface"] = "velocity"
     """Where trunks are expected, see `torchcss.settings.Settings`; not for particle filters."""
     terms: tuple[str, ...] = TERMS
-    """Terms and priors of the cost; `default` stands for the default ones."""
+    """Terms and priors of the cost; `default` stands for the default ones, `still` for those for a
+    camera that stands still."""
     evidence: float | None = None
     """How much one frame counts in the weights of modes; the presets' numbers by default."""
     limb_jumps: int = 0

@@ -54,7 +54,8 @@ class Demo:
     samples: int | None = None
     """Samples per frame; the preset's number by default."""
     terms: tuple[str, ...] = TERMS
-    """Terms and priors of the cost; `default` stands for the default ones."""
+    """Terms and priors of the cost; `default` stands for the default ones, `still` for those for a
+    camera that stands still."""
     device: str = "cpu"
     """Where to compute."""
     dtype: Literal["float64", "float32"] = "float64"
@@ -131,7 +132,8 @@ class Track:
     limb_jumps: int = 0
     """Most other poses that join the search for an arm for which the colours do not speak."""
     terms: tuple[str, ...] = TERMS
-    """Terms and priors of the cost; `default` stands for the default ones."""
+    """Terms and priors of the cost; `default` stands for the default ones, `still` for those for a
+    camera that stands still."""
     contour_weight: float = Settings.contour_weight
     """Temperature of the contour term, nats."""
     weights: dict[str, float] = field(default_factory=dict)

@@ -43,6 +43,10 @@ TERMS = (
 """Terms and priors of the cost by default: all that do not stand in for one another, but for
 `background` and `silhouette`, which take dark clothes before a dark wall for the wall."""
 
+STILL_TERMS = (*(name for name in TERMS if name != "flow"), "background", "silhouette")
+"""Those for a camera that stands still: it shows where the body is, also where the flow has lost
+it. Where a body turns quickly the flow falls behind, and holds it back."""
+
 ALL_TERMS = (
     *("contour", "motion_boundaries", "edge_energy", "region", "segmentation", "flow", "joints"),
     *("stabiliser", "anthropometric", "interpenetration", "temporal", "temporal_mixture"),
@@ -57,14 +61,16 @@ _NO_TERMS = ("motion_boundaries", "background")
 """Of these: what has no cost of its own."""
 
 
+_SETS = {"default": TERMS, "still": STILL_TERMS}
+
+
 def named_terms(names: Iterable[str]) -> tuple[str, ...]:
-    """Terms by name, where `default` stands for all of `TERMS`; each comes once.
+    """Terms by name; `default` stands for `TERMS`, `still` for `STILL_TERMS`; each comes once.
 
     Args:
         names: Names as a user gives them.
     """
-    every = [term for name in names for term in (TERMS if name == "default" else (name,))]
-    return tuple(dict.fromkeys(every))
+    return tuple(dict.fromkeys(term for name in names for term in _SETS.get(name, (name,))))
 
 
 @dataclass(frozen=True, kw_only=True)
