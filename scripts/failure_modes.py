@@ -78,7 +78,7 @@ class Config:
     """Where trunks are expected, see `torchcss.settings.Settings`; not for particle filters."""
     terms: tuple[str, ...] = TERMS
     """Terms and priors of the cost; `default` stands for the default ones, `still` for those for a
-    camera that stands still."""
+    camera that stands still, `papers` for those of the papers."""
     evidence: float | None = None
     """How much one frame counts in the weights of modes; the presets' numbers by default."""
     limb_jumps: int = 0

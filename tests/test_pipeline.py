@@ -559,6 +559,7 @@ def test_a_body_is_segmented_and_an_arm_alone_is_not():
     still = {*TERMS, "background", "silhouette"} - {"flow"}
     assert set(named_terms(["still"])) == still
     assert named_terms(["still", "flow"])[-1] == "flow"
+    assert not {"region", "segmentation", "joints"} & set(named_terms(["papers"]))
     assert make_choice(Settings(body="body34", terms=ALL_TERMS), 2.0).background
     assert not make_choice(Settings(body="arm8", terms=ALL_TERMS), 2.0).background
     assert make_choice(Settings(body="body34"), 2.0).silhouette is None

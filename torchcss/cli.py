@@ -55,7 +55,7 @@ class Demo:
     """Samples per frame; the preset's number by default."""
     terms: tuple[str, ...] = TERMS
     """Terms and priors of the cost; `default` stands for the default ones, `still` for those for a
-    camera that stands still."""
+    camera that stands still, `papers` for those of the papers."""
     device: str = "cpu"
     """Where to compute."""
     dtype: Literal["float64", "float32"] = "float64"
@@ -133,7 +133,7 @@ class Track:
     """Most other poses that join the search for an arm for which the colours do not speak."""
     terms: tuple[str, ...] = TERMS
     """Terms and priors of the cost; `default` stands for the default ones, `still` for those for a
-    camera that stands still."""
+    camera that stands still, `papers` for those of the papers."""
     contour_weight: float = Settings.contour_weight
     """Temperature of the contour term, nats."""
     weights: dict[str, float] = field(default_factory=dict)

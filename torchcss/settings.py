@@ -47,6 +47,13 @@ STILL_TERMS = (*(name for name in TERMS if name != "flow"), "background", "silho
 """Those for a camera that stands still: it shows where the body is, also where the flow has lost
 it. Where a body turns quickly the flow falls behind, and holds it back."""
 
+PAPER_TERMS = (
+    *("contour", "motion_boundaries", "flow"),
+    *("stabiliser", "anthropometric", "interpenetration", "temporal"),
+)
+"""What the papers' cost has ([IJRR] sections 3.1 and 3.2, [RR] section 3): edges weighed by motion
+boundaries, flow and priors; no colours, and joints in the first frame only."""
+
 ALL_TERMS = (
     *("contour", "motion_boundaries", "edge_energy", "region", "segmentation", "flow", "joints"),
     *("stabiliser", "anthropometric", "interpenetration", "temporal", "temporal_mixture"),
@@ -61,11 +68,11 @@ _NO_TERMS = ("motion_boundaries", "background")
 """Of these: what has no cost of its own."""
 
 
-_SETS = {"default": TERMS, "still": STILL_TERMS}
+_SETS = {"default": TERMS, "still": STILL_TERMS, "papers": PAPER_TERMS}
 
 
 def named_terms(names: Iterable[str]) -> tuple[str, ...]:
-    """Terms by name; `default` stands for `TERMS`, `still` for `STILL_TERMS`; each comes once.
+    """Terms by name, each once; `default`, `still` and `papers` stand for the sets of these names.
 
     Args:
         names: Names as a user gives them.
