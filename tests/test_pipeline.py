@@ -20,7 +20,7 @@ from torchcss.demo import run_demo
 from torchcss.errors import ConfigurationError, OutputError, VideoError
 from torchcss.hypotheses import Initialisation
 from torchcss.inference.mixture import GaussianMixture
-from torchcss.inference.tracker import Tracker, TrackerState
+from torchcss.inference.tracker import Tracker, TrackerState, stated_evidence
 from torchcss.io import tracks
 from torchcss.io.fitted_body import read_fitted_body, write_fitted_body
 from torchcss.io.track_body import body_of_track
@@ -532,6 +532,33 @@ def test_awkward_frames_leave_no_nan_and_lose_nothing():
         for part in frame.state.mixture:
             assert torch.isfinite(part).all(), name
         assert all(np.isfinite(value) for value in frame.terms.values()), name
+
+
+@pytest.mark.parametrize(
+    ("asked", "weights", "covariances"),
+    [
+        ({}, 0.3, 0.1),  # a body with keypoints in every frame
+        ({"keypoints_use": "first"}, 0.1, 0.1),
+        ({"terms": ("contour", "temporal")}, 0.1, 0.1),
+        ({"body": "arm8"}, 0.3, 0.05),
+        ({"body": "arm8", "keypoints_use": "first"}, 0.05, 0.05),
+        ({"evidence": 0.7}, 0.7, 0.1),
+        ({"keypoints_use": "first", "evidence": 0.7}, 0.7, 0.1),
+        ({"preset": "css_heavy_tailed"}, 0.3, 0.1),
+        ({"preset": "css_figure_6"}, 1.0, 1.0),
+        ({"preset": "single"}, 1.0, 1.0),
+        ({"preset": "annealed"}, None, 1.0),
+    ],
+)
+def test_how_much_a_frame_counts_in_weights_and_in_covariances(asked, weights, covariances):
+    settings = Settings(**asked)
+    tracker = make_settings_tracker(settings, load_body(settings.body).motion_rate / 25)
+    assert getattr(tracker, "evidence", None) == weights
+    assert stated_evidence(tracker) == covariances
+
+
+def test_the_file_tells_what_its_covariances_count(tracked: tuple[Path, dict]):
+    assert torchcss.load_track(tracked[0]).evidence == 0.05
 
 
 @pytest.mark.parametrize("preset", PRESETS)

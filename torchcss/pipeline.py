@@ -36,6 +36,7 @@ from torchcss.inference.tracker import (
     Tracker,
     TrackerInfo,
     TrackerState,
+    stated_evidence,
 )
 from torchcss.inference.trust_region import default_prior_variance
 from torchcss.io.video import Frame
@@ -63,9 +64,8 @@ class TrackedFrame(NamedTuple):
         body: The body on this frame's base.
         state: The tracker's state, best mode first.
         info: What the step did.
-        covariance: Covariances of the modes with the likelihood to the power `Tracker.evidence`, as
-            it counts in their weights: what the tracker states. Those in the state are of the cost
-            as it is, by which it samples.
+        covariance: Covariances of the modes with the likelihood to a power, `stated_evidence`: what
+            the tracker states. Those in the state are of the cost as it is, by which it samples.
         joints_world: Joint centres of the modes, metres.
         terms: Cost of the best mode by term, nats.
         seconds: Wall time of the frame by stage.
@@ -226,7 +226,7 @@ def track_frames(
             info,
             tempered(
                 state.mixture.covariance,
-                getattr(tracker, "evidence", 1.0),
+                stated_evidence(tracker),
                 default_prior_variance(bounds),
             ),
             body.pose(mean).joints,

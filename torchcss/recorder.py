@@ -24,7 +24,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchcss.body.model import BodyModel
-from torchcss.inference.tracker import SequenceTracker
+from torchcss.inference.tracker import SequenceTracker, stated_evidence
 from torchcss.io.atomic import output_error
 from torchcss.io.cameras import calibration
 from torchcss.io.overlay import draw_overlay, project_body
@@ -198,7 +198,7 @@ class Recorder:
             self.folder / "track.npz",
             state_names=body.state_names,
             joint_names=body.joint_names,
-            evidence=getattr(self.tracker, "evidence", 1.0),
+            evidence=stated_evidence(self.tracker),
         )
         totals = _Totals()
         ended, began = "interrupted", time.perf_counter()

@@ -95,7 +95,7 @@ class Settings:
         oversampling: How many times as many samples are drawn; those with the best edges descend,
             see `Tracker`.
         evidence: Power of a frame's likelihood in the weights of modes, above 0 and at most 1, see
-            `Tracker`; the preset's by default.
+            `Tracker`; the preset's by default. The stated covariances keep the preset's.
         limb_jumps: How many other poses of an arm for which the colours do not speak join the
             search, see `torchcss.limbs`; 0 for none. For trackers that descend from samples.
         keypoints_use: "all": keypoints are observations in every frame; "first": they only
@@ -295,12 +295,11 @@ def make_settings_tracker(settings: Settings, motion: Float[Tensor, " n"]) -> Se
         num_modes=settings.modes,
         motion=tuple(motion.tolist()),
     )
-    asked: dict[str, Any] = {}
-    if settings.oversampling != 1:
-        asked["oversampling"] = settings.oversampling
-    if settings.evidence is not None:
-        asked["evidence"] = settings.evidence
-    if not asked:
-        return tracker
-    assert isinstance(tracker, Tracker)  # `Settings` has refused the others
-    return replace(tracker, **asked)
+    if not isinstance(tracker, Tracker):
+        return tracker  # `Settings` has refused what follows
+    evidence = settings.evidence
+    if evidence is None and settings.keypoints_use == "all" and "joints" in settings.terms:
+        evidence = PRESETS[settings.preset].evidence_keypoints
+    if evidence is not None:
+        tracker = replace(tracker, evidence=evidence, covariance_evidence=tracker.evidence)
+    return replace(tracker, oversampling=settings.oversampling)

@@ -12,7 +12,7 @@ from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.inference.dynamics import ConstantVelocity, Diffusion
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.proposals import CovarianceScaled, EigenDirectionGrid, Samples
-from torchcss.inference.tracker import Tracker
+from torchcss.inference.tracker import Tracker, stated_evidence
 from torchcss.types import LocalModel, Status
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -321,6 +321,11 @@ def test_evidence_is_the_power_of_the_likelihood(generator):
         state, info = tracker.step(tracker.init(single(), generator=generator), well, BOUNDS)
         torch.testing.assert_close(state.mixture.weight, (-evidence * info.cost).softmax(0))
         assert info.parent.tolist() == [0, -1]
+        # The covariances that are stated may have another; the weights do not change with it.
+        other = replace(tracker, covariance_evidence=0.5)
+        assert (stated_evidence(tracker), stated_evidence(other)) == (evidence, 0.5)
+        same, _ = other.step(other.init(single(), generator=generator), well, BOUNDS)
+        assert torch.equal(same.mixture.weight, state.mixture.weight)
     # Frame after frame it adds up: the odds of two modes are those of all costs so far.
     assert float(info.cost[1] - info.cost[0]) > 0.5
     both = GaussianMixture(

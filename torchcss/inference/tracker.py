@@ -212,6 +212,16 @@ def _unperturbed(samples: Samples, num_modes: int) -> Bool[Tensor, " s"]:
     return first & (samples.log_weight == -torch.inf)
 
 
+def stated_evidence(tracker: SequenceTracker) -> float:
+    """Power of a frame's likelihood in the covariances that a tracker states, see `tempered`.
+
+    Args:
+        tracker: One with `covariance_evidence` or `evidence`; for others it is 1.
+    """
+    power = getattr(tracker, "covariance_evidence", None)
+    return getattr(tracker, "evidence", 1.0) if power is None else power
+
+
 @dataclass(frozen=True, kw_only=True)
 class Tracker:
     """The multiple-mode tracker of section 4.2 [IJRR].
@@ -231,6 +241,9 @@ class Tracker:
             frames as independent evidence. They are not: what a body model lacks, clutter and
             occlusion cost the same modes in frame after frame. With a sharp likelihood the first
             frames then decide for good, or, where memory is short, each frame anew.
+        covariance_evidence: The same power in the covariances that are stated, see
+            `stated_evidence`; None: that of the weights. How fast the best mode changes is one
+            question, how far off all of them are together is another.
         coarse_every: If the cost has a method `coarse()` that returns a smoother cost (or None),
             every so many samples descend on that first, so that what moved farther than the cost's
             own basin reaches is found again; 0 for never. As many of them as there are modes begin
@@ -265,6 +278,7 @@ class Tracker:
     laplace_evidence: bool = False
     memory: float = 1.0
     evidence: float = 1.0
+    covariance_evidence: float | None = None
     coarse_every: int = 3
     oversampling: int = 1
     finalists: int = 0

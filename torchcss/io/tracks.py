@@ -79,7 +79,8 @@ class Track(NamedTuple):
         joint_names: Names of the joints.
         joints_world: Joint centres of the modes, metres.
         base_transform: World from the frame in which the root moves.
-        evidence: Power with which the likelihood counts in the covariances, see `Tracker.evidence`.
+        evidence: Power with which the likelihood counts in the covariances, see
+            `torchcss.inference.tracker.stated_evidence`.
     """
 
     frames: Int[np.ndarray, " t"]
