@@ -298,7 +298,8 @@ def make_settings_tracker(settings: Settings, motion: Float[Tensor, " n"]) -> Se
     if not isinstance(tracker, Tracker):
         return tracker  # `Settings` has refused what follows
     evidence = settings.evidence
-    if evidence is None and settings.keypoints_use == "all" and "joints" in settings.terms:
+    marked = settings.keypoints_use == "all" and "joints" in settings.terms
+    if evidence is None and marked and settings.body not in ARM_NAMES:
         evidence = PRESETS[settings.preset].evidence_keypoints
     if evidence is not None:
         tracker = replace(tracker, evidence=evidence, covariance_evidence=tracker.evidence)
