@@ -39,6 +39,8 @@ from torchcss.yardstick import Thresholds, over_seeds, summarise
 
 COLUMNS = {
     # title: entry, factor, decimals
+    "limb at s": ("limb_lost_s", 1, 1),
+    "of K at s": ("limb_lost_of_modes_s", 1, 1),
     "best mm": ("root_aligned_mm", 1, 0),
     "of K mm": ("root_aligned_best_of_modes_mm", 1, 0),
     "PA mm": ("pa_mpjpe_mm", 1, 0),
@@ -242,15 +244,16 @@ def entry_of(run: Run, thresholds: Thresholds, interval_s: float) -> dict[str, A
 def print_table(table: dict[str, dict[str, Any]], sequence: str) -> None:
     """The medians, and the paper's words on the time of failure."""
     told = {row.preset: row.told for row in PUBLISHED if row.sequence == sequence}
-    titles = "".join(f"{title:>9}" for title in COLUMNS)
+    titles = "".join(f"{title:>10}" for title in COLUMNS)
     print(f"{'median over seeds':22}{'lost':>6}{'at s (range)':>18}{'paper':>16}{titles}")
     for name, row in table.items():
         middle, least, most = (f"{t:.1f}" if math.isfinite(t) else "-" for t in row["lost_s"])
         when = f"{middle} ({least}..{most})" if row["lost"] else "never"
         cells = ""
         for entry, factor, digits in COLUMNS.values():
-            value = factor * row[entry][0]
-            cells += f"{value:9.{digits}f}" if math.isfinite(value) else f"{'':9}"
+            value = factor * row[entry][0] if entry in row else math.nan
+            text = "never" if math.isinf(value) else f"{value:.{digits}f}"
+            cells += f"{'' if math.isnan(value) else text:>10}"
         ended = f"  {row['errors']} ended by an error" if row["errors"] else ""
         lost = f"{row['lost']}/{row['seeds']}"
         print(f"{name:22}{lost:>6}{when:>18}{told.get(name, ''):>16}{cells}{ended}")

@@ -363,9 +363,32 @@ def test_a_run_that_is_lost_at_once_and_one_that_is_not() -> None:
     assert (row["lost_s"], row["num_frames_held"], row["root_aligned_mm"]) == (0.0, 0, 400.0)
     row = summarise([measure(0, [[20.0]])], Thresholds(), 0.04)
     assert not row["lost"]
+    assert math.isnan(row["limb_lost_s"])
     assert math.isnan(row["lost_s"])
     assert math.isnan(row["best_weight"])  # there never was a second mode
     assert math.isnan(row["acceleration_error"])
+
+
+def test_a_limb_is_lost_where_the_mean_is_not() -> None:
+    """From 0.2 s on in the best mode; the nearest one is never so far off."""
+    far, near, between = [20.0, 300.0], [240.0, 20.0], [20.0, np.nan]
+    modes = [[near, far] if i < 5 else [between if i == 8 else far, near] for i in range(30)]
+    measures = [measure(i, errors) for i, errors in enumerate(modes)]
+    row = summarise(measures, Thresholds(), 0.04)
+    assert not row["lost"]
+    assert row["limb_lost_s"] == pytest.approx(0.2)
+    assert math.isnan(row["limb_lost_of_modes_s"])
+    # From its first frame to the last that is needed it is half a second: 12.5 intervals.
+    for count, expected in ((13, math.nan), (14, 0.2)):
+        stop = 5 + count
+        early = [m if m.frame < stop else measure(m.frame, [near, far]) for m in measures]
+        found = summarise(early, Thresholds(), 0.04)["limb_lost_s"]
+        np.testing.assert_allclose(found, expected)
+    # The first joint of the nearest mode is 240 off but for frame 8, where the other is unknown.
+    row = summarise(measures, Thresholds(lost_mm=200.0), 0.04)
+    assert row["limb_lost_of_modes_s"] == pytest.approx(0.36)
+    row = summarise(measures, Thresholds(lost_mm=350.0), 0.04)
+    assert math.isnan(row["limb_lost_s"])
 
 
 def test_medians_over_seeds() -> None:
@@ -380,6 +403,9 @@ def test_medians_over_seeds() -> None:
     assert over_seeds(rows[:3])["lost_s"] == (2.0, 0.5, math.inf)
     assert over_seeds(rows[1:2])["lost_s"] == (math.inf,) * 3
     assert np.isnan(over_seeds(rows[1:2])["x"]).all()
+    # An earlier version's run, which did not measure limbs, does not count as one that kept them.
+    later = over_seeds([*rows[:1], rows[0] | {"limb_lost_s": 1.0}, rows[1] | {"limb_lost_s": None}])
+    assert later["limb_lost_s"] == (math.inf, 1.0, math.inf)
     assert number(None, 3.0) == 3.0
     assert number(2) == 2.0
 

@@ -12,6 +12,9 @@
   errors are the same. Its frames fail above 150 mm: an arm that follows something else still begins
   at the shoulder, and a tracker that stands still while the arm swings away has 200 mm, where good
   ones have less than 40.
+* A *limb* is lost at the first frame from which on one and the same joint is farther than that from
+  where it is for half a second: in the best mode, and, as with all that is said to be of the modes,
+  in the one nearest to the truth. A mean over the joints forgives an arm that points elsewhere.
 * The *true mode is kept* if the mean root-aligned error of any mode is below 100 mm; in angles, if
   the true angles lie within three standard deviations of any mode (root of the mean squared
   Mahalanobis distance per parameter).
@@ -63,6 +66,9 @@ from torchcss.vision.camera import Camera
 
 ARM_LOST_MM = 150.0
 """Error above which a frame of an arm counts as failed."""
+
+LOSSES = ("lost_s", "limb_lost_s", "limb_lost_of_modes_s")
+"""Entries of a row that are times of a loss, NaN where there was none."""
 
 _PLACE = ROOT_NAMES[:3]
 """Where a body stands."""
@@ -420,6 +426,10 @@ def summarise(
         "lost": lost is not None,
         "lost_s": math.nan if lost is None else times[lost],
         "failed_share": _mean([m.failed for m in measures if m.failed is not None]),
+        "limb_lost_s": limb_loss([m.root_aligned_mm[0] for m in measures], times, thresholds),
+        "limb_lost_of_modes_s": limb_loss(
+            [m.root_aligned_mm[_nearest(m)] for m in measures], times, thresholds
+        ),
         "num_frames_held": len(held) if lost is None else lost,
         **_errors(held),
         "true_mode_kept": _mean(
@@ -485,6 +495,27 @@ def loss(measures: Sequence[FrameMeasures], thresholds: Thresholds) -> int | Non
     return None if first is None else known[first]
 
 
+def limb_loss(
+    errors_mm: Sequence[Float[np.ndarray, " j"]], times_s: Sequence[float], thresholds: Thresholds
+) -> float:
+    """When some joint was lost for good, see `first_loss`; NaN if none ever was.
+
+    Args:
+        errors_mm: Errors of the joints, frame by frame; NaN, where a joint is not known, ends no
+            stretch of failures and begins none.
+        times_s: Times of the frames, seconds.
+        thresholds: How far off a joint has failed, and how long that has to last.
+    """
+    errors, times, lost = np.stack(errors_mm), np.asarray(times_s, np.float64), []
+    for joint in errors.T:
+        known = np.isfinite(joint)
+        failed = joint[known] > thresholds.lost_mm
+        first = first_loss(failed, times[known], regain_s=thresholds.regain_s)
+        if first is not None:
+            lost.append(float(times[known][first]))
+    return min(lost, default=math.nan)
+
+
 def _nearest(measures: FrameMeasures) -> int:
     """The mode that is nearest to the truth, the best one where that is not known."""
     return max(0, int(best_of_modes(measures.root_aligned_mm)[1]))
@@ -507,14 +538,15 @@ def over_seeds(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
     Args:
         rows: The runs; None, which files have for NaN, counts as not known. Whoever did not lose
-            the body loses it later than anybody: infinite.
+            the body, or a limb, loses it later than anybody: infinite.
     """
     table: dict[str, Any] = {"seeds": len(rows), "lost": sum(row["lost"] for row in rows)}
-    for key, example in rows[0].items():
+    for key, example in rows[-1].items():
         if key == "lost" or not (example is None or isinstance(example, (int, float))):
             continue
-        missing = math.inf if key == "lost_s" else math.nan
-        values = [number(row[key], missing) for row in rows]
+        missing = math.inf if key in LOSSES else math.nan
+        # A file may begin with runs of an earlier version, which did not measure everything.
+        values = [number(row[key], missing) for row in rows if key in row]
         known = sorted(value for value in values if not math.isnan(value)) or [math.nan]
         # The middle by hand: the mean of two middle ones may be that of infinities.
         middle = (known[(len(known) - 1) // 2] + known[len(known) // 2]) / 2
