@@ -486,13 +486,12 @@ def loss(measures: Sequence[FrameMeasures], thresholds: Thresholds) -> int | Non
         measures: The frames of a run.
         thresholds: How long failing has to last.
     """
-    known = [index for index, m in enumerate(measures) if m.failed is not None]
-    first = first_loss(
-        [bool(measures[index].failed) for index in known],
-        [measures[index].time_s for index in known],
-        regain_s=thresholds.regain_s,
+    return _first_known_loss(
+        np.array([bool(m.failed) for m in measures]),
+        np.array([m.failed is not None for m in measures]),
+        np.array([m.time_s for m in measures]),
+        thresholds,
     )
-    return None if first is None else known[first]
 
 
 def limb_loss(
@@ -506,14 +505,24 @@ def limb_loss(
         times_s: Times of the frames, seconds.
         thresholds: How far off a joint has failed, and how long that has to last.
     """
-    errors, times, lost = np.stack(errors_mm), np.asarray(times_s, np.float64), []
-    for joint in errors.T:
-        known = np.isfinite(joint)
-        failed = joint[known] > thresholds.lost_mm
-        first = first_loss(failed, times[known], regain_s=thresholds.regain_s)
-        if first is not None:
-            lost.append(float(times[known][first]))
-    return min(lost, default=math.nan)
+    times = np.asarray(times_s, np.float64)
+    lost = [
+        _first_known_loss(joint > thresholds.lost_mm, np.isfinite(joint), times, thresholds)
+        for joint in np.stack(errors_mm).T
+    ]
+    return min((times_s[first] for first in lost if first is not None), default=math.nan)
+
+
+def _first_known_loss(
+    failed: Bool[np.ndarray, " t"],
+    known: Bool[np.ndarray, " t"],
+    times_s: Float[np.ndarray, " t"],
+    thresholds: Thresholds,
+) -> int | None:
+    """`first_loss` among the frames of which something is known."""
+    frames = np.flatnonzero(known)
+    first = first_loss(failed[frames], times_s[frames], regain_s=thresholds.regain_s)
+    return None if first is None else int(frames[first])
 
 
 def _nearest(measures: FrameMeasures) -> int:
