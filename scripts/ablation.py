@@ -24,11 +24,11 @@ import tyro
 from evaluate_track import Config as Evaluation
 from evaluate_track import main as evaluate
 
-from torchcss.demo import run_demo
+from torchcss.app.track import track_video
 from torchcss.errors import ConfigurationError, TorchcssError
 from torchcss.io.tracks import prepare_output_folder, write_summary
-from torchcss.settings import Settings
-from torchcss.track_files import track_video
+from torchcss.studies.demo import run_demo
+from torchcss.tracking.settings import Settings
 
 BASE = ("joints", "stabiliser", "temporal")
 EDGES = ("contour", *BASE)

@@ -2,8 +2,8 @@
 
     python scripts/compare_solvers.py --out compare_solvers.json
 
-One reprojection problem (`torchcss.reprojection`: 34 parameters, 22 joints in one image, sticky
-priors, joint limits) is descended from random starts by
+One reprojection problem (`torchcss.studies.reprojection`: 34 parameters, 22 joints in one image,
+sticky priors, joint limits) is descended from random starts by
 
 * `torchcss`: `TrustRegionNewton` on the closed-form cost;
 * `scipy trf`: `scipy.optimize.least_squares` with bounds and an analytic Jacobian;
@@ -52,8 +52,8 @@ from torchcss.errors import ConfigurationError, TorchcssError
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.io.tracks import prepare_output_folder, write_summary
 from torchcss.linalg import covariance_factor
-from torchcss.reprojection import ReprojectionProblem, reprojection_problem
 from torchcss.robust import Lorentzian, Quadratic
+from torchcss.studies.reprojection import ReprojectionProblem, reprojection_problem
 
 OURS, TRF, LBFGS, JAX, COMPACTED = "torchcss", "scipy trf", "scipy L-BFGS-B", "jax", "jax compacted"
 LIBRARY = {

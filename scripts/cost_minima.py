@@ -6,11 +6,12 @@ Section 3.1 [IJRR] wants few spurious minima, by robust error potentials and by 
 motion boundaries, W = 1 - k S_p. Here the contour term is varied in both, without and with flow, on
 the same lines: through the truth (of the clip: the fit to the keypoints nearest the 3D reference),
 along joints and eigenvectors of the covariance of the mode there, as far as the limits admit. The
-frames are some of the rendered arm before clutter and, with `--data`, of DIR/balance_beam_4cam.
-A minimum is spurious if it is not the one nearest the truth; `torchcss.slices` says how minima and
-their prominence are found. A slice misleads if its lowest point is over 0.1 (radians, metres) away:
-few minima are worth nothing if the lowest is wrong. All potentials are given one cost of a node
-without match; all of them, the quadratic one too, saturate there, at the search window's edge.
+frames are some of the rendered arm before clutter and, with `--data`, of DIR/balance_beam_4cam. A
+minimum is spurious if it is not the one nearest the truth; `torchcss.studies.slices` says how
+minima and their prominence are found. A slice misleads if its lowest point is over 0.1 (radians,
+metres) away: few minima are worth nothing if the lowest is wrong. All potentials are given one cost
+of a node without match; all of them, the quadratic one too, saturate there, at the search window's
+edge.
 """
 
 from __future__ import annotations
@@ -28,12 +29,13 @@ import tyro
 
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.errors import TorchcssError
-from torchcss.io import plots
 from torchcss.io.tracks import prepare_output_folder, write_summary
 from torchcss.robust import Leclerc, Lorentzian, Quadratic
-from torchcss.scenes import Scene, arm_scenes, clip_scenes
-from torchcss.settings import Settings, make_choice
-from torchcss.slices import PROMINENCE, find_minima, num_spurious
+from torchcss.show.style import save_figure
+from torchcss.studies import slice_plots as plots
+from torchcss.studies.scenes import Scene, arm_scenes, clip_scenes
+from torchcss.studies.slices import PROMINENCE, find_minima, num_spurious
+from torchcss.tracking.settings import Settings, make_choice
 
 TERMS = ("contour", "motion_boundaries", "flow", "stabiliser")
 POTENTIALS = {  # with sigma in pixels and the colour of its lines
@@ -145,7 +147,7 @@ def measure(scene: Scene, config: Config, curves: Curves) -> None:
         if line.name == DRAWN and config.out is not None:
             title = f"Contour term of {scene.name}, {plots.title_of(line)}"
             figure = plots.curves_figure(offsets, shown, plots.unit_of(line), title)
-            plots.save_figure(figure, config.out / f"variants_{scene.slug}.png")
+            save_figure(figure, config.out / f"variants_{scene.slug}.png")
 
 
 def row_of(key: tuple[str, str, str, float], curves: Curves) -> dict[str, Any]:
@@ -188,7 +190,7 @@ def draw_counts(rows: list[dict[str, Any]], out: Path) -> None:
             figures[row["body"]][row["terms"]].append(plots.CountCurve(label, *look))
     for body, panels in figures.items():
         figure = plots.counts_figure(np.array(LEAST[1:]), panels, f"Spurious minima of {body}")
-        plots.save_figure(figure, out / f"minima_{body}.png")
+        save_figure(figure, out / f"minima_{body}.png")
 
 
 if __name__ == "__main__":

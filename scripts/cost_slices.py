@@ -6,7 +6,7 @@ The frames are one of the rendered arm before clutter and, with `--data`, one of
 DIR/balance_beam_4cam. Lines go through the mode at which the optimiser arrives
 from the truth (for the clip, from the fit to the keypoints that is nearest the 3D reference), along
 joints and along eigenvectors of its covariance, close (a few standard deviations) and as far as the
-joint limits admit. How minima and jumps are counted is in `torchcss.slices`.
+joint limits admit. How minima and jumps are counted is in `torchcss.studies.slices`.
 
 Printed and written to the folder `--out`: a table by terms, the slices as figures, and, as Fig. 4
 [IJRR], a minimum that a joint limit displaced. `scripts/cost_minima.py` goes on from here: what
@@ -28,11 +28,12 @@ import tyro
 
 from torchcss.errors import TorchcssError
 from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.io import plots
 from torchcss.io.tracks import prepare_output_folder, write_summary
-from torchcss.scenes import Scene, arm_scenes, clip_scenes
-from torchcss.settings import Settings
-from torchcss.slices import PROMINENCE, Line, sample_slice
+from torchcss.show.style import save_figure
+from torchcss.studies import slice_plots as plots
+from torchcss.studies.scenes import Scene, arm_scenes, clip_scenes
+from torchcss.studies.slices import PROMINENCE, Line, sample_slice
+from torchcss.tracking.settings import Settings
 
 # As in [IJRR]: keypoints only say where to start, and so does the frame before.
 TERMS = ("contour", "motion_boundaries", "flow", "stabiliser", "interpenetration")
@@ -69,7 +70,7 @@ class Config:
     prominence: float = PROMINENCE
     """Least prominence of a minimum that counts, share of the slice's range."""
     terms: tuple[str, ...] = TERMS
-    """Terms of the cost, see `torchcss.settings.ALL_TERMS`."""
+    """Terms of the cost, see `torchcss.tracking.settings.ALL_TERMS`."""
     small: bool = False
     """The arm alone, few lines and samples: for tests."""
     out: Path | None = None
@@ -126,7 +127,7 @@ def look(scene: Scene, config: Config) -> list[dict[str, Any]]:
     if config.out is not None:
         title = f"Cost of {scene.name}, by terms"
         figure = plots.slices_figure(drawn, title, prominence=config.prominence)
-        plots.save_figure(figure, config.out / f"slices_{scene.slug}.png")
+        save_figure(figure, config.out / f"slices_{scene.slug}.png")
     return rows
 
 
@@ -182,7 +183,7 @@ def displaced_minimum(scene: Scene, config: Config) -> dict[str, Any] | None:
     if config.out is not None:
         title = f"{scene.name}: a minimum displaced by the limit of {plots.title_of(line)}"
         figure = plots.limit_figure(taken, plots.unit_of(line), (low, high), expansion, title)
-        plots.save_figure(figure, config.out / f"limit_{scene.slug}.png")
+        save_figure(figure, config.out / f"limit_{scene.slug}.png")
     return {"line": name, "slope_nats_per_radian": expansion[0], "cost_nats": modes.cost[mode]}
 
 

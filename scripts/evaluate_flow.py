@@ -29,10 +29,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchcss.errors import FlowFileError, TorchcssError
-from torchcss.io.flow_files import read_flow
 from torchcss.io.tracks import prepare_output_folder, write_summary
 from torchcss.io.video import read_image
 from torchcss.robust import Quadratic
+from torchcss.studies.flow_files import read_flow
 from torchcss.vision.boundaries import flow_discontinuities, motion_boundaries
 from torchcss.vision.flow import ACCURATE, TRACKING, OpticalFlow, robust_flow
 

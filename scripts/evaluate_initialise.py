@@ -2,8 +2,8 @@
 
     python scripts/evaluate_initialise.py --data DIR --out initialise.json
 
-Synthetic people (`torchcss.random_person`): random proportions and poses, seen from any side,
-fourteen marked joints. Real frames (with `--data`): the beam clip from either camera and the
+Synthetic people (`torchcss.studies.random_person`): random proportions and poses, seen from any
+side, fourteen marked joints. Real frames (with `--data`): the beam clip from either camera and the
 rendered turn, against their 3D references. Errors are means over the limbs' twelve joints, then
 over people or frames. "Inside": the share of true parameters, and of true joints, inside the 95 %
 interval or ellipsoid that the nearest mode states. The last rows fit the same data from a single
@@ -27,16 +27,16 @@ from torch import Tensor
 
 from torchcss.cost.joints import JointTerm
 from torchcss.errors import TorchcssError
-from torchcss.first_pose import initialise_from_joints
-from torchcss.interpretations import SINGLE_START, Search
+from torchcss.initialise.from_joints import initialise_from_joints
+from torchcss.initialise.keypoint_checks import default_sigma
+from torchcss.initialise.multi_start import SINGLE_START, Search
 from torchcss.io.cameras import read_camera
-from torchcss.io.keypoints import read_keypoints
+from torchcss.io.keypoints.read import read_keypoints
 from torchcss.io.tracks import prepare_output_folder, write_summary
 from torchcss.joint_names import canonical_joint_name
-from torchcss.marks import default_sigma
-from torchcss.metrics import LIMB_JOINTS, pa_mpjpe_mm, root_aligned_mpjpe_mm
-from torchcss.random_person import Person, coverage, random_person
 from torchcss.robust import Quadratic
+from torchcss.studies.metrics import LIMB_JOINTS, pa_mpjpe_mm, root_aligned_mpjpe_mm
+from torchcss.studies.random_person import Person, coverage, random_person
 from torchcss.vision.camera import Camera
 
 LIMBS = {"thigh": ("hip", "knee"), "shank": ("knee", "ankle"), "upper_arm": ("shoulder", "elbow"),

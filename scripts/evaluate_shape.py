@@ -2,7 +2,7 @@
 
     python scripts/evaluate_shape.py --sequences DIR ... --out shape.json
 
-Each DIR is a sequence folder with masks (`torchcss.io.sequences`). In some of its frames
+Each DIR is a sequence folder with masks (`torchcss.studies.sequences`). In some of its frames
 `torchcss.initialise` fits pose, lengths and shape to the marked joints; then to edges too; then to
 the colours on either side of the outline as well. "overlap" is the share of the union of fitted and
 true silhouette that both have, "area" the fitted one's over the true one's, "root mm" the error of
@@ -22,14 +22,14 @@ import torch
 import tyro
 
 from torchcss.errors import ConfigurationError, TorchcssError
-from torchcss.hypotheses import Initialisation
-from torchcss.initialise import initialise
-from torchcss.interpretations import Search
-from torchcss.io.sequences import RecordedSequence, read_sequence
+from torchcss.initialise.fit import initialise
+from torchcss.initialise.multi_start import Search
+from torchcss.initialise.result import Initialisation
 from torchcss.io.tracks import prepare_output_folder, write_summary
 from torchcss.io.video import VideoReader
-from torchcss.metrics import mask_overlap, root_aligned_mpjpe_mm
-from torchcss.yardstick import silhouette
+from torchcss.studies.evaluation import silhouette
+from torchcss.studies.metrics import mask_overlap, root_aligned_mpjpe_mm
+from torchcss.studies.sequences import RecordedSequence, read_sequence
 
 COMPARED = {"joints": (False, False), "edges": (True, False), "edges, colours": (True, True)}
 """Whether contours and colours are fitted."""

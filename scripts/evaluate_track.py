@@ -4,7 +4,7 @@
 
 The reference is an NPZ file with `joints [T J 3]` in metres, NaN where unknown, and `joint_names`;
 its row i belongs to frame i of the video. Names may be spelt as any detector spells them. Which
-errors there are and what they need is in `torchcss.metrics`.
+errors there are and what they need is in `torchcss.studies.metrics`.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import numpy as np
 import tyro
 
 from torchcss.errors import ConfigurationError, TorchcssError, TrackFileError
-from torchcss.io.safe_load import load_arrays
+from torchcss.files import load_arrays
 from torchcss.io.tracks import load_track, prepare_output_folder, write_summary
 from torchcss.joint_names import canonical_joint_name
-from torchcss.metrics import LIMB_JOINTS, LOST_MM, TrackErrors, track_errors
+from torchcss.studies.metrics import LIMB_JOINTS, LOST_MM, TrackErrors, track_errors
 
 FRAMES_NOTE = (
     "MPJPE means something only if track and reference share one world frame, root-aligned MPJPE "

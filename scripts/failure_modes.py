@@ -2,11 +2,11 @@
 
     python scripts/failure_modes.py --sequence DIR --seeds 3 --stop-when-lost --out J --plot P.png
 
-DIR is a sequence folder (`torchcss.io.sequences`). Every preset starts from the same first pose per
-seed and gets one row: when it loses the body, its errors until then, whether the true mode is among
-those kept, how often the truth is inside the regions that it states, impossible poses, and what it
-takes. Definitions are in `torchcss.yardstick`. Beside ours stand the paper's own failure times,
-which were measured on its sequences.
+DIR is a sequence folder (`torchcss.studies.sequences`). Every preset starts from the same first
+pose per seed and gets one row: when it loses the body, its errors until then, whether the true mode
+is among those kept, how often the truth is inside the regions that it states, impossible poses, and
+what it takes. Definitions are in `torchcss.studies.evaluation`. Beside ours stand the paper's own
+failure times, which were measured on its sequences.
 
 The trackers of a seed run side by side through the video and share its features; `--together 6`
 puts six runs side by side, of several seeds where a seed has fewer. The file OUT is written
@@ -27,15 +27,15 @@ import tyro
 from tqdm import tqdm
 
 from torchcss.errors import ConfigurationError, TorchcssError
-from torchcss.io.failure_plots import error_curves, failure_figure
-from torchcss.io.plots import save_figure
-from torchcss.io.sequences import RecordedSequence, read_sequence
 from torchcss.io.tracks import prepare_output_folder, read_summary, write_summary
-from torchcss.presets import PRESETS
-from torchcss.published import PUBLISHED
-from torchcss.settings import TERMS, Settings, named_terms
-from torchcss.side_by_side import Run, Start, find_start, track_together
-from torchcss.yardstick import Thresholds, over_seeds, summarise
+from torchcss.show.style import save_figure
+from torchcss.studies.comparison import Run, Start, find_start, track_together
+from torchcss.studies.evaluation import Thresholds, over_seeds, summarise
+from torchcss.studies.failure_plots import error_curves, failure_figure
+from torchcss.studies.published import PUBLISHED
+from torchcss.studies.sequences import RecordedSequence, read_sequence
+from torchcss.tracking.presets import PRESETS
+from torchcss.tracking.settings import TERMS, Settings, named_terms
 
 COLUMNS = {
     # title: entry, factor, decimals
@@ -77,7 +77,8 @@ class Config:
     keypoints_use: Literal["first", "all"] = "first"
     """Where keypoints are used: for the first pose only, as in the paper, or in all frames."""
     prediction: Literal["velocity", "surface"] = "velocity"
-    """Where trunks are expected, see `torchcss.settings.Settings`; not for particle filters."""
+    """Where trunks are expected, see `torchcss.tracking.settings.Settings`; not for particle
+    filters."""
     terms: tuple[str, ...] = TERMS
     """Terms and priors of the cost; `default` stands for the default ones, `still` for those for a
     camera that stands still, `papers` for those of the papers."""

@@ -37,12 +37,19 @@ import torch
 import tyro
 from torch import Tensor
 
-from torchcss.body.model import BodyModel, load_body
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel
 from torchcss.cost.targets import pose_targets
 from torchcss.errors import ConfigurationError, TorchcssError
 from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.inverse_kinematics import Search, Solutions, covered, inverse_kinematics, link_pose
 from torchcss.io.tracks import prepare_output_folder, write_summary
+from torchcss.solve.inverse_kinematics import (
+    Search,
+    Solutions,
+    covered,
+    inverse_kinematics,
+    link_pose,
+)
 from torchcss.types import Bounds
 
 CASES: dict[str, tuple[str, str, str | None]] = {

@@ -37,19 +37,20 @@ from torchcss.errors import ConfigurationError, TorchcssError
 from torchcss.inference.implicit import TermWeights, weighted_minimum
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.io.sequences import read_sequence
 from torchcss.io.tracks import prepare_output_folder, write_summary
-from torchcss.io.video import Frame, VideoReader
-from torchcss.pipeline import track_frames
-from torchcss.presets import PRESETS
-from torchcss.settings import (
+from torchcss.io.video import VideoReader
+from torchcss.studies.render.sequences import arm_sequence
+from torchcss.studies.sequences import read_sequence
+from torchcss.tracking.presets import PRESETS
+from torchcss.tracking.session import track_frames
+from torchcss.tracking.settings import (
     Settings,
     boundary_emphasis,
     make_choice,
     make_extractor,
     make_settings_tracker,
 )
-from torchcss.synthetic import arm_sequence
+from torchcss.types import Frame
 from torchcss.vision.appearance import Appearance
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FrameFeatures

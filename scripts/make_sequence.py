@@ -5,7 +5,7 @@
 
 A motion file holds `body` (a name), `state_names [n]`, `states [T n]` and `frame_rate`, and maybe
 `base_transform [4 4]`, `lengths` (JSON, metres) and `description`. What is written is in
-`torchcss.io.sequence_writer`.
+`torchcss.studies.sequence_writer`.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from torchcss.errors import ConfigurationError, TorchcssError, TrackFileError
-from torchcss.io.safe_load import load_arrays
-from torchcss.io.sequence_writer import write_sequence
-from torchcss.motions import read_motion
-from torchcss.synthetic import STYLES, Shot, shot, shot_of_motion
+from torchcss.files import load_arrays
+from torchcss.studies.render.motions import read_motion
+from torchcss.studies.render.sequences import STYLES, Shot, shot, shot_of_motion
+from torchcss.studies.sequence_writer import write_sequence
 
 
 @dataclass(frozen=True, kw_only=True)

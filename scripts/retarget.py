@@ -4,8 +4,8 @@
     python scripts/retarget.py jump.bvh --start 1 --out jump.npz --reference jump-reference.npz
 
 Reads ASF/AMC or BVH, cuts out a part, resamples it, and fits the body to hips, knees, ankles,
-shoulders, elbows and wrists (`torchcss.retarget`). The motion file (NPZ, metres, radians, Y up, the
-middle of the path over the origin, floor at height 0) holds
+shoulders, elbows and wrists (`torchcss.solve.retarget`). The motion file (NPZ, metres, radians, Y
+up, the middle of the path over the origin, floor at height 0) holds
 
 | array | meaning |
 |---|---|
@@ -34,10 +34,10 @@ import tyro
 from matplotlib.figure import Figure
 
 from torchcss.errors import ConfigurationError, TorchcssError
-from torchcss.io.atomic import replace_file
-from torchcss.io.motion_capture import MotionCapture, read_motion_capture, resample
+from torchcss.files import replace_file
+from torchcss.io.motion.positions import MotionCapture, read_motion_capture, resample
 from torchcss.io.tracks import prepare_output_folder, write_summary
-from torchcss.retarget import Retargeted, retarget
+from torchcss.solve.retarget import Retargeted, retarget
 
 
 @dataclass(frozen=True, kw_only=True)

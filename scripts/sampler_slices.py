@@ -2,12 +2,13 @@
 
     python scripts/sampler_slices.py --out slices/
 
-The slice goes through the start mode of a reprojection problem (`torchcss.sampling_study`), along
-two eigen-directions of its covariance. On an arm, the most uncertain one leads to the other minimum
-of a forward-backward flip. In the slice, (1) CONDENSATION randomises the mode by dynamical noise,
-(2) the multiple-hypothesis tracker of Cham and Rehg samples the mode's covariance and adds the same
-noise, and (3) covariance scaled sampling inflates the covariance. All samples then descend within
-the slice. The table says at what cost samples are placed, and how many end in another minimum.
+The slice goes through the start mode of a reprojection problem (`torchcss.studies.sampling_study`),
+along two eigen-directions of its covariance. On an arm, the most uncertain one leads to the other
+minimum of a forward-backward flip. In the slice, (1) CONDENSATION randomises the mode by dynamical
+noise, (2) the multiple-hypothesis tracker of Cham and Rehg samples the mode's covariance and adds
+the same noise, and (3) covariance scaled sampling inflates the covariance. All samples then descend
+within the slice. The table says at what cost samples are placed, and how many end in another
+minimum.
 
 The noise is large enough to reach as far along the uncertain direction as CSS does; `--noise`
 sets it.
@@ -34,7 +35,7 @@ from torchcss.inference.proposals import ChamRehg, Condensation, CovarianceScale
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.io.tracks import prepare_output_folder, write_summary
 from torchcss.linalg import squared_mahalanobis
-from torchcss.sampling_study import study_problem
+from torchcss.studies.sampling_study import study_problem
 from torchcss.types import Bounds, CostFunction, LocalModel, Modes, Status
 
 

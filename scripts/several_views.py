@@ -31,6 +31,8 @@ from evaluate_track import common_name, read_reference
 from jaxtyping import Float
 from torch import Tensor
 
+from torchcss.app.track import track_video
+from torchcss.app.view_files import ViewFiles
 from torchcss.body.catalog import BodySpecification, MarkerSpecification, root_joints
 from torchcss.body.model import BodyModel
 from torchcss.body.root import move_base, root_pose
@@ -39,27 +41,25 @@ from torchcss.cost.frame import beside
 from torchcss.cost.joints import JointObservation, JointTerm
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.errors import TorchcssError
-from torchcss.gross_marks import best_distinct
+from torchcss.files import load_arrays
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.trust_region import TrustRegionNewton
+from torchcss.initialise.outliers import best_distinct
 from torchcss.io.cameras import read_camera
 from torchcss.io.fitted_body import read_fitted_body
-from torchcss.io.safe_load import load_arrays
 from torchcss.io.track_body import body_of_track, pose_track
 from torchcss.io.tracks import load_track, prepare_output_folder, write_summary
 from torchcss.io.video import VideoReader
 from torchcss.linalg import squared_mahalanobis
-from torchcss.metrics import (
+from torchcss.studies.metrics import (
     LIMB_JOINTS,
     coverage,
     probability_within,
     track_errors,
 )
-from torchcss.pipeline import track_frames
-from torchcss.settings import Settings, make_extractor, make_settings_tracker
-from torchcss.track_files import track_video
-from torchcss.view_files import ViewFiles
-from torchcss.views import ViewStream
+from torchcss.tracking.session import track_frames
+from torchcss.tracking.settings import Settings, make_extractor, make_settings_tracker
+from torchcss.tracking.view import ViewStream
 from torchcss.vision.camera import Camera
 
 BEAM, BOARD = "balance_beam_4cam", "handheld_board"

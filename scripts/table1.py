@@ -2,12 +2,12 @@
 
     python scripts/table1.py --body body34 --samples 2000 --scales 1 4 8 --seed 0 --out table1.json
 
-One pose per seed is seen as joints in one image (`torchcss.reprojection`), and the minima of that
-cost are searched from its start mode: samples of its covariance, scaled, against samples of a ball
-of the same volume; both are projected onto the joint limits and descend. Scales are factors on the
-standard deviations. A minimum counts if its descent converged, if it satisfies the limits, if the
-cost curves upwards there along all free variables, and if it is none that was found before. The
-paper's own figures stand beside ours; its poses and its priors are lost.
+One pose per seed is seen as joints in one image (`torchcss.studies.reprojection`), and the minima
+of that cost are searched from its start mode: samples of its covariance, scaled, against samples of
+a ball of the same volume; both are projected onto the joint limits and descend. Scales are factors
+on the standard deviations. A minimum counts if its descent converged, if it satisfies the limits,
+if the cost curves upwards there along all free variables, and if it is none that was found before.
+The paper's own figures stand beside ours; its poses and its priors are lost.
 
 Distances are Euclidean in the parameters, "deviations" in the start mode's metric; medians are over
 the raw samples, and over the minima. `--figures DIR` draws Figs. 1, 5 and 13.
@@ -26,12 +26,12 @@ import torch
 import tyro
 
 from torchcss.errors import ConfigurationError, TorchcssError
+from torchcss.files import load_json, real_numbers
 from torchcss.inference.proposals import CovarianceScaled, Spherical
-from torchcss.io import study_plots
-from torchcss.io.safe_load import load_json, real_numbers
 from torchcss.io.tracks import prepare_output_folder, write_summary
-from torchcss.reprojection import ReprojectionProblem
-from torchcss.sampling_study import TABLE1, SamplerRun, run_sampler, spectrum, study_problem
+from torchcss.studies import study_plots
+from torchcss.studies.reprojection import ReprojectionProblem
+from torchcss.studies.sampling_study import TABLE1, SamplerRun, run_sampler, spectrum, study_problem
 
 COLUMNS = ("minima", "distance_raw", "distance", "deviations_raw", "deviations", "cost_raw", "cost")
 CHECKS = {

@@ -3,10 +3,11 @@
     python scripts/track_quadruped.py --urdf DATA/robot_models/anymal_b.urdf --marks 3d
     python scripts/track_quadruped.py --urdf DATA/robot_models/anymal_b.urdf --marks 2d
 
-ANYmal trots and turns (`torchcss.robots.trot`); its hips, knees and feet are observed with noise,
-as places in space (`torchcss.cost.targets`) or in the image of one camera. The first frame is found
-by descents from about the standing pose, the rest by the tracker `css`. Errors are those of all
-links' origins, marked or not, against the exact truth, and of the base's place, in millimetres.
+ANYmal trots and turns (`torchcss.studies.render.robots.trot`); its hips, knees and feet are
+observed with noise, as places in space (`torchcss.cost.targets`) or in the image of one camera. The
+first frame is found by descents from about the standing pose, the rest by the tracker `css`. Errors
+are those of all links' origins, marked or not, against the exact truth, and of the base's place, in
+millimetres.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ import torch
 import tyro
 from torch import Tensor
 
-from torchcss.body.model import BodyModel, load_body
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel
 from torchcss.cost.joints import JointObservation, JointTerm
 from torchcss.cost.targets import PointTargets
 from torchcss.cost.temporal import TemporalPrior
@@ -32,9 +34,9 @@ from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.tracker import CostFactory
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.io.tracks import prepare_output_folder, write_summary
-from torchcss.presets import make_tracker
-from torchcss.robots import stand, trot
-from torchcss.synthetic import look_at
+from torchcss.studies.render.robots import stand, trot
+from torchcss.studies.render.sequences import look_at
+from torchcss.tracking.presets import make_tracker
 from torchcss.types import Bounds, CostFunction
 
 MARKED = ("THIGH", "SHANK", "FOOT")

@@ -3,9 +3,10 @@
     python scripts/track_robot.py --data DATA/robot_models --robot panda --out out/panda
 
 The arm of a URDF (`panda`, `iiwa7`, `ur5`, or the path of a file with `--urdf`) swings smoothly
-within its joint limits before clutter, as capsules on its links (`torchcss.robots`). The tracker
-gets the images, the camera, the base, and the noisy image places of the links' origins in the first
-frame; from there on contours, colours and optical flow. What it finds is compared with the exact
+within its joint limits before clutter, as capsules on its links (`torchcss.studies.render.robots`).
+The tracker gets the images, the camera, the base, and the noisy image places of the links' origins
+in the first frame; from there on contours, colours and optical flow. What it finds is compared with
+the exact
 truth: every joint angle (degrees), place and orientation of the end effector (millimetres,
 degrees), and all links' origins (millimetres), for the best mode and for the mode of each frame
 that is nearest to the truth. Each seed's folder has `overlay.mp4` and the track.
@@ -29,12 +30,12 @@ import tyro
 from torch import Tensor
 
 from torchcss.body.model import BodyModel
-from torchcss.demo import track_sequence
 from torchcss.errors import ConfigurationError, TorchcssError
-from torchcss.inverse_kinematics import link_pose, pose_errors
 from torchcss.io.tracks import load_track, prepare_output_folder, write_summary
-from torchcss.robots import robot_arm, robot_sequence
-from torchcss.settings import TERMS, Settings
+from torchcss.solve.inverse_kinematics import link_pose, pose_errors
+from torchcss.studies.demo import track_sequence
+from torchcss.studies.render.robots import robot_arm, robot_sequence
+from torchcss.tracking.settings import TERMS, Settings
 
 ROBOTS: dict[str, tuple[str, tuple[float, ...]]] = {
     "panda": ("panda_hand", (0.0, -0.3, 0.0, -1.9, 0.0, 1.9, 0.8, 0.02)),
@@ -68,7 +69,7 @@ class Config:
     modes: int = 5
     """Modes kept."""
     preset: str = "css"
-    """Tracker, see `torchcss/presets.py`."""
+    """Tracker, see `torchcss/tracking/presets.py`."""
     working_size: int = 640
     """Longer side at which features are computed, pixels."""
     out: Path = Path("out/robot")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from made_clip import files  # noqa: F401
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from torchcss.io.video import VideoWriter
-from torchcss.synthetic import SyntheticSequence, arm_sequence
-from torchcss.yardstick import silhouette
+from torchcss.studies.evaluation import silhouette
+from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
 
 NOISE_PX = 1.5
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchcss.body.model import BodyModel, load_body
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel
 from torchcss.cost.part_map import part_map
 from torchcss.cost.region import part_layers
 from torchcss.vision.camera import Camera

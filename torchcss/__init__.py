@@ -5,16 +5,17 @@ of poses with covariances and weights (covariance scaled sampling, Sminchisescu 
 2003). Start with `load_body`, `track_video` and `load_track`.
 """
 
-from torchcss.body.model import BodyModel, load_body
-from torchcss.initialise import Initialisation, initialise
-from torchcss.inverse_kinematics import Solutions, inverse_kinematics
+from torchcss.app.smooth import smooth_file, smooth_video
+from torchcss.app.track import track_video
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel
+from torchcss.initialise.fit import Initialisation, initialise
 from torchcss.io.export import export_track
 from torchcss.io.tracks import Track, load_track
-from torchcss.pipeline import track_frames
-from torchcss.settings import Settings
-from torchcss.smooth import smooth_file, smooth_track
-from torchcss.smooth_video import smooth_video
-from torchcss.track_files import track_video
+from torchcss.solve.inverse_kinematics import Solutions, inverse_kinematics
+from torchcss.tracking.session import track_frames
+from torchcss.tracking.settings import Settings
+from torchcss.tracking.smooth import smooth_track
 from torchcss.vision.camera import Camera
 
 __all__ = [

@@ -19,10 +19,12 @@ Units are metres, radians, seconds, pixels (pixel centres at integers) and nats.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import Enum, IntEnum
 from typing import NamedTuple, Protocol, runtime_checkable
 
-from jaxtyping import Float, Int
+import numpy as np
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 
@@ -140,3 +142,19 @@ class CostFunction(Protocol):
     def local_model(self, x: Float[Tensor, "*batch n"]) -> LocalModel:
         """Cost, gradient and Hessian at `x`, image matches held fixed."""
         ...
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One image of a video.
+
+    Attributes:
+        index: Place in the file, from 0, whatever part of the file is read.
+        time_s: Seconds since the file's first frame. Where the file's own times do not rise from
+            one frame to the next, it is an interval of its frame rate after the last.
+        image: Red, green, blue.
+    """
+
+    index: int
+    time_s: float
+    image: UInt8[np.ndarray, "h w 3"]

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from torchcss.body.model import BodyPose, differentiate_twice, load_body
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyPose, differentiate_twice
 from torchcss.cost.flow import FlowTerm, InteriorNodes, flow_targets
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
 from torchcss.cost.joints import JointObservation, JointTerm

@@ -1,4 +1,4 @@
-"""The study problem of `torchcss.reprojection` for JAX: Levenberg-Marquardt, jitted and vmapped.
+"""The problem of `torchcss.studies.reprojection` for JAX: Levenberg-Marquardt, jitted and vmapped.
 
 Residuals with their analytic Jacobian, normal equations on the variables that no limit holds,
 Nielsen's damping per item, steps clipped to the limits, float64. The kinematics are unrolled over
@@ -19,8 +19,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from torchcss.reprojection import ReprojectionCost
 from torchcss.robust import Lorentzian, Quadratic
+from torchcss.studies.reprojection import ReprojectionCost
 
 jax.config.update("jax_enable_x64", True)
 

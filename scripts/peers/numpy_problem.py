@@ -1,4 +1,4 @@
-"""The study problem of `torchcss.reprojection` in NumPy, one state at a time, and SciPy's solvers.
+"""Problem of `torchcss.studies.reprojection` in NumPy, one state at a time, with SciPy's solvers.
 
 Residuals with their analytic Jacobian, as somebody who uses SciPy would write them: one pass over
 the moving joints, the fixed transforms between them folded into constants. Half the sum of squared
@@ -14,7 +14,7 @@ import numpy as np
 import scipy.optimize
 import torch
 
-from torchcss.reprojection import ReprojectionCost
+from torchcss.studies.reprojection import ReprojectionCost
 
 INSIDE = 1e-9
 """How far inside the limits a start of `least_squares` is moved; it refuses those on a limit."""

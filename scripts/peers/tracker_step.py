@@ -19,8 +19,8 @@ from torch.profiler import ProfilerActivity, profile
 
 from torchcss.cost.joints import JointObservation, JointTerm
 from torchcss.cost.total import CostChoice, TrackingCost
-from torchcss.inference.fixed_step import FixedStepState, fixed_step, refill, scaled_draw, start
-from torchcss.reprojection import reprojection_problem
+from torchcss.studies.fixed_step import FixedStepState, fixed_step, refill, scaled_draw, start
+from torchcss.studies.reprojection import reprojection_problem
 
 FRAME_INTERVAL = 1 / 25
 NUM_MODES = 3

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchcss.body.model import BodyModel, load_body
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel
 from torchcss.body.root import has_root
 
 mujoco = pytest.importorskip("mujoco", reason="the peer comes with the extra [bench]")

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from torchcss.body.catalog import BODY_NAMES, LENGTHS, PROPORTION_RANGE, PROPORTIONS, specification
-from torchcss.body.model import BodyModel, load_body
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel
 
 BODIES = tuple(name for name in BODY_NAMES if name.startswith("body"))
 MIRROR = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)

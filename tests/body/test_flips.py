@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from torchcss.body.flips import Segments
-from torchcss.body.model import BodyModel, load_body
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel
 
 CENTRE = torch.tensor([0.2, -0.1, 4.0], dtype=torch.float64)
 

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import math
-import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
 import pytorch_kinematics as pk
 import torch
+from reference import kinematics as reference
 from torch import Tensor
 
 from torchcss.body.catalog import BODY_NAMES
 from torchcss.body.kinematics import JointSpecification, KinematicTree
-from torchcss.body.model import BodyModel, load_body
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel
 from torchcss.errors import BodyError, ShapeError
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from reference import kinematics as reference
 
 ROBOTS = {"panda": 9, "iiwa7": 7, "ur5": 6, "anymal_b": 12, "poppy_torso": 13}
 """Moving joints of the robots in the shared data."""

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 import torch
+from reference import kinematics as reference
 from torch import Tensor
 
 from torchcss.body.catalog import BODY_NAMES
 from torchcss.body.lift import lift_to_joints
-from torchcss.body.model import BodyModel, BodyPose, differentiate_twice, load_body
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel, BodyPose, differentiate_twice
 from torchcss.types import Curvature, PointCost
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from reference import kinematics as reference
 
 NUM_POINTS = 30
 

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from torchcss.body.catalog import BODY_NAMES, specification
-from torchcss.body.model import BodyModel, differentiate_twice, load_body
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel, differentiate_twice
 from torchcss.errors import BodyError, ShapeError
 
 

@@ -8,7 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchcss.body.model import BodyModel, load_body
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel
 from torchcss.body.root import (
     ROOT_NAMES,
     has_root,

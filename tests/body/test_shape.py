@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from torchcss.body.catalog import BODY_NAMES
-from torchcss.body.model import BodyModel, load_body
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel
 from torchcss.body.shape import (
     CROSS_SECTIONS,
     ShapeParameters,

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchcss.body.model import load_body
+from torchcss.body.load import load_body
 from torchcss.body.surface import (
     SHAPE_NAMES,
     angular_grid,

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import math
-import sys
-from pathlib import Path
 
 import pytest
 import torch
+from reference import anthropometric as reference
 from torch import Tensor
 
 from torchcss.body.catalog import BODY_NAMES, LENGTHS, PROPORTIONS
-from torchcss.body.model import BodyModel, differentiate_twice, load_body
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel, differentiate_twice
 from torchcss.cost.anthropometric import INDIVIDUAL, Anthropometric, proportion_columns
 from torchcss.errors import ConfigurationError
 from torchcss.types import LocalModel
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from reference import anthropometric as reference
 
 PRIOR = Anthropometric()
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 import torch
+from reference.contour import cost_of_fixed_matches, edges_along_lines
 from torch import Tensor
 
 from torchcss.cost import contour
@@ -17,9 +16,6 @@ from torchcss.cost.visibility import ContourNodes
 from torchcss.robust import Leclerc
 from torchcss.types import PointCost
 from torchcss.vision.camera import Camera
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from reference.contour import cost_of_fixed_matches, edges_along_lines
 
 WIDTH, HEIGHT = 128, 96
 TERM = ContourTerm()

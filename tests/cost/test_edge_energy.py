@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import pytest
 import torch
+from reference.spline import spline
 from torch import Tensor
 
 from torchcss.cost.edge_energy import EdgeEnergyTerm, SplineField, edge_energy_field
@@ -16,9 +14,6 @@ from torchcss.robust import Leclerc, Lorentzian
 from torchcss.types import PointCost
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from reference.spline import spline
 
 WIDTH, HEIGHT = 40, 30
 DISTORTION = [-0.33, 0.046, -0.0043, 0.0041, 0.067]

@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 import math
-import sys
-from pathlib import Path
 
 import pytest
 import torch
+from reference import flow_residual as reference
 from torch import Tensor
 
-from torchcss.body.model import BodyModel, load_body
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel
 from torchcss.body.surface import implicit
 from torchcss.cost.flow import FlowTargets, FlowTerm, InteriorNodes, flow_targets
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.robust import Leclerc, Lorentzian
-from torchcss.synthetic import arm_sequence
+from torchcss.studies.render.sequences import arm_sequence
 from torchcss.types import Curvature, PointCost
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor
 from torchcss.vision.flow import TRACKING
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from reference import flow_residual as reference
 
 WIDTH, HEIGHT = 64, 48
 DISTORTION = [-0.33, 0.046, -0.0043, 0.0041, 0.067]

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
 import torch
+from reference import interpenetration as reference
+from reference import kinematics
 from torch import Tensor
 
-from torchcss.body.model import BodyModel, differentiate_twice, load_body
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel, differentiate_twice
 from torchcss.body.surface import implicit, surface_points
 from torchcss.cost.interpenetration import END, Interpenetration, InterpenetrationPairs, NearNodes
 from torchcss.cost.joints import JointObservation, JointTerm
@@ -19,10 +21,6 @@ from torchcss.errors import ConfigurationError
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.types import Curvature, LocalModel
 from torchcss.vision.camera import Camera
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from reference import interpenetration as reference
-from reference import kinematics
 
 TERM = Interpenetration()
 ARM = ("r_shoulder_swing", "r_shoulder_raising", "r_shoulder_twist", "r_elbow_flexion")

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from painted import a_body_before_a_camera, layers, moved, painted
 from torch import Tensor
 
-from torchcss.body.model import BodyModel, load_body
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel
 from torchcss.cost.flow import FlowTerm
 from torchcss.cost.frame import FrameCosts
 from torchcss.cost.part_map import bare_pixels, part_map
@@ -20,15 +21,11 @@ from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.proposals import CovarianceScaled
 from torchcss.inference.tracker import Tracker
-from torchcss.io.video import Frame
-from torchcss.types import Bounds, LocalModel
-from torchcss.views import Watcher
+from torchcss.tracking.view import Watcher
+from torchcss.types import Bounds, Frame, LocalModel
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor
 from torchcss.vision.flow import TRACKING
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from painted import a_body_before_a_camera, layers, moved, painted
 
 
 def plain_twin(

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
+from made_costs import EVERYTHING, JOINTS_ONLY, make_cost, make_full_cost, random_states
 from torch import Tensor
 
 from torchcss.body.model import differentiate_twice
@@ -17,9 +16,6 @@ from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.cost.view import View
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.vision.camera import Camera
-
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-from test_total import EVERYTHING, JOINTS_ONLY, make_cost, make_full_cost, random_states
 
 
 def from_the_side(camera: Camera, centre: Tensor, size_wh: tuple[int, int]) -> Camera:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchcss.body.model import load_body
+from torchcss.body.load import load_body
 from torchcss.body.shape import (
     ShapeParameters,
     surface_angles,
@@ -23,12 +23,13 @@ from torchcss.cost.shaped import Outline, ShapedCost
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.cost.visibility import ContourPredictor
 from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.jumps import flipped_poses
-from torchcss.raster import Mesh, grid_faces, render_meshes
-from torchcss.shape_fit import fit_shape
+from torchcss.initialise.shape import fit_shape
+from torchcss.studies.render.software import Mesh, render_meshes
+from torchcss.tracking.flip_moves import flipped_poses
 from torchcss.types import Bounds
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor
+from torchcss.vision.rasterise import grid_faces
 
 
 def problem(thicker: float, by: str) -> tuple[ShapedCost, torch.Tensor, ShapeParameters]:

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 from torch.func import hessian, jacrev, vmap
 
-from torchcss.body.model import BodyModel, load_body
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel
 from torchcss.cost.flow import InteriorNodes
 from torchcss.cost.frame import FrameCosts
 from torchcss.cost.part_map import part_map

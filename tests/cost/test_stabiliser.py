@@ -8,7 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchcss.body.model import differentiate_twice, load_body
+from torchcss.body.load import load_body
+from torchcss.body.model import differentiate_twice
 from torchcss.cost.stabiliser import Stabiliser, long_tailed
 
 

@@ -8,7 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchcss.body.model import BodyModel, differentiate_twice, load_body
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel, differentiate_twice
 from torchcss.cost.targets import PointTargets, pose_targets
 from torchcss.errors import BodyError, ShapeError
 from torchcss.types import CostFunction

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 import torch
+from reference.visibility import boundary_distance, is_hidden, shape_function
 from torch import Tensor
 
 from torchcss.body.catalog import BODY_NAMES
-from torchcss.body.model import BodyModel, load_body
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel
 from torchcss.body.surface import surface_points
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.flow import InteriorNodes
@@ -23,11 +23,8 @@ from torchcss.cost.visibility import (
     line_of_sight,
     visible_nodes,
 )
-from torchcss.raster import grid_faces, rasterise
 from torchcss.vision.camera import Camera
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from reference.visibility import boundary_distance, is_hidden, shape_function
+from torchcss.vision.rasterise import grid_faces, rasterise
 
 EYE = torch.zeros(3, dtype=torch.float64)
 UPRIGHT = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
+from made_costs import EVERYTHING, make_cost, random_states
 from torch import Tensor
 
 from torchcss.cost.total import TrackingCost
@@ -15,9 +14,6 @@ from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.inference.implicit import TermWeights, differentiable_minimum, weighted_minimum
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.types import Bounds, Modes, Status
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "cost"))
-from test_total import EVERYTHING, make_cost, random_states
 
 NAMES = ("joints", "stabiliser", "temporal")
 OPTIMISER = TrustRegionNewton(max_steps=200, tolerance=1e-14)

@@ -1,7 +1,6 @@
 import math
-import sys
-from pathlib import Path
 
+import problems
 import pytest
 import torch
 from hypothesis import given, settings
@@ -16,9 +15,6 @@ from torchcss.inference.importance import (
 )
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.proposals import CovarianceScaled, EigenDirectionGrid, Samples
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-import problems
 
 PRIOR = GaussianMixture(
     torch.tensor([[0.0, 0.0]]).double(),

@@ -1,7 +1,6 @@
 import io
-import sys
-from pathlib import Path
 
+import problems
 import pytest
 import torch
 
@@ -11,9 +10,6 @@ from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.particle import AnnealedParticleFilter, ParticleFilter
 from torchcss.inference.tracker import Particles
 from torchcss.types import LocalModel, Status
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-import problems
 
 FREE = problems.unbounded(2)
 BOUNDS = problems.box(2, -6, 6)

@@ -1,8 +1,7 @@
 import itertools
 import math
-import sys
-from pathlib import Path
 
+import problems
 import pytest
 import scipy.optimize
 import scipy.stats
@@ -26,9 +25,6 @@ from torchcss.inference.proposals import (
     project_in_metric,
 )
 from torchcss.types import Bounds
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-import problems
 
 FREE = problems.unbounded(2)
 COVARIANCE = torch.tensor([[4.0, 1.0], [1.0, 0.5]]).double()

@@ -1,12 +1,11 @@
 import math
-import sys
 import weakref
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from reference import smoothing as plain
 
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.inference.smoothing import (
@@ -18,9 +17,6 @@ from torchcss.inference.smoothing import (
     refine_in_windows,
 )
 from torchcss.types import Bounds, LocalModel, Status
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from reference import smoothing as plain
 
 UNBOUNDED = (-math.inf, math.inf)
 

@@ -1,8 +1,7 @@
 import io
-import sys
 from dataclasses import dataclass, replace
-from pathlib import Path
 
+import problems
 import pytest
 import torch
 from hypothesis import given, settings
@@ -14,9 +13,6 @@ from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.proposals import CovarianceScaled, EigenDirectionGrid, Samples
 from torchcss.inference.tracker import Tracker, stated_evidence
 from torchcss.types import LocalModel, Status
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-import problems
 
 BOUNDS = problems.box(2, -6, 6)
 CSS = Tracker(proposal=CovarianceScaled(covariance_scale=8), num_samples=40, num_modes=3)

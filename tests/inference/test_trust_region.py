@@ -1,7 +1,6 @@
-import sys
 from dataclasses import replace
-from pathlib import Path
 
+import problems
 import pytest
 import scipy.optimize
 import torch
@@ -12,9 +11,6 @@ from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.inference import trust_region
 from torchcss.inference.trust_region import TrustRegionNewton, default_prior_variance
 from torchcss.types import Bounds, CostFunction, LocalModel, Status
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-import problems
 
 NEWTON = TrustRegionNewton()
 

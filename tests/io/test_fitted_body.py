@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from torchcss.body.model import load_body
+from torchcss.body.load import load_body
 from torchcss.body.shape import with_shape
 from torchcss.errors import BodyError
-from torchcss.hypotheses import Initialisation
 from torchcss.inference.mixture import GaussianMixture
+from torchcss.initialise.result import Initialisation
 from torchcss.io.fitted_body import read_fitted_body, write_fitted_body
 from torchcss.vision.camera import Camera
 

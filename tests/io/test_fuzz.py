@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,24 +19,22 @@ import pytest
 import torch
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
+from made_tracks import make_track, write_track
 
-from torchcss.body.model import load_body
+from torchcss.body.load import load_body
 from torchcss.errors import TorchcssError
-from torchcss.hypotheses import Initialisation
 from torchcss.inference.mixture import GaussianMixture
+from torchcss.initialise.result import Initialisation
 from torchcss.io.cameras import read_camera
 from torchcss.io.fitted_body import read_fitted_body, write_fitted_body
-from torchcss.io.flow_files import read_flow, write_flow
-from torchcss.io.joints_file import read_joints
-from torchcss.io.keypoints import read_keypoints
-from torchcss.io.motion_capture import read_motion_capture
-from torchcss.io.sequences import read_sequence
+from torchcss.io.keypoints.one_image import read_joints
+from torchcss.io.keypoints.read import read_keypoints
+from torchcss.io.motion.positions import read_motion_capture
 from torchcss.io.tracks import load_track, read_summary, write_summary
 from torchcss.io.video import VideoReader, VideoWriter
+from torchcss.studies.flow_files import read_flow, write_flow
+from torchcss.studies.sequences import read_sequence
 from torchcss.vision.camera import Camera
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from made_tracks import make_track, write_track
 
 SIZE = (64, 48)
 T = 3

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
+from made_tracks import make_track
 
 from torchcss import load_body
 from torchcss.body.catalog import BODY_NAMES
 from torchcss.body.uncertainty import joint_jacobian
 from torchcss.errors import TrackFileError
 from torchcss.io.track_body import body_of_track, pose_track
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from made_tracks import make_track
 
 LENGTHS = {"thigh": 0.41, "neck": 0.07, "hand": 0.17, "forearm": 0.26, "shoulder_width": 0.16}
 

@@ -21,8 +21,8 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from torchcss import files as atomic
 from torchcss.errors import OutputError, ShapeError, TrackFileError
-from torchcss.io import atomic
 from torchcss.io.tracks import (
     Track,
     TrackWriter,
@@ -242,7 +242,7 @@ def test_killed_in_mid_write_keeps_the_old_file(tmp_path: Path) -> None:
     programme = (
         "import os, signal, sys\n"
         "from pathlib import Path\n"
-        "from torchcss.io.atomic import replace_file\n"
+        "from torchcss.files import replace_file\n"
         "with replace_file(Path(sys.argv[1])) as partial:\n"
         "    partial.write_bytes(b'half')\n"
         "    os.kill(os.getpid(), signal.SIGKILL)\n"

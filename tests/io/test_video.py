@@ -22,7 +22,8 @@ from PIL import Image
 
 from torchcss.errors import ConfigurationError, OutputError, ShapeError, VideoError
 from torchcss.io import video
-from torchcss.io.video import Frame, VideoReader, VideoWriter, natural_order, read_image
+from torchcss.io.video import VideoReader, VideoWriter, natural_order, read_image
+from torchcss.types import Frame
 
 
 def grey_level(index: int) -> int:

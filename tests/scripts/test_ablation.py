@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
+import ablation as script
 import pytest
 
 from torchcss.errors import ConfigurationError
-from torchcss.settings import ALL_TERMS, TERMS
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
-import ablation as script
+from torchcss.tracking.settings import ALL_TERMS, TERMS
 
 
 def test_demo_in_small(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

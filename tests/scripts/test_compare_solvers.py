@@ -18,12 +18,6 @@ from torchcss.robust import Lorentzian, Quadratic
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 
 
-@pytest.fixture
-def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(SCRIPTS)  # The processes that it starts inherit the path.
-    return importlib.import_module("compare_solvers")
-
-
 def small(script: ModuleType, **options):
     return script.Config(starts=20, subset=3, repeats=1, cores=1, **options)
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -13,17 +11,6 @@ import pytest
 from torchcss.cost.contour import ContourTerm
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "cost_minima.py"
-
-
-@pytest.fixture(scope="module")
-def script() -> ModuleType:
-    specification = importlib.util.spec_from_file_location("cost_minima", SCRIPT)
-    assert specification is not None
-    assert specification.loader is not None
-    module = importlib.util.module_from_spec(specification)
-    sys.modules["cost_minima"] = module
-    specification.loader.exec_module(module)
-    return module
 
 
 def test_small_mode(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

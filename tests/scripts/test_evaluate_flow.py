@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -13,20 +11,9 @@ import pytest
 import torch
 
 from torchcss.errors import FlowFileError
-from torchcss.io.flow_files import write_flow
+from torchcss.studies.flow_files import write_flow
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "evaluate_flow.py"
-
-
-@pytest.fixture(scope="module")
-def script() -> ModuleType:
-    specification = importlib.util.spec_from_file_location("evaluate_flow", SCRIPT)
-    assert specification is not None
-    assert specification.loader is not None
-    module = importlib.util.module_from_spec(specification)
-    sys.modules["evaluate_flow"] = module
-    specification.loader.exec_module(module)
-    return module
 
 
 def test_made_up_pair(

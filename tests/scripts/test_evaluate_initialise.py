@@ -2,26 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import sys
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "evaluate_initialise.py"
-
-
-@pytest.fixture(scope="module")
-def script() -> ModuleType:
-    specification = importlib.util.spec_from_file_location("evaluate_initialise", SCRIPT)
-    assert specification is not None
-    assert specification.loader is not None
-    module = importlib.util.module_from_spec(specification)
-    sys.modules["evaluate_initialise"] = module
-    specification.loader.exec_module(module)
-    return module
 
 
 def test_small_mode(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -2,31 +2,16 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import sys
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+from made_sequences import write_arm
 
 from torchcss.errors import ConfigurationError
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from made_sequences import write_arm
-
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "evaluate_shape.py"
-
-
-@pytest.fixture
-def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    specification = importlib.util.spec_from_file_location("evaluate_shape", SCRIPT)
-    assert specification is not None
-    assert specification.loader is not None
-    module = importlib.util.module_from_spec(specification)
-    monkeypatch.setitem(sys.modules, "evaluate_shape", module)
-    specification.loader.exec_module(module)
-    return module
 
 
 def test_small_mode(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

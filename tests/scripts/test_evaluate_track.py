@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import subprocess
 import sys
@@ -14,20 +13,9 @@ import pytest
 
 from torchcss.errors import ConfigurationError, ShapeError, TrackFileError
 from torchcss.io.tracks import TrackWriter
-from torchcss.metrics import LIMB_JOINTS
+from torchcss.studies.metrics import LIMB_JOINTS
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "evaluate_track.py"
-
-
-@pytest.fixture(scope="module")
-def script() -> ModuleType:
-    specification = importlib.util.spec_from_file_location("evaluate_track", SCRIPT)
-    assert specification is not None
-    assert specification.loader is not None
-    module = importlib.util.module_from_spec(specification)
-    sys.modules["evaluate_track"] = module
-    specification.loader.exec_module(module)
-    return module
 
 
 def write_track(

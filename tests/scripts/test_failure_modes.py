@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import subprocess
 import sys
@@ -11,28 +10,15 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-
-from torchcss.errors import ConfigurationError
-from torchcss.io.failure_plots import ErrorCurves, error_curves, failure_figure
-from torchcss.presets import PRESETS
-from torchcss.published import PUBLISHED
-from torchcss.settings import TERMS
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from made_sequences import write_arm
 
+from torchcss.errors import ConfigurationError
+from torchcss.studies.failure_plots import ErrorCurves, error_curves, failure_figure
+from torchcss.studies.published import PUBLISHED
+from torchcss.tracking.presets import PRESETS
+from torchcss.tracking.settings import TERMS
+
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "failure_modes.py"
-
-
-@pytest.fixture
-def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    specification = importlib.util.spec_from_file_location("failure_modes", SCRIPT)
-    assert specification is not None
-    assert specification.loader is not None
-    module = importlib.util.module_from_spec(specification)
-    monkeypatch.setitem(sys.modules, "failure_modes", module)
-    specification.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture(scope="module")

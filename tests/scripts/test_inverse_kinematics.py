@@ -10,8 +10,6 @@ from types import ModuleType
 
 import pytest
 import torch
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from made_robots import SIX, write_arm
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "inverse_kinematics.py"

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
+import learn_weights as script
 import pytest
 
 from torchcss.errors import ConfigurationError, TorchcssError
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
-import learn_weights as script
 
 SMALL = script.Config(frames=2, epochs=2, starts=2, working_size=160, track=True)
 

@@ -3,30 +3,24 @@
 from __future__ import annotations
 
 import json
-import runpy
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType
 
 import numpy as np
 import pytest
 import torch
 
-from torchcss.body.model import load_body
+from torchcss.body.load import load_body
 from torchcss.errors import ConfigurationError
-from torchcss.io.sequences import read_sequence
 from torchcss.io.video import VideoReader
+from torchcss.studies.sequences import read_sequence
 
 pytest.importorskip("pyvista")
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "make_sequence.py"
 
 
-@pytest.fixture(scope="module")
-def script() -> SimpleNamespace:
-    return SimpleNamespace(**runpy.run_path(str(SCRIPT)))
-
-
-def test_a_folder_holds_what_was_rendered(script: SimpleNamespace, tmp_path: Path) -> None:
+def test_a_folder_holds_what_was_rendered(script: ModuleType, tmp_path: Path) -> None:
     config = script.Config(sequence="body-dark", out=tmp_path / "dark", frames=3, small=True)
     summary = script.main(config)
     assert summary["frames"] == 3
@@ -57,7 +51,7 @@ def test_a_folder_holds_what_was_rendered(script: SimpleNamespace, tmp_path: Pat
     assert picture[sequence.mask[0]].mean() > 3 * picture[~sequence.mask[0]].mean()
 
 
-def test_a_motion_of_ones_own_is_rendered(script: SimpleNamespace, tmp_path: Path) -> None:
+def test_a_motion_of_ones_own_is_rendered(script: ModuleType, tmp_path: Path) -> None:
     body = load_body("arm7", lengths={"forearm": 0.25})
     states = body.rest.repeat(2, 1)
     states[1, body.state_index("r_elbow_flexion")] += 0.05
@@ -80,7 +74,7 @@ def test_a_motion_of_ones_own_is_rendered(script: SimpleNamespace, tmp_path: Pat
     assert sequence.truth.body.lengths["forearm"] == 0.25
 
 
-def test_options_that_do_not_fit_are_refused(script: SimpleNamespace, tmp_path: Path) -> None:
+def test_options_that_do_not_fit_are_refused(script: ModuleType, tmp_path: Path) -> None:
     for options in ({"sequence": "mocap"}, {"sequence": "arm", "motion": tmp_path / "x.npz"}):
         with pytest.raises(ConfigurationError, match="go together"):
             script.make_shot(script.Config(out=tmp_path, **options))

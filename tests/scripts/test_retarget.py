@@ -16,7 +16,7 @@ import torch
 
 from torchcss import export_track, load_body
 from torchcss.errors import ConfigurationError, MotionCaptureError, OutputError
-from torchcss.io.motion_capture import LIMBS
+from torchcss.io.motion.positions import LIMBS
 from torchcss.io.tracks import TrackWriter
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
@@ -30,11 +30,6 @@ def load(name: str) -> ModuleType:
     sys.modules[name] = module
     specification.loader.exec_module(module)
     return module
-
-
-@pytest.fixture(scope="module")
-def script() -> ModuleType:
-    return load("retarget")
 
 
 @pytest.fixture(scope="module")

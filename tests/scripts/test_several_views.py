@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
-import torch
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 import several_views as script
+import torch
 
 
 def test_board_in_small(shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

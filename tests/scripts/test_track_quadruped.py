@@ -2,27 +2,17 @@
 
 from __future__ import annotations
 
-import importlib
 import json
-import sys
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 import torch
-
-from torchcss.robots import trot
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from made_robots import write_quadruped
 
+from torchcss.studies.render.robots import trot
+
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
-
-
-@pytest.fixture
-def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(SCRIPTS)
-    return importlib.import_module("track_quadruped")
 
 
 @pytest.fixture(params=["made here", "ANYmal"])

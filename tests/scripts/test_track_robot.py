@@ -2,27 +2,17 @@
 
 from __future__ import annotations
 
-import importlib
 import json
-import sys
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 import torch
+from made_robots import write_arm
 
 from torchcss.errors import ConfigurationError
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from made_robots import write_arm
-
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
-
-
-@pytest.fixture
-def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(SCRIPTS)
-    return importlib.import_module("track_robot")
 
 
 def test_small_mode(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -53,7 +43,7 @@ def test_small_mode(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFi
 def test_robots_of_the_data_folder_swing_within_their_limits(
     script: ModuleType, shared_data: Path
 ) -> None:
-    from torchcss.robots import robot_arm, swing
+    from torchcss.studies.render.robots import robot_arm, swing
 
     folder = shared_data / "robot_models"
     if not folder.is_dir():

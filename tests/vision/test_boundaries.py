@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchcss.errors import ConfigurationError, ShapeError
-from torchcss.io.flow_files import read_flow
+from torchcss.studies.flow_files import read_flow
 from torchcss.vision.boundaries import (
     BoundaryConfiguration,
     flow_discontinuities,

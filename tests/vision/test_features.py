@@ -9,10 +9,9 @@ import torch
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.vision.boundaries import motion_boundaries
 from torchcss.vision.camera import Camera
-from torchcss.vision.edges import EdgeConfiguration, edge_features
+from torchcss.vision.edges import EdgeConfiguration, edge_features, foreground_weight
 from torchcss.vision.features import FeatureExtractor, FrameFeatures
 from torchcss.vision.flow import TRACKING, robust_flow
-from torchcss.vision.foreground import foreground_weight
 
 
 @pytest.fixture

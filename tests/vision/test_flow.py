@@ -16,8 +16,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchcss.errors import ConfigurationError, FrameError, ShapeError
-from torchcss.io.flow_files import read_flow
 from torchcss.robust import Leclerc, Lorentzian, Quadratic
+from torchcss.studies.flow_files import read_flow
 from torchcss.vision import flow as module
 from torchcss.vision.boundaries import flow_discontinuities
 from torchcss.vision.flow import ACCURATE, TRACKING, FlowConfiguration, OpticalFlow, robust_flow

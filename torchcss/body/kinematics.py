@@ -28,7 +28,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from torchcss.errors import BodyError, ShapeError, check_shape
-from torchcss.reading import read_bytes
+from torchcss.files import read_bytes
 from torchcss.types import Bounds
 
 _MOVING = ("revolute", "prismatic")

@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
-from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -19,18 +17,14 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from torchcss.body.catalog import (
-    BODY_NAMES,
     DEFAULT_RATE,
     MOTION_RATES,
     BodySpecification,
-    specification,
 )
 from torchcss.body.kinematics import KinematicTree, TreePose
 from torchcss.body.lift import lift_to_joints
-from torchcss.body.skeletons import BODY_SUFFIXES, Flesh, read_skeleton
 from torchcss.body.surface import SurfaceSample, angular_grid, surface_points
 from torchcss.errors import BodyError, ShapeError, check_shape
-from torchcss.reading import one_line
 from torchcss.types import Bounds, Curvature, LocalModel, PointCost
 
 
@@ -380,66 +374,3 @@ def differentiate_twice(value: Float[Tensor, "*batch"], x: Float[Tensor, "*batch
     ]
     hessian = torch.stack([torch.zeros_like(x) if row is None else row for row in rows], dim=-2)
     return LocalModel(value.detach(), gradient.detach(), hessian.detach())
-
-
-def load_body(
-    name_or_path: str | Path,
-    *,
-    dtype: torch.dtype = torch.float64,
-    device: torch.device | str = "cpu",
-    lengths: Mapping[str, float] | None = None,
-    scale: float = 1.0,
-    free_proportions: bool = False,
-    free_root: bool | None = None,
-    flesh: Flesh = "file",
-    units: str | float | None = None,
-    rings: int = 8,
-    meridians: int = 12,
-) -> BodyModel:
-    """Make a body: one that ships, or that of a URDF, MJCF or BVH file.
-
-    Args:
-        name_or_path: "arm7", "arm8", "body30", "body32", "body34", or the path of a file.
-        dtype: Floating type.
-        device: Where its tensors live.
-        lengths: Lengths that differ from the standard humanoid's, metres; not for files.
-        scale: Overall scale of the standard humanoid (stature 1.75 m), or of the file.
-        free_proportions: Make the lengths parameters too (for fitting). The lengths of a file stay
-            as they are.
-        free_root: Six root parameters or none; by default bodies have them and arms do not, and
-            bodies from files if the file lets them move freely.
-        flesh: Flesh of a body from a file: "file" for the solids that it describes, and along the
-            bones of links without; "bones" for all bones; "none".
-        units: Metres per unit of a BVH, or "m", "cm", "mm", "inch", "cmu"; by default guessed.
-        rings: Latitudes of the mesh of each part.
-        meridians: Longitudes of the mesh of each part.
-
-    Raises:
-        BodyError: If there is no such body, or the file cannot be used.
-    """
-    path = Path(name_or_path)
-    if str(name_or_path) in BODY_NAMES:
-        body = specification(
-            str(name_or_path),
-            lengths=lengths,
-            scale=scale,
-            free_proportions=free_proportions,
-            free_root=free_root,
-        )
-    elif path.suffix.lower() in BODY_SUFFIXES:
-        if lengths:
-            raise BodyError(f"{path}: a body from a file has its own lengths; use scale")
-        try:
-            body = read_skeleton(path, flesh=flesh, free_root=free_root, scale=scale, units=units)
-        except RecursionError as error:
-            raise BodyError(f"{path}: links hundreds deep; expected a body or a robot") from error
-    else:
-        raise BodyError(
-            f"no body {str(name_or_path)!r}; expected one of {', '.join(BODY_NAMES)} or the path "
-            f"of a file that ends in {', '.join(BODY_SUFFIXES)}"
-        )
-    try:
-        model = BodyModel(body, rings=rings, meridians=meridians)
-    except (BodyError, RecursionError) as error:  # a tree that cannot be: only a file has one
-        raise BodyError(f"{path}: {one_line(error)}") from error
-    return model.to(dtype=dtype, device=device)

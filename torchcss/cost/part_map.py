@@ -12,8 +12,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchcss.body.model import BodyModel
-from torchcss.raster import grid_faces, nearest_faces
 from torchcss.vision.camera import Camera
+from torchcss.vision.rasterise import grid_faces, nearest_faces
 
 _POSES_AT_ONCE = 16
 """Poses drawn together: it bounds the memory."""

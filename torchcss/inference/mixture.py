@@ -8,7 +8,7 @@ Weights are kept as logarithms: the product over frames of Fig. 6, step 5, would
 Covariances may be singular, huge or tiny (see `torchcss.linalg`).
 
 What to call: `GaussianMixture.prune` to keep the best modes, `distinct_modes` to discard modes
-found before (step 2.3; `torchcss.inference.minima` counts them more strictly), `match_to_prior` or
+found before (step 2.3; `torchcss.studies.minima` counts them more strictly), `match_to_prior` or
 `prior_at` for step 5, `GaussianMixture.merge` where components overlap and their moments are to be
 kept.
 """

@@ -4,7 +4,7 @@
 (3 x 3, pixels), `image_size_wh`, optionally `distortion` (k1 k2 p1 p2 k3), the world-to-camera `R`
 and `t`, and `video`, the name of the file that it took. Pose2Sim's file has one table per camera
 with `name`, `size`, `matrix`, `distortions`, `rotation` (Rodrigues vector) and `translation` in
-metres. EasyMocap's `intri.yml` and `extri.yml` (`torchcss.io.easymocap`) often lack the image size,
+metres. EasyMocap's `intri.yml` and `extri.yml` (`torchcss.io.cameras`) often lack the image size,
 which is then the video's.
 
 Units are metres inside (design, decision 12). Where the extrinsics are in another unit, or absent,
@@ -24,12 +24,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import yaml
 
 from torchcss.errors import CameraError
-from torchcss.io.easymocap import INTRINSICS, read_easymocap
-from torchcss.io.safe_load import load_json, one_line, real_numbers, shortened
+from torchcss.files import load_json, one_line, read_text, real_numbers, shortened
 from torchcss.io.video import VideoReader
-from torchcss.reading import read_text
 from torchcss.vision.camera import Camera
 
 _METRES = frozenset({"m", "metre", "metres", "meter", "meters"})
@@ -346,3 +345,77 @@ def rotation_matrix(vector: np.ndarray, where: str = "rotation") -> np.ndarray:
     first = np.sinc(angle / np.pi)
     second = 0.5 * np.sinc(0.5 * angle / np.pi) ** 2
     return np.eye(3) + first * cross + second * (cross @ cross)
+
+
+INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
+
+
+class _Loader(yaml.SafeLoader):
+    """Plain values and OpenCV's matrices."""
+
+
+def _matrix(loader: yaml.SafeLoader, node: yaml.Node) -> list[Any]:
+    """A matrix as nested lists; one of a single row or column as a list."""
+    if not isinstance(node, yaml.MappingNode):
+        raise yaml.YAMLError("an opencv-matrix has rows, cols and data")
+    values: dict[Any, Any] = loader.construct_mapping(node, deep=True)
+    rows, columns, data = values.get("rows"), values.get("cols"), values.get("data")
+    if not (isinstance(rows, int) and isinstance(columns, int) and isinstance(data, list)):
+        raise yaml.YAMLError("an opencv-matrix has rows, cols and data")
+    if rows < 1 or columns < 1 or rows * columns != len(data):
+        raise yaml.YAMLError(
+            f"line {node.start_mark.line + 1}: an opencv-matrix of {rows} rows and {columns} "
+            f"columns has other than as many numbers"
+        )
+    if 1 in (rows, columns):
+        return data
+    return [data[row * columns : (row + 1) * columns] for row in range(rows)]
+
+
+_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)
+
+
+def read_easymocap(path: Path) -> dict[str, dict[str, Any]]:
+    """Read all cameras: `K`, `dist`, `size`, `R`, `T` by name, None for what the files do not have.
+
+    Args:
+        path: The folder, or either of the files; the other is looked for beside it.
+
+    Raises:
+        CameraError: If a file is missing or malformed.
+    """
+    folder = path if path.is_dir() else path.parent
+    intrinsics = path if path.name != EXTRINSICS and not path.is_dir() else folder / INTRINSICS
+    extrinsics = folder / EXTRINSICS
+    first = _load(intrinsics)
+    second = _load(extrinsics) if extrinsics.is_file() else {}
+    names = first.get("names")
+    if not isinstance(names, list) or not all(isinstance(name, (str, int)) for name in names):
+        raise CameraError(
+            f"{intrinsics}: expected 'names', as EasyMocap writes them, found {shortened(names)}"
+        )
+    cameras: dict[str, dict[str, Any]] = {}
+    for name in map(str, names):
+        size = [first.get(f"W_{name}"), first.get(f"H_{name}")]
+        rotation = second.get(f"Rot_{name}")
+        cameras[name] = {
+            "K": first.get(f"K_{name}"),
+            "dist": first.get(f"dist_{name}", first.get(f"D_{name}")),
+            "size": None if None in size else size,
+            "R": second.get(f"R_{name}") if rotation is None else rotation,
+            "T": second.get(f"T_{name}"),
+        }
+    return cameras
+
+
+def _load(path: Path) -> dict[str, Any]:
+    text = read_text(path, CameraError)
+    if text.startswith("%YAML:1.0"):
+        text = text.partition("\n")[2]
+    try:
+        content = yaml.load(text, Loader=_Loader)
+    except (yaml.YAMLError, ValueError, TypeError, RecursionError, OverflowError) as error:
+        raise CameraError(f"{path}: cannot be read as YAML: {one_line(error)}") from error
+    if not isinstance(content, dict):
+        raise CameraError(f"{path}: not EasyMocap's; expected names, found {shortened(content)}")
+    return content

@@ -29,15 +29,14 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from torchcss.body.model import BodyModel, load_body
+from torchcss.body.load import BODY_SUFFIXES, load_body
+from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES
 from torchcss.body.shape import with_shape
-from torchcss.body.skeletons import BODY_SUFFIXES
 from torchcss.errors import BodyError
-from torchcss.hypotheses import Initialisation
+from torchcss.files import load_arrays, replace_file
 from torchcss.inference.mixture import GaussianMixture
-from torchcss.io.atomic import replace_file
-from torchcss.io.safe_load import load_arrays
+from torchcss.initialise.result import Initialisation
 from torchcss.vision.camera import Camera
 
 SCHEMA_VERSION = 1

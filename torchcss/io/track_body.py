@@ -19,7 +19,8 @@ from torch import Tensor
 
 from torchcss.body.catalog import BODY_NAMES, LENGTHS, BodySpecification, specification
 from torchcss.body.kinematics import TreePose
-from torchcss.body.model import BodyModel, BodyPose, load_body
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.root import ROOT_NAMES
 from torchcss.errors import TrackFileError
 from torchcss.io.tracks import Track

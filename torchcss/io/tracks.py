@@ -43,8 +43,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from torchcss.errors import ShapeError, TrackFileError
-from torchcss.io.atomic import prepare_output_folder, replace_file
-from torchcss.io.safe_load import load_arrays, load_json
+from torchcss.files import load_arrays, load_json, prepare_output_folder, replace_file
 
 __all__ = [
     "SCHEMA_VERSION",

@@ -17,7 +17,6 @@ import os
 import re
 from collections.abc import Generator, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
@@ -31,7 +30,8 @@ from jaxtyping import UInt8
 from PIL import Image, ImageOps
 
 from torchcss.errors import ConfigurationError, ShapeError, VideoError
-from torchcss.io.atomic import output_error, temporary_name
+from torchcss.files import output_error, temporary_name
+from torchcss.types import Frame
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 """What counts as a frame in a folder of images."""
@@ -57,22 +57,6 @@ class VideoInfo(NamedTuple):
     width: int
     height: int
     num_frames: int | None
-
-
-@dataclass(frozen=True, slots=True)
-class Frame:
-    """One image of a video.
-
-    Attributes:
-        index: Place in the file, from 0, whatever part of the file is read.
-        time_s: Seconds since the file's first frame. Where the file's own times do not rise from
-            one frame to the next, it is an interval of its frame rate after the last.
-        image: Red, green, blue.
-    """
-
-    index: int
-    time_s: float
-    image: UInt8[np.ndarray, "h w 3"]
 
 
 class VideoReader:

@@ -17,7 +17,7 @@ background is worse than none. Clothes that look like the wall behind them are t
 in the dark a body is tracked worse than without (`docs/figures.md`).
 
 By default: `Background.unknown`, then per frame `Appearance.likeness(colour, background)`, and
-`learn` once the body is found; `torchcss.views.Watcher` does it.
+`learn` once the body is found; `torchcss.tracking.view.Watcher` does it.
 """
 
 from __future__ import annotations

@@ -31,9 +31,8 @@ from torch.nn import functional
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.vision.boundaries import motion_boundaries
 from torchcss.vision.camera import Camera
-from torchcss.vision.edges import EdgeConfiguration, edge_features
+from torchcss.vision.edges import EdgeConfiguration, edge_features, foreground_weight
 from torchcss.vision.flow import FlowConfiguration, robust_flow
-from torchcss.vision.foreground import foreground_weight
 
 Frame = (
     UInt8[Tensor, "h w"] | UInt8[Tensor, "h w c"] | Float[Tensor, "h w"] | Float[Tensor, "h w c"]

@@ -25,19 +25,18 @@ import numpy as np
 
 from torchcss.body.model import BodyModel
 from torchcss.errors import ConfigurationError, TorchcssError
-from torchcss.io.atomic import prepare_output_folder, replace_file
+from torchcss.files import prepare_output_folder, replace_file
 from torchcss.io.cameras import read_camera
 from torchcss.io.export.bvh import bvh_text
 from torchcss.io.export.c3d import write_c3d
 from torchcss.io.export.mot import mot_text
-from torchcss.io.export.selection import Selection, select
+from torchcss.io.export.selection import Selection, camera_up, select
 from torchcss.io.export.smpl import smpl_arrays
 from torchcss.io.export.tables import csv_text, joint_covariances, npz_arrays
 from torchcss.io.export.trc import trc_text
 from torchcss.io.fitted_body import body_beside
 from torchcss.io.track_body import body_of_track
 from torchcss.io.tracks import SUMMARY_NAME, TRACK_NAME, Track, load_track
-from torchcss.io.viewer_layout import camera_up
 from torchcss.vision.camera import Camera
 
 __all__ = ["FORMATS", "Export", "export_track"]

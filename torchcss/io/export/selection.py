@@ -21,6 +21,7 @@ from jaxtyping import Float, Int
 
 from torchcss.errors import ConfigurationError
 from torchcss.io.tracks import Track
+from torchcss.vision.camera import Camera
 
 DEFAULT_RATE = 25.0
 """Frames per second where a single frame, or equal times, do not tell."""
@@ -284,3 +285,12 @@ def _rate(times: np.ndarray, report: list[str]) -> float:
         step = float(times[-1] - times[0]) / len(steps)
     rate = 1.0 / step
     return float(round(rate)) if abs(rate - round(rate)) < 1e-6 * rate else rate
+
+
+_ABOVE = np.radians(15.0)
+"""The eye's place about the body: so far to the camera's right, and so far up."""
+
+
+def camera_up(camera: Camera | None) -> np.ndarray | None:
+    """The direction in the world that is up in the picture; None without a camera."""
+    return None if camera is None else -camera.R_camera_world[1].double().cpu().numpy()

@@ -1,0 +1,508 @@
+"""Bodies from files of others: tree, limits and flesh against what the files say."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from torchcss.body.files.default_shape import bone_parts, rest_poses, solid_shape, touching_parts
+from torchcss.body.kinematics import JointSpecification
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel
+from torchcss.body.root import ROOT_NAMES, has_root, root_angles
+from torchcss.body.surface import implicit
+from torchcss.cost.visibility import ContourPredictor
+from torchcss.errors import BodyError
+from torchcss.io.motion.positions import read_motion_capture
+from torchcss.types import Curvature, PointCost
+
+FILES = {
+    "panda.urdf": 8,
+    "iiwa7.urdf": 7,
+    "ur5.urdf": 6,
+    "anymal_b.urdf": 12,
+    "poppy_torso.urdf": 13,
+    "humanoid_gym.xml": 21,
+    "humanoid_CMU.xml": 62,
+    "humanoid_CMU_V2019.xml": 56,
+}
+"""Parameters of the robots of the shared data; both fingers of panda are one."""
+
+BVH = """HIERARCHY
+ROOT Hips
+{
+  OFFSET 0 0 0
+  CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+  JOINT LeftUpLeg
+  {
+    OFFSET 10 -5 0
+    CHANNELS 3 Zrotation Xrotation Yrotation
+    JOINT LeftLeg
+    {
+      OFFSET 0 -43 0
+      CHANNELS 3 Zrotation Xrotation Yrotation
+      JOINT LeftFoot
+      {
+        OFFSET 0 -42 0
+        CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+        End Site
+        {
+          OFFSET 0 -5 17
+        }
+      }
+    }
+  }
+  JOINT RightUpLeg
+  {
+    OFFSET -10 -5 0
+    CHANNELS 3 Zrotation Xrotation Yrotation
+    End Site
+    {
+      OFFSET 0 -43 0
+    }
+  }
+  JOINT Spine
+  {
+    OFFSET 0 50 0
+    CHANNELS 3 Zrotation Xrotation Yrotation
+    JOINT LeftArm
+    {
+      OFFSET 18 0 0
+      CHANNELS 3 Zrotation Xrotation Yrotation
+      End Site
+      {
+        OFFSET 60 0 0
+      }
+    }
+    JOINT RightArm
+    {
+      OFFSET -18 0 0
+      CHANNELS 3 Zrotation Xrotation Yrotation
+      End Site
+      {
+        OFFSET -60 0 0
+      }
+    }
+  }
+}
+MOTION
+Frames: 2
+Frame Time: 0.04
+0 90 0 0 0 0  5 10 0  0 20 0  1 -42 2 0 0 0  -5 0 0  0 10 0  0 0 40  0 0 -40
+3 91 0 9 8 7  5 40 0  0 70 0  1 -42 2 0 0 0  -9 0 0  0 20 0  0 0 60  0 0 -50
+"""
+
+MJCF = """<mujoco>
+  <compiler angle="radian" eulerseq="XYZ"/>
+  <default>
+    <joint range="-1 2"/>
+    <default class="big"><geom type="capsule" size=".05 .1"/><joint axis="0 1 0"/></default>
+  </default>
+  <worldbody>
+    <geom type="plane" size="1 1 1"/>
+    <body name="base" pos="0 0 1" childclass="big">
+      <freejoint/>
+      <geom name="trunk" fromto="0 0 0 0 0 .4"/>
+      <body name="arm" pos=".1 .2 .3" euler=".3 -.4 .5">
+        <joint name="turn" pos="0 0 .1"/>
+        <joint name="slide" type="slide" axis="1 0 0" limited="false"/>
+        <geom type="box" size=".1 .05 .02" quat="1 0 0 1"/>
+        <frame pos="0 0 .2" axisangle="0 0 1 1.2">
+          <body name="hand" pos=".1 0 0" xyaxes="0 1 0 -1 0 0">
+            <joint name="ball" type="ball" range="0 1.2"/>
+            <geom class="main" type="mesh" mesh="thumb"/>
+            <body name="tip" pos="0 0 .15"/>
+          </body>
+        </frame>
+      </body>
+    </body>
+    <body name="table" pos="2 0 0"><geom type="box" size="1 1 1"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def robot(shared_data: Path, name: str) -> Path:
+    return shared_data / "robot_models" / name
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+def random_state(body: BodyModel, generator: torch.Generator) -> Tensor:
+    x = torch.randn(2, body.num_parameters, generator=generator, dtype=torch.float64)
+    return body.bounds.project(0.3 * x)
+
+
+def check_lift(body: BodyModel, generator: torch.Generator) -> None:
+    """The exact Hessian is that of double backward."""
+    x = random_state(body, generator)
+    link = torch.randint(len(body.tree.link_names), (9,), generator=generator)
+    offset = torch.randn(9, 3, generator=generator, dtype=torch.float64)
+    pose = body.pose(x)
+    points = body.points_on_links(pose.tree, link, offset)
+    square = torch.randn(9, 3, 3, generator=generator, dtype=torch.float64)
+    cost = PointCost(points.sum(-1), points.sin(), (square + square.mT).expand(2, 9, 3, 3))
+    exact = body.lift(pose, points, link, cost)
+    reference = body.lift(pose, points, link, cost, curvature=Curvature.AUTOGRAD)
+    for found, expected in zip(exact, reference, strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
+
+
+def check_flesh(body: BodyModel) -> None:
+    """Parts exist, are finite, hang on the body, and can be seen."""
+    assert body.num_parts
+    assert len(set(body.part_names)) == body.num_parts
+    assert {name for pair in body.neighbours for name in pair} <= set(body.part_names)
+    identity = torch.eye(3, dtype=torch.float64).expand(body.num_parts, 3, 3)
+    torch.testing.assert_close(body.part_rotation @ body.part_rotation.mT, identity)
+    surface = body.surface(body.pose(body.rest))
+    assert bool(surface.points.isfinite().all())
+    assert bool((body.part_shape[:, :3] > 0).all())
+    predictor = ContourPredictor(body, rings=7, meridians=4)
+    eye = surface.points.mean(0) + torch.tensor([0.0, 0.5, 5.0]).double()
+    nodes = predictor(body, body.pose(body.rest[None]), eye)
+    assert int((nodes.exists * nodes.visible > 0.5).sum()) >= body.num_parts
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_robots_of_others(shared_data: Path, name: str, generator: torch.Generator) -> None:
+    body = load_body(robot(shared_data, name))
+    assert body.num_parameters == FILES[name]
+    assert has_root(body) == (name == "humanoid_CMU.xml")
+    assert body.notes
+    check_flesh(body)
+    if body.num_parameters < 25:
+        check_lift(body, generator)
+
+
+@pytest.mark.parametrize("name", ["01_01.bvh", "scaled_131_01.bvh"])
+def test_a_bvh_body_moves_as_its_file_does(shared_data: Path, name: str) -> None:
+    path = shared_data / "mocap_cmu" / name
+    body = load_body(path)
+    motion = read_motion_capture(path)
+    frames = [0, len(motion.joints) // 2, len(motion.joints) - 1]
+    x = states_of(body, path, frames)
+    assert bool(((x >= body.lower) & (x <= body.upper)).all())
+    joints = {name: i for i, name in enumerate(body.tree.link_names)}
+    links = body.pose(x).tree.translation[:, [joints[name] for name in motion.joint_names]]
+    np.testing.assert_allclose(links.numpy(), motion.joints[frames], atol=1e-6)
+    assert {"l_hip", "r_knee", "l_ankle", "r_shoulder", "l_elbow", "r_wrist", "skull_tip"} <= set(
+        body.joint_names
+    )
+    check_flesh(body)
+
+
+def states_of(body: BodyModel, path: Path, frames: list[int]) -> Tensor:
+    """The state of a BVH body in frames of its own file."""
+    lines = path.read_text().splitlines()
+    channels: list[tuple[str, str]] = []
+    name = ""
+    for line in lines:
+        words = line.split()
+        if words[:1] in (["ROOT"], ["JOINT"]):
+            name = words[1]
+        if words[:1] == ["CHANNELS"]:
+            channels += [(name, word) for word in words[2:]]
+    first = next(i for i, line in enumerate(lines) if line.startswith("Frame Time")) + 1
+    metres = 0.0254 / 0.45 if "scaled" not in path.name else 1.0
+    x = torch.zeros(len(frames), body.num_parameters, dtype=torch.float64)
+    for row, frame in enumerate(frames):
+        turn = torch.eye(3, dtype=torch.float64)
+        for (name, kind), word in zip(channels, lines[first + frame].split(), strict=True):
+            letter, value = kind[0].lower(), float(word)
+            if name == channels[0][0] and kind.endswith("position"):
+                x[row, body.state_index(f"root_{letter}")] = metres * value
+            elif name == channels[0][0]:
+                angle = torch.zeros(3, 3, dtype=torch.float64)
+                j, k = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[letter]
+                angle[k, j], angle[j, k] = 1.0, -1.0
+                turn = turn @ torch.linalg.matrix_exp(math.radians(value) * angle)
+            elif f"{name}_{letter}" in body.state_names:
+                x[row, body.state_index(f"{name}_{letter}")] = math.radians(value)
+        x[row, [body.state_index(n) for n in ROOT_NAMES[3:]]] = root_angles(turn)
+    return x
+
+
+def test_what_a_bvh_does_not_say(tmp_path: Path, generator: torch.Generator) -> None:
+    body = load_body(write(tmp_path / "a.bvh", BVH))
+    check_lift(body, generator)
+    check_flesh(body)
+    # Only what moves in the file moves, 60 degrees beyond it, and the file's mean is the rest.
+    assert body.state_names[6:] == (
+        "LeftUpLeg_x", "LeftLeg_x", "RightUpLeg_z", "Spine_x", "LeftArm_y", "RightArm_y",
+    )  # fmt: skip
+    knee = body.state_index("LeftLeg_x")
+    limits = [math.degrees(float(end[knee])) for end in body.bounds]
+    assert limits == pytest.approx([-40, 90])  # the middle angle of three ends at a right angle
+    assert math.degrees(float(body.sticky_mean[knee])) == pytest.approx(45)
+    assert math.degrees(float(body.sticky_deviation[knee])) == pytest.approx(25)
+    arm = body.state_index("LeftArm_y")
+    assert math.degrees(float(body.upper[arm])) == pytest.approx(120)
+    unit, limits_note = body.notes
+    assert "a.bvh: unit: cm (10.000 mm), guessed" in unit
+    assert "a BVH has none" in limits_note
+    assert "60 degrees beyond" in limits_note
+    # Held angles are the file's; so are the positions of a joint that has them.
+    pose = body.pose(torch.zeros(body.num_parameters, dtype=torch.float64))
+    at = {name: joint for name, joint in zip(body.joint_names, pose.joints, strict=True)}
+    lean = math.radians(5)
+    expected = 0.43 * torch.tensor([math.sin(lean), -math.cos(lean), 0.0]).double()
+    torch.testing.assert_close(at["l_knee"] - at["l_hip"], expected)
+    assert float((at["l_ankle"] - at["l_knee"]).norm()) == pytest.approx(
+        0.01 * math.sqrt(1 + 42**2 + 2**2)
+    )
+    torch.testing.assert_close(at["HumanoidRoot"], 0.5 * (at["l_hip"] + at["r_hip"]))
+
+
+def test_a_bvh_without_motion(tmp_path: Path) -> None:
+    lines = BVH.replace("Frames: 2", "Frames: 1").splitlines()[:-1]
+    body = load_body(write(tmp_path / "a.bvh", "\n".join(lines)), free_root=False)
+    assert body.num_parameters == 7 * 3
+    degrees = dict(zip(body.state_names, torch.rad2deg(body.upper).tolist(), strict=True))
+    assert degrees["LeftUpLeg_z"] == pytest.approx(5 + 120)
+    assert degrees["LeftUpLeg_x"] == pytest.approx(90)
+    assert bool(body.sticky_deviation.isinf().all())
+    assert "no motion" in body.notes[1]
+
+
+def test_units_of_a_bvh(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.bvh", BVH)
+    for options, metres in (({}, 0.43), ({"units": "inch"}, 43 * 0.0254), ({"units": 2.0}, 86.0)):
+        body = load_body(path, **options)
+        joints = body.pose(body.rest).joints
+        length = joints[body.joint_index("l_knee")] - joints[body.joint_index("l_hip")]
+        assert float(length.norm()) == pytest.approx(metres)
+    small = write(tmp_path / "b.bvh", BVH.replace("43", "4.3e6"))
+    with pytest.raises(BodyError, match="no person's"):
+        load_body(small)
+    assert load_body(small, units="mm").num_parameters
+    with pytest.raises(BodyError, match="units: expected m, cm"):
+        load_body(path, units="furlong")
+    with pytest.raises(BodyError, match="positive metres"):
+        load_body(path, units=-1.0)
+
+
+def test_mjcf_by_hand(tmp_path: Path, generator: torch.Generator) -> None:
+    body = load_body(write(tmp_path / "a.xml", MJCF), free_root=False)
+    check_lift(body, generator)
+    assert body.state_names == ("turn", "slide", "ball_x", "ball_y", "ball_z")
+    assert body.lower.tolist() == pytest.approx([-1, -math.inf, -1.2, -1.2, -1.2])
+    assert body.upper.tolist() == pytest.approx([2, math.inf, 1.2, 1.2, 1.2])
+    assert any("not table" in note for note in body.notes)
+
+    def turn(axis: int, angle: float) -> np.ndarray:
+        matrix = np.eye(4)
+        j, k = (axis + 1) % 3, (axis + 2) % 3
+        matrix[j, j] = matrix[k, k] = math.cos(angle)
+        matrix[k, j], matrix[j, k] = math.sin(angle), -math.sin(angle)
+        return matrix
+
+    def shift(*by: float) -> np.ndarray:
+        matrix = np.eye(4)
+        matrix[:3, 3] = by
+        return matrix
+
+    x = torch.tensor([0.7, 0.05, 0.2, -0.3, 0.4], dtype=torch.float64)
+    # Capital letters: fixed axes, the first turn innermost.
+    arm = shift(0.1, 0.2, 0.3) @ turn(2, 0.5) @ turn(1, -0.4) @ turn(0, 0.3)
+    arm = arm @ shift(0, 0, 0.1) @ turn(1, 0.7) @ shift(0, 0, -0.1) @ shift(0.05, 0, 0)
+    hand = arm @ shift(0, 0, 0.2) @ turn(2, 1.2) @ shift(0.1, 0, 0) @ turn(2, math.pi / 2)
+    hand = hand @ turn(0, 0.2) @ turn(1, -0.3) @ turn(2, 0.4)
+    joints = body.pose(x).joints
+    for name, place in (("arm", arm), ("hand", hand), ("tip", hand @ shift(0, 0, 0.15))):
+        np.testing.assert_allclose(joints[body.joint_index(name)], place[:3, 3], atol=1e-12)
+    # Solids of the file, and a bone where a link has only a mesh.
+    assert body.part_names == ("trunk", "arm", "hand")
+    torch.testing.assert_close(
+        body.part_shape[:, :3],
+        torch.tensor([[0.05, 0.05, 0.25], [0.1, 0.05, 0.02], [0.024, 0.024, 0.0834]]).double(),
+        rtol=0.2, atol=0.0,
+    )  # fmt: skip
+    assert [
+        len(load_body(tmp_path / "a.xml", flesh=how).part_names) for how in ("bones", "none")
+    ] == [3, 0]
+
+
+def test_a_free_root_is_upright_and_at_the_body(tmp_path: Path, shared_data: Path) -> None:
+    body = load_body(write(tmp_path / "a.xml", MJCF))
+    assert has_root(body)
+    joints = body.pose(torch.zeros(body.num_parameters, dtype=torch.float64)).joints
+    torch.testing.assert_close(joints[body.joint_index("base")], torch.zeros(3).double())
+    # Robots' x forward, y left, z up are z, x and y.
+    expected = torch.tensor([0.2, 0.3, 0.1]).double()
+    torch.testing.assert_close(joints[body.joint_index("arm")], expected)
+    fixed = load_body(robot(shared_data, "humanoid_gym.xml"))
+    free = load_body(robot(shared_data, "humanoid_gym.xml"), free_root=True)
+    assert free.num_parameters == fixed.num_parameters + 6
+    at = free.pose(torch.zeros(free.num_parameters, dtype=torch.float64)).joints
+    torso, knee = (at[free.joint_index(name)] for name in ("torso", "l_knee"))
+    torch.testing.assert_close(torso, torch.zeros(3).double())
+    assert float(knee[1]) < -0.5
+    assert float(knee[0]) > 0.05
+
+
+def test_limits_and_names_of_the_humanoids(shared_data: Path) -> None:
+    gym = load_body(robot(shared_data, "humanoid_gym.xml"))
+    knee = gym.state_index("right_knee")
+    assert [math.degrees(float(end[knee])) for end in gym.bounds] == pytest.approx([-160, -2])
+    limbs = {f"{s}_{p}" for s in "lr" for p in ("hip", "knee", "ankle", "shoulder", "elbow")}
+    assert limbs <= set(gym.joint_names)
+    cmu = load_body(robot(shared_data, "humanoid_CMU.xml"))
+    assert limbs | {"l_wrist", "r_wrist", "HumanoidRoot"} <= set(cmu.joint_names)
+    tibia = cmu.state_index("ltibiarx")
+    assert [math.degrees(float(end[tibia])) for end in cmu.bounds] == pytest.approx([1, 170])
+    joints = cmu.pose(torch.zeros(cmu.num_parameters, dtype=torch.float64)).joints
+    thigh = joints[cmu.joint_index("l_hip")] - joints[cmu.joint_index("l_knee")]
+    assert float(thigh.norm()) == pytest.approx(0.404945)
+
+
+def test_primitives_of_a_urdf(tmp_path: Path) -> None:
+    text = """<robot name="r"><link name="a"><visual><origin xyz="0 0 .1" rpy="0 1.5707963 0"/>
+      <geometry><cylinder radius=".05" length=".4"/></geometry></visual></link>
+      <link name="b"><collision><geometry><box size=".2 .4 .6"/></geometry></collision></link>
+      <link name="c"/><joint name="j" type="revolute"><parent link="a"/><child link="b"/>
+      <axis xyz="0 0 1"/><limit lower="-1" upper="1"/></joint>
+      <joint name="k" type="fixed"><parent link="b"/><child link="c"/><origin xyz="0 0 1"/></joint>
+      </robot>"""
+    body = load_body(write(tmp_path / "a.urdf", text))
+    assert body.part_names == ("a", "b")
+    assert body.part_shape[:, :3].tolist() == [[0.05, 0.05, 0.2], [0.1, 0.2, 0.3]]
+    torch.testing.assert_close(
+        body.part_rotation[0] @ torch.tensor([0.0, 0.0, 1.0]).double(),
+        torch.tensor([1.0, 0.0, 0.0]).double(), rtol=0.0, atol=1e-6,
+    )  # fmt: skip
+    bones = load_body(tmp_path / "a.urdf", flesh="bones")
+    assert bones.part_names == ("b",)
+    assert load_body(tmp_path / "a.urdf", flesh="none").num_parts == 0
+    double = load_body(tmp_path / "a.urdf", scale=2.0)
+    torch.testing.assert_close(double.part_shape[:, :3], 2 * body.part_shape[:, :3])
+    # In an xml file it is still a URDF.
+    assert load_body(write(tmp_path / "a.xml", text)).state_names == ("j",)
+
+
+def test_solids_of_a_urdf_have_names_of_their_own(tmp_path: Path) -> None:
+    """The second solid of a link may not take the name of another link, wherever that stands."""
+    solid = "<visual><geometry><sphere radius='.05'/></geometry></visual>"
+    text = f"""<robot name="r"><link name="arm">{3 * solid}</link><link name="arm_2">{2 * solid}
+      </link><link name="arm_4"/><joint name="j" type="revolute"><parent link="arm"/>
+      <child link="arm_2"/><origin xyz="0 0 .5"/></joint><joint name="k" type="fixed">
+      <parent link="arm_2"/><child link="arm_4"/><origin xyz="0 0 .5"/></joint></robot>"""
+    body = load_body(write(tmp_path / "a.urdf", text))
+    assert body.part_names == ("arm", "arm_3", "arm_5", "arm_2", "arm_2_2")
+    assert ("arm", "arm_3") in body.neighbours
+
+
+def test_bones_hold_what_they_join() -> None:
+    """A part along every bone, on the bone, on the link that carries it; a trunk between limbs."""
+
+    def joint(name: str, parent: str | None, *at: float) -> JointSpecification:
+        return JointSpecification(
+            name=name, link=name, parent=parent, kind="fixed" if parent is None else "revolute",
+            translation=at if at else (0.0, 0.0, 0.0),  # type: ignore[arg-type]
+        )  # fmt: skip
+
+    joints = [
+        joint("pelvis", None), joint("twist", "pelvis"), joint("chest", "twist", 0.0, 0.5, 0.0),
+        joint("lleg", "pelvis", 0.2, -0.1, 0.0), joint("lfoot", "lleg", 0.0, -0.8, 0.0),
+        joint("rleg", "pelvis", -0.2, -0.1, 0.0), joint("rfoot", "rleg", 0.0, -0.8, 0.0),
+        joint("larm", "chest", 0.3, 0.0, 0.0), joint("lhand", "larm", 0.0, -0.6, 0.0),
+        joint("rarm", "chest", -0.3, 0.0, 0.0), joint("rhand", "rarm", 0.0, -0.6, 0.0),
+    ]  # fmt: skip
+    parts = bone_parts(joints, {})
+    poses = rest_poses(joints)
+    bones = [(a, b) for a in joints for b in joints if b.parent == a.link and b.link != "twist"]
+    assert len(parts) == len(bones)
+    for above, below in bones:
+        middle = 0.5 * (poses[above.link] + poses[below.link])[:3, 3]
+        part = next(
+            part
+            for part in parts
+            if part.link == above.link
+            and np.allclose(poses[part.link][:3, 3] + part.translation, middle)
+        )
+        along = np.array(part.rotation)[:, 2]
+        bone = (poses[below.link] - poses[above.link])[:3, 3]
+        assert np.allclose(along, bone / np.linalg.norm(bone))
+        assert part.shape[2] > 0.5 * np.linalg.norm(bone)
+    trunk = next(part for part in parts if part.link == "twist")
+    assert np.allclose(np.abs(np.array(trunk.rotation)[:, 0]), [1, 0, 0])
+    assert 0.2 < trunk.shape[0] < 0.3
+    assert trunk.shape[1] < trunk.shape[0]
+    pairs = {frozenset(pair) for pair in touching_parts(joints, parts)}
+    assert frozenset(("lleg", "rleg")) not in pairs
+    assert frozenset(("twist", "chest")) in pairs
+
+
+@pytest.mark.parametrize(("kind", "size"), [("capsule", (0.1, 0.3)), ("cylinder", (0.1, 0.3))])
+def test_solids_have_their_length_girth_and_volume(kind: str, size: tuple[float, float]) -> None:
+    shape = torch.tensor(solid_shape(kind, size)).double()
+    radius, half = size
+    assert shape[:3].tolist() == pytest.approx(
+        [radius, radius, half + radius * (kind == "capsule")]
+    )
+    axis = torch.linspace(-0.4, 0.4, 81).double()
+    x, y, z = torch.meshgrid(axis / 3, axis / 3, axis, indexing="ij")
+    points = torch.stack([x, y, z], -1)
+    inside = (implicit(shape.expand(*points.shape[:-1], 9), points) < 0).double()
+    volume = float(inside.sum()) * 0.01**3 / 9
+    true = math.pi * radius**2 * 2 * half + (4 / 3 * math.pi * radius**3) * (kind == "capsule")
+    assert volume == pytest.approx(true, rel=0.02 if kind == "capsule" else 0.12)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "match"),
+    [
+        ("a.bvh", "", "the file is empty"),
+        ("a.bvh", MJCF, "line 1: expected HIERARCHY"),
+        ("a.bvh", BVH.replace("OFFSET 10", "OFFSET ten"), "line 8: expected three numbers"),
+        ("a.xml", "", "the file is empty"),
+        ("a.xml", BVH, "the XML does not parse"),
+        ("a.xml", "<html/>", "expected <robot> with links, found <html>"),
+        ("a.xml", "<mujoco/>", "no <body>"),
+        ("a.xml", "<mujoco><worldbody/></mujoco>", "no <body>"),
+        ("a.xml", MJCF.replace(".1 .2 .3", ".1 .2"), "<body name='arm'>: expected 3 numbers"),
+        ("a.xml", MJCF.replace(".1 .2 .3", ".1 nan .3"), "<body name='arm'>: expected 3 numbers"),
+        ("a.xml", MJCF.replace(".1 .2 .3", ".1 1e30 .3"), "<body name='arm'>: expected 3 numbers"),
+        ("a.xml", MJCF.replace('type="slide"', 'type="screw"'), "'slide'.* type hinge, slide"),
+        ("a.xml", MJCF.replace('axis="1 0 0"', 'axis="0 0 0"'), "'slide'.*not zero"),
+        ("a.xml", MJCF.replace('"-1 2"', '"2 -1"'), "joint 'turn': expected a range"),
+        ("a.xml", MJCF.replace("XYZ", "XYW"), "compiler: expected eulerseq"),
+        ("a.xml", MJCF.replace("childclass=\"big\"", 'childclass="small"'), "a default class"),
+        ("a.xml", MJCF.replace('size=".1 .05 .02"', 'size=".1 0 .02"'), "'arm': expected 3 pos"),
+        ("a.xml", MJCF.replace(' size=".05 .1"', ""), "'trunk': expected 2 positive numbers as si"),
+        ("a.xml", MJCF.replace('type="box"', 'type="cone"', 1), "'arm': expected type sphere"),
+        ("a.xml", MJCF.replace('name="slide"', 'name="turn"'), "a.xml: joint names must be unique"),
+        ("a.xml", MJCF.replace("frame", "replicate"), "needs MuJoCo's compiler"),
+        ("a.xml", '<mujoco><include file="b.xml"/></mujoco>', "b.xml: there is no such file"),
+        ("a.xml", '<mujoco><include file="a.xml"/></mujoco>', "includes: do they loop"),
+        ("a.xml", MJCF.replace("<freejoint/>", "<freejoint/><joint/>"), "a free joint alone"),
+    ],
+)  # fmt: skip
+def test_bad_files(tmp_path: Path, name: str, text: str, match: str) -> None:
+    path = write(tmp_path / name, text)
+    with pytest.raises(BodyError, match=match) as caught:
+        load_body(path)
+    assert "\n" not in str(caught.value)
+    assert str(tmp_path) in str(caught.value)
+
+
+def test_bad_requests(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.xml", MJCF)
+    with pytest.raises(BodyError, match="flesh: expected file, bones or none"):
+        load_body(path, flesh="muscle")  # type: ignore[arg-type]
+    with pytest.raises(BodyError, match="scale must be positive"):
+        load_body(path, scale=0.0)
+    with pytest.raises(BodyError, match="units are for BVH"):
+        load_body(path, units="cm")
+    with pytest.raises(BodyError, match="own lengths"):
+        load_body(path, lengths={"thigh": 0.4})
+    path.write_bytes(MJCF.encode("utf-16"))
+    assert load_body(path).num_parameters == 11  # XML says its encoding itself

@@ -1,0 +1,190 @@
+"""`torchcss init`: what it writes, that `track --init` takes it, one clear line when it fails."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torchcss.app.init import write_png
+from torchcss.cli import init as cli_init
+from torchcss.cli import main as cli
+from torchcss.initialise.multi_start import Search
+from torchcss.io.keypoints.one_image import Joints
+from torchcss.io.tracks import load_track
+from torchcss.io.video import VideoReader, VideoWriter, read_image
+from torchcss.studies.render.sequences import arm_sequence
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A rendered arm as picture and as video, with its camera and joints as files."""
+    folder = tmp_path_factory.mktemp("scene")
+    sequence = arm_sequence(generator=torch.Generator().manual_seed(3), num_frames=2)
+    with VideoWriter(folder / "video.mp4", 25) as film:
+        for frame in sequence.frames:
+            film.write(frame)
+    write_png(folder / "picture.png", sequence.frames[0])
+    camera = sequence.camera
+    entry = {
+        "image_size_wh": list(camera.image_size_wh),
+        "K": camera.K.tolist(),
+        "R": camera.R_camera_world.tolist(),
+        "t": camera.t_camera_world.tolist(),
+    }
+    (folder / "cameras.json").write_text(
+        json.dumps({"units": "metre, pixel", "cameras": {"one": entry}})
+    )
+    uv = camera.project(sequence.joints_world).uv
+    names = sequence.body.joint_names
+    marks = dict(zip(names, uv[0].tolist(), strict=True))
+    (folder / "joints.json").write_text(json.dumps({"joints": marks}))
+    np.savez(
+        folder / "keypoints.npz", keypoints=uv.numpy(), confidence=np.ones(uv.shape[:2]),
+        joint_names=np.array(names),
+    )  # fmt: skip
+    return folder
+
+
+def init(scene: Path, out: Path, *more: str) -> int:
+    given = ["init", str(scene / "picture.png"), "--out", str(out), "--body", "arm8", *more]
+    if "--click" not in more and "--joints" not in more:
+        given += ["--joints", str(scene / "joints.json")]
+    return cli.main(given)
+
+
+@pytest.fixture(scope="module")
+def result(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("init") / "out"
+    assert init(scene, out, "--camera", str(scene / "cameras.json"), "--hypotheses", "3") == 0
+    return out
+
+
+def test_writes_what_it_says(scene: Path, result: Path):
+    stages = {f"stage{number}.png" for number in (1, 2, 3)}
+    assert {path.name for path in result.iterdir()} == stages | {
+        "body.npz", "hypotheses.png", "side.png", "proportions.csv", "summary.json"
+    }  # fmt: skip
+    picture = read_image(scene / "picture.png")
+    for name in stages | {"hypotheses.png"}:
+        drawn = read_image(result / name)
+        assert drawn.shape == picture.shape
+        assert (drawn != picture).any()
+    with (result / "proportions.csv").open() as file:
+        rows = {row["name"]: row for row in csv.DictReader(file)}
+    assert set(rows) == {"shoulder_width", "upper_arm", "forearm"}
+    ratio = float(rows["forearm"]["fitted_m"]) / float(rows["forearm"]["standard_m"]) - 1
+    assert 100 * ratio == pytest.approx(float(rows["forearm"]["difference_percent"]))
+    assert abs(ratio) <= 0.1 + 1e-9
+    summary = json.loads((result / "summary.json").read_text())
+    assert 1 <= summary["num_hypotheses"] <= 3
+    assert len(summary["stages"]) == 3
+    assert any("sets the scale" in line for line in summary["report"])
+
+
+def test_with_edges_alone_if_asked(scene: Path, result: Path, tmp_path: Path):
+    camera = str(scene / "cameras.json")
+    assert init(scene, tmp_path, "--camera", camera, "--hypotheses", "3", "--no-colours") == 0
+    both, edges = (json.loads((p / "summary.json").read_text()) for p in (result, tmp_path))
+    assert (both["colours"], edges["colours"]) == (True, False)
+    for name, cost in both["stages"].items():
+        assert (cost == edges["stages"][name]) == (name == "pose and proportions from joints")
+
+
+def test_track_starts_from_it(scene: Path, result: Path, tmp_path: Path, capsys):
+    given = [
+        "track", str(scene / "video.mp4"), "--camera", str(scene / "cameras.json"),
+        "--keypoints", str(scene / "keypoints.npz"), "--init", str(result), "--samples", "4",
+        "--modes", "2", "--no-overlay", "--out", str(tmp_path),
+    ]  # fmt: skip
+    assert cli.main([*given, "--body", "arm8"]) == 0
+    assert len(load_track(tmp_path).frames) == 2
+    capsys.readouterr()
+    assert cli.main([*given, "--body", "arm7"]) == 2
+    assert "the fitted body is arm8" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--joints", "nowhere.json"), "nowhere.json"),
+        (("--camera", "nowhere.json"), "nowhere.json"),
+        (("--focal-px", "500", "--field-of-view", "60"), "field_of_view"),
+        (("--field-of-view", "200"), "field_of_view"),
+        (("--stature", "175"), "stature"),
+        (("--hypotheses", "0"), "at least 1 hypothesis"),
+        (("--hypotheses", "-2"), "at least 1 hypothesis"),
+        (("--seed", str(2**70)), "seed"),
+        (("--normalised", "zero-one"), "expected fractions of the image"),
+        (("--body", "octopus"), "octopus"),
+        (("--click",), "no window can be opened"),
+    ],
+)
+def test_one_clear_line(scene: Path, tmp_path: Path, options: tuple, message: str, capsys):
+    assert init(scene, tmp_path / "out", *options) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith("torchcss: ")
+    assert message in line
+
+
+def test_clicked_joints_are_used_and_kept(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    marks = json.loads((scene / "joints.json").read_text())["joints"]
+    places = torch.tensor(list(marks.values()), dtype=torch.float64)
+    clicked = Joints(places, torch.ones(len(places)).double(), tuple(marks), ("clicked",))
+    monkeypatch.setattr(cli_init, "click_joints", lambda picture: clicked)
+    small = Search(num_starts=8, num_flips=8, num_samples=0)
+    plain = cli_init.initialise_image
+    monkeypatch.setattr(
+        cli_init, "initialise_image", lambda *a, **k: plain(*a, **{**k, "search": small})
+    )
+    assert init(scene, tmp_path, "--click", "--no-contours", "--hypotheses", "best") == 0
+    kept = json.loads((tmp_path / "joints.json").read_text())["joints"]
+    assert kept["r_wrist"] == pytest.approx(marks["r_wrist"], abs=0.01)
+    assert not (tmp_path / "stage2.png").exists()
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["num_hypotheses"] == 1
+    focal = 0.5 * 640 / math.tan(math.radians(27))
+    assert f"focal length {focal:.0f} px" in summary["report"][0]
+
+
+def test_from_a_frame_of_a_video(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """What is marked in a later frame is of that frame, for `track --start` too."""
+    marks = json.loads((scene / "joints.json").read_text())["joints"]
+    places = torch.tensor(list(marks.values()), dtype=torch.float64)
+    clicked = Joints(places, torch.ones(len(places)).double(), tuple(marks), ("clicked",))
+    seen = []
+    small = Search(num_starts=8, num_flips=8, num_samples=0)
+    plain = cli_init.initialise_image
+    monkeypatch.setattr(
+        cli_init, "initialise_image", lambda *a, **k: plain(*a, **{**k, "search": small})
+    )
+    monkeypatch.setattr(cli_init, "click_joints", lambda picture: seen.append(picture) or clicked)
+    quick = [
+        "--camera", str(scene / "cameras.json"), "--no-contours", "--hypotheses", "best",
+        "--body", "arm8",
+    ]  # fmt: skip
+    video = ["init", str(scene / "video.mp4"), "--frame", "1", *quick]
+    assert cli.main([*video, "--click", "--out", str(tmp_path / "a")]) == 0
+    second = list(VideoReader(scene / "video.mp4"))[1].image
+    assert (seen[0] == second).all()
+    made = tmp_path / "a" / "joints.json"
+    assert list(json.loads(made.read_text())["frames"]) == ["1"]
+    for number, joints in enumerate((made, scene / "keypoints.npz", scene / "joints.json")):
+        out = tmp_path / str(number)
+        assert cli.main([*video, "--joints", str(joints), "--out", str(out)]) == 0
+        assert json.loads((out / "summary.json").read_text())["frame"] == 1
+    assert cli.main([*video[:3], "7", *quick, "--joints", str(made), "--out", str(tmp_path)]) == 2
+    given = [
+        "track", str(scene / "video.mp4"), "--camera", str(scene / "cameras.json"), "--start", "1",
+        "--keypoints", str(made), "--init", str(tmp_path / "a"), "--keypoints-use", "first",
+        "--samples", "4", "--modes", "2", "--no-overlay", "--out", str(tmp_path / "track"),
+    ]  # fmt: skip
+    assert cli.main([*given, "--body", "arm8"]) == 0
+    assert list(load_track(tmp_path / "track").frames) == [1]

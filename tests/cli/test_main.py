@@ -1,0 +1,131 @@
+"""The command: one clear line and a status for every kind of bad input."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_clip import track
+
+from torchcss.cli import main as cli
+
+
+def spoil_camera(files: Path, **changes) -> None:
+    content = json.loads((files / "cameras.json").read_text())
+    content["cameras"]["one"].update(changes)
+    (files / "cameras.json").write_text(json.dumps(content))
+
+
+def spoil_keypoints(files: Path, **changes) -> None:
+    arrays = dict(np.load(files / "keypoints.npz"))
+    np.savez(files / "keypoints.npz", **{**arrays, **changes})
+
+
+def test_good_files_track(files: Path, capsys: pytest.CaptureFixture[str]):
+    assert track(files) == 0
+    assert "3 frames" in capsys.readouterr().out
+    assert (files / "out" / "track.npz").exists()
+
+
+SPOILED = {
+    "missing video": lambda f: (f / "video.mp4").unlink(),
+    "empty video": lambda f: (f / "video.mp4").write_bytes(b""),
+    "not a video": lambda f: (f / "video.mp4").write_bytes(b"hello" * 100),
+    "truncated video": lambda f: (f / "video.mp4").write_bytes(
+        (f / "video.mp4").read_bytes()[:300]
+    ),
+    "missing camera": lambda f: (f / "cameras.json").unlink(),
+    "camera of another size": lambda f: spoil_camera(f, image_size_wh=[128, 96]),
+    "camera with NaN": lambda f: spoil_camera(f, t=[0, 0, float("nan")]),
+    "missing keypoints": lambda f: (f / "keypoints.npz").unlink(),
+    "another number of frames": lambda f: spoil_keypoints(
+        f, keypoints=np.ones((7, 4, 2)), confidence=np.ones((7, 4))
+    ),
+    "unknown layout": lambda f: spoil_keypoints(f, joint_names=np.array(list("abcd"))),
+    "nobody in the first frame": lambda f: spoil_keypoints(
+        f, confidence=np.array([[0.0] * 4, [1] * 4, [1] * 4])
+    ),
+    "normalised coordinates": lambda f: spoil_keypoints(
+        f, keypoints=np.load(f / "keypoints.npz")["keypoints"] / 64
+    ),
+    "NaN keypoint": lambda f: spoil_keypoints(f, keypoints=np.full((3, 4, 2), np.nan)),
+    "too few joints": lambda f: spoil_keypoints(
+        f, confidence=np.tile([1.0, 1.0, 0.0, 0.0], (3, 1))
+    ),
+    "out is a file": lambda f: (f / "out").write_text("in the way"),
+}
+
+
+@pytest.mark.parametrize("what", SPOILED)
+def test_one_clear_line(files: Path, what: str, capsys: pytest.CaptureFixture[str]):
+    SPOILED[what](files)
+    assert track(files) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    ours = [line for line in lines if line.startswith("torchcss: ")]
+    assert len(ours) == 1
+    assert lines[-1] == ours[0]
+    assert len(ours[0]) > 30
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--start", "9"),
+        ("--stride", "0"),
+        ("--body", "octopus"),
+        ("--preset", "magic"),
+        ("--camera-name", "two"),
+        ("--layout", "BODY_99"),
+        ("--device", "cuda:99"),
+        ("--terms", "contour", "magic"),
+    ],
+)
+def test_bad_options(files: Path, options: tuple[str, ...], capsys: pytest.CaptureFixture[str]):
+    assert track(files, *options) == 2
+    assert capsys.readouterr().err.strip().splitlines()[-1].startswith("torchcss: ")
+
+
+def test_start_is_checked_before_the_offset(files: Path, capsys: pytest.CaptureFixture[str]):
+    assert track(files, "--start", "-1") == 2
+    assert "start must be at least 0, got -1" in capsys.readouterr().err
+
+
+def test_the_advice_about_fractions_can_be_followed(
+    files: Path, capsys: pytest.CaptureFixture[str]
+):
+    for kind in ("zero-one", "plus-minus-one"):
+        assert track(files, "--normalised", kind) == 2
+        assert "expected fractions of the image" in capsys.readouterr().err
+    points = np.load(files / "keypoints.npz")["keypoints"]
+    spoil_keypoints(files, keypoints=points / (63, 47))
+    assert track(files) == 2
+    assert "set normalised to zero-one or plus-minus-one" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may write everywhere")
+def test_unwritable_folder(files: Path, capsys: pytest.CaptureFixture[str]):
+    files.chmod(0o500)
+    try:
+        assert track(files) == 2
+    finally:
+        files.chmod(0o700)
+    assert "torchcss: " in capsys.readouterr().err
+
+
+def test_interrupt_has_its_own_status(files: Path, monkeypatch: pytest.MonkeyPatch):
+    def interrupted(*_args, **_kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "track_video", interrupted)
+    assert track(files) == 130
+
+
+@pytest.mark.parametrize("verb", ["demo", "track"])
+def test_help(verb: str, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as ended:
+        cli.main([verb, "--help"])
+    assert ended.value.code == 0
+    assert "--seed" in capsys.readouterr().out

@@ -1,0 +1,381 @@
+"""Initialisation: known people are found, bad marks are named, and the same seed gives the same."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import torchcss
+from torchcss.body.catalog import LENGTHS
+from torchcss.body.load import load_body
+from torchcss.cost.joints import JointObservation, JointTerm
+from torchcss.cost.part_map import part_map
+from torchcss.cost.view import View
+from torchcss.errors import BodyError, CameraError, ConfigurationError, KeypointError
+from torchcss.initialise.fit import DEFAULT_VIEW_DEGREES, default_camera, initialise
+from torchcss.initialise.from_joints import initialise_from_joints
+from torchcss.initialise.keypoint_checks import default_sigma, typical_sigma
+from torchcss.initialise.multi_start import PAPER_PROPORTIONS, SINGLE_START, Search
+from torchcss.initialise.result import Initialisation, hang_on_best, stature_of
+from torchcss.studies.metrics import LIMB_JOINTS, mask_overlap, pa_mpjpe_mm
+from torchcss.studies.random_person import Person, coverage, random_person
+from torchcss.studies.render.software import Mesh, clutter_background, render_meshes
+from torchcss.types import Modes
+from torchcss.vision.camera import Camera
+from torchcss.vision.rasterise import grid_faces
+
+SMALL = Search(num_starts=16, num_trunks=2, num_flips=16, num_samples=4)
+
+
+def person(seed: int = 1, **options) -> Person:
+    return random_person(generator=torch.Generator().manual_seed(seed), **options)
+
+
+def marks(someone: Person) -> dict[str, tuple[float, ...]]:
+    return {
+        name: tuple(place)
+        for name, place, seen in zip(
+            someone.joint_names, someone.keypoints.tolist(), someone.confidence, strict=True
+        )
+        if seen > 0
+    }
+
+
+def find(someone: Person, search: Search = SMALL, seed: int = 0, **options) -> Initialisation:
+    return initialise_from_joints(
+        "body34",
+        someone.camera,
+        someone.keypoints,
+        someone.confidence,
+        someone.joint_names,
+        generator=torch.Generator().manual_seed(seed),
+        joints=JointTerm(sigma=2.0),
+        search=search,
+        **options,
+    )
+
+
+def error_mm(found: Initialisation, someone: Person) -> np.ndarray:
+    index = [found.body.joint_index(name) for name in LIMB_JOINTS]
+    joints = found.body.pose(found.mixture.mean).joints[:, index].numpy()
+    return pa_mpjpe_mm(joints, someone.joints_world(LIMB_JOINTS).numpy()[None])
+
+
+@pytest.fixture(scope="module")
+def found() -> Initialisation:
+    return find(person(), num_modes=None)
+
+
+def test_a_person_is_found_among_the_hypotheses(found: Initialisation):
+    errors = error_mm(found, person())
+    assert errors[:7].min() < 70
+    assert errors[0] < 110
+    assert (found.cost.diff() >= 0).all()
+    assert len(found.cost) > 3
+
+
+def test_limits_hold_and_lengths_stay_in_their_interval(found: Initialisation):
+    body = found.body
+    assert bool((found.mixture.mean >= body.lower).all())
+    assert bool((found.mixture.mean <= body.upper).all())
+    for name, length in found.lengths.items():
+        assert abs(length / LENGTHS[name] - 1) < 0.1 + 1e-9
+    assert "prior on proportions sets the scale" in "\n".join(found.report)
+
+
+def test_hung_on_the_best_fit_no_hypothesis_breaks_a_limit(generator: torch.Generator):
+    body = load_body("body34")
+    size = (2000, body.num_parameters)
+    share = torch.rand(size, generator=generator, dtype=torch.float64)
+    lower, upper = body.lower.clamp(min=-3), body.upper.clamp(max=3)
+    x = lower + share * (upper - lower)
+    x[1, body.state_index("root_pitch")] = body.upper[body.state_index("root_pitch")]
+    n = len(body.state_names)
+    fits = Modes(
+        x, torch.eye(n).expand(len(x), n, n), torch.arange(len(x)), x > upper,
+        torch.zeros(len(x)), torch.zeros(len(x)),
+    )  # fmt: skip
+    hung, kept = hang_on_best(body, fits)
+    # Those whose pitch is beyond 85 degrees there are left out.
+    assert 1900 < len(kept.cost) < 2000
+    assert int(kept.cost[0]) == 0
+    assert bool(((kept.mean >= hung.lower) & (kept.mean <= hung.upper)).all())
+    joints = body.pose(x).joints[kept.cost]
+    torch.testing.assert_close(hung.pose(kept.mean).joints, joints, rtol=0, atol=1e-9)
+
+
+def test_covariances_are_those_of_modes_with_unknown_lengths(found: Initialisation):
+    assert bool((torch.linalg.eigvalsh(found.mixture.covariance) > 0).all())
+    body, covariance = found.body, found.mixture.covariance[0]
+    columns = [body.state_index(f"root_{axis}") for axis in "xyz"]
+    # 4 % of 3.5 m: the person's size is not known.
+    largest = torch.linalg.eigvalsh(covariance[columns][:, columns])[-1]
+    assert 0.05 < float(largest.sqrt()) < 0.3
+    assert found.free_body is not None
+    assert found.free_mixture is not None
+    stated = coverage(person(), found.free_body, found.free_mixture)
+    assert stated.parameters > 0.7
+
+
+def test_hypotheses_are_the_fits_and_then_samples(found: Initialisation):
+    generator = torch.Generator().manual_seed(0)
+    states = found.hypotheses(50, generator=generator)
+    fits = len(found.cost)
+    assert states.shape == (50, found.body.num_parameters)
+    assert torch.equal(states[:fits], found.mixture.mean[:50])
+    assert torch.equal(found.hypotheses(2, generator=generator), found.mixture.mean[:2])
+    assert torch.equal(states, found.body.bounds.project(states))
+
+
+def test_gross_marks_are_named_and_the_pose_is_that_without_them():
+    someone = person(8, outliers=0.05)
+    gross = {
+        name for name, is_gross in zip(someone.joint_names, someone.gross, strict=True) if is_gross
+    }
+    assert gross == {"r_wrist", "r_knee", "l_ankle"}
+    found = find(someone, num_modes=2)
+    assert set(found.left_out) == gross
+    assert any("left out" in line and "r_knee" in line for line in found.report)
+    # What is left costs no more than marks with nothing but noise.
+    assert float(found.cost[0]) < 8
+    assert bool((found.mixture.mean >= found.body.lower).all())
+    assert bool((found.mixture.mean <= found.body.upper).all())
+
+
+def test_many_starts_find_what_a_single_one_does_not(found: Initialisation):
+    single = find(person(), SINGLE_START, num_modes=None)
+    assert float(found.cost[0]) < float(single.cost[0]) - 1
+    assert len(single.cost) == 1
+
+
+def test_known_stature_sets_the_scale(found: Initialisation):
+    tall = find(person(), stature=2.0, num_modes=2)
+    assert stature_of(tall.lengths, tall.scale) == pytest.approx(2.0, abs=1e-6)
+    assert "known stature of 2 m" in "\n".join(tall.report)
+    distances = [float(each.body.base_translation.norm()) for each in (tall, found)]
+    statures = [stature_of(each.lengths, each.scale) for each in (tall, found)]
+    assert distances[0] / distances[1] == pytest.approx(statures[0] / statures[1], rel=0.05)
+    with pytest.raises(BodyError, match="stature"):
+        find(person(), stature=180)
+
+
+def test_colours_tell_the_outline_of_a_chequered_shirt():
+    """Edges all over draw limbs thin; what is on either side of the outline does not."""
+    someone = person()
+    size = 0.22  # 180 pixels tall
+    camera = someone.camera.scaled(size)
+    width, height = camera.image_size_wh
+    truth = render_meshes(
+        _in_squares(someone),
+        lambda points: tuple(camera.project(points)),  # type: ignore[arg-type]
+        height,
+        width,
+        background=clutter_background(height, width, generator=torch.Generator().manual_seed(1)),
+        eye_world=camera.centre_world,
+    )
+    marked = size * (someone.keypoints + 0.5) - 0.5
+    overlap, girth = [], []
+    for colours in (False, True):
+        found = initialise(
+            truth.image.numpy(), torch.cat([marked, someone.confidence[:, None]], dim=1), camera,
+            joint_names=someone.joint_names, generator=torch.Generator().manual_seed(0),
+            search=SMALL, num_modes=2, colours=colours,
+        )  # fmt: skip
+        drawn = part_map(found.body, found.mixture.mean[0], camera) >= 0
+        overlap.append(float(mask_overlap(drawn, truth.mask)))
+        girth.append(float((found.body.part_shape / someone.body.part_shape)[:, :2].mean()))
+    assert overlap[0] < 0.91
+    assert overlap[1] > 0.93
+    assert abs(girth[1] - 1) < 0.05 < abs(girth[0] - 1)
+
+
+def _in_squares(someone: Person) -> list[Mesh]:
+    def squares(points: torch.Tensor) -> torch.Tensor:
+        return 0.35 + 0.65 * ((points * 40).floor().sum(-1, keepdim=True) % 2)
+
+    body, size = someone.body, 24
+    rotation, centre = body.part_poses(body.pose(someone.state))
+    mesh = body.mesh(size, size)
+    colours = {"thigh": (0.3, 0.3, 0.7), "shank": (0.3, 0.3, 0.7), "hand": (0.8, 0.6, 0.5)}
+    return [
+        Mesh(
+            points @ turn.T + place,
+            normals @ turn.T,
+            grid_faces(size, size),
+            torch.tensor(colours.get(name[2:], (0.9, 0.3, 0.3)), dtype=torch.float64),
+            points,
+            squares,
+        )
+        for name, turn, place, points, normals in zip(
+            body.part_names, rotation, centre, mesh.points.flatten(1, 2),
+            mesh.normals.flatten(1, 2), strict=True,
+        )
+    ]  # fmt: skip
+
+
+def test_marks_keep_their_place_in_a_picture_whose_sides_are_rounded(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """Sides of 303 and 1000 pixels become 19 and 64: each has a factor of its own."""
+    module = import_module("torchcss.initialise.fit")
+    monkeypatch.setattr(module, "_with_contours", lambda first, cost, *_: cost)
+    camera = Camera.pinhole(303, 1000, focal_px=600.0)
+    body = load_body("arm7").with_base(
+        torch.diag(torch.tensor([1.0, -1.0, -1.0])), torch.tensor([0.0, 0.0, 3.0])
+    )
+    uv = camera.project(body.pose(body.rest).joints).uv
+    known = torch.ones(len(uv)).double()
+    observed = JointObservation(body.joint_names, uv, known, body.joint_names)
+    cost: Any = initialise(
+        np.zeros((1000, 303, 3), np.uint8), uv, camera, "arm7", working_size=64,
+        joint_names=body.joint_names, generator=torch.Generator().manual_seed(0),
+        search=SINGLE_START, others=[View(camera=camera, observation=observed)],
+    )  # fmt: skip
+    for view in cost.views:
+        assert view.camera.image_size_wh == (19, 64)
+        place, expected = view.camera.undistort(view.observation.target), camera.undistort(uv)
+        torch.testing.assert_close(place[0], expected[0][view.observation.index])
+
+
+def test_few_joints_leave_the_prior_and_say_so():
+    someone = person()
+    one = marks(someone)
+    two = {name: one[name] for name in ("l_shoulder", "l_elbow")}
+    generator = torch.Generator().manual_seed(0)
+    found = initialise(None, two, someone.camera, generator=generator, search=SMALL, num_modes=2)
+    line = next(line for line in found.report if line.startswith("not determined"))
+    for name in ("r_knee_flexion", "l_hip_twist", "neck_twist"):
+        assert name in line
+    assert not any("swapped" in line for line in found.report)
+    knee = found.body.state_index("r_knee_flexion")
+    deviation = float(found.mixture.covariance[0, knee, knee].sqrt())
+    assert deviation == pytest.approx(float(found.body.sticky_deviation[knee]), rel=0.25)
+    with pytest.raises(KeypointError, match="at least 3"):
+        find(someone._replace(confidence=(torch.arange(14) < 2).double()))
+
+
+def test_swapped_sides_are_reported_and_left_as_they_are():
+    someone = person(3, joint_names=(*person().joint_names, "nose", "l_toe", "r_toe"))
+    legs = {"hip", "knee", "ankle", "toe"}
+    swapped = tuple(_swap(name, legs) for name in someone.joint_names)
+    generator = torch.Generator().manual_seed(0)
+    given = dict(zip(swapped, someone.keypoints.tolist(), strict=True))
+    options = {"search": SMALL, "num_modes": 1}
+    found = initialise(None, given, someone.camera, generator=generator, **options)
+    assert any("left and right look swapped in the legs" in line for line in found.report)
+
+
+def _swap(name: str, places: set[str]) -> str:
+    side, _, place = name.partition("_")
+    return name if place not in places else f"{'l' if side == 'r' else 'r'}_{place}"
+
+
+def test_odd_marks_are_named_and_gross_ones_move_little():
+    someone = person()
+    spoilt = marks(someone)
+    spoilt["l_wrist"] = spoilt["l_elbow"]
+    spoilt["r_ankle"] = (30.0, 1200.0)
+    generator = torch.Generator().manual_seed(0)
+    options = {"search": SMALL, "sigma": 2.0, "num_modes": 1}
+    found = initialise(None, spoilt, someone.camera, generator=generator, **options)
+    report = "\n".join(found.report)
+    assert "at the same place: l_elbow and l_wrist" in report
+    assert "outside the image: r_ankle" in report
+    assert "r_ankle" in found.left_out
+    projected = someone.camera.project(found.body.pose(found.mixture.mean[0]).joints).uv
+    others = [name for name in LIMB_JOINTS if name not in ("l_wrist", "r_ankle")]
+    fitted = projected[[found.body.joint_index(name) for name in others]]
+    given = fitted.new_tensor([spoilt[name] for name in others])
+    assert float((fitted - given).norm(dim=-1).max()) < 20
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({}, "0 joints"),
+        ({"l_wrist": (10, 10, 0.0), "r_wrist": (50, 10, 0.0)}, "0 joints"),
+        ({"l_wrist": (10, 10), "r_wrist": (10, 10), "nose": (10, 10)}, "all 3 joints"),
+        ({"left_tentacle": (10, 10)}, "unknown joint"),
+        ({"l_wrist": (float("nan"), 10)}, "0 joints"),
+        ({"l_wrist": (10,)}, "expected"),
+    ],
+)
+def test_marks_from_which_nothing_follows(given: dict, message: str, generator: torch.Generator):
+    with pytest.raises(KeypointError, match=message):
+        initialise(None, given, person().camera, generator=generator, search=SMALL)
+
+
+def test_cameras(generator: torch.Generator):
+    camera, note = default_camera(400, 1000)
+    angle = 2 * np.degrees(np.arctan(500 / float(camera.K[0, 0])))
+    assert angle == pytest.approx(DEFAULT_VIEW_DEGREES)
+    assert "not given" in note
+    assert float(default_camera(400, 300, focal_px=123)[0].K[0, 0]) == pytest.approx(123)
+    picture = np.zeros((300, 400, 3), np.uint8)
+    with pytest.raises(CameraError, match="neither"):
+        initialise(None, marks(person()), generator=generator)
+    with pytest.raises(CameraError, match="belongs to images"):
+        initialise(picture, marks(person()), person().camera, generator=generator)
+    behind = load_body("arm7").with_base(torch.eye(3), torch.tensor([0.0, 0.0, 3.0]))
+    with pytest.raises(CameraError, match="looks away"):
+        find(person(), placed=behind)
+
+
+def test_arms_and_single_precision():
+    body = load_body("arm7").with_base(torch.eye(3), torch.tensor([0.0, 0.2, -1.5]))
+    x = body.rest + 0.2
+    x = body.bounds.project(x)
+    camera = person().camera
+    uv = camera.project(body.pose(x).joints).uv
+    found = initialise_from_joints(
+        "arm7", camera, uv, torch.ones(4), body.joint_names, search=SMALL, dtype=torch.float32,
+        generator=torch.Generator().manual_seed(0),
+    )  # fmt: skip
+    assert found.body.dtype == found.mixture.mean.dtype == torch.float32
+    assert float(found.cost[0]) < 8
+    placed, again = (
+        initialise_from_joints(
+            "arm7", camera, uv, torch.ones(4), body.joint_names, search=SMALL, placed=body,
+            generator=torch.Generator().manual_seed(0), joints=JointTerm(sigma=2.0),
+        )
+        for _ in range(2)
+    )  # fmt: skip
+    assert torch.equal(placed.mixture.mean, again.mixture.mean)
+    assert torch.equal(placed.mixture.covariance, again.mixture.covariance)
+    # An elbow that bends the other way, or not: some hypothesis is the truth.
+    apart = (placed.body.pose(placed.mixture.mean).joints - body.pose(x).joints).norm(dim=-1)
+    assert float(apart.mean(-1).min()) < 0.06
+
+
+def test_only_the_papers_proportions_if_asked():
+    search = replace(SMALL, proportions=PAPER_PROPORTIONS)
+    found = find(person(), search, num_modes=1)
+    fitted = {name for name, length in found.lengths.items() if length != LENGTHS[name]}
+    assert fitted == set(PAPER_PROPORTIONS)
+    with pytest.raises(ConfigurationError, match="tail"):
+        Search(proportions=("tail",))
+
+
+def test_default_sigma_follows_the_persons_size():
+    box = torch.tensor([[0.0, 0.0], [300.0, 400.0]])
+    assert default_sigma(box) == pytest.approx(3.0)
+    assert default_sigma(box / 100) == 1.0
+
+
+def test_typical_sigma_is_that_of_the_middle_frame():
+    box = torch.tensor([[0.0, 0.0], [300.0, 400.0], [0.0, 400.0]])
+    keypoints = torch.stack([box, 2 * box, 4 * box, 100 * box])
+    confidence = torch.tensor([[1, 1, 1], [0.3, 1, 0.3], [1, 1, 1], [1, 0, 0]])
+    assert typical_sigma(keypoints, confidence) == pytest.approx(6.0)
+    assert typical_sigma(keypoints[:2], confidence[:2]) == pytest.approx(4.5)
+    with pytest.raises(KeypointError, match="no frame has two keypoints"):
+        typical_sigma(keypoints[3:], confidence[3:])
+
+
+def test_public_name():
+    assert torchcss.initialise is initialise

@@ -1,0 +1,199 @@
+"""What goes into a file and where it goes: modes, frames, up axis, names, errors, the verb."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_tracks import make_track
+
+from torchcss import Track, export_track, load_body
+from torchcss.app.smooth import save_track
+from torchcss.cli import main as cli
+from torchcss.errors import ConfigurationError, OutputError, TrackFileError
+from torchcss.io.cameras import camera_entry
+from torchcss.io.export import FORMATS
+from torchcss.io.export.selection import DEFAULT_RATE, UP_AXES, select
+from torchcss.io.tracks import write_summary
+from torchcss.vision.camera import Camera
+
+BODY = load_body("arm8")
+PERSON = load_body("body30")
+
+
+@pytest.fixture
+def track() -> Track:
+    return make_track(BODY, counts=(2, 3, 2, 3), first_frame=4)
+
+
+@pytest.fixture
+def folder(track: Track, tmp_path: Path) -> Path:
+    arrays = track._asdict()
+    for name in ("state_names", "joint_names"):
+        arrays[name] = np.array(arrays[name])
+    np.savez(tmp_path / "track.npz", schema_version=np.array(1), **arrays)
+    return tmp_path
+
+
+def test_frames(track: Track):
+    assert select(track).frames.tolist() == [4, 5, 6, 7]
+    assert select(track, start=5, stop=7).frames.tolist() == [5, 6]
+    chosen = select(track, start=5, stride=2)
+    assert chosen.frames.tolist() == [5, 7]
+    assert chosen.rate == 30.0
+    for options in ({"start": 8}, {"stop": 4}, {"stride": 0}):
+        with pytest.raises(ConfigurationError, match=r"frames|stride"):
+            select(track, **options)
+
+
+def test_modes(track: Track):
+    assert select(track).rank.tolist() == [[0]] * 4
+    every = select(track, mode="all")
+    assert every.labels == ("mode0", "mode1", "mode2")
+    assert every.rank.tolist() == [[0, 1, -1], [0, 1, 2], [0, 1, -1], [0, 1, 2]]
+    # Where a frame lacks the mode, the nearest pose stands: that before, at the start that after.
+    state = every.state[:, 2]
+    np.testing.assert_array_equal(state[[0, 1, 2]], track.state[[1, 1, 1], 2])
+    np.testing.assert_array_equal(state[3], track.state[3, 2])
+    np.testing.assert_array_equal(every.base[2, 2], track.base_transform[1])
+    assert np.isnan(every.joints[2, 2]).all()
+    for mode in (3, -1, 1.5, "worst", True):
+        with pytest.raises(ConfigurationError, match="mode"):
+            select(track, mode=mode)  # type: ignore[arg-type]
+
+
+def test_following_the_parents(track: Track):
+    for k in range(3):
+        found = select(track, mode=k, follow=True).rank[:, 0].tolist()
+        expected = [k]
+        for t in (3, 2, 1):
+            expected.insert(0, int(track.parent[t, expected[0]]))
+        assert found == expected
+    alone = select(track, mode=1, follow=True, stride=2).rank[:, 0].tolist()
+    assert alone == select(track, mode=1, follow=True).rank[::2, 0].tolist()
+    orphan = track._replace(parent=np.full_like(track.parent, -1))
+    assert select(orphan, mode=1, follow=True).rank[:, 0].tolist() == [-1, -1, -1, 1]
+    with pytest.raises(ConfigurationError, match="no chosen frame has it"):
+        select(track, mode=2, follow=True, stop=7)
+
+
+def test_an_arm_stands_as_the_pictures_do(tmp_path: Path):
+    """Its base may lie as it likes; the camera of the summary tells what is up."""
+    track = make_track(BODY, counts=(1, 1))
+    assert select(track, y_up=True).report[-1].startswith("the world's y axis")  # the base's
+    save_track(tmp_path / "track.npz", track)
+    # Right, down and forward of a camera that looks along the world's y axis, z up.
+    camera = Camera(
+        [[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], (640, 480),
+        R_camera_world=[[1.0, 0, 0], [0, 0, -1], [0, 1, 0]],
+    )  # fmt: skip
+    entry = {"units": "metre, pixel", "cameras": {"one": camera_entry(camera)}}
+    write_summary(tmp_path, entry)
+    done = export_track(tmp_path, to="trc")
+    assert any("z axis is taken for up (the picture's upward" in line for line in done.report)
+
+
+@pytest.mark.parametrize("axis", UP_AXES)
+def test_the_up_axis_is_found(axis: str):
+    upright = make_track(PERSON, counts=(1, 1))
+    turn = np.eye(4)
+    chosen = select(upright, y_up=True, world_up=axis)
+    # The body stands along Y; a world whose axis is `axis` has it turned back.
+    turn[:3, :3] = chosen.turn.T
+    assert np.linalg.det(chosen.turn) == pytest.approx(1)
+    turned = upright._replace(
+        base_transform=turn @ upright.base_transform,
+        joints_world=upright.joints_world @ chosen.turn,
+    )
+    found = select(turned, y_up=True)
+    np.testing.assert_array_equal(found.turn, chosen.turn)
+    assert any(f"the world's {axis} axis is taken for up" in line for line in found.report)
+    np.testing.assert_allclose(found.joints, upright.joints_world[:, :1], atol=1e-12)
+    with pytest.raises(ConfigurationError, match="world_up"):
+        select(upright, world_up="up")
+
+
+def test_rates(track: Track):
+    assert select(track).rate == 60.0
+    assert select(track._replace(times=np.arange(4) * 1001 / 30000)).rate == pytest.approx(29.97003)
+    rough = select(track._replace(times=np.array([0.0, 0.04, 0.08, 0.2])))
+    assert rough.rate == pytest.approx(25.0)
+    assert any("not evenly spaced" in line for line in rough.report)
+    single = select(track, stop=5)
+    assert single.rate == DEFAULT_RATE
+    assert any("frame rate" in line for line in single.report)
+
+
+@pytest.mark.parametrize("to", [to for to in FORMATS if to != "c3d"])
+def test_every_format_by_the_verb(to: str, folder: Path, capsys: pytest.CaptureFixture[str]):
+    before = (folder / "track.npz").read_bytes()
+    assert cli.main(["export", str(folder), "--to", to, "--mode", "all"]) == 0
+    out = capsys.readouterr().out
+    written = sorted(path.name for path in folder.iterdir() if path.name != "track.npz")
+    assert len(written) == (1 if to in ("csv", "npz", "npz-smpl") else 3)
+    assert all(f"wrote {folder / name}" in out for name in written)
+    assert (folder / "track.npz").read_bytes() == before
+
+
+def test_names(folder: Path, track: Track):
+    def names(**options) -> list[str]:
+        return [path.name for path in export_track(folder / "track.npz", **options).paths]
+
+    assert names(to="trc") == ["track.trc"]
+    assert names(to="trc", mode=1) == ["track_mode1.trc"]
+    assert names(to="trc", mode=1, out=folder / "walk.TRC") == ["walk.TRC"]
+    assert names(to="trc", mode="all", out=folder / "walk.trc") == [
+        "walk_mode0.trc", "walk_mode1.trc", "walk_mode2.trc",
+    ]  # fmt: skip
+    assert names(to="csv", mode="all", out=folder / "new" / "folder") == ["track_joints.csv"]
+    assert (folder / "new" / "folder" / "track_joints.csv").is_file()
+    with pytest.raises(ConfigurationError, match="give a file or a folder"):
+        export_track(track, to="trc")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["--to", "npz", "--out", "{folder}/track.npz"], "is the track itself"),
+        (["--to", "bvh", "--out", "{folder}/a.trc"], "no name for bvh"),
+        (["--to", "mot", "--mode", "9"], "no chosen frame has it"),
+        (["--to", "csv", "--start", "100"], "no frames to export"),
+        (["--to", "trc", "--t-pose"], "only for bvh"),
+        (["--to", "bvh", "--scale", "-1"], "scale"),
+        (["--to", "bvh", "--out", "{folder}/track.npz/x"], "cannot be written"),
+    ],
+)
+def test_one_clear_line(
+    arguments: list[str], complaint: str, folder: Path, capsys: pytest.CaptureFixture[str]
+):
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    filled = [argument.format(folder=folder) for argument in arguments]
+    assert cli.main(["export", str(folder), *filled]) == 2
+    errors = capsys.readouterr().err
+    assert complaint in errors
+    assert errors.count("\n") == 1
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_a_file_that_is_there_survives_a_full_disk(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    export_track(folder, to="trc")
+    before = (folder / "track.trc").read_bytes()
+
+    def full(*_args, **_kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(OutputError, match="disk is full"):
+        export_track(folder, to="trc", stride=2)
+    assert (folder / "track.trc").read_bytes() == before
+    assert sorted(path.name for path in folder.iterdir()) == ["track.npz", "track.trc"]
+
+
+def test_no_track(tmp_path: Path):
+    with pytest.raises(TrackFileError):
+        export_track(tmp_path, to="trc")
+    with pytest.raises(ConfigurationError, match="to: expected"):
+        export_track(tmp_path, to="fbx")
+    with pytest.raises(ConfigurationError, match="frame: expected"):
+        export_track(tmp_path, to="trc", frame="z-up")  # type: ignore[arg-type]

@@ -1,0 +1,116 @@
+"""What belongs to a track is found, and its modes are drawn where they are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from made_tracks import make_track, write_track
+
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel
+from torchcss.errors import CameraError, ConfigurationError, TrackFileError, VideoError
+from torchcss.io.cameras import camera_entry
+from torchcss.io.tracks import TRACK_NAME, Track, write_summary
+from torchcss.io.video import VideoWriter
+from torchcss.show.track_pictures import TrackFiles, pictures_of
+from torchcss.studies.render.sequences import look_at
+from torchcss.vision.camera import Camera
+
+
+@pytest.fixture(scope="module")
+def body() -> BodyModel:
+    return load_body("arm8")
+
+
+@pytest.fixture(scope="module")
+def track(body: BodyModel) -> Track:
+    return make_track(body, (2, 3, 1), first_frame=1)
+
+
+@pytest.fixture(scope="module")
+def camera() -> Camera:
+    return look_at((0.3, -1.4, 4.0), (0.3, -1.4, 0.0), focal_px=160, image_size_wh=(192, 144))
+
+
+@pytest.fixture
+def folder(tmp_path: Path, track: Track, camera: Camera) -> Path:
+    """A run: the track, the summary with the camera, the overlay, and the grey video."""
+    write_track(tmp_path / TRACK_NAME, track)
+    write_track(tmp_path / "smooth.npz", track)
+    calibration = {"units": "metre, pixel", "cameras": {camera.name: camera_entry(camera)}}
+    write_summary(tmp_path, {"events": [], **calibration})
+    for name, levels in (("overlay.mp4", (40, 120, 200)), ("video.mp4", (90, 90, 90, 90, 90))):
+        with VideoWriter(tmp_path / name, 25) as film:
+            for level in levels:
+                film.write(np.full((144, 192, 3), level, np.uint8))
+    return tmp_path
+
+
+def test_the_overlay_of_a_run_is_counted_as_the_track(folder: Path, track: Track) -> None:
+    files = TrackFiles.find(folder)
+    assert files.path == folder / TRACK_NAME
+    assert files.has_pictures
+    found = {row: image.mean() for row, image in pictures_of(files, [0, 2])}
+    assert found == {0: pytest.approx(40, abs=4), 2: pytest.approx(200, abs=4)}
+
+
+def test_the_summary_holds_the_camera(folder: Path, camera: Camera) -> None:
+    found = TrackFiles.find(folder).camera
+    assert found is not None
+    torch.testing.assert_close(found.K, camera.K)
+    torch.testing.assert_close(found.R_camera_world, camera.R_camera_world)
+    torch.testing.assert_close(found.t_camera_world, camera.t_camera_world)
+    assert found.image_size_wh == camera.image_size_wh
+
+
+def test_modes_are_drawn_over_the_video_where_they_are(
+    folder: Path, track: Track, camera: Camera
+) -> None:
+    files = TrackFiles.find(folder, video=folder / "video.mp4")
+    pictures = dict(pictures_of(files, range(3)))
+    assert list(pictures) == [0, 1, 2]
+    for row, image in pictures.items():
+        # The line of text stands in the lower left corner.
+        changed = (np.abs(image.astype(int) - 90).max(-1) > 12)[:115]
+        assert 30 < changed.sum() < 0.5 * changed.size
+        wrist = track.joints_world[row, 0, track.joint_names.index("r_wrist")]
+        u, v = camera.project(torch.from_numpy(wrist)).uv.round().int().tolist()
+        assert 10 < u < 182
+        assert 10 < v < 105
+        assert changed[v - 2 : v + 3, u - 2 : u + 3].any()
+
+
+def test_a_smoothed_track_does_not_take_the_trackers_overlay(folder: Path) -> None:
+    files = TrackFiles.find(folder / "smooth.npz")
+    assert not files.has_pictures
+    assert list(pictures_of(files, range(3))) == []
+    drawn = TrackFiles.find(folder / "smooth.npz", video=folder / "video.mp4")
+    assert len(list(pictures_of(drawn, range(3)))) == 3
+
+
+def test_a_track_alone_is_enough(folder: Path) -> None:
+    for name in ("summary.json", "overlay.mp4"):
+        (folder / name).unlink()
+    files = TrackFiles.find(folder)
+    assert files.camera is None
+    assert files.summary == {}
+    assert not files.has_pictures
+    with pytest.raises(ConfigurationError, match="give --camera"):
+        TrackFiles.find(folder, video=folder / "video.mp4")
+
+
+def test_what_does_not_belong_together(
+    folder: Path, body: BodyModel, camera: Camera, track: Track
+) -> None:
+    short = TrackFiles.find(folder, video=folder / "overlay.mp4")
+    with pytest.raises(VideoError, match="1 frames of the track are missing"):
+        list(pictures_of(short, range(3)))
+    other = short._replace(camera=camera.resized(96, 72))
+    with pytest.raises(CameraError, match="96 x 72"):
+        list(pictures_of(other, range(3)))
+    write_track(folder / TRACK_NAME, make_track(body, ()))
+    with pytest.raises(TrackFileError, match="no frames"):
+        TrackFiles.find(folder)

@@ -1,0 +1,170 @@
+"""Key poses: the spline against SciPy's, the built-in motions within what a person can do."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel
+from torchcss.body.shape import with_shape
+from torchcss.cost.interpenetration import InterpenetrationPairs
+from torchcss.errors import ConfigurationError, TrackFileError
+from torchcss.studies.random_person import random_lengths
+from torchcss.studies.render.motions import (
+    MOTIONS,
+    KeyPoses,
+    clamped_spline,
+    plant_feet,
+    read_motion,
+    sample_times,
+)
+
+RATE = 50.0
+FASTEST_HAND = 3.0
+"""Metres per second: brisk reaching."""
+HARDEST = 30.0
+"""Metres per second squared, of any joint; a reaching hand is at some 10."""
+
+
+@pytest.fixture(scope="module", params=list(MOTIONS))
+def moved(request: pytest.FixtureRequest) -> tuple[str, BodyModel, Tensor]:
+    """A built-in motion, of a person of other lengths where the sequence has one."""
+    poses, _ = MOTIONS[request.param]
+    lengths = None
+    if not poses.body.startswith("arm"):
+        lengths = random_lengths(generator=torch.Generator().manual_seed(0))
+    body = load_body(poses.body, lengths=lengths)
+    return request.param, body, poses.states(body, sample_times(poses.duration, RATE, None))
+
+
+def test_the_spline_is_scipys_clamped_one() -> None:
+    interpolate = pytest.importorskip("scipy.interpolate")
+    knots, values = (0.0, 0.4, 1.5, 1.9, 3.0), (1.0, -2.0, 0.5, 0.5, 4.0)
+    at = torch.linspace(0, 3, 301, dtype=torch.float64)
+    twin = interpolate.CubicSpline(knots, values, bc_type="clamped")(at.numpy())
+    torch.testing.assert_close(
+        clamped_spline(knots, values, at), torch.from_numpy(twin), rtol=0, atol=1e-12
+    )
+    # Outside it stands still.
+    ends = clamped_spline(knots, values, at.new_tensor([-1.0, 9.0]))
+    assert ends.tolist() == [1.0, 4.0]
+
+
+def test_motions_have_the_papers_length() -> None:
+    frames = {
+        name: len(sample_times(poses.duration, RATE, None)) for name, (poses, _) in MOTIONS.items()
+    }
+    assert frames == {"arm": 400, "body-clutter": 175, "body-dark": 200}
+    assert [poses.body for poses, _ in MOTIONS.values()] == ["arm8", "body30", "body34"]
+
+
+def test_joints_stay_within_their_limits(moved: tuple[str, BodyModel, Tensor]) -> None:
+    _, body, states = moved
+    lower, upper = body.bounds
+    assert bool((states >= lower).all() & (states <= upper).all())
+
+
+def test_speeds_are_a_persons(moved: tuple[str, BodyModel, Tensor]) -> None:
+    _, body, states = moved
+    velocity = body.pose(states).joints.diff(dim=0) * RATE
+    assert float(velocity.norm(dim=-1).max()) < FASTEST_HAND
+    # Without a jump of the velocity either: the spline's second derivative is continuous.
+    assert float((velocity.diff(dim=0) * RATE).norm(dim=-1).max()) < HARDEST
+
+
+def test_it_moves_in_depth(moved: tuple[str, BodyModel, Tensor]) -> None:
+    _, body, states = moved
+    wrist = body.pose(states).joints[:, body.joint_index("r_wrist"), 2]
+    assert float(wrist.max() - wrist.min()) > 0.4
+
+
+def test_no_part_enters_another(moved: tuple[str, BodyModel, Tensor]) -> None:
+    """Not even where all girths are 8 % larger, as those of a rendered figure may be."""
+    _, body, states = moved
+    stout = body.part_shape.clone()
+    stout[:, :2] *= 1.08
+    body = with_shape(body, stout)
+    pairs = InterpenetrationPairs(body, rings=10, meridians=14)
+    near = pairs.near(body, body.pose(states), 1.1)
+    square, _, _ = pairs.radial_square(near)
+    worst = float(square.min()) if len(square) else math.inf
+    assert worst > 1, "a node of a part lies inside another part"
+
+
+@pytest.mark.parametrize("name", ["body-clutter", "body-dark"])
+def test_feet_stay_on_the_ground(name: str) -> None:
+    poses, _ = MOTIONS[name]
+    body = load_body(poses.body)
+    states = poses.states(body, sample_times(poses.duration, 25.0, None))
+    marks = [
+        body.joint_index(f"{s}_{place}") for s in "lr" for place in ("heel", "midtarsal", "toe")
+    ]
+    joints = body.pose(states).joints[:, marks]
+    assert float((joints - joints[0]).norm(dim=-1).max()) < 0.02
+    # It is the legs that keep them there.
+    turn = states[:, body.state_index("root_yaw")]
+    assert float(turn.max() - turn.min()) > math.radians(50)
+
+
+def test_planting_leaves_all_but_the_legs_alone() -> None:
+    body = load_body("body34")
+    states = body.rest.repeat(3, 1)
+    states[:, body.state_index("root_x")] = torch.tensor([0.0, 0.01, 0.02])
+    planted = plant_feet(body, states)
+    others = [
+        i
+        for i, name in enumerate(body.state_names)
+        if not any(leg in name for leg in ("hip", "knee", "ankle"))
+    ]
+    assert torch.equal(planted[:, others], states[:, others])
+    assert not torch.equal(planted, states)
+
+
+def test_the_dark_sequence_needs_the_clavicles() -> None:
+    poses, _ = MOTIONS["body-dark"]
+    for side in "lr":
+        for angle in ("elevation", "protraction"):
+            assert max(poses.degrees[f"{side}_clavicle_{angle}"]) > 20
+
+
+def test_tables_are_checked() -> None:
+    with pytest.raises(ConfigurationError, match="ascending times from 0"):
+        KeyPoses(body="arm7", times=(0.0, 2.0, 1.0))
+    with pytest.raises(ConfigurationError, match="r_elbow_flexion has 1 values for 2 times"):
+        KeyPoses(body="arm7", times=(0.0, 2.0), degrees={"r_elbow_flexion": (3,)})
+
+
+def test_a_motion_file_is_read_as_it_was_meant() -> None:
+    body = load_body("body34", lengths={"thigh": 0.4})
+    base = torch.eye(4, dtype=torch.float64)
+    base[:3, 3] = torch.tensor([1.0, 2.0, 3.0])
+    arrays = {
+        "body": np.array("body34"),
+        "state_names": np.array(body.state_names),
+        "states": np.zeros((5, body.num_parameters)),
+        "frame_rate": np.array(60.0),
+        "lengths": np.array(json.dumps({"thigh": 0.4})),
+        "base_transform": base.numpy(),
+        "description": np.array("standing"),
+    }
+    motion = read_motion(arrays, "file.npz")
+    assert motion.body.lengths == body.lengths
+    assert motion.body.base_translation.tolist() == [1.0, 2.0, 3.0]
+    assert (len(motion.states), motion.frame_rate, motion.description) == (5, 60.0, "standing")
+    for change, message in (
+        ({"states": None}, "states missing"),
+        ({"body": np.array("body99")}, "no body 'body99'"),
+        ({"state_names": np.array(("a", "b"))}, "state_names: expected those of body34"),
+        ({"states": np.zeros((5, 3))}, "expected \\[frames, 34\\]"),
+        ({"frame_rate": np.array(0.0)}, "positive frame_rate"),
+        ({"lengths": np.array("no json")}, "not a motion"),
+    ):
+        broken = {k: v for k, v in {**arrays, **change}.items() if v is not None}
+        with pytest.raises(TrackFileError, match=message):
+            read_motion(broken, "file.npz")

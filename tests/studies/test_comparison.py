@@ -1,0 +1,159 @@
+"""Trackers side by side: as if alone, features once, and stopped when they are lost."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from made_sequences import NOISE_PX, write_arm
+
+from torchcss.studies import comparison as side_by_side
+from torchcss.studies.comparison import Run, SharedFeatures, Start, find_start, track_together
+from torchcss.studies.evaluation import Thresholds
+from torchcss.studies.sequences import RecordedSequence, read_sequence
+from torchcss.tracking.settings import Settings, make_extractor
+from torchcss.vision.features import FeatureExtractor
+
+T = 3
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory: pytest.TempPathFactory) -> RecordedSequence:
+    folder = tmp_path_factory.mktemp("side") / "arm"
+    write_arm(folder, T)
+    return read_sequence(folder)
+
+
+def choose(preset: str, **changes: object) -> Settings:
+    options: dict = {"body": "arm8", "keypoints_use": "first", "working_size": 160, "samples": 4}
+    return Settings(preset=preset, **{**options, **changes})
+
+
+@pytest.fixture(scope="module")
+def begin(sequence: RecordedSequence) -> Start:
+    return find_start(sequence, choose("css"))
+
+
+def together(
+    sequence: RecordedSequence, begin: Start, *presets: str, stop: int = 2, **options: Any
+) -> list[Run]:
+    runs = [(choose(preset), begin) for preset in presets]
+    thresholds = options.pop("thresholds", Thresholds.of(sequence))
+    return list(track_together(sequence, runs, thresholds, stop=stop, **options))
+
+
+def test_side_by_side_is_as_alone(sequence: RecordedSequence, begin: Start) -> None:
+    counts: list[tuple[int, int]] = []
+    presets = ("css", "condensation")
+    both = together(sequence, begin, *presets, progress=lambda *count: counts.append(count))
+    assert counts == [(index, 2) for index in range(2)]
+    for preset, run in zip(presets, both, strict=True):
+        (alone,) = together(sequence, begin, preset)
+        assert run.settings.preset == preset
+        assert run.ended == alone.ended == "complete"
+        assert [m.frame for m in run.measures] == [0, 1]
+        for one, two in zip(run.measures, alone.measures, strict=True):
+            assert (one.absolute_mm == two.absolute_mm).all()
+            assert one.seconds["features"] > one.seconds["cost"]
+    assert both[0].measures[-1].absolute_mm[0].mean() < 40
+    assert both[0].measures[-1].overlap > 0.8
+
+
+def test_features_are_computed_once_per_frame(
+    sequence: RecordedSequence, begin: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+    forward = FeatureExtractor.forward
+
+    def spy(self: FeatureExtractor, *arguments: object) -> object:
+        asked.append(arguments)
+        return forward(self, *arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(FeatureExtractor, "forward", spy)
+    together(sequence, begin, "condensation", "condensation_inflated", stop=3)
+    assert len(asked) == 3
+    assert asked[0][1] is None
+    assert asked[2][1] is asked[1][0]
+
+
+def test_shared_features_are_the_extractors(sequence: RecordedSequence) -> None:
+    extractor = make_extractor(choose("css"))
+    shared = SharedFeatures(extractor)
+    image = torch.rand(48, 64, generator=torch.Generator().manual_seed(0))
+    other = image.clone()
+    first = shared(image)
+    assert first.colour is not None  # the region term would be silent
+    torch.testing.assert_close(first, extractor(image))
+    assert shared(image) is first
+    assert shared(other) is not first  # equal, but not the same
+    assert shared(other, image).flow is not None
+
+
+def test_a_lost_run_ends_early(sequence: RecordedSequence, begin: Start) -> None:
+    never = Thresholds(lost_mm=-1.0, regain_s=0.04)
+    options: dict = {"thresholds": never, "stop": T}
+    (run,) = together(sequence, begin, "condensation", stop_when_lost=True, **options)
+    assert run.ended == "lost"
+    assert len(run.measures) == 2
+    (run,) = together(sequence, begin, "condensation", **options)
+    assert run.ended == "complete"
+    assert len(run.measures) == T
+    assert all(m.failed for m in run.measures)
+
+
+def test_an_error_ends_one_run_only(
+    sequence: RecordedSequence, begin: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make = side_by_side.make_settings_tracker
+
+    class Broken:
+        def __init__(self, tracker: object) -> None:
+            self.init = tracker.init  # type: ignore[attr-defined]
+
+        def step(self, *_: object) -> object:
+            raise torch.linalg.LinAlgError("singular")
+
+    def make_one(settings: Settings, motion: torch.Tensor) -> object:
+        tracker = make(settings, motion)
+        return Broken(tracker) if settings.preset == "gaussian_single" else tracker
+
+    monkeypatch.setattr(side_by_side, "make_settings_tracker", make_one)
+    broken, sound = together(sequence, begin, "gaussian_single", "condensation")
+    assert broken.settings.preset == "gaussian_single"
+    assert broken.ended == f"error: {torch.linalg.LinAlgError.__name__}: singular"
+    assert not broken.measures
+    assert sound.ended == "complete"
+    assert len(sound.measures) == 2
+
+
+def test_the_start_is_the_sequences(sequence: RecordedSequence) -> None:
+    begin = find_start(sequence, choose("css"), start=2)
+    assert begin.sigma == NOISE_PX
+    truth = sequence.truth
+    assert truth is not None
+    assert torch.equal(begin.first.body.base_translation, truth.body.base_translation)
+    joints = begin.first.body.pose(begin.first.mixture.mean).joints
+    away = joints - torch.from_numpy(sequence.joints_world[2])
+    assert float(away.norm(dim=-1).mean(-1).min()) < 0.1
+    # Every run of a seed starts with the same numbers.
+    state = begin.generator.get_state()
+    begins = [(choose(preset), begin) for preset in ("condensation", "annealed")]
+    list(track_together(sequence, begins, Thresholds(), stop=1))
+    assert torch.equal(begin.generator.get_state(), state)
+
+
+def test_a_recorded_person_is_initialised(shared_data: Path) -> None:
+    sequence = read_sequence(shared_data / "rendered_turn")
+    settings = Settings(
+        preset="single", keypoints_use="first", working_size=160, terms=("joints", "stabiliser")
+    )
+    begin = find_start(sequence, settings, start=20)
+    (run,) = track_together(sequence, [(settings, begin)], Thresholds(), start=20, stop=21)
+    (measures,) = run.measures
+    assert measures.frame == 20
+    assert measures.time_s == 0
+    assert measures.absolute_mm.shape == (1, 12)
+    assert measures.root_aligned_mm.mean() < 100
+    assert measures.overlap > 0.5

@@ -1,0 +1,166 @@
+"""Scenes: the same cost as a tracker's, and a truth that the cost agrees with."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from torchcss.cost.total import TrackingCost
+from torchcss.errors import ConfigurationError
+from torchcss.inference.mixture import GaussianMixture
+from torchcss.studies.render.sequences import arm_sequence
+from torchcss.studies.scenes import Scene, arm_scenes, clip_scenes
+from torchcss.tracking.session import track_frames
+from torchcss.tracking.settings import (
+    ALL_TERMS,
+    Settings,
+    boundary_emphasis,
+    make_choice,
+    make_extractor,
+)
+from torchcss.types import Frame
+
+TERMS = tuple(term for term in ALL_TERMS if term not in ("temporal_mixture", "region"))
+SETTINGS = Settings(body="arm8", terms=TERMS)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    generator = torch.Generator().manual_seed(0)
+    return next(arm_scenes([2], generator=generator, settings=SETTINGS))
+
+
+class Spy:
+    """Stands where the tracker does: stays at the truth, and keeps the costs that it is given."""
+
+    def __init__(self, truth: torch.Tensor) -> None:
+        self.truth, self.costs = truth, []
+
+    def init(self, mixture: GaussianMixture, *, generator: torch.Generator) -> SimpleNamespace:
+        return SimpleNamespace(mixture=mixture)
+
+    def step(self, state: SimpleNamespace, cost_of, bounds):
+        self.costs.append(cost_of(torch.zeros(1, dtype=torch.long), state.mixture))
+        mean = self.truth[len(self.costs) - 1][None]
+        mixture = state.mixture._replace(mean=mean)
+        return SimpleNamespace(mixture=mixture), SimpleNamespace(origin=torch.tensor([0]))
+
+
+def costs_of_a_tracker_at_the_truth(settings: Settings, num_frames: int) -> list[TrackingCost]:
+    generator = torch.Generator().manual_seed(0)
+    sequence = arm_sequence(generator=generator, num_frames=num_frames)
+    spy, n = Spy(sequence.states), sequence.states.shape[1]
+    start = GaussianMixture(
+        sequence.states[:1], torch.eye(n, dtype=torch.float64)[None], torch.zeros(1).double()
+    )
+    for _ in track_frames(
+        [Frame(i, i / 25, image) for i, image in enumerate(sequence.frames)],
+        body=sequence.body,
+        mixture=start,
+        camera=sequence.camera,
+        extractor=make_extractor(settings),
+        tracker=spy,  # type: ignore[arg-type]
+        choice=make_choice(settings, 1.0),
+        observe=lambda index: None,
+        frame_interval=1 / 25,
+        generator=generator,
+        boundary_emphasis=boundary_emphasis(settings),
+    ):
+        pass
+    return spy.costs
+
+
+def test_the_cost_is_the_trackers(scene: Scene) -> None:
+    """Term by term that of a tracker whose only mode was at the truth one frame before."""
+    cost = costs_of_a_tracker_at_the_truth(SETTINGS, 3)[2]
+    x = scene.truth + 0.02
+    expected, found = cost.terms(x[None]), scene.cost.terms(x[None])
+    assert set(found) == set(expected) >= {"contour", "edge_energy", "flow", "temporal"}
+    for name, value in expected.items():
+        torch.testing.assert_close(found[name], value, msg=name)
+
+
+def test_colours_are_those_of_the_frame_before() -> None:
+    settings = Settings(body="arm8", terms=("region",))
+    scene = next(arm_scenes([1], generator=torch.Generator().manual_seed(0), settings=settings))
+    first, second = costs_of_a_tracker_at_the_truth(settings, 2)
+    x = scene.truth[None]
+    assert not first.terms(x).get("region", torch.zeros(1)).any(), "nothing is known at first"
+    torch.testing.assert_close(scene.cost.terms(x)["region"], second.terms(x)["region"])
+    # A fitted outline costs less than half, which is what colours that say nothing cost.
+    share = float(scene.cost.terms(x)["region"]) / scene.cost.choice.region_weight
+    assert 0 < share < 0.4
+
+
+def test_the_mode_is_near_the_truth(scene: Scene) -> None:
+    assert scene.slug == "arm_frame_2"
+    assert scene.image.shape == (480, 640, 3)
+    joints = scene.cost.body.pose(torch.stack([scene.truth, scene.mode.mean])).joints
+    assert float((joints[0] - joints[1]).norm(dim=-1).mean()) < 0.02
+    assert float(scene.mode.cost) <= float(scene.cost.value(scene.truth))
+
+
+def test_lines_and_limits(scene: Scene) -> None:
+    body, n = scene.cost.body, len(scene.truth)
+    lines = scene.lines(scene.truth)
+    names = [*body.state_names, *(f"eigen {i}" for i in range(n))]
+    assert [line.name for line in lines] == names
+    limits = scene.limits(scene.truth)
+    for line in lines:
+        low, high = line.interval(limits)
+        assert low < 0 < high
+        states = line.states([low, high])
+        assert bool((states >= body.bounds.lower - 1e-9).all())
+        assert bool((states <= body.bounds.upper + 1e-9).all())
+
+
+def test_a_line_between_two_limits_is_left_out(scene: Scene) -> None:
+    """At two limits at once, a direction that leaves one of them either way goes nowhere."""
+    body = scene.cost.body
+    corner = scene.truth.clone()
+    first, second = (body.state_index(f"r_{name}") for name in ("elbow_flexion", "wrist_flexion"))
+    corner[first], corner[second] = body.bounds.upper[first], body.bounds.upper[second]
+    covariance = torch.eye(len(corner), dtype=torch.float64)
+    covariance[first, second] = covariance[second, first] = -0.5
+    lines = scene._replace(mode=scene.mode._replace(covariance=covariance)).lines(corner)
+    # The two rise and fall together on one eigenvector, and against each other on another.
+    assert len(lines) == 2 * len(corner) - 1
+
+
+def test_single_precision_and_the_generator_decide_all() -> None:
+    settings = replace(SETTINGS, terms=("contour", "stabiliser"), dtype="float32")
+    values = []
+    for seed in (1, 1, 2):
+        generator = torch.Generator().manual_seed(seed)
+        one = next(arm_scenes([1], generator=generator, settings=settings, name="another"))
+        assert one.name == "another, frame 1"
+        assert one.truth.dtype == one.mode.mean.dtype == torch.float32
+        values.append(float(one.mode.cost))
+    assert values[0] == values[1] != values[2]
+
+
+@pytest.mark.parametrize("frames", [[], [0], [3, 0]])
+def test_a_frame_needs_one_before_it(frames: list[int], generator: torch.Generator) -> None:
+    with pytest.raises(ConfigurationError, match="frame before it"):
+        next(arm_scenes(frames, generator=generator))
+    with pytest.raises(ConfigurationError, match="frame before it"):
+        next(clip_scenes(Path(), frames, generator=generator))
+
+
+def test_a_real_frame(shared_data: Path, generator: torch.Generator) -> None:
+    folder = shared_data / "balance_beam_4cam"
+    settings = Settings(terms=("contour", "flow", "joints", "stabiliser"))
+    real = next(clip_scenes(folder, [3], generator=generator, settings=settings))
+    assert real.name == "cam01, frame 3"
+    assert set(real.cost.terms(real.truth)) == {"contour", "flow", "joints", "stabiliser"}
+    assert real.cost.body.name == "body34"
+    height, width = real.features.grey.shape
+    assert real.cost.camera.image_size_wh == (width, height) == (360, 640)
+    assert len(real.lines(real.mode.mean)) == 2 * 34
+    # No limit ends the way in depth; the reach of a slice does.
+    low, high = real.lines(real.truth)[2].interval(real.limits(real.truth))
+    assert (low, high) == pytest.approx((-0.5, 0.5))

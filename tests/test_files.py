@@ -1,0 +1,226 @@
+"""Every writer leaves a good file or none: a full disk and a killed process cost no older file."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from made_tracks import make_track, write_track
+from matplotlib.figure import Figure
+
+import torchcss.files
+from torchcss import export_track
+from torchcss.app.smooth import smooth_file
+from torchcss.body.load import load_body
+from torchcss.errors import OutputError, TorchcssError
+from torchcss.inference.mixture import GaussianMixture
+from torchcss.initialise.result import Initialisation
+from torchcss.io.fitted_body import write_fitted_body
+from torchcss.io.keypoints.one_image import Joints
+from torchcss.io.tracks import TrackWriter, load_track, write_summary
+from torchcss.io.video import VideoReader, VideoWriter
+from torchcss.show.click import write_clicked
+from torchcss.show.style import save_figure
+from torchcss.studies.flow_files import write_flow
+from torchcss.studies.sequence_writer import write_sequence
+from torchcss.vision.camera import Camera
+
+BODY = load_body("arm7", free_root=True)
+
+
+def track(path: Path) -> None:
+    made = make_track(BODY, (1, 1, 1))
+    writer = TrackWriter(path, state_names=made.state_names, joint_names=made.joint_names)
+    for t in range(3):
+        fields = ("state", "covariance", "log_weight", "cost", "parent", "joints_world")
+        values = {name: getattr(made, name)[t] for name in fields}
+        writer.append(frame=t, time_s=t / 25, **values)
+    writer.save()
+
+
+def summary(path: Path) -> None:
+    write_summary(path, {"a": list(range(100))})
+
+
+def fitted_body(path: Path) -> None:
+    x = BODY.rest[None]
+    spread = torch.eye(BODY.num_parameters).double()[None]
+    mixture = GaussianMixture(x, spread, torch.zeros(1).double())
+    found = Initialisation(BODY, mixture, torch.zeros(1).double(), (), dict(BODY.lengths))
+    write_fitted_body(path, found, Camera.pinhole(64, 48, focal_px=60.0))
+
+
+def film(path: Path) -> None:
+    with VideoWriter(path, 25) as writer:
+        for value in (0, 100, 200):
+            writer.write(np.full((48, 64, 3), value, np.uint8))
+
+
+def flow(path: Path) -> None:
+    write_flow(path, torch.zeros(2, 30, 40))
+
+
+def clicked(path: Path) -> None:
+    places = torch.tensor([[3.0, 4.0]], dtype=torch.float64)
+    write_clicked(path, Joints(places, torch.ones(1), ("l_wrist",), ()), (64, 48))
+
+
+def figure(path: Path) -> None:
+    save_figure(Figure(), path)
+
+
+def exported(kind: str) -> Callable[[Path], None]:
+    def write(path: Path) -> None:
+        export_track(make_track(BODY, (1, 1, 1)), to=kind, out=path, body=BODY)
+
+    write.__name__ = kind
+    return write
+
+
+WRITERS = {
+    "track.npz": track,
+    "summary.json": summary,
+    "body.npz": fitted_body,
+    "film.mp4": film,
+    "flow.flo": flow,
+    "clicked.json": clicked,
+    "figure.png": figure,
+    **{f"a.{kind}": exported(kind) for kind in ("bvh", "trc", "mot", "csv", "npz")},
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO])
+def test_a_disk_that_refuses_costs_no_file(
+    name: str, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / name
+    WRITERS[name](path)
+    before = path.read_bytes()
+    assert before
+
+    def refuse(*_: object) -> None:
+        raise OSError(code, os.strerror(code))
+
+    # Once when the data are to be kept on the disk, once when the file gets its name.
+    for module, function in ((torchcss.files.os, "fsync"), (torchcss.files.os, "replace")):
+        with monkeypatch.context() as context:
+            context.setattr(module, function, refuse)
+            if name == "film.mp4" and function == "fsync":
+                continue
+            with pytest.raises(OutputError) as caught:
+                WRITERS[name](path)
+        assert str(path) in str(caught.value)
+        assert "\n" not in str(caught.value)
+        assert path.read_bytes() == before
+        assert not list(tmp_path.glob("*.partial*")) + list(tmp_path.glob(".*partial*"))
+    (tmp_path / "new").mkdir()
+    with monkeypatch.context() as context:
+        context.setattr(torchcss.files.os, "replace", refuse)
+        with pytest.raises(OutputError):
+            WRITERS[name](tmp_path / "new" / name)
+    assert not list((tmp_path / "new").iterdir())
+
+
+ELSEWHERE = """
+import resource, signal, sys
+sys.path[:0] = {paths!r}
+import test_files as tests
+from pathlib import Path
+from torchcss.errors import OutputError
+folder = Path({folder!r})
+names = [name for name in tests.WRITERS if name != "film.mp4"]
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+_, most = resource.getrlimit(resource.RLIMIT_FSIZE)
+# The system itself refuses after 40 bytes, as a quota does, in whatever writes.
+resource.setrlimit(resource.RLIMIT_FSIZE, (40, most))
+written = []
+for name in names:
+    try:
+        tests.WRITERS[name](folder / name)
+        written.append(name)
+    except OutputError:
+        pass
+resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
+print("written in spite of the limit:", *written, flush=True)
+sys.stdin.readline()
+print("writing", flush=True)
+while True:
+    for name in tests.WRITERS:
+        tests.WRITERS[name](folder / name)
+"""
+
+
+def test_a_full_disk_and_a_killed_process_cost_no_file(tmp_path: Path) -> None:
+    for name, write in WRITERS.items():
+        write(tmp_path / name)
+    before = {name: (tmp_path / name).read_bytes() for name in WRITERS}
+    here = Path(__file__).resolve()
+    script = ELSEWHERE.format(paths=[str(here.parent), str(here.parents[1])], folder=str(tmp_path))
+    with subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, stdin=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdin is not None
+        assert process.stdout.readline() == "written in spite of the limit:\n"
+        assert {name: (tmp_path / name).read_bytes() for name in WRITERS} == before
+        process.stdin.write("go\n")
+        process.stdin.flush()
+        assert process.stdout.readline() == "writing\n"
+        time.sleep(0.3)
+        process.send_signal(signal.SIGKILL)
+    # Whatever was under way: every file is whole, the older one or the newer.
+    sizes = {name: len(content) for name, content in before.items()}
+    assert {name: (tmp_path / name).stat().st_size for name in WRITERS} == sizes
+    assert len(load_track(tmp_path / "track.npz").frames) == 3
+    assert len(list(VideoReader(tmp_path / "film.mp4"))) == 3
+
+
+def test_a_sequence_that_stops_leaves_the_older_one(tmp_path: Path) -> None:
+    """Frame by frame for minutes: the files of the folder are replaced at the end of each."""
+
+    class Shot:
+        """Two frames, then whatever stops it."""
+
+        name, frame_rate, seed, description = "shot", 25.0, 0, ""
+        camera = Camera.pinhole(64, 48, focal_px=60.0)
+        states = torch.zeros(3, 7)
+
+        def frames(self):
+            raise KeyboardInterrupt
+            yield
+
+    names = ("flow.npz", "mask.npz", "truth.npz", "video.mp4", "cameras.json")
+    for name in names:
+        (tmp_path / name).write_text(f"the older {name}")
+    with pytest.raises(KeyboardInterrupt):
+        write_sequence(tmp_path, Shot())  # type: ignore[arg-type]
+    assert {name: (tmp_path / name).read_text() for name in names} == {
+        name: f"the older {name}" for name in names
+    }
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == sorted(names)
+
+
+def test_smoothing_that_fails_leaves_the_older_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_track(tmp_path / "track.npz", make_track(BODY, (2, 2, 2, 2)))
+    smooth_file(tmp_path)
+    before = (tmp_path / "smooth.npz").read_bytes()
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(torchcss.files.os, "replace", refuse)
+    with pytest.raises(TorchcssError, match="disk is full"):
+        smooth_file(tmp_path)
+    assert (tmp_path / "smooth.npz").read_bytes() == before

@@ -1,0 +1,203 @@
+"""Arms for which the picture does not speak are found elsewhere, and all else is left alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from painted import a_body_before_a_camera, layers, moved, painted
+from torch import Tensor
+
+from torchcss.body.flips import Limb, Segments
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel
+from torchcss.cost.segmentation import SegmentationTerm
+from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.inference.dynamics import ConstantVelocity
+from torchcss.inference.mixture import GaussianMixture
+from torchcss.inference.proposals import CovarianceScaled
+from torchcss.inference.tracker import Tracker, TrackerState, initial_state
+from torchcss.tracking.limb_moves import astray_limbs, other_poses, with_limbs
+
+DYNAMICS = ConstantVelocity(deviation=0.05, persistence=0.8)
+
+
+def cost_of(
+    angle: float,
+    dtype: torch.dtype = torch.float64,
+    *,
+    missing: tuple[str, ...] = (),
+    views: int = 1,
+) -> tuple[BodyModel, TrackingCost]:
+    """The cost of a person whose right arm is raised by so much.
+
+    Args:
+        angle: Radians.
+        dtype: Type of it all.
+        missing: Parts that the person lacks.
+        views: How many cameras look on, all from one place.
+    """
+    body, camera = a_body_before_a_camera(dtype)
+    truth, term = moved(body, angle), SegmentationTerm()
+    likeness = painted(body, camera, truth, missing)
+    images = term.images(likeness, layers(body)[1], camera, body, truth)
+    choice = CostChoice(segmentation=term, contour=None, joints=None, interpenetration=None)
+    cost = TrackingCost(
+        body=body,
+        camera=camera,
+        choice=choice,
+        segmentation=images,
+        deviation=body.motion_rate / 25,
+    )
+    return body, replace(cost, others=(cost.alone,) * (views - 1))
+
+
+def state_at(body: BodyModel, x: Tensor, *others: Tensor) -> TrackerState:
+    mean = torch.stack([x, *others])
+    k, n = mean.shape
+    mixture = GaussianMixture(
+        mean, 1e-3 * torch.eye(n).to(x).expand(k, n, n), -torch.arange(k).to(x)
+    )
+    state = initial_state(mixture.normalise(), generator=torch.Generator().manual_seed(0))
+    return state._replace(velocity=torch.full_like(mean, 0.01))
+
+
+def arm(body: BodyModel, name: str = "r_arm") -> Limb:
+    return next(limb for limb in Segments(body).limbs if limb.name == name)
+
+
+def names(limbs: list[Limb]) -> list[str]:
+    return [limb.name for limb in limbs]
+
+
+def find(cost: TrackingCost, body: BodyModel, x: Tensor, limb: Limb, num: int = 4) -> Tensor:
+    prior = state_at(body, x).mixture
+    return other_poses(cost, body, x, limb, body.bounds, prior=prior, num=num)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("views", [1, 2])
+def test_the_limb_that_is_astray_is_named(dtype: torch.dtype, views: int):
+    body, cost = cost_of(1.3, dtype, views=views)
+    assert names(astray_limbs(cost, body, moved(body, 1.3))) == []
+    assert names(astray_limbs(cost, body, moved(body, 0.5))) == ["r_arm"]
+    both = moved(body, 0.5) + moved(body, 0.7, "l") - body.rest
+    assert names(astray_limbs(cost, body, both)) == ["l_arm", "r_arm"]
+    stepping = moved(body, 1.3)
+    stepping[body.state_index("l_hip_abduction")] = 0.7
+    assert names(astray_limbs(cost, body, stepping)) == [], "legs stand"
+
+
+def test_it_is_found_where_it_looks_like_itself():
+    body, cost = cost_of(1.4)
+    x, truth = moved(body, 0.4), moved(body, 1.4)
+    poses = find(cost, body, x, arm(body))
+    assert 1 <= len(poses) <= 4
+    assert torch.equal(body.bounds.project(poses), poses)
+    held = torch.ones(len(x), dtype=torch.bool)
+    held[arm(body).columns] = False
+    assert torch.equal(poses[:, held], x[held].expand(len(poses), -1)), "all else stays"
+    # The camera sees no depth: compare in the picture.
+    uv = [cost.camera.project(body.pose(pose).joints).uv for pose in (x, truth, *poses)]
+    elbow = body.joint_index("r_elbow")
+    missed = [float((each[elbow] - uv[1][elbow]).norm()) for each in (uv[0], *uv[2:])]
+    assert missed[1] < 0.3 * missed[0]
+    assert bool((cost.unsearched(poses) < cost.unsearched(x) - 5).all())
+    joints = body.pose(poses).joints
+    apart = (joints[:, None] - joints).norm(dim=-1).amax(-1)
+    assert float((apart + torch.eye(len(poses))).min()) > 0.15
+    # Nothing is random, and the fewer wanted, the same first.
+    assert torch.equal(find(cost, body, x, arm(body), num=1), poses[:1])
+
+
+def test_out_of_the_way_is_not_found():
+    """Before the trunk an arm covers nothing wrong; it explains nothing either."""
+    right = ("r_clavicle", "r_upper_arm", "r_forearm", "r_hand")
+    body, cost = cost_of(0.8, missing=right)
+    x = moved(body, 0.8)
+    assert "r_arm" in names(astray_limbs(cost, body, x))
+    assert len(find(cost, body, x, arm(body))) == 0
+    state = state_at(body, x)
+    assert with_limbs(state, body, cost, DYNAMICS, body.bounds, num=4) is state
+
+
+def test_what_cannot_be_seen_is_left_alone():
+    body, cost = cost_of(1.3)
+    state = state_at(body, moved(body, 0.5))
+    for column, shift in (("root_x", 9.0), ("root_z", -9.0)):  # beside and behind the camera
+        away = state._replace(mixture=state.mixture._replace(mean=state.mixture.mean.clone()))
+        away.mixture.mean[:, body.state_index(column)] += shift
+        assert names(astray_limbs(cost, body, away.mixture.mean[0])) == ["l_arm", "r_arm"]
+        assert with_limbs(away, body, cost, DYNAMICS, body.bounds, num=4) is away
+    blind = replace(cost, choice=replace(cost.choice, segmentation=None))
+    assert astray_limbs(blind, body, moved(body, 0.5)) == []
+    assert astray_limbs(replace(cost, segmentation=None), body, moved(body, 0.5)) == []
+
+
+def test_an_arm_before_the_chest_is_found_where_it_is():
+    """There it covers nothing wrong, so that nothing else tells."""
+    body, cost = cost_of(0.9)
+    x = body.rest.clone()
+    x[body.state_index("r_shoulder_swing")] = -1.2
+    x[body.state_index("r_shoulder_twist")] = 1.2
+    x[body.state_index("r_elbow_flexion")] = 1.9
+    assert "r_arm" in names(astray_limbs(cost, body, x))
+    poses = find(cost, body, x, arm(body))
+    uv = [cost.camera.project(body.pose(each).joints).uv for each in (x, moved(body, 0.9))]
+    found = cost.camera.project(body.pose(poses[0]).joints).uv
+    wrist = body.joint_index("r_wrist")
+    assert float((found - uv[1])[wrist].norm()) < 0.5 * float((uv[0] - uv[1])[wrist].norm())
+
+
+def test_it_joins_the_search_at_rest():
+    body, cost = cost_of(1.4)
+    x = moved(body, 0.4)
+    state = state_at(body, x, moved(body, 0.4, "l"))
+    joined = with_limbs(state, body, cost, DYNAMICS, body.bounds, num=3)
+    new = len(joined.mixture.mean) - 2
+    assert 1 <= new <= 3
+    assert torch.equal(joined.mixture.mean[:2], state.mixture.mean)
+    assert torch.equal(joined.velocity[:2], state.velocity)
+    odds = joined.mixture.log_weight[2:] - joined.mixture.log_weight[0]
+    torch.testing.assert_close(odds, torch.full_like(odds, -5.0))
+    assert float(joined.mixture.log_weight.exp().sum()) == pytest.approx(1)
+    assert torch.equal(joined.generator_state, state.generator_state), "nothing is drawn at random"
+    # One frame ahead all but the limb is where the best mode is expected.
+    ahead = DYNAMICS.predict(joined.mixture, joined.velocity).mean
+    columns = arm(body).columns
+    held = torch.ones(len(x), dtype=torch.bool)
+    held[columns] = False
+    torch.testing.assert_close(ahead[2:, held], ahead[:1, held].expand(new, -1))
+    assert torch.equal(ahead[2:, columns], joined.mixture.mean[2:, columns])
+    at_rest = state_at(body, moved(body, 1.4))
+    assert with_limbs(at_rest, body, cost, DYNAMICS, body.bounds, num=3) is at_rest
+
+
+def test_a_tracker_goes_on_with_the_arm_that_it_had_lost():
+    """With it the mode that leads after two frames has the arm where it is, without it has not."""
+    body, cost = cost_of(1.4)
+    tracker = Tracker(
+        proposal=CovarianceScaled(covariance_scale=1.0), num_samples=12, num_modes=4,
+        dynamics=DYNAMICS, evidence=0.3, soft_matching=True, coarse_every=0,
+    )  # fmt: skip
+    elbow, truth = body.joint_index("r_elbow"), moved(body, 1.4)
+    missed = []
+    for num in (0, 4):
+        state = state_at(body, moved(body, 0.4))
+        for _ in range(2):
+            if num:
+                state = with_limbs(state, body, cost, DYNAMICS, body.bounds, num=num)
+            state, _ = tracker.step(state, cost.of_children, body.bounds)
+        places = body.pose(torch.stack([state.mixture.mean[0], truth])).joints[:, elbow]
+        uv = cost.camera.project(places).uv
+        missed.append(float((uv[0] - uv[1]).norm()))
+    assert missed[1] < 0.3 * missed[0]
+
+
+def test_an_arm_alone_has_no_colours_to_go_by():
+    body = load_body("arm7")
+    _, camera = a_body_before_a_camera()
+    cost = TrackingCost(body=body, camera=camera, choice=CostChoice(contour=None, joints=None))
+    state = state_at(body, body.rest)
+    assert with_limbs(state, body, cost, DYNAMICS, body.bounds, num=4) is state

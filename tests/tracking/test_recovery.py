@@ -1,0 +1,156 @@
+"""A lost target is told, searched for, and found; in the track and in its summary."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import torchcss
+from torchcss.app.recorder import Recorder
+from torchcss.inference.loss_monitor import LossMonitor
+from torchcss.inference.mixture import GaussianMixture
+from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
+from torchcss.tracking.presets import make_tracker
+from torchcss.tracking.recovery import OBSERVATIONS, Recovery
+from torchcss.tracking.session import TrackedFrame, track_frames
+from torchcss.tracking.settings import Settings, make_choice, make_extractor
+from torchcss.types import Frame
+
+ELSEWHERE = range(6, 8)
+"""Frames that show a wall. It has some grain: a picture of a single colour is a camera that is out,
+and says nothing."""
+SETTINGS = Settings(body="arm8", terms=("contour",), working_size=120, overlay=False)
+TRACKER = make_tracker("css", "arm8", num_samples=4, num_modes=2, motion=0.1)
+RECOVERY = Recovery(monitor=LossMonitor(burn_in=3, slack=2.5, threshold=4.0), samples=3, modes=2)
+
+
+def track(
+    sequence: SyntheticSequence, num_frames: int, recovery: Recovery | None, seed: int = 0
+) -> list[TrackedFrame]:
+    """Track from the true first pose; some frames show a wall."""
+    wall = np.random.default_rng(0).integers(88, 93, (480, 640, 3), np.uint8)
+    images = (wall if index in ELSEWHERE else image for index, image in enumerate(sequence.frames))
+    mixture = GaussianMixture(
+        sequence.states[:1], 0.01 * torch.eye(8).double()[None], torch.zeros(1).double()
+    )
+    frames = (Frame(index, index / 25, image) for index, image in enumerate(images))
+    return list(
+        track_frames(
+            (frame for frame, _ in zip(frames, range(num_frames), strict=False)),
+            body=sequence.body,
+            mixture=mixture,
+            camera=sequence.camera,
+            extractor=make_extractor(SETTINGS),
+            tracker=TRACKER,
+            choice=make_choice(SETTINGS, 2.0),
+            observe=lambda index: None,
+            frame_interval=1 / 25,
+            generator=torch.Generator().manual_seed(seed),
+            recovery=recovery,
+        )
+    )
+
+
+@pytest.fixture(scope="module")
+def sequence() -> SyntheticSequence:
+    return arm_sequence(generator=torch.Generator().manual_seed(3), num_frames=12)
+
+
+@pytest.fixture(scope="module")
+def tracked(sequence: SyntheticSequence) -> list[TrackedFrame]:
+    return track(sequence, 12, RECOVERY)
+
+
+def test_a_target_that_disappears_is_lost_and_found_again(tracked: list[TrackedFrame]):
+    lost = [frame.lost for frame in tracked]
+    assert not any(lost[: ELSEWHERE.start])
+    assert any(lost[frame] for frame in ELSEWHERE)
+    assert not lost[-1]
+    assert max(tracked[frame].loss_score for frame in ELSEWHERE) > 2
+    # The frame after one that is lost is searched more widely, and no other.
+    for before, frame in pairwise(tracked):
+        assert int(frame.info.num_samples) == (12 if before.lost else 4)
+        assert len(frame.state.mixture.mean) <= (4 if before.lost else 2)
+    assert any(len(frame.state.mixture.mean) > 2 for frame in tracked)
+
+
+def test_parents_are_modes_of_the_frame_before(tracked: list[TrackedFrame]):
+    """Also of modes that were jumped to."""
+    for before, frame in pairwise(tracked):
+        assert int(frame.info.parent.min()) >= -1
+        assert int(frame.info.parent.max()) < len(before.state.mixture.mean)
+
+
+def test_losses_come_out_in_the_summary(
+    sequence: SyntheticSequence, tracked: list[TrackedFrame], tmp_path: Path
+):
+    recorder = Recorder(
+        folder=tmp_path,
+        settings=SETTINGS,
+        tracker=TRACKER,
+        camera=sequence.camera,
+        frame_rate=25.0,
+    )
+    summary = recorder.run(iter(tracked), tracked[0].body, len(tracked))
+    on_disk = json.loads((tmp_path / "summary.json").read_text())
+    lost = [frame.lost for frame in tracked]
+    assert on_disk["frames_searched_widely"] == summary["frames_searched_widely"] == sum(lost)
+    events = on_disk["events"]
+    assert [event["event"] for event in events] == ["lost", "found"]
+    assert [event["frame"] for event in events] == [
+        lost.index(True),
+        lost.index(False, lost.index(True)),
+    ]
+    for event in events:
+        assert event["time_s"] == event["frame"] / 25
+        assert event["deviations"] == tracked[event["frame"]].loss_score
+    track = torchcss.load_track(tmp_path)
+    assert track.frames.tolist() == list(range(12))
+    modes = np.isfinite(track.log_weight).sum(axis=1)
+    assert (track.parent[1:].max(axis=1) < modes[:-1]).all()
+    assert np.isfinite(track.joints_world[:, 0]).all()
+
+
+def test_same_seed_same_losses(sequence: SyntheticSequence, tracked: list[TrackedFrame]):
+    again = track(sequence, 9, RECOVERY)
+    for one, two in zip(again, tracked, strict=False):
+        assert torch.equal(one.state.mixture.mean, two.state.mixture.mean)
+        assert torch.equal(one.state.mixture.log_weight, two.state.mixture.log_weight)
+        assert (one.lost, one.loss_score) == (two.lost, two.loss_score)
+
+
+def test_without_recovery_nothing_is_told_and_nothing_changes(
+    sequence: SyntheticSequence, tracked: list[TrackedFrame]
+):
+    first = next(frame.frame.index for frame in tracked if frame.lost)
+    plain = track(sequence, first + 2, None)
+    for one, two in zip(plain[: first + 1], tracked, strict=False):
+        assert torch.equal(one.state.mixture.mean, two.state.mixture.mean)
+    assert not any(frame.lost for frame in plain)
+    assert {frame.loss_score for frame in plain} == {0.0}
+    assert {int(frame.info.num_samples) for frame in plain} == {4}
+
+
+def test_only_what_compares_with_the_image_is_judged():
+    recovery, priors = Recovery(), {"stabiliser": 1.0, "temporal": 2.0, "interpenetration": 0.0}
+    state = recovery.monitor.init()
+    for _ in range(10):
+        state, lost = recovery.judge(state, {"contour": 100.0, **priors})
+        assert not lost
+    assert set(state.history) == {"contour"}
+    for _ in range(5):
+        state, lost = recovery.judge(state, {"contour": 100.0, **dict.fromkeys(priors, 1e6)})
+        assert not lost
+    for _ in range(2):
+        state, _ = recovery.judge(state, {"contour": 200.0, **priors})
+    assert recovery.judge(state, {"contour": 200.0, **priors})[1]
+
+
+def test_every_term_of_the_images_is_judged():
+    images = {"contour", "edge_energy", "region", "flow", "joints"}
+    assert set(OBSERVATIONS) == images

@@ -1,0 +1,619 @@
+"""The loop from files to a track: determinism, interruption, the base transform."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import torchcss
+from torchcss.app.track import _first_pose_from_file, track_video
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel
+from torchcss.cost.joints import JointObservation
+from torchcss.errors import ConfigurationError, OutputError, VideoError
+from torchcss.inference.mixture import GaussianMixture
+from torchcss.inference.tracker import Tracker, TrackerState, stated_evidence
+from torchcss.initialise.result import Initialisation
+from torchcss.io import tracks
+from torchcss.io.fitted_body import read_fitted_body, write_fitted_body
+from torchcss.io.track_body import body_of_track
+from torchcss.io.video import VideoWriter
+from torchcss.robust import Quadratic
+from torchcss.studies.demo import run_demo
+from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
+from torchcss.tracking.flip_moves import with_modes
+from torchcss.tracking.presets import PRESETS, make_tracker
+from torchcss.tracking.session import TrackedFrame, follow_with_base, scale_keypoints, track_frames
+from torchcss.tracking.settings import (
+    ALL_TERMS,
+    TERMS,
+    Settings,
+    boundary_emphasis,
+    make_choice,
+    make_extractor,
+    make_settings_tracker,
+    named_terms,
+)
+from torchcss.tracking.view import Observe
+from torchcss.types import Frame
+from torchcss.vision.camera import Camera
+
+FRAMES = 4
+
+
+@pytest.fixture(scope="session")
+def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short rendered clip of an arm with camera and keypoints, as files."""
+    folder = tmp_path_factory.mktemp("clip")
+    generator = torch.Generator().manual_seed(3)
+    sequence = arm_sequence(generator=generator, num_frames=FRAMES)
+    with VideoWriter(folder / "video.mp4", sequence.frame_rate) as film:
+        for frame in sequence.frames:
+            film.write(frame)
+    camera = sequence.camera
+    (folder / "cameras.json").write_text(
+        json.dumps(
+            {
+                "units": "metre, pixel",
+                "cameras": {
+                    "one": {
+                        "video": "video.mp4",
+                        "image_size_wh": list(camera.image_size_wh),
+                        "K": camera.K.tolist(),
+                        "R": camera.R_camera_world.tolist(),
+                        "t": camera.t_camera_world.tolist(),
+                    }
+                },
+            }
+        )
+    )
+    uv = camera.project(sequence.joints_world).uv.numpy()
+    names = np.array(sequence.body.joint_names)
+    np.savez(
+        folder / "keypoints.npz", keypoints=uv, confidence=np.ones(uv.shape[:2]), joint_names=names
+    )
+    few = Settings(body="arm7", samples=2, modes=1, overlay=False, terms=("joints",))
+    track_video(
+        folder / "video.mp4",
+        camera=folder / "cameras.json",
+        keypoints=folder / "keypoints.npz",
+        out=folder / "first",
+        stop=1,
+        settings=few,
+    )
+    return folder
+
+
+def run(clip: Path, out: Path, **settings) -> dict:
+    """Track the clip from a first pose that is found once, in small images."""
+    settings = {"working_size": 160, **settings}
+    return track_video(
+        clip / "video.mp4",
+        camera=clip / "cameras.json",
+        keypoints=clip / "keypoints.npz",
+        init=clip / "first" / "body.npz",
+        out=out,
+        settings=Settings(body="arm7", samples=6, modes=2, overlay=False, **settings),
+    )
+
+
+@pytest.fixture(scope="module")
+def tracked(clip: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
+    """A folder that the clip was tracked into, with all defaults, and the summary."""
+    folder = tmp_path_factory.mktemp("tracked")
+    return folder, track_video(
+        clip / "video.mp4",
+        camera=clip / "cameras.json",
+        keypoints=clip / "keypoints.npz",
+        out=folder,
+        settings=Settings(body="arm7", samples=6, modes=2),
+    )
+
+
+def test_writes_what_the_design_says(tracked: tuple[Path, dict]):
+    folder, summary = tracked
+    names = {"track.npz", "summary.json", "overlay.mp4", "body.npz"}
+    assert {p.name for p in folder.iterdir()} == names
+    track = torchcss.load_track(folder)
+    assert track.frames.tolist() == list(range(FRAMES))
+    assert track.state_names == load_body("arm7").state_names
+    k = track.state.shape[1]
+    assert track.covariance.shape == (FRAMES, k, 7, 7)
+    assert track.joints_world.shape == (FRAMES, k, 4, 3)
+    weights = np.exp(track.log_weight)
+    np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-9)
+    assert (np.diff(weights, axis=1) <= 0).all()
+    on_disk = tracks.read_summary(folder)
+    assert on_disk["ended"] == summary["ended"] == "complete"
+    assert (on_disk["samples"], on_disk["modes"], on_disk["body"]) == (6, 2, "arm7")
+    assert on_disk["samples_optimised"] == 6 * FRAMES
+    for key in (
+        "preset",
+        "seed",
+        "iterations",
+        "settings",
+        "versions",
+        "seconds_per_frame",
+        "best_mode_cost_by_term",
+    ):
+        assert key in on_disk
+    assert (track.parent[0] == -1).all()
+
+
+def test_the_body_lies_beside_the_track(clip: Path, tracked: tuple[Path, dict], tmp_path: Path):
+    """What was fitted, and again where it was given; the user's own file stays as it is."""
+    fitted = read_fitted_body(tracked[0])
+    body = body_of_track(torchcss.load_track(tracked[0]), fitted.body)
+    # Flesh that was fitted, on the lengths of the track.
+    assert not torch.equal(body.part_shape, load_body("arm7", lengths=body.lengths).part_shape)
+    own = tmp_path / "own" / "body.npz"
+    own.parent.mkdir()
+    shutil.copy(tracked[0] / "body.npz", own)
+    before = own.read_bytes()
+    for init, out in ((own, tmp_path / "out"), (own.parent, own.parent), (own, own.parent)):
+        track_video(
+            clip / "video.mp4",
+            camera=clip / "cameras.json",
+            keypoints=clip / "keypoints.npz",
+            out=out,
+            init=init,
+            settings=Settings(body="arm7", samples=2, modes=1, overlay=False, terms=("joints",)),
+            stop=1,
+        )
+        again = read_fitted_body(out)
+        torch.testing.assert_close(again.body.part_shape, body.part_shape)
+        assert again.body.lengths == pytest.approx(fitted.body.lengths)
+        torch.testing.assert_close(again.mixture.mean, fitted.mixture.mean)
+    assert own.read_bytes() == before
+
+
+def test_same_seed_same_track(clip: Path, tmp_path: Path):
+    for name in ("a", "b"):
+        run(clip, tmp_path / name)
+    run(clip, tmp_path / "c", seed=1)
+    a, b, c = (torchcss.load_track(tmp_path / name) for name in "abc")
+    np.testing.assert_array_equal(a.state, b.state)
+    np.testing.assert_array_equal(a.covariance, b.covariance)
+    assert not np.array_equal(a.state, c.state)
+
+
+def test_all_terms_track(clip: Path, tmp_path: Path):
+    summary = run(clip, tmp_path, terms=ALL_TERMS)
+    # Weights of edges and the background are no terms; lengths are not free while tracking; an arm
+    # is not segmented and has no silhouette.
+    without = {"motion_boundaries", "background", "anthropometric", "segmentation", "silhouette"}
+    names = set(ALL_TERMS) - without
+    assert set(summary["best_mode_cost_by_term"]) == set(summary["share_of_cost_by_term"]) == names
+    times = summary["share_of_search_time_by_term"]
+    assert set(times) == names | {"pose", "visibility", "lift", "optimiser"}
+    assert sum(times.values()) == pytest.approx(1)
+    assert sum(summary["share_of_cost_by_term"].values()) == pytest.approx(1)
+    assert np.isfinite(torchcss.load_track(tmp_path).joints_world).all()
+
+
+def test_float32_tracks_too(clip: Path, tmp_path: Path):
+    """And the file tells what counts in its covariances, not what counts in its weights."""
+    run(clip, tmp_path, dtype="float32", evidence=0.7)
+    track = torchcss.load_track(tmp_path)
+    assert np.isfinite(track.joints_world).all()
+    assert track.evidence == PRESETS["css"].evidence_arm
+
+
+def test_a_new_run_replaces_what_belongs_to_the_last_one(clip: Path, tmp_path: Path):
+    """And what fails before its first frame replaces nothing."""
+    out = tmp_path / "out"
+    run(clip, out)
+    for other in ("smooth.npz", "overlay.mp4", "overlay_2.mp4", "overlay_of_mine.mp4"):
+        (out / other).write_bytes(b"old")
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    with pytest.raises(ConfigurationError, match="descend"):
+        run(clip, out, preset="condensation", oversampling=2)
+    with pytest.raises(ConfigurationError, match="no modes to weigh"):
+        run(clip, out, preset="condensation", evidence=0.5)
+    with pytest.raises(ConfigurationError, match="no modes to jump from"):
+        run(clip, out, preset="condensation", limb_jumps=4)
+    (tmp_path / "empty.mp4").write_bytes(b"")
+    with pytest.raises(VideoError):
+        track_video(
+            tmp_path / "empty.mp4", camera=clip / "cameras.json", keypoints=clip / "keypoints.npz",
+            out=out, settings=Settings(body="arm7"),
+        )  # fmt: skip
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+    run(clip, out, seed=3)
+    assert sorted(path.name for path in out.iterdir()) == [
+        "body.npz", "overlay_of_mine.mp4", "summary.json", "track.npz",
+    ]  # fmt: skip
+    assert (out / "track.npz").read_bytes() != before["track.npz"]
+
+
+@pytest.mark.parametrize("trouble", [KeyboardInterrupt(), OutputError("disk full")])
+def test_interruption_keeps_the_frames(
+    clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trouble: BaseException
+):
+    step, calls = Tracker.step, []
+
+    def stumbling(self: Tracker, *args, **kwargs):
+        calls.append(None)
+        if len(calls) == 3:
+            raise trouble
+        return step(self, *args, **kwargs)
+
+    monkeypatch.setattr(Tracker, "step", stumbling)
+    with pytest.raises(type(trouble)):
+        run(clip, tmp_path)
+    assert len(torchcss.load_track(tmp_path).frames) == 2
+    assert tracks.read_summary(tmp_path)["ended"] == "interrupted"
+
+
+def test_truncated_video_keeps_the_frames(clip: Path, tmp_path: Path):
+    whole = (clip / "video.mp4").read_bytes()
+    for name in ("cameras.json", "keypoints.npz"):
+        (tmp_path / name).write_bytes((clip / name).read_bytes())
+    shutil.copytree(clip / "first", tmp_path / "first")
+    (tmp_path / "video.mp4").write_bytes(whole[: int(0.8 * len(whole))])
+    with pytest.raises(VideoError, match=r"video\.mp4"):
+        run(tmp_path, tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [{"terms": ("contour", "magic")}, {"samples": 0}, {"working_size": 0}, {"device": "cuda:99"}],
+)
+def test_bad_settings(bad: dict):
+    with pytest.raises(ConfigurationError):
+        Settings(**bad)
+
+
+@pytest.mark.parametrize(
+    ("name", "bad", "good"),
+    [
+        ("contour_weight", (-1.0, float("nan"), float("inf")), (0.0, 300.0)),
+        ("boundary_emphasis", (-0.1, 1.1, float("nan")), (0.0, 1.0)),
+        ("seed", (-1, 2**63), (0, 2**63 - 1)),
+        ("limb_jumps", (-1,), (0, 2)),
+        ("terms", ((), ("motion_boundaries",), ("temporal", "stabiliser")), (("joints",),)),
+    ],
+)
+def test_settings_out_of_range_are_refused_by_name(name: str, bad: tuple, good: tuple):
+    for value in bad:
+        with pytest.raises(ConfigurationError, match=name):
+            Settings(**{name: value})
+    for value in good:
+        assert getattr(Settings(**{name: value}), name) == value
+
+
+def test_a_body_from_a_file_is_the_same_by_any_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "robots").mkdir()
+    robot = tmp_path / "robots" / "robot.urdf"
+    robot.write_text(
+        "<robot name='r'><link name='a'/><link name='b'/><joint name='j' type='continuous'>"
+        "<parent link='a'/><child link='b'/></joint></robot>"
+    )
+    body = load_body(robot, free_root=True)
+    mixture = GaussianMixture(
+        body.rest[None], torch.eye(7, dtype=torch.float64)[None], torch.zeros(1).double()
+    )
+    eye = Camera([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], (640, 480))
+    found = Initialisation(body, mixture, torch.zeros(1).double(), ())
+    write_fitted_body(tmp_path / "body.npz", found, eye)
+    monkeypatch.chdir(tmp_path / "robots")
+    for name in (str(robot), "robot.urdf", "../robots/robot.urdf"):
+        first = _first_pose_from_file(tmp_path, eye, Settings(body=name))
+        assert first.body.state_names == body.state_names
+    with pytest.raises(ConfigurationError, match=r"give the body .*robot\.urdf"):
+        _first_pose_from_file(tmp_path, eye, Settings(body="other.urdf"))
+
+
+def test_scale_keypoints_maps_pixel_centres():
+    corners = torch.tensor([[-0.5, -0.5], [1079.5, 1919.5]])
+    mapped = scale_keypoints(corners, (1080, 1920), (360, 640))
+    torch.testing.assert_close(mapped, torch.tensor([[-0.5, -0.5], [359.5, 639.5]]))
+
+
+def test_base_follows_a_body_that_leans_over(generator: torch.Generator):
+    body = load_body("body30")
+    x = body.rest.clone()
+    x[body.state_index("root_pitch")] = 1.2
+    x = x + 0.05 * torch.randn(3, 30, generator=generator, dtype=torch.float64)
+    x = body.bounds.project(x)
+    mixture = GaussianMixture(
+        x, 0.01 * torch.eye(30, dtype=torch.float64).expand(3, 30, 30), torch.zeros(3).double()
+    )
+    step = 0.05 * torch.randn(3, 30, generator=generator, dtype=torch.float64)
+    state = TrackerState(mixture, step, generator.get_state(), torch.zeros((), dtype=torch.long))
+    moved, after = follow_with_base(body, state)
+    angles = after.mixture.mean[0, [moved.state_index(f"root_{a}") for a in ("yaw", "pitch")]]
+    torch.testing.assert_close(angles, torch.zeros(2, dtype=torch.float64), atol=1e-9, rtol=0)
+    torch.testing.assert_close(moved.pose(after.mixture.mean).joints, body.pose(x).joints)
+    last = x - state.velocity
+    torch.testing.assert_close(
+        moved.pose(after.mixture.mean - after.velocity).joints, body.pose(last).joints
+    )
+    upright = replace_pitch(state, body, 0.3)
+    assert follow_with_base(body, upright)[0] is body
+
+
+def test_base_keeps_the_motion_of_a_body_that_turns(generator: torch.Generator):
+    body = load_body("body30")
+    yaw = body.state_index("root_yaw")
+    x = body.rest.expand(2, 30).clone()
+    # One mode turns as well, but is seen from the new base half a turn away.
+    x[:, yaw] = x.new_tensor([4.75, 4.75 - math.pi + 0.1])
+    step = torch.zeros_like(x)
+    step[:, yaw] = 0.3
+    mixture = GaussianMixture(
+        x, 0.01 * torch.eye(30, dtype=torch.float64).expand(2, 30, 30), torch.zeros(2).double()
+    )
+    state = TrackerState(mixture, step, generator.get_state(), torch.zeros((), dtype=torch.long))
+    moved, after = follow_with_base(body, state)
+    assert moved is not body
+    torch.testing.assert_close(after.velocity, step)
+
+
+def replace_pitch(state: TrackerState, body, pitch: float) -> TrackerState:
+    mean = state.mixture.mean.clone()
+    mean[:, body.state_index("root_pitch")] = pitch
+    return state._replace(mixture=state.mixture._replace(mean=mean))
+
+
+def test_demo_in_small(tmp_path: Path):
+    settings = Settings(body="arm8", keypoints_use="first", samples=6, modes=2)
+    summary = run_demo(tmp_path, settings=settings, num_frames=3)
+    assert summary["mpjpe_mm"] < 60
+    assert summary["mpjpe_best_of_modes_mm"] <= summary["mpjpe_mm"]
+    assert tracks.read_summary(tmp_path)["mpjpe_mm"] == pytest.approx(summary["mpjpe_mm"])
+    assert (tmp_path / "overlay.mp4").stat().st_size > 0
+    assert replace(settings, seed=1).seed == 1
+
+
+@pytest.mark.parametrize("number", [0, -3])
+def test_a_demo_without_frames_is_refused(tmp_path: Path, number: int):
+    with pytest.raises(ConfigurationError, match="num_frames must be at least 1"):
+        run_demo(tmp_path, num_frames=number)
+
+
+def write_masks(path: Path, width: int, height: int, num_frames: int = FRAMES) -> Path:
+    with VideoWriter(path, 25) as film:
+        for _ in range(num_frames):
+            film.write(np.full((height, width, 3), 255, np.uint8))
+    return path
+
+
+def test_masks_are_read_along_with_the_video(clip: Path, tmp_path: Path):
+    settings = Settings(
+        body="arm7", samples=4, modes=1, overlay=False, terms=("contour",), working_size=160
+    )
+    for masks, message in (
+        (write_masks(tmp_path / "small.mp4", 64, 48), "video's size 640 x 480, these have 64 x 48"),
+        (write_masks(tmp_path / "short.mp4", 640, 480, 2), "masks end before frame 2"),
+    ):
+        with pytest.raises(VideoError, match=message):
+            track_video(
+                clip / "video.mp4",
+                camera=clip / "cameras.json",
+                keypoints=clip / "keypoints.npz",
+                out=tmp_path / "track",
+                settings=settings,
+                masks=masks,
+                init=clip / "first" / "body.npz",
+            )
+    assert torchcss.load_track(tmp_path / "track").frames.tolist() == [0, 1]
+
+
+def test_masks_weigh_the_edges():
+    """A white mask takes two per cent of the weight, a black one most of it."""
+    sequence = arm_sequence(generator=torch.Generator().manual_seed(3), num_frames=1)
+    settings = Settings(body="arm8", terms=("contour",), working_size=160)
+    costs = []
+    for masks in (None, [np.full((480, 640), 255, np.uint8)], [np.zeros((480, 640), np.uint8)]):
+        (tracked,) = track(sequence.frames, sequence, settings, masks=masks)
+        costs.append(tracked.terms["contour"])
+    assert costs[0] == pytest.approx(costs[1], rel=0.02)
+    assert costs[2] > costs[0] + 10
+
+
+def track(
+    images: Iterable[np.ndarray],
+    sequence: SyntheticSequence,
+    settings: Settings,
+    camera: Camera | None = None,
+    masks: list[np.ndarray] | None = None,
+    observe: Observe = lambda index: None,
+    limb_jumps: int = 0,
+) -> list[TrackedFrame]:
+    """Track from the true first pose, by default without keypoints, with few samples."""
+    mixture = GaussianMixture(
+        sequence.states[:1], 0.01 * torch.eye(8, dtype=torch.float64)[None], torch.zeros(1).double()
+    )
+    return list(
+        track_frames(
+            (Frame(i, i / 25, image) for i, image in enumerate(images)),
+            body=sequence.body,
+            mixture=mixture,
+            camera=camera or sequence.camera,
+            extractor=make_extractor(settings),
+            tracker=make_tracker("css", "arm8", num_samples=4, num_modes=2, motion=0.1),
+            choice=make_choice(settings, 2.0),
+            observe=observe,
+            frame_interval=1 / 25,
+            generator=torch.Generator().manual_seed(0),
+            boundary_emphasis=boundary_emphasis(settings),
+            masks=masks,
+            limb_jumps=limb_jumps,
+        )
+    )
+
+
+def test_poses_of_limbs_join_the_search(monkeypatch: pytest.MonkeyPatch):
+    """They are compared with the flow of their own, and what descends from them is the best's."""
+    sequence = arm_sequence(generator=torch.Generator().manual_seed(0), num_frames=3)
+    settings = Settings(body="arm8", keypoints_use="first", working_size=160)
+    asked = []
+
+    def aside(state: TrackerState, body: BodyModel, *_, num: int) -> TrackerState:
+        asked.append(num)
+        elsewhere = state.mixture.mean[:1].clone()
+        elsewhere[:, body.state_index("r_elbow_flexion")] += 0.1
+        return with_modes(state, elsewhere, torch.zeros_like(elsewhere), log_odds=20.0)
+
+    monkeypatch.setattr("torchcss.tracking.session.with_limbs", aside)
+    plain = track(sequence.frames, sequence, settings)
+    assert asked == []
+    jumping = track(sequence.frames, sequence, settings, limb_jumps=4)
+    assert asked == [4, 4, 4]
+    assert int(jumping[0].info.origin.max()) == 1, "the pose was descended from"
+    known = 1
+    for with_jump, without in zip(jumping, plain, strict=True):
+        assert int(with_jump.info.parent.max()) < known
+        assert not torch.equal(with_jump.state.mixture.mean, without.state.mixture.mean)
+        known = len(with_jump.state.mixture.mean)
+
+
+def test_terms_of_the_best_mode_add_up_to_its_cost():
+    """In every frame: the priors are about the mixture that the search had, one frame ahead."""
+    sequence = arm_sequence(generator=torch.Generator().manual_seed(0), num_frames=4)
+    settings = Settings(body="arm8", keypoints_use="first", working_size=160)
+    for tracked in track(sequence.frames, sequence, settings):
+        assert sum(tracked.terms.values()) == pytest.approx(float(tracked.info.cost[0]), rel=1e-9)
+
+
+def test_frames_without_detections_have_no_term_of_joints():
+    """Detectors write such frames as zeros; they cost nothing, and are not what is usual."""
+    sequence = arm_sequence(generator=torch.Generator().manual_seed(0), num_frames=2)
+    settings = Settings(body="arm8", working_size=160, terms=("joints", "temporal"))
+    names = sequence.body.joint_names
+    marks = (
+        sequence.camera.project(sequence.joints_world).uv * 160 / sequence.camera.image_size_wh[0]
+    )
+
+    def observe(index: int) -> JointObservation:
+        return JointObservation(names, marks[index], torch.full((len(names),), 1.0 - index), names)
+
+    frames = track(sequence.frames, sequence, settings, observe=observe)
+    assert ["joints" in tracked.terms for tracked in frames] == [True, False]
+
+
+def awkward_frames(sequence: SyntheticSequence) -> dict[str, np.ndarray]:
+    """What a decoder, a cable or a film editor may put between two frames of a video."""
+    first, *others, last = sequence.frames
+    grey = first.mean(axis=-1).astype(np.uint8)
+    return {
+        "first": first,
+        "grey": grey,
+        "grey, 16 bits": grey.astype(np.uint16) * 257,
+        "with alpha": np.dstack([others[0], np.zeros_like(grey)]),
+        "repeated": others[0],
+        "after dropped ones": last,
+        "black": np.zeros_like(first),
+        "white": np.full_like(first, 255),
+        "one colour": np.full_like(first, 90),
+        "saturated": np.where(first > 90, 255, 0).astype(np.uint8),
+        "scene cut": np.ascontiguousarray(first[::-1, ::-1].transpose(1, 0, 2)[:480, :480])
+        .repeat(2, axis=1)[:, :640]
+        .copy(),
+        "back": last,
+    }
+
+
+def test_awkward_frames_leave_no_nan_and_lose_nothing():
+    sequence = arm_sequence(generator=torch.Generator().manual_seed(3), num_frames=8)
+    frames = awkward_frames(sequence)
+    assert all(frame.shape[:2] == (480, 640) for frame in frames.values())
+    settings = Settings(body="arm8", terms=ALL_TERMS, working_size=160)
+    tracked = track(frames.values(), sequence, settings)
+    for name, frame in zip(frames, tracked, strict=True):
+        assert torch.isfinite(frame.info.cost).all(), name
+        assert torch.isfinite(frame.joints_world).all(), name
+        for part in frame.state.mixture:
+            assert torch.isfinite(part).all(), name
+        assert all(np.isfinite(value) for value in frame.terms.values()), name
+
+
+@pytest.mark.parametrize(
+    ("asked", "weights", "covariances"),
+    [
+        ({}, 0.2, 0.1),  # a body with keypoints in every frame
+        ({"keypoints_use": "first"}, 0.1, 0.1),
+        ({"terms": ("contour", "temporal")}, 0.1, 0.1),
+        ({"body": "arm8"}, 0.05, 0.05),
+        ({"evidence": 0.7}, 0.7, 0.1),
+        ({"keypoints_use": "first", "evidence": 0.7}, 0.7, 0.1),
+        ({"preset": "css_heavy_tailed"}, 0.2, 0.1),
+        ({"preset": "css_figure_6"}, 1.0, 1.0),
+        ({"preset": "single"}, 1.0, 1.0),
+        ({"preset": "annealed"}, None, 1.0),
+    ],
+)
+def test_how_much_a_frame_counts_in_weights_and_in_covariances(asked, weights, covariances):
+    settings = Settings(**asked)
+    tracker = make_settings_tracker(settings, load_body(settings.body).motion_rate / 25)
+    assert getattr(tracker, "evidence", None) == weights
+    assert stated_evidence(tracker) == covariances
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_row_of_the_table_can_be_run_by_its_name(preset: str):
+    settings, row = Settings(body="arm7", preset=preset, terms=ALL_TERMS), PRESETS[preset]
+    tracker = make_settings_tracker(settings, load_body("arm7").motion_rate / 25)
+    assert (tracker.num_samples, tracker.num_modes) == (row.samples_arm, row.modes_arm)
+    choice = make_choice(settings, 2.0)
+    assert choice.joints is not None
+    assert isinstance(choice.joints.potential, Quadratic) != row.robust
+    assert choice.curvature is row.curvature
+    assert (choice.interpenetration is None) == (row.interpenetration is False)
+    # The dynamics of particles are the temporal prior, and count once.
+    for prior in (choice.temporal, choice.temporal_mixture):
+        assert (prior is None) == (row.particles is not None)
+
+
+def test_a_body_is_segmented_and_an_arm_alone_is_not():
+    assert make_choice(Settings(body="body34"), 2.0).segmentation is not None
+    assert make_choice(Settings(body="body34", preset="condensation"), 2.0).segmentation is None
+    assert make_choice(Settings(body="arm8"), 2.0).segmentation is None
+    assert not make_choice(Settings(body="body34"), 2.0).background
+    assert named_terms(["default", "background", "contour"]) == (*TERMS, "background")
+    assert named_terms(["joints"]) == ("joints",)
+    still = {*TERMS, "background", "silhouette"} - {"flow"}
+    assert set(named_terms(["still"])) == still
+    assert named_terms(["still", "flow"])[-1] == "flow"
+    assert not {"region", "segmentation", "joints"} & set(named_terms(["papers"]))
+    assert make_choice(Settings(body="body34", terms=ALL_TERMS), 2.0).background
+    assert not make_choice(Settings(body="arm8", terms=ALL_TERMS), 2.0).background
+    assert make_choice(Settings(body="body34"), 2.0).silhouette is None
+    assert make_choice(Settings(body="body34", terms=ALL_TERMS), 2.0).silhouette is not None
+    assert make_choice(Settings(body="arm8", terms=ALL_TERMS), 2.0).silhouette is None
+    terms = tuple(name for name in ALL_TERMS if name != "segmentation")
+    assert make_choice(Settings(body="body34", terms=terms), 2.0).segmentation is None
+
+
+def test_a_particle_filter_weighs_by_the_observation_alone(clip: Path, tmp_path: Path):
+    terms = ("joints", "stabiliser", "temporal", "temporal_mixture")
+    summary = run(clip, tmp_path, preset="condensation", terms=terms)
+    assert set(summary["best_mode_cost_by_term"]) == {"joints", "stabiliser"}
+    assert np.isfinite(torchcss.load_track(tmp_path).joints_world).all()
+
+
+@pytest.mark.parametrize("size", [(1, 48), (48, 1), (1, 1), (37, 53)])
+def test_images_one_pixel_wide_and_of_odd_sizes(size: tuple[int, int]):
+    width, height = size
+    sequence = arm_sequence(generator=torch.Generator().manual_seed(0), num_frames=1)
+    small = Camera(
+        [[50.0, 0.0, (width - 1) / 2], [0.0, 50.0, (height - 1) / 2], [0.0, 0.0, 1.0]],
+        size,
+        R_camera_world=np.diag([1.0, -1.0, -1.0]),
+    )
+    noise = np.random.default_rng(0).integers(0, 255, (3, height, width, 3), dtype=np.uint8)
+    tracked = track(noise, sequence, Settings(body="arm8", terms=ALL_TERMS), small)
+    for frame in tracked:
+        assert torch.isfinite(frame.info.cost).all()
+        assert torch.isfinite(frame.state.mixture.covariance).all()

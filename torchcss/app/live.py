@@ -1,0 +1,80 @@
+"""A tracker watched while it runs: the sink that shows its frames in the rerun viewer.
+
+`LiveViewer` is one of the `sinks` of a `torchcss.app.recorder.Recorder`; `torchcss track --live`
+makes it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from torchcss.app.recorder import Picture
+from torchcss.io.export.selection import camera_up, up_axis
+from torchcss.show.viewer import Viewer, close_recording, open_recording, posed_frame
+from torchcss.tracking.session import TrackedFrame
+from torchcss.vision.camera import Camera
+
+
+class LiveViewer:
+    """Shows every frame as soon as it is tracked.
+
+    It is made before the run, so that what is missing is told before anything is computed.
+
+    Args:
+        name: What the viewer calls the run.
+        save: A recording to write while tracking.
+        connect: Address of a viewer that runs, see `torchcss.show.viewer.open_recording`.
+        spawn: Whether to open a viewer; by default if neither of the others is given.
+
+    Raises:
+        MissingExtraError: If rerun is not installed.
+        ConfigurationError: If a viewer would have to be opened where there is no display.
+        OutputError: If the recording cannot be written.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        save: Path | None = None,
+        connect: str | None = None,
+        spawn: bool | None = None,
+    ) -> None:
+        self._recording = open_recording(name, save=save, connect=connect, spawn=spawn)
+        self._viewer: Viewer | None = None
+
+    def add(self, frame: TrackedFrame, picture: Picture) -> None:
+        """Show a frame.
+
+        Args:
+            frame: What the tracker found.
+            picture: How it looks.
+        """
+        body, mixture = frame.body, frame.state.mixture
+        if self._viewer is None:
+            up = _up(frame, picture.camera)
+            self._viewer = Viewer(self._recording, body, camera=picture.camera, up=up)
+        shown = posed_frame(
+            frame.frame.index,
+            frame.frame.time_s,
+            body,
+            body.pose(mixture.mean),
+            covariance=frame.covariance,
+            weight=mixture.weight,
+            cost=frame.info.cost,
+            picture=picture.image,
+            lost=frame.lost,
+        )
+        self._viewer.add(shown)
+
+    def close(self) -> None:
+        """End the recording; a viewer stays open."""
+        close_recording(self._recording)
+
+
+def _up(frame: TrackedFrame, camera: Camera) -> str:
+    """Which axis of the world is up, as the first frame has it."""
+    joints = frame.joints_world[:1].double().cpu().numpy()
+    return up_axis(frame.body.joint_names, joints, np.eye(4)[None], camera_up(camera))[0]

@@ -1,0 +1,234 @@
+"""A body from the skeleton of a BVH file: its tree, limits from its motion, its unit guessed.
+
+A rotation channel becomes a revolute joint `NAME_x`, `NAME_y` or `NAME_z`, in the file's order. The
+root's six channels become the six root parameters of every body (`torchcss.body.root`), which turn
+in an order of their own: yaw, pitch, roll. Other positions are held where the file's first frame
+has them.
+
+A BVH states no joint limits. Its motion, where it has one, says what is usual: a channel that never
+changes is held, the others may turn `MARGIN` beyond what they do in the file, and their mean and
+deviation are the body's stabilisers. A file of one pose lets all turn by `MARGIN` twice. The middle
+one of three angles stays within a right angle, where the three lock. `BodySpecification.notes` says
+all of this.
+
+Call `read_bvh_skeleton`; `torchcss.load_body("x.bvh")` does.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from torchcss.body.files.bvh_parser import Segment, Turn, parse_bvh
+from torchcss.body.files.default_shape import as_rows, as_vector
+from torchcss.body.kinematics import JointSpecification
+from torchcss.errors import MotionCaptureError
+
+BASE: Final = "world_frame"
+"""Name of the root link of a tree from a file that has none itself."""
+
+UNITS: Final[dict[str, float]] = {
+    "m": 1.0,
+    "cm": 0.01,
+    "mm": 0.001,
+    "inch": 0.0254,
+    "cmu": 0.0254 / 0.45,
+}
+"""Metres per unit of the files, by name; "cmu" is the unit of the CMU database."""
+
+MARGIN = math.radians(60)
+"""How far a joint may turn beyond what it does in the file."""
+
+_LEAST_DEVIATION = math.radians(20)
+"""Stabilisers are no narrower than this: one clip is not all that a person does."""
+
+_PERSON_SPAN = 2.4
+"""Metres along the tree between the two joints farthest apart, from toes to fingertips."""
+_LEAST_PERSON, _LARGEST_PERSON = 0.5, 1.6
+"""Shares of that span that still are a person's: from a small child to an outsize figure."""
+
+
+class Skeleton(NamedTuple):
+    """A tree that a file describes, hung on a root link of its own.
+
+    Attributes:
+        joints: The joints, parents first; the first entry is the root link `BASE`.
+        sticky: Rest value and deviation of the joints where the file's motion shows them.
+        notes: What was assumed, one line each.
+        places: The links that the file names, the joint of each standing at its link's origin.
+        has_root: Whether the file lets the whole body move freely.
+    """
+
+    joints: tuple[JointSpecification, ...]
+    sticky: dict[str, tuple[float, float]]
+    notes: tuple[str, ...]
+    places: tuple[str, ...]
+    has_root: bool
+
+
+def read_bvh_skeleton(path: Path, *, units: str | float | None = None) -> Skeleton:
+    """Read the skeleton of a BVH file.
+
+    Args:
+        path: The file.
+        units: Metres per unit, or a name of `UNITS`; None: guessed, for a person.
+
+    Raises:
+        MotionCaptureError: If the file is bad, or its unit cannot be guessed.
+    """
+    segments, values, _ = parse_bvh(path)
+    scale, unit_line = _metres(path, segments, units)
+    moves = np.ptp(values, axis=0) > 1e-6
+    has_motion = bool((moves & _is_angle(segments, len(moves))).any())
+    joints = [JointSpecification(name=BASE, link=BASE, parent=None)]
+    sticky: dict[str, tuple[float, float]] = {}
+    held: list[str] = []
+    for index, segment in enumerate(segments):
+        parent = BASE if index == 0 else segments[segment.parent].name
+        offset = scale * np.asarray(segment.offset)
+        for turn in segment.turns:
+            if not turn.is_rotation and index:
+                offset[turn.axis] = scale * values[0, turn.column]
+        turns = [turn for turn in segment.turns if turn.is_rotation] if index else []
+        locks = len({turn.axis for turn in turns}) == 3
+        for place, turn in enumerate(turns):
+            name = f"{segment.name}_{'xyz'[turn.axis]}"
+            last = place == len(turns) - 1
+            link = segment.name if last else f"{name}_link"
+            angles = values[:, turn.column]
+            joint = JointSpecification(
+                name=name, link=link, parent=parent, translation=as_vector(offset)
+            )
+            if has_motion and not moves[turn.column]:
+                held.append(name)
+                turned = as_rows(_turn(turn.axis, float(angles[0])))
+                joints.append(replace(joint, rotation=turned))
+            else:
+                lower, upper = _limits(angles, has_motion, locks and place == 1)
+                axis = as_vector(np.eye(3)[turn.axis])
+                joints.append(replace(joint, kind="revolute", axis=axis, lower=lower, upper=upper))
+                if has_motion:
+                    mean = float(angles.mean().clip(lower, upper))
+                    sticky[name] = (mean, max(float(angles.std()), _LEAST_DEVIATION))
+            parent, offset = link, np.zeros(3)
+        if not turns:
+            joints.append(
+                JointSpecification(
+                    name=f"{segment.name}_fixed",
+                    link=segment.name,
+                    parent=parent,
+                    translation=as_vector(offset if index else np.zeros(3)),
+                )
+            )
+    notes = (unit_line, _limits_line(len(values), has_motion, held))
+    names = tuple(segment.name for segment in segments)
+    return Skeleton(tuple(joints), sticky, notes, names, True)
+
+
+def guess_units(path: Path, span: float, stated: float | None) -> tuple[float, str]:
+    """Metres per unit of a motion capture file, and a line that says how that is known.
+
+    Args:
+        path: The file, for the message.
+        span: `skeleton_span`, in the file's unit.
+        stated: Metres per unit, if the file says so; taken if a person results.
+
+    Raises:
+        MotionCaptureError: If the skeleton is no person's in any unit.
+    """
+
+    def is_person(metres: float) -> bool:
+        return _LEAST_PERSON < span * metres / _PERSON_SPAN < _LARGEST_PERSON
+
+    if stated is not None and is_person(stated):
+        return stated, f"unit: {1000 * stated:.3f} mm, as the skeleton says"
+    if 0 < span < math.inf:
+        name = min(UNITS, key=lambda name: abs(math.log(span * UNITS[name] / _PERSON_SPAN)))
+        if is_person(UNITS[name]):
+            return UNITS[name], (
+                f"unit: {name} ({1000 * UNITS[name]:.3f} mm), guessed: the skeleton is then "
+                f"{span * UNITS[name]:.2f} m long from toes to fingertips"
+            )
+    raise MotionCaptureError(
+        f"{path}: the skeleton spans {span:.4g} units from end to end, which is no person's in any "
+        f"of {', '.join(UNITS)}; say the metres per unit"
+    )
+
+
+def skeleton_span(rest: Float[np.ndarray, "j 3"], segments: Sequence[Segment]) -> float:
+    """Greatest distance between two joints along the tree, whatever the pose."""
+    deepest = np.zeros(len(segments))
+    span = 0.0
+    for index in range(len(segments) - 1, 0, -1):
+        parent = segments[index].parent
+        reach = deepest[index] + float(np.linalg.norm(rest[index] - rest[parent]))
+        span = max(span, deepest[parent] + reach)
+        deepest[parent] = max(deepest[parent], reach)
+    return span
+
+
+def rest_positions(segments: Sequence[Segment]) -> Float[np.ndarray, "j 3"]:
+    """Joint positions in the zero pose, in the file's unit, root at the origin."""
+    rest = np.zeros((len(segments), 3))
+    for index, segment in enumerate(segments[1:], start=1):
+        rest[index] = rest[segment.parent] + segment.offset
+    return rest
+
+
+def _metres(
+    path: Path, segments: Sequence[Segment], units: str | float | None
+) -> tuple[float, str]:
+    if isinstance(units, str):
+        if units not in UNITS:
+            raise MotionCaptureError(
+                f"{path}: units: expected {', '.join(UNITS)} or metres per unit, got {units!r}"
+            )
+        units = UNITS[units]
+    if units is not None:
+        if not 0 < units < math.inf:
+            raise MotionCaptureError(f"{path}: units: expected positive metres, got {units}")
+        return units, f"unit: {1000 * units:.3f} mm, as given"
+    with np.errstate(all="ignore"):  # what overflows is no person's
+        span = skeleton_span(rest_positions(segments), segments)
+    return guess_units(path, span, None)
+
+
+def _is_angle(segments: Sequence[Segment], size: int) -> np.ndarray:
+    """Which columns turn a joint other than the root."""
+    turns: list[Turn] = [turn for segment in segments[1:] for turn in segment.turns]
+    is_angle = np.zeros(size, dtype=bool)
+    is_angle[[turn.column for turn in turns if turn.is_rotation]] = True
+    return is_angle
+
+
+def _limits(angles: np.ndarray, has_motion: bool, locks: bool) -> tuple[float, float]:
+    margin = MARGIN if has_motion else 2 * MARGIN
+    low, high = float(angles.min()), float(angles.max())
+    end = 0.5 * math.pi if locks else math.pi
+    return min(max(low - margin, -end), low), max(min(high + margin, end), high)
+
+
+def _limits_line(num_frames: int, has_motion: bool, held: Sequence[str]) -> str:
+    degrees = round(math.degrees(MARGIN))
+    if not has_motion:
+        return f"limits: a BVH has none, and this one no motion: {2 * degrees} degrees both ways"
+    line = (
+        f"limits: a BVH has none; each joint may turn {degrees} degrees beyond what it does in the "
+        f"{num_frames} frames of the file, whose mean and deviation are the stabilisers"
+    )
+    return line + (f"; {len(held)} that never move are held" if held else "")
+
+
+def _turn(axis: int, angle: float) -> Float[np.ndarray, "3 3"]:
+    """Rotation about one coordinate axis."""
+    matrix = np.eye(3)
+    j, k = (axis + 1) % 3, (axis + 2) % 3
+    matrix[j, j] = matrix[k, k] = math.cos(angle)
+    matrix[k, j], matrix[j, k] = math.sin(angle), -math.sin(angle)
+    return matrix

@@ -1,0 +1,246 @@
+"""The text of a BVH file: the segments of its skeleton, and the numbers that move them.
+
+What is not as it should be ends in a `MotionCaptureError` that names file and line: a damaged file
+never yields a motion. `torchcss.body.files.bvh` makes a body of what is parsed here, and
+`torchcss.io.motion.positions` positions.
+
+Call `parse_bvh`.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from torchcss.errors import MotionCaptureError
+from torchcss.files import Line, read_lines, shortened
+
+
+class Turn(NamedTuple):
+    """One number per frame that moves a segment: which column, and what it does."""
+
+    column: int
+    axis: int
+    is_rotation: bool
+
+
+class Segment(NamedTuple):
+    """A joint of the tree as both formats see it.
+
+    Attributes:
+        name: Its name.
+        parent: Position of its parent; -1 for the root.
+        offset: From its parent in the zero pose, in the file's unit.
+        axes: Its own axes in the zero pose.
+        turns: What moves it, leftmost factor first.
+        turns_itself: Its rotation turns `offset` too (Acclaim), or only what hangs on it (BVH).
+    """
+
+    name: str
+    parent: int
+    offset: tuple[float, float, float]
+    axes: Float[np.ndarray, "3 3"]
+    turns: tuple[Turn, ...]
+    turns_itself: bool
+
+
+# Numbers and places.
+
+
+def bad(path: Path, line: int, expected: str, found: object) -> MotionCaptureError:
+    """The error for a line that is not as it should be."""
+    return MotionCaptureError(
+        f"{path}: line {line}: expected {expected}, found {shortened(found)}; get a complete copy"
+    )
+
+
+def numbers(path: Path, line: int, words: Sequence[str], expected: str) -> list[float]:
+    """Finite numbers, as any program writes them (float() takes 1_000, too)."""
+    try:
+        values = [math.nan if "_" in word else float(word) for word in words]
+    except ValueError:
+        values = [math.nan]
+    if not all(math.isfinite(value) for value in values):
+        raise bad(path, line, expected, " ".join(words))
+    return values
+
+
+def count(path: Path, line: int, word: str, expected: str) -> int:
+    """A whole number of few digits: the interpreter refuses thousands of them in its own way."""
+    if not re.fullmatch(r"[0-9]{1,9}", word):
+        raise bad(path, line, expected, word)
+    return int(word)
+
+
+def axis_of(letter: str) -> int:
+    """Which axis a letter names; -1: none."""
+    return "xyz".find(letter.lower())
+
+
+# BVH.
+
+
+class _Words:
+    """The words of a hierarchy, one after the other."""
+
+    def __init__(self, path: Path, lines: Sequence[Line]) -> None:
+        self.path = path
+        self.words = [(line.number, word) for line in lines for word in line.words]
+        self.next = 0
+
+    @property
+    def line(self) -> int:
+        """Line of the next word, or of the last one."""
+        return self.words[min(self.next, len(self.words) - 1)][0]
+
+    def take(self, expected: str) -> str:
+        if self.next >= len(self.words):
+            raise bad(self.path, self.line, expected, "the end of the file")
+        self.next += 1
+        return self.words[self.next - 1][1]
+
+    def keyword(self, *wanted: str) -> str:
+        line = self.line
+        word = self.take(" or ".join(wanted))
+        if word.upper() not in wanted:
+            raise bad(self.path, line, " or ".join(wanted), word)
+        return word.upper()
+
+    def name(self) -> str:
+        """All words up to the brace: some programs write names with spaces."""
+        line, words = self.line, []
+        while (word := self.take("a name and {")) != "{":
+            words.append(word)
+        if not words:
+            raise bad(self.path, line, "a name", "{")
+        return " ".join(words)
+
+    def offset(self) -> tuple[float, float, float]:
+        self.keyword("OFFSET")
+        line = self.line
+        words = [self.take("three numbers") for _ in range(3)]
+        x, y, z = numbers(self.path, line, words, "three numbers")
+        return x, y, z
+
+
+_CHANNEL = re.compile(r"([XYZ])(POSITION|ROTATION)", re.IGNORECASE)
+
+
+def parse_bvh(path: Path) -> tuple[list[Segment], Float[np.ndarray, "t c"], float]:
+    """Segments, their numbers frame by frame (angles in radians), and frames per second.
+
+    Raises:
+        MotionCaptureError: For any bad file.
+    """
+    lines = read_lines(path, MotionCaptureError)
+    if lines[0].words[0].upper() != "HIERARCHY":
+        raise bad(path, lines[0].number, "HIERARCHY, as every BVH begins", lines[0].words[0])
+    firsts = [line.words[0].upper() for line in lines]
+    motion = firsts.index("MOTION") if "MOTION" in firsts else len(lines) - 1
+    words = _Words(path, lines[: motion + 1])
+    words.keyword("HIERARCHY")
+    segments: list[Segment] = []
+    names: set[str] = set()
+    stack: list[int] = []
+    columns: list[bool] = []  # whether it is an angle
+    allowed: tuple[str, ...] = ("ROOT",)
+    while True:
+        line = words.line
+        kind = words.keyword(*allowed)
+        if kind == "MOTION":
+            break
+        if kind == "}":
+            stack.pop()
+            allowed = ("JOINT", "END", "}") if stack else ("MOTION",)
+            continue
+        parent = stack[-1] if stack else -1
+        if kind == "END":
+            words.keyword("SITE")
+            words.keyword("{")
+            name = f"{segments[parent].name}_end"
+            name = f"{name}{len(segments)}" if name in names else name
+            names.add(name)
+            segments.append(Segment(name, parent, words.offset(), np.eye(3), (), False))
+            words.keyword("}")
+            continue
+        name = words.name()
+        if name in names:
+            raise bad(path, line, "a name of its own for every joint", name)
+        names.add(name)
+        offset = words.offset()
+        turns = _channels(words, len(columns))
+        columns += [turn.is_rotation for turn in turns]
+        segments.append(Segment(name, parent, offset, np.eye(3), turns, False))
+        stack.append(len(segments) - 1)
+        allowed = ("JOINT", "END", "}")
+    values, rate = _bvh_frames(path, lines[motion:], np.array(columns, dtype=bool))
+    return segments, values, rate
+
+
+def _channels(words: _Words, first_column: int) -> tuple[Turn, ...]:
+    words.keyword("CHANNELS")
+    line = words.line
+    number = count(words.path, line, words.take("a number of channels"), "a number of channels")
+    turns: list[Turn] = []
+    for column in range(first_column, first_column + min(number, 7)):
+        word = words.take("a channel")
+        match = _CHANNEL.fullmatch(word)
+        if match is None:
+            raise bad(words.path, line, "Xposition, ..., Zrotation", word)
+        turn = Turn(column, axis_of(match[1]), match[2].lower() == "rotation")
+        if any(turn[1:] == other[1:] for other in turns):
+            raise bad(words.path, line, "every channel once", word)
+        turns.append(turn)
+    return tuple(turns)
+
+
+def _bvh_frames(
+    path: Path, lines: list[Line], is_angle: np.ndarray
+) -> tuple[Float[np.ndarray, "t c"], float]:
+    """From MOTION on: the rows of numbers, angles in radians, and the frame rate."""
+    if len(lines) < 3:
+        raise bad(path, lines[0].number, "Frames: and Frame Time: after it", "the end of the file")
+    (first, head), (second, time), rows = lines[1], lines[2], lines[3:]
+    title = " ".join(head).split(":")
+    if len(title) != 2 or title[0].strip().lower() != "frames":
+        raise bad(path, first, "Frames: and a number", " ".join(head))
+    number = count(path, first, title[1].strip(), "a number of frames")
+    title = " ".join(time).split(":")
+    if len(title) != 2 or title[0].strip().lower() != "frame time":
+        raise bad(path, second, "Frame Time: and seconds", " ".join(time))
+    digits = title[1].strip()
+    (interval,) = numbers(path, second, [digits], "the seconds of a frame")
+    if not 1e-6 < interval < 1e3:
+        raise bad(path, second, "the seconds of a frame", digits)
+    if number != len(rows):
+        last = rows[-1].number if rows else second
+        raise bad(path, last, f"{number} frames, as Frames: says", f"{len(rows)} lines of numbers")
+    if not number:
+        raise bad(path, first, "at least one frame", "none")
+    return _table(path, rows, is_angle), _rate(interval, digits)
+
+
+def _rate(interval: float, digits: str) -> float:
+    """Frames per second; a whole number where the digits written cannot tell it from one."""
+    _, _, decimals = digits.partition(".")
+    known_to = 0.5 * 10.0 ** -len(decimals) if decimals.isdigit() else 0.0
+    whole = round(1 / interval)
+    if whole and abs(1 / whole - interval) <= known_to * (1 + 1e-9):
+        return float(whole)
+    return 1 / interval
+
+
+def _table(path: Path, rows: Sequence[Line], is_angle: np.ndarray) -> np.ndarray:
+    """Rows of numbers, angles from degrees to radians."""
+    values = np.empty((len(rows), len(is_angle)))
+    for out, (line, row) in zip(values, rows, strict=True):
+        if len(row) != len(is_angle):
+            raise bad(path, line, f"{len(is_angle)} numbers, one for every channel", len(row))
+        out[:] = numbers(path, line, row, "numbers")
+    return np.where(is_angle, np.radians(values), values)

@@ -1,0 +1,252 @@
+"""Bodies that are not in the catalogue: any URDF, MJCF or BVH file, with flesh and a root.
+
+| file | tree and limits | flesh |
+|---|---|---|
+| `.urdf` | the file's | its boxes, cylinders, spheres; along the bones where a link has none |
+| `.xml` | MJCF's, or URDF's if the file is one | its solids; along the bones likewise |
+| `.bvh` | the file's; limits from its motion (`torchcss.body.files.bvh`) | along the bones |
+
+A free root is Y up and faces +Z, as in the catalogue; robot files, Z up and facing +X, hang on it
+turned accordingly, by their root link. A fixed body stands in the frame of its file.
+
+Joints that have a name of ours (`torchcss.joint_names.skeleton_joint_names`) are landmarks under
+that name, the others under the file's; the middle of the hips is one if one link carries both.
+
+Call `read_skeleton`; `torchcss.load_body` does.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+
+from torchcss.body.catalog import (
+    BODY_NAMES,
+    BodySpecification,
+    MarkerSpecification,
+    PartSpecification,
+    root_joints,
+    scaled,
+    specification,
+)
+from torchcss.body.files.bvh import Skeleton, read_bvh_skeleton
+from torchcss.body.files.default_shape import as_vector, bone_parts, rest_poses, touching_parts
+from torchcss.body.files.mjcf import read_mjcf
+from torchcss.body.files.urdf import read_urdf_solids
+from torchcss.body.kinematics import JointSpecification, KinematicTree
+from torchcss.body.model import BodyModel
+from torchcss.errors import BodyError, MotionCaptureError
+from torchcss.files import one_line, read_bytes
+from torchcss.joint_names import skeleton_joint_names
+
+Flesh = Literal["file", "bones", "none"]
+"""Flesh of a body from a file: the file's solids and the bones of links without; the bones of all
+links; none."""
+
+BODY_SUFFIXES = (".urdf", ".xml", ".mjcf", ".bvh")
+
+_AS_IT_IS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+_Y_UP = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
+"""Robots are Z up and face +X: to Y up, facing +Z."""
+
+
+def read_skeleton(
+    path: Path,
+    *,
+    flesh: Flesh = "file",
+    free_root: bool | None = None,
+    scale: float = 1.0,
+    units: str | float | None = None,
+) -> BodySpecification:
+    """Read a body from a file.
+
+    Args:
+        path: A URDF, MJCF or BVH file.
+        flesh: Where its parts come from.
+        free_root: Give the body six root parameters; None: if the file lets it move freely (BVH,
+            MJCF with a free joint).
+        scale: Factor on all lengths.
+        units: Metres per unit of a BVH, or a name of `torchcss.body.files.bvh.UNITS`; None:
+            guessed.
+
+    Raises:
+        BodyError: If the file is missing, damaged or of another format, or its tree cannot be used.
+    """
+    if flesh not in ("file", "bones", "none"):
+        raise BodyError(f"flesh: expected file, bones or none, got {flesh!r}")
+    if not 0 < scale < np.inf:
+        raise BodyError(f"scale must be positive and finite, got {scale}")
+    skeleton, solids, turn = _read(path, units)
+    rooted = skeleton.has_root if free_root is None else free_root
+    if rooted:
+        root, base = root_joints(), skeleton.joints[0]
+        # The root moves the first body that the file names, wherever the file puts that.
+        start = rest_poses(skeleton.joints)[skeleton.places[0]][:3, 3]
+        base = replace(
+            base,
+            parent=root[-1].link,
+            rotation=turn,
+            translation=as_vector(-np.array(turn) @ start),
+        )
+        skeleton = skeleton._replace(joints=(*root, base, *skeleton.joints[1:]))
+    joints = skeleton.joints
+    known = skeleton_joint_names(skeleton.places)
+    landmarks = {
+        link: name for link, name in zip(skeleton.places, known, strict=True) if name is not None
+    }
+    parts = solids if flesh == "file" else ()
+    if flesh != "none":
+        # The world is no bone, nor is what carries the body in it or lies between its joints.
+        bare = {joint.link for joint in joints} - set(skeleton.places)
+        fleshy = frozenset(part.link for part in parts) | bare
+        for part in bone_parts(joints, landmarks, skip=fleshy):
+            name, taken = part.name, {other.name for other in parts}
+            while name in taken:
+                name += "_bone"
+            parts += (replace(part, name=name),)
+    markers = [
+        MarkerSpecification(name=landmarks.get(link, link), link=link) for link in skeleton.places
+    ]
+    return scaled(
+        BodySpecification(
+            name=str(path),
+            joints=joints,
+            parts=parts,
+            markers=(*_middle_of_hips(joints, landmarks), *markers),
+            ties={},
+            sticky=skeleton.sticky,
+            neighbours=touching_parts(joints, parts),
+            lengths={},
+            notes=tuple(f"{path.name}: {note}" for note in skeleton.notes),
+        ),
+        scale,
+    )
+
+
+def _read(
+    path: Path, units: str | float | None
+) -> tuple[Skeleton, tuple[PartSpecification, ...], tuple[tuple[float, ...], ...]]:
+    """Tree, solids, and how the file's frame hangs on a root that is Y up."""
+    if path.suffix.lower() == ".bvh":
+        try:
+            skeleton = read_bvh_skeleton(path, units=units)
+        except MotionCaptureError as error:
+            raise BodyError(str(error)) from error
+        return skeleton, (), _AS_IT_IS
+    if units is not None:
+        raise BodyError(f"{path}: units are for BVH files; this format is in metres (see scale)")
+    data = read_bytes(path, BodyError)
+    if path.suffix.lower() != ".urdf" and _root_tag(data) in ("mujoco", "mujocoinclude"):
+        return *read_mjcf(path), _Y_UP
+    tree = KinematicTree.from_urdf(path)
+    skeleton = Skeleton(
+        tree.specifications, {}, ("limits, axes and solids: as the URDF says",), tree.link_names,
+        False,
+    )  # fmt: skip
+    return skeleton, read_urdf_solids(path, data), _Y_UP
+
+
+def _root_tag(data: bytes) -> str:
+    try:
+        return ElementTree.fromstring(data).tag
+    except (ElementTree.ParseError, ValueError, LookupError):
+        return ""  # reading it as a URDF says what is wrong
+
+
+def _middle_of_hips(
+    joints: tuple[JointSpecification, ...], landmarks: dict[str, str]
+) -> list[MarkerSpecification]:
+    """The landmark `HumanoidRoot`, if both hips sit at fixed places of one link."""
+    link_of = {name: link for link, name in landmarks.items()}
+    if not {"l_hip", "r_hip"} <= set(link_of) or "HumanoidRoot" in link_of:
+        return []
+    by_link = {joint.link: joint for joint in joints}
+
+    def carriers(link: str) -> list[str]:
+        """Links that the hip joint's place is fixed in, the nearest first."""
+        place, found = poses[link][:3, 3], []
+        while (parent := by_link[link].parent) is not None:
+            found.append(parent)
+            joint = by_link[parent]
+            if joint.kind != "fixed" and np.linalg.norm(poses[parent][:3, 3] - place) > 1e-6:
+                break  # it moves the place
+            link = parent
+        return found
+
+    poses = rest_poses(joints)
+    right = carriers(link_of["r_hip"])
+    common = next((link for link in carriers(link_of["l_hip"]) if link in right), None)
+    if common is None:
+        return []
+    middle = 0.5 * (poses[link_of["l_hip"]] + poses[link_of["r_hip"]])[:3, 3] - poses[common][:3, 3]
+    x, y, z = (poses[common][:3, :3].T @ middle).tolist()
+    return [MarkerSpecification(name="HumanoidRoot", link=common, translation=(x, y, z))]
+
+
+def load_body(
+    name_or_path: str | Path,
+    *,
+    dtype: torch.dtype = torch.float64,
+    device: torch.device | str = "cpu",
+    lengths: Mapping[str, float] | None = None,
+    scale: float = 1.0,
+    free_proportions: bool = False,
+    free_root: bool | None = None,
+    flesh: Flesh = "file",
+    units: str | float | None = None,
+    rings: int = 8,
+    meridians: int = 12,
+) -> BodyModel:
+    """Make a body: one that ships, or that of a URDF, MJCF or BVH file.
+
+    Args:
+        name_or_path: "arm7", "arm8", "body30", "body32", "body34", or the path of a file.
+        dtype: Floating type.
+        device: Where its tensors live.
+        lengths: Lengths that differ from the standard humanoid's, metres; not for files.
+        scale: Overall scale of the standard humanoid (stature 1.75 m), or of the file.
+        free_proportions: Make the lengths parameters too (for fitting). The lengths of a file stay
+            as they are.
+        free_root: Six root parameters or none; by default bodies have them and arms do not, and
+            bodies from files if the file lets them move freely.
+        flesh: Flesh of a body from a file: "file" for the solids that it describes, and along the
+            bones of links without; "bones" for all bones; "none".
+        units: Metres per unit of a BVH, or "m", "cm", "mm", "inch", "cmu"; by default guessed.
+        rings: Latitudes of the mesh of each part.
+        meridians: Longitudes of the mesh of each part.
+
+    Raises:
+        BodyError: If there is no such body, or the file cannot be used.
+    """
+    path = Path(name_or_path)
+    if str(name_or_path) in BODY_NAMES:
+        body = specification(
+            str(name_or_path),
+            lengths=lengths,
+            scale=scale,
+            free_proportions=free_proportions,
+            free_root=free_root,
+        )
+    elif path.suffix.lower() in BODY_SUFFIXES:
+        if lengths:
+            raise BodyError(f"{path}: a body from a file has its own lengths; use scale")
+        try:
+            body = read_skeleton(path, flesh=flesh, free_root=free_root, scale=scale, units=units)
+        except RecursionError as error:
+            raise BodyError(f"{path}: links hundreds deep; expected a body or a robot") from error
+    else:
+        raise BodyError(
+            f"no body {str(name_or_path)!r}; expected one of {', '.join(BODY_NAMES)} or the path "
+            f"of a file that ends in {', '.join(BODY_SUFFIXES)}"
+        )
+    try:
+        model = BodyModel(body, rings=rings, meridians=meridians)
+    except (BodyError, RecursionError) as error:  # a tree that cannot be: only a file has one
+        raise BodyError(f"{path}: {one_line(error)}") from error
+    return model.to(dtype=dtype, device=device)

@@ -1,0 +1,259 @@
+"""Read and write whole files, one typed error."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from torchcss.errors import OutputError, TorchcssError
+
+_ADVICE = {
+    errno.ENOSPC: "the disk is full; free some space or choose another folder with --out",
+    errno.EDQUOT: "your disk quota is used up; free some space or choose another folder with --out",
+    errno.EFBIG: "the file is larger than this system allows; choose another folder with --out",
+    errno.EACCES: "you may not write here; choose another folder with --out",
+    errno.EPERM: "you may not write here; choose another folder with --out",
+    errno.EROFS: "the file system is read-only; choose another folder with --out",
+    errno.ENOTDIR: "part of the path is a file, not a folder; choose another folder with --out",
+    errno.EEXIST: "a file is in the way; move it or choose another folder with --out",
+    errno.EISDIR: "a folder is in the way; move it or choose another folder with --out",
+    errno.ENAMETOOLONG: "the name is too long; choose a shorter one",
+}
+
+
+def output_error(path: Path, error: OSError) -> OutputError:
+    """Return the `OutputError` that tells a user why `path` could not be written.
+
+    Args:
+        path: The file or folder that was wanted.
+        error: What the operating system, or FFmpeg on its behalf, reported.
+    """
+    advice = _ADVICE.get(
+        error.errno or 0, f"{error.strerror or error}; choose another folder with --out"
+    )
+    return OutputError(f"{path}: cannot be written: {advice}")
+
+
+@contextmanager
+def replace_file(path: Path) -> Iterator[Path]:
+    """Give a temporary name in the folder of `path`; move it to `path` if the body succeeds.
+
+    The temporary name has the same suffix, so that a writer that chooses its format by the suffix
+    is not misled. If the body fails, the temporary file goes and `path` stays as it was.
+
+    Args:
+        path: The final name.
+
+    Yields:
+        The name to write to; the body must close the file.
+
+    Raises:
+        OutputError: If the operating system refuses.
+    """
+    partial = temporary_name(path)
+    try:
+        yield partial
+        with partial.open("rb+") as stream:
+            os.fsync(stream.fileno())
+        os.replace(partial, path)
+    except OutputError:
+        raise
+    except OSError as error:
+        raise output_error(path, error) from error
+    finally:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
+
+
+def temporary_name(path: Path) -> Path:
+    """Return the name beside `path` under which this process writes before it moves the file."""
+    return path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+
+
+def prepare_output_folder(path: str | os.PathLike[str]) -> Path:
+    """Create an output folder and make sure that it can be written, before any work is done.
+
+    Args:
+        path: The folder; missing parents are created.
+
+    Returns:
+        The folder as a `Path`.
+
+    Raises:
+        OutputError: If it cannot be created, is a file, or does not let a file be written.
+    """
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        # Permissions alone do not tell: read-only mounts and quotas show when a file is written.
+        with tempfile.NamedTemporaryFile(dir=folder, prefix=".torchcss-") as probe:
+            probe.write(b"\0" * 4096)
+            probe.flush()
+    except OSError as error:
+        raise output_error(folder, error) from error
+    except ValueError as error:  # a null character in the name
+        raise OutputError(f"{str(path)!r}: not a folder name: {error}") from error
+    return folder
+
+
+class Line(NamedTuple):
+    """A line that is not empty, and where it stands.
+
+    Attributes:
+        number: From 1.
+        words: What spaces separate.
+    """
+
+    number: int
+    words: list[str]
+
+
+def read_bytes(path: Path, error_class: type[TorchcssError], size: int = -1) -> bytes:
+    """The content of a file, or its first `size` bytes.
+
+    Raises:
+        error_class: If the file is missing, empty, a folder or cannot be read.
+    """
+    try:
+        if path.is_dir():
+            raise error_class(f"{path}: expected a file, found a folder")
+        with path.open("rb") as stream:
+            data = stream.read(size)
+    except FileNotFoundError as error:
+        raise error_class(f"{path}: there is no such file; check the path") from error
+    except (OSError, ValueError) as error:  # ValueError: a null character in the name
+        if isinstance(error, error_class):
+            raise
+        raise error_class(f"{str(path)!r}: cannot be read: {one_line(error)}") from error
+    if not data:
+        raise error_class(f"{path}: the file is empty")
+    return data
+
+
+def read_text(path: Path, error_class: type[TorchcssError]) -> str:
+    """The content of a text file in UTF-8, with or without the mark that Windows puts first.
+
+    Raises:
+        error_class: As `read_bytes`, or if it is no such text; the message names the line.
+    """
+    data = read_bytes(path, error_class)
+    bad = data.find(b"\0")
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        bad, text = error.start, ""
+    if bad >= 0:
+        line = data.count(b"\n", 0, bad) + 1
+        raise error_class(f"{path}: line {line}: not text in UTF-8; save the file in that encoding")
+    return text
+
+
+def read_lines(path: Path, error_class: type[TorchcssError]) -> list[Line]:
+    """The lines of a text file that hold anything, in words.
+
+    Raises:
+        error_class: As `read_text`, or if there is no such line.
+    """
+    text = read_text(path, error_class)
+    # Not splitlines: it breaks at signs that editors do not count as lines.
+    rows = enumerate(text.replace("\r\n", "\n").replace("\r", "\n").split("\n"), start=1)
+    lines = [Line(number, words) for number, row in rows if (words := row.split())]
+    if not lines:
+        raise error_class(f"{path}: the file is empty")
+    return lines
+
+
+def one_line(error: BaseException) -> str:
+    """What an exception says, in one short line."""
+    return " ".join(str(error).split())[:120] or type(error).__name__
+
+
+def shortened(value: object) -> str:
+    """A piece of a file for a message, in one short line."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+__all__ = ["load_array", "load_arrays", "load_json", "one_line", "real_numbers", "shortened"]
+
+
+def load_json(path: Path, error_class: type[TorchcssError]) -> Any:
+    """Return the content of a JSON file.
+
+    Raises:
+        error_class: If the file is missing, empty, unreadable or not JSON.
+    """
+    data = read_bytes(path, error_class)
+    try:
+        return json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise error_class(f"{path}: not a JSON file: {one_line(error)}") from error
+
+
+def load_arrays(path: Path, error_class: type[TorchcssError]) -> Mapping[str, np.ndarray]:
+    """Return all arrays of an NPZ file, in memory.
+
+    Raises:
+        error_class: If the file is missing, damaged, no NPZ file, or holds pickled objects.
+    """
+    if not read_bytes(path, error_class, 4).startswith(b"PK"):
+        raise error_class(f"{path}: not an NPZ file; expected what numpy.savez writes")
+    try:
+        # The stream is ours: NumPy does not close its own where the archive turns out damaged.
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except Exception as error:  # zipfile, zlib and NumPy raise a dozen kinds for damaged archives
+        reason = (
+            "it holds pickled objects, which could run a programme; save plain arrays"
+            if "pickle" in str(error)
+            else f"{one_line(error)}; get a complete copy"
+        )
+        raise error_class(f"{path}: cannot be read as an NPZ file: {reason}") from error
+
+
+def load_array(path: Path, error_class: type[TorchcssError]) -> np.ndarray:
+    """Return the array of an NPY file.
+
+    Raises:
+        error_class: If the file is missing, damaged, no NPY file, or holds pickled objects.
+    """
+    if not read_bytes(path, error_class, 6).startswith(b"\x93NUMPY"):
+        raise error_class(f"{path}: not an NPY file; expected what numpy.save writes")
+    try:
+        with path.open("rb") as stream:
+            return np.load(stream, allow_pickle=False)
+    except Exception as error:  # what a damaged header leads to
+        raise error_class(f"{path}: cannot be read as an NPY file: {one_line(error)}") from error
+
+
+def real_numbers(value: object, where: str, error_class: type[TorchcssError]) -> np.ndarray:
+    """Return nested lists of numbers as a float64 array.
+
+    Args:
+        value: What JSON or TOML gave.
+        where: The place in the file, for the message.
+        error_class: What to raise.
+
+    Raises:
+        error_class: If it is ragged or holds anything but numbers.
+    """
+    try:
+        if _only_numbers(value):
+            return np.asarray(value, dtype=np.float64)
+    except (ValueError, TypeError, OverflowError, RecursionError):
+        pass  # ragged, beyond the range of float64, or nested without end
+    raise error_class(f"{where}: expected numbers, found {shortened(value)}")
+
+
+def _only_numbers(value: object) -> bool:
+    if isinstance(value, list):
+        return all(_only_numbers(entry) for entry in value)
+    return isinstance(value, (int, float)) and not isinstance(value, bool)

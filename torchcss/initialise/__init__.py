@@ -1,0 +1,1 @@
+"""From joints in one image to hypotheses of the first pose."""

@@ -1,0 +1,342 @@
+"""All the poses that explain the joints of one image: the many starts of the first stage.
+
+One image of joint centres has thousands of interpretations (section 7 [IJRR]). They are found from
+many starts in three batches, every descent bound by the joint limits:
+
+1. *Around the vertical.* Poses about the stabilisers' rest, turned through the full circle, descend
+   with the scale of the keypoints widened 16 times and then 4 times: nearly every start arrives,
+   where at the true scale most of them would treat half of the joints as outliers and stay.
+2. *Flips.* For the best few trunks, the trunk, the line of the hips and that of the shoulders lean
+   the other way in all combinations, and the segments of every limb do in theirs (Lee and Chen
+   1985; `torchcss.body.flips`). The angles that put the joints there are solved for in 3D. Limbs
+   hang on the trunk separately, so that their costs add: 4 descents per trunk tell the cost of all
+   4^4 combinations of limbs, of which the best are kept.
+3. *Covariance-scaled samples* of the best fits so far, as the tracker draws them.
+
+All of these descend once more, at four times and at the true scale of the keypoints.
+
+Call `find_interpretations`.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchcss.body.catalog import PROPORTIONS
+from torchcss.body.flips import Segments
+from torchcss.body.model import BodyModel
+from torchcss.body.root import ROOT_NAMES, has_root
+from torchcss.cost.anthropometric import proportion_columns
+from torchcss.cost.stabiliser import Stabiliser
+from torchcss.cost.total import TrackingCost
+from torchcss.errors import ConfigurationError
+from torchcss.inference.mixture import GaussianMixture, distinct_modes
+from torchcss.inference.proposals import CovarianceScaled
+from torchcss.inference.trust_region import TrustRegionNewton
+from torchcss.types import Bounds, LocalModel, Modes, PointCost
+
+_WIDE, _MIDDLE = 16.0, 4.0
+"""Factors on the keypoints' scale: a random start is off by some hundred pixels, of which the
+robust potential pulls those within three scales."""
+
+_SAME_TRUNK = 0.06
+"""Mean distance of the trunk's joints, metres, below which two trunks are one interpretation."""
+
+_SAME_ANGLE = 0.05
+"""Radians within which two flips of a limb are one: limits or the sight line closed the other."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Search:
+    """How widely interpretations are looked for.
+
+    Attributes:
+        num_starts: Starting poses around the vertical.
+        num_trunks: Distinct trunks whose flips are enumerated.
+        num_flips: Most combinations of flips to descend from; 0 for none.
+        num_samples: Covariance-scaled samples to descend from.
+        covariance_scale: Factor on their covariance.
+        limits: Hold the joint limits (False only for comparison).
+        anneal: Widen the keypoints' scale at first (False only for comparison).
+        leave_out: Leave marks out that fit no pose (False only for comparison); see
+            `torchcss.initialise.outliers`.
+        max_steps: Iterations of the last descent.
+        proportions: Which lengths are fitted, all by default; the others stay the standard
+            humanoid's.
+    """
+
+    num_starts: int = 64
+    num_trunks: int = 6
+    num_flips: int = 192
+    num_samples: int = 64
+    covariance_scale: float = 8.0
+    limits: bool = True
+    anneal: bool = True
+    leave_out: bool = True
+    max_steps: int = 40
+    proportions: tuple[str, ...] = PROPORTIONS
+
+    def __post_init__(self) -> None:
+        for name, least in (("num_starts", 1), ("num_trunks", 1), ("num_flips", 0),
+                            ("num_samples", 0), ("max_steps", 1)):  # fmt: skip
+            if getattr(self, name) < least:
+                raise ConfigurationError(
+                    f"Search.{name}: expected at least {least}, got {getattr(self, name)}"
+                )
+        if unknown := sorted(set(self.proportions) - set(PROPORTIONS)):
+            raise ConfigurationError(
+                f"Search.proportions: unknown {', '.join(unknown)}; there are "
+                f"{', '.join(PROPORTIONS)}"
+            )
+
+    def bounds(self, body: BodyModel) -> Bounds:
+        """The joint limits; only the lengths' without `limits`."""
+        columns = proportion_columns(body)
+        lower, upper = body.lower.clone(), body.upper.clone()
+        if not self.limits:
+            angle = torch.ones_like(lower, dtype=torch.bool)
+            angle[list(columns.values())] = False
+            lower[angle], upper[angle] = -math.inf, math.inf
+        held = [column for name, column in columns.items() if name not in self.proportions]
+        lower[held] = upper[held] = 0.0
+        return Bounds(lower, upper)
+
+
+PAPER_PROPORTIONS = ("hip_width", "shoulder_width", "neck", "head")
+"""The papers' eight internal proportions, which place hips, clavicles and the tip of the skull;
+left and right are one here."""
+
+SINGLE_START = Search(
+    num_starts=1, num_flips=0, num_samples=0, anneal=False, leave_out=False, max_steps=100
+)
+"""One descent from the rest pose: what a local fit without search does."""
+
+
+def find_interpretations(
+    cost: TrackingCost, *, search: Search, generator: torch.Generator
+) -> Modes:
+    """Descend from many starts to the minima of a cost of keypoints.
+
+    Args:
+        cost: Keypoints and priors of one image; its body hangs before the camera.
+        search: How widely to look.
+        generator: Source of the starts.
+
+    Returns:
+        The ends of all descents, in no order and with duplicates (see `distinct_modes`).
+    """
+    body = cost.body
+    bounds = search.bounds(body)
+    fits = descend(
+        cost, _starts(body, search.num_starts, generator), bounds,
+        ((_WIDE, 12), (_MIDDLE, 12)) if search.anneal else (),
+    )  # fmt: skip
+    starts = [fits]
+    if search.num_flips and (segments := Segments(body)).limbs:
+        trunks = _distinct_trunks(cost, segments, fits, search.num_trunks)
+        starts.append(flips(cost, segments, trunks, bounds, search.num_flips))
+    if search.num_samples or search.anneal:
+        modes = _optimise(_widened(cost, _MIDDLE), fits, bounds, 2)
+        keep = distinct_modes(modes.mean, modes.covariance, modes.cost)[:16]
+        starts[0] = modes.mean[keep]
+        if search.num_samples and len(keep):
+            # Weights flattened, so that samples do not all go to one of many near-equal fits.
+            mixture = GaussianMixture(
+                modes.mean[keep], modes.covariance[keep], -0.25 * modes.cost[keep]
+            )
+            proposal = CovarianceScaled(covariance_scale=search.covariance_scale)
+            samples = proposal.sample(mixture, search.num_samples, bounds, generator=generator)
+            starts.append(samples.x)
+    x = descend(cost, torch.cat(starts), bounds, ((_MIDDLE, 10),) if search.anneal else ())
+    return _optimise(cost, x, bounds, search.max_steps)
+
+
+def _optimise(cost: TrackingCost, x: Tensor, bounds: Bounds, steps: int) -> Modes:
+    return TrustRegionNewton(max_steps=steps, tolerance=1e-2).minimise(cost, x, bounds)
+
+
+def descend(
+    cost: TrackingCost, x: Tensor, bounds: Bounds, schedule: tuple[tuple[float, int], ...]
+) -> Tensor:
+    """Descend with the keypoints' scale widened by each factor in turn.
+
+    Args:
+        cost: The joints' cost.
+        x: Where to start.
+        bounds: Box limits.
+        schedule: Factors on the scale, and the most steps with each.
+    """
+    for factor, steps in schedule:
+        x = _optimise(_widened(cost, factor), x, bounds, steps).mean
+    return x
+
+
+def _widened(cost: TrackingCost, factor: float) -> TrackingCost:
+    joints = cost.choice.joints
+    assert joints is not None
+    wide = replace(joints, sigma=factor * joints.sigma)
+    return replace(cost, choice=replace(cost.choice, joints=wide))
+
+
+def _starts(body: BodyModel, num: int, generator: torch.Generator) -> Float[Tensor, "b n"]:
+    """Poses all around the vertical, spread about the stabilisers' rest; the first at rest."""
+    size = (num, body.num_parameters)
+    noise = torch.randn(size, generator=generator, dtype=torch.float64).to(body.tie)
+    noise[0] = 0.0
+    spread = torch.where(body.sticky_deviation.isfinite(), body.sticky_deviation, 0.3)
+    x = body.sticky_mean + 0.6 * spread * noise
+    if has_root(body):
+        columns = [body.state_index(name) for name in ROOT_NAMES]
+        x[:, columns] = 0.1 * noise[:, columns]
+        turn = torch.arange(num, device=x.device).to(x) * (2 * math.pi / num)
+        x[:, body.state_index("root_yaw")] = torch.remainder(turn + math.pi, 2 * math.pi) - math.pi
+    return body.bounds.project(x)
+
+
+def _distinct_trunks(
+    cost: TrackingCost, segments: Segments, x: Float[Tensor, "b n"], num: int
+) -> Float[Tensor, "m n"]:
+    """The best fits whose trunks differ."""
+    value = _widened(cost, _MIDDLE).value(x).nan_to_num(math.inf)
+    order = value.argsort(stable=True)
+    limb = {group for each in segments.limbs for group in each.groups}
+    trunk = [j for j, name in enumerate(cost.body.joint_names) if name not in limb]
+    joints = cost.body.pose(x).joints[:, trunk]
+    kept: list[int] = []
+    for item in order.tolist():
+        apart = (joints[kept] - joints[item]).norm(dim=-1).mean(-1)
+        if bool((apart > _SAME_TRUNK).all()):
+            kept.append(item)
+        if len(kept) == num:
+            break
+    return x[kept]
+
+
+def flips(
+    cost: TrackingCost,
+    segments: Segments,
+    x: Float[Tensor, "m n"],
+    bounds: Bounds,
+    num: int,
+) -> Float[Tensor, "s n"]:
+    """The best combinations of forward-backward flips of some poses, their angles solved for.
+
+    Args:
+        cost: The joints' cost.
+        segments: The limbs and the trunk's parts that lean one way or the other.
+        x: The poses.
+        bounds: Box limits.
+        num: How many states to return, at the most.
+    """
+    body, device = cost.body, x.device
+    trunk = [g for g in segments.trunk if g != "head"]
+    # The hand of a body moves with its forearm; that of an arm has joints of its own.
+    depth = 2 if len(segments.limbs) > 1 else 3
+    ways = [_all_ways(len(trunk), device), _all_ways(depth, device)]
+    flipped = torch.zeros(
+        len(ways[0]), len(ways[1]), len(segments.groups), dtype=torch.bool, device=device
+    )
+    for bit, group in enumerate(trunk):
+        flipped[:, :, segments.groups.index(group)] = ways[0][:, None, bit]
+    for limb in segments.limbs:
+        for bit, group in enumerate(limb.groups[:depth]):
+            flipped[:, :, segments.groups.index(group)] = ways[1][None, :, bit]
+    shape = (len(x), *flipped.shape[:2])
+    joints = body.pose(x).joints[:, None, None].expand(*shape, -1, 3)
+    target = segments.flip(joints, flipped.expand(*shape, -1), cost.camera.centre_world)
+    reach = Reach(body=body, index=segments.joint, target=target.flatten(0, 2))
+    start = x[:, None, None].expand(*shape, -1).flatten(0, 2)
+    solved = TrustRegionNewton(max_steps=15, tolerance=0.1).minimise(reach, start, bounds)
+    return _best_combinations(
+        _widened(cost, 1.5 * _MIDDLE), segments, solved.mean.unflatten(0, (-1, len(ways[1]))), num
+    )
+
+
+def _all_ways(bits: int, device: torch.device) -> Tensor:
+    rows = list(itertools.product((False, True), repeat=bits))
+    return torch.tensor(rows, dtype=torch.bool, device=device).reshape(len(rows), bits)
+
+
+def _best_combinations(
+    cost: TrackingCost, segments: Segments, x: Float[Tensor, "t w n"], num: int
+) -> Float[Tensor, "s n"]:
+    """Combine the ways of all limbs, each limb's cost added to its trunk's; keep the best.
+
+    Args:
+        cost: By which poses are judged.
+        segments: The segments of its body.
+        x: Poses: `t` trunks, each with its limbs in `w` ways.
+        num: How many combinations to keep.
+    """
+    num_trunks, num_ways, _ = x.shape
+    base = cost.value(x[:, 0])
+    extra = x.new_zeros(num_trunks, len(segments.limbs), num_ways)
+    for number, limb in enumerate(segments.limbs):
+        angles = x[:, :, limb.columns]
+        for way in range(1, num_ways):
+            mixed = x[:, 0].clone()
+            mixed[:, limb.columns] = angles[:, way]
+            apart = (angles[:, :way] - angles[:, way, None]).abs().amax(-1)
+            again = (apart < _SAME_ANGLE).any(-1)
+            extra[:, number, way] = torch.where(again, math.inf, cost.value(mixed) - base)
+    combinations = torch.tensor(
+        list(itertools.product(range(num_ways), repeat=len(segments.limbs))), device=x.device
+    )
+    total = base[:, None].expand(-1, len(combinations))
+    for number in range(len(segments.limbs)):
+        total = total + extra[:, number, combinations[:, number]]
+    flat = total.flatten().nan_to_num(math.inf)
+    best = flat.argsort(stable=True)[:num]
+    best = best[flat[best].isfinite()]
+    trunk, chosen = best // len(combinations), combinations[best % len(combinations)]
+    poses = x[trunk, 0].clone()
+    for number, limb in enumerate(segments.limbs):
+        poses[:, limb.columns] = x[trunk, chosen[:, number]][:, limb.columns]
+    return poses
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reach:
+    """Bring joints to places in 3D, and the rest near rest; a `CostFunction`.
+
+    Attributes:
+        body: The body.
+        index: Which joint centres.
+        target: Where they should be, one set for every item, metres.
+        deviation: Standard deviation of their places, metres.
+    """
+
+    body: BodyModel
+    index: Int[Tensor, " m"]
+    target: Float[Tensor, "b m 3"]
+    deviation: float = 0.01
+
+    def take(self, items: Int[Tensor, " s"]) -> Reach:
+        """The cost of some of the items."""
+        return replace(self, target=self.target[items])
+
+    def value(self, x: Float[Tensor, "b n"]) -> Float[Tensor, " b"]:
+        """Cost in nats."""
+        return self.local_model(x).value
+
+    def local_model(self, x: Float[Tensor, "b n"]) -> LocalModel:
+        """Cost, gradient and Hessian."""
+        body, precision = self.body, self.deviation**-2
+        pose = body.pose(x)
+        points = pose.joints[..., self.index, :]
+        apart = points - self.target
+        eye = precision * torch.eye(3, dtype=x.dtype, device=x.device)
+        cost = PointCost(
+            0.5 * precision * apart.square().sum(-1),
+            precision * apart,
+            eye.expand(*points.shape, 3),
+        )
+        reached = body.lift(pose, points, body.marker_link[self.index], cost)
+        near = Stabiliser().local_model(x, body.sticky_mean, body.sticky_deviation)
+        return LocalModel(*(a + b for a, b in zip(reached, near, strict=True)))

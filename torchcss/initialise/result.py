@@ -1,0 +1,252 @@
+"""What an initialisation returns: fits of pose and lengths as hypotheses to start from (section 5).
+
+`Initialisation` is the record. The functions make it out of fits: they bring the fits from one body
+to another (with lengths free or held, on another base), say how uncertain they are when the lengths
+are unknown too, and what the image leaves open.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchcss.body.catalog import LENGTHS, PROPORTION_RANGE, PROPORTIONS
+from torchcss.body.model import BodyModel
+from torchcss.body.root import ROOT_NAMES, move_base, root_pose
+from torchcss.cost.total import TrackingCost
+from torchcss.errors import BodyError
+from torchcss.inference.mixture import GaussianMixture
+from torchcss.inference.trust_region import default_prior_variance
+from torchcss.initialise.multi_start import Search
+from torchcss.linalg import inverse_on_free
+from torchcss.types import Modes
+
+STANDARD_STATURE = 1.75
+"""Stature of the standard humanoid, metres."""
+
+_SOLE = STANDARD_STATURE - sum(LENGTHS[n] for n in ("shank", "thigh", "trunk", "neck", "head"))
+"""Height of the ankle joint above the ground."""
+
+_UNDETERMINED = 0.9
+"""Share of a parameter's prior deviation from which the image is said not to determine it."""
+
+
+class Stage(NamedTuple):
+    """The best fit after one stage.
+
+    Attributes:
+        name: What was fitted to what.
+        body: The body at this stage.
+        state: Its state.
+        cost: Cost in nats of the stage's own cost function.
+    """
+
+    name: str
+    body: BodyModel
+    state: Float[Tensor, " n"]
+    cost: float
+
+
+class Initialisation(NamedTuple):
+    """Where tracking starts.
+
+    Attributes:
+        body: The body with the fitted lengths and shape, hung on the base of the best fit.
+        mixture: The distinct fits, best first.
+        cost: Their costs, nats.
+        report: What was found and assumed, one line each.
+        lengths: The fitted lengths, metres; empty where they were given.
+        scale: Overall scale of the standard humanoid that the lengths were compared with.
+        stages: The best fit after every stage.
+        free_body: The same body with its lengths as parameters; None where they were given.
+        free_mixture: The fits of pose and lengths together, best first, on `free_body`.
+        left_out: Joints whose marks fit no pose and were left out.
+    """
+
+    body: BodyModel
+    mixture: GaussianMixture
+    cost: Float[Tensor, " k"]
+    report: tuple[str, ...]
+    lengths: Mapping[str, float] = {}
+    scale: float = 1.0
+    stages: tuple[Stage, ...] = ()
+    free_body: BodyModel | None = None
+    free_mixture: GaussianMixture | None = None
+    left_out: tuple[str, ...] = ()
+
+    def hypotheses(self, num: int, *, generator: torch.Generator) -> Float[Tensor, "num n"]:
+        """The first `num` states to believe in: the fits, then samples of their mixture.
+
+        Args:
+            num: How many.
+            generator: Source of the samples.
+        """
+        fits = self.mixture.mean[:num]
+        samples = self.mixture.sample(num - len(fits), generator=generator).x
+        return torch.cat([fits, self.body.bounds.project(samples)])
+
+
+def as_initialisation(body: BodyModel, fits: Modes, notes: tuple[str, ...]) -> Initialisation:
+    """Fits, the best first, as hypotheses, with what is to be reported about them."""
+    mixture = GaussianMixture(fits.mean, fits.covariance, torch.log_softmax(-fits.cost, dim=0))
+    best = float(fits.cost[0])
+    report = (
+        *notes,
+        f"first pose: {len(fits.cost)} distinct fits to the keypoints, best cost {best:.1f}",
+    )
+    stage = Stage("pose and proportions from joints", body, fits.mean[0], best)
+    return Initialisation(body, mixture, fits.cost, report, stages=(stage,))
+
+
+def hang_on_best(body: BodyModel, fits: Modes) -> tuple[BodyModel, Modes]:
+    """Hang the body on the root of the best fit; the covariances are still to be mapped.
+
+    Fits that lie across it by a right angle, where the root's angles lock, are left out.
+    """
+    body, mean, _ = move_base(body, *root_pose(body, fits.mean[0]), fits.mean)
+    root = [body.state_index(name) for name in ROOT_NAMES]
+    inside = (mean >= body.lower) & (mean <= body.upper)
+    keep = torch.nonzero(inside[:, root].all(-1))[:, 0]
+    return body, Modes(*(field[keep] for field in fits._replace(mean=mean)))
+
+
+def columns_of(
+    source: BodyModel, target: BodyModel, x: Float[Tensor, "b n"]
+) -> Float[Tensor, "b m"]:
+    """The parameters of one body out of the states of another that has them too.
+
+    Args:
+        source: The body of the states.
+        target: The body with fewer parameters.
+        x: States.
+    """
+    return x[:, [source.state_index(name) for name in target.state_names]]
+
+
+def spread_to(
+    source: BodyModel, target: BodyModel, x: Float[Tensor, "b n"]
+) -> Float[Tensor, "b m"]:
+    """States of a body as those of one with more parameters, which stay at zero.
+
+    Args:
+        source: The body of the states.
+        target: The body with more parameters.
+        x: States.
+    """
+    full = x.new_zeros(len(x), target.num_parameters)
+    full[:, [target.state_index(name) for name in source.state_names]] = x
+    return full
+
+
+def marginal_covariance(
+    cost: TrackingCost, body: BodyModel, x: Float[Tensor, "k n"], search: Search
+) -> Float[Tensor, "k n n"]:
+    """Covariances of poses when the lengths are unknown too.
+
+    Args:
+        cost: Cost of the same body with free lengths, on the same base.
+        body: The body with lengths held.
+        x: Its fitted states.
+        search: Whether limits hold.
+    """
+    loose = cost.body
+    columns = [loose.state_index(name) for name in body.state_names]
+    full = spread_to(body, loose, x)
+    model, bounds = cost.local_model(full), search.bounds(loose)
+    held = (full <= bounds.lower) & (model.gradient > 0)
+    held = held | ((full >= bounds.upper) & (model.gradient < 0))
+    lengths = bounds.upper > bounds.lower
+    lengths[columns] = False
+    covariance = inverse_on_free(
+        model.hessian, ~held | lengths, default_prior_variance(loose.bounds)
+    )
+    return covariance[:, columns][:, :, columns]
+
+
+def stature_of(lengths: Mapping[str, float], scale: float = 1.0) -> float:
+    """Height of the standing body, metres.
+
+    Args:
+        lengths: Lengths by name, metres.
+        scale: Overall scale of the body, for the height of the ankle.
+    """
+    names = ("shank", "thigh", "trunk", "neck", "head")
+    return scale * _SOLE + sum(lengths[name] for name in names)
+
+
+def scale_of(stature: float | None) -> float:
+    """Scale of the standard humanoid for a person of this height (metres), if it is known.
+
+    Raises:
+        BodyError: If it is no person's.
+    """
+    if stature is None:
+        return 1.0
+    if not 0.4 <= stature <= 2.8:
+        raise BodyError(f"stature: expected a person's height in metres, 0.4 to 2.8, got {stature}")
+    return stature / STANDARD_STATURE
+
+
+def fitted_lengths(
+    body: BodyModel, x: Float[Tensor, " n"], stature: float | None
+) -> dict[str, float]:
+    """Fitted lengths; with known stature made to add up to it, as far as their interval allows."""
+    lengths = {
+        name: body.lengths[name] + float(x[body.state_index(f"{name}_length")])
+        for name in PROPORTIONS
+        if f"{name}_length" in body.state_names
+    }
+    if stature is None or "shank" not in lengths:
+        return lengths
+    scale = scale_of(stature)
+    factor = (stature - scale * _SOLE) / (stature_of(lengths, scale) - scale * _SOLE)
+    for name, length in lengths.items():
+        middle, margin = scale * LENGTHS[name], scale * LENGTHS[name] * PROPORTION_RANGE
+        lengths[name] = min(max(length * factor, middle - margin), middle + margin)
+    return lengths
+
+
+def scale_report(stature: float | None, lengths: Mapping[str, float], *, num_views: int = 1) -> str:
+    """The line that says what sets the scale, and the lengths.
+
+    Args:
+        stature: Height that was given, metres; None: none was.
+        lengths: The fitted lengths, metres.
+        num_views: How many cameras saw the body.
+    """
+    if not lengths:
+        return "the lengths of the body are its file's, which set the scale"
+    fitted = ", ".join(f"{name} {length:.3f} m" for name, length in lengths.items())
+    if stature is not None:
+        source = f"the known stature of {stature:g} m sets the scale"
+    elif num_views > 1:
+        source = f"{num_views} views set the scale"
+    else:
+        source = "the prior on proportions sets the scale, which one image does not show"
+    return f"{source}; lengths within 10 % of the standard humanoid: {fitted}"
+
+
+def undetermined_line(body: BodyModel, modes: Modes, joints: TrackingCost) -> str | None:
+    """Which parameters of the best fit the image leaves at their prior."""
+    prior = torch.minimum(
+        default_prior_variance(body.bounds).sqrt(), body.sticky_deviation
+    ).nan_to_num(posinf=math.inf)
+    image = replace(joints, choice=replace(joints.choice, stabiliser=None, anthropometric=None))
+    curvature = image.local_model(modes.mean[:1]).hessian[0].diagonal()
+    free = torch.as_tensor(modes.active[0]) == 0
+    deviation = modes.covariance[0].diagonal().sqrt()
+    loose = free & (deviation > _UNDETERMINED * prior)
+    # A parameter that moves no marked joint has no curvature at all.
+    loose = loose | (curvature.abs() * prior.square() < 1e-6)
+    names = [
+        name for name, is_loose in zip(body.state_names, loose.tolist(), strict=True) if is_loose
+    ]
+    if not names:
+        return None
+    return f"not determined by the joints, kept at their prior: {', '.join(names)}"

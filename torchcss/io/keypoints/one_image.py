@@ -1,0 +1,185 @@
+"""Joints of one picture: all formats of `torchcss.io.keypoints.read`, CSV, MediaPipe's JSON.
+
+| format | recognised by |
+|---|---|
+| CSV | suffix `.csv`: rows `joint, u, v[, confidence]`, with or without a heading |
+| MediaPipe | JSON: a list of 33 landmarks `{"x", "y", "visibility"}`, or it under `landmarks` |
+| other CSV | a first row that names the columns otherwise, as DeepLabCut's or `l_hip_x` |
+| these, OpenPose, COCO, clicked, NPZ | see `torchcss.io.keypoints.read` |
+
+Missing joints are simply missing. Call `read_joints`.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchcss.errors import KeypointError
+from torchcss.files import load_json
+from torchcss.io.keypoints.read import Scale, read_keypoints
+from torchcss.joint_names import ALIASES, JOINT_NAMES, canonical_joint_name
+
+
+class Joints(NamedTuple):
+    """Marked joints of one person in one picture.
+
+    Attributes:
+        keypoints: Pixels.
+        confidence: From 0, missing, to 1.
+        joint_names: The catalogue's names where it has one.
+        report: What was recognised, one line each.
+    """
+
+    keypoints: Float[Tensor, "j 2"]
+    confidence: Float[Tensor, " j"]
+    joint_names: tuple[str, ...]
+    report: tuple[str, ...]
+
+
+def read_joints(
+    path: str | os.PathLike[str],
+    *,
+    image_size_wh: tuple[int, int],
+    layout: str | None = None,
+    normalised: bool | Scale = False,
+    frame: int = 0,
+) -> Joints:
+    """Read the joints of one picture.
+
+    Args:
+        path: A file, or OpenPose's folder.
+        image_size_wh: Size of the picture.
+        layout: Layout of a file that does not name its joints.
+        normalised: Whether coordinates are fractions of the image, and which, see
+            `torchcss.io.keypoints.read.Scale` (MediaPipe's always are, rows of joints never).
+        frame: Which frame of a file that has several; a file of one picture is of that picture.
+
+    Raises:
+        KeypointError: If the file is missing, damaged or of unknown format.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".csv":
+        rows = _csv_rows(path)
+        if _are_joints(rows):
+            if normalised not in (False, "pixels"):
+                raise KeypointError(
+                    f"{path}: rows joint, u, v[, confidence] are in pixels; leave normalised out"
+                )
+            return _read_csv(path, rows)
+    if path.suffix.lower() == ".json":
+        content = load_json(path, KeypointError)
+        if isinstance(content, dict) and "landmarks" in content:
+            content = content["landmarks"]
+        rows = content if isinstance(content, list) else []
+        if rows and isinstance(rows[0], dict) and {"x", "y"} <= set(rows[0]):
+            return _read_mediapipe(path, rows, image_size_wh)
+        if isinstance(content, dict) and content.keys() & {"joints", "people"}:
+            frame = 0
+        frame = _frame_of_single_image(content, frame)
+    marks = read_keypoints(
+        path, image_size_wh=image_size_wh, layout=layout, normalised=normalised, first_frame=frame
+    )
+    return Joints(marks.keypoints[frame], marks.confidence[frame], marks.joint_names, marks.report)
+
+
+def _frame_of_single_image(content: object, otherwise: int) -> int:
+    """Where COCO detections of one image are: its number counts as that of a video's frame."""
+    rows = content if isinstance(content, list) else []
+    images = {str(row.get("image_id")) if isinstance(row, dict) else "" for row in rows}
+    only = images.pop() if len(images) == 1 else ""
+    digits = re.findall(r"[0-9]+", Path(only).stem)
+    return int(digits[-1]) if digits else otherwise
+
+
+def _csv_rows(path: Path) -> list[list[str]]:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            return [[cell.strip() for cell in row] for row in csv.reader(file) if any(row)]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise KeypointError(f"{path}: cannot be read as CSV: {error}") from error
+
+
+def _is_heading(row: list[str]) -> bool:
+    """Whether a first row names the columns: it is of no joint, and holds words."""
+    if canonical_joint_name(row[0]) is not None:
+        return False
+    try:
+        [float(cell) for cell in row[1:4] if cell]
+    except ValueError:
+        return True
+    return False
+
+
+def _are_joints(rows: list[list[str]]) -> bool:
+    """Whether these are rows `joint, u, v[, confidence]` and not another table with a heading."""
+    if len(rows) < 2 or not _is_heading(rows[0]):
+        return True
+    # MediaPipe's landmarks are a row each too, with a depth or under their own word.
+    names = [cell.lower() for cell in rows[0]]
+    if "z" in names or "landmark" in names[0]:
+        return False
+    return any(canonical_joint_name(row[0]) for row in rows[1:])
+
+
+def _read_csv(path: Path, rows: list[list[str]]) -> Joints:
+    table: dict[str, list[float]] = {}
+    for number, row in enumerate(rows):
+        where = f"{path}: row {number + 1}"
+        name = canonical_joint_name(row[0]) if row else None
+        try:
+            values = [float(cell) for cell in row[1:4] if cell]
+        except ValueError:
+            if number == 0 and _is_heading(row):
+                continue
+            raise KeypointError(
+                f"{where}: expected joint, u, v[, confidence], found {row}"
+            ) from None
+        if name is None:
+            raise KeypointError(
+                f"{where}: unknown joint {row[0]!r}; the known ones are {', '.join(JOINT_NAMES)}"
+            )
+        if not values:
+            continue  # a joint without a place is missing
+        if len(values) == 1 or not all(math.isfinite(value) for value in values):
+            raise KeypointError(f"{where}: expected joint, u, v[, confidence], found {row}")
+        if name in table:
+            raise KeypointError(f"{where}: {name} is marked twice; leave one of the rows out")
+        table[name] = [*values, 1.0][:3]
+    if not table:
+        raise KeypointError(f"{path}: no joints; expected rows joint, u, v[, confidence]")
+    numbers = torch.tensor(list(table.values()), dtype=torch.float64)
+    return Joints(
+        numbers[:, :2],
+        numbers[:, 2].clamp(0, 1),
+        tuple(table),
+        (f"format: CSV, {len(table)} joints",),
+    )
+
+
+def _read_mediapipe(path: Path, rows: list, image_size_wh: tuple[int, int]) -> Joints:
+    layout = ALIASES["MediaPipe-33"]
+    if len(rows) != len(layout):
+        raise KeypointError(f"{path}: expected {len(layout)} landmarks, found {len(rows)}")
+    try:
+        numbers = torch.tensor(
+            [[row["x"], row["y"], row.get("visibility", 1.0)] for row in rows], dtype=torch.float64
+        )
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise KeypointError(
+            f"{path}: expected x, y and visibility as numbers for every landmark"
+        ) from error
+    if not bool(numbers.isfinite().all()):
+        raise KeypointError(f"{path}: a landmark is not finite; leave its visibility at 0")
+    # Fractions of the image's sides, from its corner; pixel centres are at integers.
+    uv = numbers[:, :2] * numbers.new_tensor(image_size_wh) - 0.5
+    names = tuple(name or f"MediaPipe-33[{i}]" for i, name in enumerate(layout))
+    return Joints(uv, numbers[:, 2].clamp(0, 1), names, ("format: MediaPipe landmarks",))

@@ -1,0 +1,382 @@
+"""2D joints of one person in every frame, from the files of the usual detectors or a few clicks.
+
+| format | recognised by |
+|---|---|
+| OpenPose | a folder of `*_keypoints.json` (or other JSON with `people`), one file per frame |
+| COCO, AlphaPose | JSON: `annotations`, or a list of `{image_id, keypoints, score}` |
+| MediaPipe | JSON, CSV, NPY or NPZ with 33 landmarks, see `torchcss.io.keypoints.mediapipe` |
+| DeepLabCut | CSV with the headings `bodyparts` and `coords`, one animal or several |
+| Human3.6M | VideoPose3D's NPZ with `positions_2d`; `FILE.npz#SUBJECT/ACTION/CAMERA` |
+| CSV | any with columns such as `l_hip_x`, `l_hip_y`, see `torchcss.io.keypoints.tables` |
+| NPZ | arrays `keypoints [T J 2]`, `confidence [T J]`, `joint_names [J]` |
+| clicked | JSON: `{"joints": {"l_wrist": [u, v]}}` for one frame, or `{"frames": {"0": {...}}}` |
+
+Files that name their joints are read by name; the others by layout, which their number of joints
+tells (25 is BODY_25 or BODY_25B: the places of the points decide). Out come the catalogue's names
+(`torchcss.joint_names`); a joint that has none keeps its own. A missing joint has confidence 0 and
+stands at (0, 0). Of several people, one is followed by continuity. Every such choice is a line of
+`Keypoints.report`, to be shown to the user.
+
+By default: `read_keypoints(path, image_size_wh=(w, h), num_frames=t)`.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchcss.errors import KeypointError
+from torchcss.files import load_array, load_arrays, load_json, shortened
+from torchcss.io.keypoints.arrays import read_arrays
+from torchcss.io.keypoints.clicked import read_clicked
+from torchcss.io.keypoints.coco import read_coco
+from torchcss.io.keypoints.h36m import is_h36m, read_h36m
+from torchcss.io.keypoints.mediapipe import (
+    is_landmark_array,
+    is_mediapipe,
+    read_landmark_array,
+    read_landmarks,
+)
+from torchcss.io.keypoints.one_person import follow, size_of
+from torchcss.io.keypoints.openpose import openpose_people, read_openpose_folder
+from torchcss.io.keypoints.people import People
+from torchcss.io.keypoints.tables import read_table
+from torchcss.joint_names import ALIASES, JOINT_NAMES, layout_of_names
+
+Scale = Literal["pixels", "zero-one", "plus-minus-one"]
+"""What the coordinates of a file count: pixels, or fractions of the image from 0 or -1 to 1."""
+
+# Which layout a number of unnamed joints means; the first is the default.
+_LAYOUTS_BY_COUNT: dict[int, tuple[str, ...]] = {}
+for _name in (
+    "COCO-17", "COCO-18", "BODY_25", "BODY_25B", "MediaPipe-33", "SMPL-24", "H36M-17",
+    "Halpe-26", "Halpe-136",
+):  # fmt: skip
+    _LAYOUTS_BY_COUNT.setdefault(len(ALIASES[_name]), ())
+    _LAYOUTS_BY_COUNT[len(ALIASES[_name])] += (_name,)
+
+_NORMALISED_EXTENT = 2.0
+"""No person is so few pixels large: coordinates that all lie within are fractions of the image."""
+
+_OUTSIDE = 3.0
+"""How many times the longer image side a joint may lie outside before the file is refused."""
+
+_INSIDE_SHARE = 0.1
+"""Least share of the confident joints that must lie inside the image."""
+
+
+class Keypoints(NamedTuple):
+    """The joints of one person in an image sequence.
+
+    Attributes:
+        keypoints: Pixels (centres at integers); (0, 0) where the confidence is 0.
+        confidence: From 0, missing, to 1.
+        joint_names: The catalogue's names, the file's own for a place that has none.
+        report: What was recognised, chosen or corrected, one line each.
+    """
+
+    keypoints: Float[Tensor, "t j 2"]
+    confidence: Float[Tensor, "t j"]
+    joint_names: tuple[str, ...]
+    report: tuple[str, ...]
+
+
+def read_keypoints(
+    path: str | os.PathLike[str],
+    *,
+    image_size_wh: tuple[int, int],
+    num_frames: int | None = None,
+    layout: str | None = None,
+    normalised: bool | Scale = False,
+    first_frame: int = 0,
+) -> Keypoints:
+    """Read the 2D joints of one person from any of the formats above.
+
+    Args:
+        path: A file, or OpenPose's folder; of an archive of several recordings, which follows
+            behind a `#`.
+        image_size_wh: Size of the video's images in pixels.
+        num_frames: Number of frames of the video, which the file must match (a clicked file need
+            not). None: as many as the file has.
+        layout: A key of `torchcss.joint_names.ALIASES`, for files that do not name their joints.
+            None: recognise it.
+        normalised: True, `"zero-one"` or `"plus-minus-one"` for coordinates that are fractions of
+            the image, which are then converted: the range ends at the centres of the border pixels.
+        first_frame: The frame in which tracking starts; there somebody must be seen.
+
+    Returns:
+        Joints of the person chosen, float64.
+
+    Raises:
+        KeypointError: If the file is missing, damaged, of unknown format or layout, has another
+            number of frames, nobody in the first frame, coordinates that cannot be pixels, or a
+            confident joint that is not a number.
+    """
+    path = Path(path)
+    if layout is not None and layout not in ALIASES:
+        raise KeypointError(
+            f"{path}: unknown layout {layout!r}; the known ones are {', '.join(ALIASES)}"
+        )
+    people = _read(path, num_frames, image_size_wh)
+    if num_frames is not None and len(people.frames) != num_frames:
+        raise KeypointError(
+            f"{path}: expected {num_frames} frames, as the video has, found {len(people.frames)}; "
+            "make the keypoints from this very video"
+        )
+    if not 0 <= first_frame < max(1, len(people.frames)):
+        raise KeypointError(
+            f"{path}: the first frame {first_frame} is beyond the file, "
+            f"which has {len(people.frames)} frames"
+        )
+    report = list(people.report)
+    _check_names(path, people)
+    _check_numbers(path, people, report)
+    _check_somebody(path, people, first_frame)
+    if not people.in_pixels:
+        _to_pixels(path, people, image_size_wh, normalised, report)
+    _check_places(path, people, image_size_wh)
+    chosen = follow(people, first_frame, report)
+    names = _joint_names(path, people, chosen, layout or people.layout, report)
+    keypoints = np.where(chosen[..., 2:] > 0.0, chosen[..., :2], 0.0)
+    return Keypoints(
+        torch.from_numpy(keypoints), torch.from_numpy(chosen[..., 2].copy()), names, tuple(report)
+    )
+
+
+# The formats.
+
+
+def _read(path: Path, num_frames: int | None, image_size_wh: tuple[int, int]) -> People:
+    if path.is_dir():
+        return read_openpose_folder(path)
+    archive, mark, selection = str(path).rpartition("#")
+    if mark and not path.exists():
+        path = Path(archive)
+    else:
+        selection = ""
+    suffix = path.suffix.lower()
+    if suffix == ".npz" and is_h36m(path):
+        return read_h36m(path, selection)
+    if selection:
+        raise KeypointError(
+            f"{path}#{selection}: there is no such file, and only VideoPose3D's archives hold "
+            "several recordings to choose from"
+        )
+    if suffix in (".npz", ".npy"):
+        return _read_numpy(path, image_size_wh)
+    if suffix in (".csv", ".tsv"):
+        return read_table(path, num_frames, image_size_wh)
+    if suffix in (".h5", ".hdf5"):
+        raise KeypointError(
+            f"{path}: DeepLabCut's HDF5 holds pickled objects, which could run a programme; save "
+            "it as CSV (save_as_csv=True, or deeplabcut.analyze_videos_converth5_to_csv)"
+        )
+    content = load_json(path, KeypointError)
+    if isinstance(content, dict) and "annotations" in content:
+        return read_coco(path, content["annotations"], content, num_frames)
+    if isinstance(content, dict) and "people" in content:
+        people = openpose_people(path, content)
+        return People([people], None, ["format: OpenPose, one frame"])
+    if is_mediapipe(content):
+        return read_landmarks(path, content, num_frames, image_size_wh)
+    if isinstance(content, list):
+        return read_coco(path, content, {}, num_frames)
+    if isinstance(content, dict) and ("joints" in content or "frames" in content):
+        return read_clicked(path, content, num_frames, image_size_wh)
+    raise KeypointError(
+        f"{path}: not a keypoint file; expected OpenPose's 'people', COCO's 'annotations' or list "
+        "of detections, MediaPipe's landmarks, or clicked 'joints' or 'frames', found "
+        f"{shortened(content)}"
+    )
+
+
+def _read_numpy(path: Path, image_size_wh: tuple[int, int]) -> People:
+    if path.suffix.lower() == ".npy":
+        arrays = {path.name: load_array(path, KeypointError)}
+    else:
+        arrays = dict(load_arrays(path, KeypointError))
+    found = [name for name, array in arrays.items() if is_landmark_array(array)]
+    if len(found) == 1:
+        return read_landmark_array(path, found[0], arrays[found[0]], image_size_wh)
+    return read_arrays(path, arrays)
+
+
+# What is checked and decided.
+
+
+def _check_names(path: Path, people: People) -> None:
+    num_joints = max((frame.shape[1] for frame in people.frames), default=0)
+    if people.names is None or not num_joints:  # nobody in the whole file: another check says so
+        return
+    if len(people.names) != num_joints:
+        raise KeypointError(
+            f"{path}: {len(people.names)} joint names for {num_joints} joints; expected as many"
+        )
+    if len(set(people.names)) < num_joints:
+        raise KeypointError(f"{path}: the same joint name twice in {shortened(people.names)}")
+
+
+def _check_numbers(path: Path, people: People, report: list[str]) -> None:
+    """Refuse numbers that are not finite where they count; bring confidences into their range."""
+    clipped = 0
+    for index, frame in enumerate(people.frames):
+        confidence = frame[..., 2]
+        finite = np.isfinite(frame[..., 0]) & np.isfinite(frame[..., 1])
+        bad = np.isnan(confidence) | (~finite & (confidence != 0.0))
+        if bad.any():
+            joint = int(np.argwhere(bad)[0, -1])
+            name = repr(people.names[joint]) if people.names else str(joint)
+            found = float(np.extract(bad, confidence)[0])
+            raise KeypointError(
+                f"{path}: frame {index}: joint {name} is not a number though its confidence is "
+                f"{found:g}; expected confidence 0 where a joint is missing"
+            )
+        if (confidence > 10.0).any():
+            raise KeypointError(
+                f"{path}: frame {index}: confidence {confidence.max():g}; expected 0 to 1"
+            )
+        clipped += int(((confidence < 0.0) | (confidence > 1.0)).sum())
+        people.frames[index] = np.concatenate(
+            [
+                np.where(finite[..., None], frame[..., :2], 0.0),
+                confidence.clip(0.0, 1.0)[..., None],
+            ],
+            axis=-1,
+        )
+    if clipped:
+        report.append(f"{clipped} confidences outside 0 to 1 were moved to the nearer end")
+
+
+def _check_somebody(path: Path, people: People, first_frame: int) -> None:
+    seen = [index for index, frame in enumerate(people.frames) if (frame[..., 2] > 0.0).any()]
+    if first_frame in seen:
+        return
+    later = next((index for index in seen if index > first_frame), None)
+    advice = (
+        f"the first frame with somebody is {later}: start there"
+        if later is not None
+        else "there is none later either"
+    )
+    if first_frame == 0 and later == 1:
+        advice += ", or number the frames from 0, if the file counts them from 1"
+    raise KeypointError(
+        f"{path}: nobody in the first frame ({first_frame}), where tracking starts; {advice}"
+    )
+
+
+def _confident(people: People) -> np.ndarray:
+    """All confident points `[n, 2]` of all people."""
+    return np.concatenate([frame[frame[..., 2] > 0.0][:, :2] for frame in people.frames])
+
+
+def _to_pixels(
+    path: Path,
+    people: People,
+    image_size_wh: tuple[int, int],
+    normalised: bool | Scale,
+    report: list[str],
+) -> None:
+    points = _confident(people)
+    fractions = bool((np.abs(points) <= _NORMALISED_EXTENT).all())
+    if normalised is False or normalised == "pixels":
+        if fractions:
+            raise KeypointError(
+                f"{path}: expected pixels, but all coordinates lie between {points.min():.3g} and "
+                f"{points.max():.3g}: they seem to be fractions of the image; if so, "
+                "set normalised to zero-one or plus-minus-one"
+            )
+        return
+    if not fractions:
+        raise KeypointError(
+            f"{path}: expected fractions of the image, but coordinates reach "
+            f"{np.abs(points).max():.4g}: they seem to be pixels; if so, leave normalised out"
+        )
+    if normalised is True and (points < 0.0).any():
+        raise KeypointError(
+            f"{path}: some coordinates are negative: say whether they run from 0 to 1 with joints "
+            "outside the image (normalised 'zero-one') or from -1 to 1 ('plus-minus-one')"
+        )
+    largest = np.asarray(image_size_wh, dtype=np.float64) - 1.0
+    signed = normalised == "plus-minus-one"
+    for frame in people.frames:
+        frame[..., :2] = (0.5 * (frame[..., :2] + 1.0) if signed else frame[..., :2]) * largest
+    report.append(f"coordinates from {-1 if signed else 0} to 1 converted to pixels")
+
+
+def _check_places(path: Path, people: People, image_size_wh: tuple[int, int]) -> None:
+    points = _confident(people)
+    size = np.asarray(image_size_wh, dtype=np.float64)
+    outside = np.maximum(-points, points - size).max(axis=1)
+    if (outside > _OUTSIDE * size.max()).any():
+        u, v = points[outside.argmax()]
+        raise KeypointError(
+            f"{path}: a joint at ({u:.5g}, {v:.5g}) is far outside the image of "
+            f"{image_size_wh[0]} x {image_size_wh[1]} pixels; expected pixels of this video"
+        )
+    inside = float((outside <= 0.0).mean())
+    if inside < _INSIDE_SHARE:
+        raise KeypointError(
+            f"{path}: only {inside:.0%} of the joints lie inside the image of {image_size_wh[0]} x "
+            f"{image_size_wh[1]} pixels; expected keypoints of this video, at its size"
+        )
+
+
+def _joint_names(
+    path: Path, people: People, chosen: np.ndarray, layout: str | None, report: list[str]
+) -> tuple[str, ...]:
+    num_joints = chosen.shape[1]
+    if layout is not None and len(ALIASES[layout]) != num_joints:
+        fitting = ", ".join(_LAYOUTS_BY_COUNT.get(num_joints, ())) or "none of the known"
+        raise KeypointError(
+            f"{path}: layout {layout} has {len(ALIASES[layout])} joints, "
+            f"the file has {num_joints}; fitting layouts: {fitting}"
+        )
+    if layout is not None:
+        known, own = ALIASES[layout], people.names or ()
+        report.append(
+            f"layout: {layout}, as {'the file says' if people.layout == layout else 'asked for'}"
+        )
+    elif people.names is not None and any(layout_of_names(people.names)):
+        known, own = layout_of_names(people.names), people.names
+        report.append(f"layout: by {num_joints} names")
+    elif people.names is None and num_joints in _LAYOUTS_BY_COUNT:
+        layout, reason = _recognise(chosen)
+        known, own = ALIASES[layout], ()
+        report.append(f"layout: {layout}, {reason}")
+    else:
+        found = f"names {shortened(list(people.names))}" if people.names else "joints without names"
+        raise KeypointError(
+            f"{path}: unknown layout: found {num_joints} {found}; the known layouts are "
+            + ", ".join(f"{name} ({len(joints)})" for name, joints in ALIASES.items())
+        )
+    names = tuple(
+        name or (own[index] if own else f"{layout}[{index}]") for index, name in enumerate(known)
+    )
+    if own and (unused := [name for name in names if name not in JOINT_NAMES]):
+        report.append(f"joints that no body has: {', '.join(unused)}")
+    return names
+
+
+def _recognise(chosen: np.ndarray) -> tuple[str, str]:
+    """Return the layout of unnamed joints and why."""
+    candidates = _LAYOUTS_BY_COUNT[chosen.shape[1]]
+    if len(candidates) == 1:
+        return candidates[0], f"by its {chosen.shape[1]} joints"
+    if "BODY_25" in candidates:
+        # In BODY_25 joint 8 is computed as the middle of the hips, 9 and 12.
+        seen = (chosen[:, [8, 9, 12], 2] > 0.0).all(axis=1)
+        if seen.any():
+            gap = chosen[:, 8, :2] - 0.5 * (chosen[:, 9, :2] + chosen[:, 12, :2])
+            sizes = np.array([size_of(person) for person in chosen])
+            share = float(np.median((np.linalg.norm(gap, axis=1) / sizes)[seen]))
+            layout = "BODY_25" if share < 0.08 else "BODY_25B"
+            where = "is" if share < 0.08 else "is not"
+            return layout, f"by its 25 joints, of which 8 {where} the middle of 9 and 12"
+    others = ", ".join(candidates[1:])
+    return candidates[0], f"by its {chosen.shape[1]} joints ({others} has as many: set layout)"

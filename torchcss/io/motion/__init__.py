@@ -1,0 +1,1 @@
+"""Motion capture as other programs write it."""

@@ -1,0 +1,261 @@
+"""The text of Acclaim's files: the segments of an ASF, and the numbers of an AMC that move them.
+
+What is not as it should be ends in a `MotionCaptureError` that names file and line: a damaged file
+never yields a motion. `torchcss.io.motion.positions` makes positions of what is parsed here.
+
+Call `parse_acclaim`; BVH, the other format, is parsed in `torchcss.body.files.bvh_parser`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from torchcss.body.files.bvh_parser import Segment, Turn, axis_of, bad, count, numbers
+from torchcss.errors import MotionCaptureError
+from torchcss.files import Line, read_lines
+from torchcss.io.export.rotations import about
+
+
+class _Acclaim(NamedTuple):
+    """An ASF file: the tree, the columns of every bone with freedom, and what it says of units."""
+
+    segments: list[Segment]
+    columns: dict[str, list[int]]
+    is_angle: list[bool]
+    radians: bool
+    metres_per_unit: float | None
+
+
+def _sections(lines: Sequence[Line]) -> list[tuple[Line, list[Line]]]:
+    """The parts of a file that start with `:keyword`, without comments."""
+    found: list[tuple[Line, list[Line]]] = []
+    for line in lines:
+        if line.words[0].startswith("#"):
+            continue
+        if line.words[0].startswith(":"):
+            found.append((line, []))
+        elif found:
+            found[-1][1].append(line)
+    return found
+
+
+def parse_acclaim(
+    skeleton: Path, motion: Path
+) -> tuple[list[Segment], Float[np.ndarray, "t c"], float | None]:
+    """Segments, their numbers frame by frame (angles in radians), and the metres per unit stated.
+
+    Args:
+        skeleton: The ASF file.
+        motion: The AMC file.
+
+    Raises:
+        MotionCaptureError: For any bad file.
+    """
+    found = _parse_asf(skeleton, read_lines(skeleton, MotionCaptureError))
+    values = _parse_amc(motion, read_lines(motion, MotionCaptureError), found)
+    return found.segments, values, found.metres_per_unit
+
+
+def _parse_asf(path: Path, lines: list[Line]) -> _Acclaim:
+    sections = {head.words[0].lower(): (head, body) for head, body in _sections(lines)}
+    for name in (":root", ":bonedata", ":hierarchy"):
+        if name not in sections:
+            raise bad(path, lines[-1].number, f"a section {name}", ", ".join(sections) or "none")
+    radians, metres = _units(path, sections[":units"][1] if ":units" in sections else [])
+    bones = _bones(path, sections[":bonedata"][1], radians)
+    root = _entries(sections[":root"][1])
+    parents = _hierarchy(path, sections[":hierarchy"], set(bones))
+
+    is_angle: list[bool] = []
+    columns: dict[str, list[int]] = {}
+
+    def turns_of(name: str, line: int, freedom: Sequence[str]) -> tuple[Turn, ...]:
+        first = len(is_angle)
+        turns = []
+        for word in freedom:
+            kind, axis = word[:1].lower(), axis_of(word[1:] or "?")
+            if len(word) != 2 or kind not in "rt" or axis < 0 or (kind == "t" and name != "root"):
+                raise bad(path, line, "degrees of freedom rx, ry, rz", word)
+            turns.append(Turn(first + len(turns), axis, kind == "r"))
+        if len({turn[1:] for turn in turns}) < len(turns):
+            raise bad(path, line, "every degree of freedom once", " ".join(freedom))
+        is_angle.extend(turn.is_rotation for turn in turns)
+        if turns:
+            columns[name] = [turn.column for turn in turns]
+        return tuple(reversed(turns))  # about fixed axes, the last factor acts first
+
+    if "order" not in root:
+        raise bad(path, sections[":root"][0].number, "an order in :root", "none")
+
+    def vector(key: str) -> tuple[float, float, float]:
+        if key not in root:
+            return 0.0, 0.0, 0.0
+        words = root[key].words[1:4]
+        values = numbers(path, root[key].number, words, "three numbers")
+        if len(values) != 3:
+            raise bad(path, root[key].number, "three numbers", " ".join(words))
+        return values[0], values[1], values[2]
+
+    order, axes = root["order"], _euler(vector("orientation"), "XYZ", radians)
+    turns = turns_of("root", order.number, order.words[1:])
+    segments = [Segment("root", -1, vector("position"), axes, turns, False)]
+    index = {"root": 0}
+    for name, parent in parents.items():
+        bone = bones[name]
+        turns = turns_of(name, bone.line, bone.freedom)
+        segments.append(Segment(name, index[parent], bone.offset, bone.axes, turns, True))
+        index[name] = len(segments) - 1
+    return _Acclaim(segments, columns, is_angle, radians, metres)
+
+
+def _units(path: Path, lines: Sequence[Line]) -> tuple[bool, float | None]:
+    """Whether angles are in radians, and the metres per unit of length, where stated."""
+    units = _entries(lines)
+    radians = "angle" in units and units["angle"].words[-1].lower().startswith("rad")
+    if "length" not in units:
+        return radians, None
+    line = units["length"]
+    fraction, *_ = numbers(path, line.number, line.words[1:2] or ["nothing"], "a length")
+    return radians, 0.0254 / fraction if fraction > 1e-9 else None
+
+
+def _entries(lines: Sequence[Line]) -> dict[str, Line]:
+    """Lines by their first word."""
+    return {line.words[0].lower(): line for line in lines}
+
+
+class _Bone(NamedTuple):
+    line: int
+    offset: tuple[float, float, float]
+    axes: Float[np.ndarray, "3 3"]
+    freedom: tuple[str, ...]
+
+
+def _bones(path: Path, lines: Sequence[Line], radians: bool) -> dict[str, _Bone]:
+    bones: dict[str, _Bone] = {}
+    block: list[Line] | None = None
+    for line in lines:
+        word = line.words[0].lower()
+        if word == "begin" and block is None:
+            block = [line]
+        elif word == "end" and block is not None:
+            name, bone = _bone(path, block, radians)
+            if name in bones or name == "root":
+                raise bad(path, block[0].number, "a name of its own for every bone", name)
+            bones[name] = bone
+            block = None
+        elif block is not None and word != "begin":
+            block.append(line)
+        else:
+            raise bad(path, line.number, "begin ... end for every bone", " ".join(line.words))
+    if block is not None:
+        raise bad(path, block[-1].number, "end of a bone", "the end of the section")
+    return bones
+
+
+def _bone(path: Path, block: Sequence[Line], radians: bool) -> tuple[str, _Bone]:
+    entries = _entries(block)
+    first = block[0].number
+    for key, size in (("name", 1), ("direction", 3), ("length", 1), ("axis", 3)):
+        if key not in entries or len(entries[key].words) < 1 + size:
+            raise bad(path, first, f"{key} of a bone", ", ".join(entries))
+
+    def values_of(key: str, size: int) -> list[float]:
+        line = entries[key]
+        return numbers(path, line.number, line.words[1 : 1 + size], f"{size} numbers")
+
+    direction, axis = values_of("direction", 3), values_of("axis", 3)
+    (length,) = values_of("length", 1)
+    order = (entries["axis"].words[4:5] or ["XYZ"])[0].upper()
+    if sorted(order) != ["X", "Y", "Z"]:
+        raise bad(path, entries["axis"].number, "an order of X, Y and Z", order)
+    x, y, z = (length * value for value in direction)
+    freedom = tuple(entries["dof"].words[1:]) if "dof" in entries else ()
+    return entries["name"].words[1], _Bone(
+        entries.get("dof", block[0]).number, (x, y, z), _euler(axis, order, radians), freedom
+    )
+
+
+def _euler(angles: Sequence[float], order: str, radians: bool) -> Float[np.ndarray, "3 3"]:
+    """Rotations about fixed axes, in the order of the letters."""
+    matrix = np.eye(3)
+    for angle, letter in zip(angles, order, strict=True):
+        matrix = (
+            about(axis_of(letter), np.array(angle if radians else math.radians(angle))) @ matrix
+        )
+    return matrix
+
+
+def _hierarchy(path: Path, section: tuple[Line, list[Line]], bones: set[str]) -> dict[str, str]:
+    """Parent of every bone, parents first."""
+    parents: dict[str, str] = {}
+    for line in section[1]:
+        above, *below = line.words
+        if above.lower() in ("begin", "end") and not below:
+            continue
+        if above != "root" and above not in parents:
+            raise bad(path, line.number, "bones after their parents, from root on", above)
+        for name in below:
+            if name not in bones or name in parents:
+                raise bad(path, line.number, "bones of :bonedata, each once", name)
+            parents[name] = above
+    if set(parents) != bones:
+        missing = ", ".join(sorted(bones - set(parents)))
+        raise bad(path, section[0].number, "a parent for every bone", f"none for {missing}")
+    return parents
+
+
+def _parse_amc(path: Path, lines: list[Line], skeleton: _Acclaim) -> Float[np.ndarray, "t c"]:
+    radians = skeleton.radians
+    frames: list[Line] = []
+    values: list[list[float]] = []
+    filled: set[str] = set()
+    for line in lines:
+        first = line.words[0]
+        if first.startswith("#"):
+            continue
+        if first.startswith(":"):
+            radians = {":radians": True, ":degrees": False}.get(first.lower(), radians)
+            continue
+        if len(line.words) == 1 and first.isdigit():
+            _check_frame(path, line.number, skeleton, filled if frames else None)
+            if frames and count(path, line.number, first, "a frame number") != (
+                count(path, line.number, frames[-1].words[0], "a frame number") + 1
+            ):
+                raise bad(path, line.number, f"the frame after {frames[-1].words[0]}", first)
+            frames.append(line)
+            values.append([0.0] * len(skeleton.is_angle))
+            filled = set()
+            continue
+        if not frames:
+            raise bad(path, line.number, "the number of the first frame, as in an AMC", first)
+        columns = skeleton.columns.get(first)
+        if columns is None:
+            raise bad(path, line.number, "a bone of the skeleton with freedom", first)
+        if first in filled:
+            raise bad(path, line.number, "every bone once in a frame", first)
+        filled.add(first)
+        row = numbers(path, line.number, line.words[1:], "numbers")
+        if len(row) != len(columns):
+            raise bad(path, line.number, f"{len(columns)} numbers for {first}", len(row))
+        for column, value in zip(columns, row, strict=True):
+            values[-1][column] = value
+    if not frames:
+        raise bad(path, lines[-1].number, "frames, as in an AMC", "none")
+    _check_frame(path, lines[-1].number, skeleton, filled)
+    table = np.array(values).reshape(len(values), len(skeleton.is_angle))
+    if radians:
+        return table
+    return np.where(np.array(skeleton.is_angle, dtype=bool), np.radians(table), table)
+
+
+def _check_frame(path: Path, line: int, skeleton: _Acclaim, filled: set[str] | None) -> None:
+    """A frame is over: it must have told of every bone."""
+    if filled is not None and (missing := sorted(set(skeleton.columns) - filled)):
+        raise bad(path, line, "all bones in the frame before", f"none for {', '.join(missing)}")

@@ -1,0 +1,282 @@
+"""Motion capture files as joint positions: Acclaim's skeleton and motion (ASF, AMC), and BVH.
+
+Both formats hold a tree of rigid segments and, frame by frame, the angles between them. What is
+read is what both agree on: where every joint of the tree is in the world. World and zero pose are
+Y up in both; distances become metres, angles never leave this module.
+
+*BVH.* A joint stands at `OFFSET` in its parent's frame. Its rotations apply in the order of its
+channels, about the axes turned by those before: `R = R_parent R_1 R_2 R_3`. Position channels take
+the place of the offset, as in Blender and in the suits whose files have them in every joint.
+
+*Acclaim.* A bone has a direction and length in the zero pose, and its own axes C. Its rotations
+apply about fixed axes, first x, then y, then z, and turn the bone itself:
+`R = R_parent C (R_z R_y R_x) C^T`; it ends at `R direction length` from its parent's end. The joint
+called "lfemur" here is thus the end of that bone, the left knee.
+
+Neither format is sure to say its unit. An ASF states a fraction of an inch (that of the CMU
+database 1 / 0.45 inch, 56.4 mm); a BVH states none. Without `units`, the statement is taken if a
+person results, else the unit that makes the skeleton as large as one; the report says which.
+
+Call `read_motion_capture`, then `resample` for a part of it at another rate, and `limb_positions`
+for the joints that the catalogue names.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from torchcss.body.files.bvh import UNITS, guess_units, rest_positions, skeleton_span
+from torchcss.body.files.bvh_parser import Segment, parse_bvh
+from torchcss.errors import ConfigurationError, MotionCaptureError
+from torchcss.files import shortened
+from torchcss.io.export.rotations import about
+from torchcss.io.motion.acclaim import parse_acclaim
+from torchcss.joint_names import canonical_joint_name
+
+ACCLAIM_RATE = 120.0
+"""Frames per second of an AMC, which does not say: those of the CMU database."""
+
+_LIMBS = ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")
+LIMBS: Final[tuple[str, ...]] = tuple(f"{side}_{place}" for place in _LIMBS for side in "lr")
+"""The joints that all skeletons have and mean alike."""
+
+_LAYOUTS: Final[tuple[tuple[str, ...], ...]] = (
+    # Ends of Acclaim's bones. 'radius' and 'wrist' together are the forearm, cut where it twists.
+    ("hipjoint", "femur", "tibia", "clavicle", "humerus", "wrist"),
+    # Starts of what animators move: MotionBuilder, Mixamo, the BVH conversions of the CMU database.
+    ("upleg", "leg", "foot", "arm", "forearm", "hand"),
+)
+"""What other skeletons call `_LIMBS`, without side and prefix."""
+
+
+class MotionCapture(NamedTuple):
+    """What a file says about the motion of one skeleton.
+
+    Attributes:
+        joint_names: Names of the joints, those of the file; the tip of a BVH chain is `NAME_end`.
+        parents: Parent of every joint, which stands before it; -1 for the root.
+        rest: Joint positions in the zero pose, root at the origin, metres.
+        joints: Joint positions in the world, Y up, metres.
+        frame_rate: Frames per second.
+        report: What was assumed, one line each.
+    """
+
+    joint_names: tuple[str, ...]
+    parents: tuple[int, ...]
+    rest: Float[np.ndarray, "j 3"]
+    joints: Float[np.ndarray, "t j 3"]
+    frame_rate: float
+    report: tuple[str, ...]
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first to the last frame."""
+        return (len(self.joints) - 1) / self.frame_rate
+
+
+def read_motion_capture(
+    path: str | os.PathLike[str],
+    *,
+    skeleton: str | os.PathLike[str] | None = None,
+    units: str | float | None = None,
+    frame_rate: float | None = None,
+) -> MotionCapture:
+    """Read a motion: a `.bvh`, or an `.amc` with its `.asf`.
+
+    Args:
+        path: The file.
+        skeleton: The ASF of an AMC; by default the file of the same name beside it.
+        units: Metres per unit of the file, or a name of `UNITS`; None: as stated, or guessed.
+        frame_rate: Frames per second, instead of what the file says (BVH) or 120 (AMC).
+
+    Raises:
+        MotionCaptureError: If a file is missing, damaged or of another format, or the unit cannot
+            be guessed. The message says where.
+        ConfigurationError: If `units` or `frame_rate` is not positive or unknown.
+    """
+    path = Path(path)
+    scale = _scale_of(units)
+    if frame_rate is not None and not 0 < frame_rate < math.inf:
+        raise ConfigurationError(f"frame rate: expected a positive number, got {frame_rate}")
+    suffix = path.suffix.lower()
+    if suffix == ".bvh":
+        segments, values, rate = parse_bvh(path)
+        stated, report = None, []
+    elif suffix == ".amc":
+        beside = Path(skeleton) if skeleton is not None else path.with_suffix(".asf")
+        if skeleton is None and not beside.is_file():
+            raise MotionCaptureError(
+                f"{path}: an AMC holds no skeleton, and there is no {beside.name} beside it; name "
+                "its ASF file"
+            )
+        segments, values, stated = parse_acclaim(beside, path)
+        rate, report = ACCLAIM_RATE, ["rate assumed: an AMC does not say it"]
+    else:
+        raise MotionCaptureError(
+            f"{path}: expected a .bvh file, or an .amc file with its .asf, found {suffix!r}"
+        )
+    if frame_rate is not None:
+        rate, report = frame_rate, []
+    report = [f"{len(values)} frames, {rate:g} per second", *report]
+    with np.errstate(all="ignore"):  # whatever overflows is found below
+        rest = rest_positions(segments)
+        joints = _positions(segments, values)
+        if scale is None:
+            scale, line = guess_units(path, skeleton_span(rest, segments), stated)
+            report.append(line)
+        rest, joints = scale * rest, scale * joints
+    if not (np.isfinite(rest).all() and np.isfinite(joints).all()):
+        frame = int(np.argmin(np.isfinite(joints).all((1, 2))))
+        raise MotionCaptureError(
+            f"{path}: frame {frame + 1}: the positions are beyond all bounds; the file is damaged"
+        )
+    return MotionCapture(
+        tuple(segment.name for segment in segments),
+        tuple(segment.parent for segment in segments),
+        rest,
+        joints,
+        rate,
+        tuple(report),
+    )
+
+
+def resample(
+    motion: MotionCapture, *, rate: float, start: float = 0.0, stop: float | None = None
+) -> MotionCapture:
+    """A part of a motion at another rate, every coordinate interpolated on its own.
+
+    By cubic pieces that meet in value and slope, the slopes from five frames; bones change length
+    by a few micrometres where limbs move at everyday speed. Nothing is filtered: people move below
+    ten hertz.
+
+    Args:
+        motion: The motion.
+        rate: Frames per second.
+        start: Seconds after the first frame.
+        stop: End of the part, exclusive; None: the end of the motion, inclusive.
+
+    Raises:
+        ConfigurationError: If the rate is not positive, or no frame lies in the part.
+    """
+    if not 0 < rate < math.inf:
+        raise ConfigurationError(f"rate: expected a positive number, got {rate}")
+    end = motion.duration
+    stop_at = end + 1e-9 if stop is None else stop
+    if not (0 <= start <= end and start < stop_at):
+        raise ConfigurationError(
+            f"expected a part of the motion, 0 to {end:.3f} s, got {start:g} to {stop_at:g} s"
+        )
+    last = min(stop_at - 1e-9 / rate, end + 1e-9)
+    times = start + np.arange(math.floor((last - start) * rate) + 1) / rate
+    place = np.clip(times * motion.frame_rate, 0, len(motion.joints) - 1)
+    return motion._replace(joints=_interpolate(motion.joints, place), frame_rate=rate)
+
+
+def limb_positions(
+    motion: MotionCapture,
+) -> tuple[tuple[str, ...], tuple[int, ...], Float[np.ndarray, "t limbs 3"]]:
+    """The joints of a motion that the catalogue names too.
+
+    Args:
+        motion: The motion. Its names may be Acclaim's, animators', or any spelling that
+            `canonical_joint_name` knows.
+
+    Returns:
+        Those of `LIMBS` that there are, which joint of the motion each is, and their positions.
+
+    Raises:
+        MotionCaptureError: If hips or shoulders are not among them.
+    """
+    found = max((_match(motion.joint_names, layout) for layout in (*_LAYOUTS, None)), key=len)
+    if not {"l_hip", "r_hip", "l_shoulder", "r_shoulder"} <= set(found):
+        raise MotionCaptureError(
+            "expected hips and shoulders of both sides among the joints, found "
+            f"{shortened(', '.join(motion.joint_names))}; rename the joints"
+        )
+    names = tuple(name for name in LIMBS if name in found)
+    index = tuple(found[name] for name in names)
+    return names, index, motion.joints[:, list(index)]
+
+
+def _match(joint_names: Sequence[str], layout: tuple[str, ...] | None) -> dict[str, int]:
+    """Limbs found by one table of names, or by the package's own."""
+    found: dict[str, int] = {}
+    for index, name in enumerate(joint_names):
+        if layout is None:
+            canonical = canonical_joint_name(name)
+            if canonical in LIMBS:
+                found.setdefault(canonical, index)
+            continue
+        bare = re.sub(r"[^a-z]", "", name.lower().split(":")[-1].removeprefix("mixamorig"))
+        for side in ("left", "right", "l", "r"):
+            place = bare.removeprefix(side)
+            if place != bare and place in layout:
+                found.setdefault(f"{side[0]}_{_LIMBS[layout.index(place)]}", index)
+                break
+    return found
+
+
+def _scale_of(units: str | float | None) -> float | None:
+    if isinstance(units, str):
+        try:
+            units = UNITS[units] if units in UNITS else float(units)
+        except ValueError:
+            raise ConfigurationError(
+                f"units: expected {', '.join(UNITS)} or metres per unit, got {units!r}"
+            ) from None
+    if units is not None and not 0 < units < math.inf:
+        raise ConfigurationError(f"units: expected a positive number of metres, got {units}")
+    return units
+
+
+def _positions(
+    segments: Sequence[Segment], values: Float[np.ndarray, "t c"]
+) -> Float[np.ndarray, "t j 3"]:
+    """Forward kinematics of both formats, in the file's unit; angles in radians."""
+    joints = np.zeros((len(values), len(segments), 3))
+    rotations: list[np.ndarray] = []
+    for index, segment in enumerate(segments):
+        above = rotations[segment.parent] if index else np.eye(3)
+        start = joints[:, segment.parent] if index else 0.0
+        local = np.broadcast_to(segment.axes, (len(values), 3, 3))
+        shift = np.tile(segment.offset, (len(values), 1))
+        for turn in segment.turns:
+            if turn.is_rotation:
+                local = local @ about(turn.axis, values[:, turn.column])
+            else:
+                shift[:, turn.axis] = values[:, turn.column]
+        turned = above @ local @ segment.axes.T
+        rotations.append(turned)
+        carried = turned if segment.turns_itself else above
+        joints[:, index] = start + (carried @ shift[..., None])[..., 0]
+    return joints
+
+
+def _interpolate(
+    samples: Float[np.ndarray, "t *rest"], place: Float[np.ndarray, " s"]
+) -> Float[np.ndarray, "s *rest"]:
+    """Cubic Hermite interpolation at fractional indices."""
+    if len(samples) == 1:
+        return np.repeat(samples, len(place), axis=0)
+    slope = np.gradient(samples, axis=0, edge_order=2 if len(samples) > 2 else 1)
+    if len(samples) > 4:
+        ahead, behind = samples[4:] - samples[:-4], samples[3:-1] - samples[1:-3]
+        slope[2:-2] = (8 * behind - ahead) / 12
+    first = np.floor(place).astype(int).clip(0, len(samples) - 2)
+    u = (place - first).reshape(-1, *[1] * (samples.ndim - 1))
+    a, b = samples[first], samples[first + 1]
+    c, d = slope[first], slope[first + 1]
+    return (
+        (1 + 2 * u) * (1 - u) ** 2 * a
+        + u * (1 - u) ** 2 * c
+        + u * u * (3 - 2 * u) * b
+        + u * u * (u - 1) * d
+    )

@@ -1,0 +1,1 @@
+"""Pictures of tracks: overlays, plots, the viewer, clicking."""

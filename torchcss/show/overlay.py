@@ -1,0 +1,467 @@
+"""Tracked bodies drawn over the frames of a video.
+
+Every mode of the tracker explains the picture in its own way, and the overlay shows them together:
+the best mode as translucent shaded parts with a crisp outline each, what is hidden behind other
+parts of the same body as dashes, and every other mode as a thin outline, fainter the less it
+weighs. Each mode has its own colour, from the palette of Okabe and Ito, which colour-blind viewers
+can tell apart.
+
+Outlines come from rasterised part labels: a lattice point between four pixels belongs to an
+outline where their labels differ; smoothing that lattice with a Gaussian gives the distance to the
+outline, and with it an antialiased line of constant width. Only the bodies' bounding boxes are
+worked on, and bodies that fill a large frame are rasterised more coarsely, so that a frame costs a
+fraction of a second whatever its size.
+
+By default project every part with the camera, and call `draw_overlay(frame, modes, weights=...)`
+with the best mode first. Pixels as everywhere: centres at integers, u counts columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+from torch.nn import functional
+
+from torchcss.body.model import BodyModel
+from torchcss.errors import ConfigurationError, ShapeError, check_shape
+from torchcss.vision.camera import Camera
+from torchcss.vision.rasterise import (
+    Fragments,
+    grid_faces,
+    interpolate,
+    join_faces,
+    rasterise,
+    vertex_normals,
+)
+
+PALETTE: tuple[tuple[int, int, int], ...] = (
+    (86, 180, 233),
+    (230, 159, 0),
+    (204, 121, 167),
+    (0, 158, 115),
+    (213, 94, 0),
+    (240, 228, 66),
+    (0, 114, 178),
+)
+"""Colours of the modes, RGB, best mode first: Okabe and Ito's set without black."""
+
+
+_STEPS = 0.25
+"""Square coarse pixels: how far the cracks of a raster, enlarged, scatter about the true line:
+1/12 for rounding to pixels and 1/6 for interpolating between them."""
+
+
+class ProjectedPart(NamedTuple):
+    """The mesh of one body part as a camera sees it.
+
+    Attributes:
+        uv: Projected vertices, pixels.
+        depth: Their depth along the optical axis, metres.
+        valid: Which of them may be used (in front of the camera).
+        faces: Corner indices of the triangles.
+        part: Which part of the body it is; meshes with one number share one outline.
+    """
+
+    uv: Float[Tensor, "v 2"]
+    depth: Float[Tensor, " v"]
+    valid: Bool[Tensor, " v"]
+    faces: Int[Tensor, "f 3"]
+    part: int
+
+
+ProjectedMode = Sequence[ProjectedPart]
+"""One explanation of the picture: all the parts of the body in one pose."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OverlayStyle:
+    """How the overlay looks.
+
+    Attributes:
+        fill: Opacity of the best mode's surface, 0 to 1.
+        line: Width of the best mode's outlines, pixels; other modes get two thirds of it. `None`
+            chooses by the size of the frame: 1.5 pixels at 480 rows, 3.4 at 1080.
+        hidden: Opacity of the dashes of hidden outlines, 0 to 1.
+        faintest: Opacity of the outline of a mode that weighs nothing; one that weighs as much as
+            the best is opaque.
+        resolution: Pixels of a bounding box that are rasterised at most; larger boxes are
+            rasterised more coarsely.
+    """
+
+    fill: float = 0.45
+    line: float | None = None
+    hidden: float = 0.6
+    faintest: float = 0.35
+    resolution: int = 300_000
+
+    def __post_init__(self) -> None:
+        opacities = (self.fill, self.hidden, self.faintest)
+        if not all(0 <= opacity <= 1 for opacity in opacities):
+            raise ConfigurationError(f"opacities: expected from 0 to 1, got {opacities}")
+        if self.resolution < 1 or (self.line is not None and not self.line > 0):
+            raise ConfigurationError(
+                "overlay style: expected a positive line width and resolution, got "
+                f"{self.line} and {self.resolution}"
+            )
+
+
+class _Window(NamedTuple):
+    """The part of the frame that a body can touch, and how coarsely it is rasterised."""
+
+    top: int
+    left: int
+    height: int
+    width: int
+    scale: float
+
+    @property
+    def coarse(self) -> tuple[int, int]:
+        return max(round(self.height * self.scale), 1), max(round(self.width * self.scale), 1)
+
+    def place(self, uv: Float[Tensor, "v 2"]) -> Float[Tensor, "v 2"]:
+        """Pixels of the frame to coarse pixels of the window."""
+        rows, columns = self.coarse
+        ratio = uv.new_tensor([columns / self.width, rows / self.height])
+        return (uv - uv.new_tensor([self.left, self.top]) + 0.5) * ratio - 0.5
+
+    def enlarge(self, maps: Float[Tensor, "c r s"]) -> Float[Tensor, "c h w"]:
+        """Coarse maps to the pixels of the window."""
+        if maps.shape[1:] == (self.height, self.width):
+            return maps
+        return functional.interpolate(maps[None], (self.height, self.width), mode="bilinear")[0]
+
+
+def project_body(
+    body: BodyModel, x: Float[Tensor, "k n"], camera: Camera, *, rings: int, meridians: int
+) -> list[list[ProjectedPart]]:
+    """Project the surface of a body in several poses, as `draw_overlay` takes it.
+
+    Args:
+        body: The body on its base.
+        x: Its poses, the best first.
+        camera: Camera of the picture.
+        rings: Latitudes of the mesh of each part.
+        meridians: Longitudes of the mesh of each part.
+    """
+    local, faces = body.mesh(rings, meridians).points.flatten(1, 2), grid_faces(rings, meridians)
+    rotation, centre = body.part_poses(body.pose(x))
+    poses = []
+    for points in local @ rotation.mT + centre[..., None, :]:
+        parts = []
+        for part, vertices in enumerate(points):
+            uv, depth, valid = (tensor.cpu() for tensor in camera.project(vertices))
+            parts.append(ProjectedPart(uv, depth, valid, faces, part))
+        poses.append(parts)
+    return poses
+
+
+def draw_overlay(
+    image: UInt8[Tensor, "h w 3"],
+    modes: Sequence[ProjectedMode],
+    *,
+    weights: Float[Tensor, " k"] | Sequence[float] | None = None,
+    keypoints: Float[Tensor, "j 2"] | None = None,
+    text: str | None = None,
+    style: OverlayStyle | None = None,
+) -> UInt8[Tensor, "h w 3"]:
+    """Draw the modes of a tracker over a frame.
+
+    Args:
+        image: The frame; it is not changed.
+        modes: Projected bodies, the best first. There may be none, and parts may be behind the
+            camera or out of the picture.
+        weights: Weight of every mode, in any unit; equal when absent.
+        keypoints: Measured image points, drawn as small rings; those not finite are missing.
+        text: A line to write into the lower left corner.
+        style: Opacities and widths.
+
+    Returns:
+        A new frame.
+
+    Raises:
+        ShapeError: If the frame is not uint8 RGB, or there are not as many weights as modes.
+        ConfigurationError: If a weight is negative or not finite.
+    """
+    check_shape("image", image, None, None, 3)
+    if image.dtype != torch.uint8 or image.ndim != 3:
+        raise ShapeError(
+            f"image: expected uint8 of shape [h, w, 3], got {image.dtype} {list(image.shape)}; "
+            "scale floating point frames to 0..255 and convert them"
+        )
+    strength = torch.ones(len(modes)) if weights is None else torch.as_tensor(weights).float().cpu()
+    if strength.shape != (len(modes),):
+        raise ShapeError(
+            f"weights: expected one for each of {len(modes)} modes, got {list(strength.shape)}"
+        )
+    if not bool((torch.isfinite(strength) & (strength >= 0)).all()):
+        raise ConfigurationError(
+            f"weights: expected finite and not negative, got {strength.tolist()}; "
+            "exponentiate logarithms first"
+        )
+    style = style or OverlayStyle()
+    drawn = image.clone()
+    line = style.line or max(1.5, image.shape[0] / 320)
+    colours = drawn.new_tensor(PALETTE, dtype=torch.float32)
+    if modes:
+        _draw_body(drawn, modes[0], colours[0], line, style)
+    for index in range(len(modes) - 1, 0, -1):  # the heavier on top
+        share = float(strength[index] / strength[0]) if strength[0] > 0 else 0.0
+        opacity = style.faintest + (1 - style.faintest) * min(share, 1.0)
+        colour = colours[1 + (index - 1) % (len(PALETTE) - 1)]
+        _draw_outline(drawn, modes[index], colour, 2 * line / 3, opacity, style)
+    if keypoints is not None:
+        check_shape("keypoints", keypoints, None, 2)
+        _draw_keypoints(drawn, keypoints, 2.5 * line)
+    if text:
+        _draw_text(drawn, text)
+    return drawn
+
+
+def _window(
+    mode: ProjectedMode, height: int, width: int, margin: float, resolution: int
+) -> _Window | None:
+    """Bounding box of a body's usable vertices and `margin` in the frame; `None` if it is empty."""
+    corners = [part.uv[part.valid & (part.depth > 0)] for part in mode]
+    uv = torch.cat(corners) if corners else torch.zeros(0, 2)
+    uv = uv[torch.isfinite(uv).all(-1)]
+    if not uv.numel():
+        return None
+    bound = uv.new_tensor([width, height])
+    low = (uv.amin(0) - margin).floor().clamp_min(0).minimum(bound).long().tolist()
+    high = (uv.amax(0) + margin).ceil().clamp_min(-1).minimum(bound - 1).long().tolist()
+    left, top = low
+    columns, rows = high[0] + 1 - left, high[1] + 1 - top
+    if columns < 1 or rows < 1:
+        return None
+    return _Window(top, left, rows, columns, min(1.0, (resolution / (rows * columns)) ** 0.5))
+
+
+class _Labels(NamedTuple):
+    """A rasterised body: its joined mesh, the fragments and the part number of every pixel."""
+
+    uv: Float[Tensor, "v 2"]
+    depth: Float[Tensor, " v"]
+    faces: Int[Tensor, "f 3"]
+    fragments: Fragments
+    part: Int[Tensor, "r s"]
+
+
+def _rasterise_mode(mode: ProjectedMode, window: _Window) -> _Labels:
+    """Part labels of a body in its window."""
+    faces, owner = join_faces([part.faces for part in mode], [part.uv.shape[0] for part in mode])
+    uv, depth = torch.cat([part.uv for part in mode]), torch.cat([part.depth for part in mode])
+    valid = torch.cat([part.valid for part in mode])
+    fragments = rasterise(window.place(uv), depth, faces, *window.coarse, valid=valid)
+    number = owner.new_tensor([part.part for part in mode])[owner]
+    seen = fragments.face >= 0
+    part = torch.where(seen, number[fragments.face.clamp_min(0)], -1)
+    return _Labels(uv, depth, faces, fragments, part)
+
+
+def _borders(part: Int[Tensor, "r s"]) -> Float[Tensor, "R S"]:
+    """Length of outline that passes each lattice point, in coarse pixels; zero for most.
+
+    The lattice lies between the pixels and is one larger than the image. An outline runs along the
+    cracks between pixels of different labels; where it turns it cuts the corner, so that a line
+    has about the same length in every direction.
+    """
+    # Repeating the labels at the frame's edge draws no line where the frame cuts a body.
+    padded = functional.pad(part[None, None].float(), (1, 1, 1, 1), mode="replicate")[0, 0]
+    upright = (padded[:, 1:] != padded[:, :-1]).float()
+    level = (padded[1:] != padded[:-1]).float()
+    return torch.hypot(upright[1:] + upright[:-1], level[:, 1:] + level[:, :-1]) / 2
+
+
+def _profile(border: Float[Tensor, "R S"], sigma: float) -> Float[Tensor, "r s"]:
+    """The lattice smoothed by `sigma` coarse pixels, scaled so that a line is a hill of height 1.
+
+    Across the line the hill is `exp(-d^2 / 2 s^2)` with `s^2 = sigma^2 + _STEPS`.
+    """
+    reach = int(3 * sigma + 1)
+    # Lattice points lie half a pixel off the centres: an even kernel, cut to the image.
+    taps = torch.arange(-reach, reach, device=border.device) + 0.5
+    kernel = torch.exp(-0.5 * (taps / sigma) ** 2)
+    kernel, pad = kernel / kernel.sum(), reach - 1
+    smooth = functional.conv2d(border[None, None], kernel[None, None, :, None], padding=(pad, 0))
+    smooth = functional.conv2d(smooth, kernel[None, None, None, :], padding=(0, pad))
+    return smooth[0, 0] * (2 * torch.pi * (sigma**2 + _STEPS)) ** 0.5
+
+
+def _line_spread(width: float, scale: float) -> float:
+    """Standard deviation, coarse pixels, that smooths away the raster's steps under a line."""
+    return max(0.5 * width * scale, 0.9)
+
+
+def _cover(
+    profile: Float[Tensor, "h w"], sigma: float, scale: float, width: float
+) -> Float[Tensor, "h w"]:
+    """Antialiased coverage of lines of `width` frame pixels, from their enlarged profile."""
+    squared = -2 * (sigma**2 + _STEPS) / scale**2 * profile.clamp(1e-6, 1).log()
+    return (width / 2 + 0.5 - squared.sqrt()).clamp(0, 1)
+
+
+def _blend(
+    target: UInt8[Tensor, "h w 3"], window: _Window, colour: Tensor, opacity: Float[Tensor, "h w"]
+) -> None:
+    """Mix `colour` (one, or one per pixel) into the window of the frame, in place."""
+    view = target[window.top : window.top + window.height, window.left : window.left + window.width]
+    touched = torch.nonzero(opacity > 0, as_tuple=True)
+    alpha = opacity[touched][:, None]
+    paint = colour if colour.ndim == 1 else colour[touched]
+    view[touched] = torch.lerp(view[touched].float(), paint.float(), alpha).round().to(torch.uint8)
+
+
+def _draw_outline(
+    target: UInt8[Tensor, "h w 3"],
+    mode: ProjectedMode,
+    colour: Float[Tensor, "3"],
+    line: float,
+    opacity: float,
+    style: OverlayStyle,
+) -> None:
+    """Thin outlines of the visible parts."""
+    window = _window(mode, target.shape[0], target.shape[1], line + 1, style.resolution)
+    if window is None:
+        return
+    labels = _rasterise_mode(mode, window)
+    sigma = _line_spread(line, window.scale)
+    profile = window.enlarge(_profile(_borders(labels.part), sigma)[None])[0]
+    _blend(target, window, colour, opacity * _cover(profile, sigma, window.scale, line))
+
+
+def _draw_body(
+    target: UInt8[Tensor, "h w 3"],
+    mode: ProjectedMode,
+    colour: Float[Tensor, "3"],
+    line: float,
+    style: OverlayStyle,
+) -> None:
+    """Translucent shaded parts, their outlines, and dashes for what is hidden."""
+    window = _window(mode, target.shape[0], target.shape[1], 2 * line + 2, style.resolution)
+    if window is None:
+        return
+    labels = _rasterise_mode(mode, window)
+    light, seen = _shading(labels, target.shape[0], target.shape[1])
+    sigma = _line_spread(line, window.scale)
+    visible = _profile(_borders(labels.part), sigma)
+    hidden = _profile(_hidden_borders(mode, labels.part, window, line), sigma)
+    light, seen, visible, hidden = window.enlarge(torch.stack((light, seen, visible, hidden)))
+    faint, broad, thin = (
+        _cover(profile, sigma, window.scale, width)
+        for profile, width in ((hidden, 0.7 * line), (visible, 2 * line), (visible, line))
+    )
+    white = torch.full_like(colour, 255.0)
+    _blend(target, window, colour * light[..., None], style.fill * seen)
+    _blend(target, window, torch.lerp(colour, white, 0.5), style.hidden * faint)
+    # A dark line under a bright one stands out from any background.
+    _blend(target, window, 0.15 * colour, 0.6 * broad)
+    _blend(target, window, torch.lerp(colour, white, 0.7), thin)
+
+
+def _shading(labels: _Labels, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Lambert's shading per pixel, and where there is a surface.
+
+    The overlay knows no intrinsics; a focal length of the frame's larger side gives normals that
+    are good enough to look at.
+    """
+    middle = labels.uv.new_tensor([width / 2, height / 2])
+    depth = torch.where(torch.isfinite(labels.depth) & (labels.depth > 0), labels.depth, 1.0)
+    offset = torch.nan_to_num(labels.uv - middle).clamp(-1e6, 1e6) / max(height, width)
+    points = torch.cat((offset * depth[:, None], depth[:, None]), -1)
+    normals = vertex_normals(points, labels.faces)
+    pixel = torch.nonzero(labels.part.view(-1) >= 0)[:, 0]
+    face = labels.fragments.face.view(-1)[pixel]
+    weights = labels.fragments.barycentric.view(-1, 3)[pixel]
+    normal = functional.normalize(interpolate(normals, labels.faces, face, weights), dim=-1)
+    normal = torch.where(normal[:, 2:] > 0, -normal, normal)  # towards the viewer
+    lamp = functional.normalize(normal.new_tensor([-0.4, -0.6, -0.7]), dim=0)
+    light = torch.ones(labels.part.numel(), device=normal.device)
+    light[pixel] = (0.3 + 0.8 * (normal @ lamp).clamp_min(0)).clamp_max(1.0).float()
+    return light.view(labels.part.shape), (labels.part >= 0).float()
+
+
+def _hidden_borders(
+    mode: ProjectedMode, visible: Int[Tensor, "r s"], window: _Window, line: float
+) -> Float[Tensor, "R S"]:
+    """Dashed lattice of part silhouettes that lie behind other parts of the same body."""
+    rows, columns = visible.shape
+    dashes = visible.new_zeros(rows + 1, columns + 1, dtype=torch.float32)
+    dash = max(round(4 * line * window.scale), 2)
+    for number in sorted({part.part for part in mode}):
+        members = [part for part in mode if part.part == number]
+        placed = [part._replace(uv=window.place(part.uv)) for part in members]
+        box = _window(placed, rows, columns, 2, rows * columns)
+        if box is None:
+            continue
+        own = _rasterise_mode(placed, box).part == number
+        here = (slice(box.top, box.top + box.height), slice(box.left, box.left + box.width))
+        border = _borders(own.long())
+        # A lattice point counts as hidden where none of its four pixels shows this part.
+        shows = functional.pad(visible[here] == number, (1, 1, 1, 1))
+        shows = shows[1:] | shows[:-1]
+        border = border * ~(shows[:, 1:] | shows[:, :-1])
+        # Dashes run along the axis that the outline follows more closely, so that lines of every
+        # direction are broken: differences of the smoothed silhouette give its direction.
+        soft = functional.avg_pool2d(
+            functional.pad(own[None, None].float(), (3, 3, 3, 3), mode="replicate"), 5, 1
+        )[0, 0]
+        across = (soft[1:, 1:] - soft[1:, :-1]).abs()
+        down = (soft[1:, 1:] - soft[:-1, 1:]).abs()
+        row = torch.arange(box.height + 1, device=visible.device)[:, None] + box.top
+        column = torch.arange(box.width + 1, device=visible.device)[None] + box.left
+        phase = torch.where(across > down, row, column) // dash
+        lattice = (
+            slice(box.top, box.top + box.height + 1),
+            slice(box.left, box.left + box.width + 1),
+        )
+        dashes[lattice] = torch.maximum(dashes[lattice], border * (phase % 2 == 0))
+    return dashes
+
+
+def _draw_keypoints(
+    target: UInt8[Tensor, "h w 3"], keypoints: Float[Tensor, "j 2"], radius: float
+) -> None:
+    """Yellow rings with a dark rim."""
+    height, width = target.shape[:2]
+    yellow = target.new_tensor(PALETTE[5], dtype=torch.float32)
+    for u, v in keypoints.detach().double().cpu().tolist():
+        reach = radius + 2
+        # Also false for a keypoint that is not a number.
+        if not (-reach < u < width - 1 + reach and -reach < v < height - 1 + reach):
+            continue
+        top, left = max(int(v - reach), 0), max(int(u - reach), 0)
+        bottom, right = min(int(v + reach) + 2, height), min(int(u + reach) + 2, width)
+        window = _Window(top, left, bottom - top, right - left, 1.0)
+        y = torch.arange(top, bottom, device=target.device)[:, None] - v
+        x = torch.arange(left, right, device=target.device)[None] - u
+        off = ((x**2 + y**2).sqrt() - radius).abs()
+        _blend(target, window, 0 * yellow, 0.7 * (0.3 * radius + 1.5 - off).clamp(0, 1).float())
+        _blend(target, window, yellow, (0.3 * radius + 0.5 - off).clamp(0, 1).float())
+
+
+def _draw_text(target: UInt8[Tensor, "h w 3"], text: str) -> None:
+    """One line in the lower left corner, white on a dark strip."""
+    # Pillow comes with matplotlib; imported here because nothing else of the overlay needs it.
+    from PIL import Image, ImageDraw, ImageFont
+
+    text = " ".join(text.splitlines())
+    height, width = target.shape[:2]
+    size = max(10, round(height / 36))
+    font = ImageFont.load_default(size)
+    left, top, right, bottom = (int(side) for side in font.getbbox(text))
+    pad = size // 2
+    ink = Image.new("L", (right - left + 2 * pad, bottom - top + 2 * pad), 0)
+    ImageDraw.Draw(ink).text((pad - left, pad - top), text, fill=255, font=font)
+    cover = torch.from_numpy(np.array(ink, dtype=np.float32) / 255)
+    cover = cover[-height:, :width].to(target.device)
+    rows, columns = cover.shape
+    window = _Window(height - rows, 0, rows, columns, 1.0)
+    white = cover.new_full((3,), 255.0)
+    _blend(target, window, 0 * white, torch.full_like(cover, 0.55))
+    _blend(target, window, white, cover)

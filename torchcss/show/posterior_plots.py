@@ -1,0 +1,296 @@
+"""What a track says over time, and how sure it is: figures of its states and covariances.
+
+* `joints_figure`: where joints are, with bands of two standard deviations.
+* `angles_figure`: every parameter of the state, with bands and the joint limits.
+* `spectra_figure`: along how many directions of the state the image leaves how much uncertain, and
+  which parameters those directions mix.
+
+Lines and bands are those of each frame's best mode; the other modes are dots of their colours in
+the overlay, fainter the less they weigh. A band is what the covariance says to first order
+(`torchcss.body.uncertainty`); it knows nothing of the other modes.
+
+The look and the helpers are those of `torchcss.show.track_plots`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from torchcss.body.model import BodyModel
+from torchcss.body.root import ROOT_NAMES
+from torchcss.body.uncertainty import joint_covariance
+from torchcss.errors import ConfigurationError
+from torchcss.io.track_body import body_of_track, pose_track
+from torchcss.io.tracks import Track
+from torchcss.show.style import OKABE_ITO
+from torchcss.show.track_plots import mode_colour, tidy
+from torchcss.vision.camera import Camera
+
+DEVIATIONS = 2.0
+"""Half-width of the bands, standard deviations."""
+
+LIMBS = (
+    "skull_tip", "l_shoulder", "l_elbow", "l_wrist", "r_shoulder", "r_elbow", "r_wrist",
+    "r_hand_tip", "l_hip", "l_knee", "l_ankle", "r_hip", "r_knee", "r_ankle",
+)  # fmt: skip
+"""Joints that `joints_figure` shows of a body that has them, if it is not told others."""
+
+_LINE = OKABE_ITO["blue"]
+_SHOWN_PARAMETERS = 14
+_DIRECTIONS = 3
+_BARS = 7
+
+
+def joints_figure(
+    track: Track,
+    body: BodyModel | None = None,
+    *,
+    camera: Camera | None = None,
+    joints: Sequence[str] | None = None,
+) -> Figure:
+    """Places of joints over time, a row per joint, a column per direction.
+
+    Args:
+        track: The track.
+        body: The body, if it is none of the catalogue's (see `body_of_track`).
+        camera: Its camera: directions are then to the right, up and away as it sees them. None: the
+            axes of the track's world.
+        joints: Which joints; by default those of `LIMBS` that it has, or all.
+
+    Raises:
+        ConfigurationError: If the track has no frames, or no such joint.
+        TrackFileError: If the body cannot be told.
+    """
+    rows = _rows(track)
+    names = list(joints) if joints is not None else [n for n in LIMBS if n in track.joint_names]
+    names = names or list(track.joint_names)
+    if missing := set(names) - set(track.joint_names):
+        raise ConfigurationError(
+            f"the track has no joints {', '.join(sorted(missing))}; it has "
+            f"{', '.join(track.joint_names)}"
+        )
+    chosen = [track.joint_names.index(name) for name in names]
+    body = body_of_track(track, body)
+    pose = pose_track(
+        body,
+        torch.from_numpy(track.state[rows, 0]),
+        torch.from_numpy(track.base_transform[rows]),
+    )
+    spread = joint_covariance(body, pose, torch.from_numpy(track.covariance[rows, 0])).numpy()
+    places, labels = track.joints_world[rows], ("world x", "world y", "world z")
+    if camera is not None:
+        # Up is minus the camera's y.
+        turn = camera.R_camera_world.double().cpu().numpy() * [[1], [-1], [1]]
+        shift = camera.t_camera_world.double().cpu().numpy() * [1, -1, 1]
+        places = places @ turn.T + shift
+        spread = turn @ spread @ turn.T
+        labels = ("to the right", "up", "away from the camera")
+    deviation = np.sqrt(np.diagonal(spread, axis1=-2, axis2=-1).clip(min=0))
+
+    figure = Figure(figsize=(11.0, 1.0 + 1.15 * len(names)), layout="constrained")
+    grid = figure.subplots(len(names), 3, sharex=True, squeeze=False)
+    for panels, name, joint in zip(grid, names, chosen, strict=True):
+        for axis, axes in enumerate(panels):
+            _draw(axes, track, rows, places[:, :, joint, axis], deviation[:, joint, axis])
+        panels[0].set_ylabel(name.replace("_", " "), fontsize=9)
+    for axes, label in zip(grid[0], labels, strict=True):
+        axes.set_title(f"{label} (metres)", fontsize=10)
+    for axes in grid[-1]:
+        axes.set_xlabel("seconds", fontsize=9)
+    figure.suptitle(_caption("joint centres"), fontsize=10)
+    return figure
+
+
+def angles_figure(track: Track, body: BodyModel | None = None) -> Figure:
+    """Every parameter over time, a panel each, with its limits as dotted lines.
+
+    The root's six are relative to the base, and their lines end where that was moved.
+
+    Args:
+        track: The track.
+        body: The body, if it is none of the catalogue's (see `body_of_track`).
+
+    Raises:
+        ConfigurationError: If the track has no frames.
+        TrackFileError: If the body cannot be told.
+    """
+    rows = _rows(track)
+    body = body_of_track(track, body)
+    lower, upper = body.lower.numpy(), body.upper.numpy()
+    deviation = np.sqrt(np.diagonal(track.covariance[rows, 0], axis1=-2, axis2=-1).clip(min=0))
+    base = track.base_transform[rows]
+    moved = np.flatnonzero((np.abs(np.diff(base, axis=0)) > 1e-9).any((1, 2))) + 1
+    columns = min(len(track.state_names), 5)
+    count = math.ceil(len(track.state_names) / columns)
+    figure = Figure(figsize=(2.6 * columns + 0.6, 1.0 + 1.45 * count), layout="constrained")
+    grid = figure.subplots(count, columns, sharex=True, squeeze=False)
+    for axes in grid.flat[len(track.state_names) :]:
+        axes.set_visible(False)
+    for index, (axes, name) in enumerate(zip(grid.flat, track.state_names, strict=False)):
+        factor, unit = (1.0, "m") if _is_length(name) else (180 / math.pi, "degrees")
+        values = factor * track.state[rows, :, index]
+        breaks = moved if name in ROOT_NAMES else moved[:0]
+        _draw(axes, track, rows, values, factor * deviation[:, index], breaks=breaks)
+        low, high = axes.get_ylim()
+        for limit in (factor * lower[index], factor * upper[index]):
+            if low - 0.3 * (high - low) <= limit <= high + 0.3 * (high - low):
+                axes.axhline(limit, color=OKABE_ITO["vermilion"], lw=1.0, ls=":")
+        axes.set_title(f"{name.replace('_', ' ')} ({unit})", fontsize=8)
+    for column in range(columns):
+        shown = [axes for axes in grid[:, column] if axes.get_visible()]
+        shown[-1].set_xlabel("seconds", fontsize=9)
+        shown[-1].tick_params(labelbottom=True)
+    figure.suptitle(f"{_caption('parameters')}; dotted: joint limits", fontsize=10)
+    return figure
+
+
+def spectra_figure(track: Track) -> Figure:
+    """Spectrum of the best mode's covariance over time, and what its widest directions are.
+
+    Directions are those of the state, in which radians and metres are mixed as the tracker mixes
+    them.
+
+    Args:
+        track: The track.
+
+    Raises:
+        ConfigurationError: If the track has no frames.
+    """
+    rows = _rows(track)
+    names = [name.replace("_", " ") for name in track.state_names]
+    values, vectors = np.linalg.eigh(track.covariance[rows, 0])
+    deviation = np.sqrt(values.clip(min=0))
+    ratio = float(np.median(deviation[:, -1] / np.maximum(deviation[:, 0], np.finfo(float).tiny)))
+    times = track.times[rows]
+
+    figure = Figure(figsize=(12.0, 8.2), layout="constrained")
+    grid = figure.add_gridspec(2, 5, height_ratios=(1.0, 1.15))
+    spectrum = figure.add_subplot(grid[0, :3])
+    colours = colormaps["cividis"](np.linspace(0, 0.9, deviation.shape[1]))
+    for index, colour in enumerate(colours):
+        spectrum.plot(times, deviation[:, index], color=colour, lw=1.1)
+    spectrum.set_yscale("log")
+    spectrum.set_title(
+        f"standard deviations along all {len(names)} directions; widest over narrowest: "
+        f"{ratio:.0f} (median)",
+        fontsize=10,
+    )
+    spectrum.set_ylabel("radians and metres", fontsize=9)
+    tidy(spectrum)
+
+    share = np.square(vectors[:, :, -1])
+    order = np.argsort(-share.mean(0))[:_SHOWN_PARAMETERS]
+    heat = figure.add_subplot(grid[1, :3])
+    # Frames need not be evenly spaced: the cells end halfway between them.
+    image = heat.pcolormesh(
+        _edges(times), np.arange(len(order) + 1) - 0.5, share[:, order].T, cmap="cividis",
+        vmin=0, vmax=1,
+    )  # fmt: skip
+    heat.set_yticks(range(len(order)), [names[index] for index in order], fontsize=8)
+    heat.set_ylim(len(order) - 0.5, -0.5)
+    heat.set_title("which parameters the widest direction mixes, share of its square", fontsize=10)
+    heat.set_xlabel("seconds", fontsize=9)
+    heat.tick_params(labelsize=8)
+    figure.colorbar(image, ax=heat, pad=0.01).ax.tick_params(labelsize=8)
+    spectrum.set_xlim(*heat.get_xlim())
+
+    mean_values, mean_vectors = np.linalg.eigh(track.covariance[rows, 0].mean(0))
+    side = grid[:, 3:].subgridspec(_DIRECTIONS, 1)
+    for rank in range(min(_DIRECTIONS, len(names))):
+        axes = figure.add_subplot(side[rank])
+        direction = mean_vectors[:, -1 - rank]
+        largest = np.argsort(-np.abs(direction))[:_BARS]
+        direction = direction * np.sign(direction[largest[0]])
+        axes.barh(
+            range(len(largest)), direction[largest],
+            color=[OKABE_ITO["blue" if part > 0 else "orange"] for part in direction[largest]],
+        )  # fmt: skip
+        axes.axvline(0, color="0.45", lw=0.8)
+        axes.set_yticks(range(len(largest)), [names[index] for index in largest])
+        axes.invert_yaxis()
+        axes.set_xlim(-1.05, 1.05)
+        axes.set_title(
+            f"direction {rank + 1}, standard deviation {math.sqrt(mean_values[-1 - rank]):.2g}",
+            fontsize=9,
+        )
+        tidy(axes)
+    figure.suptitle(
+        "covariance of the best mode; right: most uncertain directions of its mean over all frames",
+        fontsize=10,
+    )
+    return figure
+
+
+def _draw(
+    axes: Axes,
+    track: Track,
+    rows: np.ndarray,
+    values: Float[np.ndarray, "t k"],
+    deviation: Float[np.ndarray, " t"],
+    *,
+    breaks: np.ndarray | None = None,
+) -> None:
+    """Draw the best mode's line and band, and the other modes as dots."""
+    times, best = track.times[rows], values[:, 0]
+    weight = np.exp(track.log_weight[rows])
+    for mode in range(1, values.shape[1]):
+        there = weight[:, mode] > 0
+        share = (weight[there, mode] / weight[there, 0]).clip(max=1.0)
+        colour = np.tile(mode_colour(mode), (len(share), 1))
+        axes.scatter(
+            times[there], values[there, mode], s=6, lw=0, zorder=2,
+            c=np.column_stack([colour, 0.15 + 0.85 * share]),
+        )  # fmt: skip
+    wide = DEVIATIONS * deviation
+    for piece in np.split(np.arange(len(rows)), [] if breaks is None else breaks):
+        axes.fill_between(
+            times[piece], (best - wide)[piece], (best + wide)[piece], color=mode_colour(0),
+            alpha=0.45, lw=0, zorder=1,
+        )  # fmt: skip
+        # A line of one frame would not be seen.
+        marker = "." if len(piece) == 1 else None
+        axes.plot(times[piece], best[piece], color=_LINE, lw=1.3, ms=3, marker=marker, zorder=3)
+    # The best mode fills the panel; what lies far from it would make it a line.
+    low, high = float((best - wide).min()), float((best + wide).max())
+    room = max(0.6 * float(np.ptp(best)), 0.15 * (high - low), 1e-3)
+    axes.set_ylim(
+        max(low, float(best.min()) - 3 * room) - 0.5 * room,
+        min(high, float(best.max()) + 3 * room) + 0.5 * room,
+    )
+    tidy(axes)
+    if len(times) > 1:
+        axes.set_xlim(times[0], times[-1])
+
+
+def _caption(what: str) -> str:
+    return (
+        f"{what}: the best mode with {DEVIATIONS:g} standard deviations; "
+        "dots: the other modes, fainter the less they weigh"
+    )
+
+
+def _is_length(name: str) -> bool:
+    return name in ROOT_NAMES[:3] or name.endswith("_length")
+
+
+def _edges(times: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t+1"]:
+    """Borders of cells about the times."""
+    if len(times) == 1:
+        return np.array([times[0] - 0.5, times[0] + 0.5])
+    middle = (times[1:] + times[:-1]) / 2
+    return np.concatenate([[2 * times[0] - middle[0]], middle, [2 * times[-1] - middle[-1]]])
+
+
+def _rows(track: Track) -> np.ndarray:
+    rows = np.flatnonzero(track.num_modes > 0)
+    if not len(rows):
+        raise ConfigurationError("the track has no frames; there is nothing to draw")
+    return rows

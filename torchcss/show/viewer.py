@@ -1,0 +1,420 @@
+"""Tracks in the rerun viewer: the modes in space over the picture that they explain.
+
+`Viewer` takes one `PosedFrame` after the other, whether they come from a file
+(`torchcss.show.view_track`) or from a tracker that runs (`torchcss.app.live`), and logs
+
+| entity | what |
+|---|---|
+| `world/camera`, `world/camera/picture` | the frustum; the frame with its modes, as JPEG |
+| `world/modes/K/skeleton` | lines between the joint centres of the mode of rank K, the best 0 |
+| `world/modes/K/uncertainty` | ellipsoids of `DEVIATIONS` standard deviations of the joints |
+| `world/modes/K/body/PART` | the flesh |
+| `cost/K`, `weight/K` | of every mode, nats, and 0 to 1 |
+| `modes/number`, `modes/apart` | how many modes, and how many of them are unlike all better ones |
+| `modes/effective` | `1 / sum w^2` |
+| `events` | when the track was lost and found |
+
+on the timelines `frame` (index in the video) and `time` (seconds). Modes have the colours that they
+have in the overlay; opacity tells their weight relative to the best.
+
+`open_recording` says where a recording goes. rerun is an optional package: the extra `viewer`.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from kornia.geometry.conversions import rotation_matrix_to_quaternion
+from PIL import Image
+from torch import Tensor
+
+from torchcss.body.model import BodyModel, BodyPose
+from torchcss.body.uncertainty import joint_covariance
+from torchcss.errors import ConfigurationError, OutputError
+from torchcss.files import one_line, prepare_output_folder
+from torchcss.show.overlay import PALETTE
+from torchcss.show.track_plots import APART, bones_of, count_apart
+from torchcss.show.viewer_layout import layout, rerun, world_axes
+from torchcss.vision.camera import Camera
+from torchcss.vision.rasterise import grid_faces
+
+if TYPE_CHECKING:
+    import rerun as rr
+
+DEVIATIONS = 2.0
+"""Half-axes of the ellipsoids, standard deviations."""
+
+APPLICATION = "torchcss"
+
+_COUNTS = {
+    "number": "modes",
+    "apart": f"of these {100 * APART:g} cm apart",
+    "effective": "effective number",
+}
+
+_RINGS, _MERIDIANS = 9, 14
+_FAINTEST, _FLESH, _MIST = 0.25, 0.35, 0.9
+"""Opacity of the lines of a mode that weighs nothing, and, relative to its lines, of the best
+mode's flesh and of ellipsoids."""
+_BONE_RADIUS, _THREAD_RADIUS = 0.006, 0.0012
+_PLANE = 0.3
+"""Radius of the best mode's lines and of those of ellipsoids, metres; length of the frustum,
+relative to the body's distance."""
+_LARGEST_PICTURE = 1280
+"""Longer side, pixels, to which larger pictures are reduced."""
+_JPEG_QUALITY = 85
+_FILE_CHUNKS_S = 5.0
+
+
+class PosedFrame(NamedTuple):
+    """One frame as a viewer shows it, modes best first.
+
+    Attributes:
+        number: Index in the video.
+        time_s: Seconds since the video's first frame.
+        weight: Weights of the modes, adding up to 1.
+        cost: Their costs, nats; infinite where nothing was seen.
+        joints: Their joint centres, metres, world frame.
+        covariance: Covariances of the joint centres, square metres.
+        rotation: World orientation of their parts of flesh.
+        centre: World place of their parts of flesh.
+        picture: The frame with its modes, or None.
+        lost: Whether the track counts as lost.
+    """
+
+    number: int
+    time_s: float
+    weight: Float[np.ndarray, " k"]
+    cost: Float[np.ndarray, " k"]
+    joints: Float[np.ndarray, "k j 3"]
+    covariance: Float[np.ndarray, "k j 3 3"]
+    rotation: Float[np.ndarray, "k p 3 3"]
+    centre: Float[np.ndarray, "k p 3"]
+    picture: UInt8[np.ndarray, "h w 3"] | None = None
+    lost: bool = False
+
+
+def posed_frame(
+    number: int,
+    time_s: float,
+    body: BodyModel,
+    pose: BodyPose,
+    *,
+    covariance: Float[Tensor, "k n n"],
+    weight: Float[Tensor, " k"],
+    cost: Float[Tensor, " k"],
+    picture: UInt8[np.ndarray, "h w 3"] | None = None,
+    lost: bool = False,
+) -> PosedFrame:
+    """Put together what a viewer shows of a frame.
+
+    Args:
+        number: Index in the video.
+        time_s: Seconds since the video's first frame.
+        body: The body.
+        pose: Its poses in the world, the best first.
+        covariance: Covariances of the states.
+        weight: Weights of the modes.
+        cost: Their costs, nats.
+        picture: The frame with its modes.
+        lost: Whether the track counts as lost.
+    """
+    rotation, centre = body.part_poses(pose)
+    spread = joint_covariance(body, pose, covariance)
+    return PosedFrame(
+        number=number,
+        time_s=time_s,
+        weight=_array(weight),
+        cost=_array(cost),
+        joints=_array(pose.joints),
+        covariance=_array(spread),
+        rotation=_array(rotation),
+        centre=_array(centre),
+        picture=picture,
+        lost=lost,
+    )
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().double().cpu().numpy()
+
+
+def has_display() -> bool:
+    """Whether a window can be opened here."""
+    if sys.platform != "linux":
+        return True
+    return any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+
+
+def open_recording(
+    name: str,
+    *,
+    save: Path | None = None,
+    connect: str | None = None,
+    spawn: bool | None = None,
+) -> rr.RecordingStream:
+    """Start a recording that goes to a file, to a viewer, or to both.
+
+    Args:
+        name: What the viewer calls it.
+        save: The file, usually `.rrd`; it grows as the recording does.
+        connect: Address of a viewer that runs, such as `rerun+http://127.0.0.1:9876/proxy`; it
+            prints its own when it starts.
+        spawn: Whether to open a viewer here, or use the one that is open; by default if neither of
+            the others is given.
+
+    Raises:
+        MissingExtraError: If rerun is not installed.
+        ConfigurationError: If a viewer would have to be opened where there is no display, or the
+            address is none.
+        OutputError: If the file cannot be written.
+    """
+    package = rerun()
+    spawn = spawn if spawn is not None else save is None and connect is None
+    if spawn and not has_display():
+        raise ConfigurationError(
+            "there is no display here to open a viewer on; save a recording, and open it elsewhere "
+            "with: rerun FILE.rrd"
+        )
+    sinks = []
+    if save is not None:
+        prepare_output_folder(save.parent)
+        sinks.append(package.FileSink(str(save)))
+    if connect is not None:
+        sinks.append(_viewer_at(connect))
+    # A file is read faster when rows come in large chunks; someone who watches wants them at once.
+    watched = spawn or connect is not None
+    chunks = None if watched else package.ChunkBatcherConfig(flush_tick=_FILE_CHUNKS_S)
+    recording = package.RecordingStream(APPLICATION, batcher_config=chunks)
+    # What a recording holds depends on the track alone.
+    recording.set_log_time_enabled(False)
+    recording.set_log_tick_enabled(False)
+    if spawn:
+        recording.spawn(connect=False)
+        sinks.append(package.GrpcSink())
+    try:
+        recording.set_sinks(*sinks)
+    except (RuntimeError, OSError) as error:
+        raise OutputError(f"{save}: cannot be written: {one_line(error)}") from error
+    recording.send_recording_name(name)
+    return recording
+
+
+def close_recording(recording: rr.RecordingStream, *, patience_s: float = 10.0) -> None:
+    """Hand over what was logged, and end a recording.
+
+    Args:
+        recording: What `open_recording` gave; it may have been closed already.
+        patience_s: How long to wait for a viewer that does not answer.
+    """
+    # A viewer that was closed before the end is no reason to fail.
+    with suppress(RuntimeError):
+        recording.flush(timeout_sec=patience_s)
+    recording.disconnect()
+
+
+def _viewer_at(address: str) -> object:
+    try:
+        return rerun().GrpcSink(address)
+    except (RuntimeError, ValueError) as error:
+        raise ConfigurationError(
+            f"{address}: not the address of a viewer; expected one such as "
+            "rerun+http://127.0.0.1:9876/proxy"
+        ) from error
+
+
+class Viewer:
+    """Logs frames into a recording.
+
+    Args:
+        recording: Where to, see `open_recording`.
+        body: The body with its flesh, for the mesh; its base does not matter.
+        camera: The camera of the pictures; None: not known.
+        up: Axis of the world that is up: x, y, z, -x, -y or -z.
+        events: Whether to leave room for losses.
+    """
+
+    def __init__(
+        self,
+        recording: rr.RecordingStream,
+        body: BodyModel,
+        *,
+        camera: Camera | None = None,
+        up: str = "y",
+        events: bool = True,
+    ) -> None:
+        self._recording = recording
+        self._body = body
+        self._bones = np.array(bones_of(body), dtype=np.int64).reshape(-1, 2)
+        self._camera = camera
+        self._up = up
+        self._events = events
+        surface = body.mesh(_RINGS, _MERIDIANS)
+        self._vertices = _array(surface.points.flatten(1, 2))
+        self._normals = _array(surface.normals.flatten(1, 2))
+        self._faces = grid_faces(_RINGS, _MERIDIANS).numpy()
+        self._known = 0
+        self._shown = 0
+        self._lost = False
+
+    def add(self, frame: PosedFrame) -> None:
+        """Log a frame.
+
+        Args:
+            frame: The frame, later than the last.
+        """
+        package, log = rerun(), self._recording.log
+        if not self._known:
+            self._begin(frame)
+        self._recording.set_time("frame", sequence=frame.number)
+        self._recording.set_time("time", duration=frame.time_s)
+        if frame.picture is not None:
+            log("world/camera/picture", _jpeg(frame.picture))
+        for mode in range(len(frame.weight)):
+            if mode == self._known:
+                self._introduce(mode)
+                self._known += 1
+            self._log_mode(frame, mode)
+        for mode in range(len(frame.weight), self._shown):
+            self._hide_mode(mode)
+        self._shown = len(frame.weight)
+        numbers = (len(frame.weight), count_apart(frame.joints), 1 / np.square(frame.weight).sum())
+        for name, number in zip(_COUNTS, numbers, strict=True):
+            log(f"modes/{name}", package.Scalars(float(number)))
+        if frame.lost != self._lost:
+            text = f"frame {frame.number}: told {'lost' if frame.lost else 'found'}"
+            level = package.TextLogLevel.WARN if frame.lost else package.TextLogLevel.INFO
+            log("events", package.TextLog(text, level=level))
+        self._lost = frame.lost
+
+    def _begin(self, frame: PosedFrame) -> None:
+        """Log what does not change, and how the viewer is to be laid out."""
+        package, log = rerun(), self._recording.log
+        log("world", world_axes(self._up), static=True)
+        best = frame.joints[0]
+        if self._camera is not None:
+            self._log_camera(self._camera, best)
+        for (name, label), colour in zip(_COUNTS.items(), PALETTE, strict=False):
+            line = package.SeriesLines(colors=colour, names=label, widths=2.0)
+            log(f"modes/{name}", line, static=True)
+        self._recording.send_blueprint(layout(best, self._camera, self._up, events=self._events))
+
+    def _introduce(self, mode: int) -> None:
+        """Log what does not change of a mode."""
+        package, log = rerun(), self._recording.log
+        for name, vertices, normals in zip(
+            self._body.part_names, self._vertices, self._normals, strict=True
+        ):
+            mesh = package.Mesh3D(
+                vertex_positions=vertices, vertex_normals=normals, triangle_indices=self._faces
+            )
+            log(f"world/modes/{mode}/body/{name}", mesh, static=True)
+        line = package.SeriesLines(
+            colors=PALETTE[mode % len(PALETTE)],
+            names="best mode" if mode == 0 else f"mode {mode + 1}",
+            widths=2.5 if mode == 0 else 1.2,
+        )
+        for series in ("cost", "weight"):
+            log(f"{series}/{mode}", line, static=True)
+
+    def _log_camera(self, camera: Camera, joints: Float[np.ndarray, "j 3"]) -> None:
+        package, log = rerun(), self._recording.log
+        camera = _reduced(camera)
+        turn = _array(camera.R_camera_world).T
+        centre = _array(camera.centre_world)
+        K = _array(camera.K).copy()
+        K[:2, 2] += 0.5  # the viewer counts pixels from the picture's corner, we from a centre
+        log("world/camera", package.Transform3D(translation=centre, mat3x3=turn), static=True)
+        pinhole = package.Pinhole(
+            image_from_camera=K,
+            resolution=camera.image_size_wh,
+            camera_xyz=package.ViewCoordinates.RDF,
+            image_plane_distance=_PLANE * float(np.linalg.norm(joints.mean(0) - centre)),
+        )
+        log("world/camera", pinhole, static=True)
+
+    def _log_mode(self, frame: PosedFrame, mode: int) -> None:
+        package, log = rerun(), self._recording.log
+        path = f"world/modes/{mode}"
+        share = float(frame.weight[mode] / frame.weight[0]) if frame.weight[0] > 0 else 1.0
+        opacity = _FAINTEST + (1 - _FAINTEST) * min(share, 1.0)
+        colour = (*PALETTE[mode % len(PALETTE)], round(255 * opacity))
+        thickness = 1.0 if mode == 0 else 0.7
+        joints = frame.joints[mode]
+        strips = package.LineStrips3D(
+            joints[self._bones], colors=colour, radii=thickness * _BONE_RADIUS
+        )
+        log(f"{path}/skeleton", strips)
+        fill = package.components.FillMode
+        half_sizes, quaternions = ellipsoids(frame.covariance[mode])
+        shapes = package.Ellipsoids3D(
+            centers=joints,
+            half_sizes=half_sizes,
+            quaternions=quaternions,
+            colors=(*colour[:3], round(255 * opacity)),
+            line_radii=_THREAD_RADIUS,
+            # A mode of little weight may be very uncertain: filled, it would hide all others.
+            fill_mode=fill.TransparentFillMajorWireframe if mode == 0 else fill.MajorWireframe,
+        )
+        log(f"{path}/uncertainty", shapes)
+        flesh = package.Mesh3D.from_fields(
+            albedo_factor=(*colour[:3], round(255 * _FLESH * share * opacity))
+        )
+        for part, name in enumerate(self._body.part_names):
+            place = package.Transform3D(
+                translation=frame.centre[mode, part], mat3x3=frame.rotation[mode, part]
+            )
+            log(f"{path}/body/{name}", place, flesh)
+        cost = frame.cost[mode]
+        log(f"cost/{mode}", package.Scalars(float(cost) if np.isfinite(cost) else np.nan))
+        log(f"weight/{mode}", package.Scalars(float(frame.weight[mode])))
+
+    def _hide_mode(self, mode: int) -> None:
+        """From here on there is no such mode."""
+        package, log = rerun(), self._recording.log
+        for name in ("skeleton", "uncertainty"):
+            log(f"world/modes/{mode}/{name}", package.Clear(recursive=False))
+        # Meshes do not change and cannot be cleared: they become invisible.
+        for name in self._body.part_names:
+            hidden = package.Mesh3D.from_fields(albedo_factor=(0, 0, 0, 0))
+            log(f"world/modes/{mode}/body/{name}", hidden)
+        for series in ("cost", "weight"):
+            log(f"{series}/{mode}", package.Scalars(np.nan))
+
+
+def ellipsoids(
+    covariance: Float[np.ndarray, "j 3 3"],
+) -> tuple[Float[np.ndarray, "j 3"], Float[np.ndarray, "j 4"]]:
+    """Half-axes, metres, and orientations (x y z w) of the ellipsoids of covariances.
+
+    Args:
+        covariance: Covariances of points, square metres.
+    """
+    values, axes = np.linalg.eigh(covariance)
+    # Eigenvectors may form a mirrored frame, which no rotation is.
+    axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
+    wxyz = rotation_matrix_to_quaternion(torch.from_numpy(axes)).numpy()
+    return DEVIATIONS * np.sqrt(values.clip(min=0)), np.roll(wxyz, -1, axis=-1)
+
+
+def _reduced(camera: Camera) -> Camera:
+    """The camera of the pictures as they are saved."""
+    width, height = camera.image_size_wh
+    factor = min(1.0, _LARGEST_PICTURE / max(width, height))
+    return camera.resized(max(round(factor * width), 1), max(round(factor * height), 1))
+
+
+def _jpeg(picture: UInt8[np.ndarray, "h w 3"]) -> rr.EncodedImage:
+    image = Image.fromarray(picture)
+    image.thumbnail((_LARGEST_PICTURE, _LARGEST_PICTURE))
+    stream = io.BytesIO()
+    image.save(stream, "JPEG", quality=_JPEG_QUALITY)
+    return rerun().EncodedImage(contents=stream.getvalue(), media_type="image/jpeg")

@@ -1,0 +1,405 @@
+"""All joint angles that put a link where it should be: inverse kinematics by covariance scaling.
+
+A pose of a hand seldom has one explanation in the joints, as an image seldom has one in the pose of
+a body; so the search is the tracker's (Fig. 6 [IJRR]). The cost is `pose_targets`: zero where the
+link is in place. Round after round, samples descend to its minima by the bounded second-order
+optimiser; half of the samples are drawn uniformly within the joint limits, half about the solutions
+known so far, in their covariances scaled up, that is along the directions which the pose leaves
+uncertain; and every new solution is tried with single joints turned by half or whole turns or
+mirrored. What descends to the pose is polished by Gauss-Newton steps to machine precision and kept
+if it is new. The search ends when several rounds in a row bring nothing new.
+
+**What a solution is.** Six numbers (a place: three) are asked for, so that m joints leave a
+redundancy of m less their rank.
+
+* Redundancy 0 (a 6-joint arm, or a 7-joint arm with one joint `fixed`): solutions are isolated
+  points, and every one is returned.
+* Redundancy 1 (a 7-joint arm): solutions are curves, the self-motion manifolds (Burdick 1989). Each
+  is followed along the null vector of the Jacobian until it closes or ends at a joint limit, and
+  returned as points along it; `Solutions.branch` numbers the connected pieces within the limits.
+* More: fix joints until one at most is redundant.
+
+    body = load_body("panda.urdf")
+    found = inverse_kinematics(
+        body, "panda_hand", pose, fixed={"panda_joint7": 0.8}, generator=torch.Generator()
+    )
+    found.x            # all states, within the limits
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchcss.body.model import BodyModel
+from torchcss.cost.targets import pose_targets
+from torchcss.errors import ConfigurationError
+from torchcss.inference.mixture import GaussianMixture
+from torchcss.inference.proposals import CovarianceScaled
+from torchcss.inference.trust_region import TrustRegionNewton, default_prior_variance
+from torchcss.linalg import inverse_on_free
+from torchcss.solve.self_motion import Curve, SolutionSet, distance_from
+from torchcss.types import Bounds
+
+_NEAR = 0.02
+"""Metres by which a descent may miss the pose to be worth polishing."""
+
+_DESCENT = TrustRegionNewton(max_steps=20, tolerance=1e-4)
+"""What reaches the pose is near it after ten steps; polishing goes on from there."""
+
+_SAME = 1e-3
+"""Radians or metres within which two isolated solutions are one."""
+
+_PARENTS = 64
+"""Points of known curves about which a round samples, at most."""
+
+_STRIDE = 10
+"""Spacings between the solutions from which curves are followed together."""
+
+
+class Solutions(NamedTuple):
+    """What was found.
+
+    Attributes:
+        x: States of the body within its limits, branch by branch; points of a curve in order.
+        branch: Number of the connected set of solutions that each belongs to.
+        closed: Of every branch, whether it is a closed curve. Others end at joint limits, or are
+            isolated points.
+        position_error: How far the link's origin is from its place, metres.
+        angle_error: Angle between the link's orientation and that asked for, radians; zero where a
+            place alone was asked for.
+        num_descents: Samples that descended.
+        num_rounds: Rounds of the search.
+    """
+
+    x: Float[Tensor, "s n"]
+    branch: Int[Tensor, " s"]
+    closed: Bool[Tensor, " c"]
+    position_error: Float[Tensor, " s"]
+    angle_error: Float[Tensor, " s"]
+    num_descents: int
+    num_rounds: int
+
+    @property
+    def num_branches(self) -> int:
+        """How many connected sets there are; of isolated solutions, how many solutions."""
+        return len(self.closed)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Search:
+    """How widely solutions are looked for.
+
+    Attributes:
+        num_samples: Descents per round, beside those from turned solutions.
+        patience: Rounds without anything new after which the search ends.
+        max_rounds: Rounds at most.
+        deviation_scale: Factor on the standard deviations of the solutions that are sampled about.
+        sigma: Error in metres that counts as one standard deviation there.
+        share: Share of the samples that are drawn about known solutions.
+        spacing: Distance between the points that a curve is returned as, radians.
+        tolerance: Distance from the pose, metres, that a solution must reach; a radian counts as a
+            quarter of a metre. In single precision, its rounding.
+    """
+
+    num_samples: int = 512
+    patience: int = 2
+    max_rounds: int = 100
+    deviation_scale: float = 8.0
+    sigma: float = 0.1
+    share: float = 0.5
+    spacing: float = 0.1
+    tolerance: float = 1e-11
+
+    def __post_init__(self) -> None:
+        for name in ("num_samples", "patience", "max_rounds", "sigma", "spacing", "tolerance"):
+            if not getattr(self, name) > 0:
+                raise ConfigurationError(
+                    f"Search.{name}: expected a positive number, got {getattr(self, name)}"
+                )
+
+
+def inverse_kinematics(
+    body: BodyModel,
+    link: str,
+    pose: Float[Tensor, "4 4"] | Float[Tensor, "3"],
+    *,
+    generator: torch.Generator,
+    fixed: Mapping[str, float] | None = None,
+    search: Search | None = None,
+) -> Solutions:
+    """Find all states that give a link its pose.
+
+    Args:
+        body: The body on its base; float64 for errors of 1e-11, float32 has some 1e-6.
+        link: The link.
+        pose: Its frame in the world, or the place of its origin alone, metres.
+        generator: Source of the samples, on the CPU.
+        fixed: Parameters that keep a value. Those that do not move the link rest.
+        search: How widely to look.
+
+    Returns:
+        The solutions within the joint limits; none if none was found.
+
+    Raises:
+        BodyError: If there is no such link or parameter.
+        ShapeError: If the pose is neither a frame nor a place.
+        ConfigurationError: If a fixed value is outside its limits, more than one free joint is
+            redundant, or a free length has no limits.
+    """
+    search = search or Search()
+    problem = _Problem.of(body, link, pose, dict(fixed or {}), search)
+    found = _Curves(problem) if problem.redundancy(generator) else _Points(problem)
+    quiet = rounds = descents = 0
+    parents = new = problem.lower.new_zeros(0, len(problem.lower))
+    while quiet < search.patience and rounds < search.max_rounds:
+        starts = torch.cat([problem.samples(parents, generator), problem.turned(new)])
+        before = found.count
+        new = found.add(problem.solve(starts))
+        parents = found.parents()
+        quiet = 0 if found.count > before else quiet + 1
+        rounds, descents = rounds + 1, descents + len(starts)
+    x, branch, closed = found.all()
+    whole = problem.states.cost.whole(x)
+    position, angle = pose_errors(body, link, pose, whole)
+    return Solutions(whole, branch, closed, position, angle, descents, rounds)
+
+
+def covered(solutions: Solutions, x: Float[Tensor, "k n"], distance: float) -> Bool[Tensor, " k"]:
+    """Which states of a body lie on the solutions found, to check a search by another one.
+
+    Args:
+        solutions: What was found.
+        x: States. Joints without limits are between minus and plus half a turn, as in `solutions`.
+        distance: From an isolated solution, or from the line through the points of a curve, at
+            which a state still counts, radians.
+    """
+    near = torch.full_like(x[:, 0], torch.inf)
+    for branch, closed in enumerate(solutions.closed.tolist()):
+        curve = Curve(solutions.x[solutions.branch == branch], closed)
+        near = torch.minimum(near, distance_from(curve, x))
+    return near <= distance
+
+
+def link_pose(
+    body: BodyModel, link: str, x: Float[Tensor, "*batch n"]
+) -> Float[Tensor, "*batch 4 4"]:
+    """Frame of a link in the world."""
+    index, tree = body.tree.link_index(link), body.pose(x).tree
+    pose = torch.eye(4, dtype=x.dtype, device=x.device).repeat(*x.shape[:-1], 1, 1)
+    pose[..., :3, :3] = tree.rotation[..., index, :, :]
+    pose[..., :3, 3] = tree.translation[..., index, :]
+    return pose
+
+
+def pose_errors(
+    body: BodyModel,
+    link: str,
+    pose: Float[Tensor, "4 4"] | Float[Tensor, "3"],
+    x: Float[Tensor, "*batch n"],
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    """Distance of a link from its place, metres, and angle from its orientation, radians."""
+    index, pose = body.tree.link_index(link), pose.to(x)
+    tree = body.pose(x).tree
+    place = pose[:3, 3] if pose.dim() == 2 else pose
+    position = (tree.translation[..., index, :] - place).norm(dim=-1)
+    if pose.dim() == 1:
+        return position, torch.zeros_like(position)
+    # |R - R'| = 2 sqrt(2) sin(angle / 2), exact for small angles too.
+    apart = (tree.rotation[..., index, :, :] - pose[:3, :3]).flatten(-2).norm(dim=-1)
+    return position, 2 * (apart / 8**0.5).clamp(max=1).asin()
+
+
+class _Problem(NamedTuple):
+    """The cost over the free parameters, their limits, and where samples start."""
+
+    states: SolutionSet
+    lower: Float[Tensor, " m"]
+    upper: Float[Tensor, " m"]
+    search: Search
+
+    @staticmethod
+    def of(
+        body: BodyModel, link: str, pose: Tensor, fixed: dict[str, float], search: Search
+    ) -> _Problem:
+        """Sort out what is free."""
+        held = body.rest.clone()
+        moves = (body.tree.ancestors[:, body.tree.link_index(link)].to(body.tie) @ body.tie) != 0
+        for name, value in fixed.items():
+            index = body.state_index(name)
+            low, high = float(body.lower[index]), float(body.upper[index])
+            if not low <= value <= high:
+                raise ConfigurationError(
+                    f"fixed {name!r}: expected a value within its limits, {low:g} to {high:g}, "
+                    f"got {value:g}"
+                )
+            held[index], moves[index] = value, False
+        columns = torch.nonzero(moves)[:, 0]
+        cost = pose_targets(body, link, pose, columns=columns, held=held, sigma=search.sigma)
+        bounds = Bounds(body.lower[columns], body.upper[columns])
+        endless = ~(bounds.lower.isfinite() & bounds.upper.isfinite())
+        turns = (body.tie[~body.tree.is_revolute] == 0).all(0)[columns]
+        if bool((endless & ~turns).any()):
+            names = [body.state_names[int(i)] for i in columns[endless & ~turns]]
+            raise ConfigurationError(f"{', '.join(names)}: a length without limits; fix it")
+        period = 2 * math.pi * endless.to(bounds.lower)
+        rounding = 64 * torch.finfo(body.dtype).eps
+        return _Problem(
+            SolutionSet(cost, bounds, period, max(search.tolerance, rounding)),
+            torch.where(endless, -math.pi, bounds.lower),
+            torch.where(endless, math.pi, bounds.upper),
+            search,
+        )
+
+    def uniform(self, num: int, generator: torch.Generator) -> Float[Tensor, "s m"]:
+        """Samples within the limits."""
+        share = torch.rand(num, len(self.lower), generator=generator, dtype=torch.float64)
+        return self.lower + share.to(self.lower) * (self.upper - self.lower)
+
+    def redundancy(self, generator: torch.Generator) -> int:
+        """Free parameters less the rank of the pose in them, at states in general position."""
+        _, jacobian = self.states.cost.errors(self.uniform(8, generator))
+        rank = int(torch.linalg.matrix_rank(jacobian.flatten(1, 2), rtol=1e-6).max())
+        redundancy = len(self.lower) - rank
+        if redundancy > 1:
+            raise ConfigurationError(
+                f"{len(self.lower)} free parameters for a pose of {rank}: expected one more at "
+                f"most; fix {redundancy - 1} or more of "
+                f"{[self.states.cost.body.state_names[int(i)] for i in self.states.cost.columns]}"
+            )
+        return redundancy
+
+    def samples(self, known: Float[Tensor, "k m"], generator: torch.Generator) -> Tensor:
+        """Starts of a round: uniform ones, and some about what is known."""
+        num = self.search.num_samples
+        about = round(self.search.share * num) if len(known) else 0
+        uniform = self.uniform(num - about, generator)
+        if not about:
+            return uniform
+        hessian = self.states.cost.local_model(known).hessian
+        free = torch.ones_like(known, dtype=torch.bool)
+        covariance = inverse_on_free(
+            hessian, free, default_prior_variance(Bounds(self.lower, self.upper))
+        )
+        proposal = CovarianceScaled(
+            deviation_scale=self.search.deviation_scale, include_modes=False, stratified=True
+        )
+        mixture = GaussianMixture(known, covariance, torch.zeros_like(known[:, 0]))
+        drawn = proposal.sample(mixture, about, self.states.bounds, generator=generator).x
+        return torch.cat([uniform, drawn])
+
+    def turned(self, x: Float[Tensor, "k m"]) -> Float[Tensor, "s m"]:
+        """Solutions with one joint turned by half or whole turns, or mirrored in its range."""
+        eye = torch.eye(len(self.lower), dtype=x.dtype, device=x.device)
+        steps = torch.cat([k * math.pi * eye for k in (-2, -1, 1, 2)])
+        turned = (x[:, None] + steps).flatten(0, 1)
+        inside = ((turned >= self.lower) & (turned <= self.upper)).all(-1)
+        mirrored = x[:, None] + eye * (self.lower + self.upper - 2 * x)[:, None]
+        return torch.cat([turned[inside], mirrored.flatten(0, 1)])
+
+    def solve(self, starts: Float[Tensor, "s m"]) -> Float[Tensor, "k m"]:
+        """Descend and polish; what reaches the pose."""
+        modes = _DESCENT.minimise(self.states.cost, starts, self.states.bounds)
+        near = modes.cost <= 0.5 * (_NEAR / self.search.sigma) ** 2
+        x, exact = self.states.polish(modes.mean[near])
+        return self.states.wrapped(x[exact])
+
+
+class _Points:
+    """Isolated solutions found so far."""
+
+    def __init__(self, problem: _Problem) -> None:
+        self.problem = problem
+        self.x = problem.lower.new_zeros(0, len(problem.lower))
+
+    @property
+    def count(self) -> int:
+        return len(self.x)
+
+    def add(self, x: Float[Tensor, "k m"]) -> Float[Tensor, "a m"]:
+        """Take in solutions; returns those that are new."""
+        before = len(self.x)
+        for known in self.x:
+            x = x[self.problem.states.apart(x, known).abs().amax(-1) > _SAME]
+        while len(x):
+            self.x = torch.cat([self.x, x[:1]])
+            x = x[self.problem.states.apart(x, x[0]).abs().amax(-1) > _SAME]
+        return self.x[before:]
+
+    def parents(self) -> Float[Tensor, "k m"]:
+        """About what to sample."""
+        return self.x
+
+    def all(self) -> tuple[Tensor, Tensor, Tensor]:
+        """States, their branches, and which branches are closed."""
+        branch = torch.arange(len(self.x), device=self.x.device)
+        return self.x, branch, torch.zeros_like(branch, dtype=torch.bool)
+
+
+class _Curves:
+    """Curves of solutions found so far."""
+
+    def __init__(self, problem: _Problem) -> None:
+        self.problem, self.spacing = problem, problem.search.spacing
+        self.curves: list[Curve] = []
+
+    @property
+    def count(self) -> int:
+        return len(self.curves)
+
+    def add(self, x: Float[Tensor, "k m"]) -> Float[Tensor, "a m"]:
+        """Take in solutions; returns one of each new curve."""
+        for curve in self.curves:
+            x = x[~self._on(curve, x)]
+        fresh = []
+        while len(x):
+            # Widely spaced ones first: most of them are of a few curves.
+            some = _thinned(self.problem.states, x, _STRIDE * self.spacing)
+            for start, curve in zip(
+                some, self.problem.states.follow(some, self.spacing), strict=True
+            ):
+                same = (x == start).all(-1)
+                if bool(same.any()):  # else another curve of this round passes there
+                    self.curves.append(curve)
+                    fresh.append(start)
+                    x = x[~(same | self._on(curve, x))]
+        return torch.stack(fresh) if fresh else x
+
+    def _on(self, curve: Curve, x: Float[Tensor, "k m"]) -> Bool[Tensor, " k"]:
+        """Which states lie on a curve, to a quarter of its spacing."""
+        return distance_from(curve, x, self.problem.states.period) <= 0.25 * self.spacing
+
+    def parents(self) -> Float[Tensor, "k m"]:
+        """Points evenly along all curves."""
+        every = torch.cat(
+            [self.problem.lower.new_zeros(0, len(self.problem.lower))]
+            + [curve.x for curve in self.curves]
+        )
+        return every[:: max(1, -(-len(every) // _PARENTS))]
+
+    def all(self) -> tuple[Tensor, Tensor, Tensor]:
+        """States, their branches, and which branches are closed."""
+        device = self.problem.lower.device
+        sizes = torch.tensor([len(curve.x) for curve in self.curves], device=device).long()
+        x = torch.cat(
+            [self.problem.lower.new_zeros(0, len(self.problem.lower))]
+            + [curve.x for curve in self.curves]
+        )
+        branch = torch.arange(len(sizes), device=device).repeat_interleave(sizes)
+        closed = torch.tensor([curve.closed for curve in self.curves], device=device).bool()
+        return self.problem.states.wrapped(x), branch, closed
+
+
+def _thinned(states: SolutionSet, x: Float[Tensor, "k m"], distance: float) -> Float[Tensor, "a m"]:
+    """A choice of states, none nearer to another than a distance."""
+    chosen = []
+    while len(x):
+        chosen.append(x[0])
+        x = x[states.apart(x, x[0]).norm(dim=-1) > distance]
+    return torch.stack(chosen)

@@ -1,0 +1,613 @@
+"""Motion capture onto a body of the catalogue, by its joint centres.
+
+Two skeletons that stand alike have different angles, but the same places for hips, knees, ankles,
+shoulders, elbows and wrists. A body is therefore fitted to where these are, frame by frame:
+
+1. *Lengths*, from the median distances between neighbouring joints, left and right alike, within 10
+   % of the standard humanoid (section 3.2.3 [IJRR]).
+2. *States*, from several starting poses per frame, all in one batch of the bound-constrained
+   search of section 4.1 [IJRR]: squared distances in space and the sticky prior of section 3.2.2
+   on what the joints do not tell (the twist of a straight arm).
+3. *One path* through the poses found in every frame, that of least cost and motion, and
+4. *all frames together*: states, limits and accelerations, flesh kept out of flesh (section 3.2.4
+   [IJRR]); both by `torchcss.inference.smoothing`. What the joints tell stays, to less than one
+   millimetre on a known motion (tested); what they do not tell, the frames before and after do.
+
+Joint limits hold exactly throughout; only the turns of the root, which have no anatomical limit,
+may exceed the body's while fitting, so that many turns in a row are one continuous path.
+
+Limbs alone leave the tilt of pelvis and feet and the head open. If the zero pose of the source is
+upright and faces +Z, as ours does, then other joints of its tree (the root, the base of the neck,
+those of head and feet) have known places in our pelvis, chest, head and feet, and are fitted too,
+less strictly.
+
+Call `retarget`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchcss.body.catalog import BODY_NAMES, LENGTHS, PROPORTION_RANGE
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel
+from torchcss.body.root import ROOT_NAMES, free_turns, has_root, root_angles, root_rotation
+from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
+from torchcss.cost.stabiliser import Stabiliser
+from torchcss.errors import ConfigurationError
+from torchcss.inference.smoothing import Transition, best_path, refine
+from torchcss.inference.trust_region import TrustRegionNewton
+from torchcss.io.motion.positions import MotionCapture, limb_positions
+from torchcss.types import LocalModel, PointCost
+
+_STERNOCLAVICULAR = 0.03
+"""Metres from the midline to where the body's shoulder width begins."""
+_TOE_DEPTH = 0.05
+"""Metres from the height of the ankle down to the toe, at rest."""
+_UPRIGHT = math.cos(math.radians(30))
+_STEEP = math.radians(75)
+"""Pitch of the root from which yaw and roll begin to be the same turn."""
+_NEAR = 0.25
+"""Metres between the middle of hips or shoulders and the joint that carries them, at most."""
+_ON_FLOOR = 0.05
+"""Share of frames in which the lowest foot may be below the floor: in most others one stands."""
+_LEAST_PATH = 1.0
+"""Metres of a path that tell the slope of its floor."""
+_LEAST_TILT, _MOST_TILT = 0.2, 4.0
+"""Degrees of a floor that is not level by mistake."""
+_DEEP = 0.01
+"""Metres that a surface must be inside another part to count as a collision."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Retargeting:
+    """How a body is fitted to joint centres.
+
+    Attributes:
+        sigma: Standard deviation of a limb's joint, metres: what two skeletons differ by.
+        sigma_others: The same for the other joints that are used.
+        num_starts: Starting poses per frame.
+        settling_s: Seconds in which everyday speed (`BodyModel.motion_rate`) is reached or lost:
+            the scale of accelerations; larger is smoother.
+        repulsion: What keeps flesh out of flesh, or None: a source of other proportions has its
+            arms where our trunk is. At this weight a dance of the CMU database has flesh more than
+            10 mm deep in 8 % of frames instead of 76 %, 21 mm at most instead of 109 mm, for 1.7 mm
+            of mean error (measured).
+        max_steps: Iterations of a descent.
+    """
+
+    sigma: float = 0.005
+    sigma_others: float = 0.03
+    num_starts: int = 4
+    settling_s: float = 0.06
+    repulsion: Interpenetration | None = field(
+        default_factory=lambda: Interpenetration(weight=100, sharpness=5)
+    )
+    max_steps: int = 60
+
+    def __post_init__(self) -> None:
+        for name in ("sigma", "sigma_others", "num_starts", "settling_s", "max_steps"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ConfigurationError(
+                    f"Retargeting.{name}: expected a positive number, got {getattr(self, name)}"
+                )
+
+
+class Retargeted(NamedTuple):
+    """A body in motion, and how well it follows.
+
+    Attributes:
+        body: The body, its base upright on the floor, facing the middle of its turns.
+        states: Its states, within its limits unless the report says otherwise.
+        joints: Its joint centres, `BodyModel.joint_names`, metres.
+        target_names: The limbs' joints that were followed.
+        targets: Where the source has them, in the same world.
+        source: All joints of the source, in the same world.
+        error: Distances between body and source, metres.
+        at_limit: Angles that a limit holds.
+        depth: How deep the flesh of one part is inside another, metres; 0 if nowhere.
+        report: What was found, one line each.
+    """
+
+    body: BodyModel
+    states: Float[Tensor, "t n"]
+    joints: Float[Tensor, "t j 3"]
+    target_names: tuple[str, ...]
+    targets: Float[Tensor, "t limbs 3"]
+    source: Float[Tensor, "t k 3"]
+    error: Float[Tensor, "t limbs"]
+    at_limit: Bool[Tensor, "t n"]
+    depth: Float[Tensor, " t"]
+    report: tuple[str, ...]
+
+
+class Points(NamedTuple):
+    """Points fixed in links of a body, and where they should be.
+
+    Attributes:
+        link: The link of each.
+        offset: Its place in that link's frame, metres.
+        target: Where it should be, metres.
+        sigma: Standard deviation, metres.
+    """
+
+    link: Int[Tensor, " p"]
+    offset: Float[Tensor, "p 3"]
+    target: Float[Tensor, "b p 3"]
+    sigma: Float[Tensor, " p"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointDistances:
+    """Squared distances in space, a sticky prior and, perhaps, a path: a `CostFunction`.
+
+    Attributes:
+        body: The body.
+        points: What should be where, item by item.
+        stabiliser: The prior on what the points do not tell.
+        repulsion: Keeps parts out of each other, if `pairs` are there too.
+        pairs: Which parts may collide.
+    """
+
+    body: BodyModel
+    points: Points
+    stabiliser: Stabiliser
+    repulsion: Interpenetration | None = None
+    pairs: InterpenetrationPairs | None = None
+
+    def take(self, items: Int[Tensor, " b"]) -> PointDistances:
+        """The cost of some items."""
+        points = self.points._replace(target=self.points.target[items])
+        return replace(self, points=points)
+
+    def value(self, x: Float[Tensor, "b n"]) -> Float[Tensor, " b"]:
+        """Cost in nats."""
+        return self.local_model(x).value
+
+    def local_model(self, x: Float[Tensor, "b n"]) -> LocalModel:
+        """Cost, gradient and exact Hessian."""
+        body, (link, offset, target, sigma) = self.body, self.points
+        pose = body.pose(x)
+        where = body.points_on_links(pose.tree, link, offset)
+        weight = sigma.pow(-2)[:, None]
+        away = where - target
+        bowl = (weight[..., None] * torch.eye(3).to(x)).expand(*away.shape, 3)
+        cost = PointCost(0.5 * (weight * away.square()).sum(-1), weight * away, bowl)
+        total = body.lift(pose, where, link, cost)
+        prior = self.stabiliser.local_model(x, body.sticky_mean, body.sticky_deviation)
+        total = LocalModel(*(a + b for a, b in zip(total, prior, strict=True)))
+        if self.repulsion is not None and self.pairs is not None:
+            apart = self.repulsion.local_model(body, pose, self.pairs)
+            total = LocalModel(*(a + b for a, b in zip(total, apart, strict=True)))
+        return total
+
+
+def retarget(
+    motion: MotionCapture,
+    *,
+    body: str = "body34",
+    generator: torch.Generator,
+    choice: Retargeting | None = None,
+    centred: bool = True,
+) -> Retargeted:
+    """Fit a body to a motion.
+
+    Args:
+        motion: The motion, Y up, at the rate that the result is to have.
+        body: Name of a body with a root.
+        generator: Source of the starting poses.
+        choice: How; the defaults suit everyday motion of adults.
+        centred: Move the middle of the path over the origin and the floor to height zero, and level
+            it where the recording has it tilted by a degree or two.
+
+    Raises:
+        ConfigurationError: If the body has no root.
+        MotionCaptureError: If the motion lacks hips or shoulders.
+    """
+    choice = choice or Retargeting()
+    names, index, _ = limb_positions(motion)
+    if body not in BODY_NAMES or not has_root(load_body(body)):
+        whole = [name for name in BODY_NAMES if has_root(load_body(name))]
+        raise ConfigurationError(f"body: expected one of {', '.join(whole)}, got {body!r}")
+    source, level = torch.from_numpy(motion.joints).clone(), []
+    if centred:
+        source -= _middle_of_path(source[:, list(index)], names)
+        source, level = levelled(source, source[:, list(index)].mean(1))
+    limbs = source[:, list(index)]
+    lengths, report = fit_lengths(names, limbs, foot=_foot_length(motion, names, index))
+    report += level
+    model = load_body(body, lengths=lengths)
+    others, line = _anchored(motion, model, names, index)
+    report.append(line)
+    points = _points(model, names, limbs, source, others, choice)
+    root = _root_by_trunk(names, limbs)
+    states = _fit(model, points, root, motion.frame_rate, choice, generator)
+    model, states = _face_middle(model, states)
+    if centred:
+        feet = [model.joint_index(f"{side}_{end}") for side in "lr" for end in ("heel", "toe")]
+        floor = model.pose(states).joints[:, feet, 1].amin(-1).quantile(_ON_FLOOR)
+        drop = torch.stack([0 * floor, -floor, 0 * floor])
+        model = model.with_base(model.base_rotation, drop)
+        limbs, source = limbs + drop, source + drop
+    joints = model.pose(states).joints
+    error = (joints[:, [model.joint_index(name) for name in names]] - limbs).norm(dim=-1)
+    slack = 1e-6
+    at_limit = (states <= model.lower + slack) | (states >= model.upper - slack)
+    depth, pairs = collision_depth(model, states)
+    report += _findings(model, states, at_limit, depth, pairs)
+    return Retargeted(
+        body=model,
+        states=states,
+        joints=joints,
+        target_names=names,
+        targets=limbs,
+        source=source,
+        error=error,
+        at_limit=at_limit,
+        depth=depth,
+        report=tuple(report),
+    )
+
+
+def fit_lengths(
+    names: tuple[str, ...],
+    limbs: Float[Tensor, "t limbs 3"],
+    *,
+    foot: float | None = None,
+) -> tuple[dict[str, float], list[str]]:
+    """Lengths of the catalogue from joint centres.
+
+    Args:
+        names: Names of the limbs' joints.
+        limbs: Their positions, metres.
+        foot: Metres from ankle to toe, where known.
+
+    Returns:
+        Lengths in metres, and a line about those that the range of proportions holds. What no joint
+        tells grows with the rest: neck, head and hand.
+    """
+    place = {name: limbs[:, i] for i, name in enumerate(names)}
+
+    def between(one: str, other: str) -> float | None:
+        """Median distance, of both sides together if the names lack theirs."""
+        pairs = [(place.get(f"{s}_{one}"), place.get(f"{s}_{other}")) for s in "lr"]
+        both = [float((a - b).norm(dim=-1).median()) for a, b in pairs
+                if a is not None and b is not None]  # fmt: skip
+        return sum(both) / len(both) if both else None
+
+    hips = 0.5 * (place["l_hip"] + place["r_hip"])
+    shoulders = 0.5 * (place["l_shoulder"] + place["r_shoulder"])
+    width = float((place["l_shoulder"] - place["r_shoulder"]).norm(dim=-1).median())
+    measured = {
+        "hip_width": float((place["l_hip"] - place["r_hip"]).norm(dim=-1).median()) / 2,
+        "trunk": float((shoulders - hips).norm(dim=-1).median()),
+        "shoulder_width": width / 2 - _STERNOCLAVICULAR,
+        "upper_arm": between("shoulder", "elbow"),
+        "forearm": between("elbow", "wrist"),
+        "thigh": between("hip", "knee"),
+        "shank": between("knee", "ankle"),
+        "foot": None if foot is None else max(foot**2 - _TOE_DEPTH**2, 0.0) ** 0.5,
+    }
+    known = {name: value for name, value in measured.items() if value is not None}
+    factor = sum(known.values()) / sum(LENGTHS[name] for name in known)
+    lengths, held = {}, []
+    for name, standard in LENGTHS.items():
+        wanted = known.get(name, factor * standard)
+        margin = PROPORTION_RANGE * standard
+        lengths[name] = min(max(wanted, standard - margin), standard + margin)
+        if name in known and abs(wanted - lengths[name]) > 1e-6:
+            held.append(f"{name} {1000 * wanted:.0f} -> {1000 * lengths[name]:.0f}")
+    if not held:
+        return lengths, ["lengths: all within 10 % of the standard humanoid's"]
+    return lengths, [f"lengths held within 10 % of the standard humanoid's, mm: {', '.join(held)}"]
+
+
+def collision_depth(
+    body: BodyModel, states: Float[Tensor, "t n"]
+) -> tuple[Float[Tensor, " t"], list[str]]:
+    """How deep surfaces are inside other parts, and which, state by state.
+
+    Along the ray from the centre of the outer part, which exceeds the distance to its surface
+    somewhat. Parts that touch in every pose do not count.
+
+    Args:
+        body: The body.
+        states: Some states.
+
+    Returns:
+        Metres, 0 where nothing collides, and the two parts' names, '' there.
+    """
+    pairs = InterpenetrationPairs(body, rings=8, meridians=12)
+    depths, names = [], []
+    for part in states.split(64):
+        near = pairs.near(body, body.pose(part), 1.0)
+        square, _, _ = pairs.radial_square(near)
+        distance = near.points.norm(dim=-1)
+        inside = torch.where(square < 1, distance * (square.clamp(min=1e-4).rsqrt() - 1), 0.0)
+        item = near.item[near.owner]
+        deepest = part.new_zeros(len(part)).scatter_reduce(0, item, inside, "amax")
+        found = [""] * len(part)
+        for node in (inside == deepest[item]).nonzero()[:, 0].tolist():
+            if inside[node] > 0:
+                pair = near.pair[near.owner[node]]
+                ends = sorted((int(pairs.first[pair]), int(pairs.second[pair])))
+                found[int(item[node])] = " and ".join(body.part_names[end] for end in ends)
+        depths.append(deepest)
+        names += found
+    return torch.cat(depths), names
+
+
+def levelled(
+    joints: Float[Tensor, "t j 3"], path: Float[Tensor, "t 3"]
+) -> tuple[Float[Tensor, "t j 3"], list[str]]:
+    """Turn a motion so that its lowest joints stay at one height all along its path.
+
+    The slope along the path's main direction is the median over pairs of frames that are far apart
+    there (Theil 1950, Sen 1968), which jumps do not disturb. A short path tells no slope, and a
+    steep one is stairs or a ramp: both stay as they are.
+
+    Args:
+        joints: All joints, metres, Y up.
+        path: Where the body is.
+
+    Returns:
+        The joints, turned about a horizontal axis through the origin, and a line if they were.
+    """
+    flat = path - path.mean(0)
+    flat = flat * flat.new_tensor([1, 0, 1])
+    direction = torch.linalg.svd(flat, full_matrices=False).Vh[0]
+    along, lowest = flat @ direction, joints[..., 1].amin(1)
+    apart = along[:, None] - along
+    far = apart > max(0.5 * float(apart.max()), _LEAST_PATH)
+    if not bool(far.any()):
+        return joints, []
+    slope = ((lowest[:, None] - lowest)[far] / apart[far]).median()
+    degrees = math.degrees(math.atan(slope))
+    if not _LEAST_TILT < abs(degrees) < _MOST_TILT:
+        return joints, []
+    up = joints.new_tensor([0.0, 1.0, 0.0])
+    # The rotation that takes the rising direction to the horizontal one.
+    rising = (direction + slope * up) / (1 + slope**2).sqrt()
+    skew = torch.outer(direction, rising) - torch.outer(rising, direction)
+    turn = torch.linalg.matrix_exp(skew * (slope.atan() / slope.atan().sin()))
+    return joints @ turn.T, [f"floor: tilted by {abs(degrees):.1f} degrees in the source, levelled"]
+
+
+def _middle_of_path(
+    limbs: Float[Tensor, "t limbs 3"], names: tuple[str, ...]
+) -> Float[Tensor, "3"]:
+    """Middle of the hips' path, on the floor."""
+    hips = limbs[:, [names.index("l_hip"), names.index("r_hip")]].mean(1)
+    middle = 0.5 * (hips.amax(0) + hips.amin(0))
+    return middle * middle.new_tensor([1, 0, 1])
+
+
+def _face_middle(
+    body: BodyModel, states: Float[Tensor, "t n"]
+) -> tuple[BodyModel, Float[Tensor, "t n"]]:
+    """The same motion on a base that faces the middle of all turns: most room to both limits."""
+    place = [body.state_index(name) for name in ROOT_NAMES[:3]]
+    yaw = body.state_index("root_yaw")
+    heading = 0.5 * (states[:, yaw].max() + states[:, yaw].min())
+    facing = root_rotation(torch.stack([heading, 0 * heading, 0 * heading]))
+    states = states.clone()
+    states[:, place] = states[:, place] @ facing
+    states[:, yaw] -= heading
+    return body.with_base(facing, torch.zeros(3)), states
+
+
+def _frame(left: Tensor, up: Tensor) -> Float[Tensor, "*batch 3 3"]:
+    """Axes (columns) left, up, forward: the first exactly, the second as nearly as may be."""
+    x = torch.nn.functional.normalize(left, dim=-1)
+    z = torch.nn.functional.normalize(torch.linalg.cross(x, up), dim=-1)
+    return torch.stack([x, torch.linalg.cross(z, x), z], dim=-1)
+
+
+def _root_by_trunk(
+    names: tuple[str, ...], limbs: Float[Tensor, "t limbs 3"]
+) -> Float[Tensor, "t 6"]:
+    """Place and turns of the root as hips and shoulders show them, turns without jumps."""
+    place = {name: limbs[:, i] for i, name in enumerate(names)}
+    hips = 0.5 * (place["l_hip"] + place["r_hip"])
+    shoulders = 0.5 * (place["l_shoulder"] + place["r_shoulder"])
+    turned = root_angles(_frame(place["l_hip"] - place["r_hip"], shoulders - hips))
+    unwrapped = torch.from_numpy(np.unwrap(turned.numpy(), axis=0))
+    return torch.cat([hips, unwrapped], dim=-1)
+
+
+def _foot_length(
+    motion: MotionCapture, names: tuple[str, ...], index: tuple[int, ...]
+) -> float | None:
+    """Metres from ankle to the farthest joint of the foot, in the zero pose."""
+    found = []
+    for name, ankle in zip(names, index, strict=True):
+        below = _below(motion.parents, ankle)
+        if name.endswith("ankle") and below:
+            apart = np.linalg.norm(motion.rest[below] - motion.rest[ankle], axis=-1)
+            found.append(float(apart.max()))
+    return sum(found) / len(found) if found and min(found) > _TOE_DEPTH else None
+
+
+class _Anchored(NamedTuple):
+    """A joint beside the limbs' with a place of its own in the body."""
+
+    joint: int
+    link: int
+    offset: Float[Tensor, "3"]
+
+
+def _anchored(
+    motion: MotionCapture, body: BodyModel, names: tuple[str, ...], index: tuple[int, ...]
+) -> tuple[list[_Anchored], str]:
+    """Joints beside the limbs' whose places in the body the zero pose tells, and a line."""
+    at = dict(zip(names, index, strict=True))
+    rest, parents = motion.rest, motion.parents
+
+    def middle(place: str) -> np.ndarray:
+        return 0.5 * (rest[at[f"l_{place}"]] + rest[at[f"r_{place}"]])
+
+    hips, shoulders = middle("hip"), middle("shoulder")
+    left, up = rest[at["l_hip"]] - hips, shoulders - hips
+    if left[0] <= _UPRIGHT * np.linalg.norm(left) or up[1] <= _UPRIGHT * np.linalg.norm(up):
+        return [], "zero pose not upright facing +Z: pelvis, feet and head follow the limbs alone"
+    pelvis = _meeting(parents, at["l_hip"], at["r_hip"])
+    chest = _meeting(parents, at["l_shoulder"], at["r_shoulder"])
+    # Where a joint is, from a point that source and body share, and the landmark that it moves with
+    found: list[tuple[int, np.ndarray, str, str]] = []
+    if np.linalg.norm(rest[pelvis] - hips) < _NEAR:
+        found.append((pelvis, hips, "HumanoidRoot", "HumanoidRoot"))
+    if chest != pelvis and np.linalg.norm(rest[chest] - shoulders) < _NEAR:
+        found.append((chest, shoulders, "vt1", "vt1"))
+        limbs = {joint for limb in index for joint in (*_above(parents, limb), limb)}
+        # The neck bends twice; the body's head turns in one place, and has what is farther up.
+        level = len(_above(parents, chest)) + 2
+        for joint in _below(parents, chest):
+            above = _above(parents, joint)
+            beside = not limbs & {joint, *above[: above.index(chest)]}
+            if beside and len(above) >= level and rest[joint, 1] > shoulders[1]:
+                found.append((joint, shoulders, "vt1", "skullbase"))
+    for name in ("l_ankle", "r_ankle"):
+        if name in at:
+            found += [(j, rest[at[name]], name, name) for j in _below(parents, at[name])]
+
+    zero = body.with_base(torch.eye(3), torch.zeros(3)).pose(torch.zeros_like(body.lower))
+    anchored = []
+    for joint, shared, here, carrier in found:
+        link = int(body.marker_link[body.joint_index(carrier)])
+        place = zero.joints[body.joint_index(here)] + torch.from_numpy(rest[joint] - shared)
+        offset = zero.tree.rotation[link].T @ (place - zero.tree.translation[link])
+        anchored.append(_Anchored(joint, link, offset))
+    listed = ", ".join(motion.joint_names[joint.joint] for joint in anchored)
+    return anchored, f"followed beside the limbs: {listed or 'nothing'}"
+
+
+def _above(parents: tuple[int, ...], joint: int) -> list[int]:
+    """All joints above a joint, the nearest first."""
+    chain: list[int] = []
+    while (joint := parents[joint]) >= 0:
+        chain.append(joint)
+    return chain
+
+
+def _below(parents: tuple[int, ...], joint: int) -> list[int]:
+    """All joints below a joint."""
+    return [other for other in range(len(parents)) if joint in _above(parents, other)]
+
+
+def _meeting(parents: tuple[int, ...], one: int, other: int) -> int:
+    """The joint nearest to two joints on different branches that is above both."""
+    shared = set(_above(parents, one))
+    return next((joint for joint in _above(parents, other) if joint in shared), 0)
+
+
+def _points(
+    body: BodyModel,
+    names: tuple[str, ...],
+    limbs: Float[Tensor, "t limbs 3"],
+    source: Float[Tensor, "t j 3"],
+    others: list[_Anchored],
+    choice: Retargeting,
+) -> Points:
+    columns = [body.joint_index(name) for name in names]
+    extra = [other.joint for other in others]
+    sigma = [choice.sigma] * len(names) + [choice.sigma_others] * len(others)
+    return Points(
+        torch.cat([body.marker_link[columns], torch.tensor([o.link for o in others]).long()]),
+        torch.cat([body.marker_offset[columns], *(other.offset[None] for other in others)]),
+        torch.cat([limbs, source[:, extra]], dim=1),
+        torch.tensor(sigma).to(limbs),
+    )
+
+
+def _fit(
+    body: BodyModel,
+    points: Points,
+    root: Float[Tensor, "t 6"],
+    rate: float,
+    choice: Retargeting,
+    generator: torch.Generator,
+) -> Float[Tensor, "t n"]:
+    """States of all frames: several descents each, the best path through them, smoothing."""
+    frames, k, n = len(root), choice.num_starts, body.num_parameters
+    bounds = free_turns(body)
+    noise = torch.randn(k, n, generator=generator, dtype=body.dtype)
+    noise[0] = 0.0
+    spread = torch.where(body.sticky_deviation.isfinite(), body.sticky_deviation, 0.0)
+    starts = (body.sticky_mean + 0.7 * spread * noise).expand(frames, k, n).clone()
+    starts[..., [body.state_index(name) for name in ROOT_NAMES]] = root[:, None]
+    cost = PointDistances(body=body, points=points, stabiliser=Stabiliser())
+    every = torch.arange(frames).repeat_interleave(k)
+    optimiser = TrustRegionNewton(max_steps=choice.max_steps, tolerance=1e-3)
+    found = optimiser.minimise(cost.take(every), starts.flatten(0, 1), bounds)
+    times = torch.arange(frames).to(root) / rate
+    speed = tuple(body.motion_rate.tolist())
+    states, costs = found.mean.unflatten(0, (frames, k)), found.cost.unflatten(0, (frames, k))
+    path = best_path(states, None, costs, times, Transition(velocity=speed))
+    states = states[torch.arange(frames), path.mode]
+    smooth = Transition(acceleration=tuple(rate / choice.settling_s for rate in speed))
+    costs = [cost]
+    if choice.repulsion is not None:
+        pairs = InterpenetrationPairs(body)
+        costs.append(replace(cost, repulsion=choice.repulsion, pairs=pairs))
+    for stage in costs:
+        states = refine(
+            stage, states, times, smooth, bounds, max_steps=choice.max_steps, tolerance=1e-2
+        ).mean
+    return states
+
+
+def _findings(
+    body: BodyModel,
+    states: Tensor,
+    at_limit: Tensor,
+    depth: Tensor,
+    pairs: list[str],
+) -> list[str]:
+    """Lines about turns, limits and collisions."""
+    lines = []
+    yaw, pitch, roll = (states[:, body.state_index(name)] for name in ROOT_NAMES[3:])
+    steepest = float(pitch.abs().max())
+    lines.append(
+        f"root: yaw turns through {math.degrees(yaw.max() - yaw.min()):.0f} degrees without a "
+        f"jump; steepest pitch {math.degrees(steepest):.0f} degrees"
+    )
+    if steepest > _STEEP:
+        lines.append(
+            "WARNING: the root's pitch nears a right angle, where yaw and roll are one turn and "
+            "the pitch is limited: this clip needs several bases; cut it there"
+        )
+    beyond = [
+        name
+        for name, turn in (("root_yaw", yaw), ("root_roll", roll))
+        if bool((turn < body.lower[body.state_index(name)]).any())
+        or bool((turn > body.upper[body.state_index(name)]).any())
+    ]
+    if beyond:
+        lines.append(
+            f"WARNING: beyond the body's limits: {', '.join(beyond)}; a tracker cannot go there, "
+            "choose a shorter part"
+        )
+    share = at_limit.double().mean(0)
+    share[[body.state_index(name) for name in ROOT_NAMES]] = 0.0
+    worst = share.argsort(descending=True)[:6].tolist()
+    held = [f"{body.state_names[i]} {100 * share[i]:.0f} %" for i in worst if share[i] > 0.005]
+    lines.append(f"angles at a limit, share of frames: {', '.join(held) or 'none'}")
+    deep = depth > _DEEP
+    if bool(deep.any()):
+        named = [pair for pair, is_deep in zip(pairs, deep.tolist(), strict=True) if is_deep]
+        common = max(set(named), key=named.count)
+        lines.append(
+            f"flesh more than {1000 * _DEEP:.0f} mm inside other flesh in "
+            f"{100 * float(deep.double().mean()):.0f} % of frames, {1000 * float(depth.max()):.0f} "
+            f"mm at most ({pairs[int(depth.argmax())]}), most often {common}"
+        )
+    else:
+        lines.append(f"no flesh more than {1000 * _DEEP:.0f} mm inside other flesh")
+    return lines

@@ -1,0 +1,1 @@
+"""Experiments: sequences with truth, metrics, evaluators."""

@@ -1,0 +1,568 @@
+"""How well a tracker follows a sequence whose truth is known, frame by frame and as a row.
+
+`Yardstick` measures every frame of a tracker, `summarise` makes a run one row of numbers, and
+`over_seeds` the rows of several runs one of medians. What the words mean (the figures are those of
+`Thresholds`):
+
+* A frame has *failed* if the best mode's mean root-aligned error exceeds 250 mm, or if its
+  silhouette overlaps the true one by less than half (intersection over union; good tracks reach
+  0.9 to 0.97 on a rendered arm of our own and 0.75 to 0.87 on a clothed person of others). The body
+  is *lost* at the first failed frame from which on all frames fail for half a second.
+* An arm hangs on a base that the tracker is told: its root is known, and root-aligned and absolute
+  errors are the same. Its frames fail above 150 mm: an arm that follows something else still begins
+  at the shoulder, and a tracker that stands still while the arm swings away has 200 mm, where good
+  ones have less than 40.
+* A *limb* is lost at the first frame from which on one and the same joint is farther than that from
+  where it is for half a second: in the best mode, and, as with all that is said to be of the modes,
+  in the one nearest to the truth. A mean over the joints forgives an arm that points elsewhere.
+* The *true mode is kept* if the mean root-aligned error of any mode is below 100 mm; in angles, if
+  the true angles lie within three standard deviations of any mode (root of the mean squared
+  Mahalanobis distance per parameter).
+* *Calibration*: how often the true joints lie in the 50, 90, and 95 % regions of a mode, the
+  joint's covariance `J S J^T` (`torchcss.body.uncertainty`) enlarged by the reference's own.
+* A pose is *impossible* if an angle is more than a degree beyond its limit, or if a part is deeper
+  than 2 cm inside another one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchcss.body.model import BodyModel, BodyPose
+from torchcss.body.root import ROOT_NAMES, has_root, move_base
+from torchcss.body.uncertainty import joint_covariance
+from torchcss.cost.interpenetration import InterpenetrationPairs
+from torchcss.cost.part_map import part_map
+from torchcss.errors import ConfigurationError
+from torchcss.inference.mixture import GaussianMixture
+from torchcss.inference.tracker import TrackerInfo
+from torchcss.linalg import squared_mahalanobis
+from torchcss.studies.metrics import (
+    LIMB_JOINTS,
+    LOST_MM,
+    REGAIN_S,
+    absolute_errors_mm,
+    acceleration_error,
+    best_of_modes,
+    coverage,
+    first_loss,
+    mask_overlap,
+    probability_within,
+    procrustes_errors_mm,
+    root_aligned_errors_mm,
+)
+from torchcss.studies.sequences import RecordedSequence
+from torchcss.tracking.session import TrackedFrame
+from torchcss.types import Frame
+from torchcss.vision.camera import Camera
+
+ARM_LOST_MM = 150.0
+"""Error above which a frame of an arm counts as failed."""
+
+LOSSES = ("lost_s", "limb_lost_s", "limb_lost_of_modes_s")
+"""Entries of a row that are times of a loss, NaN where there was none."""
+
+_PLACE = ROOT_NAMES[:3]
+"""Where a body stands."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Thresholds:
+    """The figures that make the words precise; see the module's page.
+
+    Attributes:
+        lost_mm: Error above which a frame has failed.
+        least_overlap: Overlap below which it has.
+        regain_s: How long failing has to last to be a loss.
+        true_mode_mm: Error below which a mode is the true one.
+        true_mode_deviations: Standard deviations per angle below which it is.
+        outside_degrees: How far an angle may pass its limit.
+        deep_m: How deep parts may penetrate, metres.
+        reference_m: Standard deviation of the reference per coordinate, metres.
+    """
+
+    lost_mm: float = LOST_MM
+    least_overlap: float = 0.5
+    regain_s: float = REGAIN_S
+    true_mode_mm: float = 100.0
+    true_mode_deviations: float = 3.0
+    outside_degrees: float = 1.0
+    deep_m: float = 0.02
+    reference_m: float = 0.02
+
+    @classmethod
+    def of(cls, sequence: RecordedSequence) -> Thresholds:
+        """Those for a sequence.
+
+        A reference that is not of our bodies has its joints a few centimetres elsewhere. Where it
+        is, half a centimetre allows for what the linear covariance of a joint leaves out: a limb
+        of 0.3 m that is turned by 10 degrees leaves its tangent by 4.6 mm.
+        """
+        if sequence.truth is None:
+            return cls()
+        arm = not has_root(sequence.truth.body)
+        return cls(lost_mm=ARM_LOST_MM if arm else LOST_MM, reference_m=0.005)
+
+
+class FrameMeasures(NamedTuple):
+    """One frame of one tracker against the truth; modes as the tracker orders them, best first.
+
+    Attributes:
+        frame: Index in the video.
+        time_s: Seconds since the first frame tracked.
+        failed: Whether the best mode does not follow the body; None where nothing is known.
+        weight: Weights of the modes.
+        absolute_mm: Errors of the compared joints; NaN where the reference is unknown.
+        root_aligned_mm: The same with the roots on each other.
+        procrustes_mm: The same after the best similarity.
+        within: Probability of the region of a mode that just holds the true joint.
+        angle_deviations: Standard deviations per angle between a mode and the truth; NaN if the
+            true angles are not known.
+        joints_m: Compared joints of the best mode, metres.
+        reference_m: Where they should be; NaN where unknown.
+        overlap: Of the best mode's silhouette with the true one; NaN if that is not known.
+        outside_degrees: How far the best mode's worst angle is beyond its limit.
+        penetration_m: How deep the deepest node of every mode is inside another part, metres.
+        samples: Samples drawn.
+        evaluations: Evaluations of the cost: with two derivatives for each iteration of a
+            descending sample, or the value alone for each weighing of a particle.
+        seconds: Wall time by stage; that of the features is shared by all trackers.
+    """
+
+    frame: int
+    time_s: float
+    failed: bool | None
+    weight: Float[np.ndarray, " k"]
+    absolute_mm: Float[np.ndarray, "k j"]
+    root_aligned_mm: Float[np.ndarray, "k j"]
+    procrustes_mm: Float[np.ndarray, "k j"]
+    within: Float[np.ndarray, "k j"]
+    angle_deviations: Float[np.ndarray, " k"]
+    joints_m: Float[np.ndarray, "j 3"]
+    reference_m: Float[np.ndarray, "j 3"]
+    overlap: float
+    outside_degrees: float
+    penetration_m: Float[np.ndarray, " k"]
+    samples: int
+    evaluations: int
+    seconds: dict[str, float]
+
+
+def num_evaluations(info: TrackerInfo) -> int:
+    """Evaluations of the cost in one step.
+
+    Each iteration of the optimiser is one; filters, which never iterate, weigh every sample once.
+    """
+    return int(info.num_steps.sum()) or int(info.num_samples)
+
+
+def penetration_depth(
+    body: BodyModel, pose: BodyPose, pairs: InterpenetrationPairs, surface: Tensor
+) -> Float[Tensor, "*batch"]:
+    """How deep the deepest node of a part is inside a part that is not its neighbour, metres.
+
+    Args:
+        body: The body.
+        pose: Any number of posed bodies.
+        pairs: The tables of that body, with as many nodes as shall be looked at.
+        surface: Points on every part in its frame, `[parts points 3]`, the nearest of which gives
+            the depth.
+    """
+    near = pairs.near(body, pose, 1.0)
+    square, _, _ = pairs.radial_square(near)
+    near, _ = near.select(square < 1)
+    inside = pairs.second[near.pair][near.owner]
+    depth = torch.zeros_like(near.points[:, 0])
+    for part in inside.unique().tolist():
+        own = inside == part
+        depth[own] = torch.cdist(near.points[own], surface[part]).amin(-1)
+    batch = pose.x.shape[:-1]
+    deepest = depth.new_zeros(batch.numel())
+    return deepest.scatter_reduce(0, near.item[near.owner], depth, "amax").reshape(batch)
+
+
+def silhouette(
+    body: BodyModel, x: Float[Tensor, " n"], camera: Camera, *, rings: int = 16, meridians: int = 20
+) -> Bool[np.ndarray, "h w"]:
+    """Pixels whose centres see the posed body.
+
+    Args:
+        body: The body.
+        x: Its state.
+        camera: The camera.
+        rings: Latitudes of the drawn mesh.
+        meridians: Longitudes of the drawn mesh.
+    """
+    return (part_map(body, x, camera, rings=rings, meridians=meridians) >= 0).cpu().numpy()
+
+
+def region_probability(
+    body: BodyModel,
+    mixture: GaussianMixture,
+    joints: Sequence[int],
+    reference_m: Float[np.ndarray, "*k j 3"],
+    deviation_m: float,
+    *,
+    exact: bool = False,
+) -> Float[np.ndarray, "k j"]:
+    """Probability of the region that a mode states for a joint and that just holds the true one.
+
+    Where the deviation is an allowance and the reference does not err by it, the squared distance
+    of a truth from the stated Gaussian is `sum w_i z_i^2`, `w_i` the shares of the stated variances
+    in the sums along their axes: the joints of an arm move on surfaces, and the third `w` is zero.
+    Its law is taken as `g chi^2_h` with that mean and variance (Satterthwaite, Biometrics 2, 1946).
+
+    Args:
+        body: The body.
+        mixture: The modes.
+        joints: Which joint centres.
+        reference_m: Where they are, metres; NaN where unknown.
+        deviation_m: Standard deviation of the reference per coordinate.
+        exact: The reference has no error of its own.
+    """
+    pose, joints = body.pose(mixture.mean), list(joints)
+    spread = joint_covariance(body, pose, mixture.covariance)[:, joints].double().cpu()
+    allowed = deviation_m**2
+    weight = torch.ones_like(spread[..., 0])
+    if exact:
+        stated = torch.linalg.eigvalsh(spread).clamp(min=0)
+        weight = stated / (stated + allowed)
+    spread = spread + allowed * torch.eye(3, dtype=spread.dtype)
+    away = torch.from_numpy(reference_m) - pose.joints[:, joints].double().cpu()
+    known = away.isfinite().all(-1)
+    distance = squared_mahalanobis(away.nan_to_num(), spread)
+    mean, square = weight.sum(-1), weight.square().sum(-1)
+    distance = torch.where(known, distance * mean / square, torch.nan)
+    return probability_within(distance.numpy(), (mean.square() / square).numpy())
+
+
+def compared_joints(sequence: RecordedSequence, body: BodyModel) -> tuple[str, ...]:
+    """The joints by which tracks are judged: of limbs, or all that an arm moves, mostly in view.
+
+    Raises:
+        ConfigurationError: If the sequence's reference has none of them.
+    """
+    wanted = LIMB_JOINTS if has_root(body) else _moved_joints(body)
+    reference = torch.from_numpy(sequence.joints_world)
+    known = reference.isfinite().all(-1)
+    uv, _, valid = sequence.camera.project(reference.nan_to_num())
+    seen = known & valid & sequence.camera.inside_image(uv)
+    share = seen.sum(0) / known.sum(0).clamp(min=1)
+    chosen = tuple(
+        name
+        for name in wanted
+        if name in sequence.joint_names and share[sequence.joint_names.index(name)] >= 0.5
+    )
+    if not chosen:
+        raise ConfigurationError(
+            f"{sequence.name}: the reference has no joint of {body.name} in view; it has "
+            f"{', '.join(sequence.joint_names)}"
+        )
+    return chosen
+
+
+def _moved_joints(body: BodyModel) -> tuple[str, ...]:
+    """Names of the joint centres that any parameter moves."""
+    pose = body.pose(body.rest)
+    variance = torch.eye(body.num_parameters).to(body.rest)
+    variance = joint_covariance(body, pose, variance).diagonal(dim1=-2, dim2=-1).sum(-1)
+    moves = variance > 1e-6  # square metres per radian: more than rounding
+    return tuple(name for name, moved in zip(body.joint_names, moves, strict=True) if moved)
+
+
+class Yardstick:
+    """Measures tracked frames of one sequence.
+
+    Args:
+        sequence: What is tracked.
+        body: The body that tracks it.
+        thresholds: What counts as failed.
+
+    Attributes:
+        compared: Names of the joints compared.
+    """
+
+    def __init__(self, sequence: RecordedSequence, body: BodyModel, thresholds: Thresholds) -> None:
+        self.sequence, self.thresholds = sequence, thresholds
+        self.compared = compared_joints(sequence, body)
+        # Both hips make the root, whether they are compared or not.
+        roots = ("l_hip", "r_hip") if has_root(body) else ()
+        self._common = list(dict.fromkeys((*self.compared, *roots)))
+        missing = [name for name in self._common if name not in sequence.joint_names]
+        if missing:
+            raise ConfigurationError(
+                f"{sequence.name}: cannot align the roots: the reference has no "
+                f"{' and '.join(missing)}"
+            )
+        self._column = [body.joint_index(name) for name in self._common]
+        index = [sequence.joint_names.index(name) for name in self._common]
+        self._reference = sequence.joints_world[:, index]
+        self._pairs = InterpenetrationPairs(body, rings=8, meridians=12)
+        self._surface = body.mesh(48, 64).points.flatten(1, 2)
+        self._rooted = bool(roots)
+
+    def __call__(self, tracked: TrackedFrame, start: Frame, features_s: float) -> FrameMeasures:
+        """Measure a frame.
+
+        Args:
+            tracked: The frame.
+            start: The first frame of the track.
+            features_s: What its features took, seconds.
+        """
+        sequence, limits = self.sequence, self.thresholds
+        body, number = tracked.body, tracked.frame.index
+        mixture = tracked.state.mixture._replace(covariance=tracked.covariance)
+        count = len(self.compared)
+        joints = tracked.joints_world[:, self._column].double().cpu().numpy()
+        reference = self._reference[number]
+        absolute = absolute_errors_mm(joints, reference)[:, :count]
+        aligned = absolute
+        if self._rooted:
+            aligned = root_aligned_errors_mm(joints, reference, self._common)[:, :count]
+        overlap = math.nan
+        if sequence.mask is not None:
+            drawn = silhouette(body, mixture.mean[0], sequence.camera)
+            overlap = float(mask_overlap(drawn, sequence.mask[number]))
+        poses, error = body.pose(mixture.mean), _mean(aligned[0])
+        failed = error > limits.lost_mm or overlap < limits.least_overlap
+        return FrameMeasures(
+            frame=number,
+            time_s=tracked.frame.time_s - start.time_s,
+            failed=None if math.isnan(error) and math.isnan(overlap) else failed,
+            weight=mixture.weight.double().cpu().numpy(),
+            absolute_mm=absolute,
+            root_aligned_mm=aligned,
+            procrustes_mm=procrustes_errors_mm(joints[:, :count], reference[:count]),
+            within=region_probability(
+                body,
+                mixture,
+                self._column[:count],
+                reference[:count],
+                limits.reference_m,
+                exact=sequence.truth is not None,
+            ),
+            angle_deviations=self._angle_deviations(tracked),
+            joints_m=joints[0, :count],
+            reference_m=reference[:count],
+            overlap=overlap,
+            outside_degrees=_outside(body, mixture.mean[0]),
+            penetration_m=penetration_depth(body, poses, self._pairs, self._surface).cpu().numpy(),
+            samples=int(tracked.info.num_samples),
+            evaluations=num_evaluations(tracked.info),
+            seconds={
+                "features": features_s,
+                "cost": tracked.seconds["features"],
+                "search": tracked.seconds["search"],
+            },
+        )
+
+    def _angle_deviations(self, tracked: TrackedFrame) -> np.ndarray:
+        """Standard deviations per angle between each mode and the truth."""
+        truth, body, mixture = self.sequence.truth, tracked.body, tracked.state.mixture
+        spread = tracked.covariance.double().cpu()
+        if truth is None or truth.body.state_names != body.state_names:
+            return np.full(len(mixture.mean), np.nan)
+        x = truth.states[tracked.frame.index]
+        turn, shift = (part.double().cpu() for part in (body.base_rotation, body.base_translation))
+        angles = list(range(body.num_parameters))
+        if self._rooted:
+            _, x, _ = move_base(truth.body, turn, shift, x)
+            # Where the body stands goes with its size, which one image does not tell.
+            angles = [body.state_index(name) for name in body.state_names if name not in _PLACE]
+        away = (x - mixture.mean.double().cpu())[:, angles]
+        away = torch.remainder(away + math.pi, 2 * math.pi) - math.pi
+        spread = spread[:, angles][:, :, angles]
+        return (squared_mahalanobis(away, spread) / len(angles)).sqrt().numpy()
+
+
+def _outside(body: BodyModel, x: Float[Tensor, " n"]) -> float:
+    """How far the worst joint angle is beyond its limit, degrees."""
+    joints = [i for i, name in enumerate(body.state_names) if name not in ROOT_NAMES]
+    beyond = torch.maximum(body.lower - x, x - body.upper)[joints]
+    return math.degrees(max(0.0, float(beyond.max())))
+
+
+def _mean(values: Any) -> float:
+    """Mean of the numbers that are none of them NaN; NaN if there are none."""
+    values = np.asarray(values, np.float64).reshape(-1)
+    values = values[np.isfinite(values)]
+    return float(values.mean()) if values.size else math.nan
+
+
+def summarise(
+    measures: Sequence[FrameMeasures], thresholds: Thresholds, interval_s: float
+) -> dict[str, Any]:
+    """One run as the numbers of a table's row; NaN what cannot be measured.
+
+    Means are over the frames before the loss, while the tracker still had the body, since a run
+    that is stopped when it is lost has no others; samples and seconds are of all frames. Shares
+    are of frames (`deep_modes_share`: of the modes in them), calibration is of joints in frames.
+
+    Args:
+        measures: All frames of the run, at least one.
+        thresholds: What counted as failed.
+        interval_s: Seconds between the frames.
+    """
+    times = [m.time_s for m in measures]
+    lost = loss(measures, thresholds)
+    held = measures if lost is None else measures[: max(lost, 1)]
+    near = [_nearest(m) for m in held]
+    told = [
+        (m, n) for m, n in zip(held, near, strict=True) if not np.isnan(m.root_aligned_mm).all()
+    ]
+    several = [(m, n) for m, n in told if len(m.weight) > 1]
+    depth = np.concatenate([m.penetration_m for m in held])
+    first = np.concatenate([np.arange(len(m.weight)) == 0 for m in held])
+    row: dict[str, Any] = {
+        "num_frames": len(measures),
+        "lost": lost is not None,
+        "lost_s": math.nan if lost is None else times[lost],
+        "failed_share": _mean([m.failed for m in measures if m.failed is not None]),
+        "limb_lost_s": limb_loss([m.root_aligned_mm[0] for m in measures], times, thresholds),
+        "limb_lost_of_modes_s": limb_loss(
+            [m.root_aligned_mm[_nearest(m)] for m in measures], times, thresholds
+        ),
+        "num_frames_held": len(held) if lost is None else lost,
+        **_errors(held),
+        "true_mode_kept": _mean(
+            [_mean(m.root_aligned_mm[n]) < thresholds.true_mode_mm for m, n in told]
+        ),
+        "true_angles_kept": math.nan
+        if np.isnan(held[0].angle_deviations).all()
+        else _mean([np.nanmin(m.angle_deviations) < thresholds.true_mode_deviations for m in held]),
+        "modes": _mean([len(m.weight) for m in held]),
+        # Of a calibrated mixture these two are equal: how sure it is of its best mode, and how
+        # often that is the nearest to the truth, where it has more than one.
+        "best_weight": _mean([m.weight[0] for m, _ in several]),
+        "best_is_nearest": _mean([n == 0 for _, n in several]),
+        "overlap": _mean([m.overlap for m in held]),
+        "acceleration_error": acceleration_error(
+            np.stack([m.joints_m for m in held]),
+            np.stack([m.reference_m for m in held]),
+            interval_s,
+        ),
+        "outside_share": _mean([m.outside_degrees > thresholds.outside_degrees for m in held]),
+        "deep_share": _mean(depth[first] > thresholds.deep_m),
+        "deep_modes_share": _mean(depth > thresholds.deep_m),
+        "outside_degrees": max(m.outside_degrees for m in held),
+        "penetration_mm": 1000 * float(depth[first].max()),
+        "penetration_modes_mm": 1000 * float(depth.max()),
+        "samples_per_frame": _mean([m.samples for m in measures]),
+        "evaluations_per_frame": _mean([m.evaluations for m in measures]),
+        **{
+            f"{stage}_s_per_frame": _mean([m.seconds[stage] for m in measures])
+            for stage in measures[0].seconds
+        },
+        "per_frame": {
+            "time_s": times,
+            "failed": [m.failed for m in measures],
+            "root_aligned_mm": [_mean(m.root_aligned_mm[0]) for m in measures],
+            "root_aligned_best_of_modes_mm": [
+                _mean(m.root_aligned_mm[_nearest(m)]) for m in measures
+            ],
+            "overlap": [m.overlap for m in measures],
+        },
+    }
+    for name, which in (("best", [0] * len(held)), ("nearest", near)):
+        inside = np.stack([m.within[n] for m, n in zip(held, which, strict=True)])
+        row |= {f"inside_{round(100 * p)}_{name}": s for p, s in coverage(inside).items()}
+    return row
+
+
+def loss(measures: Sequence[FrameMeasures], thresholds: Thresholds) -> int | None:
+    """The frame in which a run was lost for good, see `first_loss`; None if it never was.
+
+    A frame of which nothing is known ends no stretch of failures and begins none.
+
+    Args:
+        measures: The frames of a run.
+        thresholds: How long failing has to last.
+    """
+    return _first_known_loss(
+        np.array([bool(m.failed) for m in measures]),
+        np.array([m.failed is not None for m in measures]),
+        np.array([m.time_s for m in measures]),
+        thresholds,
+    )
+
+
+def limb_loss(
+    errors_mm: Sequence[Float[np.ndarray, " j"]], times_s: Sequence[float], thresholds: Thresholds
+) -> float:
+    """When some joint was lost for good, see `first_loss`; NaN if none ever was.
+
+    Args:
+        errors_mm: Errors of the joints, frame by frame; NaN, where a joint is not known, ends no
+            stretch of failures and begins none.
+        times_s: Times of the frames, seconds.
+        thresholds: How far off a joint has failed, and how long that has to last.
+    """
+    times = np.asarray(times_s, np.float64)
+    lost = [
+        _first_known_loss(joint > thresholds.lost_mm, np.isfinite(joint), times, thresholds)
+        for joint in np.stack(errors_mm).T
+    ]
+    return min((times_s[first] for first in lost if first is not None), default=math.nan)
+
+
+def _first_known_loss(
+    failed: Bool[np.ndarray, " t"],
+    known: Bool[np.ndarray, " t"],
+    times_s: Float[np.ndarray, " t"],
+    thresholds: Thresholds,
+) -> int | None:
+    """`first_loss` among the frames of which something is known."""
+    frames = np.flatnonzero(known)
+    first = first_loss(failed[frames], times_s[frames], regain_s=thresholds.regain_s)
+    return None if first is None else int(frames[first])
+
+
+def _nearest(measures: FrameMeasures) -> int:
+    """The mode that is nearest to the truth, the best one where that is not known."""
+    return max(0, int(best_of_modes(measures.root_aligned_mm)[1]))
+
+
+def _errors(measures: Sequence[FrameMeasures]) -> dict[str, float]:
+    """Mean errors of the best mode, and of the mode that is best by the error itself."""
+    kinds = {"mpjpe": "absolute_mm", "root_aligned": "root_aligned_mm", "pa_mpjpe": "procrustes_mm"}
+    errors = {}
+    for name, field in kinds.items():
+        values = [getattr(m, field) for m in measures]
+        errors[f"{name}_mm"] = _mean([_mean(value[0]) for value in values])
+        best = [_mean(best_of_modes(value)[0]) for value in values]
+        errors[f"{name}_best_of_modes_mm"] = _mean(best)
+    return errors
+
+
+def over_seeds(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Median, least and greatest over runs of one tracker of every number that `summarise` gives.
+
+    Args:
+        rows: The runs; None, which files have for NaN, counts as not known. Whoever did not lose
+            the body, or a limb, loses it later than anybody: infinite.
+    """
+    table: dict[str, Any] = {"seeds": len(rows), "lost": sum(row["lost"] for row in rows)}
+    for key, example in rows[-1].items():
+        if key == "lost" or not (example is None or isinstance(example, (int, float))):
+            continue
+        missing = math.inf if key in LOSSES else math.nan
+        # A file may begin with runs of an earlier version, which did not measure everything.
+        values = [number(row[key], missing) for row in rows if key in row]
+        known = sorted(value for value in values if not math.isnan(value)) or [math.nan]
+        # The middle by hand: the mean of two middle ones may be that of infinities.
+        middle = (known[(len(known) - 1) // 2] + known[len(known) // 2]) / 2
+        table[key] = (middle, known[0], known[-1])
+    return table
+
+
+def number(value: float | None, missing: float = math.nan) -> float:
+    """What a run or its file says; `missing` for NaN and for null, which stands for it."""
+    return missing if value is None or math.isnan(value) else float(value)

@@ -1,0 +1,170 @@
+"""Error against time of many trackers, one panel each, in colours that everybody can tell apart.
+
+Nothing opens a window or changes global state; see `torchcss.studies.slice_plots`. Call
+`error_curves`, `failure_figure`, then `save_figure` of that module.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from torchcss.show.style import OKABE_ITO
+
+_COLUMNS = 4
+_GREY = "0.45"
+_ABOVE = 1.6
+"""Height of the panels as a multiple of the error from which a frame has failed."""
+
+
+class ErrorCurves(NamedTuple):
+    """One tracker's panel.
+
+    Attributes:
+        name: The tracker.
+        best_mm: Error of the best mode by seed and time; `inf` after the end of a run that was
+            stopped since the body was lost, NaN where nothing is known.
+        best_of_modes_mm: The same of the mode that is nearest to the truth.
+        lost_s: When each seed lost the body, NaN if it did not.
+        published_s: When the paper's tracker failed on its own sequence.
+    """
+
+    name: str
+    best_mm: Float[np.ndarray, "seeds t"]
+    best_of_modes_mm: Float[np.ndarray, "seeds t"]
+    lost_s: Sequence[float]
+    published_s: Sequence[float] = ()
+
+
+def error_curves(
+    runs: Sequence[Mapping[str, Any]], published_s: Mapping[str, Sequence[float]]
+) -> tuple[Float[np.ndarray, " t"], list[ErrorCurves]]:
+    """Times of the frames, and the panels, from runs as `scripts/failure_modes.py` writes them.
+
+    Args:
+        runs: What `torchcss.studies.evaluation.summarise` gave, with `preset`; at least one with
+            frames. Runs that ended before the first frame have none, and are left out.
+        published_s: When the paper's trackers failed, by preset.
+    """
+    runs = [run for run in runs if "per_frame" in run]
+    times = np.array(max((run["per_frame"]["time_s"] for run in runs), key=len), np.float64)
+
+    def errors(own: Sequence[Mapping[str, Any]], key: str) -> np.ndarray:
+        values = np.full((len(own), len(times)), np.inf)
+        for row, run in zip(values, own, strict=True):
+            known = run["per_frame"][key]
+            row[: len(known)] = np.array(known, np.float64)  # what files have for NaN is None
+        return values
+
+    curves = []
+    for name in dict.fromkeys(run["preset"] for run in runs):
+        own = [run for run in runs if run["preset"] == name]
+        curves.append(
+            ErrorCurves(
+                name,
+                errors(own, "root_aligned_mm"),
+                errors(own, "root_aligned_best_of_modes_mm"),
+                np.array([run["lost_s"] for run in own], np.float64).tolist(),
+                published_s.get(name, ()),
+            )
+        )
+    return times, curves
+
+
+def failure_figure(
+    times_s: Float[np.ndarray, " t"],
+    curves: Sequence[ErrorCurves],
+    *,
+    title: str,
+    failed_mm: float,
+) -> Figure:
+    """Median error over the seeds against time, with the range of the seeds as a band.
+
+    A seed that was stopped counts as infinitely far from then on, so that the median leaves the
+    panel when half of the seeds are lost.
+
+    Args:
+        times_s: Times of the frames.
+        curves: The trackers.
+        title: What all panels show.
+        failed_mm: Error from which a frame has failed, a dotted line.
+    """
+    rows = math.ceil(len(curves) / _COLUMNS)
+    columns = min(len(curves), _COLUMNS)
+    figure = Figure(figsize=(0.6 + 3.1 * columns, 1.4 + 2.1 * rows), layout="constrained")
+    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    for axes in grid.flat[len(curves) :]:
+        axes.set_visible(False)
+    for index, (axes, tracker) in enumerate(zip(grid.flat, curves, strict=False)):
+        _draw(axes, times_s, tracker, failed_mm)
+        if index + columns >= len(curves):
+            axes.set_xlabel("seconds")
+            axes.tick_params(labelbottom=True)
+    grid[0, 0].set_xlim(times_s[0], max(times_s[-1], times_s[0] + 1e-3))
+    grid[0, 0].set_ylim(0, _ABOVE * failed_mm)
+    figure.supylabel("mean root-aligned error of the joints (mm)", fontsize=9)
+    entries: Mapping[str, object] = {
+        label: handle
+        for axes in grid.flat
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(
+        list(entries.values()), list(entries), loc="outside lower center", ncols=5, fontsize=9,
+        frameon=False,
+    )  # fmt: skip
+    figure.suptitle(title, fontsize=10)
+    return figure
+
+
+def _draw(axes: Axes, times: np.ndarray, tracker: ErrorCurves, failed_mm: float) -> None:
+    top = _ABOVE * failed_mm
+    low, middle, high = _quantiles(tracker.best_mm)
+    # The band of a seed that is lost goes up to the border.
+    axes.fill_between(
+        times, low.clip(max=2 * top), high.clip(max=2 * top), color=OKABE_ITO["blue"], alpha=0.2,
+        lw=0, label="range over the seeds",
+    )  # fmt: skip
+    axes.plot(times, middle, color=OKABE_ITO["blue"], lw=1.6, label="best mode, median")
+    nearest = _quantiles(tracker.best_of_modes_mm)[1]
+    axes.plot(
+        times, nearest, color=OKABE_ITO["orange"], lw=1.3, ls="--", label="nearest mode, median"
+    )
+    axes.axhline(failed_mm, color=_GREY, lw=0.8, ls=":")
+    lost = [time for time in tracker.lost_s if not math.isnan(time)]
+    if lost:
+        axes.plot(
+            lost, np.full(len(lost), failed_mm), "x", color=OKABE_ITO["vermilion"], ms=7, mew=1.8,
+            clip_on=False, zorder=4, label="body lost",
+        )  # fmt: skip
+    inside = [time for time in tracker.published_s if time <= times[-1]]
+    if inside:
+        axes.plot(
+            inside, np.full(len(inside), 0.95 * top), "v", color="black", ms=7, zorder=4,
+            label="failure in the paper, on its own sequence",
+        )  # fmt: skip
+    count = len(tracker.lost_s)
+    axes.set_title(f"{tracker.name}: lost {len(lost)} of {count}", fontsize=9)
+    axes.grid(visible=True, color="0.92", lw=0.6)
+    axes.set_axisbelow(True)
+    axes.tick_params(labelsize=8)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+
+
+def _quantiles(errors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Least, median and greatest over the known seeds of every time; NaN where there is none."""
+    result = np.full((3, errors.shape[1]), np.nan)
+    for index, column in enumerate(errors.T):
+        known = np.sort(column[~np.isnan(column)])
+        if known.size:
+            # The middle by hand: the mean of two middle ones may be that of infinities.
+            middle = (known[(known.size - 1) // 2] + known[known.size // 2]) / 2
+            result[:, index] = known[0], middle, known[-1]
+    result[np.isinf(result[1]) & (np.arange(3) == 1)[:, None]] = np.nan
+    return result[0], result[1], result[2]

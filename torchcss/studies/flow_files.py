@@ -1,0 +1,103 @@
+"""Middlebury `.flo` files: a dense optical flow, two numbers per pixel.
+
+Little endian throughout: float32 202021.25 (its four bytes spell PIEH), int32 width, int32 height,
+then row by row the float32 pairs (u to the right, v down) in pixels. A component beyond 1e9 in
+size marks a pixel whose flow is not known.
+
+By default: `read_flow(path)` and `write_flow(path, flow)`.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchcss.errors import FlowFileError, ShapeError, check_shape
+from torchcss.files import read_bytes, replace_file
+
+_MAGIC = b"PIEH"
+_HEADER_BYTES = 12
+_UNKNOWN_BEYOND = 1.0e9
+_UNKNOWN_WRITTEN = 1.666666752e9
+
+
+class FlowFile(NamedTuple):
+    """What a `.flo` file holds.
+
+    Attributes:
+        flow: Displacement in pixels (u to the right, v down), float32; zero where unknown.
+        known: Where the flow is known.
+    """
+
+    flow: Float[Tensor, "2 h w"]
+    known: Bool[Tensor, "h w"]
+
+
+def read_flow(path: str | os.PathLike[str]) -> FlowFile:
+    """Read a `.flo` file.
+
+    Raises:
+        FlowFileError: If the file is missing, is no flow file, or is not as long as it says.
+    """
+    path = Path(path)
+    content = read_bytes(path, FlowFileError)
+    if len(content) < _HEADER_BYTES or content[:4] != _MAGIC:
+        raise FlowFileError(
+            f"{path}: expected a .flo file, which starts with the bytes PIEH and a size, "
+            f"got {len(content)} bytes starting with {content[:4]!r}"
+        )
+    width, height = (int(side) for side in np.frombuffer(content, "<i4", count=2, offset=4))
+    expected = _HEADER_BYTES + 8 * width * height
+    if width < 1 or height < 1 or len(content) != expected:
+        raise FlowFileError(
+            f"{path}: a flow of {width} x {height} pixels needs {max(expected, 0)} bytes, "
+            f"got {len(content)}; the file is truncated or damaged"
+        )
+    values = np.frombuffer(content, "<f4", offset=_HEADER_BYTES).reshape(height, width, 2)
+    flow = torch.from_numpy(values.astype(np.float32)).movedim(-1, 0).contiguous()
+    known = (flow.abs() <= _UNKNOWN_BEYOND).all(dim=0)  # false for NaN
+    return FlowFile(torch.where(known, flow, 0.0), known)
+
+
+def write_flow(
+    path: str | os.PathLike[str],
+    flow: Float[Tensor, "2 h w"],
+    known: Bool[Tensor, "h w"] | None = None,
+) -> None:
+    """Write a `.flo` file; it stores float32.
+
+    Args:
+        path: The file, overwritten if it exists.
+        flow: Displacement in pixels (u to the right, v down).
+        known: Where the flow is known; None takes it to be known everywhere. A pixel whose flow is
+            not finite is written as unknown in either case.
+
+    Raises:
+        ShapeError: If the flow is not `[2, h, w]` with at least one pixel or `known` not `[h, w]`.
+        OutputError: If the file cannot be written; an older one of this name is left as it is.
+    """
+    check_shape("flow", flow, 2, None, None)
+    if flow.ndim != 3 or flow.numel() == 0:
+        raise ShapeError(
+            f"flow: expected [2, h, w] with at least one pixel, got {list(flow.shape)}; "
+            "write each item of a batch to a file of its own"
+        )
+    height, width = flow.shape[-2:]
+    values = flow.detach().to("cpu", torch.float32)
+    usable = (values.abs() <= _UNKNOWN_BEYOND).all(dim=0)
+    if known is not None:
+        if known.shape != (height, width):
+            raise ShapeError(
+                f"known: expected the flow's size [{height}, {width}], got {list(known.shape)}"
+            )
+        usable &= known.cpu()
+    values = torch.where(usable, values, _UNKNOWN_WRITTEN).movedim(0, -1).contiguous().numpy()
+    header = _MAGIC + np.array([width, height], "<i4").tobytes()
+    with replace_file(Path(path)) as partial:
+        partial.write_bytes(header + values.astype("<f4").tobytes())

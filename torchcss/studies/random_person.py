@@ -1,0 +1,163 @@
+"""Random people in random poses with marked joints: known truth for the initialisation.
+
+A person is a body with lengths drawn from the anthropometric prior (within 10 % of the standard
+humanoid), in a pose drawn from the sticky priors, turned any way about the vertical, seen by the
+camera of `torchcss.studies.reprojection`: 1920 x 1080 pixels, at 3.5 m. Marks have Gaussian noise;
+some may be missing, and some may be anywhere in the image.
+
+Call `random_person(generator=...)`, or `random_lengths` for the lengths alone; `coverage` tells
+whether stated covariances hold the truth.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchcss.body.catalog import LENGTHS, PROPORTION_RANGE
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel
+from torchcss.body.root import move_base
+from torchcss.cost.anthropometric import Anthropometric, proportion_columns
+from torchcss.inference.mixture import GaussianMixture
+from torchcss.studies.metrics import LIMB_JOINTS
+from torchcss.studies.reprojection import DISTANCE, FOCAL_PX, HEIGHT, WIDTH, plausible_pose
+from torchcss.vision.camera import Camera
+
+MARKED = (*LIMB_JOINTS, "vc7", "skull_tip")
+"""The joints that a person marks: those of the limbs, the base of the neck, the top of the head."""
+
+
+class Person(NamedTuple):
+    """A person with marked joints.
+
+    Attributes:
+        body: The body with its own lengths, hung before the camera.
+        state: Its pose.
+        camera: The camera.
+        joint_names: Names of the marked joints.
+        keypoints: Where they are marked, pixels.
+        confidence: 0 where a joint is missing, else 1.
+        gross: Whether a mark is a gross outlier, which no fit is told.
+    """
+
+    body: BodyModel
+    state: Float[Tensor, " n"]
+    camera: Camera
+    joint_names: tuple[str, ...]
+    keypoints: Float[Tensor, "j 2"]
+    confidence: Float[Tensor, " j"]
+    gross: Bool[Tensor, " j"]
+
+    def joints_world(self, names: tuple[str, ...]) -> Float[Tensor, "j 3"]:
+        """True positions of joints, metres."""
+        joints = self.body.pose(self.state).joints
+        return joints[[self.body.joint_index(name) for name in names]]
+
+
+def random_person(
+    *,
+    generator: torch.Generator,
+    body_name: str = "body34",
+    joint_names: tuple[str, ...] = MARKED,
+    noise_px: float = 2.0,
+    missing: float = 0.0,
+    outliers: float = 0.0,
+) -> Person:
+    """Draw a person, the same one for all kinds of marks from the same state of the generator.
+
+    Args:
+        generator: Source of everything.
+        body_name: A body with a root.
+        joint_names: Which joints are marked.
+        noise_px: Standard deviation of each coordinate.
+        missing: Probability that a joint is missing.
+        outliers: Probability that its mark is anywhere in the image.
+    """
+    lengths = random_lengths(generator=generator, body_name=body_name)
+    place = torch.tensor([0.0, 0.0, -DISTANCE], dtype=torch.float64)
+    body = load_body(body_name, lengths=lengths).with_base(torch.eye(3), place)
+    state = plausible_pose(body, generator=generator)
+    turn = torch.rand((), generator=generator, dtype=torch.float64)
+    state[body.state_index("root_yaw")] = math.pi * (2 * turn - 1)
+    K = [[FOCAL_PX, 0, (WIDTH - 1) / 2], [0, FOCAL_PX, (HEIGHT - 1) / 2], [0, 0, 1]]
+    camera = Camera(K, (WIDTH, HEIGHT), R_camera_world=np.diag([1.0, -1.0, -1.0]), name="random")
+    index = [body.joint_index(name) for name in joint_names]
+    uv = camera.project(body.pose(state).joints[index]).uv
+    noise = torch.randn(uv.shape, generator=generator, dtype=uv.dtype)
+    chance = torch.rand(2, len(index), generator=generator, dtype=uv.dtype)
+    anywhere = torch.rand(uv.shape, generator=generator, dtype=uv.dtype)
+    gross = chance[0] < outliers
+    anywhere = anywhere * uv.new_tensor([WIDTH, HEIGHT])
+    uv = torch.where(gross[:, None], anywhere, uv + noise_px * noise)
+    confidence = (chance[1] >= missing).to(uv)
+    return Person(body, state, camera, joint_names, uv, confidence, gross)
+
+
+def random_lengths(*, generator: torch.Generator, body_name: str = "body34") -> dict[str, float]:
+    """Lengths of a person drawn from the anthropometric prior, within its 10 %, metres.
+
+    Args:
+        generator: Source of randomness.
+        body_name: The body; lengths that it does not have are those of the standard humanoid.
+    """
+    free = load_body(body_name, free_proportions=True)
+    factor = torch.linalg.cholesky(Anthropometric().covariance(free))
+    drawn = factor @ torch.randn(len(factor), generator=generator, dtype=torch.float64)
+    lengths = dict(LENGTHS)
+    for name, extra in zip(proportion_columns(free), drawn.tolist(), strict=True):
+        margin = PROPORTION_RANGE * LENGTHS[name]
+        lengths[name] += min(max(extra, -margin), margin)
+    return lengths
+
+
+class Coverage(NamedTuple):
+    """Shares of the truth inside what the nearest mode states at 95 %.
+
+    Attributes:
+        parameters: Of pose and lengths, inside their own intervals.
+        joints: Of the limbs' joint centres, inside their ellipsoids in space.
+    """
+
+    parameters: float
+    joints: float
+
+
+def coverage(person: Person, body: BodyModel, mixture: GaussianMixture) -> Coverage:
+    """Compare the true pose and lengths with a mixture over both.
+
+    The nearest mode is that whose deviations, each in its own standard deviations, are least. All
+    parameters together are no Gaussian: where a limb may lean either way, poses of equal likelihood
+    lie on an arc, thinner than the arc's height.
+
+    Args:
+        person: The truth.
+        body: The body with free lengths that the mixture is about.
+        mixture: Modes of pose and lengths.
+    """
+    _, state, _ = move_base(person.body, body.base_rotation, body.base_translation, person.state)
+    truth = torch.zeros_like(mixture.mean[0])
+    truth[[body.state_index(name) for name in person.body.state_names]] = state
+    for name, column in proportion_columns(body).items():
+        truth[column] = person.body.lengths[name] - body.lengths[name]
+    apart = truth - mixture.mean
+    yaw = body.state_index("root_yaw")
+    apart[:, yaw] = torch.remainder(apart[:, yaw] + math.pi, 2 * math.pi) - math.pi
+    z = apart.abs() / mixture.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    nearest = int(z.square().mean(-1).argmin())
+    index = [body.joint_index(name) for name in LIMB_JOINTS]
+    mean = mixture.mean[nearest]
+    slope = torch.autograd.functional.jacobian(lambda x: body.pose(x).joints[index], mean)
+    spread = slope @ mixture.covariance[nearest] @ slope.mT
+    error = person.joints_world(LIMB_JOINTS) - body.pose(mean).joints[index]
+    squared = (torch.linalg.solve(spread, error[..., None])[..., 0] * error).sum(-1)
+    chi_squared_95 = 7.815  # three degrees of freedom
+    return Coverage(
+        float((z[nearest] < 1.96).double().mean()),
+        float((squared < chi_squared_95).double().mean()),
+    )

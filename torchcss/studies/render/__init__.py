@@ -1,0 +1,1 @@
+"""Rendered sequences with exact truth."""

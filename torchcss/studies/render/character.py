@@ -1,0 +1,567 @@
+"""A dressed figure for rendered sequences: one skin over a body's parts, which deforms like cloth.
+
+The tracker's body is a set of superquadrics; what it is shown must be something else, or it would
+only be asked to find itself. A `Figure` covers a body's parts with one closed mesh that
+
+* is the smooth union of the parts (of other girths, drawn at random), made once in a spread pose,
+  as the surface `-k log sum_i exp(-d_i / k) = 0` over the distances `d_i` to the parts, k = 8 mm;
+* follows the parts by dual quaternion skinning (Kavan et al., *Geometric Skinning with Approximate
+  Dual Quaternion Blending*, 2008), so that joints bend and twist without gaps and without collapse;
+* is displaced along its normals by smooth random fields that move on with the bend of the joints,
+  by creases at bent joints, and by a muscle of the upper arm that swells as the elbow bends.
+
+All of it is a function of the state alone: the same vertices in every frame, so that a point of the
+surface can be carried from frame to frame exactly. Colours belong to vertices too.
+
+By default: `Figure(body, outfit, generator=...)`, then `figure.pose(state)`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn import functional
+
+from torchcss.body.model import BodyModel
+from torchcss.body.surface import straighten
+from torchcss.errors import MissingExtraError
+from torchcss.vision.rasterise import vertex_normals
+
+_BLEND = 0.008
+"""Metres: the k of the smooth union."""
+
+_SHARING = 0.015
+"""Metres from a part at which its share in a vertex has fallen to 1/e."""
+
+_SPREAD_POSE = {
+    "shoulder_swing": -30.0,
+    "shoulder_raising": 35.0,
+    "elbow_flexion": 20.0,
+    "hip_abduction": 14.0,
+    "hip_flexion": 8.0,
+    "knee_flexion": 12.0,
+}
+"""Degrees: the pose in which the skin is made. No two limbs touch in it, and everyday poses are not
+far from it."""
+
+_PADDING = {
+    "vt1": ("neck", (0.165, 0.044, 0.058)),
+    "shoulder": ("upper_arm", (0.053, 0.053, 0.053)),
+    "elbow": ("forearm", (0.041, 0.041, 0.041)),
+    "wrist": ("hand", (0.027, 0.030, 0.027)),
+    "vl5": ("chest", (0.142, 0.130, 0.102)),
+    "hip": ("thigh", (0.082, 0.120, 0.088)),
+    "knee": ("shank", (0.056, 0.056, 0.059)),
+    "ankle": ("foot", (0.044, 0.060, 0.046)),
+}
+"""Ellipsoids about joints that fill the waists between parts: a part that must be there, and the
+semi-axes right, up and forwards, metres."""
+
+_FEATURES = {
+    "head": (
+        ((0.0, -0.092, -0.012), (0.015, 0.022, 0.026)),
+        ((0.0, -0.052, -0.086), (0.036, 0.036, 0.030)),
+        ((0.073, 0.010, -0.006), (0.010, 0.018, 0.031)),
+        ((-0.073, 0.010, -0.006), (0.010, 0.018, 0.031)),
+    ),
+    "hand": (((0.0, 0.040, -0.015), (0.013, 0.016, 0.042)),),
+}
+"""Nose, chin, ears and thumb: centre and semi-axes in the part's frame, metres."""
+
+_THUMB_TILT = 0.55
+"""Radians between thumb and hand."""
+
+_INFLUENCES = 4
+"""Parts that may share a vertex."""
+
+Colour = tuple[float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outfit:
+    """What a figure wears and how much it differs from its body.
+
+    Attributes:
+        sleeve: End of the sleeves, in limbs from the shoulder: 1 is the elbow, 2 the wrist.
+        hem: End of the shirt, in half heights of the pelvis above its middle.
+        trouser_leg: End of the trousers, in limbs from the hip: 1 is the knee, 2 the ankle.
+        pattern: Pattern of the shirt: "plaid", "stripes" or "plain".
+        shirt: Display colour of the shirt, 0 to 1.
+        accent: Second colour of the pattern.
+        trousers: Colour of the trousers.
+        skin: Colour of the skin.
+        hair: Colour of the hair.
+        shoes: Colour of the shoes.
+        texture: Standard deviation of the relative lightness of cloth.
+        girth: Standard deviation of a part's relative girth; at most twice that.
+        looseness: Standard deviation of cloth's displacement, relative to the limb's radius; skin
+            moves by a third of that.
+        creases: Height of the folds at a joint bent by 90 degrees, metres.
+        muscle: Height of the biceps at a bent elbow, metres.
+    """
+
+    sleeve: float = 0.6
+    hem: float = -0.2
+    trouser_leg: float = 2.1
+    pattern: str = "plaid"
+    shirt: Colour = (0.62, 0.16, 0.17)
+    accent: Colour = (0.80, 0.78, 0.74)
+    trousers: Colour = (0.46, 0.42, 0.33)
+    skin: Colour = (0.82, 0.60, 0.49)
+    hair: Colour = (0.20, 0.14, 0.10)
+    shoes: Colour = (0.16, 0.15, 0.16)
+    texture: float = 0.10
+    girth: float = 0.04
+    looseness: float = 0.05
+    creases: float = 0.006
+    muscle: float = 0.008
+
+
+class Skin(NamedTuple):
+    """A posed figure, world frame, metres.
+
+    Attributes:
+        vertices: Corner positions.
+        normals: Unit outward normals.
+    """
+
+    vertices: Float[Tensor, "v 3"]
+    normals: Float[Tensor, "v 3"]
+
+
+class Figure:
+    """A body covered with a skin.
+
+    Args:
+        body: The body, on its base. One state of it poses the figure.
+        outfit: Clothes and deformations.
+        generator: Source of girths, displacements and textures.
+        spacing: Edge of the mesh's cells, metres.
+        without: Parts that are left bare, such as the arm of somebody whose arm another figure is.
+
+    Attributes:
+        faces: Corner indices of the triangles.
+        part: Which part of the body every triangle belongs to.
+        colour: Display colour of every vertex, 0 to 1.
+
+    Raises:
+        MissingExtraError: If pyvista, which makes the mesh, is not installed.
+    """
+
+    def __init__(
+        self,
+        body: BodyModel,
+        outfit: Outfit | None = None,
+        *,
+        generator: torch.Generator,
+        spacing: float = 0.009,
+        without: Sequence[str] = (),
+    ) -> None:
+        self.body, self.outfit = body, outfit or Outfit()
+        self.shape = _other_girths(body, self.outfit.girth, generator)
+        kept = [i for i, name in enumerate(body.part_names) if name not in without]
+        bind_rotation, bind_centre = body.part_poses(body.pose(_spread_state(body)))
+        blobs = [(self.shape[kept], bind_rotation[kept], bind_centre[kept])]
+        blobs.append(_padding(body, bind_rotation, bind_centre, without))
+        shapes, rotations, centres = (torch.cat(group) for group in zip(*blobs, strict=True))
+        vertices, self.faces = _smooth_union(shapes, rotations, centres, spacing)
+        # Where every vertex is for every part, and how near.
+        local = (vertices[None] - bind_centre[:, None]) @ bind_rotation
+        distance = torch.stack(
+            [distance_to_part(s, p) for s, p in zip(self.shape, local, strict=True)]
+        )
+        bare = torch.ones(body.num_parts, dtype=torch.bool)
+        bare[kept] = False
+        distance[bare] = math.inf
+        shares = _shares(body, distance.T, self.faces)
+        weight, owner = shares.topk(min(_INFLUENCES, body.num_parts), dim=-1)
+        self._weight, self._owner = weight / weight.sum(-1, keepdim=True), owner
+        self._bind_rotation, self._bind_centre = bind_rotation, bind_centre
+        self._vertices, self._normals = vertices, vertex_normals(vertices, self.faces)
+        nearest = owner[:, 0]
+        corner = nearest[self.faces]
+        agree = corner[:, 1] == corner[:, 2]
+        self.part: Int[Tensor, " f"] = torch.where(agree, corner[:, 1], corner[:, 0])
+        at = torch.arange(len(vertices))
+        self._dress(local[nearest, at], nearest, vertices, generator)
+
+    def _dress(
+        self, local: Tensor, nearest: Tensor, vertices: Tensor, generator: torch.Generator
+    ) -> None:
+        """Fix colours, looseness and the random fields of all vertices."""
+        outfit, body = self.outfit, self.body
+        along = _along_limb(body, self.shape, local, nearest)
+        colour, cloth = _colours(
+            body, outfit, self.shape, local, nearest, along, vertices, generator
+        )
+        # Borders of patterns and clothes run through the middle of triangles.
+        self.colour: Float[Tensor, "v 3"] = _smooth(colour, self.faces, 1)
+        radius = (self.shape[:, 0] * self.shape[:, 1]).sqrt()
+        radius = (self._weight * radius[self._owner]).sum(-1)
+        still = torch.tensor(
+            [name == "head" or name.endswith(("hand", "foot", "neck")) for name in body.part_names]
+        )
+        loose = torch.where(cloth, 1.0, 1 / 3) * torch.where(still[nearest], 0.3, 1.0)
+        loose = _smooth(loose[:, None].to(vertices), self.faces, 2)[:, 0]
+        self._amplitude = outfit.looseness * radius * loose
+        # Cloth stands off the body a little.
+        self._offset = 0.03 * radius * _smooth(cloth[:, None].to(vertices), self.faces, 1)[:, 0]
+        waves = 10
+        direction = functional.normalize(
+            torch.randn(waves, 3, generator=generator, dtype=vertices.dtype), dim=-1
+        )
+        wavelength = 0.07 * (0.28 / 0.07) ** torch.linspace(0, 1, waves, dtype=vertices.dtype)
+        phase = 2 * math.pi * torch.rand(waves, generator=generator, dtype=vertices.dtype)
+        self._phase = vertices @ (2 * math.pi / wavelength[:, None] * direction).T + phase
+        # Folds run across the limb, and are not quite regular.
+        self._fold = 2 * math.pi * local[:, 2] / 0.035 + 1.5 * self._phase[:, -1].sin()
+        self._crease = outfit.creases * loose
+        self._muscle = outfit.muscle * _muscle(body, self.shape, local, nearest)
+
+    @property
+    def num_vertices(self) -> int:
+        """Number of vertices."""
+        return len(self._vertices)
+
+    def pose(self, state: Float[Tensor, " n"]) -> Skin:
+        """The skin in a pose.
+
+        Args:
+            state: A state of the body.
+        """
+        rotation, centre = self.body.part_poses(self.body.pose(state))
+        # Motion of every part since the skin was made: turn about the origin, then shift.
+        turn = rotation @ self._bind_rotation.mT
+        shift = centre - (turn @ self._bind_centre[..., None])[..., 0]
+        real = _quaternion(turn)
+        dual = 0.5 * _times(torch.cat([torch.zeros_like(shift[:, :1]), shift], -1), real)
+        first, second = real[self._owner[:, 0]], real[self._owner[:, 1]]
+        bend = 2 * (first * second).sum(-1).abs().clamp(max=1).acos()
+        between = 4 * self._weight[:, 0] * self._weight[:, 1]
+        height = self._offset + self._muscle * self._elbow_swell(state)
+        waves = (self._phase + (1.2 * bend * between)[:, None]).sin()
+        height = height + self._amplitude * waves.mean(-1) * math.sqrt(2 * waves.shape[-1])
+        height = height + self._crease * between * (bend / (0.5 * math.pi)) * self._fold.sin()
+        vertices = self._vertices + height[:, None] * self._normals
+        # Blend with all signs as the nearest part's, then normalise.
+        q, d = real[self._owner], dual[self._owner]
+        sign = torch.where((q * q[:, :1]).sum(-1) < 0, -1.0, 1.0).to(q) * self._weight
+        q, d = (sign[..., None] * q).sum(1), (sign[..., None] * d).sum(1)
+        length = q.norm(dim=-1, keepdim=True)
+        q, d = q / length, d / length
+        conjugate = torch.cat([q[:, :1], -q[:, 1:]], -1)
+        moved = 2 * _times(d, conjugate)[:, 1:]
+        axis, scalar = q[:, 1:], q[:, :1]
+        spin = torch.linalg.cross(axis, vertices) + scalar * vertices
+        turned = vertices + 2 * torch.linalg.cross(axis, spin)
+        vertices = turned + moved
+        return Skin(vertices, vertex_normals(vertices, self.faces))
+
+    def _elbow_swell(self, state: Tensor) -> Tensor:
+        """How much the muscle of every vertex's arm is swollen, 0 to 1."""
+        swell = state.new_zeros(self.body.num_parts)
+        for index, name in enumerate(self.body.part_names):
+            if name.endswith("upper_arm"):
+                flexion = state[self.body.state_index(f"{name[0]}_elbow_flexion")]
+                swell[index] = (0.5 * flexion).sin().square() * 1.2
+        return swell[self._owner[:, 0]]
+
+
+def distance_to_part(
+    shape: Float[Tensor, "9"], points: Float[Tensor, "p 3"]
+) -> Float[Tensor, " p"]:
+    """Distance of points to a superquadric, to first order; negative inside, metres.
+
+    With `R = F^(e1/2)`, which is 1 on the surface and grows linearly along rays, it is
+    `(R - 1) / |grad R|` (Taubin 1991).
+
+    Args:
+        shape: The nine shape numbers.
+        points: Points in the part's frame.
+    """
+    with torch.enable_grad():
+        place = points.detach().requires_grad_()
+        x, y, z = (straighten(shape, place) / shape[:3]).abs().clamp(min=1e-6).unbind(-1)
+        e1, e2 = shape[3], shape[4]
+        section = (x ** (2 / e2) + y ** (2 / e2)) ** (e2 / 2)
+        radial = (section ** (2 / e1) + z ** (2 / e1)) ** (e1 / 2)
+        (slope,) = torch.autograd.grad(radial.sum(), place)
+    least = 0.2 / shape[:3].max()
+    return (radial.detach() - 1) / slope.norm(dim=-1).clamp(min=least)
+
+
+def _other_girths(body: BodyModel, deviation: float, generator: torch.Generator) -> Tensor:
+    """The body's shapes with girths of their own, left and right alike."""
+    shape, factors = body.part_shape.clone(), {}
+    for index, name in enumerate(body.part_names):
+        bare = name.removeprefix("l_").removeprefix("r_")
+        if bare not in factors:
+            drawn = torch.randn(2, generator=generator, dtype=shape.dtype)
+            factors[bare] = 1 + deviation * drawn.clamp(-2, 2)
+        shape[index, :2] *= factors[bare]
+    return shape
+
+
+def _spread_state(body: BodyModel) -> Tensor:
+    state = body.rest.clone()
+    for column, name in enumerate(body.state_names):
+        degrees = _SPREAD_POSE.get(name.removeprefix("l_").removeprefix("r_"), 0.0)
+        state[column] += math.radians(degrees)
+    return body.bounds.project(state)
+
+
+def _padding(
+    body: BodyModel, rotation: Tensor, centre: Tensor, without: Sequence[str]
+) -> tuple[Float[Tensor, "k 9"], Float[Tensor, "k 3 3"], Float[Tensor, "k 3"]]:
+    """What is there besides the parts in the spread pose: flesh about joints, features."""
+    joints = body.pose(_spread_state(body)).joints
+    shapes, rotations, centres = [], [], []
+
+    def add(axes: Sequence[float], turn: Tensor, place: Tensor) -> None:
+        shapes.append([*axes, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
+        rotations.append(turn)
+        centres.append(place)
+
+    for index, name in enumerate(body.joint_names):
+        side = name[:2] if name[:2] in ("l_", "r_") else ""
+        owner, axes = _PADDING.get(name.removeprefix(side), ("", ()))
+        if side + owner in body.part_names and side + owner not in without:
+            add(axes, body.base_rotation, joints[index])
+    for index, name in enumerate(body.part_names):
+        bare = name.removeprefix("l_").removeprefix("r_")
+        for place, axes in _FEATURES.get(bare, ()) if name not in without else ():
+            turn = rotation[index]
+            if bare == "hand":
+                c, s = math.cos(_THUMB_TILT), math.sin(_THUMB_TILT)
+                turn = turn @ turn.new_tensor([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]])
+            add(axes, turn, centre[index] + rotation[index] @ rotation.new_tensor(place))
+    if not shapes:
+        return rotation.new_zeros(0, 9), rotation[:0], centre[:0]
+    return rotation.new_tensor(shapes), torch.stack(rotations), torch.stack(centres)
+
+
+def _smooth_union(
+    shape: Float[Tensor, "parts 9"],
+    rotation: Float[Tensor, "parts 3 3"],
+    centre: Float[Tensor, "parts 3"],
+    spacing: float,
+) -> tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]:
+    """Mesh of the smooth union of posed parts; its triangles run anticlockwise from outside."""
+    pyvista = load_pyvista()
+    margin = 6 * _BLEND
+    # A part's box in the world, with room for its taper and for the blend.
+    reach = shape[:, :3] * (
+        1 + torch.cat([shape[:, 5:7].abs(), shape.new_zeros(len(shape), 1)], -1)
+    )
+    half = (rotation.abs() * reach[:, None]).sum(-1) + margin
+    low = ((centre - half) / spacing).floor().long()
+    high = ((centre + half) / spacing).ceil().long() + 1
+    origin, size = low.amin(0), (high.amax(0) - low.amin(0)).tolist()
+    total = torch.zeros(size, dtype=torch.float64)
+    for index in range(len(shape)):
+        ranges = [
+            torch.arange(a, b)
+            for a, b in zip(low[index].tolist(), high[index].tolist(), strict=True)
+        ]
+        grid = torch.stack(torch.meshgrid(*ranges, indexing="ij"), -1)
+        points = (grid.reshape(-1, 3) * spacing - centre[index]) @ rotation[index]
+        near = torch.exp(
+            -distance_to_part(shape[index], points).clamp(-margin, 2 * margin) / _BLEND
+        )
+        box = tuple(
+            slice(a, b)
+            for a, b in zip(
+                (low[index] - origin).tolist(), (high[index] - origin).tolist(), strict=True
+            )
+        )
+        total[box] += near.reshape(grid.shape[:3])
+    field = -_BLEND * (total + math.exp(-12)).log()
+    image = pyvista.ImageData(
+        dimensions=size, spacing=(spacing,) * 3, origin=(origin * spacing).tolist()
+    )
+    image.point_data["field"] = field.numpy().ravel(order="F")
+    surface = image.contour([0.0], scalars="field", method="flying_edges", compute_normals=False)
+    vertices = torch.from_numpy(np.asarray(surface.points, dtype=np.float64))
+    faces = torch.from_numpy(np.asarray(surface.regular_faces, dtype=np.int64))
+    a, b, c = vertices[faces].unbind(1)
+    if float((a * torch.linalg.cross(b, c)).sum()) < 0:
+        faces = faces.flip(-1)
+    # Slivers, whose normals mean nothing, become ordinary triangles.
+    return _smooth(vertices, faces, 2), faces
+
+
+def _shares(body: BodyModel, distance: Tensor, faces: Tensor) -> Float[Tensor, "v parts"]:
+    """How much every part moves a vertex: the nearest one and its neighbours, by their distance."""
+    names = body.part_names
+    related = torch.eye(len(names), dtype=torch.bool)
+    for first, second in body.neighbours:
+        a, b = names.index(first), names.index(second)
+        related[a, b] = related[b, a] = True
+    nearest = distance.argmin(-1)
+    share = torch.where(related[nearest], torch.exp(-distance.clamp(min=0) / _SHARING), 0.0)
+    return _smooth(share / share.sum(-1, keepdim=True), faces, 6)
+
+
+def _smooth(values: Float[Tensor, "v c"], faces: Tensor, times: int) -> Float[Tensor, "v c"]:
+    """Average with the neighbours on a mesh."""
+    edges = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    edges = torch.cat([edges, edges.flip(-1)])
+    degree = torch.zeros_like(values[:, 0]).index_add(
+        0, edges[:, 0], torch.ones(len(edges)).to(values)
+    )
+    for _ in range(times):
+        total = torch.zeros_like(values).index_add(0, edges[:, 0], values[edges[:, 1]])
+        values = 0.5 * values + 0.5 * total / degree[:, None]
+    return values
+
+
+def _along_limb(
+    body: BodyModel, shape: Tensor, local: Tensor, nearest: Tensor
+) -> Float[Tensor, " v"]:
+    """Place along arm or leg in limbs: 0 at shoulder or hip, 1 at elbow or knee, 2 at the end.
+
+    On other parts it is the place along the part's axis from -1 to 1.
+    """
+    height = local[:, 2] / shape[nearest, 2]
+    first = {"upper_arm": 0.0, "thigh": 0.0, "forearm": 1.0, "shank": 1.0, "hand": 2.0, "foot": 2.0}
+    start = [
+        next((v for k, v in first.items() if name.endswith(k)), math.nan)
+        for name in body.part_names
+    ]
+    start = height.new_tensor(start)[nearest]
+    # A part is about 1.1 limbs long, centred on the limb.
+    return torch.where(start.isnan(), height, start + 0.5 + 0.55 * height)
+
+
+def _muscle(body: BodyModel, shape: Tensor, local: Tensor, nearest: Tensor) -> Float[Tensor, " v"]:
+    """Shape of the biceps on the upper arms, 0 to 1: on the flexing side, above the elbow."""
+    arm = torch.tensor([name.endswith("upper_arm") for name in body.part_names])[nearest]
+    x, y, z = (local / shape[nearest, :3]).unbind(-1)
+    # The elbow bends forwards, and a part that hangs has its y axis along the link's z.
+    side = torch.atan2(x, y)
+    bump = torch.exp(-((side / 0.9) ** 2) - ((z - 0.1) / 0.35) ** 2)
+    return torch.where(arm, bump, 0.0)
+
+
+def _colours(
+    body: BodyModel,
+    outfit: Outfit,
+    shape: Tensor,
+    local: Tensor,
+    nearest: Tensor,
+    along: Tensor,
+    vertices: Tensor,
+    generator: torch.Generator,
+) -> tuple[Float[Tensor, "v 3"], Tensor]:
+    """Display colours of all vertices, and which of them are covered by loose cloth."""
+
+    def where(*endings: str) -> Tensor:
+        return torch.tensor([name.endswith(endings) for name in body.part_names])[nearest]
+
+    shirt = where("chest", "clavicle") | (where("upper_arm", "forearm") & (along < outfit.sleeve))
+    shirt |= where("pelvis") & (along > outfit.hem)
+    shirt |= where("neck") & (along < -0.35)
+    trousers = (where("pelvis") & ~shirt) | (where("thigh", "shank") & (along < outfit.trouser_leg))
+    shoes = where("foot") | (where("shank") & (along > 2.1))
+    colour = vertices.new_tensor(outfit.skin).expand(len(vertices), 3).clone()
+    x, _, z = local.unbind(-1)
+    if outfit.pattern == "plaid":
+        # Bands along and around the part, which the eye takes for threads.
+        bands = [(t / 0.055).remainder(1.0) for t in (x, z)]
+        mix = 0.5 * sum(((b < 0.38).to(x) for b in bands), torch.zeros_like(x))
+        mix = mix + 0.5 * sum((((b > 0.62) & (b < 0.70)).to(x) for b in bands), torch.zeros_like(x))
+    elif outfit.pattern == "stripes":
+        mix = ((z / 0.06).remainder(1.0) < 0.4).to(x)
+    else:
+        mix = torch.zeros_like(x)
+    base, accent = vertices.new_tensor(outfit.shirt), vertices.new_tensor(outfit.accent)
+    mix = mix.clamp(0, 1)[:, None]
+    cloth_colour = base * (1 - mix) + accent * mix
+    colour = torch.where(shirt[:, None], cloth_colour, colour)
+    colour = torch.where(trousers[:, None], vertices.new_tensor(outfit.trousers), colour)
+    colour = torch.where(shoes[:, None], vertices.new_tensor(outfit.shoes), colour)
+    cloth = shirt | trousers
+    waves = 12
+    direction = functional.normalize(
+        torch.randn(waves, 3, generator=generator, dtype=x.dtype), dim=-1
+    )
+    wavelength = 0.02 * (0.15 / 0.02) ** torch.linspace(0, 1, waves, dtype=x.dtype)
+    phase = 2 * math.pi * torch.rand(waves, generator=generator, dtype=x.dtype)
+    weave = (vertices @ (2 * math.pi / wavelength[:, None] * direction).T + phase).sin().mean(-1)
+    strength = torch.where(cloth, outfit.texture, 0.3 * outfit.texture)
+    colour = colour * (1 + strength * math.sqrt(2 * waves) * weave)[:, None]
+    colour = _head(body, outfit, shape, local, nearest, colour)
+    return colour.clamp(0, 1), cloth
+
+
+def _head(
+    body: BodyModel, outfit: Outfit, shape: Tensor, local: Tensor, nearest: Tensor, colour: Tensor
+) -> Tensor:
+    """Hair, eyes and mouth."""
+    if "head" not in body.part_names:
+        return colour
+    index = body.part_names.index("head")
+    # The head's z axis points up, its y axis backwards.
+    x, y, z = (local / shape[index, :3]).unbind(-1)
+    on_head = nearest == index
+    hair = (z > 0.5 + 0.1 * (6 * x).sin()) | ((y > -0.15) & (z > -0.5 + 0.3 * (y < 0.2)))
+    colour = torch.where((on_head & hair)[:, None], colour.new_tensor(outfit.hair), colour)
+    front = on_head & (y < 0)
+    for side in (-1, 1):
+        eye = ((x - 0.42 * side) / 0.17) ** 2 + ((z - 0.12) / 0.06) ** 2 < 1
+        brow = ((x - 0.42 * side) / 0.24) ** 2 + ((z - 0.29) / 0.05) ** 2 < 1
+        colour = torch.where((front & eye)[:, None], colour.new_tensor((0.12, 0.1, 0.1)), colour)
+        colour = torch.where((front & brow)[:, None], colour.new_tensor(outfit.hair), colour)
+    mouth = (x / 0.3) ** 2 + ((z + 0.45) / 0.05) ** 2 < 1
+    return torch.where((front & mouth)[:, None], colour.new_tensor((0.62, 0.30, 0.28)), colour)
+
+
+def _quaternion(rotation: Float[Tensor, "p 3 3"]) -> Float[Tensor, "p 4"]:
+    """Unit quaternions, scalar first: the largest of the four candidates, for accuracy."""
+    m = rotation
+    trace = m.diagonal(dim1=-2, dim2=-1)
+    t0, t1, t2 = trace.unbind(-1)
+    squares = torch.stack(
+        [1 + t0 + t1 + t2, 1 + t0 - t1 - t2, 1 - t0 + t1 - t2, 1 - t0 - t1 + t2], -1
+    )
+    a, b, c = m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]
+    d, e, f = m[:, 1, 0] + m[:, 0, 1], m[:, 0, 2] + m[:, 2, 0], m[:, 2, 1] + m[:, 1, 2]
+    s0, s1, s2, s3 = squares.unbind(-1)
+    rows = torch.stack([
+        torch.stack([s0, a, b, c], -1),
+        torch.stack([a, s1, d, e], -1),
+        torch.stack([b, d, s2, f], -1),
+        torch.stack([c, e, f, s3], -1),
+    ], 1)  # fmt: skip
+    best = rows[torch.arange(len(m)), squares.argmax(-1)]
+    return functional.normalize(best, dim=-1)
+
+
+def _times(p: Float[Tensor, "*b 4"], q: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 4"]:
+    """Product of quaternions, scalar first."""
+    scalar = p[..., :1] * q[..., :1] - (p[..., 1:] * q[..., 1:]).sum(-1, keepdim=True)
+    vector = p[..., :1] * q[..., 1:] + q[..., :1] * p[..., 1:]
+    return torch.cat([scalar, vector + torch.linalg.cross(p[..., 1:], q[..., 1:])], -1)
+
+
+def load_pyvista() -> Any:
+    """Import pyvista.
+
+    Raises:
+        MissingExtraError: If it is not installed.
+    """
+    try:
+        import pyvista
+    except ImportError as error:
+        raise MissingExtraError(
+            "rendered sequences need pyvista, which is not installed: "
+            'pip install "torchcss[render]"'
+        ) from error
+    return pyvista

@@ -1,0 +1,559 @@
+"""Rendered sequences with exact ground truth: the demo's arm, and those of the papers' section 6.
+
+`arm_sequence` moves the eight parameters of arm8 smoothly, bending and rotating with reaching
+motion towards the camera, before a cluttered, unevenly lit room with a bright pillar (the arm
+experiment of section 6 [IJRR] in small). The rendered surface is finer than the tracker's mesh and
+carries a cloth texture. Frames come from the package's own renderer, so nothing else is needed.
+
+`render_sequence` renders any motion of any body as a dressed figure in a room
+(`torchcss.studies.render.character`, `torchcss.studies.render.renderer`; the extra `render`).
+`shot("arm")`, `"body-clutter"` and `"body-dark"` are the three sequences of section 6 [IJRR];
+`shot_of_motion` films a motion of the user's.
+
+The truth is exact for the rendered surface. Pixel centres are rasterised
+(`torchcss.studies.render.software`), which gives mask and part. The flow of a pixel is that of the
+surface point that it sees, carried to the next frame by its triangle; the point is hidden there if
+its triangle looks away, if it leaves the image, or if another surface is nearer. Nothing but the
+figure moves, so elsewhere the flow is 0 and hidden is what the figure covers next; shadows, which
+move too, are no motion.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+from torch.nn import functional
+
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel
+from torchcss.errors import ConfigurationError
+from torchcss.studies.random_person import random_lengths
+from torchcss.studies.render.character import Figure, Outfit, Skin
+from torchcss.studies.render.mesh_truth import MeshTruth, joints_own_parts
+from torchcss.studies.render.motions import MOTIONS, Motion, sample_times
+from torchcss.studies.render.renderer import Lamp, Stage, Style
+from torchcss.studies.render.scene import Place
+from torchcss.studies.render.software import (
+    Lighting,
+    Mesh,
+    add_sensor_noise,
+    clutter_background,
+    random_texture,
+    render_meshes,
+)
+from torchcss.vision.camera import Camera
+from torchcss.vision.rasterise import grid_faces, join_faces
+
+_SKIN = (0.86, 0.63, 0.52)
+_SLEEVE = (0.35, 0.42, 0.62)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SyntheticSequence:
+    """A rendered sequence and its truth.
+
+    Attributes:
+        frames: Images, red, green, blue.
+        frame_rate: Frames per second.
+        camera: The camera that took them.
+        body: The body that moved, hung on its base.
+        states: Its true states.
+    """
+
+    frames: list[UInt8[np.ndarray, "h w 3"]]
+    frame_rate: float
+    camera: Camera
+    body: BodyModel
+    states: Float[Tensor, "t n"]
+
+    @property
+    def joints_world(self) -> Float[Tensor, "t j 3"]:
+        """True positions of the joint centres, metres."""
+        return self.body.pose(self.states).joints
+
+
+def arm_motion(body: BodyModel, times: Float[Tensor, " t"]) -> Float[Tensor, "t n"]:
+    """States of arm8 that bend, rotate and reach towards the camera.
+
+    Args:
+        body: An arm.
+        times: Seconds.
+    """
+    degree = math.pi / 180
+    wave = {
+        # rest, amplitude, period in seconds, phase
+        "r_clavicle_protraction": (5, 14, 3.2, 0.3),
+        "r_shoulder_swing": (-62, 20, 2.9, 0.0),
+        "r_shoulder_raising": (28, 20, 2.3, 1.0),
+        "r_shoulder_twist": (0, 18, 3.7, 2.0),
+        "r_elbow_flexion": (52, 34, 1.9, 0.5),
+        "r_forearm_twist": (0, 25, 2.7, 0.0),
+        "r_wrist_flexion": (0, 15, 1.7, 0.0),
+        "r_wrist_deviation": (0, 8, 2.1, 1.0),
+    }
+    states = torch.zeros(len(times), body.num_parameters, dtype=times.dtype)
+    for column, name in enumerate(body.state_names):
+        rest, amplitude, period, phase = wave[name]
+        turn = (2 * math.pi / period) * times + phase
+        states[:, column] = degree * (rest + amplitude * turn.sin())
+    return body.bounds.project(states)
+
+
+def arm_sequence(
+    *, generator: torch.Generator, num_frames: int = 50, frame_rate: float = 25.0
+) -> SyntheticSequence:
+    """Render the demo's sequence.
+
+    Args:
+        generator: Source of the room, the textures and the sensor noise.
+        num_frames: Number of frames.
+        frame_rate: Frames per second.
+
+    Raises:
+        ConfigurationError: If there is to be no frame.
+    """
+    if num_frames < 1:
+        raise ConfigurationError(f"num_frames must be at least 1, got {num_frames}")
+    width, height = 640, 480
+    body = load_body("arm8")
+    # World: Y up, the camera at its origin looking along -Z. The body faces the camera.
+    shoulder = torch.tensor([0.30, 0.16, -1.75], dtype=torch.float64)
+    body = body.with_base(torch.eye(3, dtype=torch.float64), shoulder)
+    focal = [[640.0, 0.0, 319.5], [0.0, 640.0, 239.5], [0.0, 0.0, 1.0]]
+    camera = Camera(focal, (width, height), R_camera_world=np.diag([1.0, -1.0, -1.0]), name="demo")
+    times = torch.arange(num_frames, dtype=torch.float64) / frame_rate
+    states = arm_motion(body, times)
+    background = clutter_background(height, width, generator=generator)
+    textures = [random_texture(generator=generator) for _ in body.part_names]
+    fine = body.mesh(40, 48)
+    faces = grid_faces(40, 48)
+    lighting = Lighting(lamp_world=(0.8, 1.6, 0.4), target_world=(0.1, 0.0, -1.7))
+
+    def project(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return tuple(camera.project(points))  # type: ignore[return-value]
+
+    frames = []
+    for state in states:
+        rotation, centre = body.part_poses(body.pose(state))
+        meshes = []
+        for part, name in enumerate(body.part_names):
+            local, normals = fine.points[part].flatten(0, 1), fine.normals[part].flatten(0, 1)
+            colour = _SLEEVE if name.endswith(("upper_arm", "clavicle")) else _SKIN
+            turn = rotation[part].T
+            meshes.append(
+                Mesh(
+                    local @ turn + centre[part],
+                    normals @ turn,
+                    faces,
+                    torch.tensor(colour, dtype=torch.float64),
+                    points_part=local,
+                    texture=textures[part],
+                )
+            )
+        picture = render_meshes(
+            meshes, project, height, width,
+            background=background, eye_world=camera.centre_world, lighting=lighting,
+        ).image  # fmt: skip
+        frames.append(add_sensor_noise(picture, generator=generator).numpy())
+    return SyntheticSequence(
+        frames=frames, frame_rate=frame_rate, camera=camera, body=body, states=states
+    )
+
+
+# The papers' sequences, with a dressed figure in a room (the extra `render`).
+
+
+class SequenceFrame(NamedTuple):
+    """A rendered frame and its truth; pixel centres are at integers.
+
+    Attributes:
+        image: The picture, red, green, blue.
+        mask: Whether the first surface on the line of sight is the tracked figure.
+        part: Which part of the body it is, -1 where it is none.
+        depth: Depth of the surface, metres; `inf` in the room.
+        joints: Joint centres, world frame, metres.
+        uv: Their projections, pixels.
+        visible: Whether the first surface on the line of sight to a joint is its own limb.
+        in_image: Whether it projects into the image.
+        flow: Motion to the next frame, pixels; 0 where nothing moves. None for the last frame.
+        occluded: Whether what is seen here is hidden or out of the image in the next frame.
+    """
+
+    image: UInt8[Tensor, "h w 3"]
+    mask: Bool[Tensor, "h w"]
+    part: Int[Tensor, "h w"]
+    depth: Float[Tensor, "h w"]
+    joints: Float[Tensor, "j 3"]
+    uv: Float[Tensor, "j 2"]
+    visible: Bool[Tensor, " j"]
+    in_image: Bool[Tensor, " j"]
+    flow: Float[Tensor, "h w 2"] | None
+    occluded: Bool[Tensor, "h w"] | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shot:
+    """All that a sequence is rendered from.
+
+    Attributes:
+        name: Name of the sequence.
+        body: The body of the person, on its base, of the person's own lengths.
+        states: Its states.
+        frame_rate: Frames per second.
+        camera: Who looks.
+        style: Room and light.
+        outfit: Clothes and deformations.
+        floor: Height of the floor in the world, metres.
+        seed: Seed of everything that is drawn.
+        description: A line about it.
+        bystander: For an arm: whether the still rest of the person stands beside it.
+        spacing: Cells of the figure's mesh, metres.
+    """
+
+    name: str
+    body: BodyModel
+    states: Float[Tensor, "t n"]
+    frame_rate: float
+    camera: Camera
+    style: Style = field(default_factory=Style)
+    outfit: Outfit = field(default_factory=Outfit)
+    floor: float = 0.0
+    seed: int = 0
+    description: str = ""
+    bystander: bool = False
+    spacing: float = 0.009
+
+    @property
+    def base_transform(self) -> Float[Tensor, "4 4"]:
+        """Base of the body in the world."""
+        matrix = torch.eye(4, dtype=self.body.dtype)
+        matrix[:3, :3], matrix[:3, 3] = self.body.base_rotation, self.body.base_translation
+        return matrix
+
+    def frames(self) -> Iterator[SequenceFrame]:
+        """Render; the same frames whenever it is called."""
+        figures, generator = self.figures()
+        return render_sequence(
+            self.body, self.states, camera=self.camera, style=self.style, figures=figures,
+            floor=self.floor, generator=generator,
+        )  # fmt: skip
+
+    def figures(self) -> tuple[list[Figure], torch.Generator]:
+        """The figure of the body and whoever stands beside it; the generator as they leave it."""
+        generator = torch.Generator().manual_seed(self.seed)
+        figures = [Figure(self.body, self.outfit, generator=generator, spacing=self.spacing)]
+        if self.bystander:
+            figures.append(_rest_of_person(self.body, self.outfit, generator, 1.5 * self.spacing))
+        return figures, generator
+
+
+def render_sequence(
+    body: BodyModel,
+    states: Float[Tensor, "t n"],
+    *,
+    camera: Camera,
+    generator: torch.Generator,
+    style: Style | None = None,
+    outfit: Outfit | None = None,
+    figures: Sequence[Figure] | None = None,
+    floor: float | None = None,
+) -> Iterator[SequenceFrame]:
+    """Render any motion of any body, frame by frame.
+
+    Args:
+        body: The body on its base; arms, people, or anything with parts.
+        states: Its states.
+        camera: Who looks, in the body's world (Y up); without distortion.
+        generator: Source of the figure, the room and the sensor's noise.
+        style: Room and light.
+        outfit: Clothes and deformations of the figure that is made where none is given.
+        figures: The figure of the body; further ones stand still, hide and are no truth.
+        floor: Height of the floor; by default that of the lowest point of the first state.
+
+    Raises:
+        MissingExtraError: If pyvista is not installed.
+        CameraError: If the camera has a distortion.
+    """
+    style = style or Style()
+    figure, *others = figures or [Figure(body, outfit, generator=generator)]
+    still = [other.pose(other.body.rest) for other in others]
+    faces, owner = join_faces(
+        [figure.faces, *(other.faces for other in others)],
+        [figure.num_vertices, *(other.num_vertices for other in others)],
+    )
+    part = torch.full_like(owner, -1)
+    part[owner == 0] = figure.part
+    truth = MeshTruth(camera, faces, part, joints_own_parts(body))
+    joints = body.pose(states).joints
+    place = _place(joints, camera, floor)
+    with Stage(camera, place, style, generator=generator) as stage:
+        stage.add(figure.faces, figure.colour)
+        for other, skin in zip(others, still, strict=True):
+            stage.move(stage.add(other.faces, other.colour), *skin)
+        skins = (figure.pose(state) for state in states)
+        upcoming: Skin | None = next(skins, None)
+        labels = None
+        for index in range(len(states)):
+            skin, upcoming = upcoming, next(skins, None)
+            assert skin is not None
+            stage.move(0, *skin)
+            picture = add_sensor_noise(
+                stage.picture(), generator=generator, read=style.read_noise, shot=style.shot_noise
+            )
+            world = torch.cat([skin.vertices, *(s.vertices for s in still)])
+            labels = labels or truth.labels(world)
+            after, flow, occluded = None, None, None
+            if upcoming is not None:
+                world = torch.cat([upcoming.vertices, *(s.vertices for s in still)])
+                after = truth.labels(world)
+                flow, occluded = truth.flow(labels, after)
+            uv, visible, in_image = truth.joints(labels, joints[index])
+            yield SequenceFrame(
+                picture, labels.part >= 0, labels.part, labels.depth, joints[index], uv, visible,
+                in_image, flow, occluded,
+            )  # fmt: skip
+            labels = after
+
+
+def look_at(
+    eye: Sequence[float],
+    target: Sequence[float],
+    *,
+    focal_px: float,
+    image_size_wh: tuple[int, int] = (640, 480),
+    name: str = "cam01",
+) -> Camera:
+    """A camera with level rows that looks at a point; Y is up.
+
+    Args:
+        eye: Its centre, metres.
+        target: What it looks at.
+        focal_px: Focal length.
+        image_size_wh: Width and height of the picture.
+        name: Its name.
+    """
+    width, height = image_size_wh
+    centre = torch.as_tensor(eye, dtype=torch.float64)
+    forward = functional.normalize(torch.as_tensor(target, dtype=torch.float64) - centre, dim=-1)
+    up = forward.new_tensor([0.0, 1.0, 0.0])
+    right = functional.normalize(torch.linalg.cross(forward, up), dim=-1)
+    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    K = [[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]]
+    return Camera(
+        K, image_size_wh, R_camera_world=rotation, t_camera_world=-rotation @ centre, name=name
+    )
+
+
+def _place(joints: Float[Tensor, "t j 3"], camera: Camera, floor: float | None) -> Place:
+    """Where the motion is, seen from the camera."""
+    lowest, highest = joints.amin((0, 1)), joints.amax((0, 1))
+    middle = 0.5 * (lowest + highest)
+    away = camera.R_camera_world[2].clone()
+    away[1] = 0
+    away = functional.normalize(away, dim=-1)
+    behind = float(((joints - middle) @ away).max())
+    ground = float(lowest[1]) - 0.05 if floor is None else floor
+    return Place(middle, ground, behind + 0.15)
+
+
+def _rest_of_person(
+    arm: BodyModel, outfit: Outfit, generator: torch.Generator, spacing: float
+) -> Figure:
+    """Somebody standing still whose right arm is the given one."""
+    body = load_body("body34", lengths=arm.lengths)
+    start = body.tree.link_index("r_sternoclavicular_link")
+    place = body.pose(body.rest).tree.translation[start]
+    base = arm.base_translation - arm.base_rotation @ place
+    own = ("r_clavicle", "r_upper_arm", "r_forearm", "r_hand")
+    return Figure(body.with_base(arm.base_rotation, base), outfit, generator=generator, without=own)
+
+
+def _stand(body: BodyModel, state: Float[Tensor, " n"]) -> BodyModel:
+    """The body on a base from which its lowest point in a state touches the ground, Y = 0."""
+    lowest = body.surface(body.pose(state)).points[:, 1].min()
+    return body.with_base(
+        body.base_rotation, body.base_translation - lowest * lowest.new_tensor([0.0, 1.0, 0.0])
+    )
+
+
+CLUTTER = Style()
+"""The room of the papers' Figs. 9 and 10: clutter, uneven light, bright pillar."""
+
+DARK = Style(
+    room="dark",
+    lamps=(
+        Lamp(place=(-1.4, 1.1, 2.8), strength=1.1, cone=40.0),
+        Lamp(place=(2.2, 1.0, 0.6), strength=0.45, cone=50.0),
+    ),
+    fill=0.2,
+    ambient=0.08,
+)
+"""That of Fig. 11: black background."""
+
+STYLES = {"clutter": CLUTTER, "dark": DARK}
+
+
+def shot(
+    name: str,
+    *,
+    seed: int = 0,
+    num_frames: int | None = None,
+    frame_rate: float = 50.0,
+    small: bool = False,
+) -> Shot:
+    """One of the sequences of section 6 [IJRR], ready to be rendered.
+
+    Args:
+        name: "arm", "body-clutter" or "body-dark".
+        seed: Seed of the person, the room and the noise; the motion is always the same.
+        num_frames: Number of frames; all of the motion by default.
+        frame_rate: Frames per second.
+        small: A quarter of the picture's width and height, for tests.
+
+    Raises:
+        ConfigurationError: If there is no such sequence.
+    """
+    if name not in MOTIONS:
+        raise ConfigurationError(f"no sequence {name!r}; expected one of {', '.join(MOTIONS)}")
+    poses, description = MOTIONS[name]
+    times = sample_times(poses.duration, frame_rate, num_frames)
+    is_arm = poses.body.startswith("arm")
+    lengths = None if is_arm else random_lengths(generator=torch.Generator().manual_seed(seed))
+    body = load_body(poses.body, lengths=lengths)
+    if is_arm:
+        body = body.with_base(torch.eye(3), torch.tensor([0.42, 1.40, 0.0]))
+        states = poses.states(body, times)
+        camera = look_at((0.0, 1.30, 1.85), (0.0, 1.30, 0.0), focal_px=640.0)
+        style, outfit, spacing = ARM_STYLE, ARM_OUTFIT, 0.006
+    else:
+        states = poses.states(body, times)
+        body = _stand(body, states[0])
+        # Room above the head for arms that reach up.
+        camera = look_at((0.3, 1.35, 3.7), (0.0, 1.0, 0.0), focal_px=720.0)
+        style, outfit = (DARK, DARK_OUTFIT) if name == "body-dark" else (CLUTTER, CLUTTER_OUTFIT)
+        spacing = 0.009
+    if small:
+        camera, spacing = camera.resized(160, 120), 2 * spacing
+    return Shot(
+        name=name, body=body, states=states, frame_rate=frame_rate, camera=camera, style=style,
+        outfit=outfit, seed=seed, description=description, bystander=is_arm, spacing=spacing,
+    )  # fmt: skip
+
+
+ARM_STYLE = Style(
+    pillars=(0.385,),
+    pillar_width=0.10,
+    wall=0.5,
+    specular=0.35,
+    lamps=(
+        Lamp(place=(-1.2, 1.3, 1.6), target=(-0.1, 0.0, 0.0), strength=0.85, cone=40.0),
+        Lamp(place=(1.8, 0.8, 1.2), target=(-0.3, 0.0, -0.5), strength=0.45, cone=40.0),
+    ),
+)
+ARM_OUTFIT = Outfit(
+    sleeve=0.55,
+    pattern="stripes",
+    shirt=(0.25, 0.33, 0.55),
+    accent=(0.72, 0.72, 0.70),
+    looseness=0.06,
+    muscle=0.009,
+)
+CLUTTER_OUTFIT = Outfit(sleeve=1.85, pattern="plaid", looseness=0.06)
+DARK_OUTFIT = Outfit(
+    sleeve=1.85,
+    pattern="stripes",
+    shirt=(0.60, 0.60, 0.58),
+    accent=(0.40, 0.42, 0.46),
+    trousers=(0.42, 0.42, 0.45),
+    looseness=0.045,
+)
+
+
+def shot_of_motion(
+    motion: Motion,
+    *,
+    name: str = "mocap",
+    style: Style | None = None,
+    outfit: Outfit | None = None,
+    camera: Camera | None = None,
+    seed: int = 0,
+    num_frames: int | None = None,
+    small: bool = False,
+) -> Shot:
+    """Film any motion, by default with a camera that sees all of it from the front.
+
+    Args:
+        motion: Body and states.
+        name: Name of the sequence.
+        style: Room and light.
+        outfit: Clothes and deformations.
+        camera: Who looks.
+        seed: Seed of the figure, the room and the noise.
+        num_frames: Only the first frames.
+        small: A quarter of the picture's width and height, for tests.
+    """
+    states = motion.states[:num_frames]
+    points = motion.body.surface(motion.body.pose(states)).points
+    camera = camera or camera_in_front(motion.body, states)
+    if small:
+        width, height = camera.image_size_wh
+        camera = camera.resized(width // 4, height // 4)
+    return Shot(
+        name=name,
+        body=motion.body,
+        states=states,
+        frame_rate=motion.frame_rate,
+        camera=camera,
+        style=style or CLUTTER,
+        outfit=outfit or CLUTTER_OUTFIT,
+        floor=float(points[..., 1].min()),
+        seed=seed,
+        description=motion.description,
+        spacing=0.018 if small else 0.009,
+    )
+
+
+def camera_in_front(
+    body: BodyModel,
+    states: Float[Tensor, "t n"],
+    *,
+    focal_px: float = 720.0,
+    image_size_wh: tuple[int, int] = (640, 480),
+    margin: float = 0.06,
+) -> Camera:
+    """A camera at eye height that sees the whole motion, from where the body looks at first.
+
+    Args:
+        body: The body.
+        states: Its motion.
+        focal_px: Focal length.
+        image_size_wh: Width and height of the picture.
+        margin: Share of the picture's width and height to leave free on every side.
+    """
+    points = body.surface(body.pose(states)).points
+    lowest, highest = points.amin((0, 1)), points.amax((0, 1))
+    middle = 0.5 * (lowest + highest)
+    link = int(body.part_link[0])
+    front = body.pose(states[0]).tree.rotation[link, :, 2].clone()
+    front[1] = 0
+    front = functional.normalize(front, dim=-1)
+    width, height = image_size_wh
+    border = points.new_tensor([margin * width, margin * height])
+    distance = 1.0
+    while True:
+        eye = middle + distance * front + points.new_tensor([0.0, 0.12 * distance, 0.0])
+        camera = look_at(
+            eye.tolist(), middle.tolist(), focal_px=focal_px, image_size_wh=image_size_wh
+        )
+        uv, _, valid = camera.project(points)
+        inside = (uv > border).all() & (uv < uv.new_tensor([width, height]) - border).all()
+        if bool(valid.all() & inside) or distance > 50:
+            return camera
+        distance *= 1.05

@@ -1,0 +1,248 @@
+"""Single frames with their cost, a true state and the mode nearest to it: to look at a cost.
+
+A tracker sees many states of a frame for a moment; here one frame stays at hand. Its cost is that
+of a tracker whose only mode in the frame before was a given state, and that knows colours from that
+frame alone. A `Scene` adds the truth and the
+mode that the optimiser reaches from there, whose covariance says along which lines the cost is
+worth a look (`torchcss.studies.slices`).
+
+By default: `arm_scenes` for frames of the rendered arm, whose truth is exact, or `clip_scenes` for
+those of a recording with keypoints, where the fit to them that is nearest a 3D reference stands for
+the truth; then `Scene.lines` and `Scene.limits`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from torchcss.body.model import BodyModel
+from torchcss.body.root import ROOT_NAMES
+from torchcss.cost.frame import FrameCosts
+from torchcss.cost.joints import JointObservation
+from torchcss.cost.total import TrackingCost
+from torchcss.errors import ConfigurationError, TrackFileError
+from torchcss.files import load_arrays
+from torchcss.inference.trust_region import TrustRegionNewton
+from torchcss.initialise.fit import default_sigma, initialise_from_joints
+from torchcss.io.cameras import read_camera
+from torchcss.io.keypoints.read import read_keypoints
+from torchcss.io.video import VideoReader
+from torchcss.joint_names import canonical_joint_name
+from torchcss.studies.metrics import LIMB_JOINTS, root_aligned_mpjpe_mm
+from torchcss.studies.render.sequences import arm_sequence
+from torchcss.studies.slices import Line, eigen_lines, joint_lines
+from torchcss.tracking.session import scale_keypoints
+from torchcss.tracking.settings import Settings, boundary_emphasis, make_choice, make_extractor
+from torchcss.types import Bounds, Modes
+from torchcss.vision.features import FrameFeatures
+
+_NO_KEYPOINTS_PX = 1.0
+"""Keypoint noise of scenes without keypoints: it enters nothing."""
+
+_REACH_M = 0.5
+"""How far a slice moves the body, which no limit ends; angles go half a turn at most."""
+
+
+class Scene(NamedTuple):
+    """A frame whose cost is looked at.
+
+    Attributes:
+        name: Where the frame comes from.
+        image: The frame, at its full size.
+        features: Its features, at the working size.
+        cost: Its cost, which holds body and working camera too.
+        truth: The true state, or what stands for it.
+        mode: Where the optimiser gets from there, with its covariance.
+    """
+
+    name: str
+    image: UInt8[np.ndarray, "h w 3"]
+    features: FrameFeatures
+    cost: TrackingCost
+    truth: Float[Tensor, " n"]
+    mode: Modes
+
+    @property
+    def slug(self) -> str:
+        """The name as a part of a file's name."""
+        return self.name.replace(",", "").replace(" ", "_")
+
+    def lines(self, centre: Float[Tensor, " n"]) -> list[Line]:
+        """The lines through a state along all joints, then along the mode's eigenvectors.
+
+        A line on which the state cannot move either way without leaving its limits is left out.
+        """
+        names, covariance = self.cost.body.state_names, self.mode.covariance
+        lines = joint_lines(names, centre, covariance) + eigen_lines(centre, covariance)
+        limits = self.limits(centre)
+        return [line for line in lines if line.interval(limits) != (0.0, 0.0)]
+
+    def limits(self, centre: Float[Tensor, " n"]) -> Bounds:
+        """How far a slice through a state may go: the joint limits, and a sensible reach."""
+        names, (lower, upper) = self.cost.body.state_names, self.cost.body.bounds
+        reach = [_REACH_M if name in ROOT_NAMES[:3] else math.pi for name in names]
+        far = torch.tensor(reach).to(centre)
+        return Bounds(lower.maximum(centre - far), upper.minimum(centre + far))
+
+
+def arm_scenes(
+    frames: Sequence[int],
+    *,
+    generator: torch.Generator,
+    settings: Settings | None = None,
+    name: str = "arm",
+) -> Iterator[Scene]:
+    """Frames of the demo's sequence, without keypoints, as after the first frame of a track.
+
+    Args:
+        frames: Which frames, none of them the first, which has no motion.
+        generator: Source of the room, the textures and the sensor noise.
+        settings: Terms of the cost; its body must be "arm8".
+        name: What the scenes are called.
+
+    Raises:
+        ConfigurationError: If a frame has none before it.
+    """
+    _check_frames(frames)
+    settings = settings or Settings(body="arm8")
+    sequence = arm_sequence(generator=generator, num_frames=max(frames) + 1)
+    extractor, choice = make_extractor(settings), make_choice(settings, _NO_KEYPOINTS_PX)
+    body = sequence.body.to(dtype=settings.torch_dtype)
+    states = sequence.states.to(body.tie)
+    costs = FrameCosts(
+        body,
+        extractor.working_camera(sequence.camera),
+        choice,
+        frame_interval=1 / sequence.frame_rate,
+        boundary_emphasis=boundary_emphasis(settings),
+    )
+    for index in frames:
+        features = extractor(sequence.frames[index], sequence.frames[index - 1])
+        previous, before = states[index - 1], extractor(sequence.frames[index - 1])
+        appearance = costs.learn(None, before, body, previous)
+        cost = costs(features, body=body, before=previous, appearance=appearance)
+        cost = replace(cost, parent=previous)
+        image, truth = sequence.frames[index], states[index]
+        yield _scene(f"{name}, frame {index}", image, features, cost, truth)
+
+
+def clip_scenes(
+    folder: Path,
+    frames: Sequence[int],
+    *,
+    generator: torch.Generator,
+    view: str = "cam01",
+    settings: Settings | None = None,
+) -> Iterator[Scene]:
+    """Frames of a recording laid out as the balance-beam clip of the test data.
+
+    Body and truth come from the keypoints of the frame: of the distinct fits to them, the one whose
+    limbs are nearest the 3D reference. The state before is that fit, moved to the keypoints there.
+
+    Args:
+        folder: Holds `VIEW.mp4`, `keypoints2d_VIEW.npz`, `cameras.json`, and `reference3d.npz` with
+            `joints [T J 3]` in metres of the cameras' world frame and `joint_names`.
+        frames: Which frames, none of them the first.
+        generator: Source of the starting poses.
+        view: Which camera.
+        settings: Body and terms of the cost.
+
+    Raises:
+        ConfigurationError: If a frame has none before it.
+        TorchcssError: For any bad file.
+    """
+    _check_frames(frames)
+    settings = settings or Settings()
+    for frame in frames:
+        yield _clip_scene(folder, frame, view, settings, generator)
+
+
+def _clip_scene(
+    folder: Path, frame: int, view: str, settings: Settings, generator: torch.Generator
+) -> Scene:
+    video = folder / f"{view}.mp4"
+    before, now = VideoReader(video, start=frame - 1, stop=frame + 1)
+    full = read_camera(folder / "cameras.json", video=video).camera.to(settings.torch_dtype)
+    path = folder / f"keypoints2d_{view}.npz"
+    marks = read_keypoints(path, image_size_wh=full.image_size_wh)
+    first = initialise_from_joints(
+        settings.body,
+        full,
+        marks.keypoints[frame],
+        marks.confidence[frame],
+        marks.joint_names,
+        generator=generator,
+        dtype=settings.torch_dtype,
+    )
+    body = first.body
+    truth = _nearest(body, first.mixture.mean, folder / "reference3d.npz", frame)
+    extractor = make_extractor(settings)
+    working = extractor.working_camera(full)
+    scaled = scale_keypoints(marks.keypoints, full.image_size_wh, working.image_size_wh)
+    observed = [
+        JointObservation(
+            body.joint_names,
+            scaled[index].to(body.tie),
+            marks.confidence[index].to(body.tie),
+            marks.joint_names,
+        )
+        for index in (frame - 1, frame)
+    ]
+    features = extractor(now.image, before.image)
+    sigma = default_sigma(scaled[frame][marks.confidence[frame] > 0])
+    alone = TrackingCost(
+        body=body,
+        camera=working,
+        choice=make_choice(Settings(terms=("joints", "stabiliser")), sigma),
+        observation=observed[0],
+    )
+    previous = TrustRegionNewton().minimise(alone, truth[None], body.bounds).mean[0]
+    costs = FrameCosts(
+        body,
+        working,
+        make_choice(settings, sigma),
+        frame_interval=now.time_s - before.time_s,
+        boundary_emphasis=boundary_emphasis(settings),
+    )
+    cost = costs(
+        features,
+        body=body,
+        before=previous,
+        observation=observed[1],
+        appearance=costs.learn(None, extractor(before.image), body, previous),
+    )
+    cost = replace(cost, parent=previous)
+    return _scene(f"{view}, frame {frame}", now.image, features, cost, truth)
+
+
+def _scene(
+    name: str, image: np.ndarray, features: FrameFeatures, cost: TrackingCost, truth: Tensor
+) -> Scene:
+    mode = TrustRegionNewton().minimise(cost, truth[None], cost.body.bounds)
+    return Scene(name, image, features, cost, truth, Modes(*(part[0] for part in mode)))
+
+
+def _nearest(body: BodyModel, fits: Float[Tensor, "k n"], reference: Path, frame: int) -> Tensor:
+    """The state whose limbs are nearest the reference once the roots are on each other."""
+    arrays = load_arrays(reference, TrackFileError)
+    names = [canonical_joint_name(str(name)) for name in arrays["joint_names"]]
+    common = [name for name in LIMB_JOINTS if name in names and name in body.joint_names]
+    fitted = body.pose(fits).joints[:, [body.joint_index(name) for name in common]]
+    true = arrays["joints"][frame, [names.index(name) for name in common]]
+    return fits[int(np.argmin(root_aligned_mpjpe_mm(fitted.cpu(), true, common)))]
+
+
+def _check_frames(frames: Sequence[int]) -> None:
+    if not frames or min(frames) < 1:
+        raise ConfigurationError(
+            f"frames {list(frames)}: expected at least one, and each with a frame before it"
+        )

@@ -1,0 +1,173 @@
+"""Write a rendered sequence as a folder that `torchcss.studies.sequences` reads.
+
+| file | content |
+|---|---|
+| `video.mp4` | the frames |
+| `cameras.json` | the camera `cam01`, metres, world-to-camera |
+| `keypoints2d.npz` | `keypoints [T J 2]`, projections with Gaussian noise of `noise_px`; |
+| | `keypoints_exact`, `confidence`, `visible`, `in_image`, `joint_names`, `frame_rate` |
+| `reference3d.npz` | `joints [T J 3]`, metres, world; `joint_names`, `frame_rate`, `time_s` |
+| `mask.npz` | `mask [T H W]` |
+| `truth.npz` | `body`, `lengths` (JSON, metres), `base_transform [4 4]`, `state_names [n]`, |
+| | `states [T n]`, `frame_rate`, `seed`, `description` |
+| `flow.npz` | `flow [T-1 H W 2]`, float16, pixels from frame i to i + 1; `occluded [T-1 H W]` |
+
+`write_sequence(folder, shot)` renders while it writes: a long film never is in memory as a whole.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from torchcss.files import prepare_output_folder, replace_file
+from torchcss.io.cameras import camera_entry
+from torchcss.io.video import VideoWriter
+from torchcss.studies.render.sequences import SequenceFrame, Shot
+from torchcss.vision.camera import Camera
+
+_HIDDEN_CONFIDENCE = 0.3
+"""What a detector says of a joint that it cannot see."""
+
+
+class _Joints(NamedTuple):
+    """What is kept of a frame until the end."""
+
+    joints: Tensor
+    uv: Tensor
+    visible: Tensor
+    in_image: Tensor
+
+
+def write_sequence(
+    folder: str | os.PathLike[str],
+    shot: Shot,
+    *,
+    noise_px: float = 2.0,
+    crf: int = 14,
+    progress: bool = False,
+) -> Path:
+    """Render a shot into a folder.
+
+    Args:
+        folder: The folder; made if missing, files in it are replaced.
+        shot: What to render.
+        noise_px: Standard deviation of the 2D joints' noise.
+        crf: Quality of the film, see `VideoWriter`.
+        progress: Whether to show a bar.
+
+    Returns:
+        The folder.
+
+    Raises:
+        OutputError: If the folder cannot be written.
+        MissingExtraError: If pyvista is not installed.
+    """
+    folder = prepare_output_folder(folder)
+    frames: Iterable[SequenceFrame] = shot.frames()
+    if progress:
+        frames = tqdm(frames, total=len(shot.states), desc=shot.name, unit="frame")
+    width, height = shot.camera.image_size_wh
+    count = len(shot.states)
+    mask = np.zeros((count, height, width), bool)
+    occluded = np.zeros((count - 1, height, width), bool)
+    kept: list[_Joints] = []
+    with (
+        VideoWriter(folder / "video.mp4", shot.frame_rate, crf=crf) as film,
+        replace_file(folder / "flow.npz") as partial,
+        zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
+    ):
+        with archive.open("flow.npy", "w", force_zip64=True) as stream:
+            # Frame by frame: all of them are half a gigabyte for eight seconds.
+            header = {
+                "descr": "<f2",
+                "fortran_order": False,
+                "shape": (count - 1, height, width, 2),
+            }
+            np.lib.format.write_array_header_1_0(stream, header)
+            for index, frame in enumerate(frames):
+                film.write(frame.image.numpy())
+                mask[index] = frame.mask.numpy()
+                if frame.flow is not None and frame.occluded is not None:
+                    stream.write(frame.flow.numpy().astype("<f2").tobytes())
+                    occluded[index] = frame.occluded.numpy()
+                kept.append(_Joints(frame.joints, frame.uv, frame.visible, frame.in_image))
+        with archive.open("occluded.npy", "w", force_zip64=True) as stream:
+            np.lib.format.write_array(stream, occluded, allow_pickle=False)
+    _write_arrays(folder / "mask.npz", mask=mask)
+    _write_joints(folder, shot, kept, noise_px)
+    _write_camera(folder / "cameras.json", shot.camera)
+    body = shot.body
+    _write_arrays(
+        folder / "truth.npz",
+        body=np.array(body.name),
+        lengths=np.array(json.dumps(body.lengths)),
+        base_transform=shot.base_transform.numpy(),
+        state_names=np.array(body.state_names),
+        states=shot.states.numpy(),
+        frame_rate=np.array(shot.frame_rate),
+        seed=np.array(shot.seed),
+        description=np.array(shot.description),
+    )
+    return folder
+
+
+def _write_joints(folder: Path, shot: Shot, frames: list[_Joints], noise_px: float) -> None:
+    exact = torch.stack([frame.uv for frame in frames])
+    # Its own generator: the noise of the marks does not depend on how the picture was made.
+    generator = torch.Generator().manual_seed(shot.seed + 1)
+    noise = torch.randn(exact.shape, generator=generator, dtype=exact.dtype)
+    visible = torch.stack([frame.visible for frame in frames]).numpy()
+    names = np.array(shot.body.joint_names)
+    frame_rate = np.array(shot.frame_rate)
+    _write_arrays(
+        folder / "keypoints2d.npz",
+        keypoints=(exact + noise_px * noise).numpy(),
+        keypoints_exact=exact.numpy(),
+        confidence=np.where(visible, 1.0, _HIDDEN_CONFIDENCE),
+        visible=visible,
+        in_image=torch.stack([frame.in_image for frame in frames]).numpy(),
+        joint_names=names,
+        frame_rate=frame_rate,
+        noise_px=np.array(noise_px),
+    )
+    _write_arrays(
+        folder / "reference3d.npz",
+        joints=torch.stack([frame.joints for frame in frames]).numpy(),
+        joint_names=names,
+        camera_names=np.array([shot.camera.name]),
+        frame_rate=frame_rate,
+        time_s=np.arange(len(frames)) / shot.frame_rate,
+        units=np.array("m"),
+    )
+
+
+def _write_camera(path: Path, camera: Camera) -> None:
+    entry = {
+        "video": "video.mp4",
+        **camera_entry(camera),
+        "centre_world": camera.centre_world.tolist(),
+    }
+    content = {
+        "convention": "world to camera: X_cam = R X_world + t; OpenCV axes (x right, y down, "
+        "z forward); pixel (0, 0) is the centre of the top-left pixel",
+        "world": "right-handed, Y up, metres",
+        "units": "metre, pixel",
+        "cameras": {camera.name: entry},
+    }
+    with replace_file(path) as partial:
+        partial.write_text(json.dumps(content, indent=1), encoding="utf-8")
+
+
+def _write_arrays(path: Path, **arrays: np.ndarray) -> None:
+    with replace_file(path) as partial:
+        np.savez_compressed(partial, **arrays)  # pyright: ignore[reportArgumentType]

@@ -1,0 +1,233 @@
+"""A folder with a video and all that is known of it: what trackers are compared on.
+
+| file | content |
+|---|---|
+| `video.mp4` | the frames |
+| `cameras.json` | its camera, in the metric world of the reference (`torchcss.io.cameras`) |
+| `keypoints2d.npz` | 2D joints (`torchcss.io.keypoints.read`); maybe `in_image [T J]`, `noise_px` |
+| `reference3d.npz` | `joints [T J 3]` in metres, NaN where unknown, and `joint_names [J]` |
+| `mask.npz` | `mask [T H W]`, the silhouette; may be missing |
+| `truth.npz` | the body that moved, if it was one of ours; may be missing |
+
+`truth.npz` holds `body` (its name), `lengths` (JSON, metres), `base_transform [4 4]` (world from
+the frame in which the root moves), `state_names [n]` and `states [T n]`.
+
+A recording with several cameras has one video and one keypoint file per view: `cam01.mp4`,
+`keypoints2d_cam01.npz`, `mask_cam01.npz`.
+
+By default: `read_sequence(folder)`, or `read_sequence(folder, view="cam01")`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel
+from torchcss.errors import CameraError, KeypointError, TrackFileError, VideoError
+from torchcss.files import load_arrays, one_line
+from torchcss.io.cameras import check_image_size, read_camera
+from torchcss.io.keypoints.read import Keypoints, read_keypoints
+from torchcss.io.video import VideoReader
+from torchcss.joint_names import canonical_joint_name
+from torchcss.vision.camera import Camera
+
+
+class Truth(NamedTuple):
+    """What moved in a sequence that was made from one of our own bodies.
+
+    Attributes:
+        body: The body, with its lengths, on its base.
+        states: Its state in every frame.
+    """
+
+    body: BodyModel
+    states: Float[Tensor, "t n"]
+
+
+class RecordedSequence(NamedTuple):
+    """A video and all that is known of it, float64 on the CPU.
+
+    Attributes:
+        name: The folder's name, with the view's if there is one.
+        video: The video file.
+        num_frames: Its number of frames.
+        frame_rate: Frames per second.
+        camera: The camera, in the world of the reference.
+        keypoints: 2D joints; those that the file says are outside the image have confidence 0.
+        keypoint_noise_px: Standard deviation of their noise, if the file says it.
+        joint_names: The catalogue's names of the reference's joints, the file's own for a place
+            that has none.
+        joints_world: The reference, metres; NaN where unknown.
+        mask: Silhouette in every frame, if known.
+        truth: The body that moved, if it was one of ours.
+    """
+
+    name: str
+    video: Path
+    num_frames: int
+    frame_rate: float
+    camera: Camera
+    keypoints: Keypoints
+    keypoint_noise_px: float | None
+    joint_names: tuple[str, ...]
+    joints_world: Float[np.ndarray, "t j 3"]
+    mask: Bool[np.ndarray, "t h w"] | None
+    truth: Truth | None
+
+
+def read_sequence(folder: str | os.PathLike[str], *, view: str | None = None) -> RecordedSequence:
+    """Read a folder as described above.
+
+    Args:
+        folder: The folder.
+        view: Which camera, where there are several.
+
+    Raises:
+        VideoError: If there is no such folder or video.
+        CameraError: If the camera is missing, of another image size, or not in the metric world.
+        KeypointError: If the 2D joints are missing or do not fit the video.
+        TrackFileError: If reference, mask or truth are malformed or do not fit the video.
+    """
+    folder = Path(folder)
+    suffix = "" if view is None else f"_{view}"
+    video = folder / f"{view or 'video'}.mp4"
+    if not video.is_file():
+        raise VideoError(f"{video}: there is no such video; {_advice(folder)}")
+    reader = VideoReader(video)
+    size = (reader.info.width, reader.info.height)
+    num_frames = reader.info.num_frames or reader.count_frames()
+    loaded = read_camera(folder / "cameras.json", camera_name=view, video=video)
+    if loaded.units_note is not None:
+        raise CameraError(
+            f"{folder / 'cameras.json'}: {loaded.units_note}; a reference in 3D needs the camera "
+            "in the reference's world, in metres"
+        )
+    check_image_size(loaded.camera, *size)
+    marks, noise = _read_marks(folder / f"keypoints2d{suffix}.npz", size, num_frames)
+    names, joints = _read_reference(folder / "reference3d.npz", num_frames)
+    mask_file, truth_file = folder / f"mask{suffix}.npz", folder / "truth.npz"
+    return RecordedSequence(
+        name=folder.resolve().name + ("" if view is None else f":{view}"),
+        video=video,
+        num_frames=num_frames,
+        frame_rate=float(reader.info.frame_rate),
+        camera=loaded.camera,
+        keypoints=marks,
+        keypoint_noise_px=noise,
+        joint_names=names,
+        joints_world=joints,
+        mask=_read_mask(mask_file, (num_frames, size[1], size[0])) if mask_file.exists() else None,
+        truth=_read_truth(truth_file, num_frames) if truth_file.exists() else None,
+    )
+
+
+def _advice(folder: Path) -> str:
+    """What is there instead of the video."""
+    if not folder.is_dir():
+        return f"{folder} is no folder"
+    views = sorted(
+        file.stem.removeprefix("keypoints2d_") for file in folder.glob("keypoints2d_*.npz")
+    )
+    if views:
+        return f"the folder has the views {', '.join(views)}: choose one"
+    return "expected a folder with video.mp4, cameras.json, keypoints2d.npz and reference3d.npz"
+
+
+def _read_marks(
+    path: Path, size: tuple[int, int], num_frames: int
+) -> tuple[Keypoints, float | None]:
+    marks = read_keypoints(path, image_size_wh=size, num_frames=num_frames)
+    arrays = load_arrays(path, KeypointError)
+    inside = arrays.get("in_image")
+    if inside is not None:
+        if inside.shape != tuple(marks.confidence.shape) or inside.dtype != bool:
+            raise KeypointError(
+                f"{path}: in_image: expected bool {list(marks.confidence.shape)}, "
+                f"found {inside.dtype} {list(inside.shape)}"
+            )
+        seen = torch.from_numpy(inside)
+        # No detector finds what is not in the picture.
+        marks = marks._replace(
+            keypoints=torch.where(seen[..., None], marks.keypoints, 0.0),
+            confidence=torch.where(seen, marks.confidence, 0.0),
+        )
+    noise = arrays.get("noise_px")
+    if noise is None:
+        return marks, None
+    if noise.shape != () or not noise > 0:
+        raise KeypointError(f"{path}: noise_px: expected one positive number, found {noise}")
+    return marks, float(noise)
+
+
+def _read_reference(path: Path, num_frames: int) -> tuple[tuple[str, ...], np.ndarray]:
+    arrays = load_arrays(path, TrackFileError)
+    _require(path, arrays, "joints", "joint_names")
+    names = tuple(str(name) for name in arrays["joint_names"].reshape(-1))
+    joints = _array(path, arrays, "joints", (num_frames, len(names), 3), "f")
+    units = str(arrays.get("units", "m"))
+    if units != "m":
+        raise TrackFileError(f"{path}: units: expected metres (m), found {units!r}; convert them")
+    return tuple(canonical_joint_name(name) or name for name in names), joints.astype(np.float64)
+
+
+def _read_mask(path: Path, shape: tuple[int, int, int]) -> np.ndarray:
+    arrays = load_arrays(path, TrackFileError)
+    _require(path, arrays, "mask")
+    return _array(path, arrays, "mask", shape, "b")
+
+
+def _read_truth(path: Path, num_frames: int) -> Truth:
+    arrays = load_arrays(path, TrackFileError)
+    _require(path, arrays, "body", "lengths", "base_transform", "state_names", "states")
+    try:
+        lengths = json.loads(str(arrays["lengths"]))
+        body = load_body(
+            str(arrays["body"]), lengths={str(k): float(v) for k, v in lengths.items()}
+        )
+    except (ValueError, AttributeError, TypeError) as error:  # ValueError: JSON's and BodyError
+        raise TrackFileError(f"{path}: no body of ours: {one_line(error)}") from error
+    names = tuple(str(name) for name in arrays["state_names"].reshape(-1))
+    if names != body.state_names:
+        raise TrackFileError(
+            f"{path}: state_names: expected those of {body.name}, {', '.join(body.state_names)}; "
+            f"found {', '.join(names)}"
+        )
+    states = _array(path, arrays, "states", (num_frames, len(names)), "f")
+    base = torch.from_numpy(_array(path, arrays, "base_transform", (4, 4), "f").astype(np.float64))
+    if not np.isfinite(states).all():
+        raise TrackFileError(f"{path}: states: expected finite numbers, found some that are not")
+    return Truth(
+        body.with_base(base[:3, :3], base[:3, 3]), torch.from_numpy(states.astype(np.float64))
+    )
+
+
+def _require(path: Path, arrays: Mapping[str, np.ndarray], *names: str) -> None:
+    missing = [name for name in names if name not in arrays]
+    if missing:
+        raise TrackFileError(
+            f"{path}: expected the arrays {', '.join(names)}; {', '.join(missing)} missing"
+        )
+
+
+def _array(
+    path: Path, arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int, ...], kind: str
+) -> np.ndarray:
+    """The array, if it is of this shape, and floating point (`f`) or boolean (`b`)."""
+    array = arrays[name]
+    if array.shape != shape or array.dtype.kind != kind:
+        raise TrackFileError(
+            f"{path}: {name}: expected {'truth values' if kind == 'b' else 'numbers'} of shape "
+            f"{list(shape)}, as many frames as the video has; found {array.dtype} "
+            f"{list(array.shape)}"
+        )
+    return array

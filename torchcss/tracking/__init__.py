@@ -1,0 +1,1 @@
+"""The tracking loop: settings, presets, session, and the moves of a body."""

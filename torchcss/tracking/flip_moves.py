@@ -1,0 +1,132 @@
+"""Jumps to the other poses that project to the same places: what one camera cannot tell apart.
+
+A limb that comes towards the camera looks like one that goes away from it. Between the two lies a
+wall of cost that samples about a mode seldom cross, but where the other pose is can be computed:
+it is a forward-backward flip (`torchcss.body.flips`), as in initialisation. `with_flips` puts the
+flips of the best mode among the modes from which a tracker samples, so that every one of them is
+descended from in the next frame; the image decides what remains (Sminchisescu and Triggs,
+Kinematic Jump Processes, CVPR 2003, do so for every sample).
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchcss.body.flips import Segments
+from torchcss.body.model import BodyModel
+from torchcss.cost.joints import JointObservation, JointTerm
+from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.inference.mixture import GaussianMixture
+from torchcss.inference.tracker import TrackerState
+from torchcss.initialise.multi_start import flips
+from torchcss.vision.camera import Camera
+
+_NOISE = 0.02
+"""Scale by which flips are judged, as a share of the body's extent in the image."""
+
+_MOST_NOISE = 6.0
+"""Scales by which a joint may miss its place: as far as the ranking of the flips looks. Where joint
+limits leave nearly no flip, what they leave looks different, and a descent from it leads nowhere.
+"""
+
+_ALL = 1_000_000
+"""More combinations than any body has."""
+
+_APART = 0.15
+"""Least distance of some joint, metres, at which two poses are two. A body has a thousand flips
+that differ by the tilt of a foot or of the trunk, and they are the most plausible."""
+
+
+def with_flips(
+    state: TrackerState, body: BodyModel, camera: Camera, *, num: int, log_odds: float = -5.0
+) -> TrackerState:
+    """A tracker's state with the flips of its best mode among its modes.
+
+    Args:
+        state: Where the last frame left off, the best mode first.
+        body: The body on the state's base.
+        camera: Any camera of the view.
+        num: Most flips wanted.
+        log_odds: Their weight against that of the best mode, nats. Low odds spend one sample on
+            each, and make the image's evidence outweigh a jump before it leads.
+    """
+    x = flipped_poses(body, camera, state.mixture.mean[0], num=num)
+    return with_modes(state, x, torch.zeros_like(x), log_odds=log_odds)
+
+
+def with_modes(
+    state: TrackerState,
+    mean: Float[Tensor, "s n"],
+    velocity: Float[Tensor, "s n"],
+    *,
+    log_odds: float,
+) -> TrackerState:
+    """A tracker's state with other poses among its modes, as uncertain as the best one.
+
+    Args:
+        state: Where the last frame left off, the best mode first.
+        mean: The poses; none leaves the state as it is.
+        velocity: How far each moved in the last frame.
+        log_odds: Their weight against that of the best mode, nats.
+    """
+    if not len(mean):
+        return state
+    mixture = state.mixture
+    like = mixture.take(torch.zeros(len(mean), dtype=torch.long, device=mean.device))
+    joined = GaussianMixture(
+        torch.cat([mixture.mean, mean]),
+        torch.cat([mixture.covariance, like.covariance]),
+        torch.cat([mixture.log_weight, like.log_weight + log_odds]),
+    )
+    velocity = torch.cat([state.velocity, velocity])
+    # Particles are of the old modes; a filter draws new ones from the mixture.
+    return state._replace(mixture=joined.normalise(), velocity=velocity, particles=None)
+
+
+def flipped_poses(
+    body: BodyModel, camera: Camera, x: Float[Tensor, " n"], *, num: int
+) -> Float[Tensor, "s n"]:
+    """Other poses whose joints project to where a pose's do, the most plausible first.
+
+    Args:
+        body: The body; the poses obey its joint limits.
+        camera: Any camera of the view.
+        x: The pose.
+        num: Most poses wanted.
+
+    Returns:
+        The poses, each with a joint `_APART` from where it is in the given one and in the others;
+        none for a body without limbs that can flip, or wholly out of the camera's sight.
+    """
+    segments = Segments(body)
+    nothing = x.new_zeros(0, len(x))
+    if not segments.limbs or num < 1:
+        return nothing
+    joints = body.pose(x).joints
+    uv, _, valid = camera.project(joints)
+    if not bool(valid.any()):
+        return nothing
+    extent = float((uv[valid].amax(0) - uv[valid].amin(0)).max())
+    sigma = max(1.0, _NOISE * extent)
+    cost = TrackingCost(
+        body=body,
+        camera=camera,
+        choice=CostChoice(contour=None, joints=JointTerm(sigma=sigma)),
+        observation=JointObservation(body.joint_names, uv, valid.to(uv), body.joint_names),
+    )
+    poses = flips(cost, segments, x[None], body.bounds, _ALL)
+    places = body.pose(poses).joints
+    missed = torch.where(valid, (camera.project(places).uv - uv).norm(dim=-1), 0.0).amax(-1)
+    left = torch.nonzero((missed <= _MOST_NOISE * sigma) & _differ(places, joints))[:, 0]
+    chosen = []
+    while len(left) and len(chosen) < num:
+        chosen.append(left[0])
+        left = left[_differ(places[left], places[left[0]])]
+    return poses[torch.stack(chosen)] if chosen else nothing
+
+
+def _differ(places: Float[Tensor, "s j 3"], others: Float[Tensor, "j 3"]) -> Bool[Tensor, " s"]:
+    """Whether some joint is `_APART` from where it is in another pose."""
+    return (places - others).norm(dim=-1).amax(-1) >= _APART

@@ -1,0 +1,358 @@
+"""The trackers of the papers by name, as one table of choices.
+
+`make_tracker(name, body_name)` builds one. The number of modes is the papers': 3 for an arm, 7 for
+a body, 10 for Cham and Rehg's.
+
+| name | tracker | from |
+|---|---|---|
+| css | covariance scaled sampling, modes kept apart, soft matching, jumps | [IJRR] Fig. 6 |
+| css_figure_6 | covariance scaled sampling alone | [IJRR] Fig. 6 |
+| css_heavy_tailed | the same with Student t tails | [IJRR] Fig. 6 |
+| css_limits, css_constrained | without and with non-interpenetration | [IJRR] section 6.2 |
+| multiple_hypothesis | a regular pattern along the most uncertain directions | [RR] Fig. 4 |
+| gaussian_single, robust_single, single | one mode: Gaussian errors, robust, + limits | [IJRR] 6 |
+| condensation_modes | modes and descents, sampled by dynamical noise | [IJRR] section 6 |
+| cham_rehg, cham_rehg_ssd | Cham and Rehg (1999) in 3D, robust and not | [IJRR] section 6.1 |
+| heap_hogg, heap_hogg_ssd | Heap and Hogg (1998) in 3D, robust and not | [IJRR] section 6.1 |
+| condensation | the particle filter | [IJRR] section 1.1 |
+| condensation_inflated | with an inflated posterior | [IJRR] section 9 |
+| annealed | the annealed particle filter | [IJRR] section 1.2 |
+
+A row also says what the cost has to be: whether its potentials are robust, whether joint limits
+hold, whether parts repel each other, and which Hessian it gives. That is for whoever builds the
+cost; `Preset.bounds` gives the limits.
+
+What [IJRR] says of the two multiple-hypothesis trackers, and what is made of it here. Both combine
+sampling as in CONDENSATION with least-squares descent from the samples, for 2D models; the paper
+runs them in 3D with a Gaussian mixture and a dynamical noise large enough to search by. Cham and
+Rehg sample within the Gauss-Newton covariances of their modes, piecewise, under constant velocity,
+and keep ten modes. Heap and Hogg's samples are particles at the modes themselves, randomised by the
+noise alone. The "ssd" rows have Gaussian errors, Gauss-Newton Hessians and no joint limits, as in
+the originals; the others share the robust cost and the limits of this package.
+
+The search noise of these rows is a multiple of the everyday motion of one frame (`noise`). It and
+the numbers of particles are ours, chosen before any comparison: the papers give none. A filter gets
+as many evaluations of the cost as a descending tracker may take, 20 per sample that descends to
+the end.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+
+from torchcss.body.catalog import ARM_NAMES
+from torchcss.errors import ConfigurationError
+from torchcss.inference.dynamics import ConstantVelocity
+from torchcss.inference.particle import AnnealedParticleFilter, ParticleFilter
+from torchcss.inference.proposals import (
+    ChamRehg,
+    Condensation,
+    CovarianceScaled,
+    EigenDirectionGrid,
+    HeavyTailed,
+    Proposal,
+)
+from torchcss.inference.tracker import SequenceTracker, Tracker
+from torchcss.inference.trust_region import TrustRegionNewton
+from torchcss.types import Bounds, Curvature
+
+
+@dataclass(frozen=True, kw_only=True)
+class Preset:
+    """One row of the table.
+
+    Attributes:
+        what: The tracker in a line.
+        proposal: Where samples go, for trackers that descend from them; one that searches by
+            dynamical noise gets its `deviation` from `noise`.
+        particles: The particle filter instead; its numbers and dynamics are filled in.
+        samples_arm: Samples per frame for an arm. With 160 that race for 40 places instead of 40
+            (`finalists_arm`) css takes a fifth more evaluations; on the rendered arm none of five
+            seeds is lost; with 40 two were.
+        samples_body: Samples per frame for a body.
+        modes_arm: Modes kept for an arm.
+        modes_body: Modes kept for a body.
+        memory: See `Tracker`.
+        evidence: See `Tracker`. On the rendered arm 0.1 instead of 1 (with a memory of 0.98 and
+            matching as in Fig. 6) took the best mode's error from 128 to 59 mm: of two poses that
+            look alike the one that was right so far stays the best.
+        finalists_arm: `Tracker.finalists` for an arm; they matter with many samples only.
+        finalists_body: The same for a body.
+        proposal_arm: Where samples go for an arm, if elsewhere than for a body.
+        evidence_arm: `evidence` for an arm, if other than for a body. Its modes cost the same for
+            longer, since it has no `segmentation`: the rest of its person looks the same.
+        evidence_keypoints: `evidence` of a body with keypoints in every frame, if other than
+            without: they tell in every frame anew which modes are wrong, and who was right for long
+            leads on less. (An arm does not gain.) The covariances stay those of `evidence`: with
+            0.3, half of the true joints are in the 90 % regions, with 0.1 three quarters.
+        persistence: Share of its last motion that a mode goes on with: 0 is driftless diffusion, 1
+            constant velocity. The papers' trackers have 0. With 0.8 a mode does not lag behind a
+            limb whose flow is underestimated: on the beam clip it doubles the time that limbs are
+            held, and takes a quarter off the errors of the demo.
+        noise: Dynamical noise that the tracker searches by, in multiples of the motion of one
+            frame. Trackers that descend from scaled covariances have 1: realistic noise.
+        robust: Whether the cost's potentials are robust (False: `Quadratic`).
+        limits: Whether joint limits hold, see `bounds`.
+        interpenetration: Whether parts repel each other; None: as the cost is set up otherwise.
+        curvature: Which Hessian the cost gives.
+        separation: Distance of some joint centre, metres, from which two modes count as two
+            explanations, see `Tracker`. The papers have none; their modes are distinct minima. By
+            the mean distance an arm that is flipped hardly counts: on the rendered body-clutter
+            the best of the modes is at 78 mm with this, and was at 101 with a mean of 5 cm.
+        soft_matching: See `Tracker`.
+        jumps_every: Every how many frames the flips of the best mode join the search, see
+            `torchcss.tracking.flip_moves`; 0, as in the papers: never.
+    """
+
+    what: str
+    proposal: Proposal | None = None
+    particles: ParticleFilter | AnnealedParticleFilter | None = None
+    samples_arm: int
+    samples_body: int
+    modes_arm: int = 3
+    modes_body: int = 7
+    memory: float = 1.0
+    evidence: float = 1.0
+    finalists_arm: int = 0
+    finalists_body: int = 0
+    proposal_arm: Proposal | None = None
+    evidence_arm: float | None = None
+    evidence_keypoints: float | None = None
+    persistence: float = 0.0
+    noise: float = 1.0
+    robust: bool = True
+    limits: bool = True
+    interpenetration: bool | None = None
+    curvature: Curvature = Curvature.EXACT
+    separation: float = 0.0
+    soft_matching: bool = False
+    jumps_every: int = 0
+
+    def __post_init__(self) -> None:
+        if (self.proposal is None) == (self.particles is None):
+            raise ConfigurationError(
+                f"Preset: expected either a proposal or a particle filter, got {self.proposal} and "
+                f"{self.particles}; give one of the two"
+            )
+
+    def bounds(self, limits: Bounds) -> Bounds:
+        """Bounds that the tracker obeys: the joint limits, or none.
+
+        Args:
+            limits: Those of the body.
+        """
+        if self.limits:
+            return limits
+        return Bounds(
+            torch.full_like(limits.lower, -torch.inf), torch.full_like(limits.upper, torch.inf)
+        )
+
+
+_PERSISTENCE = 0.8
+"""Of all trackers without dynamics of their own, so that they differ in the search alone."""
+
+_FIRST_RADIUS = 1 / 16
+"""Metres and radians that a first step may go. The edges are searched for some 20 pixels to either
+side: of first steps of a radian, a half and a quarter most are rejected (measured; 17 steps
+end where 20 from a radian on did)."""
+
+_CSS = Preset(
+    what="covariance scaled sampling, [IJRR] Fig. 6 with s = 8, modes kept apart, and jumps",
+    proposal=CovarianceScaled(covariance_scale=8.0, max_deviation=1.0),
+    samples_arm=160,
+    samples_body=60,
+    memory=0.98,
+    evidence=0.1,
+    evidence_arm=0.05,
+    evidence_keypoints=0.2,
+    finalists_arm=40,
+    finalists_body=60,
+    persistence=_PERSISTENCE,
+    separation=0.12,
+    soft_matching=True,
+    jumps_every=3,
+)
+_SINGLE = Preset(
+    what="one robust mode with joint limits, no search ([IJRR] section 6)",
+    proposal=CovarianceScaled(covariance_scale=1.0),
+    samples_arm=1,
+    samples_body=1,
+    modes_arm=1,
+    modes_body=1,
+    persistence=_PERSISTENCE,
+)
+_CHAM_REHG = Preset(
+    what="Cham and Rehg's multiple-hypothesis tracker in 3D, robust ([IJRR] section 6.1)",
+    proposal=ChamRehg(deviation=0.0),
+    samples_arm=40,
+    samples_body=60,
+    modes_arm=10,
+    modes_body=10,
+    persistence=1.0,
+    noise=3.0,
+)
+_HEAP_HOGG = Preset(
+    what="Heap and Hogg's multiple-hypothesis tracker in 3D, robust ([IJRR] section 6.1)",
+    proposal=Condensation(deviation=0.0),
+    samples_arm=40,
+    samples_body=60,
+    modes_arm=10,
+    modes_body=10,
+    noise=3.0,
+)
+_CONDENSATION = Preset(
+    what="CONDENSATION: particles weighed by the likelihood ([IJRR] section 1.1)",
+    particles=ParticleFilter(num_samples=1, num_modes=1),
+    samples_arm=800,
+    samples_body=1200,
+    noise=1.5,
+)
+
+
+def _least_squares(row: Preset, what: str) -> Preset:
+    """The row with Gaussian errors, Gauss-Newton Hessians and no joint limits."""
+    return replace(row, what=what, robust=False, limits=False, curvature=Curvature.GAUSS_NEWTON)
+
+
+PRESETS: dict[str, Preset] = {
+    "css": _CSS,
+    "css_figure_6": replace(
+        _CSS,
+        what="css as printed: weights multiplied, minima however alike, no jumps to flips",
+        memory=1.0,
+        evidence=1.0,
+        evidence_arm=None,
+        evidence_keypoints=None,
+        samples_arm=40,
+        finalists_arm=0,
+        finalists_body=0,
+        separation=0.0,
+        soft_matching=False,
+        jumps_every=0,
+    ),
+    "css_heavy_tailed": replace(
+        _CSS,
+        what="covariance scaled sampling with Student t tails, [IJRR] Fig. 6",
+        proposal=HeavyTailed(covariance_scale=4.0, degrees_of_freedom=3, max_deviation=1.0),
+    ),
+    "css_limits": replace(
+        _CSS,
+        what="css with joint limits, without non-interpenetration ([IJRR] section 6.2)",
+        interpenetration=False,
+    ),
+    "css_constrained": replace(
+        _CSS,
+        what="css with joint limits and non-interpenetration ([IJRR] section 6.2)",
+        interpenetration=True,
+    ),
+    "multiple_hypothesis": Preset(
+        what="a pattern along the most uncertain directions, one pool ([RR] Fig. 4); all descend",
+        proposal=EigenDirectionGrid(num_directions=3, num_steps=1),
+        proposal_arm=EigenDirectionGrid(num_directions=1, num_steps=1),
+        samples_arm=9,  # 3 modes and 2 steps from each
+        samples_body=49,  # 7 modes and 6 steps from each
+        memory=0.0,
+        persistence=_PERSISTENCE,
+    ),
+    "single": _SINGLE,
+    "robust_single": replace(
+        _SINGLE,
+        what="one robust mode without joint limits ([IJRR] section 6)",
+        limits=False,
+    ),
+    "gaussian_single": replace(
+        _SINGLE,
+        what="one mode, Gaussian errors, no joint limits ([IJRR] section 6)",
+        robust=False,
+        limits=False,
+    ),
+    "condensation_modes": replace(
+        _CSS,
+        what="css, but sampled by dynamical noise instead of scaled covariances ([IJRR] section 6)",
+        proposal=Condensation(deviation=0.0),
+        noise=3.0,
+        separation=0.0,
+        soft_matching=False,
+        jumps_every=0,
+    ),
+    "cham_rehg": _CHAM_REHG,
+    "cham_rehg_ssd": _least_squares(
+        _CHAM_REHG, "Cham and Rehg's multiple-hypothesis tracker in 3D, least squares"
+    ),
+    "heap_hogg": _HEAP_HOGG,
+    "heap_hogg_ssd": _least_squares(
+        _HEAP_HOGG, "Heap and Hogg's multiple-hypothesis tracker in 3D, least squares"
+    ),
+    "condensation": _CONDENSATION,
+    "condensation_inflated": replace(
+        _CONDENSATION,
+        what="CONDENSATION from the posterior to the power 1/8 ([IJRR] section 9)",
+        particles=ParticleFilter(num_samples=1, num_modes=1, dilution=1 / 8),
+    ),
+    "annealed": replace(
+        _CONDENSATION,
+        what="the annealed particle filter ([IJRR] section 1.2)",
+        particles=AnnealedParticleFilter(num_samples=1, num_modes=1, num_layers=10),
+        samples_arm=80,
+        samples_body=120,
+    ),
+}
+
+
+def make_tracker(
+    preset: str,
+    body_name: str,
+    *,
+    num_samples: int | None = None,
+    num_modes: int | None = None,
+    motion: tuple[float, ...] | float = 0.0,
+) -> SequenceTracker:
+    """Build a tracker from the table.
+
+    Args:
+        preset: A name in `PRESETS`.
+        body_name: The body; arms and bodies differ in numbers.
+        num_samples: Samples per frame instead of the table's.
+        num_modes: Modes kept instead of the table's.
+        motion: Standard deviation of every parameter's motion per frame.
+
+    Raises:
+        ConfigurationError: If there is no such tracker.
+    """
+    if preset not in PRESETS:
+        raise ConfigurationError(f"no tracker {preset!r}; there are {', '.join(PRESETS)}")
+    row = PRESETS[preset]
+    arm = body_name in ARM_NAMES
+    num_samples = num_samples or (row.samples_arm if arm else row.samples_body)
+    num_modes = num_modes or (row.modes_arm if arm else row.modes_body)
+    noise = (
+        tuple(row.noise * m for m in motion) if isinstance(motion, tuple) else row.noise * motion
+    )
+    dynamics = ConstantVelocity(deviation=noise, persistence=row.persistence)
+    if row.particles is not None:
+        return replace(
+            row.particles,
+            num_samples=num_samples,
+            num_modes=num_modes,
+            dynamics=dynamics,
+        )
+    proposal = (row.proposal_arm if arm else None) or row.proposal
+    assert proposal is not None
+    evidence = row.evidence_arm if arm and row.evidence_arm is not None else row.evidence
+    # Who searches by noise adds it in the proposal; the dynamics themselves then add none.
+    if isinstance(proposal, (ChamRehg, Condensation)):
+        proposal, dynamics = replace(proposal, deviation=noise), replace(dynamics, deviation=0.0)
+    return Tracker(
+        proposal=proposal,
+        num_samples=num_samples,
+        num_modes=num_modes,
+        optimiser=TrustRegionNewton(max_steps=17, tolerance=1e-2, initial_radius=_FIRST_RADIUS),
+        memory=row.memory,
+        evidence=evidence,
+        finalists=row.finalists_arm if arm else row.finalists_body,
+        dynamics=dynamics,
+        separation=row.separation,
+        soft_matching=row.soft_matching,
+    )

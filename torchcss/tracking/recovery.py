@@ -1,0 +1,59 @@
+"""What a tracker does when it has lost its target: search more widely, and jump.
+
+`torchcss.inference.loss_monitor` tells from the costs that the track is lost. Until it is found
+again, each frame is searched with more samples, at a larger scale, for more modes, and from the
+other poses that project to the same places as the best mode: the forward-backward flips of
+initialisation (`torchcss.body.flips`), which lie far apart in space and next to each other in the
+image. A track that was lost for that reason is found in one frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from torchcss.body.model import BodyModel
+from torchcss.inference.loss_monitor import LossMonitor, MonitorState, widened
+from torchcss.inference.tracker import SequenceTracker, TrackerState
+from torchcss.tracking.flip_moves import with_flips
+from torchcss.vision.camera import Camera
+
+OBSERVATIONS = ("contour", "edge_energy", "region", "flow", "joints")
+"""The terms of the cost that compare with the image in the same way in every frame. What looks at
+the silhouette changes with what is known of the background; the rest are priors."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recovery:
+    """How losses are told, and how the search widens then.
+
+    Attributes:
+        monitor: Tells a loss from the costs.
+        samples: How many times as many samples.
+        modes: How many times as many modes.
+        scale: Factor on the covariance scale.
+        num_flips: Most flips of the best mode that join the search, see
+            `torchcss.tracking.flip_moves`.
+        patience: Frames in a row that are searched widely. What is not found by then has left, or
+            the picture has changed for good; the track stays marked as lost.
+    """
+
+    monitor: LossMonitor = field(default_factory=LossMonitor)
+    samples: int = 3
+    modes: int = 2
+    scale: float = 2.0
+    num_flips: int = 12
+    patience: int = 25
+
+    def judge(self, state: MonitorState, terms: Mapping[str, float]) -> tuple[MonitorState, bool]:
+        """Take in what the terms of a frame cost at the best mode; see `LossMonitor.update`."""
+        observed = {name: cost for name, cost in terms.items() if name in OBSERVATIONS}
+        return self.monitor.update(state, observed)
+
+    def widened(self, tracker: SequenceTracker) -> SequenceTracker:
+        """The tracker that searches for what was lost."""
+        return widened(tracker, samples=self.samples, modes=self.modes, scale=self.scale)
+
+    def with_jumps(self, state: TrackerState, body: BodyModel, camera: Camera) -> TrackerState:
+        """The state with the best mode's flips among its modes, as likely as the best itself."""
+        return with_flips(state, body, camera, num=self.num_flips, log_odds=0.0)
