@@ -36,13 +36,13 @@ class Config:
     motion: Path | None = None
     """NPZ file with the motion of --sequence mocap."""
     seed: int = 0
-    """Seed of the person, the room and the noise."""
+    """Seed of the person, the scene and the noise."""
     frames: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Only the first frames."""
     small: bool = False
     """A quarter of the picture's width and height."""
-    room: Literal["clutter", "dark"] = "clutter"
-    """Room of --sequence mocap."""
+    scene: Annotated[Literal["clutter", "dark"], tyro.conf.arg(aliases=("--room",))] = "clutter"
+    """Scene of --sequence mocap."""
     noise_px: float = 2.0
     """Standard deviation of the noise of the 2D joints."""
 
@@ -59,7 +59,7 @@ def make_shot(config: Config) -> Shot:
     return shot_of_motion(
         motion,
         name=f"mocap-{config.motion.stem}",
-        style=STYLES[config.room],
+        style=STYLES[config.scene],
         seed=config.seed,
         num_frames=config.frames,
         small=config.small,

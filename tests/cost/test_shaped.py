@@ -24,7 +24,7 @@ from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.cost.visibility import ContourPredictor
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.initialise.shape import fit_shape
-from torchcss.studies.render.software import Mesh, render_meshes
+from torchcss.studies.render.renderer import Mesh, render_meshes
 from torchcss.tracking.flip_moves import flipped_poses
 from torchcss.types import Bounds
 from torchcss.vision.camera import Camera

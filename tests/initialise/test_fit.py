@@ -24,7 +24,8 @@ from torchcss.initialise.multi_start import PAPER_PROPORTIONS, SINGLE_START, Sea
 from torchcss.initialise.result import Initialisation, hang_on_best, stature_of
 from torchcss.studies.metrics import LIMB_JOINTS, mask_overlap, pa_mpjpe_mm
 from torchcss.studies.random_person import Person, coverage, random_person
-from torchcss.studies.render.software import Mesh, clutter_background, render_meshes
+from torchcss.studies.render.clutter import clutter_background
+from torchcss.studies.render.renderer import Mesh, render_meshes
 from torchcss.types import Modes
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import grid_faces

@@ -15,8 +15,6 @@ from torchcss.errors import ConfigurationError
 from torchcss.io.video import VideoReader
 from torchcss.studies.sequences import read_sequence
 
-pytest.importorskip("pyvista")
-
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "make_sequence.py"
 
 
@@ -40,7 +38,7 @@ def test_a_folder_holds_what_was_rendered(script: ModuleType, tmp_path: Path) ->
     noise = marks["keypoints"] - marks["keypoints_exact"]
     assert abs(noise.std() / 2.0 - 1) < 0.2
     assert np.array_equal(marks["confidence"] == 1, marks["visible"])
-    # Flow of the figure, none of the room.
+    # Flow of the character, none of the room.
     motion = np.load(tmp_path / "dark" / "flow.npz")
     assert (motion["flow"].dtype, motion["flow"].shape) == (np.float16, (2, 120, 160, 2))
     assert motion["occluded"].shape == (2, 120, 160)
@@ -65,7 +63,7 @@ def test_a_motion_of_ones_own_is_rendered(script: ModuleType, tmp_path: Path) ->
         frame_rate=np.array(25.0),
     )
     out = tmp_path / "out"
-    config = script.Config(sequence="mocap", motion=clip, out=out, small=True, room="dark")
+    config = script.Config(sequence="mocap", motion=clip, out=out, small=True, scene="dark")
     assert script.main(config)["name"] == "mocap-bend"
     sequence = read_sequence(out)
     assert sequence.frame_rate == 25.0

@@ -18,7 +18,7 @@ from torchcss.body.model import BodyModel
 from torchcss.errors import ConfigurationError
 from torchcss.inference.dynamics import ConstantVelocity, Diffusion
 from torchcss.inference.mixture import GaussianMixture
-from torchcss.studies.render.software import Lighting, Mesh, random_texture, render_meshes
+from torchcss.studies.render.renderer import Lighting, Mesh, random_texture, render_meshes
 from torchcss.tracking.presets import make_tracker
 from torchcss.tracking.session import TrackedFrame, track_frames
 from torchcss.tracking.settings import Settings, make_choice, make_extractor

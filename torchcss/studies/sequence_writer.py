@@ -70,7 +70,6 @@ def write_sequence(
 
     Raises:
         OutputError: If the folder cannot be written.
-        MissingExtraError: If pyvista is not installed.
     """
     folder = prepare_output_folder(folder)
     frames: Iterable[SequenceFrame] = shot.frames()

@@ -1,9 +1,8 @@
-"""The dressed figure: a closed skin that follows its body."""
+"""The dressed character: a closed skin that follows its body."""
 
 from __future__ import annotations
 
 import math
-import sys
 
 import pytest
 import torch
@@ -12,10 +11,9 @@ from torch import Tensor
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.surface import surface_points
-from torchcss.errors import MissingExtraError
-from torchcss.studies.render.character import Figure, Outfit, distance_to_part
+from torchcss.studies.render.character import Character, Clothing, distance_to_part
 
-STIFF = Outfit(girth=0.0, looseness=0.0, creases=0.0, muscle=0.0)
+STIFF = Clothing(girth=0.0, looseness=0.0, creases=0.0, muscle=0.0)
 
 
 def volume(vertices: Tensor, faces: Tensor) -> float:
@@ -24,10 +22,9 @@ def volume(vertices: Tensor, faces: Tensor) -> float:
 
 
 @pytest.fixture(scope="module")
-def person() -> tuple[BodyModel, Figure]:
-    pytest.importorskip("pyvista")
+def person() -> tuple[BodyModel, Character]:
     body = load_body("body34")
-    return body, Figure(body, STIFF, generator=torch.Generator().manual_seed(0), spacing=0.02)
+    return body, Character(body, STIFF, generator=torch.Generator().manual_seed(0), spacing=0.02)
 
 
 def reaching(body: BodyModel) -> Tensor:
@@ -56,50 +53,50 @@ def test_distances_are_those_of_an_offset_surface() -> None:
         torch.testing.assert_close(found, torch.full_like(found, step), rtol=0.15, atol=0)
 
 
-def test_the_skin_is_closed_and_turned_outwards(person: tuple[BodyModel, Figure]) -> None:
-    body, figure = person
-    faces = figure.faces
+def test_the_skin_is_closed_and_turned_outwards(person: tuple[BodyModel, Character]) -> None:
+    body, character = person
+    faces = character.faces
     edges = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    forward = edges[:, 0] * figure.num_vertices + edges[:, 1]
-    backward = edges[:, 1] * figure.num_vertices + edges[:, 0]
+    forward = edges[:, 0] * character.num_vertices + edges[:, 1]
+    backward = edges[:, 1] * character.num_vertices + edges[:, 0]
     # Every edge belongs to two triangles, which run along it in opposite directions.
     assert torch.equal(forward.sort().values, backward.sort().values)
-    skin = figure.pose(body.rest)
+    skin = character.pose(body.rest)
     assert 0.04 < volume(skin.vertices, faces) < 0.09  # cubic metres: 40 to 90 litres
-    assert set(figure.part.tolist()) == set(range(body.num_parts))
-    assert bool(((figure.colour >= 0) & (figure.colour <= 1)).all())
+    assert set(character.part.tolist()) == set(range(body.num_parts))
+    assert bool(((character.colour >= 0) & (character.colour <= 1)).all())
 
 
-def test_limbs_keep_their_volume_when_they_bend(person: tuple[BodyModel, Figure]) -> None:
+def test_limbs_keep_their_volume_when_they_bend(person: tuple[BodyModel, Character]) -> None:
     """Linear blending would lose it at twisted and bent joints."""
-    body, figure = person
-    still = volume(figure.pose(body.rest).vertices, figure.faces)
-    bent = volume(figure.pose(reaching(body)).vertices, figure.faces)
+    body, character = person
+    still = volume(character.pose(body.rest).vertices, character.faces)
+    bent = volume(character.pose(reaching(body)).vertices, character.faces)
     assert abs(bent / still - 1) < 0.05
 
 
-def test_the_skin_lies_on_the_parts(person: tuple[BodyModel, Figure]) -> None:
-    """Of a figure without cloth or other girths, but for what fills the joints."""
-    body, figure = person
+def test_the_skin_lies_on_the_parts(person: tuple[BodyModel, Character]) -> None:
+    """Of a character without cloth or other girths, but for what fills the joints."""
+    body, character = person
     state = reaching(body)
-    skin = figure.pose(state)
+    skin = character.pose(state)
     rotation, centre = body.part_poses(body.pose(state))
     local = (skin.vertices - centre[:, None]) @ rotation
     apart = torch.stack(
         [distance_to_part(s, p) for s, p in zip(body.part_shape, local, strict=True)]
     ).amin(0)
     assert float(apart.abs().median()) < 0.008
-    middle = figure._weight[:, 0] > 0.98
+    middle = character._weight[:, 0] > 0.98
     assert float(apart[middle].abs().quantile(0.95)) < 0.02
 
 
-def test_a_skin_moves_with_its_base_and_root(person: tuple[BodyModel, Figure]) -> None:
-    body, figure = person
+def test_a_skin_moves_with_its_base_and_root(person: tuple[BodyModel, Character]) -> None:
+    body, character = person
     state = reaching(body)
-    skin = figure.pose(state)
+    skin = character.pose(state)
     shifted = state.clone()
     shifted[body.state_index("root_x")] += 0.4
-    moved = figure.pose(shifted)
+    moved = character.pose(shifted)
     torch.testing.assert_close(
         moved.vertices, skin.vertices + skin.vertices.new_tensor([0.4, 0, 0]), rtol=0, atol=1e-9
     )
@@ -107,16 +104,15 @@ def test_a_skin_moves_with_its_base_and_root(person: tuple[BodyModel, Figure]) -
 
 
 def test_cloth_moves_with_the_pose_and_muscles_swell() -> None:
-    pytest.importorskip("pyvista")
     body = load_body("arm8")
-    outfit = Outfit(girth=0.0, looseness=0.0, creases=0.0, muscle=0.02)
-    figure = Figure(body, outfit, generator=torch.Generator().manual_seed(0), spacing=0.012)
-    plain = Figure(body, STIFF, generator=torch.Generator().manual_seed(0), spacing=0.012)
+    clothing = Clothing(girth=0.0, looseness=0.0, creases=0.0, muscle=0.02)
+    character = Character(body, clothing, generator=torch.Generator().manual_seed(0), spacing=0.012)
+    plain = Character(body, STIFF, generator=torch.Generator().manual_seed(0), spacing=0.012)
     straight, bent = body.rest.clone(), body.rest.clone()
     bent[body.state_index("r_elbow_flexion")] = math.radians(110)
 
     def swelling(state: Tensor) -> Tensor:
-        return (figure.pose(state).vertices - plain.pose(state).vertices).norm(dim=-1)
+        return (character.pose(state).vertices - plain.pose(state).vertices).norm(dim=-1)
 
     assert float(swelling(straight).max()) < 1e-3
     swollen = swelling(bent)
@@ -127,7 +123,7 @@ def test_cloth_moves_with_the_pose_and_muscles_swell() -> None:
     shoulder, elbow, wrist = (
         pose.joints[body.joint_index(f"r_{name}")] for name in ("shoulder", "elbow", "wrist")
     )
-    place = figure.pose(bent).vertices[most]
+    place = character.pose(bent).vertices[most]
     axis = (elbow - shoulder) / (elbow - shoulder).norm()
     along = float((place - shoulder) @ axis) / float((elbow - shoulder).norm())
     assert 0.2 < along < 0.8
@@ -136,14 +132,7 @@ def test_cloth_moves_with_the_pose_and_muscles_swell() -> None:
 
 
 def test_parts_can_be_left_out() -> None:
-    pytest.importorskip("pyvista")
     body = load_body("arm7")
     generator = torch.Generator().manual_seed(0)
-    figure = Figure(body, STIFF, generator=generator, spacing=0.015, without=("r_hand",))
-    assert body.part_names.index("r_hand") not in figure.part.tolist()
-
-
-def test_without_pyvista_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pyvista", None)
-    with pytest.raises(MissingExtraError, match=r'pip install "torchcss\[render\]"'):
-        Figure(load_body("arm7"), generator=torch.Generator())
+    character = Character(body, STIFF, generator=generator, spacing=0.015, without=("r_hand",))
+    assert body.part_names.index("r_hand") not in character.part.tolist()

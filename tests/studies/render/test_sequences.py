@@ -103,7 +103,7 @@ def test_occlusion_is_what_rays_say(two_spheres: tuple[MeshTruth, Tensor, Tensor
     assert 0.02 < float(hidden.double().mean()) < 0.5
     # They may differ where the covering outline passes within half a pixel.
     assert float(wrong.double().mean()) < 0.003
-    # Elsewhere hidden is what the figures cover next.
+    # Elsewhere hidden is what the characters cover next.
     background = labels.part < 0
     assert torch.equal(occluded[background], truth.labels(after).part[background] >= 0)
     assert float(flow.abs().max()) > 1
@@ -184,7 +184,7 @@ def test_an_unknown_sequence_is_refused() -> None:
         shot("leg")
 
 
-# With pyvista.
+# Whole pictures.
 
 
 def few(name: str) -> Shot:
@@ -196,13 +196,11 @@ def few(name: str) -> Shot:
 
 @pytest.fixture(scope="module", params=["arm", "body-dark"])
 def rendered(request: pytest.FixtureRequest) -> tuple[Shot, list[SequenceFrame]]:
-    pytest.importorskip("pyvista")
     chosen = few(request.param)
     return chosen, list(chosen.frames())
 
 
 def test_frames_are_the_same_for_the_same_seed() -> None:
-    pytest.importorskip("pyvista")
     chosen = few("body-dark")
     first, again = (next(chosen.frames()) for _ in range(2))
     assert torch.equal(again.image, first.image)
@@ -249,12 +247,11 @@ def test_the_picture_moves_as_the_flow_says(rendered: tuple[Shot, list[SequenceF
 
 def test_the_person_is_not_the_trackers_model() -> None:
     """Lengths differ by some per cent, and so does the surface, within reason."""
-    pytest.importorskip("pyvista")
     chosen = few("body-clutter")
     ratio = torch.tensor([chosen.body.lengths[name] / LENGTHS[name] for name in LENGTHS])
     assert 0.01 < float((ratio - 1).abs().mean()) < 0.1
-    (figure,), _ = chosen.figures()
-    skin = figure.pose(chosen.states[0])
+    (character,), _ = chosen.characters()
+    skin = character.pose(chosen.states[0])
     body = load_body(chosen.body.name, lengths=chosen.body.lengths).with_base(
         chosen.body.base_rotation, chosen.body.base_translation
     )
@@ -269,7 +266,6 @@ def test_the_person_is_not_the_trackers_model() -> None:
 
 
 def test_a_users_motion_is_filmed() -> None:
-    pytest.importorskip("pyvista")
     body = load_body("arm7")
     states = body.rest.repeat(2, 1)
     states[1, body.state_index("r_elbow_flexion")] += 0.1

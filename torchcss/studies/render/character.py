@@ -1,7 +1,7 @@
-"""A dressed figure for rendered sequences: one skin over a body's parts, which deforms like cloth.
+"""A dressed character for rendered sequences: a skin over a body's parts, like cloth.
 
 The tracker's body is a set of superquadrics; what it is shown must be something else, or it would
-only be asked to find itself. A `Figure` covers a body's parts with one closed mesh that
+only be asked to find itself. A `Character` covers a body's parts with one closed mesh that
 
 * is the smooth union of the parts (of other girths, drawn at random), made once in a spread pose,
   as the surface `-k log sum_i exp(-d_i / k) = 0` over the distances `d_i` to the parts, k = 8 mm;
@@ -13,7 +13,7 @@ only be asked to find itself. A `Figure` covers a body's parts with one closed m
 All of it is a function of the state alone: the same vertices in every frame, so that a point of the
 surface can be carried from frame to frame exactly. Colours belong to vertices too.
 
-By default: `Figure(body, outfit, generator=...)`, then `figure.pose(state)`.
+By default: `Character(body, clothing, generator=...)`, then `character.pose(state)`.
 """
 
 from __future__ import annotations
@@ -21,9 +21,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -31,7 +30,7 @@ from torch.nn import functional
 
 from torchcss.body.model import BodyModel
 from torchcss.body.surface import straighten
-from torchcss.errors import MissingExtraError
+from torchcss.studies.render.renderer import Colour
 from torchcss.vision.rasterise import vertex_normals
 
 _BLEND = 0.008
@@ -81,12 +80,10 @@ _THUMB_TILT = 0.55
 _INFLUENCES = 4
 """Parts that may share a vertex."""
 
-Colour = tuple[float, float, float]
-
 
 @dataclass(frozen=True, kw_only=True)
-class Outfit:
-    """What a figure wears and how much it differs from its body.
+class Clothing:
+    """What a character wears and how much it differs from its body.
 
     Attributes:
         sleeve: End of the sleeves, in limbs from the shoulder: 1 is the elbow, 2 the wrist.
@@ -125,7 +122,7 @@ class Outfit:
 
 
 class Skin(NamedTuple):
-    """A posed figure, world frame, metres.
+    """A posed character, world frame, metres.
 
     Attributes:
         vertices: Corner positions.
@@ -136,36 +133,34 @@ class Skin(NamedTuple):
     normals: Float[Tensor, "v 3"]
 
 
-class Figure:
+class Character:
     """A body covered with a skin.
 
     Args:
-        body: The body, on its base. One state of it poses the figure.
-        outfit: Clothes and deformations.
+        body: The body, on its base. One state of it poses the character.
+        clothing: Clothes and deformations.
         generator: Source of girths, displacements and textures.
         spacing: Edge of the mesh's cells, metres.
-        without: Parts that are left bare, such as the arm of somebody whose arm another figure is.
+        without: Parts that are left bare, such as an arm that is another character.
 
     Attributes:
         faces: Corner indices of the triangles.
         part: Which part of the body every triangle belongs to.
         colour: Display colour of every vertex, 0 to 1.
 
-    Raises:
-        MissingExtraError: If pyvista, which makes the mesh, is not installed.
     """
 
     def __init__(
         self,
         body: BodyModel,
-        outfit: Outfit | None = None,
+        clothing: Clothing | None = None,
         *,
         generator: torch.Generator,
         spacing: float = 0.009,
         without: Sequence[str] = (),
     ) -> None:
-        self.body, self.outfit = body, outfit or Outfit()
-        self.shape = _other_girths(body, self.outfit.girth, generator)
+        self.body, self.clothing = body, clothing or Clothing()
+        self.shape = _other_girths(body, self.clothing.girth, generator)
         kept = [i for i, name in enumerate(body.part_names) if name not in without]
         bind_rotation, bind_centre = body.part_poses(body.pose(_spread_state(body)))
         blobs = [(self.shape[kept], bind_rotation[kept], bind_centre[kept])]
@@ -196,10 +191,10 @@ class Figure:
         self, local: Tensor, nearest: Tensor, vertices: Tensor, generator: torch.Generator
     ) -> None:
         """Fix colours, looseness and the random fields of all vertices."""
-        outfit, body = self.outfit, self.body
+        clothing, body = self.clothing, self.body
         along = _along_limb(body, self.shape, local, nearest)
         colour, cloth = _colours(
-            body, outfit, self.shape, local, nearest, along, vertices, generator
+            body, clothing, self.shape, local, nearest, along, vertices, generator
         )
         # Borders of patterns and clothes run through the middle of triangles.
         self.colour: Float[Tensor, "v 3"] = _smooth(colour, self.faces, 1)
@@ -210,7 +205,7 @@ class Figure:
         )
         loose = torch.where(cloth, 1.0, 1 / 3) * torch.where(still[nearest], 0.3, 1.0)
         loose = _smooth(loose[:, None].to(vertices), self.faces, 2)[:, 0]
-        self._amplitude = outfit.looseness * radius * loose
+        self._amplitude = clothing.looseness * radius * loose
         # Cloth stands off the body a little.
         self._offset = 0.03 * radius * _smooth(cloth[:, None].to(vertices), self.faces, 1)[:, 0]
         waves = 10
@@ -222,8 +217,8 @@ class Figure:
         self._phase = vertices @ (2 * math.pi / wavelength[:, None] * direction).T + phase
         # Folds run across the limb, and are not quite regular.
         self._fold = 2 * math.pi * local[:, 2] / 0.035 + 1.5 * self._phase[:, -1].sin()
-        self._crease = outfit.creases * loose
-        self._muscle = outfit.muscle * _muscle(body, self.shape, local, nearest)
+        self._crease = clothing.creases * loose
+        self._muscle = clothing.muscle * _muscle(body, self.shape, local, nearest)
 
     @property
     def num_vertices(self) -> int:
@@ -354,7 +349,6 @@ def _smooth_union(
     spacing: float,
 ) -> tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]:
     """Mesh of the smooth union of posed parts; its triangles run anticlockwise from outside."""
-    pyvista = load_pyvista()
     margin = 6 * _BLEND
     # A part's box in the world, with room for its taper and for the blend.
     reach = shape[:, :3] * (
@@ -383,18 +377,43 @@ def _smooth_union(
         )
         total[box] += near.reshape(grid.shape[:3])
     field = -_BLEND * (total + math.exp(-12)).log()
-    image = pyvista.ImageData(
-        dimensions=size, spacing=(spacing,) * 3, origin=(origin * spacing).tolist()
-    )
-    image.point_data["field"] = field.numpy().ravel(order="F")
-    surface = image.contour([0.0], scalars="field", method="flying_edges", compute_normals=False)
-    vertices = torch.from_numpy(np.asarray(surface.points, dtype=np.float64))
-    faces = torch.from_numpy(np.asarray(surface.regular_faces, dtype=np.int64))
-    a, b, c = vertices[faces].unbind(1)
-    if float((a * torch.linalg.cross(b, c)).sum()) < 0:
-        faces = faces.flip(-1)
+    vertices, faces = _level_set(field)
+    vertices = (vertices + origin) * spacing
     # Slivers, whose normals mean nothing, become ordinary triangles.
     return _smooth(vertices, faces, 2), faces
+
+
+def _level_set(
+    field: Float[Tensor, "x y z"],
+) -> tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]:
+    """Mesh of where a field is 0, in cells: surface nets (Gibson 1998).
+
+    Every cell with a change of sign has one vertex, in the middle of the crossings on its edges;
+    every edge with a change of sign has one quadrilateral, between the four cells around it.
+    The field is positive on the border; triangles run anticlockwise where it grows.
+    """
+    strides = field.new_tensor(field.stride()).long()
+    total, count = field.new_zeros(field.numel(), 3), field.new_zeros(field.numel())
+    quads = []
+    for axis in range(3):
+        size = field.shape[axis] - 1
+        near, far = field.narrow(axis, 0, size), field.narrow(axis, 1, size)
+        node = ((near < 0) != (far < 0)).nonzero()
+        a, b = near[tuple(node.T)], far[tuple(node.T)]
+        crossing = node.to(field)
+        crossing[:, axis] += a / (a - b)
+        u, v = strides[(axis + 1) % 3], strides[(axis + 2) % 3]
+        here = node @ strides
+        cells = torch.stack([here - u - v, here - v, here, here - u], 1)
+        for cell in cells.T:
+            total.index_add_(0, cell, crossing)
+            count.index_add_(0, cell, torch.ones_like(a))
+        quads.append(torch.where((a < 0)[:, None], cells, cells.flip(-1)))
+    quad = torch.cat(quads)
+    used = count > 0
+    number = used.cumsum(0) - 1
+    faces = torch.cat([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]])
+    return total[used] / count[used, None], number[faces]
 
 
 def _shares(body: BodyModel, distance: Tensor, faces: Tensor) -> Float[Tensor, "v parts"]:
@@ -452,7 +471,7 @@ def _muscle(body: BodyModel, shape: Tensor, local: Tensor, nearest: Tensor) -> F
 
 def _colours(
     body: BodyModel,
-    outfit: Outfit,
+    clothing: Clothing,
     shape: Tensor,
     local: Tensor,
     nearest: Tensor,
@@ -465,28 +484,30 @@ def _colours(
     def where(*endings: str) -> Tensor:
         return torch.tensor([name.endswith(endings) for name in body.part_names])[nearest]
 
-    shirt = where("chest", "clavicle") | (where("upper_arm", "forearm") & (along < outfit.sleeve))
-    shirt |= where("pelvis") & (along > outfit.hem)
+    shirt = where("chest", "clavicle") | (where("upper_arm", "forearm") & (along < clothing.sleeve))
+    shirt |= where("pelvis") & (along > clothing.hem)
     shirt |= where("neck") & (along < -0.35)
-    trousers = (where("pelvis") & ~shirt) | (where("thigh", "shank") & (along < outfit.trouser_leg))
+    trousers = (where("pelvis") & ~shirt) | (
+        where("thigh", "shank") & (along < clothing.trouser_leg)
+    )
     shoes = where("foot") | (where("shank") & (along > 2.1))
-    colour = vertices.new_tensor(outfit.skin).expand(len(vertices), 3).clone()
+    colour = vertices.new_tensor(clothing.skin).expand(len(vertices), 3).clone()
     x, _, z = local.unbind(-1)
-    if outfit.pattern == "plaid":
+    if clothing.pattern == "plaid":
         # Bands along and around the part, which the eye takes for threads.
         bands = [(t / 0.055).remainder(1.0) for t in (x, z)]
         mix = 0.5 * sum(((b < 0.38).to(x) for b in bands), torch.zeros_like(x))
         mix = mix + 0.5 * sum((((b > 0.62) & (b < 0.70)).to(x) for b in bands), torch.zeros_like(x))
-    elif outfit.pattern == "stripes":
+    elif clothing.pattern == "stripes":
         mix = ((z / 0.06).remainder(1.0) < 0.4).to(x)
     else:
         mix = torch.zeros_like(x)
-    base, accent = vertices.new_tensor(outfit.shirt), vertices.new_tensor(outfit.accent)
+    base, accent = vertices.new_tensor(clothing.shirt), vertices.new_tensor(clothing.accent)
     mix = mix.clamp(0, 1)[:, None]
     cloth_colour = base * (1 - mix) + accent * mix
     colour = torch.where(shirt[:, None], cloth_colour, colour)
-    colour = torch.where(trousers[:, None], vertices.new_tensor(outfit.trousers), colour)
-    colour = torch.where(shoes[:, None], vertices.new_tensor(outfit.shoes), colour)
+    colour = torch.where(trousers[:, None], vertices.new_tensor(clothing.trousers), colour)
+    colour = torch.where(shoes[:, None], vertices.new_tensor(clothing.shoes), colour)
     cloth = shirt | trousers
     waves = 12
     direction = functional.normalize(
@@ -495,14 +516,19 @@ def _colours(
     wavelength = 0.02 * (0.15 / 0.02) ** torch.linspace(0, 1, waves, dtype=x.dtype)
     phase = 2 * math.pi * torch.rand(waves, generator=generator, dtype=x.dtype)
     weave = (vertices @ (2 * math.pi / wavelength[:, None] * direction).T + phase).sin().mean(-1)
-    strength = torch.where(cloth, outfit.texture, 0.3 * outfit.texture)
+    strength = torch.where(cloth, clothing.texture, 0.3 * clothing.texture)
     colour = colour * (1 + strength * math.sqrt(2 * waves) * weave)[:, None]
-    colour = _head(body, outfit, shape, local, nearest, colour)
+    colour = _head(body, clothing, shape, local, nearest, colour)
     return colour.clamp(0, 1), cloth
 
 
 def _head(
-    body: BodyModel, outfit: Outfit, shape: Tensor, local: Tensor, nearest: Tensor, colour: Tensor
+    body: BodyModel,
+    clothing: Clothing,
+    shape: Tensor,
+    local: Tensor,
+    nearest: Tensor,
+    colour: Tensor,
 ) -> Tensor:
     """Hair, eyes and mouth."""
     if "head" not in body.part_names:
@@ -512,13 +538,13 @@ def _head(
     x, y, z = (local / shape[index, :3]).unbind(-1)
     on_head = nearest == index
     hair = (z > 0.5 + 0.1 * (6 * x).sin()) | ((y > -0.15) & (z > -0.5 + 0.3 * (y < 0.2)))
-    colour = torch.where((on_head & hair)[:, None], colour.new_tensor(outfit.hair), colour)
+    colour = torch.where((on_head & hair)[:, None], colour.new_tensor(clothing.hair), colour)
     front = on_head & (y < 0)
     for side in (-1, 1):
         eye = ((x - 0.42 * side) / 0.17) ** 2 + ((z - 0.12) / 0.06) ** 2 < 1
         brow = ((x - 0.42 * side) / 0.24) ** 2 + ((z - 0.29) / 0.05) ** 2 < 1
         colour = torch.where((front & eye)[:, None], colour.new_tensor((0.12, 0.1, 0.1)), colour)
-        colour = torch.where((front & brow)[:, None], colour.new_tensor(outfit.hair), colour)
+        colour = torch.where((front & brow)[:, None], colour.new_tensor(clothing.hair), colour)
     mouth = (x / 0.3) ** 2 + ((z + 0.45) / 0.05) ** 2 < 1
     return torch.where((front & mouth)[:, None], colour.new_tensor((0.62, 0.30, 0.28)), colour)
 
@@ -549,19 +575,3 @@ def _times(p: Float[Tensor, "*b 4"], q: Float[Tensor, "*b 4"]) -> Float[Tensor, 
     scalar = p[..., :1] * q[..., :1] - (p[..., 1:] * q[..., 1:]).sum(-1, keepdim=True)
     vector = p[..., :1] * q[..., 1:] + q[..., :1] * p[..., 1:]
     return torch.cat([scalar, vector + torch.linalg.cross(p[..., 1:], q[..., 1:])], -1)
-
-
-def load_pyvista() -> Any:
-    """Import pyvista.
-
-    Raises:
-        MissingExtraError: If it is not installed.
-    """
-    try:
-        import pyvista
-    except ImportError as error:
-        raise MissingExtraError(
-            "rendered sequences need pyvista, which is not installed: "
-            'pip install "torchcss[render]"'
-        ) from error
-    return pyvista

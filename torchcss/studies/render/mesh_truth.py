@@ -1,6 +1,6 @@
 """Exact truth of moving meshes in a picture: labels, flow, occlusion, visible joints.
 
-Pixel centres are rasterised (`torchcss.studies.render.software`): every pixel that sees a mesh
+Pixel centres are rasterised (`torchcss.vision.rasterise`): every pixel that sees a mesh
 knows the triangle and the point in it. The flow of the pixel is that of this point, carried to the
 next frame by its triangle. There the point is hidden if its triangle looks away, if it leaves the
 image, or if a surface lies before it; what lies there is looked up among the four nearest of the

@@ -1,427 +1,443 @@
-"""Pictures of a figure in a room, by pyvista (VTK) off screen.
+"""The renderer: triangle meshes in, pictures and exact labels out, on plain torch.
 
-A `Stage` holds a room, its lights and one or more meshes that change from frame to frame, seen by a
-`torchcss.vision.camera.Camera`. The rooms are those of `torchcss.studies.render.scene`.
+It knows neither bodies nor cameras: it takes meshes, and a function that projects points. What is
+seen is found by `torchcss.vision.rasterise`. Light is ambient, plus a lamp with a soft cone (hence
+uneven) that gives Lambert's diffuse term and Blinn's highlight `(n . h)^shininess`, h halfway
+between the directions to the lamp and to the eye; it is evaluated per sample, on interpolated
+normals.
 
-The room does not move and is drawn once. In every frame the figures are drawn over it, and the
-first lamp's light is taken away where they stand in it: on the room's surfaces and on the figures
-themselves, by the lamp's own picture of them (a shadow map).
+By default call `render_meshes`: it draws meshes before a background with antialiased silhouettes
+and returns the picture with mask, part and depth at the pixel centres. `random_texture` makes a
+cloth, `add_sensor_noise` the grain of a sensor. Scenes: `torchcss.studies.render.scene`.
 
-The picture is drawn at twice the size and averaged, so that edges are smooth and a pixel is what a
-sensor's would be. VTK's window is laid so that pixel centres are at integers, as in the camera: the
-silhouette agrees with `torchcss.vision.rasterise.rasterise` to a fraction of a pixel, which a test
-measures. Masks, flow and occlusion therefore come from the rasteriser
-(`torchcss.studies.render.sequences`), not from here.
-
-pyvista is the extra `render`; it is imported where it is used.
+Axis letters here, besides those of `torchcss.types`: `v` vertices, `f` triangles, `h w` image rows
+and columns, `i` listed samples or points. Images are uint8 RGB, `[h w 3]`; pixel centres are at
+integers; colours given as numbers are display values from 0 to 1.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import NamedTuple, Protocol
 
-import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from torchcss.errors import CameraError, ConfigurationError
-from torchcss.studies.render.character import Colour, load_pyvista
-from torchcss.studies.render.scene import Place, Room, RoomFrame, clutter_room, dark_room
-from torchcss.vision.camera import Camera
-from torchcss.vision.rasterise import join_faces, rasterise
+from torchcss.errors import ConfigurationError, check_shape
+from torchcss.vision.rasterise import interpolate, join_faces, rasterise
 
-_SUPERSAMPLE = 2
-_NEAR, _FAR = 0.05, 30.0
-"""Metres from the camera between which things are drawn."""
+_GAMMA = 2.2
+"""Exponent between display values and light."""
 
-_SHADOW_MAP = 512
-"""Pixels of a lamp's picture of the figures."""
+Projection = Callable[
+    [Float[Tensor, "v 3"]],
+    tuple[Float[Tensor, "v 2"], Float[Tensor, " v"], Bool[Tensor, " v"]],
+]
+"""World points to pixel `uv`, depth along the optical axis (metres), and whether to use them."""
 
-_SHADOW_BIAS = 0.025
-"""Metres that a point must lie behind what the lamp sees to be in its shadow."""
+Colour = tuple[float, float, float]
+"""Red, green and blue, 0 to 1."""
 
-_OWN_SHADOW = 0.6
-"""Share of its lightness that a figure loses in its own shadow."""
+Texture = Callable[[Float[Tensor, "i 3"]], Float[Tensor, "i 1"]]
+"""Part coordinates (metres) to a factor on the colour."""
+
+
+class Mesh(NamedTuple):
+    """A triangle mesh to be drawn, world frame, metres.
+
+    Attributes:
+        vertices_world: Corner positions.
+        normals_world: Outward normals; any length.
+        faces: Corner indices of the triangles.
+        colour: Display colour 0 to 1, one for the mesh or one per vertex.
+        points_part: Vertices in the part's own frame, where `texture` is evaluated.
+        texture: Factor on the colour as a function of `points_part`; plain when absent.
+    """
+
+    vertices_world: Float[Tensor, "v 3"]
+    normals_world: Float[Tensor, "v 3"]
+    faces: Int[Tensor, "f 3"]
+    colour: Float[Tensor, "*v 3"]
+    points_part: Float[Tensor, "v 3"] | None = None
+    texture: Texture | None = None
+
+
+class RenderedFrame(NamedTuple):
+    """A picture with its ground truth.
+
+    Attributes:
+        image: RGB picture, silhouettes antialiased.
+        mask: True where the pixel centre sees a mesh.
+        part: Which mesh of the sequence it sees, -1 for the background.
+        depth: Depth of what it sees, `inf` for the background.
+    """
+
+    image: UInt8[Tensor, "h w 3"]
+    mask: Bool[Tensor, "h w"]
+    part: Int[Tensor, "h w"]
+    depth: Float[Tensor, "h w"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lamp:
-    """A spotlight, placed in the room's frame about the figure.
+class Lighting:
+    """A lamp with a soft cone, and ambient light that comes mostly from above.
 
     Attributes:
-        place: Where it stands: right, up, towards the camera, metres from the figure's middle.
-        target: What it points at, the same way.
-        strength: Brightness on its axis.
-        cone: Half angle of its cone, degrees.
-        softness: Exponent of its fading from the axis to the edge of the cone.
-        colour: Its colour.
+        lamp_world: Position of the lamp, metres, world frame (Y up).
+        target_world: Where the middle of its cone points.
+        cone: Angle from the axis, radians, at which the lamp has faded to 1/e; it is what makes
+            the light uneven.
+        lamp: Strength of the lamp at the target; there is no falloff with distance.
+        ambient: Strength of the light from everywhere.
+        upward: Share of the ambient light that depends on how far up a surface looks, 0 to 1.
+        specular: Strength of the highlight; near 0 for cloth.
+        shininess: Exponent of the highlight.
+        colour: Colour of the lamp.
     """
 
-    place: tuple[float, float, float]
-    target: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    strength: float = 0.8
-    cone: float = 40.0
-    softness: float = 8.0
-    colour: Colour = (1.0, 0.97, 0.92)
+    lamp_world: tuple[float, float, float] = (-1.5, 2.5, 2.5)
+    target_world: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    cone: float = 0.6
+    lamp: float = 0.9
+    ambient: float = 0.25
+    upward: float = 0.5
+    specular: float = 0.12
+    shininess: float = 20.0
+    colour: Colour = (1.0, 1.0, 1.0)
+
+    def shade(
+        self,
+        points: Float[Tensor, "i 3"],
+        normals: Float[Tensor, "i 3"],
+        albedo: Float[Tensor, "i 3"],
+        eye: Float[Tensor, "3"],
+    ) -> Float[Tensor, "i 3"]:
+        """Light that surface points send to the eye.
+
+        Args:
+            points: Surface points, metres.
+            normals: Outward normals of any length.
+            albedo: Share of the light that is sent back, 0 to 1 (light, not display values).
+            eye: Where the camera is, metres.
+
+        Returns:
+            Light, not clipped; 1 is white.
+        """
+        lamp = points.new_tensor(self.lamp_world)
+        axis = functional.normalize(points.new_tensor(self.target_world) - lamp, dim=-1)
+        normal = functional.normalize(normals, dim=-1)
+        to_lamp = functional.normalize(lamp - points, dim=-1)
+        to_eye = functional.normalize(eye.to(points) - points, dim=-1)
+        halfway = functional.normalize(to_lamp + to_eye, dim=-1)
+
+        # 2 (1 - cos) is the squared angle near the axis and never needs an inverse cosine.
+        spread = 2 * (1 + (to_lamp * axis).sum(-1, keepdim=True))
+        beam = self.lamp * torch.exp(-spread / self.cone**2) * points.new_tensor(self.colour)
+        facing = (normal * to_lamp).sum(-1, keepdim=True).clamp_min(0)
+        highlight = (normal * halfway).sum(-1, keepdim=True).clamp_min(0) ** self.shininess
+        ambient = self.ambient * (1 + self.upward * normal[:, 1:2])
+        # The highlight vanishes with the facing term, or it would glow beyond the shadow line.
+        return albedo * (ambient + beam * facing) + beam * self.specular * highlight * facing
 
 
-@dataclass(frozen=True, kw_only=True)
-class Style:
-    """How a sequence looks.
+class Light(Protocol):
+    """What lights surfaces: a `Lighting`, or the lamps of a scene with their shadows."""
+
+    def shade(
+        self,
+        points: Float[Tensor, "i 3"],
+        normals: Float[Tensor, "i 3"],
+        albedo: Float[Tensor, "i 3"],
+        eye: Float[Tensor, "3"],
+    ) -> Float[Tensor, "i 3"]:
+        """Light that surface points send to the eye; see `Lighting.shade`."""
+        ...
+
+
+class SineTexture(NamedTuple):
+    """A sum of sine waves through space, the weave and the creases of a cloth.
 
     Attributes:
-        room: "clutter" or "dark".
-        lamps: Spotlights; the first ones cast shadows.
-        shadows: Whether lamps cast shadows.
-        fill: Strength of the light from the camera's side, without shadows.
-        ambient: Light that is everywhere.
-        specular: Strength of the highlights on the figure.
-        shininess: Their exponent.
-        pillars: Places of bright pillars, as shares of the picture's width.
-        pillar_width: Their diameter, metres.
-        wall: Distance from the farthest point of the motion to the wall, metres.
-        read_noise: Standard deviation of the sensor's noise in the dark, grey levels.
-        shot_noise: Its variance per grey level.
+        wave_vectors: Direction and angular frequency of every wave, radians per metre.
+        phases: Phase of every wave, radians.
+        amplitudes: Amplitude of every wave; they are summed, so keep the total below 1.
     """
 
-    room: str = "clutter"
-    lamps: tuple[Lamp, ...] = (
-        Lamp(place=(-1.6, 1.9, 2.4), target=(0.1, -0.1, 0.0), strength=1.0, cone=40.0),
-        Lamp(place=(2.4, 1.2, 1.0), target=(0.3, 0.0, -1.0), strength=0.5, cone=45.0),
-    )
-    shadows: bool = True
-    fill: float = 0.28
-    ambient: float = 0.2
-    specular: float = 0.22
-    shininess: float = 18.0
-    pillars: tuple[float, ...] = (0.68,)
-    pillar_width: float = 0.14
-    wall: float = 0.7
-    read_noise: float = 1.5
-    shot_noise: float = 0.02
+    wave_vectors: Float[Tensor, "m 3"]
+    phases: Float[Tensor, " m"]
+    amplitudes: Float[Tensor, " m"]
 
-    def __post_init__(self) -> None:
-        if self.room not in ("clutter", "dark"):
-            raise ConfigurationError(
-                f'Style.room: expected "clutter" or "dark", got {self.room!r}; rooms are drawn in '
-                "torchcss/studies/render/renderer.py"
-            )
+    def __call__(self, points_part: Float[Tensor, "i 3"]) -> Float[Tensor, "i 1"]:
+        """Return the factor on the colour at points of the part, around 1."""
+        angle = points_part @ self.wave_vectors.to(points_part).T + self.phases.to(points_part)
+        return (1 + angle.sin() @ self.amplitudes.to(points_part)[:, None]).clamp_min(0.1)
 
 
-class Stage:
-    """A room with figures, ready to be photographed again and again.
+def random_texture(
+    *,
+    generator: torch.Generator,
+    contrast: float = 0.25,
+    shortest: float = 0.02,
+    longest: float = 0.15,
+    num_waves: int = 7,
+) -> SineTexture:
+    """Draw a cloth texture with detail at every scale that a tracker of a limb can see.
 
     Args:
-        camera: Who looks; without distortion.
-        place: Where the figures are.
-        style: Room and light.
-        generator: Source of the room.
+        generator: Source of randomness.
+        contrast: Standard deviation of the factor on the colour.
+        shortest: Shortest wavelength, metres.
+        longest: Longest wavelength, metres; wavelengths are spread evenly in logarithm.
+        num_waves: Number of waves.
 
     Raises:
-        CameraError: If the camera has a distortion, which a projective renderer cannot draw.
-        MissingExtraError: If pyvista is not installed.
+        ConfigurationError: If the wavelengths are not positive and ordered, or there are no waves.
     """
-
-    def __init__(
-        self, camera: Camera, place: Place, style: Style, *, generator: torch.Generator
-    ) -> None:
-        pyvista = load_pyvista()
-        if bool((camera.distortion != 0).any()):
-            raise CameraError(
-                f"{camera.name}: pictures can be rendered without distortion only; give a camera "
-                "with zero coefficients"
-            )
-        self._pyvista, self._style = pyvista, style
-        self._frame = RoomFrame.of(camera, place)
-        self._plotter = self._make_plotter(camera)
-        wall = -place.behind - style.wall
-        if style.room == "clutter":
-            room = clutter_room(
-                camera, self._frame, wall=wall, pillars=style.pillars,
-                pillar_width=style.pillar_width, generator=generator,
-            )  # fmt: skip
-        else:
-            room = dark_room(wall=wall, generator=generator)
-        self._furnish(room)
-        lights = self._add_lights(place, shadows=style.shadows)
-        self._room = self._screenshot()[..., :3]
-        self._shadow: _Shadow | None = None
-        if style.shadows and lights:
-            points, seen = self._seen_points(camera)
-            lights[0].intensity = 0.0
-            key = (self._room - self._screenshot()[..., :3]).clamp(min=0)
-            lamp = style.lamps[0]
-            self._shadow = _Shadow(
-                self._frame.about(place.middle, lamp.place),
-                self._frame.about(place.middle, lamp.target),
-                lamp.cone,
-                points,
-                key * seen[..., None],
-            )
-        self._plotter.close()
-        # The room stays as it is; only the figures are drawn again and again.
-        self._plotter = self._make_plotter(camera)
-        self._add_lights(place, shadows=False)
-        self._meshes: list[Any] = []
-        self._colours: list[Tensor] = []
-        self._faces: list[Tensor] = []
-
-    def _make_plotter(self, camera: Camera) -> Any:
-        width, height = camera.image_size_wh
-        # Without a display VTK tries X11 first and says so on the console; it then finds EGL.
-        with self._pyvista.vtk_verbosity("off"):
-            plotter = self._pyvista.Plotter(
-                off_screen=True,
-                window_size=(_SUPERSAMPLE * width, _SUPERSAMPLE * height),
-                lighting="none",
-            )
-        plotter.set_background("black")
-        # The averaging smooths the edges already, and would otherwise be paid for eight times.
-        plotter.render_window.SetMultiSamples(0)
-        _set_camera(plotter.camera, camera)
-        return plotter
-
-    def _screenshot(self) -> Float[Tensor, "h w 4"]:
-        """Red, green, blue and coverage at the large size, 0 to 255."""
-        self._plotter.camera.clipping_range = (_NEAR, _FAR)
-        self._plotter.render()
-        large = self._plotter.screenshot(transparent_background=True, return_img=True)
-        return torch.from_numpy(np.array(large)).float()
-
-    def add(self, faces: Tensor, colour: Float[Tensor, "v 3"]) -> int:
-        """Add a mesh whose corners will move; returns its number.
-
-        Args:
-            faces: Corner indices of the triangles.
-            colour: Display colour of every vertex, 0 to 1.
-        """
-        nowhere = torch.zeros_like(colour)
-        mesh = self._new_mesh(nowhere, nowhere, faces, colour)
-        self._draw(mesh, scalars="colour", rgb=True, specular=self._style.specular,
-                   specular_power=self._style.shininess)  # fmt: skip
-        self._meshes.append(mesh)
-        self._colours.append(colour)
-        self._faces.append(faces)
-        return len(self._meshes) - 1
-
-    def move(
-        self, mesh: int, vertices: Float[Tensor, "v 3"], normals: Float[Tensor, "v 3"]
-    ) -> None:
-        """Move the corners of a mesh.
-
-        Args:
-            mesh: The number that `add` gave.
-            vertices: World frame, metres.
-            normals: Outward, unit.
-        """
-        target = self._meshes[mesh]
-        target.points = vertices.float().cpu().numpy()
-        target.point_data["Normals"] = normals.float().cpu().numpy()
-        target.Modified()
-
-    def picture(self) -> UInt8[Tensor, "h w 3"]:
-        """Take a picture, without sensor noise."""
-        room = self._room
-        if self._shadow is not None and self._meshes:
-            room = self._cast(self._shadow)
-        drawn = self._screenshot()
-        covered = drawn[..., 3:] / 255
-        large = drawn[..., :3] * covered + room * (1 - covered)
-        pooled = functional.avg_pool2d(large.permute(2, 0, 1)[None], _SUPERSAMPLE)
-        return pooled[0].permute(1, 2, 0).round().to(torch.uint8)
-
-    def _cast(self, shadow: _Shadow) -> Tensor:
-        """Darken the figures where they shade themselves; return the room with their shadow."""
-        corners = [torch.from_numpy(mesh.points) for mesh in self._meshes]
-        faces, _ = join_faces(self._faces, [len(points) for points in corners])
-        depth = shadow.map(torch.cat(corners), faces)
-        for mesh, points, colour in zip(self._meshes, corners, self._colours, strict=True):
-            lit = 1 - _OWN_SHADOW * shadow.of_points(points, depth)[:, None]
-            mesh.point_data["colour"] = _to_bytes(colour * lit)
-        return self._room - shadow.of_room(depth)
-
-    def _seen_points(self, camera: Camera) -> tuple[Float[Tensor, "h w 3"], Tensor]:
-        """What the room's pixels show, in the world, and which of them show anything."""
-        depth = torch.from_numpy(-np.array(self._plotter.get_image_depth())).double()
-        seen = depth.isfinite()
-        rows, columns = depth.shape
-        v, u = torch.meshgrid(
-            torch.arange(rows).double(), torch.arange(columns).double(), indexing="ij"
+    if not 0 < shortest <= longest or num_waves < 1:
+        raise ConfigurationError(
+            "random_texture: expected 0 < shortest <= longest and num_waves >= 1, got "
+            f"{shortest}, {longest} and {num_waves}; wavelengths are in metres"
         )
-        u, v = ((x + 0.5) / _SUPERSAMPLE - 0.5 for x in (u, v))
-        K = camera.K
-        ray = torch.stack(
-            [(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], torch.ones_like(u)], -1
-        )
-        local = ray * torch.where(seen, depth, 1.0)[..., None] - camera.t_camera_world
-        return local @ camera.R_camera_world, seen.float()
-
-    def close(self) -> None:
-        """Free the window."""
-        self._plotter.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    # Lights and scenery.
-
-    def _draw(self, mesh: Any, **options: Any) -> None:
-        options = {
-            "smooth_shading": False,
-            "ambient": self._style.ambient,
-            "diffuse": 1.0,
-        } | options
-        actor = self._plotter.add_mesh(mesh, show_scalar_bar=False, reset_camera=False, **options)
-        actor.prop.interpolation = "phong"
-
-    def _add_lights(self, place: Place, *, shadows: bool) -> list[Any]:
-        """Add the lamps and the fill; returns the lamps."""
-        lights = []
-        for lamp in self._style.lamps:
-            light = self._pyvista.Light(
-                position=self._frame.about(place.middle, lamp.place),
-                focal_point=self._frame.about(place.middle, lamp.target),
-                color=lamp.colour,
-                intensity=lamp.strength,
-                light_type="scene light",
-                positional=True,
-                cone_angle=lamp.cone,
-                exponent=lamp.softness,
-            )
-            self._plotter.add_light(light)
-            lights.append(light)
-        if shadows:
-            self._plotter.enable_shadows()
-        if self._style.fill > 0:
-            self._plotter.add_light(
-                self._pyvista.Light(
-                    position=self._frame.about(place.middle, (0.4, 0.5, 3.0)),
-                    focal_point=place.middle.tolist(),
-                    intensity=self._style.fill,
-                    light_type="scene light",
-                    positional=False,
-                )
-            )
-        return lights
-
-    def _furnish(self, room: Room) -> None:
-        mesh = room.scenery.mesh(self._frame)
-        drawn = self._new_mesh(mesh.vertices, mesh.normals, mesh.faces, mesh.colour)
-        self._draw(drawn, scalars="colour", rgb=True, specular=0.08)
-        for rods, more in ((room.rods, {}), (room.pillars, {"ambient": 0.4})):
-            for rod in rods:
-                a, b = self._frame.points([rod.start, rod.end]).tolist()
-                axis = np.subtract(b, a)
-                cylinder = self._pyvista.Cylinder(
-                    center=np.add(a, b) / 2,
-                    direction=axis,
-                    radius=rod.radius,
-                    height=float(np.linalg.norm(axis)),
-                    resolution=40,
-                )
-                cylinder = cylinder.triangulate().compute_normals(
-                    split_vertices=True, feature_angle=40.0
-                )
-                self._draw(cylinder, color=rod.colour, specular=0.25, specular_power=25.0, **more)
-
-    def _new_mesh(self, vertices: Tensor, normals: Tensor, faces: Tensor, colour: Tensor) -> Any:
-        mesh = self._pyvista.PolyData.from_regular_faces(
-            vertices.float().cpu().numpy(), faces.cpu().numpy()
-        )
-        mesh.point_data["Normals"] = normals.float().cpu().numpy()
-        mesh.point_data.active_normals_name = "Normals"
-        mesh.point_data["colour"] = _to_bytes(colour)
-        return mesh
+    device = generator.device
+    direction = functional.normalize(
+        torch.randn(num_waves, 3, generator=generator, device=device), dim=-1
+    )
+    share = torch.linspace(0, 1, num_waves, device=device)
+    wavelength = shortest * (longest / shortest) ** share
+    phases = 2 * torch.pi * torch.rand(num_waves, generator=generator, device=device)
+    # A sine of amplitude a has the variance a^2 / 2.
+    amplitude = contrast * (2 / num_waves) ** 0.5
+    return SineTexture(
+        wave_vectors=direction * (2 * torch.pi / wavelength)[:, None],
+        phases=phases,
+        amplitudes=torch.full_like(phases, amplitude),
+    )
 
 
-class _Shadow:
-    """The shadow of meshes in the light of one lamp.
+def render_meshes(
+    meshes: Sequence[Mesh],
+    project: Projection,
+    height: int,
+    width: int,
+    *,
+    background: UInt8[Tensor, "h w 3"],
+    eye_world: Float[Tensor, "3"],
+    lighting: Light | None = None,
+    supersample: int = 2,
+) -> RenderedFrame:
+    """Draw meshes before a background.
 
-    All of the room is taken to be behind the figures as seen from the lamp, which is how the rooms
-    are laid out; only a figure asks how deep it is.
+    The picture is rendered at `supersample` times the resolution and averaged; mask, part and
+    depth are those at the pixel centres, found separately, so that they are exact.
 
     Args:
-        place: Where the lamp is, world frame.
-        target: What it points at.
-        cone: Half angle of its cone, degrees.
-        points: What every pixel of the room's picture shows.
-        light: What the lamp adds to it.
+        meshes: What to draw.
+        project: The camera.
+        height: Rows of the picture.
+        width: Columns of the picture.
+        background: What is behind the meshes.
+        eye_world: Where the camera is, for the highlights, metres.
+        lighting: The light on the meshes; the default lamp when absent.
+        supersample: Samples per pixel and axis.
+
+    Raises:
+        ShapeError: If a mesh or the background has the wrong shape.
+        ConfigurationError: If `supersample` is less than 1.
+    """
+    check_shape("background", background, height, width, 3)
+    if supersample < 1:
+        raise ConfigurationError(f"supersample: expected at least 1, got {supersample}; 2 is usual")
+    if not meshes:
+        nothing = torch.full((height, width), -1, device=background.device)
+        far = torch.full_like(nothing, torch.inf, dtype=torch.float32)
+        return RenderedFrame(background.clone(), nothing >= 0, nothing, far)
+    joined = _join(meshes)
+    uv, depth, valid = project(joined.vertices)
+    labels = rasterise(uv, depth, joined.faces, height, width, valid=valid)
+    mask = labels.face >= 0
+    part = torch.where(mask, joined.owner[labels.face.clamp_min(0)], labels.face)
+    seen = visible_surface(meshes, project, height, width, supersample=supersample)
+    light = (lighting or Lighting()).shade(seen.points, seen.normals, seen.albedo, eye_world)
+    shown = torch.cat((to_display(light), torch.ones_like(light[:, :1])), -1)
+    pooled = pool(shown, seen.pixel, height, width, supersample)
+    mixed = pooled[..., :3] * 255 + (1 - pooled[..., 3:]) * background.to(pooled)
+    return RenderedFrame(image=to_bytes(mixed), mask=mask, part=part, depth=labels.depth)
+
+
+class VisibleSurface(NamedTuple):
+    """What the samples of a picture see of meshes.
+
+    Attributes:
+        pixel: Samples that see one, counted along the rows.
+        points: What they see, world frame, metres.
+        normals: Its outward normals, of about unit length.
+        albedo: Share of the light that it sends back.
     """
 
-    def __init__(
-        self,
-        place: Sequence[float],
-        target: Sequence[float],
-        cone: float,
-        points: Float[Tensor, "h w 3"],
-        light: Float[Tensor, "h w 3"],
-    ) -> None:
-        forward = torch.as_tensor(target, dtype=torch.float64) - torch.as_tensor(place)
-        forward = functional.normalize(forward, dim=-1)
-        side = forward.new_tensor([0.0, 1.0, 0.0] if abs(float(forward[1])) < 0.9 else [1.0, 0, 0])
-        right = functional.normalize(torch.linalg.cross(forward, side), dim=-1)
-        rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
-        focal = 0.5 * _SHADOW_MAP / math.tan(math.radians(min(cone, 70.0)))
-        middle = 0.5 * (_SHADOW_MAP - 1)
-        self.camera = Camera(
-            [[focal, 0, middle], [0, focal, middle], [0, 0, 1]],
-            (_SHADOW_MAP, _SHADOW_MAP),
-            R_camera_world=rotation,
-            t_camera_world=-rotation @ torch.as_tensor(place, dtype=torch.float64),
+    pixel: Int[Tensor, " i"]
+    points: Float[Tensor, "i 3"]
+    normals: Float[Tensor, "i 3"]
+    albedo: Float[Tensor, "i 3"]
+
+
+def visible_surface(
+    meshes: Sequence[Mesh], project: Projection, height: int, width: int, *, supersample: int = 2
+) -> VisibleSurface:
+    """What every sample of a picture sees.
+
+    Args:
+        meshes: What is there.
+        project: The camera.
+        height: Rows of the picture.
+        width: Columns of the picture.
+        supersample: Samples per pixel and axis.
+    """
+    joined = _join(meshes)
+    uv, depth, valid = project(joined.vertices)
+    fine = rasterise(
+        (uv + 0.5) * supersample - 0.5,
+        depth,
+        joined.faces,
+        height * supersample,
+        width * supersample,
+        valid=valid,
+    )
+    pixel = torch.nonzero(fine.face.view(-1) >= 0)[:, 0]
+    face, weights = fine.face.view(-1)[pixel], fine.barycentric.view(-1, 3)[pixel]
+    values = (joined.vertices, joined.normals, joined.colours**_GAMMA, joined.points_part)
+    at_pixel = interpolate(torch.cat(values, -1), joined.faces, face, weights)
+    points, normals, albedo, local = at_pixel.split(3, -1)
+    factor = torch.ones_like(albedo[:, :1])
+    for index, mesh in enumerate(meshes):
+        if mesh.texture is not None:
+            here = torch.nonzero(joined.owner[face] == index)[:, 0]
+            factor[here] = mesh.texture(local[here]).to(factor)
+    return VisibleSurface(pixel, points, normals, (albedo * factor).clamp(0, 1))
+
+
+def pool(
+    values: Float[Tensor, "i c"],
+    pixel: Int[Tensor, " i"],
+    height: int,
+    width: int,
+    supersample: int,
+) -> Float[Tensor, "h w c"]:
+    """Put the values of samples in a picture, 0 elsewhere, and average over its pixels."""
+    channels = values.shape[-1]
+    canvas = values.new_zeros(height * width * supersample**2, channels)
+    canvas[pixel] = values
+    canvas = canvas.view(1, height * supersample, width * supersample, channels)
+    return functional.avg_pool2d(canvas.permute(0, 3, 1, 2), supersample)[0].permute(1, 2, 0)
+
+
+def to_display(light: Float[Tensor, "i 3"]) -> Float[Tensor, "i 3"]:
+    """Display values of light, 0 to 1."""
+    return light.clamp(0, 1) ** (1 / _GAMMA)
+
+
+class _Joined(NamedTuple):
+    """Meshes as one: arrays over all vertices, triangles, and whose they are."""
+
+    vertices: Float[Tensor, "v 3"]
+    normals: Float[Tensor, "v 3"]
+    colours: Float[Tensor, "v 3"]
+    points_part: Float[Tensor, "v 3"]
+    faces: Int[Tensor, "f 3"]
+    owner: Int[Tensor, " f"]
+
+
+def _join(meshes: Sequence[Mesh]) -> _Joined:
+    sizes = [mesh.vertices_world.shape[0] for mesh in meshes]
+    for index, (mesh, size) in enumerate(zip(meshes, sizes, strict=True)):
+        check_shape(f"vertices_world of mesh {index}", mesh.vertices_world, size, 3)
+        check_shape(f"normals_world of mesh {index}", mesh.normals_world, size, 3)
+        check_shape(f"colour of mesh {index}", mesh.colour, 3)
+    vertices = torch.cat([mesh.vertices_world for mesh in meshes])
+    return _Joined(
+        vertices,
+        torch.cat([mesh.normals_world for mesh in meshes]),
+        torch.cat([m.colour.to(vertices).expand(n, 3) for m, n in zip(meshes, sizes, strict=True)]),
+        torch.cat([m.vertices_world if m.points_part is None else m.points_part for m in meshes]),
+        *join_faces([mesh.faces for mesh in meshes], sizes),
+    )
+
+
+def capsule(
+    radius: float, half_length: float, *, rings: int = 24, meridians: int = 24
+) -> tuple[Float[Tensor, "rings meridians 3"], Float[Tensor, "rings meridians 3"]]:
+    """Nodes and unit normals of a cylinder with round ends, along z about the origin.
+
+    Args:
+        radius: Metres.
+        half_length: Half the length of the cylinder, metres.
+        rings: Latitudes, an even number: half of them on either end.
+        meridians: Longitudes.
+    """
+    # The poles themselves are left out, as in the meshes of the parts.
+    latitude = (torch.arange(rings, dtype=torch.float64) + 0.5) / rings * math.pi - math.pi / 2
+    longitude = torch.arange(meridians, dtype=torch.float64) * (2 * math.pi / meridians)
+    up, around = torch.meshgrid(latitude, longitude, indexing="ij")
+    normals = torch.stack([up.cos() * around.cos(), up.cos() * around.sin(), up.sin()], -1)
+    points = radius * normals
+    points[..., 2] += half_length * up.sign()
+    return points, normals
+
+
+def value_noise(
+    height: int, width: int, *, cell: float, octaves: int = 3, generator: torch.Generator
+) -> Float[Tensor, "h w"]:
+    """Smooth noise with standard deviation about 1: random grids, interpolated and summed.
+
+    Args:
+        height: Rows.
+        width: Columns.
+        cell: Size of the coarsest cell, pixels.
+        octaves: Number of grids; each has half the cell and half the amplitude of the one before.
+        generator: Source of randomness.
+    """
+    total = torch.zeros(height, width, device=generator.device)
+    for octave in range(octaves):
+        size = max(cell / 2**octave, 1.0)
+        grid = torch.randn(
+            1, 1, int(height / size) + 2, int(width / size) + 2,
+            generator=generator, device=generator.device,
+        )  # fmt: skip
+        smooth = functional.interpolate(grid, (height, width), mode="bicubic", align_corners=True)
+        total += smooth[0, 0] * 0.5**octave
+    return total
+
+
+def to_bytes(image: Float[Tensor, "h w 3"]) -> UInt8[Tensor, "h w 3"]:
+    """Round grey levels from 0 to 255."""
+    return image.round().clamp(0, 255).to(torch.uint8)
+
+
+def add_sensor_noise(
+    image: UInt8[Tensor, "h w 3"],
+    *,
+    generator: torch.Generator,
+    read: float = 1.5,
+    shot: float = 0.02,
+) -> UInt8[Tensor, "h w 3"]:
+    """Add the noise of a sensor: Gaussian, with the variance `read^2 + shot * grey level`.
+
+    Args:
+        image: The clean picture.
+        generator: Source of randomness, on the picture's device.
+        read: Standard deviation in the dark, grey levels.
+        shot: Variance per grey level of signal.
+
+    Raises:
+        ConfigurationError: If a strength is negative.
+    """
+    if read < 0 or shot < 0:
+        raise ConfigurationError(
+            f"sensor noise: expected read >= 0 and shot >= 0, got {read} and {shot}"
         )
-        uv, _, valid = self.camera.project(points)
-        place_in_map = torch.where(valid[..., None], uv / middle - 1, 9.0)
-        self.room, self.light = place_in_map.float(), light
-
-    def map(self, points: Float[Tensor, "v 3"], faces: Tensor) -> Float[Tensor, "s s"]:
-        """Depth of meshes as the lamp sees them."""
-        uv, depth, valid = self.camera.project(points.double())
-        return rasterise(uv, depth, faces, _SHADOW_MAP, _SHADOW_MAP, valid=valid).depth
-
-    def of_room(self, depth: Float[Tensor, "s s"]) -> Float[Tensor, "h w 3"]:
-        """Light that the room loses; a lamp is no point, so that the edge is soft."""
-        covered = depth.isfinite().float()[None, None]
-        soft = functional.avg_pool2d(covered, 5, stride=1, padding=2)
-        share = functional.grid_sample(soft, self.room[None], align_corners=True)[0, 0]
-        return share[..., None] * self.light
-
-    def of_points(
-        self, points: Float[Tensor, "v 3"], depth: Float[Tensor, "s s"]
-    ) -> Float[Tensor, " v"]:
-        """Share of the lamp that is hidden from points of the meshes themselves."""
-        uv, own, _ = self.camera.project(points.double())
-        column, row = uv.round().long().clamp(2, _SHADOW_MAP - 3).unbind(-1)
-        hidden = [
-            own > depth[row + dv, column + du] + _SHADOW_BIAS
-            for du in (-2, -1, 0, 1, 2)
-            for dv in (-2, -1, 0, 1, 2)
-        ]
-        return torch.stack(hidden).float().mean(0)
-
-
-def _to_bytes(colour: Float[Tensor, "*v 3"]) -> np.ndarray:
-    return (255 * colour).round().clamp(0, 255).to(torch.uint8).cpu().numpy()
-
-
-def _set_camera(view: Any, camera: Camera) -> None:
-    """Give VTK's camera the place, the focal lengths and the pixel grid of ours."""
-    width, height = camera.image_size_wh
-    (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
-    centre, rotation = camera.centre_world, camera.R_camera_world
-    view.position = centre.tolist()
-    view.focal_point = (centre + rotation[2]).tolist()
-    view.up = (-rotation[1]).tolist()
-    view.view_angle = math.degrees(2 * math.atan(0.5 * height / fy))
-    # Pixel 0 reaches from -0.5 to 0.5, so that the window's middle is at (size - 1) / 2.
-    view.SetWindowCenter(-2 * (cx + 0.5) / width + 1, 2 * (cy + 0.5) / height - 1)
-    view.SetUseExplicitAspectRatio(True)
-    view.SetExplicitAspectRatio(width * fy / (height * fx))
-    view.clipping_range = (_NEAR, _FAR)
+    clean = image.float()
+    noise = torch.randn(clean.shape, generator=generator, device=clean.device)
+    return to_bytes(clean + noise * (read**2 + shot * clean).sqrt())

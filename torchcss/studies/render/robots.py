@@ -1,9 +1,9 @@
 """Robots with exact truth: arms of a URDF filmed as they move, and a quadruped's trot.
 
-`robot_arm` loads an arm and gives its links flesh of one girth, as arms have it (the URDFs of
+`robot_arm` loads an arm and gives its links shapes of one girth, as arms have it (the URDFs of
 robots name meshes, which need not be there). `robot_sequence` moves it smoothly within its joint
-limits and renders it before clutter with the package's own renderer: capsules on the links, a
-little thinner or thicker than the tracker's parts, so that the figure is not the tracker's model.
+limits and renders it before clutter: capsules on the links, a little thinner or thicker than the
+tracker's parts, so that what is filmed is not the tracker's model.
 `trot` moves a quadruped on a free root, two diagonal legs at a time.
 
 Robots are Z up; the world is Y up. An arm stands on the base that its loader gives it.
@@ -21,14 +21,13 @@ from torch import Tensor
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.errors import BodyError
-from torchcss.studies.render.sequences import SyntheticSequence, look_at
-from torchcss.studies.render.software import (
-    Lighting,
-    Mesh,
-    add_sensor_noise,
-    clutter_background,
-    random_texture,
-    render_meshes,
+from torchcss.studies.render.clutter import clutter_background
+from torchcss.studies.render.renderer import Lighting, capsule, random_texture
+from torchcss.studies.render.sequences import (
+    PaintedPart,
+    SyntheticSequence,
+    film_parts,
+    look_at,
 )
 from torchcss.vision.rasterise import grid_faces
 
@@ -160,57 +159,19 @@ def robot_sequence(
         capsule(float(shape[0]) * float(factor), float(shape[2] - shape[0]))
         for shape, factor in zip(body.part_shape, thickness, strict=True)
     ]
-    faces = grid_faces(*capsules[0][0].shape[:2])
-
-    def project(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        return tuple(camera.project(points))  # type: ignore[return-value]
-
-    frames = []
-    for state in states:
-        rotation, place = body.part_poses(body.pose(state))
-        meshes = []
-        for part, (local, normals) in enumerate(capsules):
-            turn = rotation[part].T
-            flat = local.flatten(0, 1)
-            meshes.append(
-                Mesh(
-                    flat @ turn + place[part],
-                    normals.flatten(0, 1) @ turn,
-                    faces,
-                    torch.tensor(_COLOURS[part % len(_COLOURS)], dtype=torch.float64),
-                    points_part=flat,
-                    texture=textures[part],
-                )
-            )
-        picture = render_meshes(
-            meshes, project, height, width,
-            background=background, eye_world=camera.centre_world, lighting=lighting,
-        ).image  # fmt: skip
-        frames.append(add_sensor_noise(picture, generator=generator).numpy())
+    painted = [
+        PaintedPart(
+            points.flatten(0, 1), normals.flatten(0, 1), _COLOURS[part % len(_COLOURS)], texture
+        )
+        for part, ((points, normals), texture) in enumerate(zip(capsules, textures, strict=True))
+    ]
+    frames = film_parts(
+        body, states, painted, grid_faces(*capsules[0][0].shape[:2]), camera=camera,
+        background=background, lighting=lighting, generator=generator,
+    )  # fmt: skip
     return SyntheticSequence(
         frames=frames, frame_rate=frame_rate, camera=camera, body=body, states=states
     )
-
-
-def capsule(
-    radius: float, half_length: float, *, rings: int = 24, meridians: int = 24
-) -> tuple[Float[Tensor, "rings meridians 3"], Float[Tensor, "rings meridians 3"]]:
-    """Nodes and unit normals of a cylinder with round ends, along z about the origin.
-
-    Args:
-        radius: Metres.
-        half_length: Half the length of the cylinder, metres.
-        rings: Latitudes, an even number: half of them on either end.
-        meridians: Longitudes.
-    """
-    # The poles themselves are left out, as in the meshes of the parts.
-    latitude = (torch.arange(rings, dtype=torch.float64) + 0.5) / rings * math.pi - math.pi / 2
-    longitude = torch.arange(meridians, dtype=torch.float64) * (2 * math.pi / meridians)
-    up, around = torch.meshgrid(latitude, longitude, indexing="ij")
-    normals = torch.stack([up.cos() * around.cos(), up.cos() * around.sin(), up.sin()], -1)
-    points = radius * normals
-    points[..., 2] += half_length * up.sign()
-    return points, normals
 
 
 TROT_LEGS = (("LF", "RH"), ("RF", "LH"))

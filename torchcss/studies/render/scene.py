@@ -1,25 +1,45 @@
-"""Rooms to render a figure in: what stands where, and what is painted on it.
+"""Scenes to film characters in: what stands where, what is painted on it, light and shadows.
 
-Rooms are made around what the camera sees: `clutter_room` has a stained back wall and a floor of
+Scenes are made around what the camera sees: `clutter_scene` has a stained back wall and a floor of
 boards, and before the wall posters, shelves full of boxes, cartons, leaning rods and bright
 pillars, all drawn from a generator, so that an edge tracker finds parallel contours of every
-direction and width; `dark_room` is a dark curtain. A room is rectangles with pictures on them
-(`Scenery`) and `Rod`s, in a frame of its own (`RoomFrame`); nothing here knows the renderer.
+direction and width; `dark_scene` is a dark curtain. A scene is rectangles with pictures on them
+(`Scenery`) and `Rod`s, in a frame of its own (`SceneFrame`).
+
+By default: `SceneRenderer(camera, place, style, generator=...)`, then `picture(meshes)` for every
+frame. The scene does not move and is drawn once. The light of the first lamp is taken away where
+characters stand in it, from the scene and from the characters themselves, by the lamp's own picture
+of them (a shadow map).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from torchcss.studies.render.character import Colour
-from torchcss.studies.render.software import value_noise
+from torchcss.errors import CameraError, ConfigurationError
+from torchcss.studies.render.renderer import (
+    Colour,
+    Lighting,
+    Mesh,
+    capsule,
+    pool,
+    render_meshes,
+    to_bytes,
+    to_display,
+    value_noise,
+    visible_surface,
+)
 from torchcss.vision.camera import Camera
+from torchcss.vision.rasterise import grid_faces, join_faces, rasterise
 
 _TILE = 128
 """Pixels of the pictures that boxes and posters bear."""
@@ -32,7 +52,7 @@ _CEILING = 4.2
 
 
 class Place(NamedTuple):
-    """Where a figure is in a room.
+    """Where a character is in a scene.
 
     Attributes:
         middle: Middle of what moves, world frame, metres.
@@ -45,24 +65,8 @@ class Place(NamedTuple):
     behind: float
 
 
-class PaintedMesh(NamedTuple):
-    """Triangles with colours, world frame, metres.
-
-    Attributes:
-        vertices: Their corners.
-        normals: Unit outward normals at the corners.
-        faces: Indices of the corners of each triangle.
-        colour: RGB in 0..1 at the corners.
-    """
-
-    vertices: Float[Tensor, "v 3"]
-    normals: Float[Tensor, "v 3"]
-    faces: Int[Tensor, "f 3"]
-    colour: Float[Tensor, "v 3"]
-
-
 class Rod(NamedTuple):
-    """A cylinder, in the room's frame, metres.
+    """A cylinder, in the scene's frame, metres.
 
     Attributes:
         start: Middle of one end.
@@ -77,8 +81,8 @@ class Rod(NamedTuple):
     colour: Colour
 
 
-class Room(NamedTuple):
-    """All that stands in a room.
+class Scene(NamedTuple):
+    """All that stands in a scene.
 
     Attributes:
         scenery: Walls, floor, boxes.
@@ -91,22 +95,22 @@ class Room(NamedTuple):
     pillars: list[Rod]
 
 
-class RoomFrame(NamedTuple):
-    """The room's axes: right and towards the camera are level, as seen by the camera.
+class SceneFrame(NamedTuple):
+    """The scene's axes: right and towards the camera are level, as seen by the camera.
 
-    Its origin is on the floor under the figure's middle.
+    Its origin is on the floor under the character's middle.
     """
 
     origin: Tensor
     axes: Tensor  # rows: right, up, towards the camera
 
     @classmethod
-    def of(cls, camera: Camera, place: Place) -> RoomFrame:
-        """The axes of a room around a place.
+    def of(cls, camera: Camera, place: Place) -> SceneFrame:
+        """The axes of a scene around a place.
 
         Args:
             camera: Who looks.
-            place: Where the figures are.
+            place: Where the characters are.
         """
         back = -camera.R_camera_world[2]
         up = back.new_tensor([0.0, 1.0, 0.0])
@@ -118,15 +122,17 @@ class RoomFrame(NamedTuple):
         return cls(origin.to(up), torch.stack([right, up, back]))
 
     def points(self, places: Any) -> Float[Tensor, "p 3"]:
-        """Places in the room, in the world."""
+        """Places in the scene, in the world."""
         return torch.as_tensor(places).to(self.axes) @ self.axes + self.origin
 
-    def about(self, middle: Tensor, offset: Sequence[float]) -> list[float]:
-        """A place given from the figure's middle, in the world."""
-        return (middle.to(self.axes) + torch.as_tensor(offset).to(self.axes) @ self.axes).tolist()
+    def about(self, middle: Tensor, offset: Sequence[float]) -> tuple[float, float, float]:
+        """A place given from the characters' middle, in the world."""
+        place = middle.to(self.axes) + torch.as_tensor(offset).to(self.axes) @ self.axes
+        x, y, z = place.tolist()
+        return x, y, z
 
     def ray(self, camera: Camera, u: float, v: float) -> tuple[Tensor, Tensor]:
-        """Where the camera is in the room, and the direction of a pixel."""
+        """Where the camera is in the scene, and the direction of a pixel."""
         K = camera.K
         direction = torch.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], K[2, 2]])
         start = self.axes @ (camera.centre_world - self.origin)
@@ -169,9 +175,9 @@ class Draw:
 
 
 class Scenery:
-    """Rectangles with pictures on them, in the room's frame, as one mesh.
+    """Rectangles with pictures on them, in the scene's frame, as one mesh.
 
-    Pictures are colours of vertices and not textures: VTK's shadow maps take a texture for relief.
+    Pictures are colours of vertices.
     """
 
     def __init__(self, draw: Draw) -> None:
@@ -231,9 +237,9 @@ class Scenery:
         ):
             self.quad([(x + p, y + q, z + r) for p, q, r in side], picture, 0.006)
 
-    def mesh(self, frame: RoomFrame) -> PaintedMesh:
+    def mesh(self, frame: SceneFrame) -> Mesh:
         """All of it, in the world."""
-        return PaintedMesh(
+        return Mesh(
             frame.points(torch.cat(self.points)),
             torch.cat(self.normals) @ frame.axes,
             torch.cat(self.faces),
@@ -309,11 +315,11 @@ def _boards(generator: torch.Generator) -> Float[Tensor, "h w 3"]:
     )
 
 
-def dark_room(*, wall: float, generator: torch.Generator) -> Room:
+def dark_scene(*, wall: float, generator: torch.Generator) -> Scene:
     """A dark curtain and a dark floor.
 
     Args:
-        wall: Place of the wall, towards the camera from the room's origin, metres.
+        wall: Place of the wall, towards the camera from the scene's origin, metres.
         generator: Source of the folds and stains.
     """
     scenery = Scenery(Draw(generator))
@@ -321,24 +327,24 @@ def dark_room(*, wall: float, generator: torch.Generator) -> Room:
     scenery.wall(-5.0, 5.0, 5.0, wall, cloth[..., None] * _tone(0.95, 0.95, 1.15), cell=0.04)
     boards = 0.05 * (1 + 0.3 * value_noise(128, 128, cell=8, generator=generator))
     scenery.floor(wall, boards[..., None] * _tone(1.1, 1.0, 0.9), cell=0.08)
-    return Room(scenery, [], [])
+    return Scene(scenery, [], [])
 
 
-def clutter_room(
+def clutter_scene(
     camera: Camera,
-    frame: RoomFrame,
+    frame: SceneFrame,
     *,
     wall: float,
     pillars: Sequence[float],
     pillar_width: float,
     generator: torch.Generator,
-) -> Room:
-    """A cluttered room.
+) -> Scene:
+    """A cluttered scene.
 
     Args:
         camera: Who looks: things stand where it sees them.
-        frame: The room's axes.
-        wall: Place of the wall, towards the camera from the room's origin, metres.
+        frame: The scene's axes.
+        wall: Place of the wall, towards the camera from the scene's origin, metres.
         pillars: Places of pillars, as shares of the picture's width.
         pillar_width: Their diameter, metres.
         generator: Source of everything.
@@ -382,9 +388,254 @@ def clutter_room(
     for share in pillars:
         x = frame.sideways(camera, share * camera.image_size_wh[0], depth)
         ends = (x, 0.0, depth), (x, _CEILING, depth)
-        bright.append(Rod(*ends, pillar_width / 2, (0.86, 0.86, 0.84)))
-    return Room(scenery, rods, bright)
+        bright.append(Rod(*ends, pillar_width / 2, (0.97, 0.97, 0.95)))
+    return Scene(scenery, rods, bright)
 
 
 def _tone(red: float, green: float, blue: float) -> Tensor:
     return torch.tensor([red, green, blue])
+
+
+# Light, shadows, pictures.
+
+_SHADOW_MAP = 512
+"""Pixels of a lamp's picture of what stands in its light."""
+
+_SHADOW_BIAS = 0.025
+"""Metres that a point must lie behind what the lamp sees to be in its shadow."""
+
+_SUPERSAMPLE = 2
+
+
+def lamp(
+    place: tuple[float, float, float],
+    target: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    strength: float = 0.9,
+) -> Lighting:
+    """A warm spotlight, placed about the characters' middle."""
+    return Lighting(
+        lamp_world=place,
+        target_world=target,
+        lamp=strength,
+        cone=0.5,
+        ambient=0.0,
+        colour=(1.0, 0.97, 0.92),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Style:
+    """How a sequence looks.
+
+    Attributes:
+        scene: "clutter" or "dark".
+        lamps: Spotlights, placed about the characters' middle: right, up, towards the camera,
+            metres. The first one casts shadows. Their ambient light and highlights are not used.
+        shadows: Whether it does.
+        fill: Strength of the light from the camera's side, without shadows.
+        ambient: Light that is everywhere.
+        specular: Strength of the highlights on the characters.
+        shininess: Their exponent.
+        pillars: Places of bright pillars, as shares of the picture's width.
+        pillar_width: Their diameter, metres.
+        wall: Distance from the farthest point of the motion to the wall, metres.
+        read_noise: Standard deviation of the sensor's noise in the dark, grey levels.
+        shot_noise: Its variance per grey level.
+    """
+
+    scene: str = "clutter"
+    lamps: tuple[Lighting, ...] = (
+        lamp((-1.6, 1.9, 2.4), (0.1, -0.1, 0.0), 1.3),
+        lamp((2.4, 1.2, 1.0), (0.3, 0.0, -1.0), 0.4),
+    )
+    shadows: bool = True
+    fill: float = 0.15
+    ambient: float = 0.05
+    specular: float = 0.1
+    shininess: float = 18.0
+    pillars: tuple[float, ...] = (0.68,)
+    pillar_width: float = 0.14
+    wall: float = 0.7
+    read_noise: float = 1.5
+    shot_noise: float = 0.02
+
+    def __post_init__(self) -> None:
+        if self.scene not in ("clutter", "dark"):
+            raise ConfigurationError(
+                f'Style.scene: expected "clutter" or "dark", got {self.scene!r}; scenes are drawn '
+                "in torchcss/studies/render/scene.py"
+            )
+
+
+class SceneRenderer:
+    """A scene, ready to be photographed again and again with characters in it.
+
+    Args:
+        camera: Who looks.
+        place: Where the characters are.
+        style: Scene and light.
+        generator: Source of the scene.
+
+    Raises:
+        CameraError: If the camera has a distortion.
+    """
+
+    def __init__(
+        self, camera: Camera, place: Place, style: Style, *, generator: torch.Generator
+    ) -> None:
+        if bool((camera.distortion != 0).any()):
+            raise CameraError(
+                f"{camera.name}: pictures can be rendered without distortion only; give a camera "
+                "with zero coefficients"
+            )
+        self.camera = camera
+        frame, wall = SceneFrame.of(camera, place), -place.behind - style.wall
+        if style.scene == "clutter":
+            scene = clutter_scene(
+                camera, frame, wall=wall, pillars=style.pillars,
+                pillar_width=style.pillar_width, generator=generator,
+            )  # fmt: skip
+        else:
+            scene = dark_scene(wall=wall, generator=generator)
+        self._light = _SceneLight(style, frame, place)
+        meshes = [scene.scenery.mesh(frame)]
+        meshes += [_cylinder(rod, frame) for rod in (*scene.rods, *scene.pillars)]
+        width, height = camera.image_size_wh
+        seen = visible_surface(meshes, self._project, height, width, supersample=_SUPERSAMPLE)
+        still = self._light.among(meshes).matt()
+        first, others = still.parts(seen.points, seen.normals, seen.albedo, camera.centre_world)
+        self._seen, self._first, self._others = seen, first, others
+
+    def picture(self, meshes: Sequence[Mesh]) -> UInt8[Tensor, "h w 3"]:
+        """Take a picture, without sensor noise.
+
+        Args:
+            meshes: The characters.
+        """
+        width, height = self.camera.image_size_wh
+        light = self._light.among(meshes)
+        reached = 1 - light.covered(self._seen.points)
+        shown = to_display(self._others + reached[:, None] * self._first)
+        behind = to_bytes(255 * pool(shown, self._seen.pixel, height, width, _SUPERSAMPLE))
+        return render_meshes(
+            meshes, self._project, height, width, background=behind,
+            eye_world=self.camera.centre_world, lighting=light, supersample=_SUPERSAMPLE,
+        ).image  # fmt: skip
+
+    def _project(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        uv, depth, valid = self.camera.project(points)
+        return uv, depth, valid
+
+
+class _SceneLight:
+    """The lamps of a scene; meshes that stand in the light of the first one cast shadows."""
+
+    def __init__(self, style: Style, frame: SceneFrame, place: Place) -> None:
+        def put(lamp: Lighting) -> Lighting:
+            return replace(
+                lamp,
+                lamp_world=frame.about(place.middle, lamp.lamp_world),
+                target_world=frame.about(place.middle, lamp.target_world),
+                specular=style.specular,
+                shininess=style.shininess,
+            )
+
+        # From far away and in all directions alike.
+        fill = Lighting(
+            lamp_world=(4.0, 5.0, 30.0),
+            lamp=style.fill,
+            cone=100.0,
+            ambient=style.ambient,
+            upward=0.0,
+        )
+        self.lamps = [put(lamp) for lamp in style.lamps]
+        self.fill = put(fill)
+        self.shadows = style.shadows and bool(self.lamps)
+        if self.shadows:
+            self._map = _lamp_camera(self.lamps[0])
+        self.depth: Tensor | None = None
+
+    def among(self, meshes: Sequence[Mesh]) -> _SceneLight:
+        """The same light when meshes stand in it."""
+        other = copy(self)
+        if self.shadows and meshes:
+            corners = [mesh.vertices_world for mesh in meshes]
+            faces, _ = join_faces([mesh.faces for mesh in meshes], [len(c) for c in corners])
+            uv, depth, valid = self._map.project(torch.cat(corners).double())
+            other.depth = rasterise(
+                uv, depth, faces, _SHADOW_MAP, _SHADOW_MAP, valid=valid
+            ).depth.double()
+        return other
+
+    def matt(self) -> _SceneLight:
+        """The same light on surfaces without highlights."""
+        other = copy(self)
+        other.lamps = [replace(lamp, specular=0.0) for lamp in self.lamps]
+        other.fill = replace(self.fill, specular=0.0)
+        return other
+
+    def covered(self, points: Float[Tensor, "i 3"]) -> Float[Tensor, " i"]:
+        """Share of the first lamp that meshes hide from points; a lamp is no point: soft edges."""
+        if self.depth is None:
+            return torch.zeros_like(points[:, 0])
+        uv, own, valid = self._map.project(points.double())
+        inside = valid & (uv > 2).all(-1) & (uv < _SHADOW_MAP - 3).all(-1)
+        column, row = torch.where(inside[:, None], uv, 2.0).round().long().unbind(-1)
+        near = range(-2, 3)
+        hidden = sum(
+            (own > self.depth[row + dv, column + du] + _SHADOW_BIAS).to(points)
+            for du in near
+            for dv in near
+        )
+        return torch.where(inside, hidden / len(near) ** 2, 0.0)
+
+    def parts(
+        self, points: Tensor, normals: Tensor, albedo: Tensor, eye: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Light of the first lamp where it reaches, and of all others."""
+        light = [
+            lamp.shade(points, normals, albedo, eye).to(points) for lamp in [*self.lamps, self.fill]
+        ]
+        if not self.shadows:
+            return torch.zeros_like(light[0]), torch.stack(light).sum(0)
+        first = (1 - self.covered(points))[:, None] * light[0]
+        return first, torch.stack(light[1:]).sum(0)
+
+    def shade(self, points: Tensor, normals: Tensor, albedo: Tensor, eye: Tensor) -> Tensor:
+        """Light that surface points send to the eye; see `Light`."""
+        first, others = self.parts(points, normals, albedo, eye)
+        return first + others
+
+
+def _lamp_camera(lamp: Lighting) -> Camera:
+    """A camera that sees what a lamp lights."""
+    start = torch.tensor(lamp.lamp_world, dtype=torch.float64)
+    forward = functional.normalize(torch.tensor(lamp.target_world).to(start) - start, dim=-1)
+    side = forward.new_tensor([0.0, 1.0, 0.0] if abs(float(forward[1])) < 0.9 else [1.0, 0, 0])
+    right = functional.normalize(torch.linalg.cross(forward, side), dim=-1)
+    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    middle = 0.5 * (_SHADOW_MAP - 1)
+    focal = 0.5 * _SHADOW_MAP / math.tan(min(1.5 * lamp.cone, 1.2))
+    return Camera(
+        [[focal, 0, middle], [0, focal, middle], [0, 0, 1]],
+        (_SHADOW_MAP, _SHADOW_MAP),
+        R_camera_world=rotation,
+        t_camera_world=-rotation @ start,
+    )
+
+
+def _cylinder(rod: Rod, frame: SceneFrame) -> Mesh:
+    """A rod with round ends, in the world."""
+    start, end = frame.points([rod.start, rod.end])
+    axis = functional.normalize(end - start, dim=-1)
+    points, normals = capsule(rod.radius, 0.5 * float((end - start).norm()), meridians=40)
+    side = functional.normalize(
+        torch.linalg.cross(axis, frame.axes[0] + 0.1 * frame.axes[2]), dim=-1
+    )
+    turn = torch.stack([side, torch.linalg.cross(axis, side), axis])
+    return Mesh(
+        points.flatten(0, 1) @ turn + 0.5 * (start + end),
+        normals.flatten(0, 1) @ turn,
+        grid_faces(*points.shape[:2]),
+        torch.tensor(rod.colour),
+    )

@@ -3,19 +3,19 @@
 `arm_sequence` moves the eight parameters of arm8 smoothly, bending and rotating with reaching
 motion towards the camera, before a cluttered, unevenly lit room with a bright pillar (the arm
 experiment of section 6 [IJRR] in small). The rendered surface is finer than the tracker's mesh and
-carries a cloth texture. Frames come from the package's own renderer, so nothing else is needed.
+carries a cloth texture.
 
-`render_sequence` renders any motion of any body as a dressed figure in a room
-(`torchcss.studies.render.character`, `torchcss.studies.render.renderer`; the extra `render`).
+`render_sequence` renders any motion of any body as a dressed character in a scene
+(`torchcss.studies.render.character`, `torchcss.studies.render.scene`).
 `shot("arm")`, `"body-clutter"` and `"body-dark"` are the three sequences of section 6 [IJRR];
 `shot_of_motion` films a motion of the user's.
 
 The truth is exact for the rendered surface. Pixel centres are rasterised
-(`torchcss.studies.render.software`), which gives mask and part. The flow of a pixel is that of the
+(`torchcss.vision.rasterise`), which gives mask and part. The flow of a pixel is that of the
 surface point that it sees, carried to the next frame by its triangle; the point is hidden there if
 its triangle looks away, if it leaves the image, or if another surface is nearer. Nothing but the
-figure moves, so elsewhere the flow is 0 and hidden is what the figure covers next; shadows, which
-move too, are no motion.
+character moves, so elsewhere the flow is 0 and hidden is what the character covers next; shadows
+are no motion.
 """
 
 from __future__ import annotations
@@ -35,19 +35,20 @@ from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.errors import ConfigurationError
 from torchcss.studies.random_person import random_lengths
-from torchcss.studies.render.character import Figure, Outfit, Skin
+from torchcss.studies.render.character import Character, Clothing, Skin
+from torchcss.studies.render.clutter import clutter_background
 from torchcss.studies.render.mesh_truth import MeshTruth, joints_own_parts
 from torchcss.studies.render.motions import MOTIONS, Motion, sample_times
-from torchcss.studies.render.renderer import Lamp, Stage, Style
-from torchcss.studies.render.scene import Place
-from torchcss.studies.render.software import (
+from torchcss.studies.render.renderer import (
+    Colour,
     Lighting,
     Mesh,
+    Texture,
     add_sensor_noise,
-    clutter_background,
     random_texture,
     render_meshes,
 )
+from torchcss.studies.render.scene import Place, SceneRenderer, Style, lamp
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import grid_faces, join_faces
 
@@ -106,6 +107,65 @@ def arm_motion(body: BodyModel, times: Float[Tensor, " t"]) -> Float[Tensor, "t 
     return body.bounds.project(states)
 
 
+class PaintedPart(NamedTuple):
+    """The surface of a part that is filmed, in the part's frame, metres."""
+
+    points: Float[Tensor, "v 3"]
+    normals: Float[Tensor, "v 3"]
+    colour: Colour
+    texture: Texture
+
+
+def film_parts(
+    body: BodyModel,
+    states: Float[Tensor, "t n"],
+    painted: Sequence[PaintedPart],
+    faces: Int[Tensor, "f 3"],
+    *,
+    camera: Camera,
+    background: UInt8[Tensor, "h w 3"],
+    lighting: Lighting,
+    generator: torch.Generator,
+) -> list[UInt8[np.ndarray, "h w 3"]]:
+    """Film a body's rigid parts before a background.
+
+    Args:
+        body: The body, on its base.
+        states: Its states.
+        painted: What every part looks like.
+        faces: Triangles of every part.
+        camera: Who looks.
+        background: What is behind.
+        lighting: The light on the parts.
+        generator: Source of the sensor's noise.
+    """
+
+    def project(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        uv, depth, valid = camera.project(points)
+        return uv, depth, valid
+
+    frames = []
+    for state in states:
+        rotation, centre = body.part_poses(body.pose(state))
+        meshes = [
+            Mesh(
+                part.points @ turn.T + place,
+                part.normals @ turn.T,
+                faces,
+                torch.tensor(part.colour, dtype=torch.float64),
+                points_part=part.points,
+                texture=part.texture,
+            )
+            for part, turn, place in zip(painted, rotation, centre, strict=True)
+        ]
+        picture = render_meshes(
+            meshes, project, *background.shape[:2],
+            background=background, eye_world=camera.centre_world, lighting=lighting,
+        ).image  # fmt: skip
+        frames.append(add_sensor_noise(picture, generator=generator).numpy())
+    return frames
+
+
 def arm_sequence(
     *, generator: torch.Generator, num_frames: int = 50, frame_rate: float = 25.0
 ) -> SyntheticSequence:
@@ -133,41 +193,26 @@ def arm_sequence(
     background = clutter_background(height, width, generator=generator)
     textures = [random_texture(generator=generator) for _ in body.part_names]
     fine = body.mesh(40, 48)
-    faces = grid_faces(40, 48)
+    painted = [
+        PaintedPart(
+            fine.points[part].flatten(0, 1),
+            fine.normals[part].flatten(0, 1),
+            _SLEEVE if name.endswith(("upper_arm", "clavicle")) else _SKIN,
+            textures[part],
+        )
+        for part, name in enumerate(body.part_names)
+    ]
     lighting = Lighting(lamp_world=(0.8, 1.6, 0.4), target_world=(0.1, 0.0, -1.7))
-
-    def project(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        return tuple(camera.project(points))  # type: ignore[return-value]
-
-    frames = []
-    for state in states:
-        rotation, centre = body.part_poses(body.pose(state))
-        meshes = []
-        for part, name in enumerate(body.part_names):
-            local, normals = fine.points[part].flatten(0, 1), fine.normals[part].flatten(0, 1)
-            colour = _SLEEVE if name.endswith(("upper_arm", "clavicle")) else _SKIN
-            turn = rotation[part].T
-            meshes.append(
-                Mesh(
-                    local @ turn + centre[part],
-                    normals @ turn,
-                    faces,
-                    torch.tensor(colour, dtype=torch.float64),
-                    points_part=local,
-                    texture=textures[part],
-                )
-            )
-        picture = render_meshes(
-            meshes, project, height, width,
-            background=background, eye_world=camera.centre_world, lighting=lighting,
-        ).image  # fmt: skip
-        frames.append(add_sensor_noise(picture, generator=generator).numpy())
+    frames = film_parts(
+        body, states, painted, grid_faces(40, 48), camera=camera, background=background,
+        lighting=lighting, generator=generator,
+    )  # fmt: skip
     return SyntheticSequence(
         frames=frames, frame_rate=frame_rate, camera=camera, body=body, states=states
     )
 
 
-# The papers' sequences, with a dressed figure in a room (the extra `render`).
+# The papers' sequences, with a dressed character in a scene.
 
 
 class SequenceFrame(NamedTuple):
@@ -175,9 +220,9 @@ class SequenceFrame(NamedTuple):
 
     Attributes:
         image: The picture, red, green, blue.
-        mask: Whether the first surface on the line of sight is the tracked figure.
+        mask: Whether the first surface on the line of sight is the tracked character.
         part: Which part of the body it is, -1 where it is none.
-        depth: Depth of the surface, metres; `inf` in the room.
+        depth: Depth of the surface, metres; `inf` in the scene.
         joints: Joint centres, world frame, metres.
         uv: Their projections, pixels.
         visible: Whether the first surface on the line of sight to a joint is its own limb.
@@ -208,13 +253,13 @@ class Shot:
         states: Its states.
         frame_rate: Frames per second.
         camera: Who looks.
-        style: Room and light.
-        outfit: Clothes and deformations.
+        style: Scene and light.
+        clothing: Clothes and deformations.
         floor: Height of the floor in the world, metres.
         seed: Seed of everything that is drawn.
         description: A line about it.
         bystander: For an arm: whether the still rest of the person stands beside it.
-        spacing: Cells of the figure's mesh, metres.
+        spacing: Cells of the character's mesh, metres.
     """
 
     name: str
@@ -223,7 +268,7 @@ class Shot:
     frame_rate: float
     camera: Camera
     style: Style = field(default_factory=Style)
-    outfit: Outfit = field(default_factory=Outfit)
+    clothing: Clothing = field(default_factory=Clothing)
     floor: float = 0.0
     seed: int = 0
     description: str = ""
@@ -239,19 +284,23 @@ class Shot:
 
     def frames(self) -> Iterator[SequenceFrame]:
         """Render; the same frames whenever it is called."""
-        figures, generator = self.figures()
+        characters, generator = self.characters()
         return render_sequence(
-            self.body, self.states, camera=self.camera, style=self.style, figures=figures,
+            self.body, self.states, camera=self.camera, style=self.style, characters=characters,
             floor=self.floor, generator=generator,
         )  # fmt: skip
 
-    def figures(self) -> tuple[list[Figure], torch.Generator]:
-        """The figure of the body and whoever stands beside it; the generator as they leave it."""
+    def characters(self) -> tuple[list[Character], torch.Generator]:
+        """The body's character, whoever stands beside it, and the generator as they leave it."""
         generator = torch.Generator().manual_seed(self.seed)
-        figures = [Figure(self.body, self.outfit, generator=generator, spacing=self.spacing)]
+        characters = [
+            Character(self.body, self.clothing, generator=generator, spacing=self.spacing)
+        ]
         if self.bystander:
-            figures.append(_rest_of_person(self.body, self.outfit, generator, 1.5 * self.spacing))
-        return figures, generator
+            characters.append(
+                _rest_of_person(self.body, self.clothing, generator, 1.5 * self.spacing)
+            )
+        return characters, generator
 
 
 def render_sequence(
@@ -261,8 +310,8 @@ def render_sequence(
     camera: Camera,
     generator: torch.Generator,
     style: Style | None = None,
-    outfit: Outfit | None = None,
-    figures: Sequence[Figure] | None = None,
+    clothing: Clothing | None = None,
+    characters: Sequence[Character] | None = None,
     floor: float | None = None,
 ) -> Iterator[SequenceFrame]:
     """Render any motion of any body, frame by frame.
@@ -271,55 +320,54 @@ def render_sequence(
         body: The body on its base; arms, people, or anything with parts.
         states: Its states.
         camera: Who looks, in the body's world (Y up); without distortion.
-        generator: Source of the figure, the room and the sensor's noise.
-        style: Room and light.
-        outfit: Clothes and deformations of the figure that is made where none is given.
-        figures: The figure of the body; further ones stand still, hide and are no truth.
+        generator: Source of the character, the scene and the sensor's noise.
+        style: Scene and light.
+        clothing: Clothes and deformations of the character that is made where none is given.
+        characters: The character of the body; further ones stand still, hide and are no truth.
         floor: Height of the floor; by default that of the lowest point of the first state.
 
     Raises:
-        MissingExtraError: If pyvista is not installed.
         CameraError: If the camera has a distortion.
     """
     style = style or Style()
-    figure, *others = figures or [Figure(body, outfit, generator=generator)]
+    character, *others = characters or [Character(body, clothing, generator=generator)]
     still = [other.pose(other.body.rest) for other in others]
     faces, owner = join_faces(
-        [figure.faces, *(other.faces for other in others)],
-        [figure.num_vertices, *(other.num_vertices for other in others)],
+        [character.faces, *(other.faces for other in others)],
+        [character.num_vertices, *(other.num_vertices for other in others)],
     )
     part = torch.full_like(owner, -1)
-    part[owner == 0] = figure.part
+    part[owner == 0] = character.part
     truth = MeshTruth(camera, faces, part, joints_own_parts(body))
     joints = body.pose(states).joints
     place = _place(joints, camera, floor)
-    with Stage(camera, place, style, generator=generator) as stage:
-        stage.add(figure.faces, figure.colour)
-        for other, skin in zip(others, still, strict=True):
-            stage.move(stage.add(other.faces, other.colour), *skin)
-        skins = (figure.pose(state) for state in states)
-        upcoming: Skin | None = next(skins, None)
-        labels = None
-        for index in range(len(states)):
-            skin, upcoming = upcoming, next(skins, None)
-            assert skin is not None
-            stage.move(0, *skin)
-            picture = add_sensor_noise(
-                stage.picture(), generator=generator, read=style.read_noise, shot=style.shot_noise
-            )
-            world = torch.cat([skin.vertices, *(s.vertices for s in still)])
-            labels = labels or truth.labels(world)
-            after, flow, occluded = None, None, None
-            if upcoming is not None:
-                world = torch.cat([upcoming.vertices, *(s.vertices for s in still)])
-                after = truth.labels(world)
-                flow, occluded = truth.flow(labels, after)
-            uv, visible, in_image = truth.joints(labels, joints[index])
-            yield SequenceFrame(
-                picture, labels.part >= 0, labels.part, labels.depth, joints[index], uv, visible,
-                in_image, flow, occluded,
-            )  # fmt: skip
-            labels = after
+    renderer = SceneRenderer(camera, place, style, generator=generator)
+    bystanders = [
+        Mesh(skin.vertices, skin.normals, other.faces, other.colour)
+        for other, skin in zip(others, still, strict=True)
+    ]
+    skins = (character.pose(state) for state in states)
+    upcoming: Skin | None = next(skins, None)
+    labels = None
+    for index in range(len(states)):
+        skin, upcoming = upcoming, next(skins, None)
+        assert skin is not None
+        mesh = Mesh(skin.vertices, skin.normals, character.faces, character.colour)
+        picture = add_sensor_noise(
+            renderer.picture([mesh, *bystanders]), generator=generator, read=style.read_noise,
+            shot=style.shot_noise,
+        )  # fmt: skip
+        labels = labels or truth.labels(torch.cat([skin.vertices, *(s.vertices for s in still)]))
+        after, flow, occluded = None, None, None
+        if upcoming is not None:
+            after = truth.labels(torch.cat([upcoming.vertices, *(s.vertices for s in still)]))
+            flow, occluded = truth.flow(labels, after)
+        uv, visible, in_image = truth.joints(labels, joints[index])
+        yield SequenceFrame(
+            picture, labels.part >= 0, labels.part, labels.depth, joints[index], uv, visible,
+            in_image, flow, occluded,
+        )  # fmt: skip
+        labels = after
 
 
 def look_at(
@@ -364,15 +412,17 @@ def _place(joints: Float[Tensor, "t j 3"], camera: Camera, floor: float | None) 
 
 
 def _rest_of_person(
-    arm: BodyModel, outfit: Outfit, generator: torch.Generator, spacing: float
-) -> Figure:
+    arm: BodyModel, clothing: Clothing, generator: torch.Generator, spacing: float
+) -> Character:
     """Somebody standing still whose right arm is the given one."""
     body = load_body("body34", lengths=arm.lengths)
     start = body.tree.link_index("r_sternoclavicular_link")
     place = body.pose(body.rest).tree.translation[start]
     base = arm.base_translation - arm.base_rotation @ place
     own = ("r_clavicle", "r_upper_arm", "r_forearm", "r_hand")
-    return Figure(body.with_base(arm.base_rotation, base), outfit, generator=generator, without=own)
+    return Character(
+        body.with_base(arm.base_rotation, base), clothing, generator=generator, without=own
+    )
 
 
 def _stand(body: BodyModel, state: Float[Tensor, " n"]) -> BodyModel:
@@ -384,16 +434,13 @@ def _stand(body: BodyModel, state: Float[Tensor, " n"]) -> BodyModel:
 
 
 CLUTTER = Style()
-"""The room of the papers' Figs. 9 and 10: clutter, uneven light, bright pillar."""
+"""The scene of the papers' Figs. 9 and 10: clutter, uneven light, bright pillar."""
 
 DARK = Style(
-    room="dark",
-    lamps=(
-        Lamp(place=(-1.4, 1.1, 2.8), strength=1.1, cone=40.0),
-        Lamp(place=(2.2, 1.0, 0.6), strength=0.45, cone=50.0),
-    ),
-    fill=0.2,
-    ambient=0.08,
+    scene="dark",
+    lamps=(lamp((-1.4, 1.1, 2.8), strength=1.0), lamp((2.2, 1.0, 0.6), strength=0.2)),
+    fill=0.05,
+    ambient=0.01,
 )
 """That of Fig. 11: black background."""
 
@@ -412,7 +459,7 @@ def shot(
 
     Args:
         name: "arm", "body-clutter" or "body-dark".
-        seed: Seed of the person, the room and the noise; the motion is always the same.
+        seed: Seed of the person, the scene and the noise; the motion is always the same.
         num_frames: Number of frames; all of the motion by default.
         frame_rate: Frames per second.
         small: A quarter of the picture's width and height, for tests.
@@ -431,19 +478,21 @@ def shot(
         body = body.with_base(torch.eye(3), torch.tensor([0.42, 1.40, 0.0]))
         states = poses.states(body, times)
         camera = look_at((0.0, 1.30, 1.85), (0.0, 1.30, 0.0), focal_px=640.0)
-        style, outfit, spacing = ARM_STYLE, ARM_OUTFIT, 0.006
+        style, clothing, spacing = ARM_STYLE, ARM_CLOTHING, 0.006
     else:
         states = poses.states(body, times)
         body = _stand(body, states[0])
         # Room above the head for arms that reach up.
         camera = look_at((0.3, 1.35, 3.7), (0.0, 1.0, 0.0), focal_px=720.0)
-        style, outfit = (DARK, DARK_OUTFIT) if name == "body-dark" else (CLUTTER, CLUTTER_OUTFIT)
+        style, clothing = (
+            (DARK, DARK_CLOTHING) if name == "body-dark" else (CLUTTER, CLUTTER_CLOTHING)
+        )
         spacing = 0.009
     if small:
         camera, spacing = camera.resized(160, 120), 2 * spacing
     return Shot(
         name=name, body=body, states=states, frame_rate=frame_rate, camera=camera, style=style,
-        outfit=outfit, seed=seed, description=description, bystander=is_arm, spacing=spacing,
+        clothing=clothing, seed=seed, description=description, bystander=is_arm, spacing=spacing,
     )  # fmt: skip
 
 
@@ -451,13 +500,13 @@ ARM_STYLE = Style(
     pillars=(0.385,),
     pillar_width=0.10,
     wall=0.5,
-    specular=0.35,
+    specular=0.15,
     lamps=(
-        Lamp(place=(-1.2, 1.3, 1.6), target=(-0.1, 0.0, 0.0), strength=0.85, cone=40.0),
-        Lamp(place=(1.8, 0.8, 1.2), target=(-0.3, 0.0, -0.5), strength=0.45, cone=40.0),
+        lamp((-1.2, 1.3, 1.6), (-0.1, 0.0, 0.0), strength=1.4),
+        lamp((1.8, 0.8, 1.2), (-0.3, 0.0, -0.5), strength=0.4),
     ),
 )
-ARM_OUTFIT = Outfit(
+ARM_CLOTHING = Clothing(
     sleeve=0.55,
     pattern="stripes",
     shirt=(0.25, 0.33, 0.55),
@@ -465,8 +514,8 @@ ARM_OUTFIT = Outfit(
     looseness=0.06,
     muscle=0.009,
 )
-CLUTTER_OUTFIT = Outfit(sleeve=1.85, pattern="plaid", looseness=0.06)
-DARK_OUTFIT = Outfit(
+CLUTTER_CLOTHING = Clothing(sleeve=1.85, pattern="plaid", looseness=0.06)
+DARK_CLOTHING = Clothing(
     sleeve=1.85,
     pattern="stripes",
     shirt=(0.60, 0.60, 0.58),
@@ -481,7 +530,7 @@ def shot_of_motion(
     *,
     name: str = "mocap",
     style: Style | None = None,
-    outfit: Outfit | None = None,
+    clothing: Clothing | None = None,
     camera: Camera | None = None,
     seed: int = 0,
     num_frames: int | None = None,
@@ -492,10 +541,10 @@ def shot_of_motion(
     Args:
         motion: Body and states.
         name: Name of the sequence.
-        style: Room and light.
-        outfit: Clothes and deformations.
+        style: Scene and light.
+        clothing: Clothes and deformations.
         camera: Who looks.
-        seed: Seed of the figure, the room and the noise.
+        seed: Seed of the character, the scene and the noise.
         num_frames: Only the first frames.
         small: A quarter of the picture's width and height, for tests.
     """
@@ -512,7 +561,7 @@ def shot_of_motion(
         frame_rate=motion.frame_rate,
         camera=camera,
         style=style or CLUTTER,
-        outfit=outfit or CLUTTER_OUTFIT,
+        clothing=clothing or CLUTTER_CLOTHING,
         floor=float(points[..., 1].min()),
         seed=seed,
         description=motion.description,
