@@ -32,7 +32,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.app.track import track_video
-from torchcss.app.view_files import ViewFiles
 from torchcss.body.catalog import BodySpecification, MarkerSpecification, root_joints
 from torchcss.body.model import BodyModel
 from torchcss.body.root import move_base, root_pose
@@ -47,9 +46,11 @@ from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.initialise.outliers import best_distinct
 from torchcss.io.cameras import read_camera
 from torchcss.io.fitted_body import read_fitted_body
-from torchcss.io.track_body import body_of_track, pose_track
+from torchcss.io.run import body_of_track
+from torchcss.io.track_body import pose_track
 from torchcss.io.tracks import load_track, prepare_output_folder, write_summary
 from torchcss.io.video import VideoReader
+from torchcss.io.view_files import ViewFiles
 from torchcss.linalg import squared_mahalanobis
 from torchcss.studies.metrics import (
     LIMB_JOINTS,

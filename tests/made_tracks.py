@@ -10,7 +10,9 @@ import numpy as np
 import torch
 
 from torchcss.body.model import BodyModel
-from torchcss.io.tracks import SCHEMA_VERSION, Track, TrackWriter
+from torchcss.errors import TrackFileError
+from torchcss.files import load_arrays
+from torchcss.io.tracks import FrameModes, Track, TrackWriter, save_track
 
 BEAM_UP = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)
 """Turns Y up into Z up: world (x, y, z) = body (z, x, y)."""
@@ -29,7 +31,7 @@ def make_track(
     """Random poses within the joint limits, standing about upright; the base moves in frame 2."""
     source = torch.Generator().manual_seed(seed)
     up = torch.eye(3, dtype=torch.float64) if up is None else up
-    writer = TrackWriter("unused", state_names=body.state_names, joint_names=body.joint_names)
+    writer = TrackWriter("unused", Track.empty(body.state_names, body.joint_names, body=body))
     n = body.num_parameters
     lower = body.lower.clamp(min=-spread)
     upper = body.upper.clamp(max=spread)
@@ -47,24 +49,27 @@ def make_track(
         base = np.eye(4)
         base[:3, :3], base[:3, 3] = turn, shift
         writer.append(
-            frame=first_frame + index,
-            time_s=(first_frame + index) / rate,
-            state=state,
-            covariance=factor @ factor.mT,
-            log_weight=torch.linspace(1.0, 0.5, k).softmax(0).log(),
-            cost=torch.linspace(1.0, 2.0, k),
-            parent=torch.full((k,), -1)
-            if not index
-            else torch.arange(k).flip(0) % counts[index - 1],
-            joints_world=placed.pose(state).joints,
-            base_transform=base,
+            FrameModes(
+                frame=first_frame + index,
+                time_s=(first_frame + index) / rate,
+                state=state,
+                covariance=factor @ factor.mT,
+                log_weight=torch.linspace(1.0, 0.5, k).softmax(0).log(),
+                cost=torch.linspace(1.0, 2.0, k),
+                parent=torch.full((k,), -1)
+                if not index
+                else torch.arange(k).flip(0) % counts[index - 1],
+                joints_world=placed.pose(state).joints,
+                base_transform=base,
+            )
         )
     return writer.track()
 
 
-def write_track(path: Path, track: Track) -> None:
-    """Save a track as the tracker does."""
-    arrays = track._asdict()
-    for name in ("state_names", "joint_names"):
-        arrays[name] = np.array(arrays[name], dtype=np.str_)
-    np.savez(path, schema_version=np.array(SCHEMA_VERSION), **arrays)
+def save_v01_track(path: Path, track: Track) -> None:
+    """Save a track as version 0.1 did, which wrote neither body nor cameras nor settings."""
+    save_track(path, track)
+    arrays = dict(load_arrays(path, TrackFileError))
+    for name in ("body", "cameras", "settings"):
+        del arrays[name]
+    np.savez(path, **(arrays | {"schema_version": np.array(1)}))

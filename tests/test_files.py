@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from made_tracks import make_track, write_track
+from made_tracks import make_track
 from matplotlib.figure import Figure
 
 import torchcss.files
@@ -26,7 +26,7 @@ from torchcss.inference.mixture import GaussianMixture
 from torchcss.initialise.result import Initialisation
 from torchcss.io.fitted_body import write_fitted_body
 from torchcss.io.keypoints.one_image import Joints
-from torchcss.io.tracks import TrackWriter, load_track, write_summary
+from torchcss.io.tracks import FrameModes, Track, TrackWriter, load_track, save_track, write_summary
 from torchcss.io.video import VideoReader, VideoWriter
 from torchcss.show.click import write_clicked
 from torchcss.show.style import save_figure
@@ -39,11 +39,11 @@ BODY = load_body("arm7", free_root=True)
 
 def track(path: Path) -> None:
     made = make_track(BODY, (1, 1, 1))
-    writer = TrackWriter(path, state_names=made.state_names, joint_names=made.joint_names)
+    writer = TrackWriter(path, Track.empty(made.state_names, made.joint_names))
     for t in range(3):
         fields = ("state", "covariance", "log_weight", "cost", "parent", "joints_world")
         values = {name: getattr(made, name)[t] for name in fields}
-        writer.append(frame=t, time_s=t / 25, **values)
+        writer.append(FrameModes(frame=t, time_s=t / 25, **values))
     writer.save()
 
 
@@ -213,7 +213,7 @@ def test_a_sequence_that_stops_leaves_the_older_one(tmp_path: Path) -> None:
 def test_smoothing_that_fails_leaves_the_older_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write_track(tmp_path / "track.npz", make_track(BODY, (2, 2, 2, 2)))
+    save_track(tmp_path / "track.npz", make_track(BODY, (2, 2, 2, 2)))
     smooth_file(tmp_path)
     before = (tmp_path / "smooth.npz").read_bytes()
 

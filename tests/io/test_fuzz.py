@@ -19,18 +19,19 @@ import pytest
 import torch
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
-from made_tracks import make_track, write_track
+from made_tracks import make_track
 
 from torchcss.body.load import load_body
 from torchcss.errors import TorchcssError
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.initialise.result import Initialisation
 from torchcss.io.cameras import read_camera
+from torchcss.io.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from torchcss.io.fitted_body import read_fitted_body, write_fitted_body
 from torchcss.io.keypoints.one_image import read_joints
 from torchcss.io.keypoints.read import read_keypoints
 from torchcss.io.motion.positions import read_motion_capture
-from torchcss.io.tracks import load_track, read_summary, write_summary
+from torchcss.io.tracks import load_track, read_summary, save_track, write_summary
 from torchcss.io.video import VideoReader, VideoWriter
 from torchcss.studies.flow_files import read_flow, write_flow
 from torchcss.studies.sequences import read_sequence
@@ -189,6 +190,7 @@ READERS = (
     Reader("robot.xml", load_body),
     Reader("a.flo", read_flow),
     Reader("track.npz", load_track),
+    Reader("checkpoint.npz", beside(read_checkpoint)),
     Reader("summary.json", read_summary),
     Reader("body.npz", read_fitted_body, slow=True),
     Reader("film.mp4", pictures, slow=True),
@@ -258,7 +260,8 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "robot.urdf").write_text(URDF)
     (folder / "robot.xml").write_text(MJCF)
     write_flow(folder / "a.flo", torch.randn(2, 4, 5, generator=torch.Generator().manual_seed(0)))
-    write_track(folder / "track.npz", make_track(body, (2, 1, 2)))
+    save_track(folder / "track.npz", make_track(body, (2, 1, 2)))
+    write_checkpoint(folder, Checkpoint(2, {"a": torch.zeros(3), "b": torch.tensor(1)}))
     write_summary(folder / "summary.json", {"a": 1.5, "b": [1, 2]})
     x = body.rest[None]
     mixture = GaussianMixture(x, 0.01 * torch.eye(7).double()[None], torch.zeros(1).double())

@@ -24,6 +24,7 @@ from hypothesis import strategies as st
 from torchcss import files as atomic
 from torchcss.errors import OutputError, ShapeError, TrackFileError
 from torchcss.io.tracks import (
+    FrameModes,
     Track,
     TrackWriter,
     load_track,
@@ -52,16 +53,16 @@ def some_modes(k: int, seed: int = 0) -> dict[str, Any]:
 
 
 def new_writer(path: Path) -> TrackWriter:
-    return TrackWriter(path, state_names=STATE, joint_names=JOINTS)
+    return TrackWriter(path, Track.empty(STATE, JOINTS))
 
 
 def write_track(path: Path, counts: tuple[int, ...] = (2, 3, 1)) -> TrackWriter:
     writer = new_writer(path)
     for index, k in enumerate(counts):
-        writer.append(
+        writer.append(FrameModes(
             frame=10 + 2 * index, time_s=index / 30, base_transform=torch.eye(4) * (index + 1),
             **some_modes(k, index),
-        )  # fmt: skip
+        ))  # fmt: skip
     writer.save()
     return writer
 
@@ -103,7 +104,7 @@ def test_file_has_exactly_the_arrays_of_the_design(tmp_path: Path) -> None:
         "state": (3, 3, 3), "covariance": (3, 3, 3, 3), "log_weight": (3, 3), "cost": (3, 3),
         "parent": (3, 3), "joint_names": (2,), "joints_world": (3, 3, 2, 3),
         "base_transform": (3, 4, 4),
-        "evidence": (),
+        "evidence": (), "body": (), "cameras": (), "settings": (),
     }  # fmt: skip
 
 
@@ -113,8 +114,8 @@ def test_best_mode_first_and_parents_follow(tmp_path: Path) -> None:
     first["log_weight"] = torch.tensor([0.2, 0.5, 0.3]).log()
     second["log_weight"] = torch.tensor([0.1, 0.9]).log()
     second["parent"] = torch.tensor([0, 2])
-    writer.append(frame=0, time_s=0.0, **first)
-    writer.append(frame=1, time_s=0.1, **second)
+    writer.append(FrameModes(frame=0, time_s=0.0, **first))
+    writer.append(FrameModes(frame=1, time_s=0.1, **second))
     track = writer.track()
     np.testing.assert_array_equal(track.state[0], first["state"][[1, 2, 0]])
     # The second frame's best mode came from mode 2, which now stands at 1; the other from 0, at 2.
@@ -126,10 +127,10 @@ def test_modes_without_weight_are_left_out() -> None:
     writer = new_writer(Path("unused.npz"))
     modes = some_modes(3)
     modes["log_weight"] = torch.tensor([-torch.inf, 0.0, -torch.inf])
-    writer.append(frame=0, time_s=0.0, **modes)
+    writer.append(FrameModes(frame=0, time_s=0.0, **modes))
     child = some_modes(2)
     child["parent"] = torch.tensor([0, 1])
-    writer.append(frame=1, time_s=0.1, **child)
+    writer.append(FrameModes(frame=1, time_s=0.1, **child))
     track = writer.track()
     assert track.num_modes.tolist() == [1, 2]
     np.testing.assert_array_equal(track.state[0, 0], modes["state"][1])
@@ -142,7 +143,7 @@ def test_saving_again_and_again(tmp_path: Path) -> None:
     writer.save()
     assert load_track(path).state.shape == (0, 0, 3)
     for index in range(4):
-        writer.append(frame=index, time_s=index / 10, **some_modes(2, index))
+        writer.append(FrameModes(frame=index, time_s=index / 10, **some_modes(2, index)))
         writer.save()
         assert len(load_track(path).frames) == index + 1
 
@@ -169,11 +170,11 @@ def test_saving_again_and_again(tmp_path: Path) -> None:
 )
 def test_frames_that_do_not_fit(change: dict[str, Any], words: str) -> None:
     writer = new_writer(Path("unused.npz"))
-    writer.append(frame=0, time_s=0.0, **some_modes(2))
+    writer.append(FrameModes(frame=0, time_s=0.0, **some_modes(2)))
     with pytest.raises(ShapeError, match=words):
-        writer.append(**{"frame": 1, "time_s": 0.1, **some_modes(2), **change})
+        writer.append(FrameModes(**{"frame": 1, "time_s": 0.1, **some_modes(2), **change}))
     assert len(writer) == 1
-    writer.append(frame=1, time_s=0.1, **some_modes(2))
+    writer.append(FrameModes(frame=1, time_s=0.1, **some_modes(2)))
 
 
 # Disks that refuse.
@@ -194,7 +195,7 @@ def test_refusals_keep_the_old_file(
     path = tmp_path / "track.npz"
     writer = write_track(path)
     before = path.read_bytes()
-    writer.append(frame=100, time_s=9.0, **some_modes(2))
+    writer.append(FrameModes(frame=100, time_s=9.0, **some_modes(2)))
 
     def refuse(*_: object, **__: object) -> None:
         raise OSError(number, os.strerror(number))
@@ -220,7 +221,7 @@ def test_really_full(tmp_path: Path) -> None:
     path = tmp_path / "track.npz"
     writer = write_track(path)
     for index in range(100, 200):
-        writer.append(frame=index, time_s=float(index), **some_modes(3))
+        writer.append(FrameModes(frame=index, time_s=float(index), **some_modes(3)))
     before = path.read_bytes()
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -325,11 +326,11 @@ def test_other_schema_version(tmp_path: Path) -> None:
     write_track(tmp_path / "track.npz")
     arrays = arrays_of(tmp_path / "track.npz")
     np.savez(tmp_path / "b.npz", **(arrays | {"schema_version": np.array(7)}))
-    with pytest.raises(TrackFileError, match="version 7, this program reads 1"):
+    with pytest.raises(TrackFileError, match="version 7, this program reads 1 and 2"):
         load_track(tmp_path / "b.npz")
 
 
-OBLIGATORY = [name for name in Track._fields if name not in ("base_transform", "evidence")]
+OBLIGATORY = [name for name in Track._fields[:11] if name != "base_transform"]
 
 
 @pytest.mark.parametrize("name", OBLIGATORY)
@@ -357,13 +358,13 @@ def test_nan_is_refused(tmp_path: Path) -> None:
 
 def test_the_power_of_the_covariances_is_kept(tmp_path: Path) -> None:
     path = tmp_path / "track.npz"
-    writer = TrackWriter(path, state_names=("a",), joint_names=("b",), evidence=0.1)
-    writer.append(
+    writer = TrackWriter(path, Track.empty(("a",), ("b",), likelihood_power=0.1))
+    writer.append(FrameModes(
         frame=0, time_s=0.0, state=[[0.0]], covariance=[[[1.0]]], log_weight=[0.0], cost=[1.0],
         parent=[-1], joints_world=[[[0.0, 0.0, 0.0]]],
-    )  # fmt: skip
+    ))  # fmt: skip
     writer.save()
-    assert load_track(path).evidence == 0.1
+    assert load_track(path).likelihood_power == 0.1
     arrays = dict(np.load(path))
     np.savez(tmp_path / "bad.npz", **{**arrays, "evidence": np.array(0.0)})
     with pytest.raises(TrackFileError, match="positive power, got 0"):
@@ -371,7 +372,7 @@ def test_the_power_of_the_covariances_is_kept(tmp_path: Path) -> None:
     # A track of somebody else's need not say it.
     del arrays["evidence"]
     np.savez(tmp_path / "old.npz", **arrays)
-    assert load_track(tmp_path / "old.npz").evidence == 1.0
+    assert load_track(tmp_path / "old.npz").likelihood_power == 1.0
 
 
 def test_base_transform_is_optional(tmp_path: Path) -> None:

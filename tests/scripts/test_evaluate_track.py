@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from torchcss.errors import ConfigurationError, ShapeError, TrackFileError
-from torchcss.io.tracks import TrackWriter
+from torchcss.io.tracks import FrameModes, Track, TrackWriter
 from torchcss.studies.metrics import LIMB_JOINTS
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "evaluate_track.py"
@@ -28,18 +28,20 @@ def write_track(
 ) -> Path:
     """A track whose modes are at `joints [T K J 3]`; `modes[i]` of them exist in frame i."""
     folder.mkdir(exist_ok=True)
-    writer = TrackWriter(folder / "track.npz", state_names=("a", "b"), joint_names=names)
+    writer = TrackWriter(folder / "track.npz", Track.empty(("a", "b"), names))
     for row in range(len(joints)):
         k = joints.shape[1] if modes is None else modes[row]
         writer.append(
-            frame=row if frames is None else frames[row],
-            time_s=row / 25,
-            state=np.zeros((k, 2)),
-            covariance=np.tile(np.eye(2), (k, 1, 1)),
-            log_weight=np.log(np.arange(k, 0, -1) / (k * (k + 1) / 2)),
-            cost=np.arange(k),
-            parent=np.full(k, -1),
-            joints_world=joints[row, :k],
+            FrameModes(
+                frame=row if frames is None else frames[row],
+                time_s=row / 25,
+                state=np.zeros((k, 2)),
+                covariance=np.tile(np.eye(2), (k, 1, 1)),
+                log_weight=np.log(np.arange(k, 0, -1) / (k * (k + 1) / 2)),
+                cost=np.arange(k),
+                parent=np.full(k, -1),
+                joints_world=joints[row, :k],
+            )
         )
     writer.save()
     return folder

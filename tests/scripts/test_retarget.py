@@ -17,7 +17,7 @@ import torch
 from torchcss import export_track, load_body
 from torchcss.errors import ConfigurationError, MotionCaptureError, OutputError
 from torchcss.io.motion.positions import LIMBS
-from torchcss.io.tracks import TrackWriter
+from torchcss.io.tracks import FrameModes, Track, TrackWriter
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 
@@ -36,7 +36,7 @@ def load(name: str) -> ModuleType:
 def motion(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A BVH of our own: ten frames at 20 Hz of a body that turns and bends its arms."""
     body = load_body("body34", lengths={"thigh": 0.41})
-    writer = TrackWriter("unused", state_names=body.state_names, joint_names=body.joint_names)
+    writer = TrackWriter("unused", Track.empty(body.state_names, body.joint_names, body=body))
     for index in range(10):
         state = body.bounds.project(body.sticky_mean.clone())
         state[body.state_index("root_yaw")] = 0.2 * index
@@ -45,14 +45,16 @@ def motion(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for side in "lr":
             state[body.state_index(f"{side}_shoulder_raising")] = 0.6
         writer.append(
-            frame=index,
-            time_s=index / 20,
-            state=state[None],
-            covariance=torch.eye(len(state), dtype=state.dtype)[None],
-            log_weight=torch.zeros(1),
-            cost=torch.zeros(1),
-            parent=torch.full((1,), -1),
-            joints_world=body.pose(state).joints[None],
+            FrameModes(
+                frame=index,
+                time_s=index / 20,
+                state=state[None],
+                covariance=torch.eye(len(state), dtype=state.dtype)[None],
+                log_weight=torch.zeros(1),
+                cost=torch.zeros(1),
+                parent=torch.full((1,), -1),
+                joints_world=body.pose(state).joints[None],
+            )
         )
     folder = tmp_path_factory.mktemp("motion")
     done = export_track(writer.track(), to="bvh", out=folder, frame="world", body=body)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from made_tracks import make_track, write_track
+from made_tracks import make_track
 from matplotlib.axes import Axes
 from matplotlib.collections import FillBetweenPolyCollection, PathCollection
 from matplotlib.figure import Figure
@@ -18,7 +18,7 @@ from torchcss.body.uncertainty import joint_covariance
 from torchcss.cli import main as cli
 from torchcss.errors import ConfigurationError
 from torchcss.io.track_body import pose_track
-from torchcss.io.tracks import TRACK_NAME, Track
+from torchcss.io.tracks import TRACK_NAME, Track, save_track
 from torchcss.io.video import VideoWriter
 from torchcss.show.posterior_plots import DEVIATIONS, angles_figure, joints_figure, spectra_figure
 from torchcss.show.style import save_figure
@@ -154,7 +154,7 @@ def test_one_frame_can_be_drawn(body: BodyModel, tmp_path: Path) -> None:
 def test_the_verb_writes_every_figure(
     track: Track, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_track(tmp_path / TRACK_NAME, track)
+    save_track(tmp_path / TRACK_NAME, track)
     with VideoWriter(tmp_path / "overlay.mp4", 25) as film:
         for level in (40, 90, 150, 200):
             film.write(np.full((48, 64, 3), level, np.uint8))

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from made_tracks import make_track, write_track
+from made_tracks import make_track
 
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.errors import CameraError, ConfigurationError, TrackFileError, VideoError
 from torchcss.io.cameras import camera_entry
-from torchcss.io.tracks import TRACK_NAME, Track, write_summary
+from torchcss.io.tracks import TRACK_NAME, Track, save_track, write_summary
 from torchcss.io.video import VideoWriter
 from torchcss.show.track_pictures import TrackFiles, pictures_of
 from torchcss.studies.render.sequences import look_at
@@ -38,8 +38,8 @@ def camera() -> Camera:
 @pytest.fixture
 def folder(tmp_path: Path, track: Track, camera: Camera) -> Path:
     """A run: the track, the summary with the camera, the overlay, and the grey video."""
-    write_track(tmp_path / TRACK_NAME, track)
-    write_track(tmp_path / "smooth.npz", track)
+    save_track(tmp_path / TRACK_NAME, track)
+    save_track(tmp_path / "smooth.npz", track)
     calibration = {"units": "metre, pixel", "cameras": {camera.name: camera_entry(camera)}}
     write_summary(tmp_path, {"events": [], **calibration})
     for name, levels in (("overlay.mp4", (40, 120, 200)), ("video.mp4", (90, 90, 90, 90, 90))):
@@ -111,6 +111,6 @@ def test_what_does_not_belong_together(
     other = short._replace(camera=camera.resized(96, 72))
     with pytest.raises(CameraError, match="96 x 72"):
         list(pictures_of(other, range(3)))
-    write_track(folder / TRACK_NAME, make_track(body, ()))
+    save_track(folder / TRACK_NAME, make_track(body, ()))
     with pytest.raises(TrackFileError, match="no frames"):
         TrackFiles.find(folder)

@@ -122,7 +122,7 @@ def test_modes_over_time(track: Track, tmp_path: Path) -> None:
     counts = {line.get_label(): line.get_ydata() for line in number.get_lines()}
     assert counts["modes"].tolist() == [2, 3, 2]
     assert save_figure(figure, tmp_path / "modes.png").stat().st_size > 5000
-    none = Track(*(v if isinstance(v, (tuple, float)) else v[:0] for v in track))
+    none = track.first(0)
     with pytest.raises(ConfigurationError, match="no frames"):
         track_plots.modes_figure(none)
 

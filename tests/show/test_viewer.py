@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from made_tracks import make_track, write_track
+from made_tracks import make_track
 from PIL import Image
 
 from torchcss.body.load import load_body
@@ -19,7 +19,7 @@ from torchcss.body.uncertainty import joint_covariance
 from torchcss.cli import main as cli
 from torchcss.errors import ConfigurationError, MissingExtraError, OutputError
 from torchcss.io.track_body import pose_track
-from torchcss.io.tracks import TRACK_NAME, Track, write_summary
+from torchcss.io.tracks import TRACK_NAME, Track, save_track, write_summary
 from torchcss.io.video import VideoWriter
 from torchcss.show import viewer
 from torchcss.show.overlay import PALETTE
@@ -297,7 +297,7 @@ def test_the_verb_saves_a_body_without_pictures(
     pytest.importorskip("rerun")
     body = load_body("body34")
     track = make_track(body, (2, 1))
-    write_track(tmp_path / TRACK_NAME, track)
+    save_track(tmp_path / TRACK_NAME, track)
     write_summary(tmp_path, {"events": []})
     out = tmp_path / "view.rrd"
     assert cli.main(["view", str(tmp_path), "--save", str(out)]) == 0

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from torchcss.app.track import track_video
-from torchcss.app.view_files import ViewFiles
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.cost.joints import JointObservation, JointTerm
 from torchcss.cost.total import CostChoice
@@ -19,6 +18,7 @@ from torchcss.inference.mixture import GaussianMixture
 from torchcss.io.cameras import read_camera
 from torchcss.io.tracks import load_track
 from torchcss.io.video import VideoWriter
+from torchcss.io.view_files import ViewFiles
 from torchcss.show.track_pictures import TrackFiles
 from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
 from torchcss.tracking.presets import make_tracker

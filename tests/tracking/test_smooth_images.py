@@ -17,7 +17,7 @@ from torchcss.app.smooth import settings_of
 from torchcss.cli import main as cli
 from torchcss.cost.joints import JointObservation
 from torchcss.errors import ConfigurationError, VideoError
-from torchcss.io.tracks import Track, TrackWriter, read_summary, write_summary
+from torchcss.io.tracks import FrameModes, Track, TrackWriter, read_summary, write_summary
 from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
 from torchcss.tracking.session import scale_keypoints
 from torchcss.tracking.settings import Settings, make_choice, make_extractor
@@ -50,7 +50,7 @@ def setup(sequence: SyntheticSequence) -> Setup:
     body, camera, source = sequence.body, sequence.camera, torch.Generator().manual_seed(1)
     extractor = make_extractor(SETTINGS)
     working = extractor.working_shape(*camera.image_size_wh)
-    writer = TrackWriter("unused", state_names=body.state_names, joint_names=body.joint_names)
+    writer = TrackWriter("unused", Track.empty(body.state_names, body.joint_names, body=body))
     base = np.eye(4)
     base[:3, :3], base[:3, 3] = body.base_rotation, body.base_translation
     n = body.num_parameters
@@ -58,15 +58,17 @@ def setup(sequence: SyntheticSequence) -> Setup:
         noisy = state + 0.08 * torch.randn(1, n, generator=source, dtype=torch.float64)
         noisy = body.bounds.project(noisy)
         writer.append(
-            frame=index,
-            time_s=index / sequence.frame_rate,
-            state=noisy,
-            covariance=0.08**2 * torch.eye(n)[None],
-            log_weight=torch.zeros(1),
-            cost=torch.zeros(1),
-            parent=torch.zeros(1) - 1,
-            joints_world=body.pose(noisy).joints,
-            base_transform=base,
+            FrameModes(
+                frame=index,
+                time_s=index / sequence.frame_rate,
+                state=noisy,
+                covariance=0.08**2 * torch.eye(n)[None],
+                log_weight=torch.zeros(1),
+                cost=torch.zeros(1),
+                parent=torch.zeros(1) - 1,
+                joints_world=body.pose(noisy).joints,
+                base_transform=base,
+            )
         )
     exact = camera.project(sequence.joints_world).uv
     seen = exact + NOISE_PX * torch.randn(exact.shape, generator=source, dtype=torch.float64)

@@ -28,8 +28,10 @@ from torchcss.body.model import BodyModel
 from torchcss.files import output_error
 from torchcss.inference.tracker import SequenceTracker, stated_evidence
 from torchcss.io.cameras import calibration
-from torchcss.io.tracks import TrackWriter, write_summary
+from torchcss.io.checkpoint import remove_checkpoint
+from torchcss.io.tracks import TRACK_NAME, FrameModes, Track, TrackWriter, write_summary
 from torchcss.io.video import VideoWriter
+from torchcss.io.view_files import RecordedCamera
 from torchcss.show.overlay import draw_overlay, project_body
 from torchcss.tracking.session import TrackedFrame
 from torchcss.tracking.settings import Settings
@@ -165,6 +167,7 @@ class Recorder:
         frame_rate: Frames per second of the overlay.
         video: What that camera took, if it was read from a file.
         others: Further cameras and their videos.
+        recorded: All cameras with their files, for the track; empty: the first camera alone.
         notes: Lines for the user, also in the summary.
         extra: Further entries of the summary.
         sinks: What sees the frames besides; closed at the end of the run.
@@ -178,6 +181,7 @@ class Recorder:
     frame_rate: float
     video: Path | None = None
     others: Sequence[tuple[Camera, Path]] = ()
+    recorded: Sequence[RecordedCamera] = ()
     notes: list[str] = field(default_factory=list)
     extra: dict[str, Any] = field(default_factory=dict)
     sinks: Sequence[Sink] = ()
@@ -195,10 +199,15 @@ class Recorder:
             The summary.
         """
         writer = TrackWriter(
-            self.folder / "track.npz",
-            state_names=body.state_names,
-            joint_names=body.joint_names,
-            evidence=stated_evidence(self.tracker),
+            self.folder / TRACK_NAME,
+            Track.empty(
+                body.state_names,
+                body.joint_names,
+                likelihood_power=stated_evidence(self.tracker),
+                body=body,
+                cameras=self.recorded or [RecordedCamera(self.camera)],
+                settings=asdict(self.settings),
+            ),
         )
         totals = _Totals()
         ended, began = "interrupted", time.perf_counter()
@@ -215,6 +224,7 @@ class Recorder:
                 for frame in bar:
                     self._append(writer, frame)
                     if len(writer) == 1:
+                        remove_checkpoint(self.folder)
                         writer.save()
                         self._replace_last_run()
                     drawn = time.perf_counter()
@@ -256,16 +266,19 @@ class Recorder:
         base[:3, :3] = frame.body.base_rotation.cpu().numpy()
         base[:3, 3] = frame.body.base_translation.cpu().numpy()
         mixture = frame.state.mixture
+        parent = frame.info.parent
         writer.append(
-            frame=frame.frame.index,
-            time_s=frame.frame.time_s,
-            state=mixture.mean,
-            covariance=frame.covariance,
-            log_weight=mixture.log_weight,
-            cost=frame.info.cost,
-            parent=frame.info.parent if len(writer) else torch.full_like(frame.info.parent, -1),
-            joints_world=frame.joints_world,
-            base_transform=base,
+            FrameModes(
+                frame=frame.frame.index,
+                time_s=frame.frame.time_s,
+                state=mixture.mean,
+                covariance=frame.covariance,
+                log_weight=mixture.log_weight,
+                cost=frame.info.cost,
+                parent=parent if len(writer) else torch.full_like(parent, -1),
+                joints_world=frame.joints_world,
+                base_transform=base,
+            )
         )
 
     def _summary(self, ended: str, num_frames: int, wall: float, totals: _Totals) -> dict[str, Any]:

@@ -10,21 +10,22 @@ from typing import Any
 
 import torch
 
-from torchcss.app.view_files import ViewFiles, open_view
+from torchcss.app.view_files import open_view
 from torchcss.body.model import BodyModel
 from torchcss.errors import ConfigurationError, TrackFileError
 from torchcss.io.fitted_body import body_beside, read_fitted_body
 from torchcss.io.keypoints.read import Scale
-from torchcss.io.track_body import body_of_track
+from torchcss.io.run import body_of_track
 from torchcss.io.tracks import (
     SUMMARY_NAME,
     Track,
-    TrackWriter,
     load_track,
     prepare_output_folder,
     read_summary,
+    save_track,
     write_summary,
 )
+from torchcss.io.view_files import ViewFiles
 from torchcss.tracking.settings import Settings, boundary_emphasis, make_choice, make_extractor
 from torchcss.tracking.smooth import SmoothedTrack, Smoothing, smooth_track
 from torchcss.tracking.smooth_images import smooth_frames
@@ -106,32 +107,6 @@ def write_smoothed(done: SmoothedTrack, into: Path, source: Path) -> dict[str, A
     entry = {"file": into / SMOOTH_NAME, **done.effect, "modes": done.modes}
     write_summary(into, {**summary, "smoothed": entry})
     return entry
-
-
-def save_track(path: Path, track: Track) -> None:
-    """Write a track to a file.
-
-    Raises:
-        OutputError: If it cannot be written.
-    """
-    writer = TrackWriter(
-        path,
-        state_names=track.state_names,
-        joint_names=track.joint_names,
-        evidence=track.evidence,
-    )
-    for index in range(len(track.frames)):
-        k = int(track.num_modes[index])
-        writer.append(
-            frame=int(track.frames[index]),
-            time_s=float(track.times[index]),
-            base_transform=track.base_transform[index],
-            **{
-                name: getattr(track, name)[index, :k]
-                for name in ("state", "covariance", "log_weight", "cost", "parent", "joints_world")
-            },
-        )
-    writer.save()
 
 
 def smooth_video(

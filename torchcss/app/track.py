@@ -16,7 +16,7 @@ import torch
 from tqdm import tqdm
 
 from torchcss.app.recorder import OtherFilm, Recorder, Sink
-from torchcss.app.view_files import OpenView, ViewFiles, open_view
+from torchcss.app.view_files import OpenView, open_view
 from torchcss.body.load import load_body
 from torchcss.cost.view import View
 from torchcss.errors import CameraError, ConfigurationError
@@ -24,6 +24,7 @@ from torchcss.initialise.result import Initialisation
 from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body, write_fitted_body
 from torchcss.io.keypoints.read import Scale
 from torchcss.io.tracks import prepare_output_folder
+from torchcss.io.view_files import RecordedCamera, ViewFiles
 from torchcss.tracking.first_frame import initialise_video
 from torchcss.tracking.presets import PRESETS
 from torchcss.tracking.recovery import Recovery
@@ -160,6 +161,10 @@ def track_video(
         camera=eye,
         frame_rate=1 / interval,
         video=video,
+        recorded=[
+            RecordedCamera(opened.camera.camera, each)
+            for each, opened in zip((files, *others), (view, *beside), strict=True)
+        ],
         others=[
             (opened.camera.camera, each.video) for each, opened in zip(others, beside, strict=True)
         ],

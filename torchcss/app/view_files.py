@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from collections.abc import Container, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,38 +15,13 @@ from torchcss.cost.joints import JointObservation
 from torchcss.errors import VideoError
 from torchcss.initialise.keypoint_checks import typical_sigma
 from torchcss.io.cameras import LoadedCamera, check_image_size, read_camera
-from torchcss.io.keypoints.read import Keypoints, Scale, read_keypoints
+from torchcss.io.keypoints.read import Keypoints, read_keypoints
 from torchcss.io.video import VideoReader
+from torchcss.io.view_files import ViewFiles
 from torchcss.tracking.session import scale_keypoints
 from torchcss.tracking.view import ViewStream
 from torchcss.types import Frame
 from torchcss.vision.features import FeatureExtractor
-
-
-@dataclass(frozen=True, kw_only=True)
-class ViewFiles:
-    """What one camera recorded.
-
-    Attributes:
-        video: A video, or a folder of images.
-        keypoints: 2D joints, see `torchcss.io.keypoints.read`; None only for a further camera,
-            whose pictures then speak alone.
-        camera_name: Which camera of the calibration file; by default the one of this video.
-        masks: Foreground of every frame, white or in shades of belief: a video or a folder of
-            images, of the size and number of the video's frames.
-        layout: Layout of a keypoint file that does not name its joints.
-        normalised: Whether keypoints are fractions of the image, and which, see
-            `torchcss.io.keypoints.read.Scale`.
-        offset: This video's frame at the time of the first camera's frame 0.
-    """
-
-    video: Path
-    keypoints: Path | None
-    camera_name: str | None = None
-    masks: Path | None = None
-    layout: str | None = None
-    normalised: bool | Scale = False
-    offset: int = 0
 
 
 class OpenView(NamedTuple):

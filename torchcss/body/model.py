@@ -52,6 +52,7 @@ class BodyModel(nn.Module):
 
     Attributes:
         name: Name of the body, for a body from a file its path: `load_body(name)` makes it again.
+        specification: What it was built of; `part_shape` may have changed since.
         notes: What was assumed when it was read from a file, one line each.
         state_names: Names of the parameters, the order of x.
         joint_names: Names of the joint centres, the order of `BodyPose.joints`.
@@ -82,6 +83,7 @@ class BodyModel(nn.Module):
     def __init__(self, body: BodySpecification, *, rings: int = 8, meridians: int = 12) -> None:
         super().__init__()
         self.name = body.name
+        self.specification = body
         self.lengths = dict(body.lengths)
         self.tree = KinematicTree(body.joints)
         self.neighbours = body.neighbours

@@ -27,13 +27,13 @@ import tyro
 from torchcss.app.live import LiveViewer
 from torchcss.app.smooth import smooth_file, smooth_video
 from torchcss.app.track import track_video
-from torchcss.app.view_files import ViewFiles
 from torchcss.cli.export import Export
 from torchcss.cli.init import Init
 from torchcss.cli.smooth import Smooth, report
 from torchcss.cli.view import Plot, View
 from torchcss.errors import ConfigurationError, OutputError, TorchcssError
 from torchcss.io.keypoints.read import Scale
+from torchcss.io.view_files import ViewFiles
 from torchcss.studies.demo import run_demo
 from torchcss.tracking.settings import TERMS, Settings, named_terms
 

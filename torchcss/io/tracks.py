@@ -1,11 +1,11 @@
 """A track on disk: every frame's modes in `track.npz`, what was run in `summary.json`.
 
-Schema version 1. T frames, K the largest number of modes, n parameters,
+Schema version 2. T frames, K the largest number of modes, n parameters,
 J joints:
 
 | array | shape | meaning |
 |---|---|---|
-| `schema_version` | | 1 |
+| `schema_version` | | 2 |
 | `frames` | T | index in the video |
 | `times` | T | seconds since the video's first frame |
 | `state_names` | n | names of the parameters |
@@ -16,12 +16,17 @@ J joints:
 | `parent` | T K | mode of the frame before that it came from; -1: none |
 | `joint_names` | J | names of the joints |
 | `joints_world` | T K J 3 | metres, world frame |
-| `base_transform` | T 4 4 | world from the frame in which the root moves (design decision 11) |
+| `base_transform` | T 4 4 | world from the frame in which the root moves (decision "root") |
+| `evidence` | | power with which the likelihood counts in the covariances |
+| `body` | | JSON: the body that was tracked, see `torchcss.io.track_body` |
+| `cameras` | | JSON: cameras and what they recorded, see `torchcss.io.view_files` |
+| `settings` | | JSON: what the tracker was told |
 
-The best mode of a frame is first. Absent modes hold zeros (parent -1, cost inf).
+The best mode of a frame is first. Absent modes hold zeros (parent -1, cost inf). Version 1 has the
+same without the last three, which may also be empty.
 
 By default: a `TrackWriter` that is saved now and then, so that a stopped run keeps its frames, and
-`load_track` to read back.
+`torchcss.io.run.Run.open`, or `load_track` for the file alone, to read back.
 """
 
 from __future__ import annotations
@@ -42,28 +47,69 @@ from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from torchcss.errors import ShapeError, TrackFileError
-from torchcss.files import load_arrays, load_json, prepare_output_folder, replace_file
+from torchcss.body.model import BodyModel
+from torchcss.errors import ShapeError, TorchcssError, TrackFileError
+from torchcss.files import (
+    load_arrays,
+    load_json,
+    one_line,
+    prepare_output_folder,
+    replace_file,
+)
+from torchcss.io.track_body import body_from_plain, body_to_plain, on_origin
+from torchcss.io.view_files import RecordedCamera, camera_from_plain, camera_to_plain
 
 __all__ = [
     "SCHEMA_VERSION",
     "SUMMARY_NAME",
     "TRACK_NAME",
+    "FrameModes",
     "Track",
     "TrackWriter",
     "load_track",
     "prepare_output_folder",
     "read_summary",
+    "save_track",
     "write_summary",
 ]
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 TRACK_NAME = "track.npz"
 SUMMARY_NAME = "summary.json"
 
+_PER_MODE = ("state", "covariance", "log_weight", "cost", "parent", "joints_world")
+_POWER_KEY = "evidence"
+"""Name of `Track.likelihood_power` in the file, as version 1 has it."""
+
+
+class FrameModes(NamedTuple):
+    """One frame of a track, as it is appended.
+
+    Attributes:
+        frame: Index in the video, greater than the last.
+        time_s: Seconds since the video's first frame.
+        state: `[k n]`, in any order.
+        covariance: `[k n n]`.
+        log_weight: `[k]`; modes with `-inf` are left out.
+        cost: `[k]`, nats; infinite for all of them where the frame said nothing.
+        parent: `[k]`, modes of the frame appended before, -1 for none.
+        joints_world: `[k j 3]`, metres.
+        base_transform: `[4 4]`.
+    """
+
+    frame: int
+    time_s: float
+    state: Tensor | ArrayLike
+    covariance: Tensor | ArrayLike
+    log_weight: Tensor | ArrayLike
+    cost: Tensor | ArrayLike
+    parent: Tensor | ArrayLike
+    joints_world: Tensor | ArrayLike
+    base_transform: Tensor | ArrayLike = np.eye(4)
+
 
 class Track(NamedTuple):
-    """The modes of every frame, as NumPy arrays; the module's docstring has the table.
+    """The modes of every frame, as NumPy arrays, and what they are modes of.
 
     Attributes:
         frames: Index of each frame in the video.
@@ -78,8 +124,10 @@ class Track(NamedTuple):
         joint_names: Names of the joints.
         joints_world: Joint centres of the modes, metres.
         base_transform: World from the frame in which the root moves.
-        evidence: Power with which the likelihood counts in the covariances, see
-            `torchcss.inference.tracker.stated_evidence`.
+        likelihood_power: Power with which the likelihood counts in the covariances.
+        body: The body that was tracked, on the world's origin; None where the file does not say.
+        cameras: What watched it, the first camera first; empty where the file does not say.
+        settings: What the tracker was told, as plain data.
     """
 
     frames: Int[np.ndarray, " t"]
@@ -93,26 +141,63 @@ class Track(NamedTuple):
     joint_names: tuple[str, ...]
     joints_world: Float[np.ndarray, "t k j 3"]
     base_transform: Float[np.ndarray, "t 4 4"]
-    evidence: float = 1.0
+    likelihood_power: float = 1.0
+    body: BodyModel | None = None
+    cameras: tuple[RecordedCamera, ...] = ()
+    settings: Mapping[str, Any] = {}
+
+    @classmethod
+    def empty(
+        cls,
+        state_names: Sequence[str],
+        joint_names: Sequence[str],
+        *,
+        likelihood_power: float = 1.0,
+        body: BodyModel | None = None,
+        cameras: Sequence[RecordedCamera] = (),
+        settings: Mapping[str, Any] | None = None,
+    ) -> Track:
+        """A track of no frames, for a `TrackWriter` to begin with.
+
+        Args:
+            state_names: Names of the parameters.
+            joint_names: Names of the joints.
+            likelihood_power: Power with which the likelihood counts in the covariances.
+            body: The body that is tracked, on any base.
+            cameras: What watches it.
+            settings: What the tracker is told.
+        """
+        n, j = len(state_names), len(joint_names)
+        shapes = {"state": (n,), "covariance": (n, n), "joints_world": (j, 3)}
+        modes = {name: np.zeros((0, 0, *shapes.get(name, ()))) for name in _PER_MODE}
+        return cls(
+            frames=np.zeros(0, dtype=np.int64),
+            times=np.zeros(0),
+            state_names=tuple(state_names),
+            joint_names=tuple(joint_names),
+            base_transform=np.zeros((0, 4, 4)),
+            **{**modes, "parent": np.zeros((0, 0), dtype=np.int64)},
+            likelihood_power=float(likelihood_power),
+            body=None if body is None else on_origin(body),
+            cameras=tuple(cameras),
+            settings=dict(settings or {}),
+        )
 
     @property
     def num_modes(self) -> Int[np.ndarray, " t"]:
         """How many modes each frame has."""
         return (self.log_weight > -np.inf).sum(axis=1)
 
+    def first(self, num_frames: int) -> Track:
+        """The same track up to a frame, as when no more had been tracked."""
+        most = int(self.num_modes[:num_frames].max(initial=0))
+        return self._replace(
+            **{name: getattr(self, name)[:num_frames, :most] for name in _PER_MODE},
+            **{name: getattr(self, name)[:num_frames] for name in _PER_FRAME},
+        )
 
-class _Modes(NamedTuple):
-    """One frame as it was appended, best mode first."""
 
-    frame: int
-    time_s: float
-    state: np.ndarray
-    covariance: np.ndarray
-    log_weight: np.ndarray
-    cost: np.ndarray
-    parent: np.ndarray
-    joints_world: np.ndarray
-    base_transform: np.ndarray
+_PER_FRAME = ("frames", "times", "base_transform")
 
 
 class TrackWriter:
@@ -120,91 +205,61 @@ class TrackWriter:
 
     Args:
         path: The file, usually `track.npz` in the output folder.
-        state_names: Names of the parameters.
-        joint_names: Names of the joints.
-        evidence: Power with which the likelihood counts in the covariances.
+        begun: What goes before: `Track.empty`, or the frames of a run that goes on.
     """
 
-    def __init__(
-        self,
-        path: str | os.PathLike[str],
-        *,
-        state_names: Sequence[str],
-        joint_names: Sequence[str],
-        evidence: float = 1.0,
-    ) -> None:
+    def __init__(self, path: str | os.PathLike[str], begun: Track) -> None:
         self.path = Path(path)
-        self._state_names = tuple(state_names)
-        self._joint_names = tuple(joint_names)
-        self._evidence = float(evidence)
-        self._modes: list[_Modes] = []
-        self._rank_of_parent = np.zeros(0, dtype=np.int64)
+        self._begun = begun
+        self._modes: list[FrameModes] = []
+        self._last_frame = int(begun.frames[-1]) if len(begun.frames) else -1
+        self._rank_of_parent = np.arange(begun.num_modes[-1] if len(begun.frames) else 0)
 
     def __len__(self) -> int:
-        return len(self._modes)
+        return len(self._begun.frames) + len(self._modes)
 
-    def append(
-        self,
-        *,
-        frame: int,
-        time_s: float,
-        state: Tensor | ArrayLike,
-        covariance: Tensor | ArrayLike,
-        log_weight: Tensor | ArrayLike,
-        cost: Tensor | ArrayLike,
-        parent: Tensor | ArrayLike,
-        joints_world: Tensor | ArrayLike,
-        base_transform: Tensor | ArrayLike | None = None,
-    ) -> None:
+    def append(self, modes: FrameModes) -> None:
         """Add one frame; its modes may be in any order and of any number, but at least one.
 
         They are put in the order of their weights, and the next frame's parents, which count the
         modes as they were given here, follow.
 
         Args:
-            frame: Index in the video, greater than the last.
-            time_s: Seconds since the video's first frame.
-            state: `[k n]`.
-            covariance: `[k n n]`.
-            log_weight: `[k]`; modes with `-inf` are left out.
-            cost: `[k]`, nats; infinite for all of them where the frame said nothing.
-            parent: `[k]`, modes of the frame appended before, -1 for none.
-            joints_world: `[k j 3]`, metres.
-            base_transform: `[4 4]`; None: the identity.
+            modes: The frame.
 
         Raises:
             ShapeError: If a shape does not fit, or a number that must be finite is not.
         """
-        num_parameters, num_joints = len(self._state_names), len(self._joint_names)
-        weights = _array("log_weight", log_weight, (None,), finite=False)
+        num_parameters, num_joints = len(self._begun.state_names), len(self._begun.joint_names)
+        frame = int(modes.frame)
+        weights = _array("log_weight", modes.log_weight, (None,), finite=False)
         (k,) = weights.shape
-        parents = _array("parent", parent, (k,)).astype(np.int64)
-        modes = _Modes(
-            int(frame),
-            float(time_s),
-            _array("state", state, (k, num_parameters)),
-            _array("covariance", covariance, (k, num_parameters, num_parameters)),
-            weights,
-            _array("cost", cost, (k,), finite=False),
-            parents,
-            _array("joints_world", joints_world, (k, num_joints, 3)),
-            np.eye(4)
-            if base_transform is None
-            else _array("base_transform", base_transform, (4, 4)),
-        )
+        cost = _array("cost", modes.cost, (k,), finite=False)
+        parents = _array("parent", modes.parent, (k,)).astype(np.int64)
+        per_mode = {
+            "state": _array("state", modes.state, (k, num_parameters)),
+            "covariance": _array(
+                "covariance", modes.covariance, (k, num_parameters, num_parameters)
+            ),
+            "log_weight": weights,
+            "cost": cost,
+            "joints_world": _array("joints_world", modes.joints_world, (k, num_joints, 3)),
+        }
+        base = _array("base_transform", modes.base_transform, (4, 4))
         if np.isnan(weights).any() or (weights == np.inf).any() or not (weights > -np.inf).any():
             raise ShapeError(
                 f"frame {frame}: log_weight: expected at least one weight above -inf and none "
                 f"infinite or NaN, got {weights.tolist()}"
             )
-        if not (np.isfinite(modes.cost).all() or (modes.cost == np.inf).all()):
+        if not (np.isfinite(cost).all() or (cost == np.inf).all()):
             raise ShapeError(
                 f"frame {frame}: cost: expected finite numbers, or inf for all modes of a frame "
-                f"that said nothing, got {modes.cost.tolist()}"
+                f"that said nothing, got {cost.tolist()}"
             )
-        if not math.isfinite(modes.time_s) or (self._modes and frame <= self._modes[-1].frame):
+        if not math.isfinite(modes.time_s) or (len(self) and frame <= self._last_frame):
             raise ShapeError(
-                f"frame {frame} at {time_s} s: expected frames in rising order, at finite times"
+                f"frame {frame} at {modes.time_s} s: expected frames in rising order, at finite "
+                "times"
             )
         if (parents < -1).any() or (parents >= len(self._rank_of_parent)).any():
             raise ShapeError(
@@ -212,47 +267,41 @@ class TrackWriter:
                 f"got {parents.tolist()}"
             )
         # -1 stands at the end of the extended table, where the index -1 finds it.
-        parents = np.append(self._rank_of_parent, -1)[parents]
+        per_mode["parent"] = np.append(self._rank_of_parent, -1)[parents]
         order = np.argsort(-weights, kind="stable")
         order = order[weights[order] > -np.inf]
         self._rank_of_parent = np.full(k, -1)
         self._rank_of_parent[order] = np.arange(len(order))
-        self._modes.append(
-            modes._replace(
-                state=modes.state[order],
-                covariance=modes.covariance[order],
-                log_weight=weights[order],
-                cost=modes.cost[order],
-                parent=parents[order],
-                joints_world=modes.joints_world[order],
-            )
-        )
+        self._last_frame = frame
+        ordered = {name: values[order] for name, values in per_mode.items()}
+        self._modes.append(FrameModes(frame, float(modes.time_s), base_transform=base, **ordered))
 
     def track(self) -> Track:
-        """Return what was appended so far."""
-        t = len(self._modes)
-        k = max((len(modes.cost) for modes in self._modes), default=0)
-        n, j = len(self._state_names), len(self._joint_names)
-        track = Track(
-            frames=np.array([modes.frame for modes in self._modes], dtype=np.int64),
-            times=np.array([modes.time_s for modes in self._modes], dtype=np.float64),
-            state_names=self._state_names,
+        """Return all frames so far."""
+        begun, new = self._begun, self._modes
+        old = len(begun.frames)
+        k = max([begun.state.shape[1], *(len(np.asarray(modes.cost)) for modes in new)])
+        n, j = len(begun.state_names), len(begun.joint_names)
+        t = old + len(new)
+        track = begun._replace(
+            frames=np.append(begun.frames, [modes.frame for modes in new]).astype(np.int64),
+            times=np.append(begun.times, [modes.time_s for modes in new]),
             state=np.zeros((t, k, n)),
             covariance=np.zeros((t, k, n, n)),
             log_weight=np.full((t, k), -np.inf),
             cost=np.full((t, k), np.inf),
             parent=np.full((t, k), -1, dtype=np.int64),
-            joint_names=self._joint_names,
             joints_world=np.zeros((t, k, j, 3)),
-            base_transform=np.array([modes.base_transform for modes in self._modes]).reshape(
-                -1, 4, 4
+            base_transform=np.concatenate(
+                [begun.base_transform, *(np.asarray(modes.base_transform)[None] for modes in new)]
             ),
-            evidence=self._evidence,
         )
-        for index, modes in enumerate(self._modes):
-            for name in ("state", "covariance", "log_weight", "cost", "parent", "joints_world"):
-                values = getattr(modes, name)
-                getattr(track, name)[index, : len(values)] = values
+        for name in _PER_MODE:
+            values = getattr(track, name)
+            values[:old, : begun.state.shape[1]] = getattr(begun, name)
+            for index, modes in enumerate(new, start=old):
+                own = getattr(modes, name)
+                values[index, : len(own)] = own
         return track
 
     def save(self) -> None:
@@ -261,11 +310,31 @@ class TrackWriter:
         Raises:
             OutputError: If the disk is full or does not let the file be written.
         """
-        arrays = self.track()._asdict()
-        for name in ("state_names", "joint_names"):
-            arrays[name] = np.array(arrays[name], dtype=np.str_)
-        with replace_file(self.path) as partial:
-            np.savez(partial, schema_version=np.array(SCHEMA_VERSION), **arrays)
+        save_track(self.path, self.track())
+
+
+def save_track(path: str | os.PathLike[str], track: Track) -> None:
+    """Write a track; the file is replaced in one step, or stays as it was.
+
+    Args:
+        path: The file.
+        track: The track.
+
+    Raises:
+        OutputError: If the disk is full or does not let the file be written.
+    """
+    arrays = track._asdict()
+    for name in ("state_names", "joint_names"):
+        arrays[name] = np.array(arrays[name], dtype=np.str_)
+    arrays[_POWER_KEY] = arrays.pop("likelihood_power")
+    plain = {
+        "body": None if track.body is None else body_to_plain(track.body),
+        "cameras": [camera_to_plain(camera) for camera in track.cameras],
+        "settings": dict(track.settings),
+    }
+    arrays |= {name: np.array(json.dumps(value, default=str)) for name, value in plain.items()}
+    with replace_file(Path(path)) as partial:
+        np.savez(partial, schema_version=np.array(SCHEMA_VERSION), **arrays)
 
 
 def load_track(path: str | os.PathLike[str]) -> Track:
@@ -290,16 +359,18 @@ def load_track(path: str | os.PathLike[str]) -> Track:
             f"{path}: not a track: expected an array schema_version, "
             f"found {', '.join(arrays) or 'no arrays'}"
         )
-    if int(version) != SCHEMA_VERSION:
+    if int(version) not in (1, SCHEMA_VERSION):
         raise TrackFileError(
-            f"{path}: has schema version {int(version)}, this program reads {SCHEMA_VERSION}; "
-            "use the version of torchcss that wrote it, or track again"
+            f"{path}: has schema version {int(version)}, this program reads 1 and "
+            f"{SCHEMA_VERSION}; use the version of torchcss that wrote it, or track again"
         )
-    # A track of somebody else's may be in the world frame, and of the cost as it is.
-    absent: dict[str, Any] = {"evidence": np.ones(())}
-    missing = [name for name in Track._fields if name not in arrays]
-    missing = [name for name in missing if name not in ("base_transform", *absent)]
-    if missing:
+    return Track(**_checked_arrays(arrays, path), **_described(arrays, path))
+
+
+def _checked_arrays(arrays: Mapping[str, np.ndarray], path: Path) -> dict[str, Any]:
+    """The numbers of a track, of the shapes and types that they must have."""
+    obligatory = [name for name in Track._fields[: -len(_DESCRIBED)] if name not in _OPTIONAL]
+    if missing := [name for name in obligatory if name not in arrays]:
         raise TrackFileError(f"{path}: not a complete track: {', '.join(missing)} missing")
     t, k = arrays["log_weight"].shape if arrays["log_weight"].ndim == 2 else (-1, -1)
     n, j = arrays["state_names"].size, arrays["joint_names"].size
@@ -307,18 +378,20 @@ def load_track(path: str | os.PathLike[str]) -> Track:
         "frames": (t,), "times": (t,), "state_names": (n,), "state": (t, k, n),
         "covariance": (t, k, n, n), "log_weight": (t, k), "cost": (t, k), "parent": (t, k),
         "joint_names": (j,), "joints_world": (t, k, j, 3), "base_transform": (t, 4, 4),
-        "evidence": (),
+        _POWER_KEY: (),
     }  # fmt: skip
-    absent["base_transform"] = np.tile(np.eye(4), (max(t, 0), 1, 1))
+    # A track of somebody else's may be in the world frame, and of the cost as it is.
+    absent = {
+        "base_transform": np.tile(np.eye(4), (max(t, 0), 1, 1)),
+        _POWER_KEY: np.ones(()),
+    }
     kinds = {"frames": "iu", "parent": "iu", "state_names": "U", "joint_names": "U"}
     values: dict[str, Any] = {}
-    for name in Track._fields:
-        array = arrays.get(name)
-        if array is None:
-            array = absent[name]
-        if array.shape != shapes[name] or array.dtype.kind not in kinds.get(name, "f"):
+    for name, shape in shapes.items():
+        array = arrays.get(name, absent.get(name, np.zeros(0)))
+        if array.shape != shape or array.dtype.kind not in kinds.get(name, "f"):
             raise TrackFileError(
-                f"{path}: {name}: expected shape {list(shapes[name])}, "
+                f"{path}: {name}: expected shape {list(shape)}, "
                 f"got {array.dtype} {list(array.shape)}"
             )
         if array.dtype.kind == "f" and np.isnan(array).any():
@@ -327,12 +400,36 @@ def load_track(path: str | os.PathLike[str]) -> Track:
             values[name] = tuple(str(entry) for entry in array)
         else:
             values[name] = array.astype(np.float64 if array.dtype.kind == "f" else np.int64)
-    values["evidence"] = float(values["evidence"])
-    if not 0 < values["evidence"] < np.inf:
+    power = float(values.pop(_POWER_KEY))
+    if not 0 < power < np.inf:
+        raise TrackFileError(f"{path}: {_POWER_KEY}: expected a positive power, got {power:g}")
+    return {**values, "likelihood_power": power}
+
+
+_DAMAGE = (TorchcssError, ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError,
+           ValueError)  # fmt: skip
+"""What comes of building a body or a camera from any JSON."""
+
+_DESCRIBED = ("body", "cameras", "settings")
+_OPTIONAL = ("base_transform", "likelihood_power")
+
+
+def _described(arrays: Mapping[str, np.ndarray], path: Path) -> dict[str, Any]:
+    """What the numbers are modes of, as far as the file says it."""
+    try:
+        plain = {name: json.loads(str(arrays[name])) for name in _DESCRIBED if name in arrays}
+        body, settings = plain.get("body"), plain.get("settings", {})
+        return {
+            "body": None if body is None else body_from_plain(body),
+            "cameras": tuple(
+                camera_from_plain(entry, path.parent) for entry in plain.get("cameras", [])
+            ),
+            "settings": dict(settings),
+        }
+    except _DAMAGE as error:
         raise TrackFileError(
-            f"{path}: evidence: expected a positive power, got {values['evidence']:g}"
-        )
-    return Track(**values)
+            f"{path}: its body, cameras or settings are damaged: {one_line(error)}"
+        ) from error
 
 
 def write_summary(path: str | os.PathLike[str], summary: Mapping[str, Any]) -> None:

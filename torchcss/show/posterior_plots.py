@@ -28,7 +28,8 @@ from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.errors import ConfigurationError
-from torchcss.io.track_body import body_of_track, pose_track
+from torchcss.io.run import body_of_track
+from torchcss.io.track_body import pose_track
 from torchcss.io.tracks import Track
 from torchcss.show.style import OKABE_ITO
 from torchcss.show.track_plots import mode_colour, tidy

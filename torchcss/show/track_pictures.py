@@ -19,7 +19,7 @@ from torchcss.body.model import BodyModel
 from torchcss.errors import ConfigurationError, TrackFileError, VideoError
 from torchcss.io.cameras import check_image_size, read_camera
 from torchcss.io.fitted_body import body_beside, read_fitted_body
-from torchcss.io.track_body import body_of_track
+from torchcss.io.run import body_of_track
 from torchcss.io.tracks import SUMMARY_NAME, TRACK_NAME, Track, load_track, read_summary
 from torchcss.io.video import VideoReader
 from torchcss.show.overlay import draw_overlay, project_body

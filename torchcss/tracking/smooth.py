@@ -37,7 +37,8 @@ from torchcss.inference.smoothing import (
     best_path,
     refine,
 )
-from torchcss.io.track_body import body_of_track, pose_track
+from torchcss.io.run import body_of_track
+from torchcss.io.track_body import pose_track
 from torchcss.io.tracks import (
     Track,
 )
@@ -101,6 +102,8 @@ def smooth_track(
         TrackFileError: If the track is empty, its times do not rise, or its body cannot be told.
     """
     choice, began = choice or Smoothing(), time.perf_counter()
+    if not len(track.frames):
+        raise TrackFileError("the track has no frames, of which any could be smoothed")
     if not (np.diff(track.times) > 0).all():
         raise TrackFileError("the times of the track do not rise; it cannot be smoothed")
     body = body_of_track(track, body)
@@ -120,7 +123,7 @@ def smooth_track(
     path = best_path(
         state,
         # Between frames the modes count as they are; `choice.evidence` tempers their costs.
-        track.evidence * covariance,
+        track.likelihood_power * covariance,
         node,
         times,
         Transition(velocity=tuple(body.motion_rate.tolist())),
@@ -137,13 +140,13 @@ def smooth_track(
         motion_prior(body, choice),
         free_turns(body),
         # The covariances of the track have its power already.
-        evidence=1 / (choice.persistence * track.evidence),
+        evidence=1 / (choice.persistence * track.likelihood_power),
         changes=changes,
     )
     # The modes' covariances have the power `evidence`, their costs are full nats.
-    cost = cost[everywhere, path.mode] + smooth.cost / track.evidence
+    cost = cost[everywhere, path.mode] + smooth.cost / track.likelihood_power
     result = track_of(track, body, smooth, cost=cost)
-    result = result._replace(evidence=1 / choice.persistence)
+    result = result._replace(likelihood_power=1 / choice.persistence)
     modes = path.mode.numpy()
     effect = {
         **asdict(choice),

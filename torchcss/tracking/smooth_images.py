@@ -29,7 +29,7 @@ from torchcss.cost.frame import FrameCosts, beside
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.errors import VideoError
 from torchcss.inference.smoothing import refine_in_windows
-from torchcss.io.track_body import body_of_track
+from torchcss.io.run import body_of_track
 from torchcss.io.tracks import Track
 from torchcss.tracking.smooth import (
     SmoothedTrack,
@@ -141,7 +141,7 @@ def smooth_frames(
         changes=changes,
     )
     result = track_of(track, body, refined, cost=refined.cost)
-    result = result._replace(evidence=1 / choice.persistence)
+    result = result._replace(likelihood_power=1 / choice.persistence)
     effect = {
         **first.effect,
         **effect_of(track, first.modes, result),

@@ -9,13 +9,12 @@ import pytest
 from made_tracks import make_track
 
 from torchcss import Track, export_track, load_body
-from torchcss.app.smooth import save_track
 from torchcss.cli import main as cli
 from torchcss.errors import ConfigurationError, OutputError, TrackFileError
 from torchcss.io.cameras import camera_entry
 from torchcss.io.export import FORMATS
 from torchcss.io.export.selection import DEFAULT_RATE, UP_AXES, select
-from torchcss.io.tracks import write_summary
+from torchcss.io.tracks import save_track, write_summary
 from torchcss.vision.camera import Camera
 
 BODY = load_body("arm8")
@@ -29,10 +28,7 @@ def track() -> Track:
 
 @pytest.fixture
 def folder(track: Track, tmp_path: Path) -> Path:
-    arrays = track._asdict()
-    for name in ("state_names", "joint_names"):
-        arrays[name] = np.array(arrays[name])
-    np.savez(tmp_path / "track.npz", schema_version=np.array(1), **arrays)
+    save_track(tmp_path / "track.npz", track)
     return tmp_path
 
 

@@ -35,7 +35,7 @@ from torchcss.io.export.smpl import smpl_arrays
 from torchcss.io.export.tables import csv_text, joint_covariances, npz_arrays
 from torchcss.io.export.trc import trc_text
 from torchcss.io.fitted_body import body_beside
-from torchcss.io.track_body import body_of_track
+from torchcss.io.run import body_of_track
 from torchcss.io.tracks import SUMMARY_NAME, TRACK_NAME, Track, load_track
 from torchcss.vision.camera import Camera
 

@@ -1,0 +1,104 @@
+"""What the cameras of a run recorded: the files of each, and how a track's file holds them.
+
+`ViewFiles` are the files of one camera as a user gives them, `RecordedCamera` the calibrated camera
+with its files.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from torchcss.io.cameras import camera_entry
+from torchcss.io.keypoints.read import Scale
+from torchcss.vision.camera import Camera
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewFiles:
+    """What one camera recorded.
+
+    Attributes:
+        video: A video, or a folder of images.
+        keypoints: 2D joints, see `torchcss.io.keypoints.read`; None only for a further camera,
+            whose pictures then speak alone.
+        camera_name: Which camera of the calibration file; by default the one of this video.
+        masks: Foreground of every frame, white or in shades of belief: a video or a folder of
+            images, of the size and number of the video's frames.
+        layout: Layout of a keypoint file that does not name its joints.
+        normalised: Whether keypoints are fractions of the image, and which, see
+            `torchcss.io.keypoints.read.Scale`.
+        offset: This video's frame at the time of the first camera's frame 0.
+    """
+
+    video: Path
+    keypoints: Path | None
+    camera_name: str | None = None
+    masks: Path | None = None
+    layout: str | None = None
+    normalised: bool | Scale = False
+    offset: int = 0
+
+
+class RecordedCamera(NamedTuple):
+    """A camera of a run.
+
+    Attributes:
+        camera: The camera, of the size of its video.
+        files: What it recorded; None where that was not read from files, or is not known.
+    """
+
+    camera: Camera
+    files: ViewFiles | None = None
+
+
+_PATHS = ("video", "keypoints", "masks")
+
+
+def camera_to_plain(recorded: RecordedCamera) -> dict[str, Any]:
+    """What JSON holds of a camera and its files, whose paths are made absolute."""
+    camera, files = recorded
+    entry = {"name": camera.name, "near": camera.near, **camera_entry(camera)}
+    if files is None:
+        return entry
+    plain = asdict(files)
+    for name in _PATHS:
+        plain[name] = None if plain[name] is None else os.path.abspath(plain[name])
+    return {**entry, "files": plain}
+
+
+def camera_from_plain(entry: Mapping[str, Any], folder: Path) -> RecordedCamera:
+    """The camera and its files again.
+
+    Args:
+        entry: From `camera_to_plain`.
+        folder: Where the run lies: files that are no longer where they were are looked for in it.
+
+    Raises:
+        KeyError, TypeError, ValueError: If it is not such an entry.
+    """
+    camera = Camera(
+        entry["K"],
+        tuple(entry["image_size_wh"]),
+        distortion=entry["distortion"],
+        R_camera_world=entry["R"],
+        t_camera_world=entry["t"],
+        name=entry["name"],
+        near=entry["near"],
+    )
+    if entry.get("files") is None:
+        return RecordedCamera(camera)
+    files = ViewFiles(**entry["files"])
+    places = {name: _place(getattr(files, name), folder) for name in _PATHS}
+    return RecordedCamera(camera, replace(files, **places))
+
+
+def _place(path: str | None, folder: Path) -> Path | None:
+    """Where a file is now: where it was, or in the run's folder; else where it was."""
+    if path is None:
+        return None
+    beside = folder / Path(path).name
+    return beside if not os.path.exists(path) and beside.exists() else Path(path)
