@@ -37,19 +37,20 @@ from torchcss.errors import ConfigurationError, TorchcssError
 from torchcss.inference.implicit import TermWeights, weighted_minimum
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.trust_region import TrustRegionNewton
+from torchcss.initialise.result import Initialisation
 from torchcss.io.tracks import prepare_output_folder, write_summary
 from torchcss.io.video import VideoReader
 from torchcss.studies.render.sequences import arm_sequence
 from torchcss.studies.sequences import read_sequence
 from torchcss.tracking.presets import PRESETS
-from torchcss.tracking.session import track_frames
+from torchcss.tracking.session import TrackingSession
 from torchcss.tracking.settings import (
     Settings,
     boundary_emphasis,
     make_choice,
     make_extractor,
-    make_settings_tracker,
 )
+from torchcss.tracking.view import CameraView
 from torchcss.types import Frame
 from torchcss.vision.appearance import Appearance
 from torchcss.vision.camera import Camera
@@ -279,21 +280,20 @@ def tracked_error(
     truth: Truth, settings: Settings, weights: Mapping[str, float], seed: int
 ) -> dict[str, float]:
     """Mean error of a whole track from the true first pose, of the best mode and of all, mm."""
-    settings = replace(settings, weights=dict(weights))
+    settings = replace(settings, weights=dict(weights), seed=seed)
     n = truth.body.num_parameters
-    first = GaussianMixture(
+    mixture = GaussianMixture(
         truth.states[:1], 0.01 * torch.eye(n).double()[None], torch.zeros(1).double()
+    )
+    session = TrackingSession(
+        settings,
+        Initialisation(truth.body, mixture, torch.zeros(1).double(), ()),
+        [CameraView(truth.camera)],
+        frame_interval=truth.interval,
     )
     best, of_modes = [], []
     frames = (Frame(i, i * truth.interval, image) for i, image in enumerate(truth.images))
-    for frame in track_frames(
-        tqdm(frames, total=len(truth.images), unit="frame"), body=truth.body, mixture=first,
-        camera=truth.camera, extractor=make_extractor(settings),
-        tracker=make_settings_tracker(settings, truth.body.motion_rate * truth.interval),
-        choice=make_choice(settings, 1.0), observe=lambda index: None,
-        frame_interval=truth.interval, generator=torch.Generator().manual_seed(seed),
-        boundary_emphasis=boundary_emphasis(settings),
-    ):  # fmt: skip
+    for frame in session.track(tqdm(frames, total=len(truth.images), unit="frame")):
         joints = truth.body.pose(truth.states[frame.frame.index]).joints
         error = (frame.joints_world - joints).norm(dim=-1).mean(-1)
         best.append(1000 * float(error[0]))

@@ -21,6 +21,7 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Literal
 
@@ -44,8 +45,10 @@ from torchcss.files import load_arrays
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.initialise.outliers import best_distinct
+from torchcss.initialise.result import Initialisation
 from torchcss.io.cameras import read_camera
 from torchcss.io.fitted_body import read_fitted_body
+from torchcss.io.keypoints.read import Keypoints
 from torchcss.io.run import body_of_track
 from torchcss.io.track_body import pose_track
 from torchcss.io.tracks import load_track, prepare_output_folder, write_summary
@@ -58,9 +61,9 @@ from torchcss.studies.metrics import (
     probability_within,
     track_errors,
 )
-from torchcss.tracking.session import track_frames
-from torchcss.tracking.settings import Settings, make_extractor, make_settings_tracker
-from torchcss.tracking.view import ViewStream
+from torchcss.tracking.session import TrackingSession
+from torchcss.tracking.settings import Settings
+from torchcss.tracking.view import CameraView
 from torchcss.vision.camera import Camera
 
 BEAM, BOARD = "balance_beam_4cam", "handheld_board"
@@ -226,28 +229,22 @@ def board(config: Config, folder: Path) -> dict[str, Any]:
             body="board", terms=("joints", "temporal"), samples=config.samples or 40, modes=3,
             working_size=1280, seed=config.seed,
         )  # fmt: skip
-        streams = [
-            ViewStream(
-                VideoReader(folder / f"{view}.mp4", start=start, stop=stop),
-                camera,
-                corner_marks(body, marks[view]),
-            )
+        seen = [
+            CameraView(camera, corner_keypoints(body, marks[view]), CORNER_NOISE_PX)
             for view, camera in zip(views, cameras, strict=True)
         ]
+        readers = [VideoReader(folder / f"{view}.mp4", start=start, stop=stop) for view in views]
         generator = torch.Generator().manual_seed(config.seed)
-        placed, mixture = place(body, streams, start, generator)
-        choice = CostChoice(
-            contour=None, stabiliser=None, anthropometric=None,
-            joints=JointTerm(sigma=CORNER_NOISE_PX),
-        )  # fmt: skip
+        placed, mixture = place(body, seen, start, generator)
+        session = TrackingSession(
+            settings,
+            Initialisation(placed, mixture, torch.zeros(len(mixture.mean)).double(), ()),
+            seen,
+            frame_interval=interval,
+            generator=generator,
+        )
         sums, errors, frames = Sums(), [], 0
-        for tracked in track_frames(
-            streams[0].frames, body=placed, mixture=mixture, camera=streams[0].camera,
-            extractor=make_extractor(settings),
-            tracker=make_settings_tracker(settings, placed.motion_rate * interval),
-            choice=choice, observe=streams[0].observe, frame_interval=interval,
-            generator=generator, others=streams[1:],
-        ):  # fmt: skip
+        for tracked in session.track(zip_longest(*readers)):
             joints = tracked.joints_world[0]
             away = joints - truth[tracked.frame.index]
             pose = tracked.body.pose(tracked.state.mixture.mean[:1])
@@ -286,28 +283,28 @@ def board_body(corners: Float[np.ndarray, "m 3"]) -> BodyModel:
     )
 
 
-def corner_marks(body: BodyModel, corners: Float[np.ndarray, "t m 2"]) -> Any:
-    """Corners of a frame as an observation."""
-
-    def observe(index: int) -> JointObservation:
-        place = torch.from_numpy(corners[index])
-        seen = place.isfinite().all(-1).double()
-        return JointObservation(body.joint_names, place, seen, body.joint_names)
-
-    return observe
+def corner_keypoints(body: BodyModel, corners: Float[np.ndarray, "t m 2"]) -> Keypoints:
+    """Corners of all frames as keypoints."""
+    place = torch.from_numpy(corners)
+    seen = place.isfinite().all(-1).double()
+    return Keypoints(place, seen, body.joint_names, ())
 
 
 def place(
-    body: BodyModel, streams: Sequence[ViewStream], start: int, generator: torch.Generator
+    body: BodyModel, views: Sequence[CameraView], start: int, generator: torch.Generator
 ) -> tuple[BodyModel, GaussianMixture]:
     """Find the board in the first frame, from random turns before the first camera."""
-    first = streams[0]
-    observation = first.observe(start)
-    assert observation is not None
-    middle = observation.target[observation.weight > 0].mean(0)
+    observations = []
+    for view in views:
+        known = view.keypoints
+        assert known is not None
+        at_start = known.keypoints[start], known.confidence[start], known.joint_names
+        observations.append(JointObservation(body.joint_names, *at_start))
+    first = observations[0]
+    middle = first.target[first.weight > 0].mean(0)
     # An arm's length away; how far exactly, the descent finds.
     body = body.with_base(
-        torch.eye(3).double(), first.camera.unproject(middle, middle.new_tensor(0.8))
+        torch.eye(3).double(), views[0].camera.unproject(middle, middle.new_tensor(0.8))
     )
     x = torch.zeros(100, body.num_parameters, dtype=torch.float64)
     x[:, 3:] = 3.0 * torch.randn(100, 3, generator=generator, dtype=torch.float64).clamp(-1, 1)
@@ -319,10 +316,8 @@ def place(
         )  # fmt: skip
         cost = beside(
             [
-                TrackingCost(
-                    body=body, camera=s.camera, choice=choice, observation=s.observe(start)
-                )
-                for s in streams
+                TrackingCost(body=body, camera=view.camera, choice=choice, observation=observation)
+                for view, observation in zip(views, observations, strict=True)
             ]
         )
         modes = TrustRegionNewton(max_steps=60, tolerance=1e-6).minimise(cost, x, body.bounds)

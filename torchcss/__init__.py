@@ -7,24 +7,30 @@ of poses with covariances and weights (covariance scaled sampling, Sminchisescu 
 
 from torchcss.app.smooth import smooth_file, smooth_video
 from torchcss.app.track import track_video
+from torchcss.app.v01 import track_frames
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.initialise.fit import Initialisation, initialise
 from torchcss.io.export import export_track
 from torchcss.io.tracks import Track, load_track
 from torchcss.solve.inverse_kinematics import Solutions, inverse_kinematics
-from torchcss.tracking.session import track_frames
+from torchcss.tracking.session import Observation, Posterior, TrackingSession
 from torchcss.tracking.settings import Settings
 from torchcss.tracking.smooth import smooth_track
+from torchcss.tracking.view import CameraView
 from torchcss.vision.camera import Camera
 
 __all__ = [
     "BodyModel",
     "Camera",
+    "CameraView",
     "Initialisation",
+    "Observation",
+    "Posterior",
     "Settings",
     "Solutions",
     "Track",
+    "TrackingSession",
     "export_track",
     "initialise",
     "inverse_kinematics",

@@ -153,8 +153,10 @@ class Frame:
         time_s: Seconds since the file's first frame. Where the file's own times do not rise from
             one frame to the next, it is an interval of its frame rate after the last.
         image: Red, green, blue.
+        mask: Foreground of the image, of its size, white or in shades of belief; None: not known.
     """
 
     index: int
     time_s: float
     image: UInt8[np.ndarray, "h w 3"]
+    mask: UInt8[np.ndarray, "h w *c"] | None = None

@@ -20,7 +20,7 @@ from torchcss.io.cameras import read_camera
 from torchcss.io.tracks import load_track, read_summary
 from torchcss.io.video import VideoReader, VideoWriter
 from torchcss.show.track_plots import bones_of
-from torchcss.tracking.session import TrackedFrame
+from torchcss.tracking.session import Posterior
 from torchcss.tracking.settings import Settings
 
 SETTINGS = Settings(body="arm7", samples=3, modes=2, terms=("joints",))
@@ -59,7 +59,7 @@ def test_a_live_recording_is_the_track(files: Path, monkeypatch: pytest.MonkeyPa
     chunk = pytest.importorskip("rerun.chunk")
     drawn, draw = [], recorder.draw_modes
 
-    def count(frame: TrackedFrame, *arguments: object) -> np.ndarray:
+    def count(frame: Posterior, *arguments: object) -> np.ndarray:
         drawn.append(frame.frame.index)
         return draw(frame, *arguments)  # pyright: ignore[reportArgumentType]
 
@@ -96,7 +96,7 @@ class Watcher:
         self.closed = 0
         self._fail_at, self._error = fail_at, error
 
-    def add(self, frame: TrackedFrame, picture: Picture) -> None:
+    def add(self, frame: Posterior, picture: Picture) -> None:
         if frame.frame.index == self._fail_at and self._error is not None:
             raise self._error
         assert picture.image is picture.image

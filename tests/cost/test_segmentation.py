@@ -21,7 +21,7 @@ from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.proposals import CovarianceScaled
 from torchcss.inference.tracker import Tracker
-from torchcss.tracking.view import Watcher
+from torchcss.tracking.view import NOTHING_KNOWN, NOTHING_SEEN, CameraView, Observer
 from torchcss.types import Bounds, Frame, LocalModel
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor
@@ -171,13 +171,16 @@ def test_a_camera_that_stands_still_knows_what_was_behind(dtype: torch.dtype) ->
         )
         costs = FrameCosts(body, camera, choice)
         extractor = FeatureExtractor(colour=True).to(dtype)
-        watcher = Watcher(costs, extractor, lambda _: None, None)
+        observer = Observer(view=CameraView(camera), costs=costs, extractor=extractor)
+        seen, memory = NOTHING_SEEN, NOTHING_KNOWN
         for index in range(2):
-            watcher.look(Frame(index, 0.0, before_a_wall(body, camera, before)))
-            watcher.learn(body, before[None])
-        watcher.look(Frame(2, 0.0, before_a_wall(body, camera, after)))
-        assert (watcher.background is not None) == asked
-        cost = watcher.cost(body, before[None])
+            frame = Frame(index, 0.0, before_a_wall(body, camera, before))
+            seen = observer.observe(frame, seen)
+            memory = observer.learn(observer.recall(memory, seen), seen, body, before[None])
+        seen = observer.observe(Frame(2, 0.0, before_a_wall(body, camera, after)), seen)
+        memory = observer.recall(memory, seen)
+        assert (memory.background is not None) == asked
+        cost = observer.cost(seen, memory, body, before[None])
         where = torch.zeros(2, dtype=torch.long)
         prior = GaussianMixture(before[None], torch.eye(len(before))[None].to(before), before[:1])
         both = torch.stack([after, before])
@@ -187,11 +190,11 @@ def test_a_camera_that_stands_still_knows_what_was_behind(dtype: torch.dtype) ->
         gaps[asked] = float(shown[1] - shown[0])
     assert gaps[True] > gaps[False] + 20
     # A cut, and a picture that is missing.
-    watcher.look(None)
-    watcher.learn(body, before[None])
-    assert watcher.background is not None
-    watcher.look(Frame(3, 0.0, 255 - before_a_wall(body, camera, after)))
-    assert watcher.background is None
+    seen = observer.observe(None, seen)
+    memory = observer.learn(memory, seen, body, before[None])
+    assert memory.background is not None
+    seen = observer.observe(Frame(3, 0.0, 255 - before_a_wall(body, camera, after)), seen)
+    assert observer.recall(memory, seen).background is None
 
 
 def test_pixels_are_bare_where_no_likely_pose_is_near() -> None:

@@ -9,11 +9,11 @@ import pytest
 import torch
 from made_sequences import NOISE_PX, write_arm
 
-from torchcss.studies import comparison as side_by_side
-from torchcss.studies.comparison import Run, SharedFeatures, Start, find_start, track_together
+from torchcss.studies.comparison import Run, Start, find_start, track_together
 from torchcss.studies.evaluation import Thresholds
 from torchcss.studies.sequences import RecordedSequence, read_sequence
-from torchcss.tracking.settings import Settings, make_extractor
+from torchcss.tracking.session import Observation, Posterior, TrackingSession
+from torchcss.tracking.settings import Settings
 from torchcss.vision.features import FeatureExtractor
 
 T = 3
@@ -78,19 +78,6 @@ def test_features_are_computed_once_per_frame(
     assert asked[2][1] is asked[1][0]
 
 
-def test_shared_features_are_the_extractors(sequence: RecordedSequence) -> None:
-    extractor = make_extractor(choose("css"))
-    shared = SharedFeatures(extractor)
-    image = torch.rand(48, 64, generator=torch.Generator().manual_seed(0))
-    other = image.clone()
-    first = shared(image)
-    assert first.colour is not None  # the region term would be silent
-    torch.testing.assert_close(first, extractor(image))
-    assert shared(image) is first
-    assert shared(other) is not first  # equal, but not the same
-    assert shared(other, image).flow is not None
-
-
 def test_a_lost_run_ends_early(sequence: RecordedSequence, begin: Start) -> None:
     never = Thresholds(lost_mm=-1.0, regain_s=0.04)
     options: dict = {"thresholds": never, "stop": T}
@@ -106,20 +93,14 @@ def test_a_lost_run_ends_early(sequence: RecordedSequence, begin: Start) -> None
 def test_an_error_ends_one_run_only(
     sequence: RecordedSequence, begin: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    make = side_by_side.make_settings_tracker
+    step = TrackingSession.step
 
-    class Broken:
-        def __init__(self, tracker: object) -> None:
-            self.init = tracker.init  # type: ignore[attr-defined]
-
-        def step(self, *_: object) -> object:
+    def breaking(self: TrackingSession, observation: Observation) -> Posterior:
+        if self.settings.preset == "gaussian_single":
             raise torch.linalg.LinAlgError("singular")
+        return step(self, observation)
 
-    def make_one(settings: Settings, motion: torch.Tensor) -> object:
-        tracker = make(settings, motion)
-        return Broken(tracker) if settings.preset == "gaussian_single" else tracker
-
-    monkeypatch.setattr(side_by_side, "make_settings_tracker", make_one)
+    monkeypatch.setattr(TrackingSession, "step", breaking)
     broken, sound = together(sequence, begin, "gaussian_single", "condensation")
     assert broken.settings.preset == "gaussian_single"
     assert broken.ended == f"error: {torch.linalg.LinAlgError.__name__}: singular"

@@ -8,19 +8,16 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from made_sessions import seen_by, session_at
 
 from torchcss.cost.total import TrackingCost
 from torchcss.errors import ConfigurationError
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.studies.render.sequences import arm_sequence
 from torchcss.studies.scenes import Scene, arm_scenes, clip_scenes
-from torchcss.tracking.session import track_frames
 from torchcss.tracking.settings import (
     ALL_TERMS,
     Settings,
-    boundary_emphasis,
-    make_choice,
-    make_extractor,
 )
 from torchcss.types import Frame
 
@@ -53,23 +50,16 @@ class Spy:
 def costs_of_a_tracker_at_the_truth(settings: Settings, num_frames: int) -> list[TrackingCost]:
     generator = torch.Generator().manual_seed(0)
     sequence = arm_sequence(generator=generator, num_frames=num_frames)
-    spy, n = Spy(sequence.states), sequence.states.shape[1]
-    start = GaussianMixture(
-        sequence.states[:1], torch.eye(n, dtype=torch.float64)[None], torch.zeros(1).double()
+    spy, view = Spy(sequence.states), seen_by(sequence.camera, sigma=1.0)
+    session = session_at(
+        settings,
+        sequence.body,
+        sequence.states[0],
+        view,
+        variance=1.0,
     )
-    for _ in track_frames(
-        [Frame(i, i / 25, image) for i, image in enumerate(sequence.frames)],
-        body=sequence.body,
-        mixture=start,
-        camera=sequence.camera,
-        extractor=make_extractor(settings),
-        tracker=spy,  # type: ignore[arg-type]
-        choice=make_choice(settings, 1.0),
-        observe=lambda index: None,
-        frame_interval=1 / 25,
-        generator=generator,
-        boundary_emphasis=boundary_emphasis(settings),
-    ):
+    session.plan = session.plan._replace(tracker=spy, jumps_every=0, recovery=None)  # type: ignore[arg-type]
+    for _ in session.track(Frame(i, i / 25, image) for i, image in enumerate(sequence.frames)):
         pass
     return spy.costs
 

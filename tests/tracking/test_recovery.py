@@ -3,57 +3,48 @@
 from __future__ import annotations
 
 import json
-from itertools import pairwise
+from dataclasses import replace
+from itertools import islice, pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from made_sessions import seen_by, session_at
 
 import torchcss
 from torchcss.app.recorder import Recorder
 from torchcss.inference.loss_monitor import LossMonitor
-from torchcss.inference.mixture import GaussianMixture
 from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
 from torchcss.tracking.presets import make_tracker
 from torchcss.tracking.recovery import OBSERVATIONS, Recovery
-from torchcss.tracking.session import TrackedFrame, track_frames
-from torchcss.tracking.settings import Settings, make_choice, make_extractor
+from torchcss.tracking.session import Posterior
+from torchcss.tracking.settings import Settings
 from torchcss.types import Frame
 
 ELSEWHERE = range(6, 8)
 """Frames that show a wall. It has some grain: a picture of a single colour is a camera that is out,
 and says nothing."""
-SETTINGS = Settings(body="arm8", terms=("contour",), working_size=120, overlay=False)
-TRACKER = make_tracker("css", "arm8", num_samples=4, num_modes=2, motion=0.1)
+SETTINGS = Settings(
+    body="arm8", terms=("contour",), working_size=120, overlay=False, samples=4, modes=2
+)
 RECOVERY = Recovery(monitor=LossMonitor(burn_in=3, slack=2.5, threshold=4.0), samples=3, modes=2)
 
 
 def track(
     sequence: SyntheticSequence, num_frames: int, recovery: Recovery | None, seed: int = 0
-) -> list[TrackedFrame]:
+) -> list[Posterior]:
     """Track from the true first pose; some frames show a wall."""
     wall = np.random.default_rng(0).integers(88, 93, (480, 640, 3), np.uint8)
     images = (wall if index in ELSEWHERE else image for index, image in enumerate(sequence.frames))
-    mixture = GaussianMixture(
-        sequence.states[:1], 0.01 * torch.eye(8).double()[None], torch.zeros(1).double()
+    settings = replace(SETTINGS, seed=seed, recovery=recovery is not None)
+    session = session_at(settings, sequence.body, sequence.states[0], seen_by(sequence.camera))
+    session.plan = session.plan._replace(recovery=recovery)
+    session.state = session.state._replace(
+        monitor=None if recovery is None else recovery.monitor.init()
     )
     frames = (Frame(index, index / 25, image) for index, image in enumerate(images))
-    return list(
-        track_frames(
-            (frame for frame, _ in zip(frames, range(num_frames), strict=False)),
-            body=sequence.body,
-            mixture=mixture,
-            camera=sequence.camera,
-            extractor=make_extractor(SETTINGS),
-            tracker=TRACKER,
-            choice=make_choice(SETTINGS, 2.0),
-            observe=lambda index: None,
-            frame_interval=1 / 25,
-            generator=torch.Generator().manual_seed(seed),
-            recovery=recovery,
-        )
-    )
+    return list(session.track(islice(frames, num_frames)))
 
 
 @pytest.fixture(scope="module")
@@ -62,11 +53,11 @@ def sequence() -> SyntheticSequence:
 
 
 @pytest.fixture(scope="module")
-def tracked(sequence: SyntheticSequence) -> list[TrackedFrame]:
+def tracked(sequence: SyntheticSequence) -> list[Posterior]:
     return track(sequence, 12, RECOVERY)
 
 
-def test_a_target_that_disappears_is_lost_and_found_again(tracked: list[TrackedFrame]):
+def test_a_target_that_disappears_is_lost_and_found_again(tracked: list[Posterior]):
     lost = [frame.lost for frame in tracked]
     assert not any(lost[: ELSEWHERE.start])
     assert any(lost[frame] for frame in ELSEWHERE)
@@ -79,7 +70,7 @@ def test_a_target_that_disappears_is_lost_and_found_again(tracked: list[TrackedF
     assert any(len(frame.state.mixture.mean) > 2 for frame in tracked)
 
 
-def test_parents_are_modes_of_the_frame_before(tracked: list[TrackedFrame]):
+def test_parents_are_modes_of_the_frame_before(tracked: list[Posterior]):
     """Also of modes that were jumped to."""
     for before, frame in pairwise(tracked):
         assert int(frame.info.parent.min()) >= -1
@@ -87,12 +78,12 @@ def test_parents_are_modes_of_the_frame_before(tracked: list[TrackedFrame]):
 
 
 def test_losses_come_out_in_the_summary(
-    sequence: SyntheticSequence, tracked: list[TrackedFrame], tmp_path: Path
+    sequence: SyntheticSequence, tracked: list[Posterior], tmp_path: Path
 ):
     recorder = Recorder(
         folder=tmp_path,
         settings=SETTINGS,
-        tracker=TRACKER,
+        tracker=make_tracker("css", "arm8", num_samples=4, num_modes=2),
         camera=sequence.camera,
         frame_rate=25.0,
     )
@@ -116,7 +107,7 @@ def test_losses_come_out_in_the_summary(
     assert np.isfinite(track.joints_world[:, 0]).all()
 
 
-def test_same_seed_same_losses(sequence: SyntheticSequence, tracked: list[TrackedFrame]):
+def test_same_seed_same_losses(sequence: SyntheticSequence, tracked: list[Posterior]):
     again = track(sequence, 9, RECOVERY)
     for one, two in zip(again, tracked, strict=False):
         assert torch.equal(one.state.mixture.mean, two.state.mixture.mean)
@@ -125,7 +116,7 @@ def test_same_seed_same_losses(sequence: SyntheticSequence, tracked: list[Tracke
 
 
 def test_without_recovery_nothing_is_told_and_nothing_changes(
-    sequence: SyntheticSequence, tracked: list[TrackedFrame]
+    sequence: SyntheticSequence, tracked: list[Posterior]
 ):
     first = next(frame.frame.index for frame in tracked if frame.lost)
     plain = track(sequence, first + 2, None)

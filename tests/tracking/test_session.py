@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from made_sessions import seen_by, session_at
 
 import torchcss
 from torchcss.app.track import _first_pose_from_file, track_video
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
-from torchcss.cost.joints import JointObservation
 from torchcss.errors import ConfigurationError, OutputError, VideoError
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.tracker import Tracker, TrackerState, stated_evidence
@@ -30,19 +30,17 @@ from torchcss.robust import Quadratic
 from torchcss.studies.demo import run_demo
 from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
 from torchcss.tracking.flip_moves import with_modes
-from torchcss.tracking.presets import PRESETS, make_tracker
-from torchcss.tracking.session import TrackedFrame, follow_with_base, scale_keypoints, track_frames
+from torchcss.tracking.presets import PRESETS
+from torchcss.tracking.session import Posterior, follow_with_base
 from torchcss.tracking.settings import (
     ALL_TERMS,
     TERMS,
     Settings,
-    boundary_emphasis,
     make_choice,
-    make_extractor,
     make_settings_tracker,
     named_terms,
 )
-from torchcss.tracking.view import Observe
+from torchcss.tracking.view import CameraView, scale_keypoints
 from torchcss.types import Frame
 from torchcss.vision.camera import Camera
 
@@ -426,32 +424,19 @@ def track(
     images: Iterable[np.ndarray],
     sequence: SyntheticSequence,
     settings: Settings,
-    camera: Camera | None = None,
+    view: CameraView | None = None,
     masks: list[np.ndarray] | None = None,
-    observe: Observe = lambda index: None,
-    limb_jumps: int = 0,
-) -> list[TrackedFrame]:
+) -> list[Posterior]:
     """Track from the true first pose, by default without keypoints, with few samples."""
-    mixture = GaussianMixture(
-        sequence.states[:1], 0.01 * torch.eye(8, dtype=torch.float64)[None], torch.zeros(1).double()
+    few = replace(settings, samples=4, modes=2, recovery=False)
+    view = view or seen_by(sequence.camera)
+    session = session_at(few, sequence.body, sequence.states[0], view)
+    session.plan = session.plan._replace(jumps_every=0)
+    frames = (
+        Frame(i, i / 25, image, None if masks is None else masks[i])
+        for i, image in enumerate(images)
     )
-    return list(
-        track_frames(
-            (Frame(i, i / 25, image) for i, image in enumerate(images)),
-            body=sequence.body,
-            mixture=mixture,
-            camera=camera or sequence.camera,
-            extractor=make_extractor(settings),
-            tracker=make_tracker("css", "arm8", num_samples=4, num_modes=2, motion=0.1),
-            choice=make_choice(settings, 2.0),
-            observe=observe,
-            frame_interval=1 / 25,
-            generator=torch.Generator().manual_seed(0),
-            boundary_emphasis=boundary_emphasis(settings),
-            masks=masks,
-            limb_jumps=limb_jumps,
-        )
-    )
+    return list(session.track(frames))
 
 
 def test_poses_of_limbs_join_the_search(monkeypatch: pytest.MonkeyPatch):
@@ -469,7 +454,7 @@ def test_poses_of_limbs_join_the_search(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("torchcss.tracking.session.with_limbs", aside)
     plain = track(sequence.frames, sequence, settings)
     assert asked == []
-    jumping = track(sequence.frames, sequence, settings, limb_jumps=4)
+    jumping = track(sequence.frames, sequence, replace(settings, limb_jumps=4))
     assert asked == [4, 4, 4]
     assert int(jumping[0].info.origin.max()) == 1, "the pose was descended from"
     known = 1
@@ -491,15 +476,10 @@ def test_frames_without_detections_have_no_term_of_joints():
     """Detectors write such frames as zeros; they cost nothing, and are not what is usual."""
     sequence = arm_sequence(generator=torch.Generator().manual_seed(0), num_frames=2)
     settings = Settings(body="arm8", working_size=160, terms=("joints", "temporal"))
-    names = sequence.body.joint_names
-    marks = (
-        sequence.camera.project(sequence.joints_world).uv * 160 / sequence.camera.image_size_wh[0]
-    )
-
-    def observe(index: int) -> JointObservation:
-        return JointObservation(names, marks[index], torch.full((len(names),), 1.0 - index), names)
-
-    frames = track(sequence.frames, sequence, settings, observe=observe)
+    view = seen_by(sequence.camera, sequence.joints_world, sequence.body.joint_names)
+    assert view.keypoints is not None
+    view.keypoints.confidence[1] = 0
+    frames = track(sequence.frames, sequence, settings, view)
     assert ["joints" in tracked.terms for tracked in frames] == [True, False]
 
 
@@ -613,7 +593,7 @@ def test_images_one_pixel_wide_and_of_odd_sizes(size: tuple[int, int]):
         R_camera_world=np.diag([1.0, -1.0, -1.0]),
     )
     noise = np.random.default_rng(0).integers(0, 255, (3, height, width, 3), dtype=np.uint8)
-    tracked = track(noise, sequence, Settings(body="arm8", terms=ALL_TERMS), small)
+    tracked = track(noise, sequence, Settings(body="arm8", terms=ALL_TERMS), seen_by(small))
     for frame in tracked:
         assert torch.isfinite(frame.info.cost).all()
         assert torch.isfinite(frame.state.mixture.covariance).all()

@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 import json
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from made_sessions import seen_by, session_at
 
 from torchcss.app.track import track_video
 from torchcss.body.uncertainty import joint_covariance
-from torchcss.cost.joints import JointObservation, JointTerm
-from torchcss.cost.total import CostChoice
 from torchcss.errors import CameraError, VideoError
-from torchcss.inference.mixture import GaussianMixture
 from torchcss.io.cameras import read_camera
 from torchcss.io.tracks import load_track
 from torchcss.io.video import VideoWriter
 from torchcss.io.view_files import ViewFiles
 from torchcss.show.track_pictures import TrackFiles
 from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
-from torchcss.tracking.presets import make_tracker
-from torchcss.tracking.session import TrackedFrame, track_frames
-from torchcss.tracking.settings import Settings, make_extractor
-from torchcss.tracking.view import ViewStream
+from torchcss.tracking.session import Posterior
+from torchcss.tracking.settings import Settings
 from torchcss.types import Frame
 from torchcss.vision.camera import Camera
 
@@ -56,41 +53,29 @@ def follow(
     sequence: SyntheticSequence,
     images: list[np.ndarray],
     others: list[tuple[Camera, list[np.ndarray]]],
-) -> list[TrackedFrame]:
+) -> list[Posterior]:
     """Track from keypoints in all frames, exact in every view, with few samples."""
-    names = sequence.body.joint_names
-
-    def stream(camera: Camera, images: list[np.ndarray]) -> ViewStream:
-        def observe(index: int) -> JointObservation:
-            uv = camera.project(sequence.joints_world[index]).uv
-            return JointObservation(names, uv, torch.ones(len(uv)).double(), names)
-
-        return ViewStream((Frame(i, i / 25, x) for i, x in enumerate(images)), camera, observe)
-
-    main = stream(sequence.camera, images)
+    joints, names = sequence.joints_world, sequence.body.joint_names
+    cameras = [sequence.camera, *(camera for camera, _ in others)]
+    views = [seen_by(camera, joints, names, sigma=1.0) for camera in cameras]
     # The first pose is wrong in depth, which the first camera hardly sees.
     start = sequence.states[:1] + 0.1
-    settings = Settings(body="arm8", terms=("joints",), working_size=640)
+    settings = Settings(
+        body="arm8", terms=("joints", "stabiliser"), working_size=640, samples=6, modes=2,
+        recovery=False,
+    )  # fmt: skip
+    session = session_at(settings, sequence.body, start, *views)
+    moments = zip_longest(images, *(beside for _, beside in others))
     return list(
-        track_frames(
-            main.frames,
-            body=sequence.body,
-            mixture=GaussianMixture(
-                start, 0.01 * torch.eye(8).double()[None], torch.zeros(1).double()
-            ),
-            camera=main.camera,
-            extractor=make_extractor(settings),
-            tracker=make_tracker("css", "arm8", num_samples=6, num_modes=2, motion=0.1),
-            choice=CostChoice(contour=None, joints=JointTerm(sigma=1.0), temporal=None),
-            observe=main.observe,
-            frame_interval=1 / 25,
-            generator=torch.Generator().manual_seed(0),
-            others=[stream(*other) for other in others],
+        session.track(
+            [None if image is None else Frame(i, i / 25, image) for image in moment]
+            for i, moment in enumerate(moments)
+            if moment[0] is not None
         )
     )
 
 
-def errors_mm(tracked: list[TrackedFrame], sequence: SyntheticSequence) -> list[float]:
+def errors_mm(tracked: list[Posterior], sequence: SyntheticSequence) -> list[float]:
     return [
         1000 * float((each.joints_world[0] - sequence.joints_world[i]).norm(dim=-1).mean())
         for i, each in enumerate(tracked)
@@ -110,7 +95,7 @@ def test_a_second_view_shows_depth(sequence: SyntheticSequence, side: Camera):
     assert np.mean(errors_mm(two, sequence)) < 0.5 * np.mean(errors_mm(one, sequence))
     assert [each.others[0].index for each in two if each.others[0]] == list(range(FRAMES))
 
-    def depth_variance(tracked: TrackedFrame) -> float:
+    def depth_variance(tracked: Posterior) -> float:
         mode = tracked.body.pose(tracked.state.mixture.mean[:1])
         spread = joint_covariance(tracked.body, mode, tracked.covariance[:1])
         line = sequence.camera.R_camera_world[2].double()

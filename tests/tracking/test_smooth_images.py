@@ -15,14 +15,14 @@ from made_clip import track
 from torchcss import load_track
 from torchcss.app.smooth import settings_of
 from torchcss.cli import main as cli
-from torchcss.cost.joints import JointObservation
 from torchcss.errors import ConfigurationError, VideoError
+from torchcss.io.keypoints.read import Keypoints
 from torchcss.io.tracks import FrameModes, Track, TrackWriter, read_summary, write_summary
 from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
-from torchcss.tracking.session import scale_keypoints
-from torchcss.tracking.settings import Settings, make_choice, make_extractor
+from torchcss.tracking.settings import Settings
 from torchcss.tracking.smooth import Smoothing, smooth_track
 from torchcss.tracking.smooth_images import smooth_frames
+from torchcss.tracking.view import CameraView
 from torchcss.types import Frame
 
 NUM_FRAMES = 8
@@ -48,8 +48,6 @@ class Setup(NamedTuple):
 @pytest.fixture
 def setup(sequence: SyntheticSequence) -> Setup:
     body, camera, source = sequence.body, sequence.camera, torch.Generator().manual_seed(1)
-    extractor = make_extractor(SETTINGS)
-    working = extractor.working_shape(*camera.image_size_wh)
     writer = TrackWriter("unused", Track.empty(body.state_names, body.joint_names, body=body))
     base = np.eye(4)
     base[:3, :3], base[:3, 3] = body.base_rotation, body.base_translation
@@ -72,18 +70,11 @@ def setup(sequence: SyntheticSequence) -> Setup:
         )
     exact = camera.project(sequence.joints_world).uv
     seen = exact + NOISE_PX * torch.randn(exact.shape, generator=source, dtype=torch.float64)
-    scaled = scale_keypoints(seen, camera.image_size_wh, working)
-
-    def observe(index: int) -> JointObservation:
-        names = body.joint_names
-        return JointObservation(names, scaled[index], torch.ones(len(names)).double(), names)
-
+    keypoints = Keypoints(seen, torch.ones_like(seen[..., 0]), body.joint_names, ())
     arguments = {
         "body": body,
-        "camera": camera,
-        "extractor": extractor,
-        "cost": make_choice(SETTINGS, NOISE_PX * working[0] / camera.image_size_wh[0]),
-        "observe": observe,
+        "settings": SETTINGS,
+        "views": [CameraView(camera, keypoints, NOISE_PX)],
     }
     return Setup(writer.track(), sequence.joints_world.numpy(), arguments)
 
@@ -114,10 +105,7 @@ def test_images_correct_what_the_modes_say(setup: Setup, sequence: SyntheticSequ
 
 def test_colours_are_learnt_for_the_region_term(setup: Setup, sequence: SyntheticSequence):
     settings = replace(SETTINGS, terms=("region", "temporal"))
-    arguments = setup.arguments | {
-        "cost": make_choice(settings, 1.0),
-        "extractor": make_extractor(settings),
-    }
+    arguments = setup.arguments | {"settings": settings}
     done = smooth_frames(setup.track, images(sequence), **arguments)
     before = done.effect["mean_cost_before_images"]
     assert before > 1
@@ -143,9 +131,6 @@ def test_other_videos_are_refused(setup: Setup, sequence: SyntheticSequence):
         smooth_frames(setup.track, short, **setup.arguments)
     with pytest.raises(VideoError, match="no frame 0"):
         smooth_frames(setup.track, list(images(sequence))[1:], **setup.arguments)
-    masks = [np.ones((480, 640), dtype=np.uint8)] * 3
-    with pytest.raises(VideoError, match="masks end before frame 3"):
-        smooth_frames(setup.track, images(sequence), masks=masks, **setup.arguments)
 
 
 def test_track_and_smooth_on_files(files: Path, capsys: pytest.CaptureFixture[str]):

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 import pytest
 import torch
+from made_sessions import seen_by, session_at
 from torch import Tensor
 from torch.nn import functional
 
@@ -19,9 +20,8 @@ from torchcss.errors import ConfigurationError
 from torchcss.inference.dynamics import ConstantVelocity, Diffusion
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.studies.render.renderer import Lighting, Mesh, random_texture, render_meshes
-from torchcss.tracking.presets import make_tracker
-from torchcss.tracking.session import TrackedFrame, track_frames
-from torchcss.tracking.settings import Settings, make_choice, make_extractor
+from torchcss.tracking.session import Posterior
+from torchcss.tracking.settings import Settings
 from torchcss.tracking.surface_prediction import Carrier, Displaced, Sight, SurfaceCost, trunk_of
 from torchcss.types import Frame
 from torchcss.vision.camera import Camera
@@ -361,33 +361,25 @@ def test_the_setting_is_checked() -> None:
         Settings(prediction="surface", preset="condensation")
 
 
-def tracked(prediction: Literal["velocity", "surface"]) -> list[TrackedFrame]:
+def tracked(prediction: Literal["velocity", "surface"]) -> list[Posterior]:
     """Three frames of a person who turns by eight degrees in each."""
     settings = Settings(
-        prediction=prediction, keypoints_use="first", terms=("contour", "temporal"), seed=0
+        prediction=prediction,
+        keypoints_use="first",
+        terms=("contour", "temporal"),
+        seed=0,
+        samples=4,
+        modes=2,
+        recovery=False,
     )
     body, x = the_body(), poses()
-    eye = 1e-4 * torch.eye(34, dtype=torch.float64)
     images = [picture(turned(x, 8.0 * t)[0]) for t in range(3)]
     frames = [
         Frame(t, t * INTERVAL, (255 * image).round().byte()[..., None].expand(-1, -1, 3).numpy())
         for t, image in enumerate(images)
     ]
-    return list(
-        track_frames(
-            frames,
-            body=body,
-            mixture=GaussianMixture(x, eye[None], torch.zeros(1).double()),
-            camera=the_camera(),
-            extractor=make_extractor(settings),
-            tracker=make_tracker("css", "body34", num_samples=4, num_modes=2, motion=0.02),
-            choice=make_choice(settings, 2.0),
-            observe=lambda _: None,
-            frame_interval=INTERVAL,
-            generator=torch.Generator().manual_seed(0),
-            carries=settings.prediction == "surface",
-        )
-    )
+    session = session_at(settings, body, x, seen_by(the_camera()), variance=1e-4)
+    return list(session.track(frames))
 
 
 def test_a_tracker_turns_with_the_body() -> None:
@@ -396,7 +388,7 @@ def test_a_tracker_turns_with_the_body() -> None:
         assert torch.equal(one.state.mixture.mean, other.state.mixture.mean)
     goal = turned(poses(), 16.0)
 
-    def behind(frames: list[TrackedFrame]) -> float:
+    def behind(frames: list[Posterior]) -> float:
         return abs(float(turn_between(frames[-1].state.mixture.mean[:1], goal)))
 
     assert behind(first) < 5

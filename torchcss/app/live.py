@@ -13,7 +13,7 @@ import numpy as np
 from torchcss.app.recorder import Picture
 from torchcss.io.export.selection import camera_up, up_axis
 from torchcss.show.viewer import Viewer, close_recording, open_recording, posed_frame
-from torchcss.tracking.session import TrackedFrame
+from torchcss.tracking.session import Posterior
 from torchcss.vision.camera import Camera
 
 
@@ -45,7 +45,7 @@ class LiveViewer:
         self._recording = open_recording(name, save=save, connect=connect, spawn=spawn)
         self._viewer: Viewer | None = None
 
-    def add(self, frame: TrackedFrame, picture: Picture) -> None:
+    def add(self, frame: Posterior, picture: Picture) -> None:
         """Show a frame.
 
         Args:
@@ -74,7 +74,7 @@ class LiveViewer:
         close_recording(self._recording)
 
 
-def _up(frame: TrackedFrame, camera: Camera) -> str:
+def _up(frame: Posterior, camera: Camera) -> str:
     """Which axis of the world is up, as the first frame has it."""
     joints = frame.joints_world[:1].double().cpu().numpy()
     return up_axis(frame.body.joint_names, joints, np.eye(4)[None], camera_up(camera))[0]

@@ -1,6 +1,6 @@
 """Writes a run as it goes: `track.npz`, `summary.json` and `overlay.mp4`.
 
-`Recorder.run` takes what `torchcss.tracking.session.track_frames` yields; a run that is interrupted
+`Recorder.run` takes what `TrackingSession.track` yields; a run that is interrupted
 keeps what it has. Whatever else should see the frames as they come is a `Sink`: the overlay's film
 is one, the live viewer (`torchcss.app.live`) another. `draw_modes` draws one frame of the overlay.
 """
@@ -33,7 +33,7 @@ from torchcss.io.tracks import TRACK_NAME, FrameModes, Track, TrackWriter, write
 from torchcss.io.video import VideoWriter
 from torchcss.io.view_files import RecordedCamera
 from torchcss.show.overlay import draw_overlay, project_body
-from torchcss.tracking.session import TrackedFrame
+from torchcss.tracking.session import Posterior
 from torchcss.tracking.settings import Settings
 from torchcss.types import Status
 from torchcss.vision.camera import Camera
@@ -44,7 +44,7 @@ all of it, since a save replaces the last good file only when it is complete."""
 
 
 def draw_modes(
-    tracked: TrackedFrame,
+    tracked: Posterior,
     camera: Camera,
     *,
     image: UInt8[np.ndarray, "h w 3"] | None = None,
@@ -81,7 +81,7 @@ class Picture:
         camera: Camera of the full-size image.
     """
 
-    def __init__(self, frame: TrackedFrame, camera: Camera) -> None:
+    def __init__(self, frame: Posterior, camera: Camera) -> None:
         self.camera = camera
         self._frame = frame
 
@@ -94,7 +94,7 @@ class Picture:
 class Sink(Protocol):
     """What wants to see the frames of a run as they come."""
 
-    def add(self, frame: TrackedFrame, picture: Picture) -> None:
+    def add(self, frame: Posterior, picture: Picture) -> None:
         """Take the next frame.
 
         Args:
@@ -119,7 +119,7 @@ class Film:
     def __init__(self, path: Path, frame_rate: float) -> None:
         self._writer = VideoWriter(path, frame_rate)
 
-    def add(self, frame: TrackedFrame, picture: Picture) -> None:
+    def add(self, frame: Posterior, picture: Picture) -> None:
         """Append the picture."""
         self._writer.write(picture.image)
 
@@ -135,14 +135,14 @@ class OtherFilm:
         path: The file.
         frame_rate: Frames per second.
         camera: The camera of its full-size images.
-        place: Which of `TrackedFrame.others` it took.
+        place: Which of `Posterior.others` it took.
     """
 
     def __init__(self, path: Path, frame_rate: float, camera: Camera, place: int) -> None:
         self._writer = VideoWriter(path, frame_rate)
         self._camera, self._place = camera, place
 
-    def add(self, frame: TrackedFrame, picture: Picture) -> None:
+    def add(self, frame: Posterior, picture: Picture) -> None:
         """Append the picture; a black one where the camera has ended."""
         del picture
         own = frame.others[self._place]
@@ -187,11 +187,11 @@ class Recorder:
     sinks: Sequence[Sink] = ()
     on_first_frame: Callable[[], None] | None = None
 
-    def run(self, frames: Iterator[TrackedFrame], body: BodyModel, total: int | None) -> dict:
+    def run(self, frames: Iterator[Posterior], body: BodyModel, total: int | None) -> dict:
         """Track to the end, or to an interruption, which is recorded and raised again.
 
         Args:
-            frames: What `track_frames` yields.
+            frames: What `TrackingSession.track` yields.
             body: The body, for the names in the file.
             total: Number of frames, for the progress bar.
 
@@ -261,7 +261,7 @@ class Recorder:
         if self.on_first_frame is not None:
             self.on_first_frame()
 
-    def _append(self, writer: TrackWriter, frame: TrackedFrame) -> None:
+    def _append(self, writer: TrackWriter, frame: Posterior) -> None:
         base = np.eye(4)
         base[:3, :3] = frame.body.base_rotation.cpu().numpy()
         base[:3, 3] = frame.body.base_translation.cpu().numpy()
@@ -336,7 +336,7 @@ class _Totals:
     statuses: Tensor = field(default_factory=lambda: torch.zeros(len(Status), dtype=torch.long))
     events: list[dict[str, Any]] = field(default_factory=list)
 
-    def add(self, frame: TrackedFrame, *, overlay_s: float) -> None:
+    def add(self, frame: Posterior, *, overlay_s: float) -> None:
         """Take in a frame, and how long the sinks took, drawing included."""
         for into, values in (
             (self.seconds, {**frame.seconds, "overlay": overlay_s}),

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from torchcss.app.view_files import open_view
+from torchcss.app.view_files import moments, open_view
 from torchcss.body.model import BodyModel
 from torchcss.errors import ConfigurationError, TrackFileError
 from torchcss.io.fitted_body import body_beside, read_fitted_body
@@ -26,7 +26,7 @@ from torchcss.io.tracks import (
     write_summary,
 )
 from torchcss.io.view_files import ViewFiles
-from torchcss.tracking.settings import Settings, boundary_emphasis, make_choice, make_extractor
+from torchcss.tracking.settings import Settings
 from torchcss.tracking.smooth import SmoothedTrack, Smoothing, smooth_track
 from torchcss.tracking.smooth_images import smooth_frames
 
@@ -163,31 +163,13 @@ def smooth_video(
         normalised=normalised,
     )
     views = [open_view(each, camera, start=first, stop=stop) for each in (files, *others)]
-    extractor = make_extractor(settings)
-    noise = views[0].noise(extractor)
-    main, *beside_it = (
-        view.stream(
-            extractor,
-            found.joint_names,
-            torch.zeros((), dtype=torch.float64),
-            sigma=noise,
-            only_first=first if settings.keypoints_use == "first" else None,
-            frames=set(found.frames.tolist()),
-        )
-        for view in views
-    )
     done = smooth_frames(
         found,
-        main.frames,
+        moments(views, set(found.frames.tolist())),
+        settings=settings,
+        views=[view.view(torch.zeros((), dtype=torch.float64)) for view in views],
         body=flesh,
-        camera=main.camera,
-        extractor=extractor,
-        cost=make_choice(settings, noise),
-        observe=main.observe,
         choice=choice,
-        boundary_emphasis=boundary_emphasis(settings),
-        masks=main.masks,
-        others=beside_it,
     )
     return write_smoothed(done, into, folder)
 

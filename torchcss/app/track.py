@@ -16,7 +16,7 @@ import torch
 from tqdm import tqdm
 
 from torchcss.app.recorder import OtherFilm, Recorder, Sink
-from torchcss.app.view_files import OpenView, open_view
+from torchcss.app.view_files import OpenView, moments, open_view
 from torchcss.body.load import load_body
 from torchcss.cost.view import View
 from torchcss.errors import CameraError, ConfigurationError
@@ -26,15 +26,9 @@ from torchcss.io.keypoints.read import Scale
 from torchcss.io.tracks import prepare_output_folder
 from torchcss.io.view_files import RecordedCamera, ViewFiles
 from torchcss.tracking.first_frame import initialise_video
-from torchcss.tracking.presets import PRESETS
-from torchcss.tracking.recovery import Recovery
-from torchcss.tracking.session import track_frames
+from torchcss.tracking.session import TrackingSession
 from torchcss.tracking.settings import (
     Settings,
-    boundary_emphasis,
-    make_choice,
-    make_extractor,
-    make_settings_tracker,
 )
 from torchcss.vision.camera import Camera
 
@@ -134,21 +128,14 @@ def track_video(
     # What it was read from stays as it is, be it in the same folder.
     own = init is None or Path(init).resolve() not in (out.resolve(), fitted_path.resolve())
 
-    extractor = make_extractor(settings)
-    noise = view.noise(extractor)
-    streams = [
-        opened.stream(
-            extractor,
-            first.body.joint_names,
-            first.body.tie,
-            sigma=noise,
-            only_first=start if settings.keypoints_use == "first" else None,
-        )
-        for opened in (view, *beside)
-    ]
-    main = streams[0]
     interval = stride / float(reader.info.frame_rate)
-    tracker = make_settings_tracker(settings, first.body.motion_rate * interval)
+    session = TrackingSession(
+        settings,
+        first,
+        [opened.view(first.body.tie) for opened in (view, *beside)],
+        frame_interval=interval,
+        generator=generator,
+    )
     films = [
         OtherFilm(out / f"overlay_{place + 2}.mp4", 1 / interval, opened.camera.camera, place)
         for place, opened in enumerate(beside)
@@ -157,7 +144,7 @@ def track_video(
     recorder = Recorder(
         folder=out,
         settings=settings,
-        tracker=tracker,
+        tracker=session.plan.tracker,
         camera=eye,
         frame_rate=1 / interval,
         video=video,
@@ -182,27 +169,7 @@ def track_video(
         sinks=films if live is None else [*films, live],
         on_first_frame=partial(write_fitted_body, fitted_path, first, eye) if own else None,
     )
-    tracked = track_frames(
-        main.frames,
-        body=first.body,
-        mixture=first.mixture,
-        camera=main.camera,
-        extractor=extractor,
-        tracker=tracker,
-        choice=make_choice(settings, noise),
-        observe=main.observe,
-        frame_interval=interval,
-        generator=generator,
-        boundary_emphasis=boundary_emphasis(settings),
-        limits=PRESETS[settings.preset].limits,
-        jumps_every=PRESETS[settings.preset].jumps_every,
-        limb_jumps=settings.limb_jumps,
-        carries=settings.prediction == "surface",
-        recovery=Recovery() if settings.recovery else None,
-        masks=main.masks,
-        others=streams[1:],
-    )
-    return recorder.run(tracked, first.body, reader.num_selected)
+    return recorder.run(session.track(moments((view, *beside))), first.body, reader.num_selected)
 
 
 def _first_view(opened: OpenView, start: int, sigma: float, settings: Settings) -> View:

@@ -5,7 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator
+from collections.abc import Container, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,10 +19,8 @@ from torchcss.io.cameras import LoadedCamera, check_image_size, read_camera
 from torchcss.io.keypoints.read import Keypoints, read_keypoints
 from torchcss.io.video import VideoReader
 from torchcss.io.view_files import ViewFiles
-from torchcss.tracking.session import scale_keypoints
-from torchcss.tracking.view import ViewStream
+from torchcss.tracking.view import CameraView, scale_keypoints
 from torchcss.types import Frame
-from torchcss.vision.features import FeatureExtractor
 
 
 class OpenView(NamedTuple):
@@ -54,9 +53,31 @@ class OpenView(NamedTuple):
         said = () if self.keypoints is None else self.keypoints.report
         return [note for note in (self.camera.units_note, *said) if note]
 
-    def noise(self, extractor: FeatureExtractor) -> float:
-        """Noise of a keypoint in pixels of the features."""
-        return self.sigma * extractor.working_shape(*self.size_wh)[0] / self.size_wh[0]
+    def view(self, like: Tensor) -> CameraView:
+        """The camera that looks on, for a session.
+
+        Args:
+            like: A tensor of the body's type and device.
+        """
+        camera = self.camera.camera.to(dtype=like.dtype, device=like.device)
+        return CameraView(camera, self.keypoints, self.sigma, self.offset)
+
+    def images(self) -> Iterator[Frame]:
+        """The frames to be tracked, each with its mask where there are masks.
+
+        Raises:
+            VideoError: If they cannot be read, or the masks end before the video.
+        """
+        masks = None if self.masks is None else iter(self.masks)
+        for frame in self.reader:
+            if masks is None:
+                yield frame
+            elif (mask := next(masks, None)) is None:
+                raise VideoError(
+                    f"the masks end before frame {frame.index}; give one for every frame"
+                )
+            else:
+                yield replace(frame, mask=mask.image)
 
     def marks(
         self,
@@ -87,38 +108,23 @@ class OpenView(NamedTuple):
             relative_noise=relative_noise,
         )
 
-    def stream(
-        self,
-        extractor: FeatureExtractor,
-        joint_names: tuple[str, ...],
-        like: Tensor,
-        *,
-        sigma: float,
-        only_first: int | None = None,
-        frames: Container[int] | None = None,
-    ) -> ViewStream:
-        """What the camera sends, for `torchcss.tracking.session.track_frames`.
 
-        Args:
-            extractor: Makes the features.
-            joint_names: The body's joint centres.
-            like: A tensor of the body's type and device.
-            sigma: Noise that the joint term is told, pixels of the first camera's features.
-            only_first: The one frame whose keypoints are used; None: those of all.
-            frames: The frames to send; None: all. These are the first camera's numbers.
-        """
-        size, noise = extractor.working_shape(*self.size_wh), self.noise(extractor) / sigma
+def moments(
+    views: Sequence[OpenView], frames: Container[int] | None = None
+) -> Iterator[tuple[Frame | None, ...]]:
+    """The images of one moment after another, for `TrackingSession.track`.
 
-        def sent(reader: VideoReader) -> Iterator[Frame]:
-            return (f for f in reader if frames is None or f.index - self.offset in frames)
+    Args:
+        views: The cameras; the first one's video tells how long.
+        frames: The frames of the first one's video that are wanted; None: all.
+    """
 
-        def observe(index: int) -> JointObservation | None:
-            if only_first is not None and index != only_first + self.offset:
-                return None
-            return self.marks(index, size, joint_names, like, relative_noise=noise)
+    def wanted(view: OpenView) -> Iterator[Frame]:
+        return (f for f in view.images() if frames is None or f.index - view.offset in frames)
 
-        masks = None if self.masks is None else (mask.image for mask in sent(self.masks))
-        return ViewStream(sent(self.reader), self.camera.camera, observe, masks)
+    first, *others = (wanted(view) for view in views)
+    for frame in first:
+        yield (frame, *(next(other, None) for other in others))
 
 
 def open_view(

@@ -8,14 +8,13 @@ memory, and a run can end as soon as it has lost the body.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 
 from torchcss.body.root import has_root
-from torchcss.cost.joints import JointObservation, JointTerm
+from torchcss.cost.joints import JointTerm
 from torchcss.errors import TorchcssError
 from torchcss.initialise.from_joints import initialise_from_joints
 from torchcss.initialise.keypoint_checks import typical_sigma
@@ -24,18 +23,10 @@ from torchcss.io.video import VideoReader
 from torchcss.studies.evaluation import FrameMeasures, Thresholds, Yardstick, loss
 from torchcss.studies.sequences import RecordedSequence
 from torchcss.tracking.first_frame import initialise_video
-from torchcss.tracking.presets import PRESETS
-from torchcss.tracking.recovery import Recovery
-from torchcss.tracking.session import TrackedFrame, scale_keypoints, track_frames
-from torchcss.tracking.settings import (
-    Settings,
-    boundary_emphasis,
-    make_choice,
-    make_extractor,
-    make_settings_tracker,
-)
+from torchcss.tracking.session import TrackingSession
+from torchcss.tracking.settings import Settings
+from torchcss.tracking.view import CameraView
 from torchcss.types import Frame
-from torchcss.vision.features import FeatureExtractor, FrameFeatures
 
 
 class Start(NamedTuple):
@@ -82,34 +73,6 @@ def find_start(sequence: RecordedSequence, settings: Settings, *, start: int = 0
     return Start(first, sigma, generator)
 
 
-class SharedFeatures(FeatureExtractor):
-    """An extractor that remembers the last frame, for trackers that are run side by side.
-
-    Args:
-        extractor: What makes the features.
-    """
-
-    def __init__(self, extractor: FeatureExtractor) -> None:
-        super().__init__(
-            edges=extractor.edges,
-            flow=extractor.flow,
-            working_size=extractor.working_size,
-            colour=extractor.colour,
-        )
-        self.to(dtype=extractor.luma.dtype, device=extractor.luma.device)
-        self._last: tuple[tuple[Any, ...], FrameFeatures] | None = None
-
-    def forward(self, frame: Any, previous: Any = None, mask: Any = None) -> FrameFeatures:
-        """See `FeatureExtractor`; the same objects as last time give the same features."""
-        asked = (frame, previous, mask)
-        if self._last is not None and all(
-            have is want for have, want in zip(self._last[0], asked, strict=True)
-        ):
-            return self._last[1]
-        self._last = (asked, super().forward(*asked))
-        return self._last[1]
-
-
 class Run(NamedTuple):
     """One tracker from the first frame to its end.
 
@@ -149,34 +112,31 @@ def track_together(
         Every run, when it ends.
     """
     reader = VideoReader(sequence.video, start=start, stop=stop)
-    extractor = SharedFeatures(make_extractor(runs[0][0]))
-    current: list[Frame | None] = [None]
     going = [
         (
             Run(settings, [], "complete"),
-            _follow(sequence, settings, begin, iter(lambda: current[0], None), extractor, start),
+            session_of(sequence, settings, begin),
             Yardstick(sequence, begin.first.body, thresholds),
         )
         for settings, begin in runs
     ]
+    eye = going[0][1]
     first: Frame | None = None
     for frame in reader:
-        clock = time.perf_counter()
-        extractor(frame.image, None if current[0] is None else current[0].image)
-        features_s = time.perf_counter() - clock
-        current[0], first = frame, first or frame
+        observation, first = eye.observe(frame), first or frame
         left = []
-        for run, tracked, yardstick in going:
+        for run, session, yardstick in going:
             ended = None
             try:
-                run.measures.append(yardstick(next(tracked), first, features_s))
+                posterior = session.step(observation)
+                run.measures.append(yardstick(posterior, first, observation.seconds))
             except (TorchcssError, RuntimeError, ArithmeticError) as error:
                 # The others go on: a study takes hours. The table says that this one ended.
                 ended = f"error: {type(error).__name__}: {error}"
             if ended is None and stop_when_lost and loss(run.measures, thresholds) is not None:
                 ended = "lost"
             if ended is None:
-                left.append((run, tracked, yardstick))
+                left.append((run, session, yardstick))
             else:
                 yield run._replace(ended=ended)
         going = left
@@ -188,42 +148,19 @@ def track_together(
         yield run
 
 
-def _follow(
-    sequence: RecordedSequence,
-    settings: Settings,
-    begin: Start,
-    frames: Iterator[Frame],
-    extractor: FeatureExtractor,
-    start: int,
-) -> Iterator[TrackedFrame]:
-    marks, body, interval = sequence.keypoints, begin.first.body, 1 / sequence.frame_rate
-    full = sequence.camera.image_size_wh
-    working = extractor.working_shape(*full)
-    scaled = scale_keypoints(marks.keypoints, full, working).to(body.tie)
-    confidence = marks.confidence.to(body.tie)
+def session_of(sequence: RecordedSequence, settings: Settings, begin: Start) -> TrackingSession:
+    """A session that tracks a sequence.
 
-    def observe(index: int) -> JointObservation | None:
-        if settings.keypoints_use == "first" and index != start:
-            return None
-        return JointObservation(
-            body.joint_names, scaled[index], confidence[index], marks.joint_names
-        )
-
-    return track_frames(
-        frames,
-        body=body,
-        mixture=begin.first.mixture,
-        camera=sequence.camera,
-        extractor=extractor,
-        tracker=make_settings_tracker(settings, body.motion_rate * interval),
-        choice=make_choice(settings, begin.sigma * working[0] / full[0]),
-        observe=observe,
-        frame_interval=interval,
+    Args:
+        sequence: What is tracked.
+        settings: How.
+        begin: Where it starts.
+    """
+    camera = sequence.camera.to(dtype=settings.torch_dtype, device=settings.device)
+    return TrackingSession(
+        settings,
+        begin.first,
+        [CameraView(camera, sequence.keypoints, begin.sigma)],
+        frame_interval=1 / sequence.frame_rate,
         generator=begin.generator,
-        boundary_emphasis=boundary_emphasis(settings),
-        limits=PRESETS[settings.preset].limits,
-        recovery=Recovery() if settings.recovery else None,
-        jumps_every=PRESETS[settings.preset].jumps_every,
-        limb_jumps=settings.limb_jumps,
-        carries=settings.prediction == "surface",
     )

@@ -6,6 +6,7 @@ frame only; from there on it sees edges. `run_demo` is what `torchcss demo` call
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,21 +14,17 @@ import numpy as np
 import torch
 
 from torchcss.app.recorder import Recorder
-from torchcss.cost.joints import JointObservation, JointTerm
+from torchcss.cost.joints import JointTerm
 from torchcss.initialise.fit import initialise_from_joints
+from torchcss.io.keypoints.read import Keypoints
 from torchcss.io.tracks import load_track, prepare_output_folder, write_summary
 from torchcss.io.video import VideoWriter
 from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
-from torchcss.tracking.presets import PRESETS
-from torchcss.tracking.recovery import Recovery
-from torchcss.tracking.session import track_frames
+from torchcss.tracking.session import TrackingSession
 from torchcss.tracking.settings import (
     Settings,
-    boundary_emphasis,
-    make_choice,
-    make_extractor,
-    make_settings_tracker,
 )
+from torchcss.tracking.view import CameraView
 from torchcss.types import Frame
 
 KEYPOINT_NOISE_PX = 1.5
@@ -102,39 +99,25 @@ def track_sequence(
         dtype=dtype,
         device=device,
     )
-    marks = JointObservation(
-        body.joint_names, keypoints.to(dtype=dtype, device=device), confidence.to(dtype).to(device),
-        body.joint_names,
-    )  # fmt: skip
     interval = 1 / sequence.frame_rate
-    tracker = make_settings_tracker(settings, body.motion_rate * interval)
-    tracked = track_frames(
-        (Frame(i, i * interval, image) for i, image in enumerate(sequence.frames)),
-        body=first.body,
-        mixture=first.mixture,
-        camera=camera_there,
-        extractor=make_extractor(settings),
-        tracker=tracker,
-        choice=make_choice(settings, KEYPOINT_NOISE_PX),
-        observe=lambda index: marks if index == 0 else None,
+    seen = Keypoints(keypoints[None], confidence[None], body.joint_names, ())
+    session = TrackingSession(
+        replace(settings, keypoints_use="first"),
+        first,
+        [CameraView(camera_there, seen, KEYPOINT_NOISE_PX)],
         frame_interval=interval,
         generator=generator,
-        boundary_emphasis=boundary_emphasis(settings),
-        limits=PRESETS[settings.preset].limits,
-        recovery=Recovery() if settings.recovery else None,
-        jumps_every=PRESETS[settings.preset].jumps_every,
-        limb_jumps=settings.limb_jumps,
-        carries=settings.prediction == "surface",
     )
+    frames = (Frame(i, i * interval, image) for i, image in enumerate(sequence.frames))
     recorder = Recorder(
         folder=out,
         settings=settings,
-        tracker=tracker,
+        tracker=session.plan.tracker,
         camera=camera_there,
         frame_rate=sequence.frame_rate,
         notes=list(first.report),
     )
-    summary = recorder.run(tracked, first.body, len(sequence.frames))
+    summary = recorder.run(session.track(frames), first.body, len(sequence.frames))
     track = load_track(out)
     reference = truth.cpu().numpy()[track.frames]
     error = np.linalg.norm(track.joints_world - reference[:, None], axis=-1).mean(-1)

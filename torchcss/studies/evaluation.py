@@ -60,7 +60,7 @@ from torchcss.studies.metrics import (
     root_aligned_errors_mm,
 )
 from torchcss.studies.sequences import RecordedSequence
-from torchcss.tracking.session import TrackedFrame
+from torchcss.tracking.session import Posterior
 from torchcss.types import Frame
 from torchcss.vision.camera import Camera
 
@@ -309,7 +309,7 @@ class Yardstick:
         self._surface = body.mesh(48, 64).points.flatten(1, 2)
         self._rooted = bool(roots)
 
-    def __call__(self, tracked: TrackedFrame, start: Frame, features_s: float) -> FrameMeasures:
+    def __call__(self, tracked: Posterior, start: Frame, features_s: float) -> FrameMeasures:
         """Measure a frame.
 
         Args:
@@ -359,12 +359,12 @@ class Yardstick:
             evaluations=num_evaluations(tracked.info),
             seconds={
                 "features": features_s,
-                "cost": tracked.seconds["features"],
+                "cost": tracked.seconds["features"] - features_s,
                 "search": tracked.seconds["search"],
             },
         )
 
-    def _angle_deviations(self, tracked: TrackedFrame) -> np.ndarray:
+    def _angle_deviations(self, tracked: Posterior) -> np.ndarray:
         """Standard deviations per angle between each mode and the truth."""
         truth, body, mixture = self.sequence.truth, tracked.body, tracked.state.mixture
         spread = tracked.covariance.double().cpu()

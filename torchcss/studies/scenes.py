@@ -40,8 +40,8 @@ from torchcss.joint_names import canonical_joint_name
 from torchcss.studies.metrics import LIMB_JOINTS, root_aligned_mpjpe_mm
 from torchcss.studies.render.sequences import arm_sequence
 from torchcss.studies.slices import Line, eigen_lines, joint_lines
-from torchcss.tracking.session import scale_keypoints
 from torchcss.tracking.settings import Settings, boundary_emphasis, make_choice, make_extractor
+from torchcss.tracking.view import scale_keypoints
 from torchcss.types import Bounds, Modes
 from torchcss.vision.features import FrameFeatures
 

@@ -1,13 +1,19 @@
-"""From frames to a trajectory: the one loop that the command line, scripts and notebooks share.
+"""From frames to posteriors: the one loop that the command line, studies and notebooks share.
 
-`track_frames` turns any sequence of images into tracked frames: features, cost, one step of the
-tracker, and the base transform moved where the root's angles near their lock. `torchcss.cost.frame`
-makes the cost of a frame from its features; whoever looks at a cost, or smooths a track, uses the
-same. `torchcss.app.track.track_video` wraps the loop for files.
+    session = TrackingSession(settings, first, views, frame_interval=1 / 25)
+    for posterior in session.track(images):
+        ...
 
-Any number of synchronised, calibrated cameras may look on (`ViewStream`): what all of them see adds
-up in the cost. A camera that sends pictures of one colour, or none any more, is out: it says
-nothing until it is back.
+`first` says where the body may be in the first frame (`torchcss.initialise`), `views` which cameras
+look on (`CameraView`). A frame takes two calls, so that the next one can be seen while this one is
+searched:
+
+    observation = session.observe(images)   # features: what needs the pictures alone
+    posterior = session.step(observation)   # cost and search: what needs the state
+
+Any number of synchronised, calibrated cameras may look on: what all of them see adds up in the
+cost. `checkpoint` returns all that the next frame needs as a record of tensors, and
+`TrackingSession.resume` goes on from it bit for bit.
 """
 
 from __future__ import annotations
@@ -16,19 +22,19 @@ import math
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, has_root, move_base, root_pose
-from torchcss.cost.frame import FrameCosts, beside
-from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.cost.frame import beside
+from torchcss.cost.total import TrackingCost
+from torchcss.errors import ConfigurationError
+from torchcss.inference.loss_monitor import MonitorState
 from torchcss.inference.mixture import GaussianMixture, tempered
-from torchcss.inference.proposals import unbounded
 from torchcss.inference.tracker import (
     CostFactory,
     SequenceTracker,
@@ -38,34 +44,62 @@ from torchcss.inference.tracker import (
     stated_evidence,
 )
 from torchcss.inference.trust_region import default_prior_variance
+from torchcss.initialise.result import Initialisation
 from torchcss.stopwatch import Stopwatch
 from torchcss.tracking.flip_moves import with_flips
 from torchcss.tracking.limb_moves import with_limbs
-from torchcss.tracking.recovery import Recovery
+from torchcss.tracking.settings import Plan, Settings, make_plan
 from torchcss.tracking.surface_prediction import Carrier, Displaced, Sight
-from torchcss.tracking.view import Observe, ViewStream, Watcher
+from torchcss.tracking.view import (
+    NOTHING_KNOWN,
+    NOTHING_SEEN,
+    CameraView,
+    Observer,
+    ViewMemory,
+    ViewObservation,
+)
 from torchcss.types import Frame
-from torchcss.vision.camera import Camera
-from torchcss.vision.features import FeatureExtractor
 
 _PITCH_LIMIT = math.radians(55)
 """The base follows once the root's pitch exceeds this, well before it locks at 90 degrees."""
 
+_NUM_FLIPS = 8
+"""Flips of the best mode that join the search where flips are made."""
 
-NUM_JUMPS = 8
-"""Flips of the best mode that join the search where jumps are made."""
+Images = Frame | Sequence[Frame | None]
+"""The images of one moment, one of each view; None from a camera that has ended."""
 
 
-class TrackedFrame(NamedTuple):
-    """One frame's result.
+class Observation(NamedTuple):
+    """What all cameras see of one moment.
 
     Attributes:
-        frame: The image and its place in the video.
+        views: What each of them sees, the first one's view first.
+        seconds: Wall time of the features.
+    """
+
+    views: tuple[ViewObservation, ...]
+    seconds: float
+
+    @property
+    def frame(self) -> Frame:
+        """The first camera's image."""
+        frame = self.views[0].frame
+        assert frame is not None
+        return frame
+
+
+class Posterior(NamedTuple):
+    """What is known after one frame.
+
+    Attributes:
+        frame: The first camera's image and its place in the video.
         body: The body on this frame's base.
         state: The tracker's state, best mode first.
         info: What the step did.
-        covariance: Covariances of the modes with the likelihood to a power, `stated_evidence`: what
-            the tracker states. Those in the state are of the cost as it is, by which it samples.
+        covariance: Covariances of the modes that the tracker states, with the likelihood to a
+            power, `stated_evidence`. Those in the state are of the cost as it is, by which it
+            samples.
         joints_world: Joint centres of the modes, metres.
         terms: Cost of the best mode by term, nats.
         seconds: Wall time of the frame by stage.
@@ -90,157 +124,274 @@ class TrackedFrame(NamedTuple):
     others: tuple[Frame | None, ...] = ()
 
 
-def track_frames(
-    frames: Iterable[Frame],
-    *,
-    body: BodyModel,
-    mixture: GaussianMixture,
-    camera: Camera,
-    extractor: FeatureExtractor,
-    tracker: SequenceTracker,
-    choice: CostChoice,
-    observe: Observe,
-    frame_interval: float,
-    generator: torch.Generator,
-    boundary_emphasis: float = 0.0,
-    limits: bool = True,
-    masks: Iterable[np.ndarray | Tensor] | None = None,
-    recovery: Recovery | None = None,
-    jumps_every: int = 0,
-    limb_jumps: int = 0,
-    carries: bool = False,
-    others: Sequence[ViewStream] = (),
-) -> Iterator[TrackedFrame]:
-    """Track a body through a sequence of images.
+class SessionState(NamedTuple):
+    """What the next frame needs, and nothing else.
 
-    Args:
-        frames: The images, in order.
-        body: The body on its base.
-        mixture: Where it may be in the first frame.
-        camera: Camera of the full-size images.
-        extractor: Makes the features, at its working size.
-        tracker: Search, optimiser, numbers of samples and modes.
-        choice: Terms and weights of the cost; pixels are those of the working image.
-        observe: Keypoints by frame.
-        frame_interval: Seconds between frames, which scales the expected motion.
-        generator: Source of the samples.
-        boundary_emphasis: Weight of motion boundaries, see `FrameFeatures.edge_field`.
-        limits: Whether joint limits hold.
-        masks: Foreground of each of the images, of their size, as `FeatureExtractor` takes it;
-            None: not known.
-        recovery: How losses are told and what is done then; None: nothing.
-        jumps_every: Every how many frames the flips of the best mode join the search, see
-            `torchcss.tracking.flip_moves`; 0: never. Not where several cameras look on: to them a
-            flip looks different.
-        limb_jumps: How many other poses of an arm for which the colours do not speak join the
-            search, see `torchcss.tracking.limb_moves`; 0: none. Not for particle filters.
-        carries: Whether the pictures tell where each mode's trunk is expected, see
-            `torchcss.tracking.surface_prediction`. Not for particle filters.
-        others: What further cameras send.
-
-    Yields:
-        A `TrackedFrame` for every frame.
+    Attributes:
+        tracker: Modes, velocities, generator.
+        body: The body on its present base.
+        seen: What each camera saw last: the picture, and its contrast where that is wanted.
+        memory: What each camera has taught.
+        monitor: What tells a loss; None where nothing does.
+        num_lost: Frames in a row that counted as lost, up to the last.
     """
 
-    def watcher(camera: Camera, observe: Observe, masks: Iterable[Any] | None) -> Watcher:
-        costs = FrameCosts(
-            body,
-            extractor.working_camera(camera),
-            choice,
-            frame_interval=frame_interval,
-            boundary_emphasis=boundary_emphasis,
-        )
-        return Watcher(costs, extractor, observe, masks, carries=carries)
+    tracker: TrackerState
+    body: BodyModel
+    seen: tuple[ViewObservation, ...]
+    memory: tuple[ViewMemory, ...]
+    monitor: MonitorState | None
+    num_lost: int = 0
 
-    watchers = [watcher(camera, observe, masks)]
-    watchers += [watcher(other.camera, other.observe, other.masks) for other in others]
-    streams = [iter(other.frames) for other in others]
-    state = tracker.init(mixture, generator=generator)
-    carrier = Carrier(body) if carries else None
-    lost, num_lost = False, 0
-    watch = None if recovery is None else recovery.monitor.init()
-    for frame in frames:
-        clock = time.perf_counter()
-        beside_it = tuple(next(stream, None) for stream in streams)
-        for each, image in zip(watchers, (frame, *beside_it), strict=True):
-            each.look(image)
-        jumping = time.perf_counter()
-        searching, num_prior = tracker, len(state.mixture.mean)
-        if recovery is not None and 0 < num_lost <= recovery.patience:
-            searching = recovery.widened(tracker)
-            state = recovery.with_jumps(state, body, camera)
-        elif jumps_every and not others and int(state.frame) % jumps_every == 0:
-            state = with_flips(state, body, camera, num=NUM_JUMPS)
-        jumped = time.perf_counter() - jumping
-        stopwatch = Stopwatch()
-        cost = beside([each.cost(body, state.mixture.mean, stopwatch) for each in watchers])
-        bounds = body.bounds if limits else unbounded(state.mixture.mean)
-        if limb_jumps and isinstance(searching, Tracker):
-            looking, known = time.perf_counter(), len(state.mixture.mean)
-            dynamics = searching.dynamics
-            state = with_limbs(state, body, cost, dynamics, bounds, num=limb_jumps)
-            if len(state.mixture.mean) > known:
-                modes = state.mixture.mean
-                cost = beside([each.cost(body, modes, stopwatch) for each in watchers])
-            jumped += time.perf_counter() - looking
-        featured = time.perf_counter()
-        prior = state.mixture
-        if carrier is not None and isinstance(searching, Tracker):
-            sights = [
-                Sight(view.camera, *each.contrasts)
-                for view, each in zip(cost.views, watchers, strict=True)
-            ]
-            mean = state.mixture.mean
-            expected = carrier(
-                body,
-                sights,
-                before=mean,
-                velocity=state.velocity,
-                expected=searching.dynamics.predict(state.mixture, state.velocity).mean,
-                deviation=cost.deviation,
-            )
-            dynamics = Displaced(searching.dynamics, expected - mean)
-            searching = replace(searching, dynamics=dynamics)
-        asked: list[GaussianMixture] = []
-        state, info = searching.step(state, _noting(cost, asked), bounds)
-        if len(prior.mean) > num_prior:
-            # A mode that was jumped to goes back to the best one, from which the jump was made.
-            info = info._replace(parent=torch.where(info.parent < num_prior, info.parent, 0))
-        searched, term_seconds = time.perf_counter(), dict(stopwatch.seconds)
-        mean = state.mixture.mean
-        # About the prior that the search had, one frame ahead.
-        values = cost.of_children(info.origin[:1], asked[0]).terms(mean[:1])
-        if choice.segmentation is not None:
-            values["segmentation"] = cost.unsearched(mean[:1])
-        terms = {name: float(value[0]) for name, value in values.items()}
-        if recovery is not None and watch is not None:
-            watch, lost = recovery.judge(watch, _per_view(terms, watchers))
-            num_lost = num_lost + 1 if lost else 0
-        if not lost:
-            for each in watchers:
-                each.learn(body, mean, state.mixture.log_weight)
-        yield TrackedFrame(
-            frame,
-            body,
-            state,
-            info,
-            tempered(
-                state.mixture.covariance,
-                stated_evidence(tracker),
-                default_prior_variance(bounds),
-            ),
-            body.pose(mean).joints,
-            terms,
-            {
-                "features": featured - clock - jumped,
-                "search": searched - featured + jumped,
-            },
-            term_seconds,
-            lost,
-            0.0 if watch is None else watch.score,
-            beside_it,
+
+class TrackingSession:
+    """Tracks a body through a sequence of images.
+
+    Args:
+        settings: How to track.
+        first: Where the body may be in the first frame, and the body.
+        views: The cameras that look on, in one world, the first one's video being the one that
+            counts the frames; their keypoints.
+        frame_interval: Seconds between frames, which scales the expected motion.
+        generator: Source of the samples; None: one seeded with `settings.seed`.
+
+    Raises:
+        ConfigurationError: If there is no view, or what the settings ask for does not fit them.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        first: Initialisation,
+        views: Sequence[CameraView],
+        *,
+        frame_interval: float = 1 / 25,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        generator = generator or torch.Generator().manual_seed(settings.seed)
+        self._begin(settings, first.body, views, frame_interval)
+        nothing = len(self._observers)
+        self.state = SessionState(
+            tracker=self.plan.tracker.init(first.mixture, generator=generator),
+            body=first.body,
+            seen=(NOTHING_SEEN,) * nothing,
+            memory=(NOTHING_KNOWN,) * nothing,
+            monitor=None if self.plan.recovery is None else self.plan.recovery.monitor.init(),
         )
-        body, state = follow_with_base(body, state)
+        self._seen = self.state.seen
+
+    @classmethod
+    def resume(
+        cls,
+        state: SessionState,
+        settings: Settings,
+        views: Sequence[CameraView],
+        *,
+        frame_interval: float = 1 / 25,
+    ) -> TrackingSession:
+        """A session that goes on where another left off, with the same settings and views.
+
+        Args:
+            state: What `checkpoint` returned.
+            settings: How to track.
+            views: The cameras.
+            frame_interval: Seconds between frames.
+        """
+        session = cls.__new__(cls)
+        session._begin(settings, state.body, views, frame_interval)
+        if len(state.seen) != len(session._observers):
+            raise ConfigurationError(
+                f"the checkpoint is of {len(state.seen)} views, given are {len(views)}; give the "
+                "same views"
+            )
+        session.state, session._seen = state, state.seen
+        return session
+
+    def _begin(
+        self,
+        settings: Settings,
+        body: BodyModel,
+        views: Sequence[CameraView],
+        frame_interval: float,
+    ) -> None:
+        if not views:
+            raise ConfigurationError("views: expected at least one camera that looks on, got none")
+        self.settings = settings
+        self.plan: Plan = make_plan(settings, body, views[0], frame_interval)
+        self._observers = [self.plan.observer(body, view) for view in views]
+        self._bounds = self.plan.bounds
+        self._carrier = Carrier(body) if settings.prediction == "surface" else None
+
+    def checkpoint(self) -> SessionState:
+        """All that the next frame needs; see `torchcss.tracking.checkpoint` for its tensors."""
+        return self.state
+
+    def track(self, images: Iterable[Images]) -> Iterator[Posterior]:
+        """Track through a sequence.
+
+        Args:
+            images: The images of one moment after another.
+
+        Yields:
+            What is known after each of them.
+        """
+        for each in images:
+            yield self.step(self.observe(each))
+
+    def observe(self, images: Images) -> Observation:
+        """See the images of one moment, in their order.
+
+        Args:
+            images: One of each view, or that of the only one.
+        """
+        began = time.perf_counter()
+        frames = (images,) if isinstance(images, Frame) else tuple(images)
+        # Views without an image are out.
+        frames += (None,) * (len(self._observers) - len(frames))
+        self._seen = tuple(
+            observer.observe(frame, before)
+            for observer, frame, before in zip(self._observers, frames, self._seen, strict=True)
+        )
+        return Observation(self._seen, time.perf_counter() - began)
+
+    def step(self, observation: Observation) -> Posterior:
+        """Search one frame; the observations come in their order, each once.
+
+        Args:
+            observation: What `observe` has returned.
+        """
+        before, plan, stopwatch = self.state, self.plan, Stopwatch()
+        body, clock = before.body, [time.perf_counter()]
+        memory = tuple(
+            observer.recall(known, seen)
+            for observer, known, seen in self._of_views(before.memory, observation)
+        )
+        tracker, prior = self._with_flips(before)
+        clock.append(time.perf_counter())
+        cost = self._cost(observation, memory, prior, stopwatch)
+        clock.append(time.perf_counter())
+        if plan.limb_jumps and isinstance(tracker, Tracker):
+            num = plan.limb_jumps
+            found = with_limbs(prior, body, cost, tracker.dynamics, self._bounds, num=num)
+            if len(found.mixture.mean) > len(prior.mixture.mean):
+                prior, cost = found, self._cost(observation, memory, found, stopwatch)
+        tracker = self._told_by_pictures(tracker, prior, observation, cost)
+        asked: list[GaussianMixture] = []
+        after, info = tracker.step(prior, _noting(cost, asked), self._bounds)
+        num_known = len(before.tracker.mixture.mean)
+        if len(prior.mixture.mean) > num_known:
+            # A mode that was jumped to goes back to the best one, from which the jump was made.
+            info = info._replace(parent=torch.where(info.parent < num_known, info.parent, 0))
+        clock.append(time.perf_counter())
+        term_seconds = dict(stopwatch.seconds)
+
+        modes = after.mixture
+        terms = self._terms_of_best(cost.of_children(info.origin[:1], asked[0]), modes)
+        monitor, lost = before.monitor, False
+        if plan.recovery is not None and monitor is not None:
+            monitor, lost = plan.recovery.judge(monitor, _per_view(terms, observation))
+        if not lost:
+            memory = tuple(
+                observer.learn(known, seen, body, modes.mean, modes.log_weight)
+                for observer, known, seen in self._of_views(memory, observation)
+            )
+        next_body, moved = follow_with_base(body, after)
+        num_lost = before.num_lost + 1 if lost else 0
+        self.state = SessionState(moved, next_body, observation.views, memory, monitor, num_lost)
+        return Posterior(
+            frame=observation.frame,
+            body=body,
+            state=after,
+            info=info,
+            covariance=tempered(
+                modes.covariance,
+                stated_evidence(plan.tracker),
+                default_prior_variance(self._bounds),
+            ),
+            joints_world=body.pose(modes.mean).joints,
+            terms=terms,
+            seconds={
+                "features": observation.seconds + clock[2] - clock[1],
+                "search": clock[1] - clock[0] + clock[3] - clock[2],
+            },
+            term_seconds=term_seconds,
+            lost=lost,
+            loss_score=0.0 if monitor is None else monitor.score,
+            others=tuple(view.frame for view in observation.views[1:]),
+        )
+
+    def _of_views(
+        self, memory: Sequence[ViewMemory], observation: Observation
+    ) -> Iterator[tuple[Observer, ViewMemory, ViewObservation]]:
+        return zip(self._observers, memory, observation.views, strict=True)
+
+    def _cost(
+        self,
+        observation: Observation,
+        memory: Sequence[ViewMemory],
+        prior: TrackerState,
+        stopwatch: Stopwatch,
+    ) -> TrackingCost:
+        """The cost of a frame, for samples of the prior's modes."""
+        keypoints = not self.plan.keypoints_first_only or int(prior.frame) == 0
+        return beside(
+            [
+                observer.cost(
+                    seen,
+                    known,
+                    self.state.body,
+                    prior.mixture.mean,
+                    keypoints=keypoints,
+                    stopwatch=stopwatch,
+                )
+                for observer, known, seen in self._of_views(memory, observation)
+            ]
+        )
+
+    def _with_flips(self, state: SessionState) -> tuple[SequenceTracker, TrackerState]:
+        """The tracker of a frame, wider after a loss, and the prior with the best mode's flips."""
+        plan, tracker, camera = self.plan, state.tracker, self._observers[0].view.camera
+        if plan.recovery is not None and 0 < state.num_lost <= plan.recovery.patience:
+            jumped = plan.recovery.with_jumps(tracker, state.body, camera)
+            return plan.recovery.widened(plan.tracker), jumped
+        # To several cameras a flip looks different.
+        alone = len(self._observers) == 1
+        if plan.jumps_every and alone and int(tracker.frame) % plan.jumps_every == 0:
+            tracker = with_flips(tracker, state.body, camera, num=_NUM_FLIPS)
+        return plan.tracker, tracker
+
+    def _told_by_pictures(
+        self,
+        tracker: SequenceTracker,
+        prior: TrackerState,
+        observation: Observation,
+        cost: TrackingCost,
+    ) -> SequenceTracker:
+        """The tracker whose dynamics know where the pictures have carried each mode's trunk."""
+        if self._carrier is None or not isinstance(tracker, Tracker):
+            return tracker
+        sights = [
+            Sight(view.camera, seen.contrast_before, seen.contrast)
+            for view, seen in zip(cost.views, observation.views, strict=True)
+        ]
+        mean = prior.mixture.mean
+        expected = self._carrier(
+            self.state.body,
+            sights,
+            before=mean,
+            velocity=prior.velocity,
+            expected=tracker.dynamics.predict(prior.mixture, prior.velocity).mean,
+            deviation=cost.deviation,
+        )
+        return replace(tracker, dynamics=Displaced(tracker.dynamics, expected - mean))
+
+    def _terms_of_best(self, cost: TrackingCost, modes: GaussianMixture) -> dict[str, float]:
+        """What the best mode costs by term, about the prior that the search had."""
+        best = modes.mean[:1]
+        values = cost.terms(best)
+        if cost.choice.segmentation is not None:
+            values["segmentation"] = cost.unsearched(best)
+        return {name: float(value[0]) for name, value in values.items()}
 
 
 def _noting(cost: TrackingCost, priors: list[GaussianMixture]) -> CostFactory:
@@ -253,14 +404,19 @@ def _noting(cost: TrackingCost, priors: list[GaussianMixture]) -> CostFactory:
     return of_children
 
 
-def _per_view(terms: dict[str, float], watchers: Sequence[Watcher]) -> dict[str, float]:
+def _per_view(terms: dict[str, float], observation: Observation) -> dict[str, float]:
     """What a frame costs a view: the sum falls when a view is out, and is no better for it."""
-    seen = max(1, sum(each.features is not None for each in watchers))
+    seen = max(1, sum(view.features is not None for view in observation.views))
     return {name: value / seen for name, value in terms.items()}
 
 
 def follow_with_base(body: BodyModel, state: TrackerState) -> tuple[BodyModel, TrackerState]:
-    """Move the base under the best mode if the root's pitch nears its lock (design decision 11)."""
+    """Move the base under the best mode if the root's pitch nears its lock (decision: root).
+
+    Args:
+        body: The body on its base.
+        state: The tracker's state on that base.
+    """
     if not has_root(body):
         return body, state
     best = state.mixture.mean[0]
@@ -280,17 +436,3 @@ def follow_with_base(body: BodyModel, state: TrackerState) -> tuple[BodyModel, T
         velocity=velocity,
         particles=None,
     )
-
-
-def scale_keypoints(
-    keypoints: Float[Tensor, "*t j 2"], full: tuple[int, int], working: tuple[int, int]
-) -> Float[Tensor, "*t j 2"]:
-    """Pixels of the full image to pixels of the working image (centres at integers).
-
-    Args:
-        keypoints: Pixels of the full image.
-        full: Its width and height.
-        working: Width and height of the working image.
-    """
-    factor = keypoints.new_tensor([working[0] / full[0], working[1] / full[1]])
-    return (keypoints + 0.5) * factor - 0.5

@@ -9,17 +9,19 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.body.catalog import ARM_NAMES
+from torchcss.body.model import BodyModel
 from torchcss.cost.anthropometric import Anthropometric
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.edge_energy import EdgeEnergyTerm
 from torchcss.cost.flow import FlowTerm
+from torchcss.cost.frame import FrameCosts
 from torchcss.cost.interpenetration import Interpenetration
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.region import RegionTerm
@@ -32,7 +34,9 @@ from torchcss.errors import ConfigurationError
 from torchcss.inference.tracker import SequenceTracker, Tracker
 from torchcss.robust import Quadratic
 from torchcss.tracking.presets import PRESETS, make_tracker
-from torchcss.tracking.recovery import OBSERVATIONS
+from torchcss.tracking.recovery import OBSERVATIONS, Recovery
+from torchcss.tracking.view import CameraView, Observer
+from torchcss.types import Bounds, Curvature
 from torchcss.vision.features import FeatureExtractor
 from torchcss.vision.flow import TRACKING
 
@@ -101,7 +105,11 @@ class Settings:
             samples.
         keypoints_use: "all": keypoints are observations in every frame; "first": they only
             give the first pose, as in the papers.
-        terms: Terms and priors of the cost; see `make_choice` for what the preset changes.
+        terms: Terms and priors of the cost; `default` stands for the default ones, `still` for
+            those for a camera that stands still, `papers` for those of the papers. See
+            `make_choice` for what the preset changes.
+        curvature: Which Hessian the optimiser gets; the preset's by default. "autograd" is the slow
+            reference.
         working_size: Longer side, in pixels, at which features are computed; larger images are
             reduced to it.
         contour_weight: Temperature of the contour term, see `CostChoice`.
@@ -125,6 +133,7 @@ class Settings:
     limb_jumps: int = 0
     keypoints_use: Literal["first", "all"] = "all"
     terms: tuple[str, ...] = TERMS
+    curvature: Literal["exact", "gauss-newton", "autograd"] | None = None
     working_size: int = 640
     contour_weight: float = 150.0
     weights: Mapping[str, float] = field(default_factory=dict)
@@ -136,6 +145,7 @@ class Settings:
     recovery: bool = True
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "terms", named_terms(self.terms))
         if self.preset not in PRESETS:
             raise ConfigurationError(f"no tracker {self.preset!r}; there are {', '.join(PRESETS)}")
         unknown = sorted(set(self.terms) - set(ALL_TERMS))
@@ -275,7 +285,7 @@ def make_choice(settings: Settings, sigma: float) -> CostChoice:
         interpenetration=Interpenetration() if repels else None,
         contour_weight=settings.contour_weight,
         weights=dict(settings.weights),
-        curvature=row.curvature,
+        curvature=row.curvature if settings.curvature is None else Curvature(settings.curvature),
     )
 
 
@@ -305,3 +315,90 @@ def make_settings_tracker(settings: Settings, motion: Float[Tensor, " n"]) -> Se
     if evidence is not None:
         tracker = replace(tracker, evidence=evidence, covariance_evidence=tracker.evidence)
     return replace(tracker, oversampling=settings.oversampling)
+
+
+class Plan(NamedTuple):
+    """What settings mean for a body before a camera: the parts of a session.
+
+    Attributes:
+        extractor: Makes the features.
+        choice: Terms and weights of the cost, in pixels of the features of the first view.
+        tracker: Search, optimiser, numbers of samples and modes.
+        bounds: Bounds that the search obeys.
+        keypoints_first_only: Whether keypoints count in the first frame alone.
+        boundary_emphasis: Weight of motion boundaries, see `FrameFeatures.edge_field`.
+        recovery: How losses are told and what is done then; None: nothing.
+        jumps_every: Every how many frames the flips of the best mode join the search; 0: never.
+        limb_jumps: How many other poses of an arm join the search; 0: none.
+        surface_prediction: Whether the pictures tell where each mode's trunk is expected.
+        frame_interval: Seconds between frames.
+        noise: Noise of a wrist's keypoint that the cost is told, pixels of those features.
+    """
+
+    extractor: FeatureExtractor
+    choice: CostChoice
+    tracker: SequenceTracker
+    bounds: Bounds
+    keypoints_first_only: bool
+    boundary_emphasis: float
+    recovery: Recovery | None
+    jumps_every: int
+    limb_jumps: int
+    surface_prediction: bool
+    frame_interval: float
+    noise: float
+
+    def observer(self, body: BodyModel, view: CameraView) -> Observer:
+        """One camera's part of the loop.
+
+        Args:
+            body: The body; later it may hang on another base.
+            view: The camera.
+        """
+        costs = FrameCosts(
+            body,
+            self.extractor.working_camera(view.camera),
+            self.choice,
+            frame_interval=self.frame_interval,
+            boundary_emphasis=self.boundary_emphasis,
+        )
+        return Observer(
+            view=view,
+            costs=costs,
+            extractor=self.extractor,
+            relative_noise=_working_noise(self.extractor, view) / self.noise,
+            contrast=self.surface_prediction,
+        )
+
+
+def make_plan(settings: Settings, body: BodyModel, view: CameraView, frame_interval: float) -> Plan:
+    """Decide what the settings mean.
+
+    Args:
+        settings: How to track.
+        body: The body.
+        view: The first camera, whose keypoints set the noise.
+        frame_interval: Seconds between frames.
+    """
+    extractor, row = make_extractor(settings), PRESETS[settings.preset]
+    noise = _working_noise(extractor, view)
+    return Plan(
+        extractor=extractor,
+        choice=make_choice(settings, noise),
+        tracker=make_settings_tracker(settings, body.motion_rate * frame_interval),
+        bounds=row.bounds(body.bounds),
+        keypoints_first_only=settings.keypoints_use == "first",
+        boundary_emphasis=boundary_emphasis(settings),
+        recovery=Recovery() if settings.recovery else None,
+        jumps_every=row.jumps_every,
+        limb_jumps=settings.limb_jumps,
+        surface_prediction=settings.prediction == "surface",
+        frame_interval=frame_interval,
+        noise=noise,
+    )
+
+
+def _working_noise(extractor: FeatureExtractor, view: CameraView) -> float:
+    """Noise of a view's keypoints in pixels of the features."""
+    full = view.camera.image_size_wh
+    return view.noise * extractor.working_shape(*full)[0] / full[0]

@@ -20,17 +20,18 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from torch import Tensor
 from tqdm import tqdm
 
 from torchcss.body.model import BodyModel
 from torchcss.body.root import free_turns
-from torchcss.cost.frame import FrameCosts, beside
-from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.cost.frame import beside
+from torchcss.cost.total import TrackingCost
 from torchcss.errors import VideoError
 from torchcss.inference.smoothing import refine_in_windows
 from torchcss.io.run import body_of_track
 from torchcss.io.tracks import Track
+from torchcss.tracking.session import Images
+from torchcss.tracking.settings import Settings, make_plan
 from torchcss.tracking.smooth import (
     SmoothedTrack,
     Smoothing,
@@ -40,10 +41,8 @@ from torchcss.tracking.smooth import (
     smooth_track,
     track_of,
 )
-from torchcss.tracking.view import Observe, ViewStream, Watcher
+from torchcss.tracking.view import NOTHING_KNOWN, NOTHING_SEEN, CameraView, Observer
 from torchcss.types import Frame, Status
-from torchcss.vision.camera import Camera
-from torchcss.vision.features import FeatureExtractor
 
 IMAGES = Smoothing(agility=20.0)
 """How to smooth by default. Images say where the body is more exactly than the modes of a tracker
@@ -52,35 +51,24 @@ do, so that motion may be freer; chosen on the same view as the other default.""
 
 def smooth_frames(
     track: Track,
-    frames: Iterable[Frame],
+    images: Iterable[Images],
     *,
+    settings: Settings,
+    views: Sequence[CameraView],
     body: BodyModel | None = None,
-    camera: Camera,
-    extractor: FeatureExtractor,
-    cost: CostChoice,
-    observe: Observe,
     choice: Smoothing | None = None,
-    boundary_emphasis: float = 0.0,
-    masks: Iterable[np.ndarray | Tensor] | None = None,
-    others: Sequence[ViewStream] = (),
 ) -> SmoothedTrack:
     """Smooth a track, and fit the result to the images again.
 
     Args:
         track: The track.
-        frames: The images of its frames, in order.
-        body: The body with its flesh; None: told from the track, with the flesh of the standard
+        images: The images of its frames, in order, as `TrackingSession.observe` takes them.
+        settings: How it was tracked. Temporal terms are left out, and the segmentation, which tells
+            modes apart. Colours are learnt from the track that was smoothed without images.
+        views: The cameras that look on.
+        body: The body with its shape; None: told from the track, with the shape of the standard
             humanoid.
-        camera: Camera of the full-size images.
-        extractor: Makes the features, at its working size.
-        cost: Terms and weights; temporal terms are left out, and the segmentation, which tells
-            modes apart. Colours are learnt from the track that was smoothed without images. Pixels
-            are those of the working image.
-        observe: Keypoints by frame.
         choice: How to smooth; `IMAGES` by default.
-        boundary_emphasis: See `FrameFeatures.edge_field`.
-        masks: Foreground of each of the images; None: not known.
-        others: What further cameras send, see `torchcss.tracking.session.track_frames`.
 
     Raises:
         TorchcssError: As `smooth_track`; or if frames are missing.
@@ -92,43 +80,43 @@ def smooth_frames(
         torch.from_numpy(array) for array in (first.track.state[:, 0], track.base_transform)
     )
     changes = base_changes(body, bases)
-    watchers = [
-        Watcher(
-            FrameCosts(
-                body,
-                extractor.working_camera(view.camera),
-                replace(cost, temporal=None, temporal_mixture=None, segmentation=None),
-                boundary_emphasis=boundary_emphasis,
-            ),
-            extractor,
-            view.observe,
-            view.masks,
-        )
-        for view in (ViewStream(frames, camera, observe, masks), *others)
-    ]
-    streams = [iter(view.frames) for view in others]
+    plan = make_plan(settings, body, views[0], 0.0)
+    cost = replace(plan.choice, temporal=None, temporal_mixture=None, segmentation=None)
+    plan = plan._replace(choice=cost, surface_prediction=False)
+    observers = [plan.observer(body, view) for view in views]
     at_start: list[float] = []
 
     def costs() -> Iterator[TrackingCost]:
-        images = iter(tqdm(frames, total=len(track.frames), unit="frame", dynamic_ncols=True))
+        moments = iter(tqdm(images, total=len(track.frames), unit="frame", dynamic_ncols=True))
+        seen = (NOTHING_SEEN,) * len(observers)
+        memory = [NOTHING_KNOWN] * len(observers)
         for row, index in enumerate(track.frames.tolist()):
-            frame = next(images, None)
-            if frame is None or frame.index != index:
+            frames = next(moments, None)
+            frames = (frames,) if isinstance(frames, Frame) else tuple(frames or (None,))
+            if frames[0] is None or frames[0].index != index:
                 raise VideoError(
                     f"the video has no frame {index} where the track expects it; give the video "
                     "that was tracked"
                 )
-            beside_it = [next(stream, None) for stream in streams]
-            for watcher, image in zip(watchers, (frame, *beside_it), strict=True):
-                watcher.look(image)
+            frames += (None,) * (len(observers) - len(frames))
+            seen = tuple(map(Observer.observe, observers, frames, seen))
+            memory = list(map(Observer.recall, observers, memory, seen))
             before = start[row - 1 : row] if row else None
             if before is not None and row - 1 in changes:
                 before = changes[row - 1](before)
             there = body.with_base(bases[row, :3, :3], bases[row, :3, 3])
-            one = beside([watcher.cost(there, before) for watcher in watchers])
+            keypoints = row == 0 or not plan.keypoints_first_only
+            one = beside(
+                [
+                    observer.cost(now, known, there, before, keypoints=keypoints)
+                    for observer, now, known in zip(observers, seen, memory, strict=True)
+                ]
+            )
             at_start.append(float(one.value(start[row : row + 1])))
-            for watcher in watchers:
-                watcher.learn(there, start[row : row + 1])
+            memory = [
+                observer.learn(known, now, there, start[row : row + 1])
+                for observer, now, known in zip(observers, seen, memory, strict=True)
+            ]
             yield one
 
     refined = refine_in_windows(

@@ -1,23 +1,29 @@
-"""What cameras send, and what one of them sees of a frame: the input side of the loop.
+"""What a camera sends, what is seen of a frame, and what is remembered: the loop's input side.
+
+A `CameraView` says where a camera stands and what keypoints its video has. An `Observer` turns its
+frames into what the cost compares with; it holds constants only. What is seen of a frame depends on
+the pictures alone (`observe`); what the cost makes of it depends on what the body and its
+surroundings look like (`cost`), which is learnt from the poses found (`learn`).
 
 A camera that sends pictures of one colour, or none any more, is out: it says nothing until it is
-back. `torchcss.tracking.session` and `torchcss.tracking.smooth_images` look through these at any
-number of cameras.
+back.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.body.model import BodyModel
 from torchcss.cost.frame import FrameCosts
 from torchcss.cost.joints import JointObservation
 from torchcss.cost.total import TrackingCost
-from torchcss.errors import VideoError
+from torchcss.initialise.keypoint_checks import typical_sigma
+from torchcss.io.keypoints.read import Keypoints
 from torchcss.stopwatch import Stopwatch
 from torchcss.types import Frame
 from torchcss.vision.appearance import Appearance
@@ -27,117 +33,195 @@ from torchcss.vision.contrast import local_contrast
 from torchcss.vision.features import FeatureExtractor, FrameFeatures
 from torchcss.vision.spline import SplineField, spline_field
 
-Observe = Callable[[int], JointObservation | None]
-"""Keypoints of a frame by its index, in pixels of the working image; None if there are none."""
 
-
-class ViewStream(NamedTuple):
-    """What a further camera sends, one image for each of the first camera's.
+class CameraView(NamedTuple):
+    """A camera that looks on, with the keypoints of its video.
 
     Attributes:
-        frames: The images, in order; where they end before the first camera's, the view is out.
-        camera: Camera of the full-size images, in the first one's world.
-        observe: Keypoints by this stream's frames.
-        masks: Foreground of each of the images, of their size; None: not known.
+        camera: Camera of the full-size images. All views share one world.
+        keypoints: 2D keypoints by frame of its video, pixels of the full-size images; None: none.
+        sigma: Noise of a wrist's keypoint, pixels of the full-size images; None: a share of the
+            person's size.
+        offset: Its frame at the time of the first view's frame 0.
     """
 
-    frames: Iterable[Frame]
     camera: Camera
-    observe: Observe
-    masks: Iterable[np.ndarray | Tensor] | None = None
+    keypoints: Keypoints | None = None
+    sigma: float | None = None
+    offset: int = 0
+
+    @property
+    def noise(self) -> float:
+        """Noise of a wrist's keypoint, pixels of the full-size images; 1 without keypoints."""
+        if self.sigma is not None:
+            return self.sigma
+        if self.keypoints is None:
+            return 1.0
+        return typical_sigma(self.keypoints.keypoints, self.keypoints.confidence)
 
 
-class Watcher:
-    """One camera's part of the loop: features, and what things look like in its images.
+class ViewObservation(NamedTuple):
+    """What one camera sees of one moment.
 
-    Args:
+    Attributes:
+        frame: Its image; None from a camera that has ended.
+        picture: The pixels of that image; None if the camera is out.
+        features: Features of the image; None if the camera is out.
+        contrast: Local contrast of the image; None if the camera is out, or nobody asks.
+        contrast_before: The same of the image before.
+    """
+
+    frame: Frame | None
+    picture: np.ndarray | None = None
+    features: FrameFeatures | None = None
+    contrast: SplineField | None = None
+    contrast_before: SplineField | None = None
+
+
+class ViewMemory(NamedTuple):
+    """What one camera has taught.
+
+    Attributes:
+        appearance: What body and surroundings look like; None: not known.
+        background: What is behind the body; None: not known, or not asked for.
+    """
+
+    appearance: Appearance | None = None
+    background: Background | None = None
+
+
+NOTHING_SEEN = ViewObservation(None)
+NOTHING_KNOWN = ViewMemory()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observer:
+    """One camera's part of the loop.
+
+    Attributes:
+        view: The camera and its keypoints.
         costs: Makes the costs of this camera's images.
         extractor: Makes the features.
-        observe: Keypoints by frame.
-        masks: Foreground of each of the images; None: not known.
-        carries: Whether the image tells where the trunk is expected, see
-            `torchcss.tracking.surface_prediction`.
-
-    Attributes:
-        features: Those of the image taken in last; None if the view is out.
-        appearance: What body and surroundings look like; None: not known yet.
-        background: What is behind the body; None: not known yet, or not asked for.
-        contrasts: Local contrast of the image before and of the one taken in last; None where there
-            is no picture, or nobody asks.
+        relative_noise: Noise of this view's keypoints in the features' pixels, in multiples of what
+            the keypoint term is told.
+        contrast: Whether local contrast is wanted, for `torchcss.tracking.surface_prediction`.
     """
 
-    def __init__(
-        self,
-        costs: FrameCosts,
-        extractor: FeatureExtractor,
-        observe: Observe,
-        masks: Iterable[np.ndarray | Tensor] | None,
-        *,
-        carries: bool = False,
-    ) -> None:
-        self.carries = carries
-        self.costs, self.extractor, self.observe = costs, extractor, observe
-        self.masks = None if masks is None else iter(masks)
-        self.last: np.ndarray | None = None
-        self.appearance: Appearance | None = None
-        self.background: Background | None = None
-        self.index: int | None = None
-        self.features: FrameFeatures | None = None
-        self.contrasts: tuple[SplineField | None, SplineField | None] = (None, None)
+    view: CameraView
+    costs: FrameCosts
+    extractor: FeatureExtractor
+    relative_noise: float = 1.0
+    contrast: bool = False
 
-    def look(self, frame: Frame | None) -> None:
-        """Take in the next image; None, or one of a single colour, is a view that is out."""
-        self.contrasts = (self.contrasts[1], None)
-        self.index, self.features = None if frame is None else frame.index, None
-        if frame is None:
-            self.last = None
-            return
-        mask = None
-        if self.masks is not None and (mask := next(self.masks, None)) is None:
-            raise VideoError(f"the masks end before frame {frame.index}; give one for every frame")
-        # There is no flow out of or into a missing picture.
-        if frame.image.size and frame.image.min() == frame.image.max():
-            self.last = None
-            return
-        features = self.extractor(frame.image, self.last, mask)
-        self.features, self.last, colour = features, frame.image, features.colour
-        if self.carries:
+    def observe(self, frame: Frame | None, before: ViewObservation) -> ViewObservation:
+        """See a frame.
+
+        Args:
+            frame: The image; None from a camera that has ended.
+            before: What was seen of the moment before.
+        """
+        if frame is None or _is_of_one_colour(frame.image):
+            return ViewObservation(frame, contrast_before=before.contrast)
+        features = self.extractor(frame.image, before.picture, frame.mask)
+        contrast = None
+        if self.contrast:
             # Single precision is far finer than what is compared, and twice as fast.
-            contrast = local_contrast(features.grey.float()).to(features.grey)
-            self.contrasts = (self.contrasts[0], spline_field(contrast))
-        if self.background is not None and colour is not None and not self.background.holds(colour):
-            self.background = None
+            contrast = spline_field(local_contrast(features.grey.float()).to(features.grey))
+        return ViewObservation(frame, frame.image, features, contrast, before.contrast)
+
+    def recall(self, memory: ViewMemory, seen: ViewObservation) -> ViewMemory:
+        """What is known still holds for a frame: the background of another scene does not."""
+        colour = None if seen.features is None else seen.features.colour
+        if memory.background is None or colour is None or memory.background.holds(colour):
+            return memory
+        return memory._replace(background=None)
 
     def cost(
-        self, body: BodyModel, before: Tensor | None, stopwatch: Stopwatch | None = None
+        self,
+        seen: ViewObservation,
+        memory: ViewMemory,
+        body: BodyModel,
+        before: Float[Tensor, "k n"] | None,
+        *,
+        keypoints: bool = True,
+        stopwatch: Stopwatch | None = None,
     ) -> TrackingCost:
-        """The cost of the image taken in last; `before` are the modes before it."""
-        observation = None if self.index is None else self.observe(self.index)
-        if observation is not None and observation.says_nothing:
-            observation = None
+        """The cost of a frame.
+
+        Args:
+            seen: What is seen of it.
+            memory: What is known.
+            body: The body on this frame's base.
+            before: The modes of the frame before; None: no flow.
+            keypoints: Whether keypoints count in this frame.
+            stopwatch: Where the time of evaluations is added up.
+        """
+        observation = self.keypoints_of(seen.frame, body) if keypoints else None
         return self.costs(
-            self.features,
+            seen.features,
             body=body,
             before=before,
             observation=observation,
-            appearance=self.appearance,
-            background=self.background,
+            appearance=memory.appearance,
+            background=memory.background,
             stopwatch=stopwatch,
         )
 
-    def learn(self, body: BodyModel, modes: Tensor, log_weight: Tensor | None = None) -> None:
-        """Take in what body, surroundings and background look like in that image.
+    def learn(
+        self,
+        memory: ViewMemory,
+        seen: ViewObservation,
+        body: BodyModel,
+        modes: Float[Tensor, "k n"],
+        log_weight: Float[Tensor, " k"] | None = None,
+    ) -> ViewMemory:
+        """Take in what body, surroundings and background look like in a frame.
 
         Args:
+            memory: What was known.
+            seen: What is seen of the frame.
             body: The body on this frame's base.
-            modes: Poses that it may have, `[k n]`, the best first.
+            modes: Poses that it may have, the best first.
             log_weight: Their weights; None: all the same.
         """
-        self.appearance = self.costs.learn(self.appearance, self.features, body, modes[0])
-        self.background = self.costs.learn_background(
-            self.background,
-            self.features,
-            body,
-            modes,
-            modes.new_zeros(len(modes)) if log_weight is None else log_weight,
+        weight = modes.new_zeros(len(modes)) if log_weight is None else log_weight
+        return ViewMemory(
+            self.costs.learn(memory.appearance, seen.features, body, modes[0]),
+            self.costs.learn_background(memory.background, seen.features, body, modes, weight),
         )
+
+    def keypoints_of(self, frame: Frame | None, body: BodyModel) -> JointObservation | None:
+        """The keypoints of a frame, in the features' pixels; None if there are none."""
+        known = self.view.keypoints
+        if known is None or frame is None or not 0 <= frame.index < len(known.keypoints):
+            return None
+        full = self.view.camera.image_size_wh
+        scaled = scale_keypoints(
+            known.keypoints[frame.index], full, self.extractor.working_shape(*full)
+        )
+        observation = JointObservation(
+            body.joint_names,
+            scaled.to(body.tie),
+            known.confidence[frame.index].to(body.tie),
+            known.joint_names,
+            relative_noise=self.relative_noise,
+        )
+        return None if observation.says_nothing else observation
+
+
+def scale_keypoints(
+    keypoints: Float[Tensor, "*t j 2"], full: tuple[int, int], working: tuple[int, int]
+) -> Float[Tensor, "*t j 2"]:
+    """Pixels of the full image to pixels of the working image (centres at integers).
+
+    Args:
+        keypoints: Pixels of the full image.
+        full: Its width and height.
+        working: Width and height of the working image.
+    """
+    factor = keypoints.new_tensor([working[0] / full[0], working[1] / full[1]])
+    return (keypoints + 0.5) * factor - 0.5
+
+
+def _is_of_one_colour(image: np.ndarray) -> bool:
+    return bool(image.size) and image.min() == image.max()
