@@ -23,13 +23,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 import tyro
-from torch import Tensor
 
-from torchcss.cost.joints import JointTerm
 from torchcss.errors import TorchcssError
-from torchcss.initialise.from_joints import initialise_from_joints
+from torchcss.initialise.fit import initialise
 from torchcss.initialise.keypoint_checks import default_sigma
 from torchcss.initialise.multi_start import SINGLE_START, Search
+from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
 from torchcss.io.cameras import read_camera
 from torchcss.io.keypoints.read import read_keypoints
 from torchcss.io.tracks import prepare_output_folder, write_summary
@@ -37,6 +36,7 @@ from torchcss.joint_names import canonical_joint_name
 from torchcss.robust import Quadratic
 from torchcss.studies.metrics import LIMB_JOINTS, pa_mpjpe_mm, root_aligned_mpjpe_mm
 from torchcss.studies.random_person import Person, coverage, random_person
+from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
 
 LIMBS = {"thigh": ("hip", "knee"), "shank": ("knee", "ankle"), "upper_arm": ("shoulder", "elbow"),
@@ -81,12 +81,10 @@ class Config:
 
 
 class Case(NamedTuple):
-    """Marked joints of one image with their truth; the person only where it is synthetic."""
+    """Keypoints of one image with their truth; the person only where it is synthetic."""
 
     camera: Camera
-    names: tuple[str, ...]
-    uv: Tensor
-    confidence: Tensor
+    keypoints: Keypoints
     joints: np.ndarray
     sigma: float
     lengths: dict[str, float]
@@ -131,8 +129,8 @@ def cases(config: Config, condition: str) -> Iterator[tuple[int, Case]]:
             noise = SYNTHETIC[condition].get("noise_px", 2.0)
             known = person.gross if condition == TOLD else torch.zeros_like(person.gross)
             yield seed, Case(
-                person.camera, person.joint_names, person.keypoints,
-                torch.where(known, 0.0, person.confidence),
+                person.camera,
+                Keypoints(person.keypoints, person.confidence, person.joint_names).without(known),
                 person.joints_world(LIMB_JOINTS).numpy(), max(noise, 1.0), person.body.lengths,
                 person,
             )  # fmt: skip
@@ -140,7 +138,7 @@ def cases(config: Config, condition: str) -> Iterator[tuple[int, Case]]:
     assert config.data is not None
     folder, video, file = CLIPS[condition]
     camera = read_camera(config.data / folder / "cameras.json", video=video).camera
-    marks = read_keypoints(config.data / folder / file, image_size_wh=camera.image_size_wh)
+    keypoints = read_keypoints(config.data / folder / file, image_size_wh=camera.image_size_wh)
     reference = np.load(config.data / folder / "reference3d.npz")
     names = [canonical_joint_name(str(name)) for name in reference["joint_names"]]
     joints = reference["joints"][:, [names.index(name) for name in LIMB_JOINTS]]
@@ -150,9 +148,8 @@ def cases(config: Config, condition: str) -> Iterator[tuple[int, Case]]:
                                   for side in "lr"])) for limb, (a, b) in LIMBS.items()
     }  # fmt: skip
     for frame in np.linspace(0, len(joints) - 1, config.frames).round().astype(int).tolist():
-        uv, seen = marks.keypoints[frame], marks.confidence[frame]
-        sigma = default_sigma(uv[seen > 0])
-        yield frame, Case(camera, marks.joint_names, uv, seen, joints[frame], sigma, lengths)
+        there = keypoints.at(frame)
+        yield frame, Case(camera, there, joints[frame], default_sigma(there), lengths)
 
 
 def fit(case: Case, variant: str, config: Config, seed: int) -> dict[str, float]:
@@ -161,15 +158,17 @@ def fit(case: Case, variant: str, config: Config, seed: int) -> dict[str, float]
     search = SINGLE_START if variant == "single start" else search
     if variant == "without limits":
         search = replace(search, limits=False)
-    joints = JointTerm(sigma=case.sigma)
+    options = InitialiseOptions(
+        sigma=case.sigma, search=search, num_modes=50, least_joints=LEAST_JOINTS
+    )
     if variant == "not robust":
-        joints, search = replace(joints, potential_kind=Quadratic), replace(search, leave_out=False)
+        search = replace(search, leave_out=False)
+        options = replace(options, potential_kind=Quadratic, search=search)
     generator = torch.Generator().manual_seed(seed)
     began = time.process_time()
-    found = initialise_from_joints(
-        "body34", case.camera, case.uv, case.confidence, case.names, generator=generator,
-        joints=joints, search=search, num_modes=50,
-    )  # fmt: skip
+    found = initialise(
+        None, case.keypoints, case.camera, "body34", generator=generator, options=options
+    )
     seconds = time.process_time() - began
     body, states = found.body, found.hypotheses(50, generator=generator)
     places = body.pose(states).joints[:, [body.joint_index(name) for name in LIMB_JOINTS]].numpy()

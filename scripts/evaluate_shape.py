@@ -24,6 +24,7 @@ import tyro
 from torchcss.errors import ConfigurationError, TorchcssError
 from torchcss.initialise.fit import initialise
 from torchcss.initialise.multi_start import Search
+from torchcss.initialise.options import InitialiseOptions
 from torchcss.initialise.result import Initialisation
 from torchcss.io.tracks import prepare_output_folder, write_summary
 from torchcss.io.video import VideoReader
@@ -83,17 +84,15 @@ def fit(
 ) -> dict[str, float]:
     """Fit one frame and measure."""
     (frame,) = VideoReader(sequence.video, start=index, stop=index + 1)
-    marks = sequence.keypoints
     found = initialise(
         frame.image,
-        torch.cat([marks.keypoints[index], marks.confidence[index, :, None]], dim=-1),
+        sequence.keypoints.at(index),
         sequence.camera,
         config.body,
-        joint_names=marks.joint_names,
         generator=torch.Generator().manual_seed(config.seed),
-        search=FEW if config.small else None,
-        contours=contours,
-        colours=colours,
+        options=InitialiseOptions(
+            search=FEW if config.small else Search(), contours=contours, colours=colours
+        ),
     )
     assert sequence.mask is not None
     true = sequence.mask[index]

@@ -38,7 +38,7 @@ from torchcss.body.model import BodyModel
 from torchcss.body.root import move_base, root_pose
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.cost.frame import beside
-from torchcss.cost.joints import JointObservation, JointTerm
+from torchcss.cost.joints import JointTerm
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.errors import TorchcssError
 from torchcss.files import load_arrays
@@ -48,7 +48,6 @@ from torchcss.initialise.outliers import best_distinct
 from torchcss.initialise.result import Initialisation
 from torchcss.io.cameras import read_camera
 from torchcss.io.fitted_body import read_fitted_body
-from torchcss.io.keypoints.read import Keypoints
 from torchcss.io.run import body_of_track
 from torchcss.io.track_body import pose_track
 from torchcss.io.tracks import load_track, prepare_output_folder, write_summary
@@ -64,6 +63,7 @@ from torchcss.studies.metrics import (
 from torchcss.tracking.session import TrackingSession
 from torchcss.tracking.settings import Settings
 from torchcss.tracking.view import CameraView
+from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
 
 BEAM, BOARD = "balance_beam_4cam", "handheld_board"
@@ -287,21 +287,15 @@ def corner_keypoints(body: BodyModel, corners: Float[np.ndarray, "t m 2"]) -> Ke
     """Corners of all frames as keypoints."""
     place = torch.from_numpy(corners)
     seen = place.isfinite().all(-1).double()
-    return Keypoints(place, seen, body.joint_names, ())
+    return Keypoints(place, seen, body.joint_names)
 
 
 def place(
     body: BodyModel, views: Sequence[CameraView], start: int, generator: torch.Generator
 ) -> tuple[BodyModel, GaussianMixture]:
     """Find the board in the first frame, from random turns before the first camera."""
-    observations = []
-    for view in views:
-        known = view.keypoints
-        assert known is not None
-        at_start = known.keypoints[start], known.confidence[start], known.joint_names
-        observations.append(JointObservation(body.joint_names, *at_start))
-    first = observations[0]
-    middle = first.target[first.weight > 0].mean(0)
+    seen = [view.keypoints.at(start) for view in views if view.keypoints is not None]
+    middle = seen[0].positions[seen[0].confidence > 0].mean(0)
     # An arm's length away; how far exactly, the descent finds.
     body = body.with_base(
         torch.eye(3).double(), views[0].camera.unproject(middle, middle.new_tensor(0.8))
@@ -316,8 +310,8 @@ def place(
         )  # fmt: skip
         cost = beside(
             [
-                TrackingCost(body=body, camera=view.camera, choice=choice, observation=observation)
-                for view, observation in zip(views, observations, strict=True)
+                TrackingCost(body=body, camera=view.camera, choice=choice, keypoints=keypoints)
+                for view, keypoints in zip(views, seen, strict=True)
             ]
         )
         modes = TrustRegionNewton(max_steps=60, tolerance=1e-6).minimise(cost, x, body.bounds)

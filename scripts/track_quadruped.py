@@ -25,7 +25,7 @@ from torch import Tensor
 
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
-from torchcss.cost.joints import JointObservation, JointTerm
+from torchcss.cost.joints import JointTerm
 from torchcss.cost.targets import PointTargets
 from torchcss.cost.temporal import TemporalPrior
 from torchcss.cost.total import CostChoice, TrackingCost
@@ -37,7 +37,7 @@ from torchcss.io.tracks import prepare_output_folder, write_summary
 from torchcss.studies.render.robots import stand, trot
 from torchcss.studies.render.sequences import look_at
 from torchcss.tracking.presets import make_tracker
-from torchcss.types import Bounds, CostFunction
+from torchcss.types import Bounds, CostFunction, Keypoints
 
 MARKED = ("THIGH", "SHANK", "FOOT")
 """Links whose origins are marked: hip, knee and foot of every leg."""
@@ -114,12 +114,10 @@ def make_costs(
             body=body,
             camera=camera,
             choice=choice,
-            observation=JointObservation(
-                tuple(body.joint_names), marks, torch.ones_like(marks[:, 0]), tuple(names)
-            ),
+            keypoints=Keypoints(place, torch.ones_like(place[:, 0]), tuple(names)),
             deviation=body.motion_rate / RATE,
         )
-        for marks in uv
+        for place in uv
     ]
     return [cost.of_children for cost in costs], replace(
         costs[0], choice=replace(choice, temporal=None)

@@ -13,11 +13,12 @@ from torchcss.body.model import BodyModel
 from torchcss.cost.edge_energy import EdgeEnergyTerm, edge_energy_field
 from torchcss.cost.flow import FlowTerm, InteriorNodes, flow_targets
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
-from torchcss.cost.joints import JointObservation, JointTerm
+from torchcss.cost.joints import JointTerm
 from torchcss.cost.temporal import MixturePrior
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.cost.visibility import ContourPredictor
 from torchcss.inference.mixture import GaussianMixture
+from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
 
 WIDTH, HEIGHT = 160, 120
@@ -82,9 +83,7 @@ def make_cost(
         choice=choice,
         predictor=ContourPredictor(body),
         edge_field=field.to(dtype),
-        observation=JointObservation(
-            body.joint_names, keypoints.to(dtype), confidence.to(dtype), body.joint_names
-        ),
+        keypoints=Keypoints(keypoints.to(dtype), confidence.to(dtype), body.joint_names),
         parent=parents.to(dtype),
         deviation=body.motion_rate / 25,
     )

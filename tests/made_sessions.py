@@ -8,10 +8,10 @@ from torch import Tensor
 from torchcss.body.model import BodyModel
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.initialise.result import Initialisation
-from torchcss.io.keypoints.read import Keypoints
 from torchcss.tracking.session import TrackingSession
 from torchcss.tracking.settings import Settings
 from torchcss.tracking.view import CameraView
+from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
 
 INTERVAL = 1 / 25
@@ -37,7 +37,7 @@ def seen_by(
     if joints is None:
         return CameraView(camera, sigma=sigma)
     uv = camera.project(joints).uv
-    return CameraView(camera, Keypoints(uv, torch.ones_like(uv[..., 0]), names, ()), sigma)
+    return CameraView(camera, Keypoints(uv, torch.ones_like(uv[..., 0]), names), sigma)
 
 
 def session_at(

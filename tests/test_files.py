@@ -25,13 +25,13 @@ from torchcss.errors import OutputError, TorchcssError
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.initialise.result import Initialisation
 from torchcss.io.fitted_body import write_fitted_body
-from torchcss.io.keypoints.one_image import Joints
 from torchcss.io.tracks import FrameModes, Track, TrackWriter, load_track, save_track, write_summary
 from torchcss.io.video import VideoReader, VideoWriter
 from torchcss.show.click import write_clicked
 from torchcss.show.style import save_figure
 from torchcss.studies.flow_files import write_flow
 from torchcss.studies.sequence_writer import write_sequence
+from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
 
 BODY = load_body("arm7", free_root=True)
@@ -71,7 +71,7 @@ def flow(path: Path) -> None:
 
 def clicked(path: Path) -> None:
     places = torch.tensor([[3.0, 4.0]], dtype=torch.float64)
-    write_clicked(path, Joints(places, torch.ones(1), ("l_wrist",), ()), (64, 48))
+    write_clicked(path, Keypoints(places, torch.ones(1), ("l_wrist",)), (64, 48))
 
 
 def figure(path: Path) -> None:

@@ -10,7 +10,9 @@ from torchcss.app.track import track_video
 from torchcss.app.v01 import track_frames
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
-from torchcss.initialise.fit import Initialisation, initialise
+from torchcss.initialise.fit import initialise
+from torchcss.initialise.options import InitialiseOptions
+from torchcss.initialise.result import Initialisation
 from torchcss.io.export import export_track
 from torchcss.io.tracks import Track, load_track
 from torchcss.solve.inverse_kinematics import Solutions, inverse_kinematics
@@ -18,6 +20,7 @@ from torchcss.tracking.session import Observation, Posterior, TrackingSession
 from torchcss.tracking.settings import Settings
 from torchcss.tracking.smooth import smooth_track
 from torchcss.tracking.view import CameraView
+from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
 
 __all__ = [
@@ -25,6 +28,8 @@ __all__ = [
     "Camera",
     "CameraView",
     "Initialisation",
+    "InitialiseOptions",
+    "Keypoints",
     "Observation",
     "Posterior",
     "Settings",

@@ -21,10 +21,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum, IntEnum
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 
@@ -142,6 +143,61 @@ class CostFunction(Protocol):
     def local_model(self, x: Float[Tensor, "*batch n"]) -> LocalModel:
         """Cost, gradient and Hessian at `x`, image matches held fixed."""
         ...
+
+
+class Keypoints(NamedTuple):
+    """2D joints of one body, in one image or in every frame of a sequence.
+
+    Attributes:
+        positions: Pixels, centres at integers.
+        confidence: From 0, not known, to 1.
+        names: Name of every joint: the catalogue's, or the file's own where that has none.
+        relative_noise: Standard deviation in multiples of what the cost's joint term is told, since
+            views in which the body is larger have more pixels of noise.
+        report: What a reader recognised, chosen or corrected, one line each.
+    """
+
+    positions: Float[Tensor, "*t j 2"]
+    confidence: Float[Tensor, "*t j"]
+    names: tuple[str, ...]
+    relative_noise: float = 1.0
+    report: tuple[str, ...] = ()
+
+    @property
+    def says_nothing(self) -> bool:
+        """Whether no joint is known, as in a frame in which nobody was detected."""
+        return not bool((self.confidence > 0).any())
+
+    def at(self, frame: int | Int[Tensor, " s"]) -> Self:
+        """The keypoints of one frame, or of some."""
+        return self._replace(positions=self.positions[frame], confidence=self.confidence[frame])
+
+    def only(self, names: tuple[str, ...]) -> Self:
+        """Those of some joints, in the order in which they are."""
+        columns = [column for column, name in enumerate(self.names) if name in names]
+        return self._replace(
+            positions=self.positions[..., columns, :],
+            confidence=self.confidence[..., columns],
+            names=tuple(self.names[column] for column in columns),
+        )
+
+    def without(self, joints: Bool[Tensor, "*t j"]) -> Self:
+        """The same with some joints not known."""
+        return self._replace(confidence=torch.where(joints, 0.0, self.confidence))
+
+    def scaled(self, from_wh: tuple[int, int], to_wh: tuple[int, int]) -> Self:
+        """The same in pixels of the image at another size.
+
+        Args:
+            from_wh: Width and height of the image that they are in now.
+            to_wh: Width and height of the resized image.
+        """
+        factor = self.positions.new_tensor([to_wh[0] / from_wh[0], to_wh[1] / from_wh[1]])
+        return self._replace(positions=(self.positions + 0.5) * factor - 0.5)
+
+    def to(self, like: Tensor) -> Self:
+        """The same in the type and on the device of a tensor."""
+        return self._replace(positions=self.positions.to(like), confidence=self.confidence.to(like))
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,11 +17,11 @@ from torchcss.body.load import load_body
 from torchcss.body.model import BodyPose, differentiate_twice
 from torchcss.cost.flow import FlowTerm, InteriorNodes, flow_targets
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
-from torchcss.cost.joints import JointObservation, JointTerm
+from torchcss.cost.joints import JointTerm, match_joints
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.cost.visibility import ContourPredictor, front_facing, visible_nodes
 from torchcss.joint_names import ALIASES
-from torchcss.types import LocalModel
+from torchcss.types import Keypoints, LocalModel
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor
 
@@ -41,9 +41,9 @@ def made_up_costs(
     joints = body.pose(body.rest).joints[[body.joint_index(name) for name in names]]
     uv = camera.project(joints).uv
     uv = uv + 3.0 * torch.randn(uv.shape, generator=generator, dtype=dtype)
-    observation = JointObservation(body.joint_names, uv, torch.ones_like(uv[:, 0]), names)
+    keypoints = Keypoints(uv, torch.ones_like(uv[:, 0]), names)
     choice = CostChoice(contour=None, joints=JointTerm(), stabiliser=None, temporal=None)
-    alone = TrackingCost(body=body, camera=camera, choice=choice, observation=observation)
+    alone = TrackingCost(body=body, camera=camera, choice=choice, keypoints=keypoints)
     edges = FeatureExtractor().to(dtype)(made_up_frames(size_wh)[1]).edge_field()
     interior = InteriorNodes(body)
     full = replace(
@@ -72,13 +72,14 @@ def made_up_frames(size_wh: tuple[int, int]) -> tuple[Tensor, Tensor]:
 
 def autograd_model(cost: TrackingCost, x: Tensor) -> LocalModel:
     """Value (but for a constant), gradient and Hessian of joints, contour, flow and two priors."""
-    choice, body, camera, observation = cost.choice, cost.body, cost.camera, cost.observation
+    choice, body, camera, keypoints = cost.choice, cost.body, cost.camera, cost.keypoints
     leaf = x.detach().requires_grad_()
     pose = body.pose(leaf)
     value = torch.zeros_like(x[:, 0])
-    if choice.joints is not None and observation is not None:
-        projection = camera.project(pose.joints[:, observation.index])
-        value = value + choice.joints.value(projection, observation).sum(-1)
+    if choice.joints is not None and keypoints is not None:
+        targets = match_joints(keypoints, body.joint_names)
+        projection = camera.project(pose.joints[:, targets.joint])
+        value = value + choice.joints.value(projection, targets).sum(-1)
     if choice.contour is not None:
         value = value + contour(cost, body.pose(x), pose)
     if choice.flow is not None:

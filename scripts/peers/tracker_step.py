@@ -17,10 +17,11 @@ from torch._dynamo.utils import counters
 from torch._inductor.utils import fresh_inductor_cache
 from torch.profiler import ProfilerActivity, profile
 
-from torchcss.cost.joints import JointObservation, JointTerm
+from torchcss.cost.joints import JointTerm
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.studies.fixed_step import FixedStepState, fixed_step, refill, scaled_draw, start
 from torchcss.studies.reprojection import reprojection_problem
+from torchcss.types import Keypoints
 
 FRAME_INTERVAL = 1 / 25
 NUM_MODES = 3
@@ -65,9 +66,7 @@ def make_frames(body_name: str, pool: int, like: Tensor, seed: int) -> Iterator[
     while True:
         uv = problem.observed + torch.randn(problem.observed.shape, generator=generator)
         uv = uv.to(like)
-        observation = JointObservation(
-            body.joint_names, uv, torch.ones_like(uv[:, 0]), problem.joint_names
-        )
+        keypoints = Keypoints(uv, torch.ones_like(uv[:, 0]), problem.joint_names)
         modes = torch.randn(NUM_MODES, len(motion), generator=generator).to(like)
         modes = problem.start.mean.to(like) + 0.5 * motion * modes
         mean = modes[torch.arange(pool, device=like.device) % NUM_MODES]
@@ -76,7 +75,7 @@ def make_frames(body_name: str, pool: int, like: Tensor, seed: int) -> Iterator[
             body=body,
             camera=camera,
             choice=choice,
-            observation=observation,
+            keypoints=keypoints,
             parent=mean,
             deviation=motion,
         )

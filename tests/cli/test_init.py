@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +16,11 @@ from torchcss.app.init import write_png
 from torchcss.cli import init as cli_init
 from torchcss.cli import main as cli
 from torchcss.initialise.multi_start import Search
-from torchcss.io.keypoints.one_image import Joints
+from torchcss.initialise.options import InitialiseOptions
 from torchcss.io.tracks import load_track
 from torchcss.io.video import VideoReader, VideoWriter, read_image
 from torchcss.studies.render.sequences import arm_sequence
+from torchcss.types import Keypoints
 
 
 @pytest.fixture(scope="module")
@@ -132,18 +134,24 @@ def test_one_clear_line(scene: Path, tmp_path: Path, options: tuple, message: st
     assert message in line
 
 
+def few_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the verb look less widely."""
+    plain, small = cli_init.initialise_image, Search(num_starts=8, num_flips=8, num_samples=0)
+
+    def quick(*files, options: InitialiseOptions, **more):
+        return plain(*files, options=replace(options, search=small), **more)
+
+    monkeypatch.setattr(cli_init, "initialise_image", quick)
+
+
 def test_clicked_joints_are_used_and_kept(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     marks = json.loads((scene / "joints.json").read_text())["joints"]
     places = torch.tensor(list(marks.values()), dtype=torch.float64)
-    clicked = Joints(places, torch.ones(len(places)).double(), tuple(marks), ("clicked",))
+    clicked = Keypoints(places, torch.ones(len(places)).double(), tuple(marks))
     monkeypatch.setattr(cli_init, "click_joints", lambda picture: clicked)
-    small = Search(num_starts=8, num_flips=8, num_samples=0)
-    plain = cli_init.initialise_image
-    monkeypatch.setattr(
-        cli_init, "initialise_image", lambda *a, **k: plain(*a, **{**k, "search": small})
-    )
+    few_starts(monkeypatch)
     assert init(scene, tmp_path, "--click", "--no-contours", "--hypotheses", "best") == 0
     kept = json.loads((tmp_path / "joints.json").read_text())["joints"]
     assert kept["r_wrist"] == pytest.approx(marks["r_wrist"], abs=0.01)
@@ -158,13 +166,9 @@ def test_from_a_frame_of_a_video(scene: Path, tmp_path: Path, monkeypatch: pytes
     """What is marked in a later frame is of that frame, for `track --start` too."""
     marks = json.loads((scene / "joints.json").read_text())["joints"]
     places = torch.tensor(list(marks.values()), dtype=torch.float64)
-    clicked = Joints(places, torch.ones(len(places)).double(), tuple(marks), ("clicked",))
+    clicked = Keypoints(places, torch.ones(len(places)).double(), tuple(marks))
     seen = []
-    small = Search(num_starts=8, num_flips=8, num_samples=0)
-    plain = cli_init.initialise_image
-    monkeypatch.setattr(
-        cli_init, "initialise_image", lambda *a, **k: plain(*a, **{**k, "search": small})
-    )
+    few_starts(monkeypatch)
     monkeypatch.setattr(cli_init, "click_joints", lambda picture: seen.append(picture) or clicked)
     quick = [
         "--camera", str(scene / "cameras.json"), "--no-contours", "--hypotheses", "best",

@@ -16,10 +16,10 @@ from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel, differentiate_twice
 from torchcss.body.surface import implicit, surface_points
 from torchcss.cost.interpenetration import END, Interpenetration, InterpenetrationPairs, NearNodes
-from torchcss.cost.joints import JointObservation, JointTerm
+from torchcss.cost.joints import JointTerm, match_joints
 from torchcss.errors import ConfigurationError
 from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.types import Curvature, LocalModel
+from torchcss.types import Curvature, Keypoints, LocalModel
 from torchcss.vision.camera import Camera
 
 TERM = Interpenetration()
@@ -353,8 +353,8 @@ class FistCost:
             )  # fmt: skip
             seen = camera.project(body.pose(target).joints).uv
             names = body.joint_names
-            observation = JointObservation(names, seen, torch.ones(len(names)).to(x), names)
-            cost = JointTerm(sigma=5.0).point_cost(pose.joints, camera, observation)
+            targets = match_joints(Keypoints(seen, torch.ones(len(names)).to(x), names), names)
+            cost = JointTerm(sigma=5.0).point_cost(pose.joints, camera, targets)
             image = body.lift(pose, pose.joints, body.marker_link, cost)
             model = LocalModel(*(a + b for a, b in zip(model, image, strict=True)))
         if self.term is None:

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchcss.cost.joints import OUTLIER_LENGTHS, SPREAD, JointObservation, JointTerm
-from torchcss.types import PointCost
+from torchcss.cost.joints import OUTLIER_LENGTHS, SPREAD, JointTargets, JointTerm, match_joints
+from torchcss.types import Keypoints, PointCost
 from torchcss.vision.camera import Camera
 
 NAMES = ("l_shoulder", "r_wrist", "nose", "skull_tip", "l_hip", "vt1")
@@ -31,13 +31,13 @@ def make_camera(distortion: list[float] | None = None) -> Camera:
 
 def observe(
     camera: Camera, points: Tensor, generator: torch.Generator, *, noise: float = 10.0
-) -> JointObservation:
+) -> JointTargets:
     keypoints = camera.project(points).uv
     keypoints = keypoints + noise * torch.randn(
         keypoints.shape, generator=generator, dtype=torch.float64
     )
     confidence = torch.rand(len(NAMES), generator=generator, dtype=torch.float64)
-    return JointObservation(NAMES, keypoints, confidence, NAMES)
+    return match_joints(Keypoints(keypoints, confidence, NAMES), NAMES)
 
 
 def random_points(*batch: int, generator: torch.Generator) -> Tensor:
@@ -57,10 +57,10 @@ def test_derivatives_per_point_are_those_of_autograd(
     camera = make_camera(distortion)
     points = random_points(*batch, generator=generator)
     first = points.reshape(-1, len(NAMES), 3)[0]
-    observation = observe(camera, first, generator, noise=noise)
-    got = TERM.point_cost(points, camera, observation)
+    targets = observe(camera, first, generator, noise=noise)
+    got = TERM.point_cost(points, camera, targets)
     leaf = points.clone().requires_grad_()
-    value = TERM.value(camera.project(leaf), observation)
+    value = TERM.value(camera.project(leaf), targets)
     (gradient,) = torch.autograd.grad(value.sum(), leaf, create_graph=True)
     rows = [
         torch.autograd.grad(gradient[..., a].sum(), leaf, retain_graph=True)[0] for a in range(3)
@@ -77,14 +77,14 @@ def test_gauss_newton_leaves_out_the_curvature_of_the_projection(
 ) -> None:
     camera = make_camera()
     points = random_points(generator=generator)
-    observation = observe(camera, points, generator, noise=40.0)
+    targets = observe(camera, points, generator, noise=40.0)
     model = camera.project_with_derivatives(points)
-    error = (model.uv - observation.target).requires_grad_()
-    rho = TERM.potential(observation.weight * error.square().sum(-1)).rho
+    error = (model.uv - targets.position).requires_grad_()
+    rho = TERM.potential(targets.weight * error.square().sum(-1)).rho
     (slope,) = torch.autograd.grad(0.5 * rho.sum(), error, create_graph=True)
     rows = [torch.autograd.grad(slope[:, a].sum(), error, retain_graph=True)[0] for a in range(2)]
     bowl = torch.stack(rows, dim=-2)
-    got = TERM.point_cost(points, camera, observation, gauss_newton=True)
+    got = TERM.point_cost(points, camera, targets, gauss_newton=True)
     jacobian = camera.jacobian(model)
     torch.testing.assert_close(got.hessian, jacobian.mT @ bowl @ jacobian)
 
@@ -101,20 +101,20 @@ def test_the_potential_is_that_of_its_docstring() -> None:
 def test_weights_follow_confidence_and_spread() -> None:
     keypoints = torch.zeros(len(NAMES), 2, dtype=torch.float64)
     confidence = torch.tensor([1.0, 0.5, 1.0, 1.0, 2.0, 1.0], dtype=torch.float64)
-    observation = JointObservation(NAMES, keypoints, confidence, NAMES)
+    targets = match_joints(Keypoints(keypoints, confidence, NAMES), NAMES)
     spread = [SPREAD["shoulder"], 1.0, SPREAD["nose"], SPREAD["skull_tip"], SPREAD["hip"], 1.3]
     expected = torch.tensor([1.0, 0.5, 1.0, 1.0, 1.0, 1.0]) / torch.tensor(spread).square()
-    torch.testing.assert_close(observation.weight, expected.double())
+    torch.testing.assert_close(targets.weight, expected.double())
 
 
 def test_keypoints_are_matched_by_name() -> None:
     keypoints = torch.arange(8, dtype=torch.float64).reshape(4, 2)
     order = ("nose", "tail", "l_hip", "r_wrist")
-    observation = JointObservation(NAMES, keypoints, torch.ones(4).double(), order)
-    assert observation.index.tolist() == [2, 4, 1]
-    assert observation.target.tolist() == [[0.0, 1.0], [4.0, 5.0], [6.0, 7.0]]
-    none = JointObservation(("a",), keypoints, torch.ones(4).double(), order)
-    assert none.index.shape == (0,)
+    targets = match_joints(Keypoints(keypoints, torch.ones(4).double(), order), NAMES)
+    assert targets.joint.tolist() == [2, 4, 1]
+    assert targets.position.tolist() == [[0.0, 1.0], [4.0, 5.0], [6.0, 7.0]]
+    none = match_joints(Keypoints(keypoints, torch.ones(4).double(), order), ("a",))
+    assert none.joint.shape == (0,)
     camera = make_camera()
     cost = TERM.point_cost(torch.zeros(2, 0, 3, dtype=torch.float64), camera, none)
     assert cost.value.shape == (2, 0)
@@ -131,8 +131,8 @@ def test_missing_keypoints_cost_nothing_whatever_they_hold(
     keypoints[1] = bad
     confidence = torch.ones(len(NAMES), dtype=torch.float64)
     confidence[1] = 0.0
-    observation = JointObservation(NAMES, keypoints, confidence, NAMES)
-    cost = TERM.point_cost(points, camera, observation)
+    targets = match_joints(Keypoints(keypoints, confidence, NAMES), NAMES)
+    cost = TERM.point_cost(points, camera, targets)
     for part in cost:
         assert torch.isfinite(part).all()
         assert not part[:, 1].any()
@@ -143,23 +143,23 @@ def test_missing_keypoints_cost_nothing_whatever_they_hold(
 def test_confidences_that_are_none(confidence: float, generator: torch.Generator) -> None:
     keypoints = torch.zeros(len(NAMES), 2, dtype=torch.float64)
     all_of_them = torch.full((len(NAMES),), confidence, dtype=torch.float64)
-    observation = JointObservation(NAMES, keypoints, all_of_them, NAMES)
-    assert not observation.weight.any()
+    targets = match_joints(Keypoints(keypoints, all_of_them, NAMES), NAMES)
+    assert not targets.weight.any()
 
 
 def test_a_joint_behind_the_camera_costs_a_constant(generator: torch.Generator) -> None:
     camera = make_camera()
     points = random_points(generator=generator)
-    observation = observe(camera, points, generator)
+    targets = observe(camera, points, generator)
     behind = points.clone()
     behind[1] = (torch.tensor([0.1, 0.2, -2.0]) - camera.t_camera_world) @ camera.R_camera_world
-    cost = TERM.point_cost(behind, camera, observation)
-    far = observation.weight[1] * (OUTLIER_LENGTHS * TERM.sigma) ** 2
+    cost = TERM.point_cost(behind, camera, targets)
+    far = targets.weight[1] * (OUTLIER_LENGTHS * TERM.sigma) ** 2
     torch.testing.assert_close(cost.value[1], 0.5 * TERM.potential(far).rho)
     assert not cost.gradient[1].any()
     assert not cost.hessian[1].any()
     assert float(cost.value[1]) > 0
-    torch.testing.assert_close(TERM.value(camera.project(behind), observation), cost.value)
+    torch.testing.assert_close(TERM.value(camera.project(behind), targets), cost.value)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -168,9 +168,7 @@ def test_types(dtype: torch.dtype, generator: torch.Generator) -> None:
     points = random_points(4, generator=generator)
     double = observe(camera, points[0], generator)
     expected = TERM.point_cost(points, camera, double)
-    keypoints = camera.project(points[0]).uv
-    single = JointObservation(NAMES, keypoints.to(dtype), torch.ones(len(NAMES)).to(dtype), NAMES)
-    single.target, single.weight = double.target.to(dtype), double.weight.to(dtype)
+    single = JointTargets(double.joint, double.position.to(dtype), double.weight.to(dtype))
     got = TERM.point_cost(points.to(dtype), camera, single)
     for ours, theirs in zip(got, expected, strict=True):
         assert ours.dtype == dtype
@@ -187,6 +185,8 @@ def test_far_keypoints_and_points_stay_finite(dtype: torch.dtype) -> None:
     )
     for far in (1e4, 1e9, 1e15, 1e30):
         keypoints = torch.full((len(NAMES), 2), far, dtype=dtype)
-        observation = JointObservation(NAMES, keypoints, torch.ones(len(NAMES), dtype=dtype), NAMES)
-        for part in TERM.point_cost(points, camera, observation):
+        targets = match_joints(
+            Keypoints(keypoints, torch.ones(len(NAMES), dtype=dtype), NAMES), NAMES
+        )
+        for part in TERM.point_cost(points, camera, targets):
             assert torch.isfinite(part).all()

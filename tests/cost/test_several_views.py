@@ -11,10 +11,11 @@ from torch import Tensor
 
 from torchcss.body.model import differentiate_twice
 from torchcss.cost.frame import beside
-from torchcss.cost.joints import JointObservation, JointTerm
+from torchcss.cost.joints import JointTerm, match_joints
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.cost.view import View
 from torchcss.inference.mixture import GaussianMixture
+from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
 
 
@@ -41,9 +42,7 @@ def two_views(choice: CostChoice = EVERYTHING, name: str = "arm8") -> tuple[Trac
         first,
         camera=camera,
         edge_field=first.edge_field.flip(-1)[:, :100, :128].contiguous(),
-        observation=JointObservation(
-            first.body.joint_names, uv, seen, first.body.joint_names, relative_noise=0.7
-        ),
+        keypoints=Keypoints(uv, seen, first.body.joint_names, relative_noise=0.7),
     )
     return first, second, beside([first, second])
 
@@ -73,9 +72,10 @@ def test_derivatives_over_both_views(generator: torch.Generator) -> None:
     def value(x: Tensor) -> Tensor:
         joints, total = first.body.pose(x).joints, 0.0
         for view in (first, second):
-            assert view.observation is not None
-            there = joints[..., view.observation.index, :]
-            total = total + term.value(view.camera.project(there), view.observation).sum(-1)
+            assert view.keypoints is not None
+            targets = match_joints(view.keypoints, first.body.joint_names)
+            there = joints[..., targets.joint, :]
+            total = total + term.value(view.camera.project(there), targets).sum(-1)
         return torch.as_tensor(total)
 
     leaf = x.clone().requires_grad_()
@@ -87,11 +87,13 @@ def test_derivatives_over_both_views(generator: torch.Generator) -> None:
 
 def test_a_second_view_narrows_depth() -> None:
     """The variance along the first camera's line of sight falls, by far more than across it."""
-    first, _, both = two_views(replace(JOINTS_ONLY, joints=JointTerm(sigma=1.0)), "body34")
-    assert first.observation is not None
+    first, second, _ = two_views(replace(JOINTS_ONLY, joints=JointTerm(sigma=1.0)), "body34")
+    assert first.keypoints is not None
     # At the pose that both see, so that no potential is past its bend.
     x = random_states(first.body, generator=torch.Generator().manual_seed(5))
-    first.observation.target = first.camera.project(first.body.pose(x).joints).uv
+    exact = first.camera.project(first.body.pose(x).joints).uv
+    first = replace(first, keypoints=first.keypoints._replace(positions=exact))
+    both = beside([first, second])
     depth, across = (first.body.state_index(name) for name in ("root_z", "root_x"))
     deviations = [
         (cost.local_model(x).hessian + torch.eye(len(x))).inverse().diagonal().sqrt()
@@ -109,11 +111,11 @@ def test_a_view_without_pictures_and_marks_says_nothing(generator: torch.Generat
     with_it = replace(first, others=(out,))
     torch.testing.assert_close(with_it.value(x), first.value(x), rtol=0, atol=0)
     # The first camera may be the one that is out.
-    other_first = replace(first, edge_field=None, observation=None, others=(second.alone,))
+    other_first = replace(first, edge_field=None, keypoints=None, others=(second.alone,))
     expected = second.value(x)
     torch.testing.assert_close(other_first.value(x), expected, rtol=1e-12, atol=1e-12)
     assert other_first.coarse() is not None
-    assert replace(first, observation=None, others=(out,)).coarse() is None
+    assert replace(first, keypoints=None, others=(out,)).coarse() is None
 
 
 def test_samples_keep_their_own_targets_in_every_view(generator: torch.Generator) -> None:
@@ -149,8 +151,8 @@ def test_keypoints_of_a_view_in_a_picture_of_another_size() -> None:
     small = first.of_keypoints(0.6)
     assert small.camera.image_size_wh == (96, 72)
     assert small.edge_field is None
-    assert small.observation is not None
-    assert first.observation is not None
-    known = first.observation.weight > 0
-    place = first.camera.undistort(first.observation.target[known])
-    torch.testing.assert_close(small.camera.undistort(small.observation.target[known]), place)
+    assert small.keypoints is not None
+    assert first.keypoints is not None
+    known = first.keypoints.confidence > 0
+    place = first.camera.undistort(first.keypoints.positions[known])
+    torch.testing.assert_close(small.camera.undistort(small.keypoints.positions[known]), place)

@@ -17,7 +17,7 @@ from torchcss.body.shape import (
 from torchcss.body.surface import surface_points
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.frame import FrameCosts
-from torchcss.cost.joints import JointObservation, JointTerm
+from torchcss.cost.joints import JointTerm
 from torchcss.cost.region import RegionTerm
 from torchcss.cost.shaped import Outline, ShapedCost
 from torchcss.cost.total import CostChoice, TrackingCost
@@ -26,7 +26,7 @@ from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.initialise.shape import fit_shape
 from torchcss.studies.render.renderer import Mesh, render_meshes
 from torchcss.tracking.flip_moves import flipped_poses
-from torchcss.types import Bounds
+from torchcss.types import Bounds, Keypoints
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor
 from torchcss.vision.rasterise import grid_faces
@@ -84,9 +84,7 @@ def problem(thicker: float, by: str) -> tuple[ShapedCost, torch.Tensor, ShapePar
         body=body,
         camera=camera,
         choice=CostChoice(contour=None, temporal=None, joints=JointTerm(sigma=1.0)),
-        observation=JointObservation(
-            body.joint_names, joints, torch.ones(len(joints)).double(), body.joint_names
-        ),
+        keypoints=Keypoints(joints, torch.ones(len(joints)).double(), body.joint_names),
     )
     if by == "edges":
         outline = Outline(ContourTerm(), features.edge_field().double(), 150.0)

@@ -215,10 +215,10 @@ def test_weights_scale_their_terms(generator: torch.Generator) -> None:
 def test_terms_are_silent_without_their_data(generator: torch.Generator) -> None:
     cost = make_cost()
     x = random_states(cost.body, 2, generator=generator)
-    assert set(replace(cost, observation=None).terms(x)) == {"contour", "stabiliser", "temporal"}
+    assert set(replace(cost, keypoints=None).terms(x)) == {"contour", "stabiliser", "temporal"}
     assert set(replace(cost, edge_field=None).terms(x)) == {"joints", "stabiliser", "temporal"}
     assert set(replace(cost, predictor=None).terms(x)) == {"joints", "stabiliser", "temporal"}
-    bare = replace(cost, observation=None, edge_field=None, parent=None)
+    bare = replace(cost, keypoints=None, edge_field=None, parent=None)
     assert set(bare.terms(x)) == {"stabiliser"}
     assert torch.isfinite(bare.local_model(x).hessian).all()
 
@@ -255,7 +255,7 @@ def test_the_coarse_cost_is_the_keypoints_without_outliers(generator: torch.Gene
     assert fine.tolist() == pytest.approx([1, 0.074], abs=1e-3)
     assert trusting.tolist() == pytest.approx([1, 0.742], abs=1e-3)
     assert (coarse.terms(x)["joints"] >= cost.terms(x)["joints"]).all()
-    assert replace(cost, observation=None).coarse() is None
+    assert replace(cost, keypoints=None).coarse() is None
     assert replace(cost, choice=replace(EVERYTHING, joints=None)).coarse() is None
 
 
@@ -266,7 +266,7 @@ def test_a_body_without_flesh_has_no_contour(tmp_path: Path) -> None:
         "<parent link='a'/><child link='b'/></joint></robot>"
     )
     body = load_body(path)
-    cost = replace(make_cost(), body=body, observation=None, parent=None, deviation=None)
+    cost = replace(make_cost(), body=body, keypoints=None, parent=None, deviation=None)
     cost = replace(cost, predictor=ContourPredictor(body))
     x = torch.zeros(3, 1, dtype=torch.float64)
     assert not cost.value(x).any()

@@ -13,20 +13,19 @@ import torch
 import torchcss
 from torchcss.body.catalog import LENGTHS
 from torchcss.body.load import load_body
-from torchcss.cost.joints import JointObservation, JointTerm
 from torchcss.cost.part_map import part_map
 from torchcss.cost.view import View
 from torchcss.errors import BodyError, CameraError, ConfigurationError, KeypointError
 from torchcss.initialise.fit import DEFAULT_VIEW_DEGREES, default_camera, initialise
-from torchcss.initialise.from_joints import initialise_from_joints
 from torchcss.initialise.keypoint_checks import default_sigma, typical_sigma
 from torchcss.initialise.multi_start import PAPER_PROPORTIONS, SINGLE_START, Search
+from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
 from torchcss.initialise.result import Initialisation, hang_on_best, stature_of
 from torchcss.studies.metrics import LIMB_JOINTS, mask_overlap, pa_mpjpe_mm
 from torchcss.studies.random_person import Person, coverage, random_person
 from torchcss.studies.render.clutter import clutter_background
 from torchcss.studies.render.renderer import Mesh, render_meshes
-from torchcss.types import Modes
+from torchcss.types import Keypoints, Modes
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import grid_faces
 
@@ -47,17 +46,15 @@ def marks(someone: Person) -> dict[str, tuple[float, ...]]:
     }
 
 
-def find(someone: Person, search: Search = SMALL, seed: int = 0, **options) -> Initialisation:
-    return initialise_from_joints(
-        "body34",
+def find(someone: Person, search: Search = SMALL, **options) -> Initialisation:
+    return initialise(
+        None,
+        Keypoints(someone.keypoints, someone.confidence, someone.joint_names),
         someone.camera,
-        someone.keypoints,
-        someone.confidence,
-        someone.joint_names,
-        generator=torch.Generator().manual_seed(seed),
-        joints=JointTerm(sigma=2.0),
-        search=search,
-        **options,
+        generator=torch.Generator().manual_seed(0),
+        options=InitialiseOptions(
+            sigma=2.0, search=search, **{"least_joints": LEAST_JOINTS, **options}
+        ),
     )
 
 
@@ -179,13 +176,13 @@ def test_colours_tell_the_outline_of_a_chequered_shirt():
         background=clutter_background(height, width, generator=torch.Generator().manual_seed(1)),
         eye_world=camera.centre_world,
     )
-    marked = size * (someone.keypoints + 0.5) - 0.5
+    keypoints = Keypoints(someone.keypoints, someone.confidence, someone.joint_names)
     overlap, girth = [], []
     for colours in (False, True):
         found = initialise(
-            truth.image.numpy(), torch.cat([marked, someone.confidence[:, None]], dim=1), camera,
-            joint_names=someone.joint_names, generator=torch.Generator().manual_seed(0),
-            search=SMALL, num_modes=2, colours=colours,
+            truth.image.numpy(), keypoints.scaled(someone.camera.image_size_wh, (width, height)),
+            camera, generator=torch.Generator().manual_seed(0),
+            options=InitialiseOptions(search=SMALL, num_modes=2, colours=colours),
         )  # fmt: skip
         drawn = part_map(found.body, found.mixture.mean[0], camera) >= 0
         overlap.append(float(mask_overlap(drawn, truth.mask)))
@@ -230,17 +227,17 @@ def test_marks_keep_their_place_in_a_picture_whose_sides_are_rounded(
         torch.diag(torch.tensor([1.0, -1.0, -1.0])), torch.tensor([0.0, 0.0, 3.0])
     )
     uv = camera.project(body.pose(body.rest).joints).uv
-    known = torch.ones(len(uv)).double()
-    observed = JointObservation(body.joint_names, uv, known, body.joint_names)
+    keypoints = Keypoints(uv, torch.ones(len(uv)).double(), body.joint_names)
     cost: Any = initialise(
-        np.zeros((1000, 303, 3), np.uint8), uv, camera, "arm7", working_size=64,
-        joint_names=body.joint_names, generator=torch.Generator().manual_seed(0),
-        search=SINGLE_START, others=[View(camera=camera, observation=observed)],
+        np.zeros((1000, 303, 3), np.uint8), keypoints, camera, "arm7",
+        generator=torch.Generator().manual_seed(0),
+        options=InitialiseOptions(search=SINGLE_START, working_size=64),
+        others=[View(camera=camera, keypoints=keypoints)],
     )  # fmt: skip
     for view in cost.views:
         assert view.camera.image_size_wh == (19, 64)
-        place, expected = view.camera.undistort(view.observation.target), camera.undistort(uv)
-        torch.testing.assert_close(place[0], expected[0][view.observation.index])
+        place, expected = view.camera.undistort(view.keypoints.positions), camera.undistort(uv)
+        torch.testing.assert_close(place[0], expected[0])
 
 
 def test_few_joints_leave_the_prior_and_say_so():
@@ -248,7 +245,8 @@ def test_few_joints_leave_the_prior_and_say_so():
     one = marks(someone)
     two = {name: one[name] for name in ("l_shoulder", "l_elbow")}
     generator = torch.Generator().manual_seed(0)
-    found = initialise(None, two, someone.camera, generator=generator, search=SMALL, num_modes=2)
+    options = InitialiseOptions(search=SMALL, num_modes=2)
+    found = initialise(None, two, someone.camera, generator=generator, options=options)
     line = next(line for line in found.report if line.startswith("not determined"))
     for name in ("r_knee_flexion", "l_hip_twist", "neck_twist"):
         assert name in line
@@ -266,8 +264,8 @@ def test_swapped_sides_are_reported_and_left_as_they_are():
     swapped = tuple(_swap(name, legs) for name in someone.joint_names)
     generator = torch.Generator().manual_seed(0)
     given = dict(zip(swapped, someone.keypoints.tolist(), strict=True))
-    options = {"search": SMALL, "num_modes": 1}
-    found = initialise(None, given, someone.camera, generator=generator, **options)
+    options = InitialiseOptions(search=SMALL, num_modes=1)
+    found = initialise(None, given, someone.camera, generator=generator, options=options)
     assert any("left and right look swapped in the legs" in line for line in found.report)
 
 
@@ -282,8 +280,8 @@ def test_odd_marks_are_named_and_gross_ones_move_little():
     spoilt["l_wrist"] = spoilt["l_elbow"]
     spoilt["r_ankle"] = (30.0, 1200.0)
     generator = torch.Generator().manual_seed(0)
-    options = {"search": SMALL, "sigma": 2.0, "num_modes": 1}
-    found = initialise(None, spoilt, someone.camera, generator=generator, **options)
+    options = InitialiseOptions(search=SMALL, sigma=2.0, num_modes=1)
+    found = initialise(None, spoilt, someone.camera, generator=generator, options=options)
     report = "\n".join(found.report)
     assert "at the same place: l_elbow and l_wrist" in report
     assert "outside the image: r_ankle" in report
@@ -308,7 +306,7 @@ def test_odd_marks_are_named_and_gross_ones_move_little():
 )
 def test_marks_from_which_nothing_follows(given: dict, message: str, generator: torch.Generator):
     with pytest.raises(KeypointError, match=message):
-        initialise(None, given, person().camera, generator=generator, search=SMALL)
+        initialise(None, given, person().camera, generator=generator)
 
 
 def test_cameras(generator: torch.Generator):
@@ -324,7 +322,7 @@ def test_cameras(generator: torch.Generator):
         initialise(picture, marks(person()), person().camera, generator=generator)
     behind = load_body("arm7").with_base(torch.eye(3), torch.tensor([0.0, 0.0, 3.0]))
     with pytest.raises(CameraError, match="looks away"):
-        find(person(), placed=behind)
+        initialise(None, marks(person()), person().camera, behind, generator=generator)
 
 
 def test_arms_and_single_precision():
@@ -333,16 +331,17 @@ def test_arms_and_single_precision():
     x = body.bounds.project(x)
     camera = person().camera
     uv = camera.project(body.pose(x).joints).uv
-    found = initialise_from_joints(
-        "arm7", camera, uv, torch.ones(4), body.joint_names, search=SMALL, dtype=torch.float32,
-        generator=torch.Generator().manual_seed(0),
+    keypoints = Keypoints(uv, torch.ones(4), body.joint_names)
+    found = initialise(
+        None, keypoints, camera, "arm7", generator=torch.Generator().manual_seed(0),
+        options=InitialiseOptions(search=SMALL, dtype=torch.float32),
     )  # fmt: skip
     assert found.body.dtype == found.mixture.mean.dtype == torch.float32
     assert float(found.cost[0]) < 8
     placed, again = (
-        initialise_from_joints(
-            "arm7", camera, uv, torch.ones(4), body.joint_names, search=SMALL, placed=body,
-            generator=torch.Generator().manual_seed(0), joints=JointTerm(sigma=2.0),
+        initialise(
+            None, keypoints, camera, body, generator=torch.Generator().manual_seed(0),
+            options=InitialiseOptions(search=SMALL, sigma=2.0),
         )
         for _ in range(2)
     )  # fmt: skip
@@ -364,18 +363,20 @@ def test_only_the_papers_proportions_if_asked():
 
 def test_default_sigma_follows_the_persons_size():
     box = torch.tensor([[0.0, 0.0], [300.0, 400.0]])
-    assert default_sigma(box) == pytest.approx(3.0)
-    assert default_sigma(box / 100) == 1.0
+    keypoints = Keypoints(box, torch.ones(2), ("l_wrist", "r_wrist"))
+    assert default_sigma(keypoints) == pytest.approx(3.0)
+    assert default_sigma(keypoints._replace(positions=box / 100)) == 1.0
 
 
 def test_typical_sigma_is_that_of_the_middle_frame():
     box = torch.tensor([[0.0, 0.0], [300.0, 400.0], [0.0, 400.0]])
-    keypoints = torch.stack([box, 2 * box, 4 * box, 100 * box])
+    places = torch.stack([box, 2 * box, 4 * box, 100 * box])
     confidence = torch.tensor([[1, 1, 1], [0.3, 1, 0.3], [1, 1, 1], [1, 0, 0]])
-    assert typical_sigma(keypoints, confidence) == pytest.approx(6.0)
-    assert typical_sigma(keypoints[:2], confidence[:2]) == pytest.approx(4.5)
+    keypoints = Keypoints(places, confidence, ("l_wrist", "r_wrist", "nose"))
+    assert typical_sigma(keypoints) == pytest.approx(6.0)
+    assert typical_sigma(keypoints.at(torch.tensor([0, 1]))) == pytest.approx(4.5)
     with pytest.raises(KeypointError, match="no frame has two keypoints"):
-        typical_sigma(keypoints[3:], confidence[3:])
+        typical_sigma(keypoints.at(torch.tensor([3])))
 
 
 def test_public_name():

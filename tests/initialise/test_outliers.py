@@ -3,62 +3,55 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from torchcss.cost.anthropometric import Anthropometric
-from torchcss.cost.joints import JointObservation, JointTerm
+from torchcss.cost.joints import JointTerm
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.initialise.multi_start import Search
 from torchcss.initialise.outliers import (
-    _EachWithout,
     best_distinct,
     capped_cost,
-    leave_out,
+    find_outliers,
     price_of_leaving_out,
     refine,
     without,
 )
 from torchcss.studies.random_person import Person, random_person
+from torchcss.types import Keypoints
 
 
 def person_and_cost(seed: int = 0, **options) -> tuple[Person, TrackingCost]:
     """A person and the cost of the marks, lengths known."""
     someone = random_person(generator=torch.Generator().manual_seed(seed), **options)
-    observation = JointObservation(
-        someone.body.joint_names, someone.keypoints, someone.confidence, someone.joint_names
-    )
+    keypoints = Keypoints(someone.keypoints, someone.confidence, someone.joint_names)
     choice = CostChoice(
         contour=None, joints=JointTerm(sigma=2.0), temporal=None, anthropometric=Anthropometric()
     )
     return someone, TrackingCost(
-        body=someone.body, camera=someone.camera, choice=choice, observation=observation
+        body=someone.body, camera=someone.camera, choice=choice, keypoints=keypoints
     )
 
 
 def moved(cost: TrackingCost, mark: int, pixels: tuple[float, float]) -> TrackingCost:
     """The same with one mark elsewhere."""
-    other = without(cost, torch.zeros(14, dtype=torch.bool))
-    assert other.observation is not None
-    assert cost.observation is not None
-    other.observation.target = cost.observation.target.clone()
-    other.observation.target[mark] += other.observation.target.new_tensor(pixels)
-    return other
+    assert cost.keypoints is not None
+    places = cost.keypoints.positions.clone()
+    places[mark] += places.new_tensor(pixels)
+    return replace(cost, keypoints=cost.keypoints._replace(positions=places))
 
 
 def test_price_is_that_of_a_place_anywhere_in_the_image():
     _, cost = person_and_cost()
     price = price_of_leaving_out(cost)
     plain = math.log(0.95 / 0.05 * 1920 * 1080 / (2 * math.pi * 4))
-    wrist = cost.body.joint_index("l_wrist")
-    hip = cost.body.joint_index("l_hip")
-    assert cost.observation is not None
-    at = {
-        int(joint): float(each) for joint, each in zip(cost.observation.index, price, strict=True)
-    }
-    assert at[wrist] == pytest.approx(plain)
-    assert at[hip] == pytest.approx(plain - math.log(4))
+    assert cost.keypoints is not None
+    at = dict(zip(cost.keypoints.names, price.tolist(), strict=True))
+    assert at["l_wrist"] == pytest.approx(plain)
+    assert at["l_hip"] == pytest.approx(plain - math.log(4))
 
 
 @pytest.mark.parametrize("name", ["r_knee", "l_shoulder", "vc7"])
@@ -67,21 +60,23 @@ def test_a_mark_that_is_elsewhere_is_left_out_and_no_other(name: str):
     mark = someone.joint_names.index(name)
     search = Search()
     fits = best_distinct(refine(cost, someone.state[None], search))
-    assert not bool(leave_out(cost, fits, search).any())
+    assert not bool(find_outliers(cost, fits, search).any())
     spoilt = moved(cost, mark, (180.0, -120.0))
-    gross = leave_out(spoilt, best_distinct(refine(spoilt, someone.state[None], search)), search)
+    gross = find_outliers(
+        spoilt, best_distinct(refine(spoilt, someone.state[None], search)), search
+    )
     assert torch.nonzero(gross)[:, 0].tolist() == [mark]
 
 
 def test_where_very_many_marks_do_not_fit_none_is_left_out(generator: torch.Generator):
     someone, cost = person_and_cost()
-    scattered = without(cost, torch.zeros(14, dtype=torch.bool))
-    assert scattered.observation is not None
-    size = scattered.observation.target.new_tensor(cost.camera.image_size_wh)
-    scattered.observation.target = size * torch.rand(14, 2, generator=generator).double()
+    assert cost.keypoints is not None
+    size = torch.tensor(cost.camera.image_size_wh)
+    anywhere = size * torch.rand(14, 2, generator=generator).double()
+    scattered = replace(cost, keypoints=cost.keypoints._replace(positions=anywhere))
     search = Search()
     fits = best_distinct(refine(scattered, someone.state[None], search))
-    assert not bool(leave_out(scattered, fits, search).any())
+    assert not bool(find_outliers(scattered, fits, search).any())
 
 
 def test_no_mark_costs_more_than_leaving_it_out():
@@ -103,7 +98,7 @@ def test_every_item_is_without_its_own_marks(generator: torch.Generator):
     gross = torch.rand(5, 14, generator=generator) < 0.3
     noise = torch.randn(5, len(someone.state), generator=generator, dtype=torch.float64)
     x = someone.body.bounds.project(someone.state + 0.05 * noise)
-    together = _EachWithout.of(cost, gross)
+    together = without(cost, gross)
     items = torch.tensor([3, 0, 4])
     for model, rows in (
         (together.local_model(x), range(5)),

@@ -62,8 +62,8 @@ def test_marks_skips_and_takes_back(clicker: JointClicker):
     push(clicker, 0)
     push(clicker, 1)
     joints = clicker.joints
-    assert joints.joint_names == (CLICKED[0], CLICKED[2])
-    np.testing.assert_allclose(joints.keypoints.numpy(), [[50, 20], [61, 31]], atol=1e-6)
+    assert joints.names == (CLICKED[0], CLICKED[2])
+    np.testing.assert_allclose(joints.positions.numpy(), [[50, 20], [61, 31]], atol=1e-6)
     assert clicker.next_joint == CLICKED[4]
     push(clicker, 2)
     assert clicker.finished
@@ -95,7 +95,7 @@ def test_a_notebooks_widget_answers_to_what_the_browser_sends():
     click(2, (0.5, 0.5))
     click(2, (0.5, 0.5))
     click(3, (0.5, 0.5))
-    np.testing.assert_allclose(clicker.joints.keypoints.numpy(), [[50, 20]], atol=1e-6)
+    np.testing.assert_allclose(clicker.joints.positions.numpy(), [[50, 20]], atol=1e-6)
     assert clicker.next_joint == CLICKED[2]
     send("key_press", key="kEnter")
     assert clicker.finished
@@ -116,7 +116,7 @@ def test_clicks_beside_the_picture_count_for_nothing(clicker: JointClicker):
 def test_after_the_last_joint_nothing_is_asked(clicker: JointClicker):
     for number in range(len(CLICKED) + 3):
         press(clicker, 10 + number, 20)
-    assert len(clicker.joints.joint_names) == len(CLICKED)
+    assert len(clicker.joints.names) == len(CLICKED)
     type_key(clicker, "u")
     assert clicker.next_joint == CLICKED[-1]
     type_key(clicker, "enter")
@@ -145,8 +145,8 @@ def test_written_joints_read_back(clicker: JointClicker, tmp_path: Path):
     write_clicked(path, clicker.joints, (200, 120))
     assert json.loads(path.read_text())["image_size_wh"] == [200, 120]
     found = read_joints(path, image_size_wh=(200, 120))
-    assert found.joint_names == clicker.joints.joint_names
-    np.testing.assert_allclose(found.keypoints.numpy(), clicker.joints.keypoints.numpy())
+    assert found.names == clicker.joints.names
+    np.testing.assert_allclose(found.positions.numpy(), clicker.joints.positions.numpy())
 
 
 def test_bad_requests(clicker: JointClicker):

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchcss.body.load import load_body
 from torchcss.body.model import differentiate_twice
-from torchcss.cost.joints import JointObservation, JointTerm
+from torchcss.cost.joints import JointTerm
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.errors import BodyError, CameraError, ShapeError
 from torchcss.inference.trust_region import TrustRegionNewton, default_prior_variance
@@ -22,7 +22,7 @@ from torchcss.studies.reprojection import (
     plausible_pose,
     reprojection_problem,
 )
-from torchcss.types import CostFunction, LocalModel, Status
+from torchcss.types import CostFunction, Keypoints, LocalModel, Status
 from torchcss.vision.camera import Camera
 
 ROBUST = Lorentzian(nu=8.0, sigma=8.0**0.5)
@@ -72,12 +72,10 @@ def test_a_slow_twin_agrees() -> None:
     """The tracker's cost with nothing but joints and priors."""
     names = ("l_wrist", "r_wrist", "l_elbow", "r_knee", "l_ankle")
     problem = make(potential=ROBUST, joint_names=names, pixel_noise=2.0)
-    observation = JointObservation(
-        problem.body.joint_names, problem.observed, torch.ones(len(names)).double(), names
-    )
+    keypoints = Keypoints(problem.observed, torch.ones(len(names)).double(), names)
     choice = CostChoice(contour=None, temporal=None, joints=JointTerm(sigma=2.0, nu=8.0))
     twin = TrackingCost(
-        body=problem.body, camera=problem.camera, choice=choice, observation=observation
+        body=problem.body, camera=problem.camera, choice=choice, keypoints=keypoints
     )
     x = starts(problem, 20, spread=0.3)
     assert bool((problem.body.pose(x).joints[..., 2] < -0.1).all()), "all before the camera"

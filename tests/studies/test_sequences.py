@@ -31,14 +31,14 @@ def test_everything_is_read(made: tuple[Path, SyntheticSequence]) -> None:
     assert sequence.name == "arm"
     assert (sequence.num_frames, sequence.frame_rate) == (T, 25.0)
     assert sequence.keypoint_noise_px == NOISE_PX
-    assert sequence.joint_names == sequence.keypoints.joint_names == arm.body.joint_names
+    assert sequence.joint_names == sequence.keypoints.names == arm.body.joint_names
     truth, mask = sequence.truth, sequence.mask
     assert truth is not None
     assert mask is not None
     torch.testing.assert_close(truth.body.pose(truth.states).joints, arm.joints_world)
     np.testing.assert_allclose(sequence.joints_world, arm.joints_world.numpy())
     exact = sequence.camera.project(torch.from_numpy(sequence.joints_world)).uv
-    assert float((sequence.keypoints.keypoints - exact).abs().max()) < 5 * NOISE_PX
+    assert float((sequence.keypoints.positions - exact).abs().max()) < 5 * NOISE_PX
     # The mask is where the body is: all joints inside the image lie on it.
     assert mask.shape == (T, 480, 640)
     column, row = exact[0].round().long().T.tolist()
@@ -79,7 +79,7 @@ def test_joints_outside_the_image_are_missing(
     change(folder / "keypoints2d.npz", in_image=inside)
     marks = read_sequence(folder).keypoints
     assert marks.confidence.tolist() == inside.astype(float).tolist()
-    assert marks.keypoints[1, 2].tolist() == [0, 0]
+    assert marks.positions[1, 2].tolist() == [0, 0]
 
 
 def test_a_view_of_several(made: tuple[Path, SyntheticSequence], tmp_path: Path) -> None:
@@ -182,8 +182,8 @@ def test_recordings_of_others(
     names = [n for n in ("l_wrist", "r_ankle", "l_hip") if n in sequence.joint_names]
     for joint in names:
         points = torch.from_numpy(sequence.joints_world[:, sequence.joint_names.index(joint)])
-        column = sequence.keypoints.joint_names.index(joint)
+        column = sequence.keypoints.names.index(joint)
         seen = (sequence.keypoints.confidence[:, column] > 0.5) & points.isfinite().all(-1)
-        away = sequence.camera.project(points[seen]).uv - sequence.keypoints.keypoints[seen, column]
+        away = sequence.camera.project(points[seen]).uv - sequence.keypoints.positions[seen, column]
         if bool(seen.any()):
             assert float(away.norm(dim=-1).median()) < 0.01 * max(sequence.camera.image_size_wh)

@@ -40,7 +40,7 @@ from torchcss.tracking.settings import (
     make_settings_tracker,
     named_terms,
 )
-from torchcss.tracking.view import CameraView, scale_keypoints
+from torchcss.tracking.view import CameraView
 from torchcss.types import Frame
 from torchcss.vision.camera import Camera
 
@@ -310,12 +310,6 @@ def test_a_body_from_a_file_is_the_same_by_any_path(
         assert first.body.state_names == body.state_names
     with pytest.raises(ConfigurationError, match=r"give the body .*robot\.urdf"):
         _first_pose_from_file(tmp_path, eye, Settings(body="other.urdf"))
-
-
-def test_scale_keypoints_maps_pixel_centres():
-    corners = torch.tensor([[-0.5, -0.5], [1079.5, 1919.5]])
-    mapped = scale_keypoints(corners, (1080, 1920), (360, 640))
-    torch.testing.assert_close(mapped, torch.tensor([[-0.5, -0.5], [359.5, 639.5]]))
 
 
 def test_base_follows_a_body_that_leans_over(generator: torch.Generator):

@@ -16,14 +16,13 @@ from torchcss import load_track
 from torchcss.app.smooth import settings_of
 from torchcss.cli import main as cli
 from torchcss.errors import ConfigurationError, VideoError
-from torchcss.io.keypoints.read import Keypoints
 from torchcss.io.tracks import FrameModes, Track, TrackWriter, read_summary, write_summary
 from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
 from torchcss.tracking.settings import Settings
 from torchcss.tracking.smooth import Smoothing, smooth_track
 from torchcss.tracking.smooth_images import smooth_frames
 from torchcss.tracking.view import CameraView
-from torchcss.types import Frame
+from torchcss.types import Frame, Keypoints
 
 NUM_FRAMES = 8
 NOISE_PX = 1.0
@@ -70,7 +69,7 @@ def setup(sequence: SyntheticSequence) -> Setup:
         )
     exact = camera.project(sequence.joints_world).uv
     seen = exact + NOISE_PX * torch.randn(exact.shape, generator=source, dtype=torch.float64)
-    keypoints = Keypoints(seen, torch.ones_like(seen[..., 0]), body.joint_names, ())
+    keypoints = Keypoints(seen, torch.ones_like(seen[..., 0]), body.joint_names)
     arguments = {
         "body": body,
         "settings": SETTINGS,

@@ -16,78 +16,114 @@ from __future__ import annotations
 
 import csv
 import time
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from torchcss.cost.view import View
 from torchcss.errors import CameraError
 from torchcss.files import prepare_output_folder, replace_file
 from torchcss.initialise.fit import default_camera, initialise
-from torchcss.initialise.multi_start import Search
+from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
 from torchcss.initialise.result import Initialisation, stature_of
 from torchcss.io.cameras import check_image_size, read_camera
 from torchcss.io.fitted_body import FITTED_BODY_NAME, write_fitted_body
-from torchcss.io.keypoints.one_image import Joints, read_joints
+from torchcss.io.keypoints.one_image import read_joints
 from torchcss.io.keypoints.read import Scale
 from torchcss.io.tracks import write_summary
 from torchcss.io.video import read_frame
 from torchcss.show.initialisation_views import draw_fit, draw_hypotheses, proportion_table
-from torchcss.tracking.settings import check_seed
+from torchcss.tracking.settings import Settings, check_seed
+from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
 
 NUM_DRAWN = 7
 """Hypotheses drawn at most."""
 
 
-def initialise_image(
-    image: Path,
-    *,
-    joints: Path | Joints,
-    out: Path,
-    frame: int = 0,
-    camera: Path | None = None,
-    camera_name: str | None = None,
-    focal_px: float | None = None,
-    field_of_view_degrees: float | None = None,
-    body: str = "body34",
-    stature: float | None = None,
-    num_modes: int | None = 8,
-    contours: bool = True,
-    colours: bool = True,
-    layout: str | None = None,
-    normalised: bool | Scale = False,
-    sigma: float | None = None,
-    search: Search | None = None,
-    seed: int = 0,
-    device: str = "cpu",
-    dtype: torch.dtype = torch.float64,
-) -> tuple[Initialisation, dict[str, Any]]:
-    """Initialise from a picture and write the results.
+@dataclass(frozen=True, kw_only=True)
+class PictureFiles:
+    """A picture with its camera and the joints of a person in it.
 
-    Args:
+    Attributes:
         image: The picture, or a video.
-        joints: File of the marked joints, or the joints.
-        out: Output folder.
         frame: Which frame of the video.
+        keypoints: File of the joints, or the joints.
+        layout: Layout of a file that does not name its joints.
+        normalised: Whether joints are fractions of the image, and which, see
+            `torchcss.io.keypoints.read.Scale`.
         camera: Calibration file; None: a pinhole camera.
         camera_name: Camera in the file.
         focal_px: Focal length of the pinhole camera, pixels.
         field_of_view_degrees: Its angle between left and right border, instead.
-        body: Name of a body that ships.
-        stature: Height of the standing person, metres.
-        num_modes: Most hypotheses; None for all.
-        contours: Fit shape to contours too.
-        colours: Let that fit see the colours on either side of the outline.
-        layout: Layout of a joints file that does not name its joints.
-        normalised: Whether joints are fractions of the image, and which, see
-            `torchcss.io.keypoints.read.Scale`.
-        sigma: Noise of a marked wrist, pixels.
-        search: How widely interpretations are looked for.
+    """
+
+    image: Path
+    frame: int = 0
+    keypoints: Path | Keypoints
+    layout: str | None = None
+    normalised: bool | Scale = False
+    camera: Path | None = None
+    camera_name: str | None = None
+    focal_px: float | None = None
+    field_of_view_degrees: float | None = None
+
+    def read_camera(self, width: int, height: int) -> tuple[Camera, list[str]]:
+        """The camera of a picture of this size, and what is to be said about it.
+
+        Raises:
+            CameraError: If it cannot be read, is of another size, or is given twice.
+        """
+        focal, angle = self.focal_px, self.field_of_view_degrees
+        if self.camera is None:
+            camera, note = default_camera(
+                width, height, focal_px=focal, field_of_view_degrees=angle
+            )
+            return camera, [note]
+        if focal is not None or angle is not None:
+            raise CameraError("give a camera file, a focal length or a field of view, not several")
+        loaded = read_camera(self.camera, camera_name=self.camera_name, video=self.image)
+        check_image_size(loaded.camera, width, height)
+        notes = [f"camera: {loaded.camera.name}", loaded.units_note]
+        return loaded.camera, [note for note in notes if note]
+
+    def read_keypoints(self, width: int, height: int) -> Keypoints:
+        """The joints in a picture of this size.
+
+        Raises:
+            KeypointError: If they cannot be read.
+        """
+        if isinstance(self.keypoints, Keypoints):
+            return self.keypoints
+        return read_joints(
+            self.keypoints,
+            image_size_wh=(width, height),
+            layout=self.layout,
+            normalised=self.normalised,
+            frame=self.frame,
+        )
+
+
+def initialise_image(
+    files: PictureFiles,
+    out: Path,
+    *,
+    body: str = "body34",
+    seed: int = 0,
+    options: InitialiseOptions | None = None,
+) -> tuple[Initialisation, dict[str, Any]]:
+    """Initialise from a picture and write the results.
+
+    Args:
+        files: The picture, its camera and its joints.
+        out: Output folder.
+        body: Name of a body that ships, or a URDF, MJCF or BVH file.
         seed: Seed of all random numbers.
-        device: Where to compute.
-        dtype: Floating type.
+        options: How to look, and what to fit.
 
     Returns:
         What was found, and the summary.
@@ -96,65 +132,34 @@ def initialise_image(
         TorchcssError: With one line that says what was wrong, for any bad input.
     """
     check_seed(seed)
-    picture = read_frame(image, frame)
+    options = options or InitialiseOptions()
+    picture = read_frame(files.image, files.frame)
     height, width = picture.shape[:2]
     prepare_output_folder(out)
-    if camera is None:
-        eye, note = default_camera(
-            width, height, focal_px=focal_px, field_of_view_degrees=field_of_view_degrees
-        )
-        notes = [note]
-    else:
-        if focal_px is not None or field_of_view_degrees is not None:
-            raise CameraError("give a camera file, a focal length or a field of view, not several")
-        loaded = read_camera(camera, camera_name=camera_name, video=image)
-        check_image_size(loaded.camera, width, height)
-        eye = loaded.camera
-        notes = [f"camera: {eye.name}", *([loaded.units_note] if loaded.units_note else [])]
-    if not isinstance(joints, Joints):
-        joints = read_joints(
-            joints,
-            image_size_wh=(width, height),
-            layout=layout,
-            normalised=normalised,
-            frame=frame,
-        )
+    camera, notes = files.read_camera(width, height)
+    keypoints = files.read_keypoints(width, height)
     began = time.perf_counter()
-    found = initialise(
-        picture,
-        torch.cat([joints.keypoints, joints.confidence[:, None]], dim=1),
-        eye,
-        body,
-        joint_names=joints.joint_names,
-        generator=torch.Generator().manual_seed(seed),
-        sigma=sigma,
-        stature=stature,
-        num_modes=num_modes,
-        contours=contours,
-        colours=colours,
-        search=search,
-        dtype=dtype,
-        device=device,
-    )
+    generator = torch.Generator().manual_seed(seed)
+    found = initialise(picture, keypoints, camera, body, generator=generator, options=options)
     seconds = time.perf_counter() - began
-    found = found._replace(report=(*notes, *joints.report, *found.report))
-    eye = eye.to(dtype=dtype, device=device)
-    marked = torch.where(joints.confidence[:, None] > 0, joints.keypoints, torch.nan)
-    write_fitted_body(out / FITTED_BODY_NAME, found, eye)
-    _draw(out, found, picture, eye, marked)
+    found = found._replace(report=(*notes, *keypoints.report, *found.report))
+    camera = camera.to(dtype=options.dtype, device=options.device)
+    write_fitted_body(out / FITTED_BODY_NAME, found, camera)
+    known = keypoints.confidence[:, None] > 0
+    _draw(out, found, picture, camera, torch.where(known, keypoints.positions, torch.nan))
     rows = proportion_table(found.lengths, found.scale)
     with replace_file(out / "proportions.csv") as partial, partial.open("w", newline="") as file:
         writer = csv.DictWriter(file, ["name", "fitted_m", "standard_m", "difference_percent"])
         writer.writeheader()
         writer.writerows(rows)
     summary: dict[str, Any] = {
-        "image": image,
-        "frame": frame,
-        "camera": eye.name,
+        "image": files.image,
+        "frame": files.frame,
+        "camera": camera.name,
         "body": body,
         "seed": seed,
-        "contours": contours,
-        "colours": colours,
+        "contours": options.contours,
+        "colours": options.colours,
         "seconds": seconds,
         "report": found.report,
         "num_hypotheses": len(found.cost),
@@ -164,15 +169,61 @@ def initialise_image(
     }
     if "shank" in found.lengths:
         summary["stature_m"] = stature_of(found.lengths, found.scale)
-        summary["stature_known"] = stature is not None
+        summary["stature_known"] = options.stature is not None
     write_summary(out / "summary.json", summary)
     return found, summary
 
 
-def _draw(out: Path, found: Initialisation, picture: Any, camera: Camera, marked: Tensor) -> None:
+def initialise_video(
+    video: Path,
+    keypoints: Keypoints,
+    camera: Camera,
+    settings: Settings,
+    *,
+    start: int,
+    sigma: float,
+    generator: torch.Generator,
+    others: Sequence[View] = (),
+) -> Initialisation:
+    """Fit pose, proportions and shape to the frame where tracking starts, as the settings say.
+
+    Args:
+        video: A video, or a folder of images.
+        keypoints: Its keypoints in every frame.
+        camera: Its camera.
+        settings: Body, terms, working size, type and device.
+        start: The frame.
+        sigma: Noise of the keypoints, pixels of the full image.
+        generator: Source of the starting poses.
+        others: What further cameras see of that moment, see `initialise`.
+
+    Raises:
+        TorchcssError: If the frame cannot be read, or too few joints are known in it.
+    """
+    options = InitialiseOptions(
+        sigma=sigma,
+        least_joints=LEAST_JOINTS,
+        contours="contour" in settings.terms,
+        colours="region" in settings.terms,
+        working_size=settings.working_size,
+        dtype=settings.torch_dtype,
+        device=settings.device,
+    )
+    return initialise(
+        read_frame(video, start),
+        keypoints.at(start),
+        camera,
+        settings.body,
+        generator=generator,
+        options=options,
+        others=others,
+    )
+
+
+def _draw(out: Path, found: Initialisation, picture: Any, camera: Camera, known: Tensor) -> None:
     pictures = {
         f"stage{number}.png": draw_fit(
-            picture, stage.body, stage.state[None], camera, keypoints=marked,
+            picture, stage.body, stage.state[None], camera, keypoints=known,
             text=f"stage {number}: {stage.name}",
         )
         for number, stage in enumerate(found.stages, start=1)

@@ -15,9 +15,9 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
+from torchcss.app.init import initialise_video
 from torchcss.app.recorder import OtherFilm, Recorder, Sink
 from torchcss.app.view_files import OpenView, moments, open_view
-from torchcss.body.load import load_body
 from torchcss.cost.view import View
 from torchcss.errors import CameraError, ConfigurationError
 from torchcss.initialise.result import Initialisation
@@ -25,7 +25,6 @@ from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body, write_fi
 from torchcss.io.keypoints.read import Scale
 from torchcss.io.tracks import prepare_output_folder
 from torchcss.io.view_files import RecordedCamera, ViewFiles
-from torchcss.tracking.first_frame import initialise_video
 from torchcss.tracking.session import TrackingSession
 from torchcss.tracking.settings import (
     Settings,
@@ -103,8 +102,8 @@ def track_video(
                 f"{camera}: several cameras need their places in one world, in metres; that of "
                 f"{each.video} is not known so: give R and t"
             )
-    reader, sigma, marks = view.reader, view.sigma, view.keypoints
-    assert marks is not None
+    reader, sigma, seen = view.reader, view.sigma, view.keypoints
+    assert seen is not None
     generator = torch.Generator().manual_seed(settings.seed)
     dtype, device = settings.torch_dtype, settings.device
     notes = [note for opened in (view, *beside) for note in opened.notes]
@@ -114,7 +113,7 @@ def track_video(
     else:
         first = initialise_video(
             video,
-            marks,
+            seen,
             eye,
             settings,
             start=start,
@@ -175,15 +174,11 @@ def track_video(
 def _first_view(opened: OpenView, start: int, sigma: float, settings: Settings) -> View:
     """What a further camera sees of the first frame, in the pixels of its video."""
     camera = opened.camera.camera.to(dtype=settings.torch_dtype, device=settings.device)
-    body = load_body(settings.body, dtype=settings.torch_dtype, device=settings.device)
-    marks = opened.marks(
-        start + opened.offset,
-        opened.size_wh,
-        body.joint_names,
-        body.tie,
-        relative_noise=opened.sigma / sigma,
-    )
-    return View(camera=camera, observation=marks)
+    keypoints, frame = opened.keypoints, start + opened.offset
+    if keypoints is None or not 0 <= frame < len(keypoints.confidence):
+        return View(camera=camera)
+    keypoints = keypoints.at(frame).to(camera.K)
+    return View(camera=camera, keypoints=keypoints._replace(relative_noise=opened.sigma / sigma))
 
 
 def _first_pose_from_file(path: Path, camera: Camera, settings: Settings) -> Initialisation:

@@ -12,15 +12,14 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from torchcss.cost.joints import JointObservation
 from torchcss.errors import VideoError
 from torchcss.initialise.keypoint_checks import typical_sigma
 from torchcss.io.cameras import LoadedCamera, check_image_size, read_camera
-from torchcss.io.keypoints.read import Keypoints, read_keypoints
+from torchcss.io.keypoints.read import read_keypoints
 from torchcss.io.video import VideoReader
 from torchcss.io.view_files import ViewFiles
-from torchcss.tracking.view import CameraView, scale_keypoints
-from torchcss.types import Frame
+from torchcss.tracking.view import CameraView
+from torchcss.types import Frame, Keypoints
 
 
 class OpenView(NamedTuple):
@@ -78,35 +77,6 @@ class OpenView(NamedTuple):
                 )
             else:
                 yield replace(frame, mask=mask.image)
-
-    def marks(
-        self,
-        index: int,
-        size_wh: tuple[int, int],
-        joint_names: tuple[str, ...],
-        like: Tensor,
-        *,
-        relative_noise: float = 1.0,
-    ) -> JointObservation | None:
-        """The keypoints of a frame of this video; None where there are none.
-
-        Args:
-            index: The frame.
-            size_wh: Size of the picture in whose pixels they are wanted.
-            joint_names: The body's joint centres.
-            like: A tensor of the body's type and device.
-            relative_noise: See `JointObservation`.
-        """
-        keypoints = self.keypoints
-        if keypoints is None or not 0 <= index < len(keypoints.keypoints):
-            return None
-        return JointObservation(
-            joint_names,
-            scale_keypoints(keypoints.keypoints[index], self.size_wh, size_wh).to(like),
-            keypoints.confidence[index].to(like),
-            keypoints.joint_names,
-            relative_noise=relative_noise,
-        )
 
 
 def moments(
@@ -172,5 +142,5 @@ def open_view(
         normalised=files.normalised,
         first_frame=start,
     )
-    sigma = typical_sigma(keypoints.keypoints, keypoints.confidence)
+    sigma = typical_sigma(keypoints)
     return OpenView(reader, masks, loaded, keypoints, sigma, files.offset)

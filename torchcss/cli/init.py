@@ -9,14 +9,16 @@ from typing import Annotated, Literal
 import torch
 import tyro
 
-from torchcss.app.init import initialise_image
+from torchcss.app.init import PictureFiles, initialise_image
+from torchcss.body.catalog import PROPORTIONS
 from torchcss.errors import KeypointError
 from torchcss.files import prepare_output_folder
 from torchcss.initialise.multi_start import PAPER_PROPORTIONS, Search
-from torchcss.io.keypoints.one_image import Joints
+from torchcss.initialise.options import InitialiseOptions
 from torchcss.io.keypoints.read import Scale
 from torchcss.io.video import read_frame
 from torchcss.show.click import click_joints, write_clicked
+from torchcss.types import Keypoints
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,35 +72,37 @@ class Init:
         """Run the verb."""
         if self.click == (self.joints is not None):
             raise KeypointError("give a file with --joints, or --click to mark the joints")
-        joints: Path | Joints | None = self.joints
-        if joints is None:
+        keypoints: Path | Keypoints | None = self.joints
+        if keypoints is None:
             picture = read_frame(self.image, self.frame)
-            joints = click_joints(picture)
+            keypoints = click_joints(picture)
             prepare_output_folder(self.out)
             size = (picture.shape[1], picture.shape[0])
-            write_clicked(self.out / "joints.json", joints, size, frame=self.frame)
-        keep = {"best": 1, "all": None}.get(str(self.hypotheses), self.hypotheses)
-        found, summary = initialise_image(
-            self.image,
-            joints=joints,
-            out=self.out,
+            write_clicked(self.out / "joints.json", keypoints, size, frame=self.frame)
+        files = PictureFiles(
+            image=self.image,
             frame=self.frame,
+            keypoints=keypoints,
+            layout=self.layout,
+            normalised=self.normalised,
             camera=self.camera,
             camera_name=self.camera_name,
             focal_px=self.focal_px,
             field_of_view_degrees=self.field_of_view,
-            body=self.body,
+        )
+        proportions = PAPER_PROPORTIONS if self.proportions == "papers" else PROPORTIONS
+        options = InitialiseOptions(
+            sigma=self.sigma,
             stature=self.stature,
-            num_modes=keep,  # type: ignore[arg-type]
+            num_modes={"best": 1, "all": None}.get(str(self.hypotheses), self.hypotheses),  # type: ignore[arg-type]
             contours=self.contours,
             colours=self.colours,
-            layout=self.layout,
-            normalised=self.normalised,
-            sigma=self.sigma,
-            search=Search(proportions=PAPER_PROPORTIONS) if self.proportions == "papers" else None,
-            seed=self.seed,
-            device=self.device,
+            search=Search(proportions=proportions),
             dtype=torch.float32 if self.dtype == "float32" else torch.float64,
+            device=self.device,
+        )
+        found, summary = initialise_image(
+            files, self.out, body=self.body, seed=self.seed, options=options
         )
         print("\n".join(found.report))
         print(f"{'length':16}{'fitted, m':>12}{'standard, m':>14}{'difference':>12}")

@@ -7,7 +7,7 @@ samples of those modes; `TrackingCost.of_children` gives each sample the targets
 the mode that it came from, and is the `CostFactory` that `Tracker.step` takes.
 
     costs = FrameCosts(body, camera, choice, frame_interval=1 / 25, boundary_emphasis=0.3)
-    cost = costs(features, body=body, before=state.mixture.mean, observation=keypoints)
+    cost = costs(features, body=body, before=state.mixture.mean, keypoints=keypoints)
     state, info = tracker.step(state, cost.of_children, body.bounds)
 
 Several cameras have one `FrameCosts` each; `beside` makes one cost of what they give.
@@ -27,13 +27,13 @@ from torchcss.body.model import BodyModel
 from torchcss.cost.edge_energy import edge_energy_field
 from torchcss.cost.flow import FlowTargets, InteriorNodes, flow_targets
 from torchcss.cost.interpenetration import InterpenetrationPairs
-from torchcss.cost.joints import JointObservation
 from torchcss.cost.part_map import bare_pixels, part_map
 from torchcss.cost.region import RegionImages, part_layers, region_field, region_masks
 from torchcss.cost.silhouette import SilhouetteImages
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.cost.visibility import ContourPredictor, visible_nodes
 from torchcss.stopwatch import Stopwatch
+from torchcss.types import Keypoints
 from torchcss.vision.appearance import Appearance
 from torchcss.vision.background import Background
 from torchcss.vision.camera import Camera
@@ -85,7 +85,7 @@ class FrameCosts:
         *,
         body: BodyModel,
         before: Float[Tensor, "k n"] | None = None,
-        observation: JointObservation | None = None,
+        keypoints: Keypoints | None = None,
         appearance: Appearance | None = None,
         background: Background | None = None,
         stopwatch: Stopwatch | None = None,
@@ -96,7 +96,7 @@ class FrameCosts:
             features: Features of the frame; None: the picture is missing, and says nothing.
             body: The body on this frame's base.
             before: The modes of the frame before, which the flow carries on; None: no flow.
-            observation: Keypoints of the frame, in pixels of the features.
+            keypoints: Of the frame, in pixels of the features.
             appearance: What the body and its surroundings look like, see `learn`; None: not known.
             background: What is behind the body, see `learn_background`; None: not known.
             stopwatch: Where the time of evaluations is added up.
@@ -107,7 +107,7 @@ class FrameCosts:
             choice=self.choice,
             predictor=self.predictor,
             interior=self.interior,
-            observation=observation,
+            keypoints=keypoints,
             pairs=self.pairs,
             deviation=self.deviation,
             stopwatch=stopwatch,

@@ -11,13 +11,15 @@ one that lies farther off, since the Lorentzian grows without end.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchcss.robust import Lorentzian, RobustPotential
-from torchcss.types import PointCost
+from torchcss.types import Keypoints, PointCost
 from torchcss.vision.camera import Camera, Projection
 
 SPREAD = {
@@ -42,59 +44,52 @@ OUTLIER_LENGTHS = 10.0
 _FAR_PX = 1e8
 
 
-class JointObservation:
+class JointTargets(NamedTuple):
     """Keypoints of one frame matched to the joint centres of a body.
 
-    Args:
-        joint_names: Names of the body's joint centres.
-        keypoints: Detected positions, pixels, in the order of `keypoint_names`.
-        confidence: Confidence in [0, 1]; 0 where there is none.
-        keypoint_names: Names of the keypoints; those that the body lacks are left out.
-        relative_noise: Noise of these keypoints in multiples of `JointTerm.sigma`: views in which
-            the person is larger have more pixels of noise.
-
     Attributes:
-        index: Joint centre of every correspondence.
-        target: Where it should project, pixels.
+        joint: Joint centre of every correspondence.
+        position: Where it should project, pixels.
         weight: Confidence over squared spread, the latter in multiples of `JointTerm.sigma`.
     """
 
-    def __init__(
-        self,
-        joint_names: tuple[str, ...],
-        keypoints: Float[Tensor, "j 2"],
-        confidence: Float[Tensor, " j"],
-        keypoint_names: tuple[str, ...],
-        *,
-        relative_noise: float = 1.0,
-    ) -> None:
-        pairs = [
-            (joint_names.index(name), column)
-            for column, name in enumerate(keypoint_names)
-            if name in joint_names
-        ]
-        device = keypoints.device
-        columns = torch.tensor([column for _, column in pairs], dtype=torch.long, device=device)
-        spread = [_spread(keypoint_names[column]) for _, column in pairs]
-        self.index: Int[Tensor, " m"] = torch.tensor(
-            [joint for joint, _ in pairs], dtype=torch.long, device=device
-        )
-        target, confidence = keypoints[columns], confidence[columns]
-        known = (confidence > 0) & target.isfinite().all(-1)
-        self.target: Float[Tensor, "m 2"] = torch.where(known[:, None], target, 0.0)
-        weight = torch.where(known, confidence.clamp(0, 1), 0.0)
-        noise = relative_noise * keypoints.new_tensor(spread)
-        self.weight: Float[Tensor, " m"] = weight / noise.square()
-
-    @property
-    def says_nothing(self) -> bool:
-        """Whether it has no keypoint of this body, as in a frame in which nobody was detected."""
-        return not bool((self.weight > 0).any())
+    joint: Int[Tensor, " m"]
+    position: Float[Tensor, "*b m 2"]
+    weight: Float[Tensor, "*b m"]
 
 
-def _error(uv: Float[Tensor, "*batch m 2"], observation: JointObservation) -> Tensor:
+def match_joints(keypoints: Keypoints, joint_names: tuple[str, ...]) -> JointTargets:
+    """Match keypoints to the joint centres of a body; those that the body lacks are left out.
+
+    Args:
+        keypoints: Those of one frame, or of one for each sample.
+        joint_names: Names of the body's joint centres.
+    """
+    columns, joints, spread = _pairs(keypoints.names, joint_names)
+    place, confidence = keypoints.positions[..., columns, :], keypoints.confidence[..., columns]
+    known = (confidence > 0) & place.isfinite().all(-1)
+    weight = torch.where(known, confidence.clamp(0, 1), 0.0)
+    noise = keypoints.relative_noise * place.new_tensor(spread)
+    return JointTargets(
+        torch.tensor(joints, dtype=torch.long, device=place.device),
+        torch.where(known[..., None], place, 0.0),
+        weight / noise.square(),
+    )
+
+
+@cache
+def _pairs(
+    names: tuple[str, ...], joint_names: tuple[str, ...]
+) -> tuple[list[int], list[int], list[float]]:
+    """Columns of keypoints that a body has, its joints, and their spread."""
+    columns = [column for column, name in enumerate(names) if name in joint_names]
+    joints = [joint_names.index(names[column]) for column in columns]
+    return columns, joints, [_spread(names[column]) for column in columns]
+
+
+def _error(uv: Float[Tensor, "*batch m 2"], targets: JointTargets) -> Tensor:
     """Distance in the image; beyond all images it is cut off, lest its square overflow."""
-    return (uv - observation.target).clamp(-_FAR_PX, _FAR_PX)
+    return (uv - targets.position).clamp(-_FAR_PX, _FAR_PX)
 
 
 def _spread(name: str) -> float:
@@ -120,41 +115,39 @@ class JointTerm:
         """`rho` on the squared error in pixels; its curvature at zero is that of sigma."""
         return self.potential_kind(nu=self.nu, sigma=self.sigma * self.nu**0.5)
 
-    def value(
-        self, projection: Projection, observation: JointObservation
-    ) -> Float[Tensor, "*batch m"]:
+    def value(self, projection: Projection, targets: JointTargets) -> Float[Tensor, "*batch m"]:
         """Cost of every correspondence, nats.
 
         Args:
-            projection: Where the joint centres of the observation project.
-            observation: The keypoints.
+            projection: Where the joint centres of the targets project.
+            targets: The keypoints, matched to the body.
         """
-        error = _error(projection.uv, observation)
-        squared = observation.weight * error.square().sum(-1)
+        error = _error(projection.uv, targets)
+        squared = targets.weight * error.square().sum(-1)
         rho = self.potential(squared).rho
-        return 0.5 * torch.where(projection.valid, rho, self._unseen(observation))
+        return 0.5 * torch.where(projection.valid, rho, self._unseen(targets))
 
     def point_cost(
         self,
         points_world: Float[Tensor, "*batch m 3"],
         camera: Camera,
-        observation: JointObservation,
+        targets: JointTargets,
         *,
         gauss_newton: bool = False,
     ) -> PointCost:
         """The same with first and second derivatives in the joint centres' positions.
 
         Args:
-            points_world: The joint centres of the observation, metres.
-            camera: The camera whose pixels the observation is in.
-            observation: The keypoints.
+            points_world: The joint centres of the targets, metres.
+            camera: The camera whose pixels the targets are in.
+            targets: The keypoints, matched to the body.
             gauss_newton: Leave out the curvature of the projection, eq. 9 [RR].
         """
         model = camera.project_with_derivatives(points_world)
-        error = _error(model.uv, observation)
-        weight = observation.weight
+        error = _error(model.uv, targets)
+        weight = targets.weight
         rho, first, second = self.potential(weight * error.square().sum(-1))
-        value = 0.5 * torch.where(model.valid, rho, self._unseen(observation))
+        value = 0.5 * torch.where(model.valid, rho, self._unseen(targets))
         gradient = (first * weight)[..., None] * error
         outer = error[..., :, None] * error[..., None, :]
         hessian = (first * weight)[..., None, None] * torch.eye(
@@ -163,6 +156,6 @@ class JointTerm:
         hessian = hessian + (2 * second * weight.square())[..., None, None] * outer
         return camera.pull_back(model, value, gradient, hessian, gauss_newton=gauss_newton)
 
-    def _unseen(self, observation: JointObservation) -> Tensor:
-        far = observation.weight * (OUTLIER_LENGTHS * self.sigma) ** 2
+    def _unseen(self, targets: JointTargets) -> Tensor:
+        far = targets.weight * (OUTLIER_LENGTHS * self.sigma) ** 2
         return self.potential(far).rho

@@ -46,7 +46,7 @@ from torchcss.cost.contour import ContourTerm
 from torchcss.cost.edge_energy import EdgeEnergyTerm
 from torchcss.cost.flow import FlowTerm, InteriorNodes
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
-from torchcss.cost.joints import JointTerm
+from torchcss.cost.joints import JointTerm, match_joints
 from torchcss.cost.region import RegionTerm
 from torchcss.cost.segmentation import SegmentationTerm
 from torchcss.cost.silhouette import SilhouetteTerm
@@ -226,7 +226,7 @@ class TrackingCost(View):
         None in frames without keypoints.
         """
         joints = self.choice.joints
-        if joints is None or all(view.observation is None for view in self.views):
+        if joints is None or all(view.keypoints is None for view in self.views):
             return None
         trusting = replace(joints, nu=COARSE_SCALE**2 * joints.nu)
         return replace(self, choice=replace(self._without_images(), joints=trusting))
@@ -460,16 +460,16 @@ class TrackingCost(View):
                 partial(term.value, *arguments),
                 partial(term.point_cost, *arguments),
             )
-        if choice.joints is not None and view.observation is not None:
-            term, observation = choice.joints, view.observation
-            joints = pose.joints[..., observation.index, :]
+        if choice.joints is not None and view.keypoints is not None:
+            term, targets = choice.joints, match_joints(view.keypoints, body.joint_names)
+            joints = pose.joints[..., targets.joint, :]
             yield _Observed(
                 "joints",
                 joints,
-                body.marker_link[observation.index],
+                body.marker_link[targets.joint],
                 choice.joint_weight,
-                lambda: term.value(camera.project(joints), observation),
-                partial(term.point_cost, joints, camera, observation),
+                lambda: term.value(camera.project(joints), targets),
+                partial(term.point_cost, joints, camera, targets),
             )
 
     def _priors(self, x: Tensor, pose: BodyPose) -> Iterator[_Prior]:

@@ -6,7 +6,6 @@ observations of all views are independent given the pose, so that their costs ad
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -14,10 +13,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchcss.cost.flow import FlowTargets
-from torchcss.cost.joints import JointObservation
 from torchcss.cost.region import RegionImages
 from torchcss.cost.segmentation import SegmentationImages
 from torchcss.cost.silhouette import SilhouetteImages
+from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
 from torchcss.vision.spline import SplineField
 
@@ -34,7 +33,8 @@ class View:
         segmentation: What the pixels look like, for the weights of modes; None: not known.
         silhouette: What is before the background; None: not known.
         targets: Where the flow carried the nodes of each sample's parent mode, `[b p 2]`.
-        observation: Keypoints of the frame, in that image's pixels; None if there are none.
+        keypoints: Of the frame, in that image's pixels, or one set for each sample; None if there
+            are none.
     """
 
     camera: Camera
@@ -44,7 +44,7 @@ class View:
     segmentation: SegmentationImages | None = None
     silhouette: SilhouetteImages | None = None
     targets: FlowTargets | None = None
-    observation: JointObservation | None = None
+    keypoints: Keypoints | None = None
 
     def of_parents(self, parent: Int[Tensor, " b"]) -> Self:
         """The view for samples of some modes, each with the flow of the mode that it came from."""
@@ -52,15 +52,16 @@ class View:
 
     def of_samples(self, items: Int[Tensor, " b"]) -> Self:
         """The view for some of the samples, where each has targets of its own."""
-        if self.targets is None or self.targets.uv.dim() <= 2:
-            return self
-        return replace(self, targets=self.targets.take(items))
+        view = self
+        if self.targets is not None and self.targets.uv.dim() > 2:
+            view = replace(view, targets=self.targets.take(items))
+        if self.keypoints is not None and self.keypoints.confidence.dim() > 1:
+            view = replace(view, keypoints=self.keypoints.at(items))
+        return view
 
     def of_keypoints(self, factor: float) -> View:
         """The keypoints alone, as they are in a picture that is so many times as large."""
-        camera, observation = self.camera.scaled(factor), self.observation
-        if observation is not None:
-            observation = copy(observation)
-            sizes = observation.target.new_tensor([camera.image_size_wh, self.camera.image_size_wh])
-            observation.target = sizes[0] / sizes[1] * (observation.target + 0.5) - 0.5
-        return View(camera=camera, observation=observation)
+        camera, keypoints = self.camera.scaled(factor), self.keypoints
+        if keypoints is not None:
+            keypoints = keypoints.scaled(self.camera.image_size_wh, camera.image_size_wh)
+        return View(camera=camera, keypoints=keypoints)

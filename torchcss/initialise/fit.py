@@ -1,6 +1,6 @@
 """Pose, proportions, shape and first hypotheses from one picture (section 5 [IJRR]).
 
-The first stage fits pose and lengths to the marked joints (`torchcss.initialise.from_joints`). With
+The first stage fits pose and lengths to the joints (`torchcss.initialise.from_joints`). With
 a picture, the second fits cross-sections and tapers to joints and contours, pose and lengths held,
 to each of the poses that the joints do not tell apart, and the third all parameters from the
 cheapest (`torchcss.initialise.shape`); the fits are then refined on the body so found, contours
@@ -19,16 +19,14 @@ from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from torch import Tensor
 
-from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.root import has_root
 from torchcss.body.shape import WHOLE_SHAPE, ShapeParameters, with_shape
-from torchcss.cost.anthropometric import Anthropometric
+from torchcss.cost.contour import ContourTerm
 from torchcss.cost.frame import FrameCosts
-from torchcss.cost.joints import JointObservation, JointTerm
 from torchcss.cost.region import RegionTerm
 from torchcss.cost.shaped import Outline
 from torchcss.cost.total import CostChoice, TrackingCost
@@ -36,9 +34,9 @@ from torchcss.cost.view import View
 from torchcss.cost.visibility import ContourPredictor
 from torchcss.errors import CameraError
 from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.initialise.from_joints import initialise_from_joints
-from torchcss.initialise.keypoint_checks import default_sigma, keypoint_table, swapped_sides
-from torchcss.initialise.multi_start import Search
+from torchcss.initialise.from_joints import fit_joints
+from torchcss.initialise.keypoint_checks import default_sigma, keypoints_by_name, swapped_sides
+from torchcss.initialise.options import InitialiseOptions
 from torchcss.initialise.outliers import best_distinct
 from torchcss.initialise.result import (
     Initialisation,
@@ -47,11 +45,13 @@ from torchcss.initialise.result import (
     columns_of,
     fitted_lengths,
     hang_on_best,
-    marginal_covariance,
     scale_report,
     spread_to,
+    with_lengths,
+    with_unknown_lengths,
 )
 from torchcss.initialise.shape import ShapeFit, fit_shape
+from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor
 
@@ -66,151 +66,126 @@ tell nothing, edges still lead. On a walker of 160 pixels the silhouettes overla
 alone; beside colours by 0.72 at full weight, 0.77 at a quarter, and 0.78 without edges."""
 
 _RIVALS = 3.0
-"""By how much more than the best a pose may cost the joints, nats, and be given flesh of its own:
-odds of twenty to one. Flesh takes time, and changes what poses cost by less."""
+"""By how much more than the best a pose may cost the joints, nats, and be given a shape of its
+own: odds of twenty to one. A shape takes time, and changes what poses cost by less."""
 
 
 def initialise(
     image: UInt8[np.ndarray, "h w 3"] | Tensor | None,
-    joints_2d: Mapping[str, Sequence[float]] | Float[Tensor, "j c"],
+    keypoints: Keypoints | Mapping[str, Sequence[float]],
     camera: Camera | None = None,
-    body: str = "body34",
+    body: str | BodyModel = "body34",
     *,
     generator: torch.Generator,
-    joint_names: tuple[str, ...] | None = None,
-    focal_px: float | None = None,
-    field_of_view_degrees: float | None = None,
-    sigma: float | None = None,
-    stature: float | None = None,
-    num_modes: int | None = 8,
-    contours: bool = True,
-    colours: bool = True,
-    working_size: int = 640,
-    search: Search | None = None,
-    least_joints: int = 1,
+    options: InitialiseOptions | None = None,
     others: Sequence[View] = (),
-    dtype: torch.dtype = torch.float64,
-    device: torch.device | str = "cpu",
 ) -> Initialisation:
-    """Fit pose, proportions and shape of a body to one picture with marked joints: all stages.
+    """Fit pose, proportions and shape of a body to one picture with known joints: all stages.
 
     Args:
         image: Red, green, blue; None where only its joints are known (then `camera` is needed).
-        joints_2d: Pixels by joint name, `(u, v)` or `(u, v, confidence)`, missing ones missing; or
-            a tensor of as many rows as `joint_names`.
-        camera: The camera of the picture. None: a pinhole camera of the given focal length or field
-            of view, else of `DEFAULT_VIEW_DEGREES` along the longer side.
-        body: Name of a body that ships.
+        keypoints: The joints, or pixels by joint name, `(u, v)` or `(u, v, confidence)`.
+        camera: The camera of the picture, such as `Camera.pinhole`. None: a pinhole camera with a
+            field of view of `DEFAULT_VIEW_DEGREES` along the longer side.
+        body: Name of a body that ships, or the path of a URDF, MJCF or BVH file; or a body whose
+            base, lengths and shape are known, of which the pose alone is fitted.
         generator: Source of the starting poses.
-        joint_names: Names of the rows of `joints_2d`, if it is a tensor.
-        focal_px: Focal length in pixels.
-        field_of_view_degrees: Angle between the left and the right border of the picture.
-        sigma: Noise of a marked wrist, pixels; by default 0.6 % of the person's size.
-        stature: Height of the standing person, metres, where it is known.
-        num_modes: Most hypotheses; 1 for the best alone, None for all.
-        contours: Run the second and third stage on the picture's contours.
-        colours: Let them see the colours on either side too.
-        working_size: Longer side of the picture on which contours are searched.
-        search: How widely interpretations are looked for.
-        least_joints: Fewest joints of the body that have to be marked.
+        options: How the pose is looked for, and what else is fitted.
         others: What further cameras see at the same time, in the same world; of these the keypoints
             are used.
-        dtype: Type of the body.
-        device: Where to compute.
 
     Raises:
-        KeypointError: If fewer joints of the body are marked, or all are at one place.
-        CameraError: If the camera is of another image size, or there is neither picture nor camera.
+        KeypointError: If fewer joints of the body are known than asked for, or all are at one
+            place.
+        CameraError: If the camera is of another image size or looks away from a placed body, or
+            there is neither picture nor camera.
         BodyError: If the stature is no person's.
-        ConfigurationError: If no hypothesis is to be kept.
     """
-    names, keypoints, confidence = keypoint_table(joints_2d, joint_names)
-    notes: list[str] = []
+    options = options or InitialiseOptions()
+    if not isinstance(keypoints, Keypoints):
+        keypoints = keypoints_by_name(keypoints)
+    notes: Sequence[str] = ()
     if camera is None:
         if image is None:
             raise CameraError("neither picture nor camera is given; give one, for the image's size")
-        camera, note = default_camera(
-            image.shape[1], image.shape[0], focal_px=focal_px,
-            field_of_view_degrees=field_of_view_degrees,
-        )  # fmt: skip
-        notes.append(note)
+        camera, *notes = default_camera(image.shape[1], image.shape[0])
     if image is not None and tuple(image.shape[1::-1]) != camera.image_size_wh:
         raise CameraError(
             f"camera {camera.name!r} belongs to images of {camera.image_size_wh} pixels, this one "
             f"has {tuple(image.shape[1::-1])}; use camera.resized if it was only resized"
         )
-    camera = camera.to(dtype=dtype, device=device)
-    joints = JointTerm(sigma=sigma or default_sigma(keypoints[confidence > 0]))
-    first = initialise_from_joints(
-        body, camera, keypoints, confidence, names, generator=generator, joints=joints,
-        search=search, num_modes=num_modes, stature=stature, least_joints=least_joints,
-        others=others, dtype=dtype, device=device,
-    )  # fmt: skip
-    notes += swapped_sides(
-        first.body, first.mixture.mean[0], camera, keypoints, confidence, names, joints, generator
+    camera = camera.to(dtype=options.dtype, device=options.device)
+    if not options.sigma:
+        options = replace(options, sigma=default_sigma(keypoints))
+    view, others = View(camera=camera, keypoints=keypoints), tuple(others)
+    first = fit_joints(body, view, generator=generator, options=options, others=others)
+    given = keypoints.only(first.body.joint_names).to(first.body.tie)
+    alone = TrackingCost(
+        body=first.body, camera=camera, choice=options.joint_choice, keypoints=given
     )
+    notes = (*notes, *swapped_sides(alone, first.mixture.mean[0], generator))
     first = first._replace(report=(*notes, *first.report))
-    if image is None or not contours:
+    if image is None or not options.contours or isinstance(body, BodyModel):
         return first
-    kept = torch.tensor([name not in first.left_out for name in names]).to(confidence)
-    extractor = FeatureExtractor(working_size=working_size, colour=colours)
-    features = extractor.to(device=device)(image)
-    working = extractor.working_camera(camera)
-    # Of the longer side, which is not rounded: the shorter one has a factor of its own.
-    factor = max(working.image_size_wh) / max(camera.image_size_wh)
-    choice = CostChoice(
-        region=RegionTerm() if colours else None,
-        contour_weight=_BESIDE_COLOURS if colours else CostChoice.contour_weight,
-        joints=replace(joints, sigma=factor * joints.sigma),
-        temporal=None,
-        anthropometric=Anthropometric() if stature is None else Anthropometric(stature=0.0),
+    left_out = torch.tensor([name in first.left_out for name in given.names])
+    view = replace(view, keypoints=given.without(left_out.to(options.device)))
+    cost = _contour_cost(image, first, view, options)
+    scaled = (each.of_keypoints(_factor(view.camera, cost.camera)) for each in others)
+    return _with_contours(first, replace(cost, others=tuple(scaled)), options)
+
+
+def _factor(camera: Camera, working: Camera) -> float:
+    """By how much a picture was shrunk: its longer side, the shorter one may be rounded."""
+    return max(working.image_size_wh) / max(camera.image_size_wh)
+
+
+def _contour_cost(
+    image: UInt8[np.ndarray, "h w 3"] | Tensor,
+    first: Initialisation,
+    view: View,
+    options: InitialiseOptions,
+) -> TrackingCost:
+    """The cost of a picture at its working size: joints, edges and colours."""
+    extractor = FeatureExtractor(working_size=options.working_size, colour=options.colours)
+    features = extractor.to(device=options.device)(image)
+    working = extractor.working_camera(view.camera)
+    factor = _factor(view.camera, working)
+    choice = options.joint_choice
+    assert choice.joints is not None
+    costs = FrameCosts(
+        first.body,
+        working,
+        replace(
+            choice,
+            contour=ContourTerm(),
+            region=RegionTerm() if options.colours else None,
+            contour_weight=_BESIDE_COLOURS if options.colours else CostChoice.contour_weight,
+            joints=replace(choice.joints, sigma=factor * choice.joints.sigma),
+        ),
     )
-    observation = JointObservation(
-        first.body.joint_names,
-        keypoints.to(first.body.tie),
-        (kept * confidence).to(first.body.tie),
-        names,
-    )
-    marked = View(camera=camera, observation=observation).of_keypoints(factor)
-    costs = FrameCosts(first.body, working, choice)
-    cost = costs(
+    return costs(
         features,
         body=first.body,
-        observation=marked.observation,
+        keypoints=view.of_keypoints(factor).keypoints,
         appearance=costs.learn(None, features, first.body, first.mixture.mean[0], fitted=False),
     )
-    cost = replace(cost, others=tuple(view.of_keypoints(factor) for view in others))
-    return _with_contours(first, cost, stature, search or Search(), num_modes)
 
 
 def _with_contours(
-    first: Initialisation,
-    cost: TrackingCost,
-    stature: float | None,
-    search: Search,
-    num_modes: int | None,
+    first: Initialisation, cost: TrackingCost, options: InitialiseOptions
 ) -> Initialisation:
     """The second and the third stage, and the hypotheses refined on the body that they find."""
-    name, scale, rooted = first.body.name, first.scale, has_root(first.body)
-    scale_line = partial(scale_report, stature, num_views=len(cost.views))
-
-    def load(lengths: Mapping[str, float], *, free: bool) -> BodyModel:
-        bare = {name: length / scale for name, length in lengths.items()}
-        body = load_body(
-            name, lengths=bare, scale=scale, free_proportions=free, free_root=rooted,
-            dtype=first.body.dtype, device=first.body.tie.device,
-        )  # fmt: skip
-        return body.with_base(first.body.base_rotation, first.body.base_translation)
-
-    loose = load(first.lengths, free=True)
+    search, rooted = options.search, has_root(first.body)
+    load = partial(with_lengths, first.body, scale=first.scale, free_root=rooted)
+    loose = load(first.lengths, free_proportions=True)
     rivals = first.mixture.mean[first.cost <= first.cost[0] + _RIVALS]
     parameters = ShapeParameters(loose, WHOLE_SHAPE)
     bones = replace(cost.choice, contour=None, region=None)
-    flesh, whole = fit_shape(
+    sections, whole = fit_shape(
         replace(cost, body=loose, choice=bones), spread_to(first.body, loose, rivals), parameters,
         _outlines(cost), bounds=search.bounds(loose),
     )  # fmt: skip
-    lengths = {**first.lengths, **fitted_lengths(loose, whole.state, stature)}
+    lengths = {**first.lengths, **fitted_lengths(loose, whole.state, options.stature)}
 
     def shaped(body: BodyModel, fit: ShapeFit) -> BodyModel:
         offset = (fit.shape @ parameters.tie.T).unflatten(-1, body.part_shape.shape)
@@ -219,25 +194,25 @@ def _with_contours(
     def cost_of(body: BodyModel) -> TrackingCost:
         return replace(cost, body=body, predictor=ContourPredictor(body))
 
-    body = shaped(load(lengths, free=False), whole)
+    body = shaped(load(lengths), whole)
     best = columns_of(loose, body, whole.state[None])
     starts = torch.cat([best, first.mixture.mean])
     fits = TrustRegionNewton(max_steps=40, tolerance=1e-2).minimise(
         cost_of(body), starts, search.bounds(body)
     )
-    kept = best_distinct(fits, num_modes)
+    kept = best_distinct(fits, options.num_modes)
     if rooted:
         body, kept = hang_on_best(body, kept)
-        loose_now = shaped(load(lengths, free=True), whole)
-        loose_now = loose_now.with_base(body.base_rotation, body.base_translation)
-        covariance = marginal_covariance(cost_of(loose_now), body, kept.mean, search)
-        kept = kept._replace(covariance=covariance)
+        free = shaped(load(lengths, free_proportions=True), whole)
+        free = free.with_base(body.base_rotation, body.base_translation)
+        kept = with_unknown_lengths(cost_of(free), body, kept, search)
     result = as_initialisation(body, kept, first.report)
     second = Stage(
-        "cross-sections, with contours", shaped(first.body, flesh),
-        first.mixture.mean[flesh.start], flesh.cost,
+        "cross-sections, with contours", shaped(first.body, sections),
+        first.mixture.mean[sections.start], sections.cost,
     )  # fmt: skip
     third = Stage("all parameters, with contours", body, kept.mean[0], float(kept.cost[0]))
+    scale_line = partial(scale_report, options.stature, num_views=len(cost.views))
     return first._replace(
         body=body,
         mixture=result.mixture,

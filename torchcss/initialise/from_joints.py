@@ -3,40 +3,37 @@
 It fits joint angles, the place of the body and its internal proportions (within 10 % of the
 standard humanoid, left and right tied) to the joints, with hard joint limits, by the robust
 optimisation that tracks (section 4.1), from many starts (`torchcss.initialise.multi_start`),
-without the marks that fit no pose (`torchcss.initialise.outliers`). The best fit gives the lengths.
-With them held, every fit is refined once more, and the distinct ones become the mixture that the
-tracker begins with. Their covariances are those of the pose with the lengths unknown: the inverse
-Hessian of pose and lengths together, of which the pose's block is kept.
+without the keypoints that fit no pose (`torchcss.initialise.outliers`). The best fit gives the
+lengths. With them held, every fit is refined once more, and the distinct ones become the mixture
+that the tracker begins with. Their covariances are those of the pose with the lengths unknown: the
+inverse Hessian of pose and lengths together, of which the pose's block is kept.
 
 One image does not tell a large person from a small one farther away: `stature` fixes the scale,
-or the view of another camera (`others`), else the anthropometric prior does.
+or the view of another camera, else the anthropometric prior does.
 
-Call `initialise_from_joints`, for the first frame of a video say.
+`torchcss.initialise.fit.initialise` calls `fit_joints`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from torchcss.body.catalog import ARM_NAMES
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.root import has_root, move_base, root_pose
-from torchcss.cost.anthropometric import Anthropometric
-from torchcss.cost.joints import JointObservation, JointTerm
-from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.cost.joints import JointTargets, match_joints
+from torchcss.cost.total import TrackingCost
 from torchcss.cost.view import View
-from torchcss.errors import CameraError, ConfigurationError
+from torchcss.errors import CameraError
 from torchcss.inference.mixture import GaussianMixture
-from torchcss.initialise.keypoint_checks import check_joints, default_sigma
-from torchcss.initialise.multi_start import Search, find_interpretations
-from torchcss.initialise.outliers import best_distinct, explain, refine
+from torchcss.initialise.keypoint_checks import check_joints
+from torchcss.initialise.multi_start import multi_start_fits
+from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
+from torchcss.initialise.outliers import best_distinct, fits_and_outliers, refine, without
 from torchcss.initialise.result import (
     STANDARD_STATURE,
     Initialisation,
@@ -44,135 +41,81 @@ from torchcss.initialise.result import (
     columns_of,
     fitted_lengths,
     hang_on_best,
-    marginal_covariance,
     scale_of,
     scale_report,
     undetermined_line,
+    with_lengths,
+    with_unknown_lengths,
 )
 from torchcss.types import Modes
 from torchcss.vision.camera import Camera
 
-LEAST_JOINTS = 3
-"""Fewer joints than this fix neither depth nor direction of a body."""
 
-
-def initialise_from_joints(
-    name: str,
-    camera: Camera,
-    keypoints: Float[Tensor, "j 2"],
-    confidence: Float[Tensor, " j"],
-    keypoint_names: tuple[str, ...],
+def fit_joints(
+    body: str | BodyModel,
+    view: View,
     *,
     generator: torch.Generator,
-    joints: JointTerm | None = None,
-    search: Search | None = None,
-    num_modes: int | None = 8,
-    stature: float | None = None,
-    placed: BodyModel | None = None,
-    least_joints: int = LEAST_JOINTS,
-    others: Sequence[View] = (),
-    dtype: torch.dtype = torch.float64,
-    device: torch.device | str = "cpu",
+    options: InitialiseOptions,
+    others: tuple[View, ...] = (),
 ) -> Initialisation:
-    """Fit place, pose and lengths of a body to the joints of one image: the first stage.
+    """Fit place, pose and lengths of a body to the joints of one image.
 
     Args:
-        name: Name of a body that ships, or the path of a URDF, MJCF or BVH file.
-        camera: The camera; the keypoints are in its pixels.
-        keypoints: Pixels.
-        confidence: In [0, 1]; 0 where a joint is missing.
-        keypoint_names: Canonical joint names.
+        body: Name of a body that ships, or the path of a URDF, MJCF or BVH file; or a body whose
+            base and lengths are known, of which the pose alone is fitted.
+        view: The camera and the keypoints in its pixels.
         generator: Source of the starting poses.
-        joints: The joint term; a default fitted to the size of the person in the image.
-        search: How widely interpretations are looked for.
-        num_modes: Most distinct fits to keep; 1 for the best alone, None for all.
-        stature: Height of the standing person, metres, where it is known.
-        placed: A body whose base and lengths are known: only its own parameters are fitted.
-        least_joints: Fewest joints to accept; with fewer than three much stays at its prior.
+        options: How to look.
         others: What further cameras see at the same time, in the same world; only their keypoints
-            matter. Starts and gross marks are looked for in the first camera's view.
-        dtype: Type of the body.
-        device: Where to compute.
+            matter. Starts and outliers are looked for in the first camera's view.
 
     Raises:
-        KeypointError: If fewer than `least_joints` joints of the body are seen, or all at one
-            place.
+        KeypointError: If too few joints of the body are seen, or all at one place.
         CameraError: If the camera looks away from a placed body.
         BodyError: If the stature is no person's.
-        ConfigurationError: If no fit is to be kept.
     """
-    if num_modes is not None and num_modes < 1:
-        raise ConfigurationError(f"expected at least 1 hypothesis to be kept, got {num_modes}")
-    keypoints = keypoints.to(dtype=dtype, device=device)
-    confidence = confidence.to(dtype=dtype, device=device)
-    joints = joints or JointTerm(sigma=default_sigma(keypoints[confidence > 0]))
-    search = search or Search()
-    scale = scale_of(stature)
+    scale = scale_of(options.stature)
     # Arms are placed by the fit; afterwards their shoulder stays where it was found.
-    free = placed or load_body(
-        name, dtype=dtype, device=device, scale=scale, free_proportions=True, free_root=True
-    )
-    observation = JointObservation(free.joint_names, keypoints, confidence, keypoint_names)
-    warnings = (*free.notes, *check_joints(name, observation, free, camera, least_joints))
-    choice = CostChoice(
-        contour=None,
-        joints=joints,
-        temporal=None,
-        anthropometric=Anthropometric() if stature is None else Anthropometric(stature=0.0),
-    )
-
-    def cost_of(body: BodyModel) -> TrackingCost:
-        return TrackingCost(
-            body=body,
-            camera=camera,
-            choice=choice,
-            observation=observation,
-            others=tuple(others),
+    free = (
+        body
+        if isinstance(body, BodyModel)
+        else load_body(
+            body, dtype=options.dtype, device=options.device, scale=scale, free_proportions=True,
+            free_root=True,
         )
-
-    if placed is not None:
-        _check_in_view(placed, camera)
-        fits = find_interpretations(cost_of(placed), search=search, generator=generator)
-        kept = best_distinct(fits, num_modes)
-        return as_initialisation(placed, kept, warnings)
-
-    free = _hang_before_camera(free, camera, observation)
-    fits, gross = explain(cost_of(free), search=search, generator=generator)
-    left_out: tuple[str, ...] = ()
-    if bool(gross.any()):
-        left_out = tuple(free.joint_names[joint] for joint in observation.index[gross].tolist())
-        warnings = (*warnings, f"marks that fit no pose, left out: {', '.join(left_out)}")
-        observation.weight = torch.where(gross, 0.0, observation.weight)
-    lengths = fitted_lengths(free, fits.mean[0], stature)
-
-    def load(**options: Any) -> BodyModel:
-        bare = {name: length / scale for name, length in lengths.items()}
-        body = load_body(name, dtype=dtype, device=device, lengths=bare, scale=scale, **options)
-        return body.with_base(free.base_rotation, free.base_translation)
-
-    # With the lengths of the best fit, twice as many fits as are asked for have their chance.
-    candidates = fits.mean if num_modes is None else fits.mean[: 2 * num_modes + 8]
-    body = load(free_root=True)
-    starts = columns_of(free, body, candidates)
-    body, starts, _ = move_base(body, *root_pose(body, starts[0]), starts)
-    fits_held = refine(cost_of(body), starts, search)
-    if name in ARM_NAMES:
-        # The root of the best fit becomes the arm's base, and only its angles are searched.
-        arm = load().with_base(*root_pose(body, fits_held.mean[int(_order(fits_held)[0])]))
-        fits_held = refine(cost_of(arm), columns_of(body, arm, fits_held.mean), search)
-        body = arm
-    kept = best_distinct(fits_held, num_modes)
-    if has_root(body):
-        body, kept = hang_on_best(body, kept)
-        loose = load(free_root=True, free_proportions=True)
-        loose = loose.with_base(body.base_rotation, body.base_translation)
-        covariance = marginal_covariance(cost_of(loose), body, kept.mean, search)
-        kept = kept._replace(covariance=covariance)
-    free_fits = fits if num_modes is None else Modes(*(field[:num_modes] for field in fits))
-    result = as_initialisation(body, kept, warnings)
-    report = [*result.report, scale_report(stature, lengths, num_views=1 + len(others))]
-    if (line := undetermined_line(body, kept, joints=cost_of(body))) is not None:
+    )  # fmt: skip
+    assert view.keypoints is not None
+    keypoints = view.keypoints.only(free.joint_names).to(free.tie)
+    keypoints = keypoints.without(~keypoints.positions.isfinite().all(-1))
+    notes = (*free.notes, *check_joints(free.name, keypoints, view.camera, options.least_joints))
+    cost = TrackingCost(
+        body=free,
+        camera=view.camera,
+        choice=options.joint_choice,
+        keypoints=keypoints,
+        others=others,
+    )
+    if isinstance(body, BodyModel):
+        _check_in_view(body, view.camera)
+        fits = multi_start_fits(cost, search=options.search, generator=generator)
+        return as_initialisation(body, best_distinct(fits, options.num_modes), notes)
+    free = _hang_before_camera(free, view.camera, match_joints(keypoints, free.joint_names))
+    cost = replace(cost, body=free)
+    fits, outliers = fits_and_outliers(cost, search=options.search, generator=generator)
+    left_out = tuple(
+        name for name, out in zip(keypoints.names, outliers.tolist(), strict=True) if out
+    )
+    if left_out:
+        notes = (*notes, f"keypoints that fit no pose, left out: {', '.join(left_out)}")
+        cost = without(cost, outliers)
+    lengths = fitted_lengths(free, fits.mean[0], options.stature)
+    held, kept = _with_lengths_held(cost, fits, lengths, scale, options)
+    result = as_initialisation(held, kept, notes)
+    report = [*result.report, scale_report(options.stature, lengths, num_views=1 + len(others))]
+    if (line := undetermined_line(held, kept, joints=replace(cost, body=held))) is not None:
         report.append(line)
+    fits = Modes(*(field[: options.num_modes] for field in fits))
     return result._replace(
         report=tuple(report),
         lengths=lengths,
@@ -180,13 +123,38 @@ def initialise_from_joints(
         left_out=left_out,
         free_body=free,
         free_mixture=GaussianMixture(
-            free_fits.mean, free_fits.covariance, torch.log_softmax(-free_fits.cost, dim=0)
+            fits.mean, fits.covariance, torch.log_softmax(-fits.cost, dim=0)
         ),
     )
 
 
-def _order(fits: Modes) -> Tensor:
-    return fits.cost.nan_to_num(math.inf).argsort(stable=True)
+def _with_lengths_held(
+    cost: TrackingCost,
+    fits: Modes,
+    lengths: dict[str, float],
+    scale: float,
+    options: InitialiseOptions,
+) -> tuple[BodyModel, Modes]:
+    """Refine fits on the body with these lengths; the distinct ones, the body hung on the best."""
+    free, num = cost.body, options.num_modes
+    # Twice as many fits as are asked for have their chance.
+    candidates = fits.mean if num is None else fits.mean[: 2 * num + 8]
+    body = with_lengths(free, lengths, scale, free_root=True)
+    starts = columns_of(free, body, candidates)
+    body, starts, _ = move_base(body, *root_pose(body, starts[0]), starts)
+    refined = refine(replace(cost, body=body), starts, options.search)
+    if free.name in ARM_NAMES:
+        # The root of the best fit becomes the arm's base, and only its angles are searched.
+        best = refined.mean[int(refined.cost.nan_to_num(math.inf).argmin())]
+        arm = with_lengths(free, lengths, scale, free_root=None).with_base(*root_pose(body, best))
+        starts = columns_of(body, arm, refined.mean)
+        body, refined = arm, refine(replace(cost, body=arm), starts, options.search)
+    kept = best_distinct(refined, num)
+    if not has_root(body):
+        return body, kept
+    body, kept = hang_on_best(body, kept)
+    loose = with_lengths(body, lengths, scale, free_root=True, free_proportions=True)
+    return body, with_unknown_lengths(replace(cost, body=loose), body, kept, options.search)
 
 
 def _check_in_view(body: BodyModel, camera: Camera) -> None:
@@ -197,14 +165,12 @@ def _check_in_view(body: BodyModel, camera: Camera) -> None:
         )
 
 
-def _hang_before_camera(
-    body: BodyModel, camera: Camera, observation: JointObservation
-) -> BodyModel:
+def _hang_before_camera(body: BodyModel, camera: Camera, targets: JointTargets) -> BodyModel:
     """Base: upright in the image, facing the camera, as far as the limbs' lengths suggest."""
-    seen = observation.weight > 0
-    index, target = observation.index[seen], observation.target[seen]
+    seen = targets.weight > 0
+    index, target = targets.joint[seen], targets.position[seen]
     rest = body.pose(body.rest).joints[index]
-    # Medians, so that a gross mark does not move the body away.
+    # Medians, so that an outlier does not move the body away.
     middle, centre_px = rest.median(dim=0).values, target.median(dim=0).values
     in_body = (rest - middle).norm(dim=-1).median()
     on_image = (target - centre_px).norm(dim=-1).median()

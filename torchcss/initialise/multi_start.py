@@ -1,7 +1,7 @@
 """All the poses that explain the joints of one image: the many starts of the first stage.
 
-One image of joint centres has thousands of interpretations (section 7 [IJRR]). They are found from
-many starts in three batches, every descent bound by the joint limits:
+Thousands of poses explain one image of joint centres (section 7 [IJRR]). They are found from many
+starts in three batches, every descent bound by the joint limits:
 
 1. *Around the vertical.* Poses about the stabilisers' rest, turned through the full circle, descend
    with the scale of the keypoints widened 16 times and then 4 times: nearly every start arrives,
@@ -15,7 +15,7 @@ many starts in three batches, every descent bound by the joint limits:
 
 All of these descend once more, at four times and at the true scale of the keypoints.
 
-Call `find_interpretations`.
+Call `multi_start_fits`.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _WIDE, _MIDDLE = 16.0, 4.0
 robust potential pulls those within three scales."""
 
 _SAME_TRUNK = 0.06
-"""Mean distance of the trunk's joints, metres, below which two trunks are one interpretation."""
+"""Mean distance of the trunk's joints, metres, below which two trunks count as one."""
 
 _SAME_ANGLE = 0.05
 """Radians within which two flips of a limb are one: limits or the sight line closed the other."""
@@ -54,7 +54,7 @@ _SAME_ANGLE = 0.05
 
 @dataclass(frozen=True, kw_only=True)
 class Search:
-    """How widely interpretations are looked for.
+    """How widely poses are looked for.
 
     Attributes:
         num_starts: Starting poses around the vertical.
@@ -64,7 +64,7 @@ class Search:
         covariance_scale: Factor on their covariance.
         limits: Hold the joint limits (False only for comparison).
         anneal: Widen the keypoints' scale at first (False only for comparison).
-        leave_out: Leave marks out that fit no pose (False only for comparison); see
+        leave_out: Leave keypoints out that fit no pose (False only for comparison); see
             `torchcss.initialise.outliers`.
         max_steps: Iterations of the last descent.
         proportions: Which lengths are fitted, all by default; the others stay the standard
@@ -118,9 +118,7 @@ SINGLE_START = Search(
 """One descent from the rest pose: what a local fit without search does."""
 
 
-def find_interpretations(
-    cost: TrackingCost, *, search: Search, generator: torch.Generator
-) -> Modes:
+def multi_start_fits(cost: TrackingCost, *, search: Search, generator: torch.Generator) -> Modes:
     """Descend from many starts to the minima of a cost of keypoints.
 
     Args:

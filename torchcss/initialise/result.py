@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.body.catalog import LENGTHS, PROPORTION_RANGE, PROPORTIONS
+from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, move_base, root_pose
 from torchcss.cost.total import TrackingCost
@@ -66,7 +67,7 @@ class Initialisation(NamedTuple):
         stages: The best fit after every stage.
         free_body: The same body with its lengths as parameters; None where they were given.
         free_mixture: The fits of pose and lengths together, best first, on `free_body`.
-        left_out: Joints whose marks fit no pose and were left out.
+        left_out: Joints whose keypoints fit no pose and were left out.
     """
 
     body: BodyModel
@@ -119,45 +120,60 @@ def hang_on_best(body: BodyModel, fits: Modes) -> tuple[BodyModel, Modes]:
 def columns_of(
     source: BodyModel, target: BodyModel, x: Float[Tensor, "b n"]
 ) -> Float[Tensor, "b m"]:
-    """The parameters of one body out of the states of another that has them too.
-
-    Args:
-        source: The body of the states.
-        target: The body with fewer parameters.
-        x: States.
-    """
+    """The parameters of one body out of the states of another that has them too."""
     return x[:, [source.state_index(name) for name in target.state_names]]
 
 
 def spread_to(
     source: BodyModel, target: BodyModel, x: Float[Tensor, "b n"]
 ) -> Float[Tensor, "b m"]:
-    """States of a body as those of one with more parameters, which stay at zero.
-
-    Args:
-        source: The body of the states.
-        target: The body with more parameters.
-        x: States.
-    """
+    """States of a body as those of one with more parameters, which stay at zero."""
     full = x.new_zeros(len(x), target.num_parameters)
     full[:, [target.state_index(name) for name in source.state_names]] = x
     return full
 
 
-def marginal_covariance(
-    cost: TrackingCost, body: BodyModel, x: Float[Tensor, "k n"], search: Search
-) -> Float[Tensor, "k n n"]:
-    """Covariances of poses when the lengths are unknown too.
+def with_lengths(
+    body: BodyModel,
+    lengths: Mapping[str, float],
+    scale: float,
+    *,
+    free_root: bool | None,
+    free_proportions: bool = False,
+) -> BodyModel:
+    """The body of the same name with other lengths, on the same base.
+
+    Args:
+        body: The body.
+        lengths: Its lengths, metres.
+        scale: Its overall scale.
+        free_root: Whether it has root parameters; None: as it is by itself.
+        free_proportions: Whether the lengths are parameters.
+    """
+    other = load_body(
+        body.name,
+        lengths={name: length / scale for name, length in lengths.items()},
+        scale=scale,
+        free_proportions=free_proportions,
+        free_root=free_root,
+        dtype=body.dtype,
+        device=body.tie.device,
+    )
+    return other.with_base(body.base_rotation, body.base_translation)
+
+
+def with_unknown_lengths(cost: TrackingCost, body: BodyModel, fits: Modes, search: Search) -> Modes:
+    """Fits with the covariances that their poses have when the lengths are unknown too.
 
     Args:
         cost: Cost of the same body with free lengths, on the same base.
         body: The body with lengths held.
-        x: Its fitted states.
+        fits: Its fits.
         search: Whether limits hold.
     """
     loose = cost.body
     columns = [loose.state_index(name) for name in body.state_names]
-    full = spread_to(body, loose, x)
+    full = spread_to(body, loose, fits.mean)
     model, bounds = cost.local_model(full), search.bounds(loose)
     held = (full <= bounds.lower) & (model.gradient > 0)
     held = held | ((full >= bounds.upper) & (model.gradient < 0))
@@ -166,16 +182,11 @@ def marginal_covariance(
     covariance = inverse_on_free(
         model.hessian, ~held | lengths, default_prior_variance(loose.bounds)
     )
-    return covariance[:, columns][:, :, columns]
+    return fits._replace(covariance=covariance[:, columns][:, :, columns])
 
 
 def stature_of(lengths: Mapping[str, float], scale: float = 1.0) -> float:
-    """Height of the standing body, metres.
-
-    Args:
-        lengths: Lengths by name, metres.
-        scale: Overall scale of the body, for the height of the ankle.
-    """
+    """Height of the standing body, metres; its overall scale tells the height of the ankle."""
     names = ("shank", "thigh", "trunk", "neck", "head")
     return scale * _SOLE + sum(lengths[name] for name in names)
 
@@ -242,7 +253,7 @@ def undetermined_line(body: BodyModel, modes: Modes, joints: TrackingCost) -> st
     free = torch.as_tensor(modes.active[0]) == 0
     deviation = modes.covariance[0].diagonal().sqrt()
     loose = free & (deviation > _UNDETERMINED * prior)
-    # A parameter that moves no marked joint has no curvature at all.
+    # A parameter that moves no known joint has no curvature at all.
     loose = loose | (curvature.abs() * prior.square() < 1e-6)
     names = [
         name for name, is_loose in zip(body.state_names, loose.tolist(), strict=True) if is_loose

@@ -1,13 +1,13 @@
-"""Stages two and three of initialisation: the flesh, then everything (section 5 [IJRR]).
+"""Stages two and three of initialisation: the parts' shape, then everything (section 5 [IJRR]).
 
 The second stage fits cross-sections and tapers of all parts, left and right tied, to joints and
 outlines in the image while pose and lengths are held; the third fits all parameters to the same.
 Each is the bound-constrained robust optimisation of section 4.1 on `ShapedCost`.
 
-One camera leaves several poses open that cost the joints the same. Flesh fitted to one of them
+One camera leaves several poses open that cost the joints the same. A shape fitted to one of them
 speaks for it: an arm believed to be too close to the camera is made thin, and whatever is compared
-with the image afterwards then prefers it there. So every pose gets flesh of its own first, and that
-of the cheapest is what the third stage goes on with.
+with the image afterwards then prefers it there. So every pose gets a shape of its own first, and
+that of the cheapest is what the third stage goes on with.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class ShapeFit(NamedTuple):
 
     Attributes:
         state: State of the body with free lengths.
-        start: Which of the poses the flesh was fitted to.
+        start: Which of the poses the shape was fitted to.
         shape: Offsets of the shape parameters.
         cost: Nats.
     """
@@ -69,7 +69,7 @@ def fit_shape(
     y = torch.cat([states, states.new_zeros(len(states), len(parameters.names))], dim=-1)
     volume = [name.endswith(CROSS_SECTIONS) for name in parameters.names]
     own = torch.tensor(volume, device=states.device).to(states)
-    fleshes = [
+    sections = [
         optimiser.minimise(
             cost,
             start[None],
@@ -77,11 +77,11 @@ def fit_shape(
         )
         for start in y
     ]
-    best = min(range(len(fleshes)), key=lambda k: float(fleshes[k].cost[0]))
-    flesh = fleshes[best]
+    best = min(range(len(sections)), key=lambda k: float(sections[k].cost[0]))
+    second = sections[best]
     pairs = zip(bounds or base.body.bounds, parameters.bounds, strict=True)
-    whole = optimiser.minimise(cost, flesh.mean, Bounds(*(torch.cat(pair) for pair in pairs)))
+    whole = optimiser.minimise(cost, second.mean, Bounds(*(torch.cat(pair) for pair in pairs)))
     return tuple(  # type: ignore[return-value]
         ShapeFit(fit.mean[0, :n], best, fit.mean[0, n:], float(fit.cost[0]))
-        for fit in (flesh, whole)
+        for fit in (second, whole)
     )

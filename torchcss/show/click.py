@@ -27,7 +27,7 @@ from matplotlib.widgets import Button
 from torchcss.body.load import load_body
 from torchcss.errors import ConfigurationError, KeypointError
 from torchcss.files import replace_file
-from torchcss.io.keypoints.one_image import Joints
+from torchcss.types import Keypoints
 
 CLICKED = (
     "skull_tip", "vc7",
@@ -116,7 +116,7 @@ class JointClicker:
         return self.names[len(self.places)]
 
     @property
-    def joints(self) -> Joints:
+    def joints(self) -> Keypoints:
         """The joints marked so far.
 
         Raises:
@@ -127,7 +127,7 @@ class JointClicker:
             raise KeypointError("no joint was clicked: click at least three of them")
         places = torch.tensor(list(marked.values()), dtype=torch.float64)
         report = (f"clicked: {len(marked)} joints",)
-        return Joints(places, torch.ones_like(places[:, 0]), tuple(marked), report)
+        return Keypoints(places, torch.ones_like(places[:, 0]), tuple(marked), report=report)
 
     def mark(self, u: float, v: float) -> None:
         """Answer where the next joint is, pixels."""
@@ -200,7 +200,7 @@ def spoken(joint: str) -> str:
     return f"{'left' if side == 'l' else 'right'} {words.get(place, place)} (the person's own)"
 
 
-def click_joints(image: UInt8[np.ndarray, "h w 3"], names: tuple[str, ...] = CLICKED) -> Joints:
+def click_joints(image: UInt8[np.ndarray, "h w 3"], names: tuple[str, ...] = CLICKED) -> Keypoints:
     """Open a window, let the user click, and wait until it is closed.
 
     Args:
@@ -225,7 +225,11 @@ def click_joints(image: UInt8[np.ndarray, "h w 3"], names: tuple[str, ...] = CLI
 
 
 def write_clicked(
-    path: str | os.PathLike[str], joints: Joints, image_size_wh: tuple[int, int], *, frame: int = 0
+    path: str | os.PathLike[str],
+    joints: Keypoints,
+    image_size_wh: tuple[int, int],
+    *,
+    frame: int = 0,
 ) -> None:
     """Write joints as a clicked file.
 
@@ -240,7 +244,7 @@ def write_clicked(
     """
     places = {
         name: [round(number, 2) for number in place]
-        for name, place in zip(joints.joint_names, joints.keypoints.tolist(), strict=True)
+        for name, place in zip(joints.names, joints.positions.tolist(), strict=True)
     }
     marked = {"joints": places} if frame == 0 else {"frames": {str(frame): places}}
     content = {"image_size_wh": list(image_size_wh), **marked}

@@ -13,16 +13,16 @@ from typing import NamedTuple
 
 import torch
 
+from torchcss.app.init import initialise_video
 from torchcss.body.root import has_root
-from torchcss.cost.joints import JointTerm
 from torchcss.errors import TorchcssError
-from torchcss.initialise.from_joints import initialise_from_joints
+from torchcss.initialise.fit import initialise
 from torchcss.initialise.keypoint_checks import typical_sigma
+from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
 from torchcss.initialise.result import Initialisation
 from torchcss.io.video import VideoReader
 from torchcss.studies.evaluation import FrameMeasures, Thresholds, Yardstick, loss
 from torchcss.studies.sequences import RecordedSequence
-from torchcss.tracking.first_frame import initialise_video
 from torchcss.tracking.session import TrackingSession
 from torchcss.tracking.settings import Settings
 from torchcss.tracking.view import CameraView
@@ -54,21 +54,23 @@ def find_start(sequence: RecordedSequence, settings: Settings, *, start: int = 0
         settings: The body, the seed, the type; the tracker does not matter.
         start: First frame.
     """
-    marks, dtype, device = sequence.keypoints, settings.torch_dtype, settings.device
+    keypoints, dtype, device = sequence.keypoints, settings.torch_dtype, settings.device
     generator = torch.Generator().manual_seed(settings.seed)
     camera = sequence.camera.to(dtype=dtype, device=device)
     truth = sequence.truth
     if truth is not None and truth.body.name == settings.body and not has_root(truth.body):
-        sigma = sequence.keypoint_noise_px or typical_sigma(marks.keypoints, marks.confidence)
-        first = initialise_from_joints(
-            settings.body, camera, marks.keypoints[start], marks.confidence[start],
-            marks.joint_names, generator=generator, joints=JointTerm(sigma=sigma),
-            placed=truth.body.to(dtype=dtype, device=device), dtype=dtype, device=device,
-        )  # fmt: skip
+        sigma = sequence.keypoint_noise_px or typical_sigma(keypoints)
+        options = InitialiseOptions(
+            sigma=sigma, least_joints=LEAST_JOINTS, dtype=dtype, device=device
+        )
+        placed = truth.body.to(dtype=dtype, device=device)
+        first = initialise(
+            None, keypoints.at(start), camera, placed, generator=generator, options=options
+        )
         return Start(first, sigma, generator)
-    sigma = typical_sigma(marks.keypoints, marks.confidence)
+    sigma = typical_sigma(keypoints)
     first = initialise_video(
-        sequence.video, marks, camera, settings, start=start, sigma=sigma, generator=generator
+        sequence.video, keypoints, camera, settings, start=start, sigma=sigma, generator=generator
     )
     return Start(first, sigma, generator)
 

@@ -14,9 +14,8 @@ import numpy as np
 import torch
 
 from torchcss.app.recorder import Recorder
-from torchcss.cost.joints import JointTerm
-from torchcss.initialise.fit import initialise_from_joints
-from torchcss.io.keypoints.read import Keypoints
+from torchcss.initialise.fit import initialise
+from torchcss.initialise.options import InitialiseOptions
 from torchcss.io.tracks import load_track, prepare_output_folder, write_summary
 from torchcss.io.video import VideoWriter
 from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
@@ -25,7 +24,7 @@ from torchcss.tracking.settings import (
     Settings,
 )
 from torchcss.tracking.view import CameraView
-from torchcss.types import Frame
+from torchcss.types import Frame, Keypoints
 
 KEYPOINT_NOISE_PX = 1.5
 
@@ -82,29 +81,19 @@ def track_sequence(
     truth = sequence.joints_world
     exact = camera.project(truth[0]).uv
     noise = torch.randn(exact.shape, generator=generator, dtype=exact.dtype)
-    keypoints = exact + KEYPOINT_NOISE_PX * noise
-    confidence = torch.ones_like(keypoints[:, 0])
     body = sequence.body.to(dtype=dtype, device=device)
+    places = exact + KEYPOINT_NOISE_PX * noise
+    keypoints = Keypoints(places[None], torch.ones_like(places[None, :, 0]), body.joint_names)
     camera_there = camera.to(dtype=dtype, device=device)
-    joints = JointTerm(sigma=KEYPOINT_NOISE_PX)
-    first = initialise_from_joints(
-        settings.body,
-        camera_there,
-        keypoints,
-        confidence,
-        body.joint_names,
-        generator=generator,
-        joints=joints,
-        placed=body,
-        dtype=dtype,
-        device=device,
+    options = InitialiseOptions(sigma=KEYPOINT_NOISE_PX, dtype=dtype, device=device)
+    first = initialise(
+        None, keypoints.at(0), camera_there, body, generator=generator, options=options
     )
     interval = 1 / sequence.frame_rate
-    seen = Keypoints(keypoints[None], confidence[None], body.joint_names, ())
     session = TrackingSession(
         replace(settings, keypoints_use="first"),
         first,
-        [CameraView(camera_there, seen, KEYPOINT_NOISE_PX)],
+        [CameraView(camera_there, keypoints, KEYPOINT_NOISE_PX)],
         frame_interval=interval,
         generator=generator,
     )

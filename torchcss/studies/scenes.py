@@ -27,12 +27,13 @@ from torch import Tensor
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES
 from torchcss.cost.frame import FrameCosts
-from torchcss.cost.joints import JointObservation
 from torchcss.cost.total import TrackingCost
 from torchcss.errors import ConfigurationError, TrackFileError
 from torchcss.files import load_arrays
 from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.initialise.fit import default_sigma, initialise_from_joints
+from torchcss.initialise.fit import initialise
+from torchcss.initialise.keypoint_checks import default_sigma
+from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
 from torchcss.io.cameras import read_camera
 from torchcss.io.keypoints.read import read_keypoints
 from torchcss.io.video import VideoReader
@@ -41,7 +42,6 @@ from torchcss.studies.metrics import LIMB_JOINTS, root_aligned_mpjpe_mm
 from torchcss.studies.render.sequences import arm_sequence
 from torchcss.studies.slices import Line, eigen_lines, joint_lines
 from torchcss.tracking.settings import Settings, boundary_emphasis, make_choice, make_extractor
-from torchcss.tracking.view import scale_keypoints
 from torchcss.types import Bounds, Modes
 from torchcss.vision.features import FrameFeatures
 
@@ -173,37 +173,23 @@ def _clip_scene(
     before, now = VideoReader(video, start=frame - 1, stop=frame + 1)
     full = read_camera(folder / "cameras.json", video=video).camera.to(settings.torch_dtype)
     path = folder / f"keypoints2d_{view}.npz"
-    marks = read_keypoints(path, image_size_wh=full.image_size_wh)
-    first = initialise_from_joints(
-        settings.body,
-        full,
-        marks.keypoints[frame],
-        marks.confidence[frame],
-        marks.joint_names,
-        generator=generator,
-        dtype=settings.torch_dtype,
+    keypoints = read_keypoints(path, image_size_wh=full.image_size_wh)
+    options = InitialiseOptions(least_joints=LEAST_JOINTS, dtype=settings.torch_dtype)
+    first = initialise(
+        None, keypoints.at(frame), full, settings.body, generator=generator, options=options
     )
     body = first.body
     truth = _nearest(body, first.mixture.mean, folder / "reference3d.npz", frame)
     extractor = make_extractor(settings)
     working = extractor.working_camera(full)
-    scaled = scale_keypoints(marks.keypoints, full.image_size_wh, working.image_size_wh)
-    observed = [
-        JointObservation(
-            body.joint_names,
-            scaled[index].to(body.tie),
-            marks.confidence[index].to(body.tie),
-            marks.joint_names,
-        )
-        for index in (frame - 1, frame)
-    ]
+    scaled = keypoints.scaled(full.image_size_wh, working.image_size_wh).to(body.tie)
     features = extractor(now.image, before.image)
-    sigma = default_sigma(scaled[frame][marks.confidence[frame] > 0])
+    sigma = default_sigma(scaled.at(frame))
     alone = TrackingCost(
         body=body,
         camera=working,
         choice=make_choice(Settings(terms=("joints", "stabiliser")), sigma),
-        observation=observed[0],
+        keypoints=scaled.at(frame - 1),
     )
     previous = TrustRegionNewton().minimise(alone, truth[None], body.bounds).mean[0]
     costs = FrameCosts(
@@ -217,7 +203,7 @@ def _clip_scene(
         features,
         body=body,
         before=previous,
-        observation=observed[1],
+        keypoints=scaled.at(frame),
         appearance=costs.learn(None, extractor(before.image), body, previous),
     )
     cost = replace(cost, parent=previous)

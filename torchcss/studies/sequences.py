@@ -36,9 +36,10 @@ from torchcss.body.model import BodyModel
 from torchcss.errors import CameraError, KeypointError, TrackFileError, VideoError
 from torchcss.files import load_arrays, one_line
 from torchcss.io.cameras import check_image_size, read_camera
-from torchcss.io.keypoints.read import Keypoints, read_keypoints
+from torchcss.io.keypoints.read import read_keypoints
 from torchcss.io.video import VideoReader
 from torchcss.joint_names import canonical_joint_name
+from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
 
 
@@ -113,7 +114,7 @@ def read_sequence(folder: str | os.PathLike[str], *, view: str | None = None) ->
             "in the reference's world, in metres"
         )
     check_image_size(loaded.camera, *size)
-    marks, noise = _read_marks(folder / f"keypoints2d{suffix}.npz", size, num_frames)
+    keypoints, noise = _read_keypoints(folder / f"keypoints2d{suffix}.npz", size, num_frames)
     names, joints = _read_reference(folder / "reference3d.npz", num_frames)
     mask_file, truth_file = folder / f"mask{suffix}.npz", folder / "truth.npz"
     return RecordedSequence(
@@ -122,7 +123,7 @@ def read_sequence(folder: str | os.PathLike[str], *, view: str | None = None) ->
         num_frames=num_frames,
         frame_rate=float(reader.info.frame_rate),
         camera=loaded.camera,
-        keypoints=marks,
+        keypoints=keypoints,
         keypoint_noise_px=noise,
         joint_names=names,
         joints_world=joints,
@@ -143,30 +144,30 @@ def _advice(folder: Path) -> str:
     return "expected a folder with video.mp4, cameras.json, keypoints2d.npz and reference3d.npz"
 
 
-def _read_marks(
+def _read_keypoints(
     path: Path, size: tuple[int, int], num_frames: int
 ) -> tuple[Keypoints, float | None]:
-    marks = read_keypoints(path, image_size_wh=size, num_frames=num_frames)
+    keypoints = read_keypoints(path, image_size_wh=size, num_frames=num_frames)
     arrays = load_arrays(path, KeypointError)
     inside = arrays.get("in_image")
     if inside is not None:
-        if inside.shape != tuple(marks.confidence.shape) or inside.dtype != bool:
+        if inside.shape != tuple(keypoints.confidence.shape) or inside.dtype != bool:
             raise KeypointError(
-                f"{path}: in_image: expected bool {list(marks.confidence.shape)}, "
+                f"{path}: in_image: expected bool {list(keypoints.confidence.shape)}, "
                 f"found {inside.dtype} {list(inside.shape)}"
             )
         seen = torch.from_numpy(inside)
         # No detector finds what is not in the picture.
-        marks = marks._replace(
-            keypoints=torch.where(seen[..., None], marks.keypoints, 0.0),
-            confidence=torch.where(seen, marks.confidence, 0.0),
+        keypoints = keypoints._replace(
+            positions=torch.where(seen[..., None], keypoints.positions, 0.0),
+            confidence=torch.where(seen, keypoints.confidence, 0.0),
         )
     noise = arrays.get("noise_px")
     if noise is None:
-        return marks, None
+        return keypoints, None
     if noise.shape != () or not noise > 0:
         raise KeypointError(f"{path}: noise_px: expected one positive number, found {noise}")
-    return marks, float(noise)
+    return keypoints, float(noise)
 
 
 def _read_reference(path: Path, num_frames: int) -> tuple[tuple[str, ...], np.ndarray]:

@@ -16,11 +16,12 @@ from torch import Tensor
 
 from torchcss.body.flips import Segments
 from torchcss.body.model import BodyModel
-from torchcss.cost.joints import JointObservation, JointTerm
+from torchcss.cost.joints import JointTerm
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.tracker import TrackerState
 from torchcss.initialise.multi_start import flips
+from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
 
 _NOISE = 0.02
@@ -114,7 +115,7 @@ def flipped_poses(
         body=body,
         camera=camera,
         choice=CostChoice(contour=None, joints=JointTerm(sigma=sigma)),
-        observation=JointObservation(body.joint_names, uv, valid.to(uv), body.joint_names),
+        keypoints=Keypoints(uv, valid.to(uv), body.joint_names),
     )
     poses = flips(cost, segments, x[None], body.bounds, _ALL)
     places = body.pose(poses).joints

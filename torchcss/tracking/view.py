@@ -20,12 +20,10 @@ from torch import Tensor
 
 from torchcss.body.model import BodyModel
 from torchcss.cost.frame import FrameCosts
-from torchcss.cost.joints import JointObservation
 from torchcss.cost.total import TrackingCost
 from torchcss.initialise.keypoint_checks import typical_sigma
-from torchcss.io.keypoints.read import Keypoints
 from torchcss.stopwatch import Stopwatch
-from torchcss.types import Frame
+from torchcss.types import Frame, Keypoints
 from torchcss.vision.appearance import Appearance
 from torchcss.vision.background import Background
 from torchcss.vision.camera import Camera
@@ -57,7 +55,7 @@ class CameraView(NamedTuple):
             return self.sigma
         if self.keypoints is None:
             return 1.0
-        return typical_sigma(self.keypoints.keypoints, self.keypoints.confidence)
+        return typical_sigma(self.keypoints)
 
 
 class ViewObservation(NamedTuple):
@@ -156,12 +154,11 @@ class Observer:
             keypoints: Whether keypoints count in this frame.
             stopwatch: Where the time of evaluations is added up.
         """
-        observation = self.keypoints_of(seen.frame, body) if keypoints else None
         return self.costs(
             seen.features,
             body=body,
             before=before,
-            observation=observation,
+            keypoints=self.keypoints_of(seen.frame, body) if keypoints else None,
             appearance=memory.appearance,
             background=memory.background,
             stopwatch=stopwatch,
@@ -190,37 +187,17 @@ class Observer:
             self.costs.learn_background(memory.background, seen.features, body, modes, weight),
         )
 
-    def keypoints_of(self, frame: Frame | None, body: BodyModel) -> JointObservation | None:
-        """The keypoints of a frame, in the features' pixels; None if there are none."""
+    def keypoints_of(self, frame: Frame | None, body: BodyModel) -> Keypoints | None:
+        """The body's keypoints of a frame, in the features' pixels; None if there are none."""
         known = self.view.keypoints
-        if known is None or frame is None or not 0 <= frame.index < len(known.keypoints):
+        if known is None or frame is None or not 0 <= frame.index < len(known.confidence):
             return None
         full = self.view.camera.image_size_wh
-        scaled = scale_keypoints(
-            known.keypoints[frame.index], full, self.extractor.working_shape(*full)
-        )
-        observation = JointObservation(
-            body.joint_names,
-            scaled.to(body.tie),
-            known.confidence[frame.index].to(body.tie),
-            known.joint_names,
-            relative_noise=self.relative_noise,
-        )
-        return None if observation.says_nothing else observation
-
-
-def scale_keypoints(
-    keypoints: Float[Tensor, "*t j 2"], full: tuple[int, int], working: tuple[int, int]
-) -> Float[Tensor, "*t j 2"]:
-    """Pixels of the full image to pixels of the working image (centres at integers).
-
-    Args:
-        keypoints: Pixels of the full image.
-        full: Its width and height.
-        working: Width and height of the working image.
-    """
-    factor = keypoints.new_tensor([working[0] / full[0], working[1] / full[1]])
-    return (keypoints + 0.5) * factor - 0.5
+        keypoints = known.at(frame.index).only(body.joint_names)
+        if keypoints.says_nothing:
+            return None
+        keypoints = keypoints.scaled(full, self.extractor.working_shape(*full)).to(body.tie)
+        return keypoints._replace(relative_noise=self.relative_noise)
 
 
 def _is_of_one_colour(image: np.ndarray) -> bool:

@@ -14,8 +14,9 @@ import torch
 
 from torchcss.errors import KeypointError
 from torchcss.io.keypoints.mediapipe import NAMES
-from torchcss.io.keypoints.read import Keypoints, read_keypoints
+from torchcss.io.keypoints.read import read_keypoints
 from torchcss.joint_names import ALIASES, JOINT_NAMES, canonical_joint_name
+from torchcss.types import Keypoints
 
 SIZE = (640, 480)
 FRAMES = 4
@@ -34,10 +35,10 @@ def read(path: Path | str, **options: Any) -> Keypoints:
 
 
 def check(found: Keypoints, triples: np.ndarray, layout: str, *, confidence: bool = True) -> None:
-    np.testing.assert_allclose(found.keypoints, triples[..., :2], atol=1e-6)
+    np.testing.assert_allclose(found.positions, triples[..., :2], atol=1e-6)
     if confidence:
         np.testing.assert_allclose(found.confidence, triples[..., 2], atol=1e-6)
-    names = [name if name in JOINT_NAMES else None for name in found.joint_names]
+    names = [name if name in JOINT_NAMES else None for name in found.names]
     assert names == list(ALIASES[layout])
 
 
@@ -96,7 +97,7 @@ def test_mediapipe_frames_without_a_person(tmp_path: Path) -> None:
         found = read(path, num_frames=3)
         assert found.confidence.bool().any(1).tolist() == [True, False, True]
     path.write_text(json.dumps([{"frame": 0, "landmarks": POSES[0]}]))
-    assert read(path, num_frames=3).keypoints.shape == (3, 33, 2)  # the end is often left out
+    assert read(path, num_frames=3).positions.shape == (3, 33, 2)  # the end is often left out
 
 
 def test_mediapipe_frames_that_count_from_one(tmp_path: Path) -> None:
@@ -205,9 +206,9 @@ def test_deeplabcut(tmp_path: Path) -> None:
     path = tmp_path / "videoDLC_resnet50.csv"
     path.write_text(deeplabcut({"one": marks}))
     found = read(path, num_frames=FRAMES)
-    np.testing.assert_allclose(found.keypoints, marks[..., :2])
+    np.testing.assert_allclose(found.positions, marks[..., :2])
     np.testing.assert_allclose(found.confidence, marks[..., 2])
-    assert found.joint_names == ("nose", "l_shoulder", "r_shoulder", "l_elbow", "tailbase")
+    assert found.names == ("nose", "l_shoulder", "r_shoulder", "l_elbow", "tailbase")
     assert any("tailbase" in line for line in found.report)
     # Labelled by hand: no likelihood, pictures' names for frames, gaps where nothing was marked.
     marks[2, 1] = np.nan
@@ -223,7 +224,7 @@ def test_deeplabcut_with_several_animals(tmp_path: Path) -> None:
     path = tmp_path / "multi.csv"
     path.write_text(deeplabcut({"individual1": other, "individual2": one}))
     found = read(path, num_frames=FRAMES)
-    np.testing.assert_allclose(found.keypoints, one[..., :2])
+    np.testing.assert_allclose(found.positions, one[..., :2])
     assert any("2 individuals" in line for line in found.report)
 
 
@@ -262,11 +263,11 @@ def test_human36m(tmp_path: Path) -> None:
     }
     path = archive(tmp_path / "data_2d_h36m_gt.npz", recordings)
     found = read(f"{path}#S9/Walking 1/1", num_frames=FRAMES)
-    np.testing.assert_allclose(found.keypoints, marks[..., :2] + 1, atol=1e-3)
+    np.testing.assert_allclose(found.positions, marks[..., :2] + 1, atol=1e-3)
     assert found.confidence.unique().tolist() == [1.0]
-    assert found.joint_names[:3] == ("HumanoidRoot", "r_hip", "r_knee")
+    assert found.names[:3] == ("HumanoidRoot", "r_hip", "r_knee")
     assert any("S9/Walking 1/1" in line for line in found.report)
-    assert read(f"{path}#S11").keypoints.shape == (FRAMES, 17, 2)
+    assert read(f"{path}#S11").positions.shape == (FRAMES, 17, 2)
     for selection, words in (
         ("", r"say which recording.*there are: S9, S11"),
         ("#S7", r"no subject 'S7'.*S9, S11"),
@@ -287,7 +288,7 @@ def test_videopose3d_of_a_single_video(tmp_path: Path) -> None:
     marks[1] = np.nan  # nobody found
     path = archive(tmp_path / "a.npz", {"film.mp4": {"custom": [marks[..., :2]]}}, "coco")
     found = read(path, num_frames=FRAMES)
-    assert found.joint_names == ALIASES["COCO-17"]
+    assert found.names == ALIASES["COCO-17"]
     assert found.confidence[:, 0].tolist() == [1.0, 0.0, 1.0, 1.0]
     assert "layout: COCO-17, as the file says" in found.report
 

@@ -22,8 +22,8 @@ def test_csv_with_and_without_heading(tmp_path: Path):
     for text in (rows, "joint,u,v,confidence\n" + rows):
         path.write_text(text)
         found = read_joints(path, image_size_wh=SIZE)
-        assert found.joint_names == ("l_wrist", "r_knee")
-        assert found.keypoints.tolist() == [[10.5, 20], [30, 40]]
+        assert found.names == ("l_wrist", "r_knee")
+        assert found.positions.tolist() == [[10.5, 20], [30, 40]]
         assert found.confidence.tolist() == [1, 0.5]
 
 
@@ -60,8 +60,8 @@ def test_other_csv_goes_to_its_reader(tmp_path: Path, text: str):
     path = tmp_path / "joints.csv"
     path.write_text(text)
     found = read_joints(path, image_size_wh=SIZE)
-    assert found.joint_names == ("l_hip", "r_knee")
-    assert found.keypoints.tolist() == [[100, 200], [300, 400]]
+    assert found.names == ("l_hip", "r_knee")
+    assert found.positions.tolist() == [[100, 200], [300, 400]]
     assert found.confidence.tolist() == [0.9, 0.5]
 
 
@@ -72,8 +72,8 @@ def test_csv_of_landmarks(tmp_path: Path, named: bool):
     rows = [f"{name if named else i},0.5,0.25,-0.1,0.8" for i, name in enumerate(NAMES)]
     path.write_text("\n".join(["landmark,x,y,z,visibility", *rows]))
     found = read_joints(path, image_size_wh=SIZE)
-    assert len(found.joint_names) == len(NAMES)
-    assert found.keypoints[found.joint_names.index("l_wrist")].tolist() == [319.5, 119.5]
+    assert len(found.names) == len(NAMES)
+    assert found.positions[found.names.index("l_wrist")].tolist() == [319.5, 119.5]
 
 
 def test_rows_of_joints_are_pixels(tmp_path: Path):
@@ -89,9 +89,9 @@ def test_mediapipe(tmp_path: Path):
         path = tmp_path / "pose.json"
         path.write_text(json.dumps(content))
         found = read_joints(path, image_size_wh=SIZE)
-        wrist = found.joint_names.index("l_wrist")
+        wrist = found.names.index("l_wrist")
         assert wrist == ALIASES["MediaPipe-33"].index("l_wrist")
-        np.testing.assert_allclose(found.keypoints[wrist], [319.5, 480 * wrist / 33 - 0.5])
+        np.testing.assert_allclose(found.positions[wrist], [319.5, 480 * wrist / 33 - 0.5])
         assert float(found.confidence[wrist]) == 0.9
     for spoilt in (
         rows[:5],
@@ -107,10 +107,10 @@ def test_other_formats_go_to_their_reader(tmp_path: Path):
     path = tmp_path / "clicked.json"
     path.write_text(json.dumps({"joints": {"l_wrist": [100, 200], "r_hip": [150, 220, 0.7]}}))
     found = read_joints(path, image_size_wh=SIZE)
-    assert found.joint_names == ("l_wrist", "r_hip")
+    assert found.names == ("l_wrist", "r_hip")
     person = np.tile([[320.0, 240.0, 1.0]], (25, 1)) + np.arange(25)[:, None] * [[3, 4, 0]]
     path.write_text(json.dumps({"people": [{"pose_keypoints_2d": person.flatten().tolist()}]}))
-    assert "l_wrist" in read_joints(path, image_size_wh=SIZE, layout="BODY_25").joint_names
+    assert "l_wrist" in read_joints(path, image_size_wh=SIZE, layout="BODY_25").names
 
 
 def test_coco_detections_of_a_picture_with_any_number(tmp_path: Path):
@@ -120,8 +120,8 @@ def test_coco_detections_of_a_picture_with_any_number(tmp_path: Path):
     for number in (0, 1, 785, "000785.jpg"):
         path.write_text(json.dumps([{**row, "image_id": number}]))
         found = read_joints(path, image_size_wh=SIZE)
-        wrist = found.joint_names.index("l_wrist")
-        assert found.keypoints[wrist].tolist() == person[wrist, :2].tolist()
+        wrist = found.names.index("l_wrist")
+        assert found.positions[wrist].tolist() == person[wrist, :2].tolist()
     path.write_text(json.dumps([{**row, "image_id": number} for number in (1, 2)]))
     with pytest.raises(KeypointError, match="nobody in the first frame"):
         read_joints(path, image_size_wh=SIZE)

@@ -13,8 +13,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from torchcss.errors import KeypointError
-from torchcss.io.keypoints.read import Keypoints, read_keypoints
+from torchcss.io.keypoints.read import read_keypoints
 from torchcss.joint_names import ALIASES, JOINT_NAMES
+from torchcss.types import Keypoints
 
 SIZE = (640, 480)
 
@@ -79,11 +80,11 @@ def read(path: Path, **options: Any) -> Keypoints:
 def check(found: Keypoints, frames: list[np.ndarray], layout: str) -> None:
     """Compare what was read with what was written."""
     triples = torch.from_numpy(np.stack(frames))
-    torch.testing.assert_close(found.keypoints, triples[..., :2])
+    torch.testing.assert_close(found.positions, triples[..., :2])
     torch.testing.assert_close(found.confidence, triples[..., 2])
     expected = ALIASES[layout]
-    assert [name if name in JOINT_NAMES else None for name in found.joint_names] == list(expected)
-    assert len(set(found.joint_names)) == len(expected)
+    assert [name if name in JOINT_NAMES else None for name in found.names] == list(expected)
+    assert len(set(found.names)) == len(expected)
     assert all("\n" not in line for line in found.report)
 
 
@@ -126,9 +127,9 @@ def test_detections_with_feet(tmp_path: Path, layout: str) -> None:
     path = write_json(tmp_path / "a.json", detections([[p] for p in frames], "{}.jpg"))
     found = read(path, num_frames=5)
     check(found, frames, layout)
-    assert found.joint_names[:17] == ALIASES["COCO-17"]
-    assert found.joint_names[17:22] == ("skull_tip", "vc7", "HumanoidRoot", "l_toe", "r_toe")
-    assert found.joint_names[24:26] == ("l_heel", "r_heel")
+    assert found.names[:17] == ALIASES["COCO-17"]
+    assert found.names[17:22] == ("skull_tip", "vc7", "HumanoidRoot", "l_toe", "r_toe")
+    assert found.names[24:26] == ("l_heel", "r_heel")
 
 
 def test_detections_that_count_from_one(tmp_path: Path) -> None:
@@ -142,7 +143,7 @@ def test_frames_without_detection_are_missing(tmp_path: Path) -> None:
     path = write_json(tmp_path / "a.json", detections([[frames[0]], [], [], [frames[3]], []]))
     found = read(path, num_frames=5)
     assert found.confidence.bool().any(1).tolist() == [True, False, False, True, False]
-    assert not found.keypoints[1].any()
+    assert not found.positions[1].any()
 
 
 def test_annotations(tmp_path: Path) -> None:
@@ -163,7 +164,7 @@ def test_annotations(tmp_path: Path) -> None:
         ] + [{"image_id": 90, "bbox": [0, 0, 1, 1]}],
     }  # fmt: skip
     found = read(write_json(tmp_path / "a.json", content), num_frames=5)
-    torch.testing.assert_close(found.keypoints[4], torch.from_numpy(frames[4][:, :2]))
+    torch.testing.assert_close(found.positions[4], torch.from_numpy(frames[4][:, :2]))
     assert found.confidence[0, 0] == 1.0
     assert found.confidence[1, 3] == 0.0
     assert found.confidence[2, 4] == 0.5
@@ -175,7 +176,7 @@ def test_arrays_by_name_and_by_count(tmp_path: Path) -> None:
     names = np.array([name or f"odd{i}" for i, name in enumerate(ALIASES["BODY_25B"])])
     named = read(write_npz(tmp_path / "a.npz", frames, joint_names=names), num_frames=5)
     check(named, frames, "BODY_25B")
-    assert "odd20" in named.joint_names
+    assert "odd20" in named.names
     assert any("odd20" in line for line in named.report)
     check(read(write_npz(tmp_path / "b.npz", frames)), frames, "BODY_25B")
     no_confidence = write_npz(tmp_path / "c.npz", frames, confidence=None)
@@ -195,17 +196,17 @@ def test_clicked_joints(tmp_path: Path) -> None:
     }
     path = write_json(tmp_path / "a.json", content)
     found = read(path, num_frames=3)
-    assert found.joint_names == ("r_shoulder", "r_elbow")
-    assert found.keypoints[0].tolist() == [[10, 20], [30, 40]]
+    assert found.names == ("r_shoulder", "r_elbow")
+    assert found.positions[0].tolist() == [[10, 20], [30, 40]]
     assert found.confidence.tolist() == [[1.0, 0.5], [0, 0], [0, 0]]
-    assert read(path).keypoints.shape == (1, 2, 2)
+    assert read(path).positions.shape == (1, 2, 2)
 
 
 def test_clicked_joints_of_some_frames(tmp_path: Path) -> None:
     content = {"frames": {"2": {"l_wrist": [7, 8]}, "4": {"joints": {"l_elbow": [9, 10]}}}}
     path = write_json(tmp_path / "a.json", content)
     found = read(path, num_frames=6, first_frame=2)
-    assert found.joint_names == ("l_wrist", "l_elbow")
+    assert found.names == ("l_wrist", "l_elbow")
     assert found.confidence.nonzero().tolist() == [[2, 0], [4, 1]]
     with pytest.raises(KeypointError, match=r"nobody in the first frame .0.*is 2"):
         read(path, num_frames=6)
@@ -235,7 +236,7 @@ def test_a_bystander_does_not_take_over(tmp_path: Path) -> None:
     frames[5] = []
     found = read(write_openpose(tmp_path / "pose", frames))
     assert found.confidence.bool().any(1).tolist() == [True] * 3 + [False] * 3 + [True] * 2
-    torch.testing.assert_close(found.keypoints[7], torch.from_numpy(actor[7][:, :2]))
+    torch.testing.assert_close(found.positions[7], torch.from_numpy(actor[7][:, :2]))
     assert any("3 frames" in line for line in found.report)
 
 
@@ -245,7 +246,7 @@ def test_starts_in_the_first_frame_asked_for(tmp_path: Path) -> None:
     frames = [[one[index] * (1, 1, 0.1), other[index]] for index in range(2)]
     frames += [[other[index], one[index]] for index in range(2, 5)]
     found = read(write_openpose(tmp_path / "pose", frames), first_frame=2)
-    np.testing.assert_allclose(found.keypoints, np.stack(one)[..., :2])
+    np.testing.assert_allclose(found.positions, np.stack(one)[..., :2])
     assert any("frame 2" in line for line in found.report)
 
 
@@ -266,7 +267,7 @@ def test_missing_joints_may_be_nan(tmp_path: Path) -> None:
     frames[2][5] = (np.nan, np.nan, 0.0)
     found = read(write_npz(tmp_path / "a.npz", frames))
     assert found.confidence[2, 5] == 0.0
-    assert found.keypoints.isfinite().all()
+    assert found.positions.isfinite().all()
 
 
 @pytest.mark.parametrize("bad", [(np.nan, 1.0, 0.5), (1.0, np.inf, 1.0), (1.0, 1.0, np.nan)])
@@ -514,7 +515,7 @@ def only_keypoint_errors(path: Path, **options: Any) -> None:
     except KeypointError as error:
         message = str(error)
     else:
-        assert found.keypoints.isfinite().all()
+        assert found.positions.isfinite().all()
         message = ""
     assert "\n" not in message
 
@@ -611,11 +612,11 @@ def test_real_files(
     with np.load(path) as archive:
         confident = archive["confidence"] > 0
         np.testing.assert_array_equal(
-            found.keypoints.numpy()[confident], archive["keypoints"][confident]
+            found.positions.numpy()[confident], archive["keypoints"][confident]
         )
         np.testing.assert_array_equal(found.confidence, archive["confidence"])
-    assert sum(name in JOINT_NAMES for name in found.joint_names) == known
-    assert {"l_wrist", "r_ankle", "vc7", "skull_tip"} <= set(found.joint_names)
+    assert sum(name in JOINT_NAMES for name in found.names) == known
+    assert {"l_wrist", "r_ankle", "vc7", "skull_tip"} <= set(found.names)
 
 
 def test_real_body_25b_as_openpose_writes_it(shared_data: Path, tmp_path: Path) -> None:
@@ -627,6 +628,6 @@ def test_real_body_25b_as_openpose_writes_it(shared_data: Path, tmp_path: Path) 
     found = read(folder, image_size_wh=(1080, 1920), num_frames=100)
     named = read(path, image_size_wh=(1080, 1920))
     assert any("BODY_25B" in line for line in found.report)
-    torch.testing.assert_close(found.keypoints, named.keypoints)
-    places = [i for i, name in enumerate(named.joint_names) if name in JOINT_NAMES]
-    assert all(found.joint_names[i] == named.joint_names[i] for i in places)
+    torch.testing.assert_close(found.positions, named.positions)
+    places = [i for i, name in enumerate(named.names) if name in JOINT_NAMES]
+    assert all(found.names[i] == named.names[i] for i in places)

@@ -17,32 +17,14 @@ import math
 import os
 import re
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from torchcss.errors import KeypointError
 from torchcss.files import load_json
 from torchcss.io.keypoints.read import Scale, read_keypoints
 from torchcss.joint_names import ALIASES, JOINT_NAMES, canonical_joint_name
-
-
-class Joints(NamedTuple):
-    """Marked joints of one person in one picture.
-
-    Attributes:
-        keypoints: Pixels.
-        confidence: From 0, missing, to 1.
-        joint_names: The catalogue's names where it has one.
-        report: What was recognised, one line each.
-    """
-
-    keypoints: Float[Tensor, "j 2"]
-    confidence: Float[Tensor, " j"]
-    joint_names: tuple[str, ...]
-    report: tuple[str, ...]
+from torchcss.types import Keypoints
 
 
 def read_joints(
@@ -52,7 +34,7 @@ def read_joints(
     layout: str | None = None,
     normalised: bool | Scale = False,
     frame: int = 0,
-) -> Joints:
+) -> Keypoints:
     """Read the joints of one picture.
 
     Args:
@@ -85,10 +67,9 @@ def read_joints(
         if isinstance(content, dict) and content.keys() & {"joints", "people"}:
             frame = 0
         frame = _frame_of_single_image(content, frame)
-    marks = read_keypoints(
+    return read_keypoints(
         path, image_size_wh=image_size_wh, layout=layout, normalised=normalised, first_frame=frame
-    )
-    return Joints(marks.keypoints[frame], marks.confidence[frame], marks.joint_names, marks.report)
+    ).at(frame)
 
 
 def _frame_of_single_image(content: object, otherwise: int) -> int:
@@ -130,7 +111,7 @@ def _are_joints(rows: list[list[str]]) -> bool:
     return any(canonical_joint_name(row[0]) for row in rows[1:])
 
 
-def _read_csv(path: Path, rows: list[list[str]]) -> Joints:
+def _read_csv(path: Path, rows: list[list[str]]) -> Keypoints:
     table: dict[str, list[float]] = {}
     for number, row in enumerate(rows):
         where = f"{path}: row {number + 1}"
@@ -157,15 +138,15 @@ def _read_csv(path: Path, rows: list[list[str]]) -> Joints:
     if not table:
         raise KeypointError(f"{path}: no joints; expected rows joint, u, v[, confidence]")
     numbers = torch.tensor(list(table.values()), dtype=torch.float64)
-    return Joints(
+    return Keypoints(
         numbers[:, :2],
         numbers[:, 2].clamp(0, 1),
         tuple(table),
-        (f"format: CSV, {len(table)} joints",),
+        report=(f"format: CSV, {len(table)} joints",),
     )
 
 
-def _read_mediapipe(path: Path, rows: list, image_size_wh: tuple[int, int]) -> Joints:
+def _read_mediapipe(path: Path, rows: list, image_size_wh: tuple[int, int]) -> Keypoints:
     layout = ALIASES["MediaPipe-33"]
     if len(rows) != len(layout):
         raise KeypointError(f"{path}: expected {len(layout)} landmarks, found {len(rows)}")
@@ -182,4 +163,4 @@ def _read_mediapipe(path: Path, rows: list, image_size_wh: tuple[int, int]) -> J
     # Fractions of the image's sides, from its corner; pixel centres are at integers.
     uv = numbers[:, :2] * numbers.new_tensor(image_size_wh) - 0.5
     names = tuple(name or f"MediaPipe-33[{i}]" for i, name in enumerate(layout))
-    return Joints(uv, numbers[:, 2].clamp(0, 1), names, ("format: MediaPipe landmarks",))
+    return Keypoints(uv, numbers[:, 2].clamp(0, 1), names, report=("format: MediaPipe landmarks",))

@@ -24,12 +24,10 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from torchcss.errors import KeypointError
 from torchcss.files import load_array, load_arrays, load_json, shortened
@@ -48,6 +46,7 @@ from torchcss.io.keypoints.openpose import openpose_people, read_openpose_folder
 from torchcss.io.keypoints.people import People
 from torchcss.io.keypoints.tables import read_table
 from torchcss.joint_names import ALIASES, JOINT_NAMES, layout_of_names
+from torchcss.types import Keypoints
 
 Scale = Literal["pixels", "zero-one", "plus-minus-one"]
 """What the coordinates of a file count: pixels, or fractions of the image from 0 or -1 to 1."""
@@ -69,22 +68,6 @@ _OUTSIDE = 3.0
 
 _INSIDE_SHARE = 0.1
 """Least share of the confident joints that must lie inside the image."""
-
-
-class Keypoints(NamedTuple):
-    """The joints of one person in an image sequence.
-
-    Attributes:
-        keypoints: Pixels (centres at integers); (0, 0) where the confidence is 0.
-        confidence: From 0, missing, to 1.
-        joint_names: The catalogue's names, the file's own for a place that has none.
-        report: What was recognised, chosen or corrected, one line each.
-    """
-
-    keypoints: Float[Tensor, "t j 2"]
-    confidence: Float[Tensor, "t j"]
-    joint_names: tuple[str, ...]
-    report: tuple[str, ...]
 
 
 def read_keypoints(
@@ -143,9 +126,12 @@ def read_keypoints(
     _check_places(path, people, image_size_wh)
     chosen = follow(people, first_frame, report)
     names = _joint_names(path, people, chosen, layout or people.layout, report)
-    keypoints = np.where(chosen[..., 2:] > 0.0, chosen[..., :2], 0.0)
+    positions = np.where(chosen[..., 2:] > 0.0, chosen[..., :2], 0.0)
     return Keypoints(
-        torch.from_numpy(keypoints), torch.from_numpy(chosen[..., 2].copy()), names, tuple(report)
+        torch.from_numpy(positions),
+        torch.from_numpy(chosen[..., 2].copy()),
+        names,
+        report=tuple(report),
     )
 
 

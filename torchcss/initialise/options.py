@@ -1,0 +1,67 @@
+"""What can be chosen about an initialisation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+
+from torchcss.cost.anthropometric import Anthropometric
+from torchcss.cost.joints import JointTerm
+from torchcss.cost.total import CostChoice
+from torchcss.errors import ConfigurationError
+from torchcss.initialise.multi_start import Search
+from torchcss.robust import Lorentzian
+
+LEAST_JOINTS = 3
+"""Fewer joints than this fix neither depth nor direction of a body."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class InitialiseOptions:
+    """How a first pose is found.
+
+    Attributes:
+        sigma: Noise of a wrist's keypoint, pixels; None: 0.6 % of the person's size.
+        stature: Height of the standing person, metres, where it is known.
+        num_modes: Most hypotheses; 1 for the best alone, None for all.
+        least_joints: Fewest joints of the body that have to be known; with fewer than
+            `LEAST_JOINTS` much stays at its prior.
+        contours: Run the second and third stage on the picture's contours.
+        colours: Let them see the colours on either side too.
+        working_size: Longer side of the picture on which contours are searched.
+        search: How widely poses are looked for.
+        potential_kind: Robust potential of the keypoints.
+        dtype: Type of the body.
+        device: Where to compute.
+    """
+
+    sigma: float | None = None
+    stature: float | None = None
+    num_modes: int | None = 8
+    least_joints: int = 1
+    contours: bool = True
+    colours: bool = True
+    working_size: int = 640
+    search: Search = field(default_factory=Search)
+    potential_kind: type = Lorentzian
+    dtype: torch.dtype = torch.float64
+    device: torch.device | str = "cpu"
+
+    def __post_init__(self) -> None:
+        if self.num_modes is not None and self.num_modes < 1:
+            raise ConfigurationError(
+                f"expected at least 1 hypothesis to be kept, got {self.num_modes}"
+            )
+
+    @property
+    def joint_choice(self) -> CostChoice:
+        """Terms of the first stage: keypoints of known noise, and the priors of a single image."""
+        assert self.sigma is not None
+        known = self.stature is not None
+        return CostChoice(
+            contour=None,
+            joints=JointTerm(sigma=self.sigma, potential_kind=self.potential_kind),
+            temporal=None,
+            anthropometric=Anthropometric(stature=0.0) if known else Anthropometric(),
+        )
