@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,6 +13,10 @@ import torch
 from torchcss.body.model import BodyModel
 from torchcss.errors import TrackFileError
 from torchcss.files import load_arrays
+from torchcss.io.export import Export, ExportOptions, export
+from torchcss.io.export.bvh import BvhStyle
+from torchcss.io.export.selection import SelectionChoice
+from torchcss.io.run import Run
 from torchcss.io.tracks import FrameModes, Track, TrackWriter, save_track
 
 BEAM_UP = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)
@@ -73,3 +78,12 @@ def save_v01_track(path: Path, track: Track) -> None:
     for name in ("body", "cameras", "settings"):
         del arrays[name]
     np.savez(path, **(arrays | {"schema_version": np.array(1)}))
+
+
+def export_as(
+    run: Run | Track | Path, to: str, out: Path | None = None, *, frame: Any = None, **options: Any
+) -> Export:
+    """Export with the options of all choices side by side."""
+    bvh = {name: options.pop(name) for name in list(options) if hasattr(BvhStyle, name)}
+    choice = ExportOptions(selection=SelectionChoice(**options), frame=frame, bvh=BvhStyle(**bvh))
+    return export(run, out, to=to, options=choice)

@@ -14,12 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from made_tracks import make_track
+from made_tracks import export_as, make_track
 from matplotlib.figure import Figure
 
 import torchcss.files
-from torchcss import export_track
-from torchcss.app.smooth import smooth_file
+from torchcss.app.smooth import smooth
 from torchcss.body.load import load_body
 from torchcss.errors import OutputError, TorchcssError
 from torchcss.inference.mixture import GaussianMixture
@@ -80,7 +79,7 @@ def figure(path: Path) -> None:
 
 def exported(kind: str) -> Callable[[Path], None]:
     def write(path: Path) -> None:
-        export_track(make_track(BODY, (1, 1, 1)), to=kind, out=path, body=BODY)
+        export_as(make_track(BODY, (1, 1, 1)), to=kind, out=path)
 
     write.__name__ = kind
     return write
@@ -214,7 +213,7 @@ def test_smoothing_that_fails_leaves_the_older_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     save_track(tmp_path / "track.npz", make_track(BODY, (2, 2, 2, 2)))
-    smooth_file(tmp_path)
+    smooth(tmp_path)
     before = (tmp_path / "smooth.npz").read_bytes()
 
     def refuse(*_: object) -> None:
@@ -222,5 +221,5 @@ def test_smoothing_that_fails_leaves_the_older_file(
 
     monkeypatch.setattr(torchcss.files.os, "replace", refuse)
     with pytest.raises(TorchcssError, match="disk is full"):
-        smooth_file(tmp_path)
+        smooth(tmp_path)
     assert (tmp_path / "smooth.npz").read_bytes() == before

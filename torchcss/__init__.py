@@ -5,20 +5,26 @@ of poses with covariances and weights (covariance scaled sampling, Sminchisescu 
 2003). Start with `load_body`, `track_video` and `load_track`.
 """
 
-from torchcss.app.smooth import smooth_file, smooth_video
+from torchcss.app.smooth import smooth
 from torchcss.app.track import track_video
-from torchcss.app.v01 import track_frames
+from torchcss.app.v01 import (
+    export_track,
+    smooth_file,
+    smooth_track,
+    smooth_video,
+    track_frames,
+)
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.initialise.fit import initialise
 from torchcss.initialise.options import InitialiseOptions
 from torchcss.initialise.result import Initialisation
-from torchcss.io.export import export_track
+from torchcss.io.export import export
+from torchcss.io.run import Run
 from torchcss.io.tracks import Track, load_track
 from torchcss.solve.inverse_kinematics import Solutions, inverse_kinematics
 from torchcss.tracking.session import Observation, Posterior, TrackingSession
 from torchcss.tracking.settings import Settings
-from torchcss.tracking.smooth import smooth_track
 from torchcss.tracking.view import CameraView
 from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
@@ -32,15 +38,18 @@ __all__ = [
     "Keypoints",
     "Observation",
     "Posterior",
+    "Run",
     "Settings",
     "Solutions",
     "Track",
     "TrackingSession",
+    "export",
     "export_track",
     "initialise",
     "inverse_kinematics",
     "load_body",
     "load_track",
+    "smooth",
     "smooth_file",
     "smooth_track",
     "smooth_video",

@@ -13,8 +13,9 @@ from types import ModuleType
 import numpy as np
 import pytest
 import torch
+from made_tracks import export_as
 
-from torchcss import export_track, load_body
+from torchcss import load_body
 from torchcss.errors import ConfigurationError, MotionCaptureError, OutputError
 from torchcss.io.motion.positions import LIMBS
 from torchcss.io.tracks import FrameModes, Track, TrackWriter
@@ -57,7 +58,7 @@ def motion(tmp_path_factory: pytest.TempPathFactory) -> Path:
             )
         )
     folder = tmp_path_factory.mktemp("motion")
-    done = export_track(writer.track(), to="bvh", out=folder, frame="world", body=body)
+    done = export_as(writer.track(), to="bvh", out=folder, frame="world")
     return done.paths[0]
 
 

@@ -67,7 +67,7 @@ def test_joints_in_the_world_and_as_the_camera_sees_them(track: Track, body: Bod
     deviation = np.sqrt(spread[:, wrist, 2, 2])
 
     world = joints_figure(track, joints=["r_elbow", "r_wrist"]).axes
-    seen = joints_figure(track, body, camera=camera, joints=["r_elbow", "r_wrist"]).axes
+    seen = joints_figure(track, camera=camera, joints=["r_elbow", "r_wrist"]).axes
     assert [axes.get_title() for axes in seen[:3]] == [
         "to the right (metres)", "up (metres)", "away from the camera (metres)"
     ]  # fmt: skip

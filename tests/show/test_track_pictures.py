@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,14 @@ from made_tracks import make_track
 
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
-from torchcss.errors import CameraError, ConfigurationError, TrackFileError, VideoError
+from torchcss.errors import CameraError, TrackFileError, VideoError
 from torchcss.io.cameras import camera_entry
+from torchcss.io.run import Given, Run
 from torchcss.io.tracks import TRACK_NAME, Track, save_track, write_summary
 from torchcss.io.video import VideoWriter
-from torchcss.show.track_pictures import TrackFiles, pictures_of
+from torchcss.io.view_files import RecordedCamera, ViewFiles
+from torchcss.show.posterior_plots import plot_track
+from torchcss.show.track_pictures import has_pictures, pictures_of
 from torchcss.studies.render.sequences import look_at
 from torchcss.vision.camera import Camera
 
@@ -49,17 +53,15 @@ def folder(tmp_path: Path, track: Track, camera: Camera) -> Path:
     return tmp_path
 
 
-def test_the_overlay_of_a_run_is_counted_as_the_track(folder: Path, track: Track) -> None:
-    files = TrackFiles.find(folder)
-    assert files.path == folder / TRACK_NAME
-    assert files.has_pictures
-    found = {row: image.mean() for row, image in pictures_of(files, [0, 2])}
+def test_the_overlay_of_a_run_is_counted_as_the_track(folder: Path) -> None:
+    run = Run.open(folder)
+    assert has_pictures(run)
+    found = {row: image.mean() for row, image in pictures_of(run, [0, 2])}
     assert found == {0: pytest.approx(40, abs=4), 2: pytest.approx(200, abs=4)}
 
 
-def test_the_summary_holds_the_camera(folder: Path, camera: Camera) -> None:
-    found = TrackFiles.find(folder).camera
-    assert found is not None
+def test_the_summary_of_an_old_run_holds_the_camera(folder: Path, camera: Camera) -> None:
+    found = Run.open(folder).camera
     torch.testing.assert_close(found.K, camera.K)
     torch.testing.assert_close(found.R_camera_world, camera.R_camera_world)
     torch.testing.assert_close(found.t_camera_world, camera.t_camera_world)
@@ -69,8 +71,8 @@ def test_the_summary_holds_the_camera(folder: Path, camera: Camera) -> None:
 def test_modes_are_drawn_over_the_video_where_they_are(
     folder: Path, track: Track, camera: Camera
 ) -> None:
-    files = TrackFiles.find(folder, video=folder / "video.mp4")
-    pictures = dict(pictures_of(files, range(3)))
+    run = Run.open(folder, Given(video=folder / "video.mp4"))
+    pictures = dict(pictures_of(run, range(3), anew=True))
     assert list(pictures) == [0, 1, 2]
     for row, image in pictures.items():
         # The line of text stands in the lower left corner.
@@ -83,34 +85,37 @@ def test_modes_are_drawn_over_the_video_where_they_are(
         assert changed[v - 2 : v + 3, u - 2 : u + 3].any()
 
 
-def test_a_smoothed_track_does_not_take_the_trackers_overlay(folder: Path) -> None:
-    files = TrackFiles.find(folder / "smooth.npz")
-    assert not files.has_pictures
-    assert list(pictures_of(files, range(3))) == []
-    drawn = TrackFiles.find(folder / "smooth.npz", video=folder / "video.mp4")
-    assert len(list(pictures_of(drawn, range(3)))) == 3
+def test_a_smoothed_track_is_drawn_over_the_video_that_the_run_knows(
+    folder: Path, track: Track, camera: Camera
+) -> None:
+    run = Run.open(folder / "smooth.npz")
+    assert not has_pictures(run)
+    assert list(pictures_of(run, range(3))) == []
+    files = ViewFiles(video=folder / "video.mp4", keypoints=None)
+    known = track._replace(cameras=(RecordedCamera(camera, files),))
+    save_track(folder / "smooth.npz", known)
+    assert len(list(pictures_of(Run.open(folder / "smooth.npz"), range(3)))) == 3
+    (folder / "video.mp4").unlink()
+    assert not has_pictures(Run.open(folder / "smooth.npz"))
 
 
 def test_a_track_alone_is_enough(folder: Path) -> None:
     for name in ("summary.json", "overlay.mp4"):
         (folder / name).unlink()
-    files = TrackFiles.find(folder)
-    assert files.camera is None
-    assert files.summary == {}
-    assert not files.has_pictures
-    with pytest.raises(ConfigurationError, match="give --camera"):
-        TrackFiles.find(folder, video=folder / "video.mp4")
+    run = Run.open(folder)
+    assert (run.cameras, run.summary, has_pictures(run)) == ((), {}, False)
+    with pytest.raises(TrackFileError, match="--camera"):
+        Run.open(folder, Given(video=folder / "video.mp4"))
 
 
-def test_what_does_not_belong_together(
-    folder: Path, body: BodyModel, camera: Camera, track: Track
-) -> None:
-    short = TrackFiles.find(folder, video=folder / "overlay.mp4")
+def test_what_does_not_belong_together(folder: Path, body: BodyModel, camera: Camera) -> None:
+    short = Run.open(folder, Given(video=folder / "overlay.mp4"))
     with pytest.raises(VideoError, match="1 frames of the track are missing"):
-        list(pictures_of(short, range(3)))
-    other = short._replace(camera=camera.resized(96, 72))
+        list(pictures_of(short, range(3), anew=True))
+    small = RecordedCamera(camera.resized(96, 72), short.cameras[0].files)
+    other = replace(short, track=short.track._replace(cameras=(small,)))
     with pytest.raises(CameraError, match="96 x 72"):
-        list(pictures_of(other, range(3)))
+        list(pictures_of(other, range(3), anew=True))
     save_track(folder / TRACK_NAME, make_track(body, ()))
     with pytest.raises(TrackFileError, match="no frames"):
-        TrackFiles.find(folder)
+        plot_track(Run.open(folder))

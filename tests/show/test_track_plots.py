@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from made_tracks import make_track
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
@@ -169,5 +168,5 @@ def test_a_contact_sheet_of_an_overlay_counts_as_the_track_does(
 
 def test_a_body_of_ones_own(body: BodyModel) -> None:
     track = make_track(body)
-    figure = track_plots.side_view_figure(track, 0, body=body.to(dtype=torch.float32))
+    figure = track_plots.side_view_figure(track, 0)
     assert len(legend(figure)) == 2

@@ -18,14 +18,15 @@ from torchcss.body.model import BodyModel
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.cli import main as cli
 from torchcss.errors import ConfigurationError, MissingExtraError, OutputError
+from torchcss.io.run import Run
 from torchcss.io.track_body import pose_track
 from torchcss.io.tracks import TRACK_NAME, Track, save_track, write_summary
 from torchcss.io.video import VideoWriter
+from torchcss.io.view_files import RecordedCamera
 from torchcss.show import viewer
 from torchcss.show.overlay import PALETTE
-from torchcss.show.track_pictures import TrackFiles
 from torchcss.show.track_plots import bones_of, count_apart, effective_number
-from torchcss.show.view_track import posed_frames, view_track
+from torchcss.show.viewer import posed_frames, view_track
 from torchcss.show.viewer_layout import _eye, layout, world_axes
 from torchcss.studies.render.sequences import look_at
 from torchcss.vision.camera import Camera
@@ -33,11 +34,10 @@ from torchcss.vision.camera import Camera
 EVENTS = [{"event": "lost", "frame": 11}, {"event": "found", "frame": 12}]
 
 
-def files_of(track: Track, body: BodyModel, camera: Camera | None, overlay: Path | None = None):
-    return TrackFiles(
-        path=Path("run/track.npz"), track=track, body=body, summary={"events": EVENTS},
-        camera=camera, video=None, overlay=overlay,
-    )  # fmt: skip
+def run_of(track: Track, camera: Camera | None, folder: Path = Path("run")) -> Run:
+    cameras = () if camera is None else (RecordedCamera(camera),)
+    track = track._replace(cameras=cameras)
+    return Run(path=folder / TRACK_NAME, track=track, summary={"events": EVENTS})
 
 
 @pytest.fixture(scope="module")
@@ -56,14 +56,12 @@ def track(body: BodyModel) -> Track:
 
 
 @pytest.fixture(scope="module")
-def files(
-    track: Track, body: BodyModel, camera: Camera, tmp_path_factory: pytest.TempPathFactory
-) -> TrackFiles:
-    overlay = tmp_path_factory.mktemp("made") / "overlay.mp4"
-    with VideoWriter(overlay, 25) as film:
+def run(track: Track, camera: Camera, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    folder = tmp_path_factory.mktemp("run")
+    with VideoWriter(folder / "overlay.mp4", 25) as film:
         for level in (40, 120, 200):
             film.write(np.full((48, 64, 3), level, np.uint8))
-    return files_of(track, body, camera, overlay)
+    return run_of(track, camera, folder)
 
 
 Rows = dict[str, dict[int | None, dict[str, Any]]]
@@ -87,10 +85,10 @@ def read(path: Path) -> Rows:
 
 
 @pytest.fixture(scope="module")
-def rows(files: TrackFiles, tmp_path_factory: pytest.TempPathFactory) -> Rows:
+def rows(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Rows:
     pytest.importorskip("rerun")
     path = tmp_path_factory.mktemp("saved") / "deep" / "track.rrd"
-    view_track(files, save=path)
+    view_track(run, save=path)
     return read(path)
 
 
@@ -219,7 +217,7 @@ def test_large_pictures_are_reduced_with_their_camera(
 ) -> None:
     package = pytest.importorskip("rerun")
     large = look_at((0.3, -1.0, 5.0), (0.3, -1.0, 0.0), focal_px=3000, image_size_wh=(2560, 1440))
-    frame = next(posed_frames(files_of(track, body, large)))
+    frame = next(posed_frames(run_of(track, large)))
     frame = frame._replace(picture=np.zeros((1440, 2560, 3), np.uint8))
     recording = viewer.open_recording("large", save=tmp_path / "large.rrd")
     viewer.Viewer(recording, body, camera=large).add(frame)
@@ -261,11 +259,11 @@ def test_ellipsoids_of_mirrored_and_flat_covariances() -> None:
 
 
 def test_without_rerun_the_error_says_what_to_install(
-    files: TrackFiles, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(MissingExtraError, match=r'pip install "torchcss\[viewer\]"'):
-        view_track(files, save=tmp_path / "track.rrd")
+        view_track(run, save=tmp_path / "track.rrd")
     assert not list(tmp_path.iterdir())
 
 
@@ -278,11 +276,11 @@ def no_display(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("no_display")
-def test_without_a_display_only_recordings(files: TrackFiles, tmp_path: Path) -> None:
+def test_without_a_display_only_recordings(run: Run, tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match=r"no display.*rerun FILE\.rrd"):
-        view_track(files)
+        view_track(run)
     with pytest.raises(ConfigurationError, match="not the address of a viewer"):
-        view_track(files, connect="here")
+        view_track(run, connect="here")
 
 
 def test_a_recording_that_cannot_be_written(tmp_path: Path) -> None:

@@ -15,10 +15,10 @@ from torchcss.app.track import track_video
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.errors import CameraError, VideoError
 from torchcss.io.cameras import read_camera
+from torchcss.io.run import Given, Run
 from torchcss.io.tracks import load_track
 from torchcss.io.video import VideoWriter
 from torchcss.io.view_files import ViewFiles
-from torchcss.show.track_pictures import TrackFiles
 from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
 from torchcss.tracking.session import Posterior
 from torchcss.tracking.settings import Settings
@@ -170,10 +170,10 @@ def test_from_files(folder: Path, tmp_path: Path, sequence: SyntheticSequence):
         given = read_camera(folder / "cameras.json", camera_name=name).camera
         for part in ("K", "R_camera_world", "t_camera_world"):
             torch.testing.assert_close(getattr(known, part), getattr(given, part))
-    shown = TrackFiles.find(tmp_path).camera
+    shown = Run.open(tmp_path).camera
     assert shown is not None
     assert shown.name == "front"
-    over = TrackFiles.find(tmp_path, video=folder / "side.mp4").camera
+    over = Run.open(tmp_path, Given(video=folder / "side.mp4")).camera
     assert over is not None
     assert over.name == "side"
     assert any("2 views set the scale" in note for note in summary["notes"])

@@ -12,9 +12,8 @@ import torch
 from made_clip import track
 from made_tracks import make_track
 
-import torchcss
 from torchcss import load_body, load_track
-from torchcss.app.smooth import smooth_file
+from torchcss.app.smooth import smooth
 from torchcss.body.model import BodyModel
 from torchcss.body.root import move_base
 from torchcss.cli import main as cli
@@ -109,7 +108,7 @@ def body() -> BodyModel:
 
 def test_smoothing_takes_the_other_mode_and_the_noise_away(body: BodyModel):
     track, truth = noisy_track(body)
-    done = smooth_track(track, choice=Smoothing(evidence=0.5, persistence=2.0))
+    done = smooth_track(track, choice=Smoothing(likelihood_power=0.5, persistence=2.0))
     # Every fifth frame's best mode was the other pose.
     right = [1 if index % 5 == 2 else 0 for index in range(30)]
     assert done.modes.tolist() == right
@@ -131,11 +130,11 @@ def test_smoothing_takes_the_other_mode_and_the_noise_away(body: BodyModel):
     assert np.median(values) < DEVIATION**2
 
 
-def test_the_agility_and_the_persistence_do_what_they_say(body: BodyModel):
+def test_the_acceleration_ratio_and_the_persistence_do_what_they_say(body: BodyModel):
     track, _ = noisy_track(body)
     jitters = [
-        smooth_track(track, choice=Smoothing(agility=agility)).effect["jitter_after_m_per_s2"]
-        for agility in (2.0, 10.0, 50.0)
+        smooth_track(track, choice=choice).effect["jitter_after_m_per_s2"]
+        for choice in (Smoothing(acceleration_ratio=ratio) for ratio in (2.0, 10.0, 50.0))
     ]
     assert jitters == sorted(jitters)
     # The persistence scales covariances and moves nothing.
@@ -268,10 +267,10 @@ def test_random_modes_of_every_base(tmp_path: Path):
 
 def test_bad_choices_and_tracks_are_refused(body: BodyModel):
     track, _ = noisy_track(body, 4)
-    with pytest.raises(ConfigurationError, match="agility"):
-        Smoothing(agility=0.0)
-    with pytest.raises(ConfigurationError, match="evidence"):
-        Smoothing(evidence=math.inf)
+    with pytest.raises(ConfigurationError, match="acceleration_ratio"):
+        Smoothing(acceleration_ratio=0.0)
+    with pytest.raises(ConfigurationError, match="likelihood_power"):
+        Smoothing(likelihood_power=math.inf)
     with pytest.raises(ConfigurationError, match="persistence"):
         Smoothing(persistence=-1.0)
     with pytest.raises(TrackFileError, match="times"):
@@ -286,19 +285,19 @@ def test_files_stay_and_the_summary_says_what_was_done(tmp_path: Path, body: Bod
     save_track(tmp_path / "track.npz", track)
     write_summary(tmp_path, {"seed": 3})
     before = (tmp_path / "track.npz").read_bytes()
-    assert cli.main(["smooth", str(tmp_path), "--agility", "8"]) == 0
+    assert cli.main(["smooth", str(tmp_path), "--acceleration-ratio", "8"]) == 0
     assert (tmp_path / "track.npz").read_bytes() == before
     summary = read_summary(tmp_path)
     assert summary["seed"] == 3
-    assert summary["smoothed"]["agility"] == 8
+    assert summary["smoothed"]["acceleration_ratio"] == 8
     assert len(summary["smoothed"]["modes"]) == 30
     assert load_track(tmp_path / "smooth.npz").state.shape[1] == 1
     with pytest.raises(ConfigurationError, match="would replace it"):
-        smooth_file(tmp_path / "smooth.npz")
+        smooth(tmp_path / "smooth.npz")
     # Elsewhere, from the file itself, without a summary; again is the same.
     (tmp_path / "summary.json").unlink()
     elsewhere = tmp_path / "other"
-    smooth_file(tmp_path / "track.npz", out=elsewhere, choice=Smoothing(agility=8.0))
+    smooth(tmp_path / "track.npz", Smoothing(acceleration_ratio=8.0), out=elsewhere)
     assert (elsewhere / "smooth.npz").read_bytes() == (tmp_path / "smooth.npz").read_bytes()
     assert not (tmp_path / "summary.json").exists()
     assert json.loads((elsewhere / "summary.json").read_text())["smoothed"]["path_switches"] == 0
@@ -328,15 +327,17 @@ def test_a_body_is_used_without_a_video_too(
     assert "misses the joints of the track" in capsys.readouterr().err
 
 
-def test_options_of_images_need_a_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_options_of_keypoints_need_the_images(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     options = {
-        "--camera": "a", "--keypoints": "b", "--camera-name": "c", "--layout": "BODY_25",
-        "--normalised": "zero-one", "--masks": "d",
-    }  # fmt: skip
+        "--keypoints": "b",
+        "--layout": "BODY_25",
+        "--normalised": "zero-one",
+        "--masks": "d",
+    }
     words = [word for pair in options.items() for word in pair]
     assert cli.main(["smooth", str(tmp_path), *words]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert all(option in line for option in (*options, "--video"))
+    assert all(option in line for option in (*options, "--images"))
 
 
 def test_track_smooths_when_it_is_done(files: Path, capsys: pytest.CaptureFixture[str]):
@@ -345,9 +346,3 @@ def test_track_smooths_when_it_is_done(files: Path, capsys: pytest.CaptureFixtur
     found = load_track(files / "out" / "smooth.npz")
     assert found.state.shape[:2] == (3, 1)
     assert "smoothed" in read_summary(files / "out")
-
-
-def test_public_names():
-    assert torchcss.smooth_track is smooth_track
-    assert torchcss.smooth_file is smooth_file
-    assert callable(torchcss.smooth_video)

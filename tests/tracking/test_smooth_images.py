@@ -16,7 +16,8 @@ from torchcss import load_track
 from torchcss.app.smooth import settings_of
 from torchcss.cli import main as cli
 from torchcss.errors import ConfigurationError, VideoError
-from torchcss.io.tracks import FrameModes, Track, TrackWriter, read_summary, write_summary
+from torchcss.io.run import Run
+from torchcss.io.tracks import FrameModes, Track, TrackWriter, read_summary
 from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
 from torchcss.tracking.settings import Settings
 from torchcss.tracking.smooth import Smoothing, smooth_track
@@ -71,7 +72,6 @@ def setup(sequence: SyntheticSequence) -> Setup:
     seen = exact + NOISE_PX * torch.randn(exact.shape, generator=source, dtype=torch.float64)
     keypoints = Keypoints(seen, torch.ones_like(seen[..., 0]), body.joint_names)
     arguments = {
-        "body": body,
         "settings": SETTINGS,
         "views": [CameraView(camera, keypoints, NOISE_PX)],
     }
@@ -145,19 +145,18 @@ def test_track_and_smooth_on_files(files: Path, capsys: pytest.CaptureFixture[st
     )  # fmt: skip
     assert cli.main(["smooth", str(out), *inputs, "--out", str(files / "again")]) == 0
     assert (files / "again" / "smooth.npz").read_bytes() == first
-    assert cli.main(["smooth", str(out), *inputs[:2]]) == 2
-    assert "--camera and --keypoints" in capsys.readouterr().err
+    # The run knows them all.
+    assert cli.main(["smooth", str(out), "--images", "--out", str(files / "third")]) == 0
+    assert (files / "third" / "smooth.npz").read_bytes() == first
 
 
-def test_settings_come_from_the_summary(tmp_path: Path, setup: Setup):
-    assert settings_of(tmp_path, setup.track).body == "arm8"
-    write_summary(
-        tmp_path,
-        {"settings": {"body": "arm8", "terms": ["joints"], "dtype": "float32", "new": 3}},
-    )
-    settings = settings_of(tmp_path, setup.track)
+def test_settings_come_from_the_run(setup: Setup):
+    def told(settings: dict[str, Any]) -> Settings:
+        return settings_of(Run(path=Path("a"), track=setup.track._replace(settings=settings)))
+
+    assert told({}).body == "arm8"
+    settings = told({"body": "arm8", "terms": ["joints"], "dtype": "float32", "new": 3})
     assert settings.terms == ("joints",)
     assert settings.dtype == "float64"
-    write_summary(tmp_path, {"settings": {"terms": 3}})
     with pytest.raises(ConfigurationError, match="not those of torchcss"):
-        settings_of(tmp_path, setup.track)
+        told({"terms": 3})

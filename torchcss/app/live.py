@@ -12,7 +12,7 @@ import numpy as np
 
 from torchcss.app.recorder import Picture
 from torchcss.io.export.selection import camera_up, up_axis
-from torchcss.show.viewer import Viewer, close_recording, open_recording, posed_frame
+from torchcss.show.viewer import PosedFrame, Viewer, close_recording, open_recording
 from torchcss.tracking.session import Posterior
 from torchcss.vision.camera import Camera
 
@@ -56,11 +56,10 @@ class LiveViewer:
         if self._viewer is None:
             up = _up(frame, picture.camera)
             self._viewer = Viewer(self._recording, body, camera=picture.camera, up=up)
-        shown = posed_frame(
-            frame.frame.index,
-            frame.frame.time_s,
-            body,
-            body.pose(mixture.mean),
+        shown = PosedFrame(
+            number=frame.frame.index,
+            time_s=frame.frame.time_s,
+            pose=body.pose(mixture.mean),
             covariance=frame.covariance,
             weight=mixture.weight,
             cost=frame.info.cost,

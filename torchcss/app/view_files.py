@@ -98,13 +98,18 @@ def moments(
 
 
 def open_view(
-    files: ViewFiles, camera: Path, *, start: int = 0, stop: int | None = None, stride: int = 1
+    files: ViewFiles,
+    camera: Path | LoadedCamera,
+    *,
+    start: int = 0,
+    stop: int | None = None,
+    stride: int = 1,
 ) -> OpenView:
     """Open the files of a view.
 
     Args:
         files: The files.
-        camera: The calibration.
+        camera: The calibration, or what was read from it.
         start: First frame, of the first camera's video.
         stop: Frame before which to end, of the same.
         stride: Every how many frames to read.
@@ -130,7 +135,11 @@ def open_view(
                 f"{files.masks}: masks must have the video's size {width} x {height}, these have "
                 f"{masks.info.width} x {masks.info.height}"
             )
-    loaded = read_camera(camera, camera_name=files.camera_name, video=files.video)
+    loaded = (
+        camera
+        if isinstance(camera, LoadedCamera)
+        else read_camera(camera, camera_name=files.camera_name, video=files.video)
+    )
     check_image_size(loaded.camera, width, height)
     if files.keypoints is None:
         return OpenView(reader, masks, loaded, None, 1.0, files.offset)

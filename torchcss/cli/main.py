@@ -25,11 +25,11 @@ from typing import Annotated, Literal
 import tyro
 
 from torchcss.app.live import LiveViewer
-from torchcss.app.smooth import smooth_file, smooth_video
+from torchcss.app.smooth import report, smooth
 from torchcss.app.track import track_video
 from torchcss.cli.export import Export
 from torchcss.cli.init import Init
-from torchcss.cli.smooth import Smooth, report
+from torchcss.cli.smooth import Smooth
 from torchcss.cli.view import Plot, View
 from torchcss.errors import ConfigurationError, OutputError, TorchcssError
 from torchcss.io.keypoints.read import Scale
@@ -225,21 +225,9 @@ class Track:
             f"{summary['num_frames']} frames, {summary['seconds_per_frame']:.2f} s each; "
             f"track, summary{' and overlay' if self.overlay else ''} are in {self.out}"
         )
-        if self.smooth_images:
-            done = smooth_video(
-                self.out,
-                video=self.video,
-                camera=self.camera,
-                keypoints=self.keypoints,
-                camera_name=self.camera_name,
-                layout=self.layout,
-                normalised=self.normalised,
-                masks=self.masks,
-                others=others,
-            )
-            print(report(done))
-        elif self.smooth:
-            print(report(smooth_file(self.out)))
+        if self.smooth or self.smooth_images:
+            done = smooth(self.out, images=self.smooth_images)
+            print(report(done.summary["smoothed"]))
 
     def others(self) -> list[ViewFiles]:
         """What the further cameras recorded."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -44,20 +44,31 @@ class Given:
     """What a run lacks, or has moved; what is given here counts before what the folder says.
 
     Attributes:
-        body: The body that was tracked: a `body.npz`, or what `load_body` takes.
+        body: The body that was tracked: a `body.npz`, a robot's file, or the name of a body.
         camera: Calibration file of the first camera.
-        camera_name: Which camera of the file; by default the one of the video.
-        video: What the first camera took.
-        keypoints: 2D joints in that video.
-        layout: Layout of a keypoint file that does not name its joints.
-        normalised: Whether keypoints are fractions of the image, and which.
-        masks: Foreground of every frame.
+        camera_name: Which camera of the file, or of the run; by default the one of the video, or
+            the one that was tracked with.
+        video: What that camera took.
     """
 
-    body: str | os.PathLike[str] | BodyModel | None = None
+    body: Path | None = None
     camera: Path | None = None
     camera_name: str | None = None
     video: Path | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class GivenKeypoints:
+    """The same of what belongs to the first camera's video.
+
+    Attributes:
+        keypoints: 2D joints in it, as for track.
+        layout: Layout of a keypoint file that does not name its joints, e.g. BODY_25.
+        normalised: Whether keypoints are pixels, or fractions of the image from 0 to 1 or from -1
+            to 1.
+        masks: Foreground of every frame: a video or a folder of images of the video's size.
+    """
+
     keypoints: Path | None = None
     layout: str | None = None
     normalised: Scale | None = None
@@ -79,17 +90,23 @@ class Run:
     summary: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
-    def open(cls, folder: str | os.PathLike[str], given: Given | None = None) -> Run:
+    def open(
+        cls,
+        folder: str | os.PathLike[str],
+        given: Given | None = None,
+        keypoints: GivenKeypoints | None = None,
+    ) -> Run:
         """Open a run.
 
         Args:
             folder: The folder, or a track's file in it (`track.npz`, `smooth.npz`).
             given: What the folder lacks.
+            keypoints: What it lacks of the first camera's video.
 
         Raises:
             TorchcssError: If a file is missing or damaged, or what is given does not fit.
         """
-        given, path = given or Given(), Path(folder)
+        given, keypoints, path = given or Given(), keypoints or GivenKeypoints(), Path(folder)
         path = path / TRACK_NAME if path.is_dir() else path
         track = load_track(path)
         own = path.parent / SUMMARY_NAME
@@ -98,7 +115,7 @@ class Run:
             path=path,
             track=track._replace(
                 body=_body(track, path.parent, given),
-                cameras=_cameras(track.cameras or _cameras_of_summary(own, summary), own, given),
+                cameras=_with_keypoints(_cameras(track, own, summary, given), keypoints),
                 settings=track.settings or summary.get("settings", {}),
             ),
             summary=summary,
@@ -200,54 +217,68 @@ def body_of_track(track: Track, body: BodyModel | None = None) -> BodyModel:
 
 def _body(track: Track, folder: Path, given: Given) -> BodyModel | None:
     """The body that is given, else the track's own, else that of version 0.1's `body.npz`."""
-    if isinstance(given.body, BodyModel):
-        return body_of_track(track, given.body)
-    if given.body is None:
+    path = given.body
+    if path is None:
         if track.body is not None or not (folder / FITTED_BODY_NAME).is_file():
             return track.body
-        return body_of_track(track, read_fitted_body(folder).body)
-    path = Path(given.body)
+        path = folder
     if path.is_dir() or path.suffix.lower() == ".npz":
         return body_of_track(track, read_fitted_body(path).body)
     rooted = set(ROOT_NAMES) <= set(track.state_names)
-    return body_of_track(track, load_body(str(given.body), free_root=rooted))
+    return body_of_track(track, load_body(str(path), free_root=rooted))
 
 
-def _cameras_of_summary(path: Path, summary: Mapping[str, Any]) -> tuple[RecordedCamera, ...]:
+def _cameras(
+    track: Track, own: Path, summary: Mapping[str, Any], given: Given
+) -> tuple[RecordedCamera, ...]:
+    """The cameras, the one that is given first."""
+    known = track.cameras or _cameras_of_summary(own, summary)
+    wanted = None if given.video is None else given.video.name
+    if given.camera is not None:
+        source, name, video = given.camera, given.camera_name, given.video
+        camera = read_camera(source, camera_name=name, video=video).camera
+        first, *others = known or (RecordedCamera(camera),)
+        known = (first._replace(camera=camera), *others)
+    elif given.camera_name is not None or wanted is not None:
+        chosen = [
+            each
+            for each in known
+            if each.camera.name == given.camera_name
+            or (given.camera_name is None and each.files and each.files.video.name == wanted)
+        ]
+        if given.camera_name is not None and not chosen:
+            raise TrackFileError(
+                f"{own.parent}: the run has no camera {given.camera_name!r}; it has "
+                f"{', '.join(each.camera.name for each in known) or 'none that is known'}"
+            )
+        known = (*chosen, *(each for each in known if each not in chosen))
+    if given.video is None:
+        return known
+    if not known:
+        raise TrackFileError(
+            f"{own.parent}: --video: the run does not say which camera took it; give --camera"
+        )
+    files = known[0].files or ViewFiles(video=given.video, keypoints=None)
+    return (known[0]._replace(files=replace(files, video=given.video)), *known[1:])
+
+
+def _cameras_of_summary(own: Path, summary: Mapping[str, Any]) -> tuple[RecordedCamera, ...]:
     """The cameras that version 0.1 put into `summary.json`, with their videos."""
-    views = [summary, *summary.get("other_views", [])]
-    if not summary.get("cameras"):
-        return ()
     found = []
-    for view in views:
+    for view in (summary, *summary.get("other_views", [])) if summary.get("cameras") else ():
         name = view.get("camera") or next(iter(summary["cameras"]))
         video = view.get("video")
         files = None if video is None else ViewFiles(video=Path(video), keypoints=None)
         with suppress(TorchcssError):  # a summary that somebody edited: as if it had none
-            found.append(RecordedCamera(read_camera(path, camera_name=name).camera, files))
+            found.append(RecordedCamera(read_camera(own, camera_name=name).camera, files))
     return tuple(found)
 
 
-def _cameras(
-    known: tuple[RecordedCamera, ...], summary: Path, given: Given
+def _with_keypoints(
+    known: tuple[RecordedCamera, ...], given: GivenKeypoints
 ) -> tuple[RecordedCamera, ...]:
-    """The cameras, the first of them as it is given."""
-    camera, files = known[0] if known else (None, None)
-    if given.camera is not None:
-        source, name = given.camera, given.camera_name
-        camera = read_camera(source, camera_name=name, video=given.video).camera
-    elif given.camera_name is not None:
-        named = [each for each in known if each.camera.name == given.camera_name]
-        camera = (
-            named[0].camera if named else read_camera(summary, camera_name=given.camera_name).camera
-        )
-    if given.video is not None:
-        files = replace(files or ViewFiles(video=given.video, keypoints=None), video=given.video)
-    told = {
-        name: value
-        for name in ("keypoints", "layout", "normalised", "masks")
-        if (value := getattr(given, name)) is not None
-    }
-    if files is not None:
-        files = replace(files, **told)
-    return known if camera is None else (RecordedCamera(camera, files), *known[1:])
+    """The cameras, with what is given of the first one's video."""
+    told: dict[str, Any] = {name: value for name, value in asdict(given).items() if value}
+    if not told or not known or known[0].files is None:
+        return known
+    return (known[0]._replace(files=replace(known[0].files, **told)), *known[1:])

@@ -1,5 +1,6 @@
 """What a track says over time, and how sure it is: figures of its states and covariances.
 
+* `plot_track`: all figures of a run, as files.
 * `joints_figure`: where joints are, with bands of two standard deviations.
 * `angles_figure`: every parameter of the state, with bands and the joint limits.
 * `spectra_figure`: along how many directions of the state the image leaves how much uncertain, and
@@ -16,6 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -24,15 +26,24 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.errors import ConfigurationError
-from torchcss.io.run import body_of_track
+from torchcss.files import prepare_output_folder
+from torchcss.io.run import Run, body_of_track
 from torchcss.io.track_body import pose_track
 from torchcss.io.tracks import Track
-from torchcss.show.style import OKABE_ITO
-from torchcss.show.track_plots import mode_colour, tidy
+from torchcss.show.style import OKABE_ITO, save_figure
+from torchcss.show.track_pictures import has_pictures, pictures_of, rows_with_modes
+from torchcss.show.track_plots import (
+    effective_number,
+    mode_colour,
+    modes_figure,
+    sheet_of,
+    shrunk,
+    side_view_figure,
+    tidy,
+)
 from torchcss.vision.camera import Camera
 
 DEVIATIONS = 2.0
@@ -48,11 +59,60 @@ _LINE = OKABE_ITO["blue"]
 _SHOWN_PARAMETERS = 14
 _DIRECTIONS = 3
 _BARS = 7
+_SHEET = 12
+
+
+def plot_track(
+    run: Run, out: Path | None = None, *, frame: int | None = None, anew: bool = False
+) -> list[Path]:
+    """Draw all figures of a run as PNG files, which `torchcss plot` does.
+
+    | file | shows |
+    |---|---|
+    | `modes.png` | weights, number of explanations, cost, losses |
+    | `joints.png`, `angles.png` | joint centres and parameters with their uncertainty |
+    | `spectra.png` | spectrum of the covariance, widest directions by parameters |
+    | `side_view.png` | all modes of one frame, from the camera and from the side |
+    | `frames.png` | frames with the modes over them, where there are pictures |
+
+    Args:
+        run: The run.
+        out: Folder for the files; by default `plots` in the run's.
+        frame: Which frame of the video is seen from the side; by default the one whose weight is
+            spread over most modes.
+        anew: Whether to draw over the video even where the tracker left an overlay.
+
+    Returns:
+        What was written.
+
+    Raises:
+        TorchcssError: If the body is not known, the folder cannot be written, or a picture cannot
+            be read.
+    """
+    track, rows = run.track._replace(body=run.body), rows_with_modes(run)
+    out = prepare_output_folder(run.folder / "plots" if out is None else out)
+    camera = run.cameras[0].camera if run.cameras else None
+    if frame is None:
+        frame = int(track.frames[rows[effective_number(track)[rows].argmax()]])
+    figures = {
+        "modes": modes_figure(track, run.summary),
+        "joints": joints_figure(track, camera=camera),
+        "angles": angles_figure(track),
+        "spectra": spectra_figure(track),
+        "side_view": side_view_figure(track, frame, camera=camera),
+    }
+    if has_pictures(run):
+        chosen = np.unique(rows[np.linspace(0, len(rows) - 1, _SHEET).round().astype(int)])
+        found = [(row, shrunk(image)) for row, image in pictures_of(run, chosen, anew=anew)]
+        figures["frames"] = sheet_of(
+            [image for _, image in found],
+            [f"frame {track.frames[row]}, {track.times[row]:.2f} s" for row, _ in found],
+        )
+    return [save_figure(figure, out / f"{name}.png") for name, figure in figures.items()]
 
 
 def joints_figure(
     track: Track,
-    body: BodyModel | None = None,
     *,
     camera: Camera | None = None,
     joints: Sequence[str] | None = None,
@@ -61,7 +121,6 @@ def joints_figure(
 
     Args:
         track: The track.
-        body: The body, if it is none of the catalogue's (see `body_of_track`).
         camera: Its camera: directions are then to the right, up and away as it sees them. None: the
             axes of the track's world.
         joints: Which joints; by default those of `LIMBS` that it has, or all.
@@ -79,7 +138,7 @@ def joints_figure(
             f"{', '.join(track.joint_names)}"
         )
     chosen = [track.joint_names.index(name) for name in names]
-    body = body_of_track(track, body)
+    body = body_of_track(track)
     pose = pose_track(
         body,
         torch.from_numpy(track.state[rows, 0]),
@@ -110,21 +169,20 @@ def joints_figure(
     return figure
 
 
-def angles_figure(track: Track, body: BodyModel | None = None) -> Figure:
+def angles_figure(track: Track) -> Figure:
     """Every parameter over time, a panel each, with its limits as dotted lines.
 
     The root's six are relative to the base, and their lines end where that was moved.
 
     Args:
         track: The track.
-        body: The body, if it is none of the catalogue's (see `body_of_track`).
 
     Raises:
         ConfigurationError: If the track has no frames.
         TrackFileError: If the body cannot be told.
     """
     rows = _rows(track)
-    body = body_of_track(track, body)
+    body = body_of_track(track)
     lower, upper = body.lower.numpy(), body.upper.numpy()
     deviation = np.sqrt(np.diagonal(track.covariance[rows, 0], axis1=-2, axis2=-1).clip(min=0))
     base = track.base_transform[rows]

@@ -90,7 +90,7 @@ everything, and would hide the rest."""
 def side_view_figure(
     track: Track,
     frame: int,
-    body: BodyModel | None = None,
+    *,
     camera: Camera | None = None,
     reference: Mapping[str, Float[np.ndarray, "3"]] | None = None,
 ) -> Figure:
@@ -103,7 +103,6 @@ def side_view_figure(
     Args:
         track: The track.
         frame: Index of the frame in the video.
-        body: The body, if it is none of the catalogue's (see `body_of_track`).
         camera: The camera that the frame was taken with; None: the track is in the camera's own
             frame, as it is where the calibration has no extrinsics.
         reference: Where joints should be, metres in the track's frame, by any detector's names;
@@ -115,7 +114,7 @@ def side_view_figure(
         ShapeError: If a place of the reference is not three numbers.
     """
     row = _row_of(track, frame)
-    body = body_of_track(track, body)
+    body = body_of_track(track)
     count = int(track.num_modes[row])
     pose = pose_track(
         body,

@@ -1,14 +1,14 @@
 """Tracks in the rerun viewer: the modes in space over the picture that they explain.
 
-`Viewer` takes one `PosedFrame` after the other, whether they come from a file
-(`torchcss.show.view_track`) or from a tracker that runs (`torchcss.app.live`), and logs
+`Viewer` takes one `PosedFrame` after the other, whether they come from a run on disk (`view_track`,
+which `torchcss view` calls) or from a tracker that runs (`torchcss.app.live`), and logs
 
 | entity | what |
 |---|---|
 | `world/camera`, `world/camera/picture` | the frustum; the frame with its modes, as JPEG |
 | `world/modes/K/skeleton` | lines between the joint centres of the mode of rank K, the best 0 |
 | `world/modes/K/uncertainty` | ellipsoids of `DEVIATIONS` standard deviations of the joints |
-| `world/modes/K/body/PART` | the flesh |
+| `world/modes/K/body/PART` | the shape |
 | `cost/K`, `weight/K` | of every mode, nats, and 0 to 1 |
 | `modes/number`, `modes/apart` | how many modes, and how many of them are unlike all better ones |
 | `modes/effective` | `1 / sum w^2` |
@@ -25,6 +25,7 @@ from __future__ import annotations
 import io
 import os
 import sys
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -35,12 +36,17 @@ from jaxtyping import Float, UInt8
 from kornia.geometry.conversions import rotation_matrix_to_quaternion
 from PIL import Image
 from torch import Tensor
+from tqdm import tqdm
 
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.errors import ConfigurationError, OutputError
-from torchcss.files import one_line, prepare_output_folder
+from torchcss.files import one_line, prepare_output_folder, replace_file
+from torchcss.io.export.selection import camera_up, up_axis
+from torchcss.io.run import Run
+from torchcss.io.track_body import pose_track
 from torchcss.show.overlay import PALETTE
+from torchcss.show.track_pictures import pictures_of, rows_with_modes
 from torchcss.show.track_plots import APART, bones_of, count_apart
 from torchcss.show.viewer_layout import layout, rerun, world_axes
 from torchcss.vision.camera import Camera
@@ -61,9 +67,9 @@ _COUNTS = {
 }
 
 _RINGS, _MERIDIANS = 9, 14
-_FAINTEST, _FLESH, _MIST = 0.25, 0.35, 0.9
+_FAINTEST, _SHAPE = 0.25, 0.35
 """Opacity of the lines of a mode that weighs nothing, and, relative to its lines, of the best
-mode's flesh and of ellipsoids."""
+mode's parts."""
 _BONE_RADIUS, _THREAD_RADIUS = 0.006, 0.0012
 _PLANE = 0.3
 """Radius of the best mode's lines and of those of ellipsoids, metres; length of the frustum,
@@ -80,67 +86,93 @@ class PosedFrame(NamedTuple):
     Attributes:
         number: Index in the video.
         time_s: Seconds since the video's first frame.
+        pose: Poses of the body in the world.
+        covariance: Covariances of the states.
         weight: Weights of the modes, adding up to 1.
         cost: Their costs, nats; infinite where nothing was seen.
-        joints: Their joint centres, metres, world frame.
-        covariance: Covariances of the joint centres, square metres.
-        rotation: World orientation of their parts of flesh.
-        centre: World place of their parts of flesh.
         picture: The frame with its modes, or None.
         lost: Whether the track counts as lost.
     """
 
     number: int
     time_s: float
-    weight: Float[np.ndarray, " k"]
-    cost: Float[np.ndarray, " k"]
-    joints: Float[np.ndarray, "k j 3"]
-    covariance: Float[np.ndarray, "k j 3 3"]
-    rotation: Float[np.ndarray, "k p 3 3"]
-    centre: Float[np.ndarray, "k p 3"]
+    pose: BodyPose
+    covariance: Float[Tensor, "k n n"]
+    weight: Float[Tensor, " k"]
+    cost: Float[Tensor, " k"]
     picture: UInt8[np.ndarray, "h w 3"] | None = None
     lost: bool = False
 
 
-def posed_frame(
-    number: int,
-    time_s: float,
-    body: BodyModel,
-    pose: BodyPose,
-    *,
-    covariance: Float[Tensor, "k n n"],
-    weight: Float[Tensor, " k"],
-    cost: Float[Tensor, " k"],
-    picture: UInt8[np.ndarray, "h w 3"] | None = None,
-    lost: bool = False,
-) -> PosedFrame:
-    """Put together what a viewer shows of a frame.
+def view_track(
+    run: Run, *, save: Path | None = None, connect: str | None = None, anew: bool = False
+) -> None:
+    """Show a track, or save a recording of it.
 
     Args:
-        number: Index in the video.
-        time_s: Seconds since the video's first frame.
-        body: The body.
-        pose: Its poses in the world, the best first.
-        covariance: Covariances of the states.
-        weight: Weights of the modes.
-        cost: Their costs, nats.
-        picture: The frame with its modes.
-        lost: Whether the track counts as lost.
+        run: The run.
+        save: The recording to write; without it a viewer is opened.
+        connect: Address of a viewer that runs, instead.
+        anew: Whether to draw over the video even where the tracker left an overlay.
+
+    Raises:
+        TorchcssError: As `open_recording`; if the body is not known; if a picture cannot be read;
+            if the recording cannot be written.
     """
-    rotation, centre = body.part_poses(pose)
-    spread = joint_covariance(body, pose, covariance)
-    return PosedFrame(
-        number=number,
-        time_s=time_s,
-        weight=_array(weight),
-        cost=_array(cost),
-        joints=_array(pose.joints),
-        covariance=_array(spread),
-        rotation=_array(rotation),
-        centre=_array(centre),
-        picture=picture,
-        lost=lost,
-    )
+    rows_with_modes(run)
+    if save is None:
+        _replay(run, None, connect, anew)
+        return
+    prepare_output_folder(save.parent)
+    with replace_file(save) as partial:
+        _replay(run, partial, connect, anew)
+
+
+def posed_frames(run: Run, *, anew: bool = False) -> Iterator[PosedFrame]:
+    """Yield the frames of a track, with pictures where there are any.
+
+    Args:
+        run: The run.
+        anew: Whether to draw over the video even where the tracker left an overlay.
+    """
+    track, body = run.track, run.body
+    rows = rows_with_modes(run)
+    pictures = pictures_of(run, rows, anew=anew)
+    changes = {int(event["frame"]): event["event"] for event in run.summary.get("events", [])}
+    lost = False
+    for row in rows:
+        count, index = int(track.num_modes[row]), int(track.frames[row])
+        state, covariance, log_weight, cost = (
+            torch.from_numpy(values[row, :count])
+            for values in (track.state, track.covariance, track.log_weight, track.cost)
+        )
+        base = torch.from_numpy(track.base_transform[row]).expand(count, 4, 4)
+        lost = changes[index] == "lost" if index in changes else lost
+        yield PosedFrame(
+            number=index,
+            time_s=float(track.times[row]),
+            pose=pose_track(body, state, base),
+            covariance=covariance,
+            weight=log_weight.softmax(0),
+            cost=cost,
+            picture=next(pictures, (row, None))[1],
+            lost=lost,
+        )
+
+
+def _replay(run: Run, save: Path | None, connect: str | None, anew: bool) -> None:
+    track, camera = run.track, run.cameras[0].camera if run.cameras else None
+    best = track.joints_world[:, 0]
+    up, _ = up_axis(track.joint_names, best, track.base_transform, camera_up(camera))
+    events = bool(run.summary.get("events"))
+    recording = open_recording(run.folder.resolve().name, save=save, connect=connect)
+    try:
+        viewer = Viewer(recording, run.body, camera=camera, up=up, events=events)
+        frames = posed_frames(run, anew=anew)
+        for frame in tqdm(frames, total=len(track.frames), unit="frame", dynamic_ncols=True):
+            viewer.add(frame)
+    finally:
+        close_recording(recording)
 
 
 def _array(tensor: Tensor) -> np.ndarray:
@@ -236,7 +268,7 @@ class Viewer:
 
     Args:
         recording: Where to, see `open_recording`.
-        body: The body with its flesh, for the mesh; its base does not matter.
+        body: The body, for the mesh; its base does not matter.
         camera: The camera of the pictures; None: not known.
         up: Axis of the world that is up: x, y, z, -x, -y or -z.
         events: Whether to leave room for losses.
@@ -272,21 +304,29 @@ class Viewer:
             frame: The frame, later than the last.
         """
         package, log = rerun(), self._recording.log
+        joints, weight, cost = map(_array, (frame.pose.joints, frame.weight, frame.cost))
+        spread = _array(joint_covariance(self._body, frame.pose, frame.covariance))
+        rotation, centre = map(_array, self._body.part_poses(frame.pose))
         if not self._known:
-            self._begin(frame)
+            self._begin(joints[0])
         self._recording.set_time("frame", sequence=frame.number)
         self._recording.set_time("time", duration=frame.time_s)
         if frame.picture is not None:
             log("world/camera/picture", _jpeg(frame.picture))
-        for mode in range(len(frame.weight)):
+        for mode in range(len(weight)):
             if mode == self._known:
                 self._introduce(mode)
                 self._known += 1
-            self._log_mode(frame, mode)
-        for mode in range(len(frame.weight), self._shown):
+            share = float(weight[mode] / weight[0]) if weight[0] > 0 else 1.0
+            self._log_pose(mode, share, joints[mode], spread[mode])
+            self._log_shape(mode, share, rotation[mode], centre[mode])
+            nats = float(cost[mode]) if np.isfinite(cost[mode]) else np.nan
+            log(f"cost/{mode}", package.Scalars(nats))
+            log(f"weight/{mode}", package.Scalars(float(weight[mode])))
+        for mode in range(len(weight), self._shown):
             self._hide_mode(mode)
-        self._shown = len(frame.weight)
-        numbers = (len(frame.weight), count_apart(frame.joints), 1 / np.square(frame.weight).sum())
+        self._shown = len(weight)
+        numbers = (len(weight), count_apart(joints), 1 / np.square(weight).sum())
         for name, number in zip(_COUNTS, numbers, strict=True):
             log(f"modes/{name}", package.Scalars(float(number)))
         if frame.lost != self._lost:
@@ -295,11 +335,10 @@ class Viewer:
             log("events", package.TextLog(text, level=level))
         self._lost = frame.lost
 
-    def _begin(self, frame: PosedFrame) -> None:
+    def _begin(self, best: Float[np.ndarray, "j 3"]) -> None:
         """Log what does not change, and how the viewer is to be laid out."""
         package, log = rerun(), self._recording.log
         log("world", world_axes(self._up), static=True)
-        best = frame.joints[0]
         if self._camera is not None:
             self._log_camera(self._camera, best)
         for (name, label), colour in zip(_COUNTS.items(), PALETTE, strict=False):
@@ -341,41 +380,49 @@ class Viewer:
         )
         log("world/camera", pinhole, static=True)
 
-    def _log_mode(self, frame: PosedFrame, mode: int) -> None:
+    def _log_pose(
+        self,
+        mode: int,
+        share: float,
+        joints: Float[np.ndarray, "j 3"],
+        covariance: Float[np.ndarray, "j 3 3"],
+    ) -> None:
+        """Log a mode's joints, which weighs `share` as much as the best."""
         package, log = rerun(), self._recording.log
         path = f"world/modes/{mode}"
-        share = float(frame.weight[mode] / frame.weight[0]) if frame.weight[0] > 0 else 1.0
-        opacity = _FAINTEST + (1 - _FAINTEST) * min(share, 1.0)
-        colour = (*PALETTE[mode % len(PALETTE)], round(255 * opacity))
+        colour = _colour(mode, _opacity(share))
         thickness = 1.0 if mode == 0 else 0.7
-        joints = frame.joints[mode]
         strips = package.LineStrips3D(
             joints[self._bones], colors=colour, radii=thickness * _BONE_RADIUS
         )
         log(f"{path}/skeleton", strips)
         fill = package.components.FillMode
-        half_sizes, quaternions = ellipsoids(frame.covariance[mode])
+        half_sizes, quaternions = ellipsoids(covariance)
         shapes = package.Ellipsoids3D(
             centers=joints,
             half_sizes=half_sizes,
             quaternions=quaternions,
-            colors=(*colour[:3], round(255 * opacity)),
+            colors=colour,
             line_radii=_THREAD_RADIUS,
             # A mode of little weight may be very uncertain: filled, it would hide all others.
             fill_mode=fill.TransparentFillMajorWireframe if mode == 0 else fill.MajorWireframe,
         )
         log(f"{path}/uncertainty", shapes)
-        flesh = package.Mesh3D.from_fields(
-            albedo_factor=(*colour[:3], round(255 * _FLESH * share * opacity))
-        )
-        for part, name in enumerate(self._body.part_names):
-            place = package.Transform3D(
-                translation=frame.centre[mode, part], mat3x3=frame.rotation[mode, part]
-            )
-            log(f"{path}/body/{name}", place, flesh)
-        cost = frame.cost[mode]
-        log(f"cost/{mode}", package.Scalars(float(cost) if np.isfinite(cost) else np.nan))
-        log(f"weight/{mode}", package.Scalars(float(frame.weight[mode])))
+
+    def _log_shape(
+        self,
+        mode: int,
+        share: float,
+        rotation: Float[np.ndarray, "p 3 3"],
+        centre: Float[np.ndarray, "p 3"],
+    ) -> None:
+        """Log a mode's parts, which weighs `share` as much as the best."""
+        package, log = rerun(), self._recording.log
+        colour = _colour(mode, _SHAPE * share * _opacity(share))
+        surface = package.Mesh3D.from_fields(albedo_factor=colour)
+        for name, turn, place in zip(self._body.part_names, rotation, centre, strict=True):
+            at = package.Transform3D(translation=place, mat3x3=turn)
+            log(f"world/modes/{mode}/body/{name}", at, surface)
 
     def _hide_mode(self, mode: int) -> None:
         """From here on there is no such mode."""
@@ -388,6 +435,15 @@ class Viewer:
             log(f"world/modes/{mode}/body/{name}", hidden)
         for series in ("cost", "weight"):
             log(f"{series}/{mode}", package.Scalars(np.nan))
+
+
+def _opacity(share: float) -> float:
+    """Of the lines of a mode that weighs `share` as much as the best."""
+    return _FAINTEST + (1 - _FAINTEST) * min(share, 1.0)
+
+
+def _colour(mode: int, opacity: float) -> tuple[int, int, int, int]:
+    return (*PALETTE[mode % len(PALETTE)], round(255 * opacity))
 
 
 def ellipsoids(

@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Float
 
 from torchcss.errors import MissingExtraError
-from torchcss.io.export.selection import _ABOVE
 from torchcss.vision.camera import Camera
 
 if TYPE_CHECKING:
@@ -21,7 +20,8 @@ if TYPE_CHECKING:
 
 _AXES = {"x": "X_UP", "y": "Y_UP", "z": "Z_UP", "-x": "X_DOWN", "-y": "Y_DOWN", "-z": "Z_DOWN"}
 
-_ASIDE = np.radians(55.0)
+_ASIDE, _ABOVE = np.radians(55.0), np.radians(15.0)
+"""The eye's place about the body: so far to the camera's right, and so far up."""
 
 
 def rerun() -> ModuleType:

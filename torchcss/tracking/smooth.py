@@ -5,13 +5,12 @@ A track holds, for every frame, the modes that the frame and those before it lea
 each chosen mode as what its frame says, and moves the states together to where that and the motion
 prior agree, within the joint limits (`inference.smoothing.refine`). It needs nothing but the track.
 
-The motion prior is the body's `motion_rate` for velocities, and `Smoothing.agility` times that for
-accelerations. A frame in which the tracker had nothing to go by (its modes were carried over, their
-cost is infinite) says nothing; its state follows from its neighbours.
+The motion prior is the body's `motion_rate` for velocities, and `Smoothing.acceleration_ratio`
+times that for accelerations. A frame in which the tracker had nothing to go by (its modes were kept
+from the frame before, their cost is infinite) says nothing; its state follows from its neighbours.
 
 The result is a `Track` of one mode per frame, which everything that reads tracks can read; the
-alternatives stay in the track that it came from. `smooth_file` reads `track.npz`, writes
-`smooth.npz` beside it or elsewhere, and adds an entry `smoothed` to `summary.json`.
+alternatives stay in the track that it came from. `torchcss.smooth` does it for a run on disk.
 """
 
 from __future__ import annotations
@@ -51,23 +50,21 @@ class Smoothing:
     """How to smooth.
 
     Attributes:
-        evidence: Power of each frame's likelihood when modes of several frames are weighed against
-            the motion between them. It is below one because errors of images persist over frames
-            (see `Tracker.memory`). Chosen on four clips.
-        agility: Standard deviation of accelerations over that of velocities, 1/s. The higher, the
-            closer the result stays to the modes. Chosen on one view of a man who balances.
+        likelihood_power: Power of each frame's likelihood when modes of several frames are weighed
+            against the motion between them; below 1 because errors of images persist over frames.
+        acceleration_ratio: Expected accelerations over expected velocities, 1/s; lower is smoother.
+            For the modes of a tracker 10 is good, for images 20.
         persistence: How many frames say as much, in the covariances, as one that is independent.
             Smoothing averages the noise of single frames, but not what persists: the person's size,
-            their clothes. At the default true joints lie in the stated 90 % regions about as often
-            as in the tracker's.
+            their clothes.
     """
 
-    evidence: float = 0.2
-    agility: float = 10.0
+    likelihood_power: float = 0.2
+    acceleration_ratio: float = 10.0
     persistence: float = 40.0
 
     def __post_init__(self) -> None:
-        for name in ("evidence", "agility", "persistence"):
+        for name in ("likelihood_power", "acceleration_ratio", "persistence"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ConfigurationError(
                     f"{name}: expected a positive number, got {getattr(self, name)}"
@@ -88,25 +85,23 @@ class SmoothedTrack(NamedTuple):
     effect: dict[str, Any]
 
 
-def smooth_track(
-    track: Track, body: BodyModel | None = None, *, choice: Smoothing | None = None
-) -> SmoothedTrack:
+def smooth_track(track: Track, *, choice: Smoothing | None = None) -> SmoothedTrack:
     """Smooth a track.
 
     Args:
         track: The track, with several modes per frame or one.
-        body: The body, if it is none of the catalogue's (see `body_of_track`).
         choice: How to smooth.
 
     Raises:
-        TrackFileError: If the track is empty, its times do not rise, or its body cannot be told.
+        TrackFileError: If the track is empty, its times do not rise, or it does not say which body
+            it is of.
     """
     choice, began = choice or Smoothing(), time.perf_counter()
     if not len(track.frames):
         raise TrackFileError("the track has no frames, of which any could be smoothed")
     if not (np.diff(track.times) > 0).all():
         raise TrackFileError("the times of the track do not rise; it cannot be smoothed")
-    body = body_of_track(track, body)
+    body = body_of_track(track)
     bases = torch.from_numpy(track.base_transform)
     times = torch.from_numpy(track.times)
     state, covariance = torch.from_numpy(track.state), torch.from_numpy(track.covariance)
@@ -122,12 +117,12 @@ def smooth_track(
 
     path = best_path(
         state,
-        # Between frames the modes count as they are; `choice.evidence` tempers their costs.
+        # Between frames the modes count as they are; `choice.likelihood_power` tempers their costs.
         track.likelihood_power * covariance,
         node,
         times,
         Transition(velocity=tuple(body.motion_rate.tolist())),
-        evidence=choice.evidence,
+        evidence=choice.likelihood_power,
         changes=changes,
         period=period,
     )
@@ -143,7 +138,7 @@ def smooth_track(
         evidence=1 / (choice.persistence * track.likelihood_power),
         changes=changes,
     )
-    # The modes' covariances have the power `evidence`, their costs are full nats.
+    # The modes' covariances have the track's power, their costs are full nats.
     cost = cost[everywhere, path.mode] + smooth.cost / track.likelihood_power
     result = track_of(track, body, smooth, cost=cost)
     result = result._replace(likelihood_power=1 / choice.persistence)
@@ -167,7 +162,8 @@ def motion_prior(body: BodyModel, choice: Smoothing) -> Transition:
     """
     rate = body.motion_rate * choice.persistence**0.5
     return Transition(
-        velocity=tuple(rate.tolist()), acceleration=tuple((choice.agility * rate).tolist())
+        velocity=tuple(rate.tolist()),
+        acceleration=tuple((choice.acceleration_ratio * rate).tolist()),
     )
 
 

@@ -7,9 +7,9 @@ frame (edges, keypoints, flow, priors, but no temporal prior about a parent mode
 prior over all of them (`inference.smoothing.refine_in_windows`). Frames that the tracker had lost
 get the evidence of their image again.
 
-The flow of a frame carries the nodes of the frame before, as the start has them.
+The flow of a frame moves the nodes of the frame before, as the start has them.
 
-`smooth_video` does it for files, and writes what `smooth_file` writes.
+`torchcss.smooth` does it for a run on disk.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from torchcss.body.model import BodyModel
 from torchcss.body.root import free_turns
 from torchcss.cost.frame import beside
 from torchcss.cost.total import TrackingCost
@@ -44,7 +43,7 @@ from torchcss.tracking.smooth import (
 from torchcss.tracking.view import NOTHING_KNOWN, NOTHING_SEEN, CameraView, Observer
 from torchcss.types import Frame, Status
 
-IMAGES = Smoothing(agility=20.0)
+IMAGES = Smoothing(acceleration_ratio=20.0)
 """How to smooth by default. Images say where the body is more exactly than the modes of a tracker
 do, so that motion may be freer; chosen on the same view as the other default."""
 
@@ -55,7 +54,6 @@ def smooth_frames(
     *,
     settings: Settings,
     views: Sequence[CameraView],
-    body: BodyModel | None = None,
     choice: Smoothing | None = None,
 ) -> SmoothedTrack:
     """Smooth a track, and fit the result to the images again.
@@ -66,16 +64,14 @@ def smooth_frames(
         settings: How it was tracked. Temporal terms are left out, and the segmentation, which tells
             modes apart. Colours are learnt from the track that was smoothed without images.
         views: The cameras that look on.
-        body: The body with its shape; None: told from the track, with the shape of the standard
-            humanoid.
         choice: How to smooth; `IMAGES` by default.
 
     Raises:
         TorchcssError: As `smooth_track`; or if frames are missing.
     """
     choice = choice or IMAGES
-    first, began = smooth_track(track, body, choice=choice), time.perf_counter()
-    body = body_of_track(track, body)
+    first, began = smooth_track(track, choice=choice), time.perf_counter()
+    body = body_of_track(track)
     start, bases = (
         torch.from_numpy(array) for array in (first.track.state[:, 0], track.base_transform)
     )

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from made_tracks import BEAM_UP, make_track
+from made_tracks import BEAM_UP, export_as, make_track
 from reference.bvh import BvhFile, read_bvh
 
-from torchcss import Track, export_track, load_body
+from torchcss import Track, load_body
 from torchcss.body.catalog import BODY_NAMES
 from torchcss.body.model import BodyModel
 from torchcss.errors import ConfigurationError
@@ -23,7 +23,7 @@ UP_OF_FILE = np.array(((0, 1, 0), (0, 0, 1), (1, 0, 0)), dtype=np.float64)
 
 
 def export(track: Track, folder: Path, **options) -> BvhFile:
-    done = export_track(track, to="bvh", out=folder, **options)
+    done = export_as(track, "bvh", folder, **options)
     return read_bvh(done.paths[0].read_text())
 
 
@@ -42,9 +42,7 @@ def test_the_joints_come_back(name: str, tmp_path: Path):
     track = make_track(body, spread=2.0)
     for order in ROTATION_ORDERS:
         for rest in ("hanging", "t-pose"):
-            # The body is told from the track once, and given to save time in the other cases.
-            given = None if (order, rest) == ("ZXY", "hanging") else body
-            options = {"rotation_order": order, "rest_pose": rest, "body": given}
+            options = {"rotation_order": order, "rest_pose": rest}
             file = export(track, tmp_path, frame="world", **options)
             found = joints_of(file, track.joint_names)
             np.testing.assert_allclose(found, track.joints_world[:, 0], atol=1e-5)
@@ -72,7 +70,7 @@ def test_h_anim_names_and_parents(tmp_path: Path):
 def test_zero_channels_are_the_rest_pose(tmp_path: Path):
     track = make_track(body_named("body32"))
     for rest, height in (("hanging", -0.5), ("t-pose", 0.0)):
-        file = export(track, tmp_path, rest_pose=rest, body=body_named("body32"))
+        file = export(track, tmp_path, rest_pose=rest)
         still = file._replace(motion=np.zeros_like(file.motion[:1])).positions()[0]
         at = dict(zip(file.names, still, strict=True))
         assert at["skull_tip"][1] > 0.7
@@ -90,9 +88,9 @@ def test_zero_channels_are_the_rest_pose(tmp_path: Path):
 @pytest.mark.parametrize("name", ["body34", "arm8"])
 def test_first_frame_in_t_pose(name: str, rest: str, frame: str, tmp_path: Path):
     track = make_track(body_named(name), up=BEAM_UP)
-    options = {"rest_pose": rest, "frame": frame, "world_up": "z", "body": body_named(name)}
+    options = {"rest_pose": rest, "frame": frame, "world_up": "z"}
     plain = export(track, tmp_path, **options)
-    file = export(track, tmp_path, t_pose_frame=True, **options)
+    file = export(track, tmp_path, t_pose=True, **options)
     assert len(file.motion) == 4
     np.testing.assert_allclose(file.positions()[1:], plain.positions(), atol=1e-7)
     first = file.positions()[0] @ (np.eye(3) if frame == "y-up" else UP_OF_FILE.T)
@@ -109,14 +107,14 @@ def test_first_frame_in_t_pose(name: str, rest: str, frame: str, tmp_path: Path)
 @pytest.mark.parametrize("scale", [100.0, 39.37, 0.001])
 def test_scale(scale: float, tmp_path: Path):
     track = make_track(body_named("body30"))
-    file = export(track, tmp_path, frame="world", scale=scale, body=body_named("body30"))
+    file = export(track, tmp_path, frame="world", scale=scale)
     found = joints_of(file, track.joint_names) / scale
     np.testing.assert_allclose(found, track.joints_world[:, 0], atol=1e-4)
 
 
 def test_y_up(tmp_path: Path):
     track = make_track(body_named("body34"), up=BEAM_UP)
-    done = export_track(track, to="bvh", out=tmp_path)
+    done = export_as(track, to="bvh", out=tmp_path)
     assert any("z axis is taken for up" in line for line in done.report)
     file = read_bvh(done.paths[0].read_text())
     found = joints_of(file, track.joint_names)
@@ -129,7 +127,7 @@ def test_other_scales_and_free_lengths(tmp_path: Path):
     np.testing.assert_allclose(found, track.joints_world[:, 0], atol=1e-5)
     # Lengths that change cannot be said: those of the first frame stand, and the report says so.
     loose = make_track(load_body("body30", free_proportions=True, lengths=LENGTHS))
-    done = export_track(loose, to="bvh", out=tmp_path, frame="world")
+    done = export_as(loose, to="bvh", out=tmp_path, frame="world")
     assert any("lengths change by up to" in line for line in done.report)
     found = joints_of(read_bvh(done.paths[0].read_text()), loose.joint_names)
     np.testing.assert_allclose(found[0], loose.joints_world[0, 0], atol=1e-5)
@@ -152,18 +150,18 @@ def test_a_robot(tmp_path: Path):
     )
     body = load_body(urdf)
     track = make_track(body)
-    file = export(track, tmp_path, frame="world", body=body)
+    file = export(track, tmp_path, frame="world")
     found = joints_of(file, track.joint_names)
     np.testing.assert_allclose(found, track.joints_world[:, 0], atol=1e-5)
     with pytest.raises(ConfigurationError, match="no T-pose"):
-        export(track, tmp_path, body=body, t_pose_frame=True)
+        export(track, tmp_path, t_pose=True)
 
 
 def test_bad_options(tmp_path: Path):
     track = make_track(body_named("body30"))
     for options in ({"rotation_order": "XYX"}, {"scale": 0.0}, {"rest_pose": "sitting"}):
         with pytest.raises(ConfigurationError):
-            export_track(track, to="bvh", out=tmp_path, **options)
+            export_as(track, to="bvh", out=tmp_path, **options)
     assert not list(tmp_path.iterdir())
 
 
@@ -187,7 +185,7 @@ def test_our_words_are_those_of_others(shared_data: Path, tmp_path: Path):
                          and ws[0] not in ("ROOT", "JOINT", "OFFSET")) for ws in words}  # fmt: skip
 
     theirs = kinds((shared_data / "mocap_cmu" / "01_01.bvh").read_text())
-    done = export_track(make_track(body_named("body34")), to="bvh", out=tmp_path)
+    done = export_as(make_track(body_named("body34")), to="bvh", out=tmp_path)
     assert kinds(done.paths[0].read_text()) <= theirs | {""}
 
 
@@ -238,7 +236,7 @@ def test_written_and_loaded(tmp_path: Path):
     track = make_track(body_named("body30"))
     save_track(tmp_path / "track.npz", track)
     assert load_track(tmp_path).frames.tolist() == [0, 1, 2]
-    done = export_track(tmp_path, to="bvh")
+    done = export_as(tmp_path, to="bvh")
     assert done.paths == (tmp_path / "track.bvh",)
-    other = export_track(track, to="bvh", out=tmp_path / "memory.bvh")
+    other = export_as(track, to="bvh", out=tmp_path / "memory.bvh")
     assert done.paths[0].read_bytes() == other.paths[0].read_bytes()

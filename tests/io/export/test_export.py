@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_tracks import make_track
+from made_tracks import export_as, make_track
 
-from torchcss import Track, export_track, load_body
+from torchcss import Track, load_body
 from torchcss.cli import main as cli
 from torchcss.errors import ConfigurationError, OutputError, TrackFileError
 from torchcss.io.cameras import camera_entry
 from torchcss.io.export import FORMATS
-from torchcss.io.export.selection import DEFAULT_RATE, UP_AXES, select
+from torchcss.io.export.selection import DEFAULT_RATE, UP_AXES, SelectionChoice, select
 from torchcss.io.tracks import save_track, write_summary
 from torchcss.vision.camera import Camera
 
@@ -34,18 +34,18 @@ def folder(track: Track, tmp_path: Path) -> Path:
 
 def test_frames(track: Track):
     assert select(track).frames.tolist() == [4, 5, 6, 7]
-    assert select(track, start=5, stop=7).frames.tolist() == [5, 6]
-    chosen = select(track, start=5, stride=2)
+    assert select(track, SelectionChoice(start=5, stop=7)).frames.tolist() == [5, 6]
+    chosen = select(track, SelectionChoice(start=5, stride=2))
     assert chosen.frames.tolist() == [5, 7]
     assert chosen.rate == 30.0
     for options in ({"start": 8}, {"stop": 4}, {"stride": 0}):
         with pytest.raises(ConfigurationError, match=r"frames|stride"):
-            select(track, **options)
+            select(track, SelectionChoice(**options))
 
 
 def test_modes(track: Track):
     assert select(track).rank.tolist() == [[0]] * 4
-    every = select(track, mode="all")
+    every = select(track, SelectionChoice(mode="all"))
     assert every.labels == ("mode0", "mode1", "mode2")
     assert every.rank.tolist() == [[0, 1, -1], [0, 1, 2], [0, 1, -1], [0, 1, 2]]
     # Where a frame lacks the mode, the nearest pose stands: that before, at the start that after.
@@ -56,22 +56,23 @@ def test_modes(track: Track):
     assert np.isnan(every.joints[2, 2]).all()
     for mode in (3, -1, 1.5, "worst", True):
         with pytest.raises(ConfigurationError, match="mode"):
-            select(track, mode=mode)  # type: ignore[arg-type]
+            select(track, SelectionChoice(mode=mode))  # type: ignore[arg-type]
 
 
 def test_following_the_parents(track: Track):
     for k in range(3):
-        found = select(track, mode=k, follow=True).rank[:, 0].tolist()
+        found = select(track, SelectionChoice(mode=k, follow=True)).rank[:, 0].tolist()
         expected = [k]
         for t in (3, 2, 1):
             expected.insert(0, int(track.parent[t, expected[0]]))
         assert found == expected
-    alone = select(track, mode=1, follow=True, stride=2).rank[:, 0].tolist()
-    assert alone == select(track, mode=1, follow=True).rank[::2, 0].tolist()
+    alone = select(track, SelectionChoice(mode=1, follow=True, stride=2)).rank[:, 0].tolist()
+    assert alone == select(track, SelectionChoice(mode=1, follow=True)).rank[::2, 0].tolist()
     orphan = track._replace(parent=np.full_like(track.parent, -1))
-    assert select(orphan, mode=1, follow=True).rank[:, 0].tolist() == [-1, -1, -1, 1]
+    alone = select(orphan, SelectionChoice(mode=1, follow=True)).rank[:, 0].tolist()
+    assert alone == [-1, -1, -1, 1]
     with pytest.raises(ConfigurationError, match="no chosen frame has it"):
-        select(track, mode=2, follow=True, stop=7)
+        select(track, SelectionChoice(mode=2, follow=True, stop=7))
 
 
 def test_an_arm_stands_as_the_pictures_do(tmp_path: Path):
@@ -86,7 +87,7 @@ def test_an_arm_stands_as_the_pictures_do(tmp_path: Path):
     )  # fmt: skip
     entry = {"units": "metre, pixel", "cameras": {"one": camera_entry(camera)}}
     write_summary(tmp_path, entry)
-    done = export_track(tmp_path, to="trc")
+    done = export_as(tmp_path, to="trc")
     assert any("z axis is taken for up (the picture's upward" in line for line in done.report)
 
 
@@ -94,7 +95,7 @@ def test_an_arm_stands_as_the_pictures_do(tmp_path: Path):
 def test_the_up_axis_is_found(axis: str):
     upright = make_track(PERSON, counts=(1, 1))
     turn = np.eye(4)
-    chosen = select(upright, y_up=True, world_up=axis)
+    chosen = select(upright, SelectionChoice(world_up=axis), y_up=True)
     # The body stands along Y; a world whose axis is `axis` has it turned back.
     turn[:3, :3] = chosen.turn.T
     assert np.linalg.det(chosen.turn) == pytest.approx(1)
@@ -107,7 +108,7 @@ def test_the_up_axis_is_found(axis: str):
     assert any(f"the world's {axis} axis is taken for up" in line for line in found.report)
     np.testing.assert_allclose(found.joints, upright.joints_world[:, :1], atol=1e-12)
     with pytest.raises(ConfigurationError, match="world_up"):
-        select(upright, world_up="up")
+        select(upright, SelectionChoice(world_up="up"))
 
 
 def test_rates(track: Track):
@@ -116,7 +117,7 @@ def test_rates(track: Track):
     rough = select(track._replace(times=np.array([0.0, 0.04, 0.08, 0.2])))
     assert rough.rate == pytest.approx(25.0)
     assert any("not evenly spaced" in line for line in rough.report)
-    single = select(track, stop=5)
+    single = select(track, SelectionChoice(stop=5))
     assert single.rate == DEFAULT_RATE
     assert any("frame rate" in line for line in single.report)
 
@@ -134,7 +135,7 @@ def test_every_format_by_the_verb(to: str, folder: Path, capsys: pytest.CaptureF
 
 def test_names(folder: Path, track: Track):
     def names(**options) -> list[str]:
-        return [path.name for path in export_track(folder / "track.npz", **options).paths]
+        return [path.name for path in export_as(folder / "track.npz", **options).paths]
 
     assert names(to="trc") == ["track.trc"]
     assert names(to="trc", mode=1) == ["track_mode1.trc"]
@@ -145,7 +146,7 @@ def test_names(folder: Path, track: Track):
     assert names(to="csv", mode="all", out=folder / "new" / "folder") == ["track_joints.csv"]
     assert (folder / "new" / "folder" / "track_joints.csv").is_file()
     with pytest.raises(ConfigurationError, match="give a file or a folder"):
-        export_track(track, to="trc")
+        export_as(track, to="trc")
 
 
 @pytest.mark.parametrize(
@@ -173,7 +174,7 @@ def test_one_clear_line(
 
 
 def test_a_file_that_is_there_survives_a_full_disk(folder: Path, monkeypatch: pytest.MonkeyPatch):
-    export_track(folder, to="trc")
+    export_as(folder, to="trc")
     before = (folder / "track.trc").read_bytes()
 
     def full(*_args, **_kwargs):
@@ -181,15 +182,15 @@ def test_a_file_that_is_there_survives_a_full_disk(folder: Path, monkeypatch: py
 
     monkeypatch.setattr(Path, "write_text", full)
     with pytest.raises(OutputError, match="disk is full"):
-        export_track(folder, to="trc", stride=2)
+        export_as(folder, to="trc", stride=2)
     assert (folder / "track.trc").read_bytes() == before
     assert sorted(path.name for path in folder.iterdir()) == ["track.npz", "track.trc"]
 
 
 def test_no_track(tmp_path: Path):
     with pytest.raises(TrackFileError):
-        export_track(tmp_path, to="trc")
+        export_as(tmp_path, to="trc")
     with pytest.raises(ConfigurationError, match="to: expected"):
-        export_track(tmp_path, to="fbx")
+        export_as(tmp_path, to="fbx")
     with pytest.raises(ConfigurationError, match="frame: expected"):
-        export_track(tmp_path, to="trc", frame="z-up")  # type: ignore[arg-type]
+        export_as(tmp_path, to="trc", frame="z-up")  # type: ignore[arg-type]

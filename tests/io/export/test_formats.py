@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from made_tracks import BEAM_UP, make_track
+from made_tracks import BEAM_UP, export_as, make_track
 from reference.bvh import rotation
 from reference.c3d import read_c3d
 
-from torchcss import export_track, load_body
+from torchcss import load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.root import root_rotation
 from torchcss.body.uncertainty import joint_covariance
@@ -58,7 +58,7 @@ def test_mot_header_is_upstream_s(shared_data: Path):
 
 def test_trc(tmp_path: Path):
     track = make_track(body_named("body34"), first_frame=7, up=BEAM_UP)
-    done = export_track(track, to="trc", out=tmp_path / "walk.trc")
+    done = export_as(track, to="trc", out=tmp_path / "walk.trc")
     data = done.paths[0].read_bytes()
     assert b"\r" not in data
     lines = data.decode().split("\n")
@@ -74,7 +74,7 @@ def test_trc(tmp_path: Path):
 
 def test_missing_modes_are_empty_cells(tmp_path: Path):
     track = make_track(body_named("body30"))
-    done = export_track(track, to="trc", out=tmp_path, mode=2, frame="world")
+    done = export_as(track, to="trc", out=tmp_path, mode=2, frame="world")
     assert done.paths[0].name == "track_mode2.trc"
     assert "mode2: absent in 2 of 3 frames" in done.report
     rows = [line.split("\t") for line in done.paths[0].read_text().split("\n")[5:-1]]
@@ -87,7 +87,7 @@ def test_missing_modes_are_empty_cells(tmp_path: Path):
 def test_mot(name: str, tmp_path: Path):
     body = body_named(name)
     track = make_track(body, up=BEAM_UP)
-    done = export_track(track, to="mot", out=tmp_path, body=body)
+    done = export_as(track, to="mot", out=tmp_path)
     lines = done.paths[0].read_text().split("\n")
     assert lines[2:5] == ["nRows=3", f"nColumns={1 + body.num_parameters}", "inDegrees=yes"]
     assert lines[10].split("\t") == ["time", *body.state_names]
@@ -112,7 +112,7 @@ def test_c3d(tmp_path: Path):
     pytest.importorskip("ezc3d")
     track = make_track(body_named("body34"), first_frame=3)
     for mode in (0, 2):
-        done = export_track(track, to="c3d", out=tmp_path, mode=mode)
+        done = export_as(track, to="c3d", out=tmp_path, mode=mode)
         file = read_c3d(done.paths[0].read_bytes())
         assert file.labels == track.joint_names
         assert (file.units, file.rate) == ("m", 60.0)
@@ -126,15 +126,15 @@ def test_c3d(tmp_path: Path):
 def test_c3d_without_its_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "ezc3d", None)
     with pytest.raises(MissingExtraError, match=r"pip install .*\[c3d\]"):
-        export_track(make_track(body_named("arm7")), to="c3d", out=tmp_path)
+        export_as(make_track(body_named("arm7")), to="c3d", out=tmp_path)
     assert not list(tmp_path.iterdir())
 
 
 def test_tables(tmp_path: Path):
     body = body_named("body32")
     track = make_track(body, first_frame=10)
-    npz = export_track(track, to="npz", mode="all", out=tmp_path, body=body).paths
-    table = export_track(track, to="csv", mode="all", out=tmp_path, body=body).paths
+    npz = export_as(track, to="npz", mode="all", out=tmp_path).paths
+    table = export_as(track, to="csv", mode="all", out=tmp_path).paths
     assert [path.name for path in (*npz, *table)] == ["track_joints.npz", "track_joints.csv"]
     with np.load(npz[0]) as archive:
         arrays = dict(archive)
@@ -170,8 +170,8 @@ def test_covariances_turn_with_the_frame(tmp_path: Path):
     track = make_track(body, up=BEAM_UP)
     found = []
     for frame in ("world", "y-up"):
-        options = {"frame": frame, "world_up": "z", "body": body}
-        path = export_track(track, to="npz", out=tmp_path, **options).paths[0]
+        options = {"frame": frame, "world_up": "z"}
+        path = export_as(track, to="npz", out=tmp_path, **options).paths[0]
         with np.load(path) as archive:
             found.append((archive["joint_covariance"], archive["frame_from_world"]))
     turn = found[1][1]
@@ -219,7 +219,7 @@ T_POSE_BONES = {
 def test_smpl_limbs_point_where_ours_do(name: str, tmp_path: Path):
     body = body_named(name)
     track = make_track(body, spread=2.0)
-    path = export_track(track, to="npz-smpl", mode="all", out=tmp_path, body=body).paths[0]
+    path = export_as(track, to="npz-smpl", mode="all", out=tmp_path).paths[0]
     with np.load(path) as archive:
         poses, trans = archive["poses"], archive["trans"]
         assert archive["smpl_joint_names"].tolist() == [joint for joint, _, _ in SMPL_JOINTS]
@@ -251,7 +251,7 @@ def test_smpl_of_the_t_pose_is_zero(tmp_path: Path):
     state = np.zeros_like(track.state)
     joints = body.pose(torch.from_numpy(state[0])).joints.numpy()[None]
     track = track._replace(state=state, joints_world=joints, base_transform=np.eye(4)[None])
-    path = export_track(track, to="npz-smpl", out=tmp_path, body=body).paths[0]
+    path = export_as(track, to="npz-smpl", out=tmp_path).paths[0]
     with np.load(path) as archive:
         poses = archive["poses"].reshape(24, 3)
         assert archive["poses"].shape == (1, 72)
@@ -269,4 +269,4 @@ def test_smpl_of_the_t_pose_is_zero(tmp_path: Path):
 def test_options_of_one_format_only(tmp_path: Path):
     track = make_track(body_named("arm7"))
     with pytest.raises(ConfigurationError, match="scale: only for bvh, not for trc"):
-        export_track(track, to="trc", out=tmp_path, scale=100.0)
+        export_as(track, to="trc", out=tmp_path, scale=100.0)

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from made_tracks import make_track
+from made_tracks import export_as, make_track
 from reference.bvh import read_bvh, rotation
 
-from torchcss import export_track, load_body
+from torchcss import load_body
 from torchcss.errors import ConfigurationError, MotionCaptureError
 from torchcss.io.motion.positions import (
     LIMBS,
@@ -216,7 +216,7 @@ def test_our_own_export_comes_back(tmp_path: Path) -> None:
     track = make_track(body, spread=1.0)
     options = {"to": "bvh", "out": tmp_path, "frame": "world"}
     for scale in (1.0, 100.0):
-        path = export_track(track, body=body, scale=scale, **options).paths[0]
+        path = export_as(track, scale=scale, **options).paths[0]
         found = read_motion_capture(path)
         assert any("unit: m " in line or "unit: cm " in line for line in found.report)
         index = [found.joint_names.index(name) for name in body.joint_names]

@@ -11,48 +11,56 @@
 | `npz-smpl` | `track_smpl.npz` | SMPL's pose parameters, joints and covariances | one file |
 
 Each format is a module of its own that makes the content; only this one touches the disk. Call
-`export_track`.
+`export`.
 """
 
 from __future__ import annotations
 
 import os
-from contextlib import suppress
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from torchcss.body.model import BodyModel
-from torchcss.errors import ConfigurationError, TorchcssError
+from torchcss.errors import ConfigurationError
 from torchcss.files import prepare_output_folder, replace_file
-from torchcss.io.cameras import read_camera
-from torchcss.io.export.bvh import bvh_text
+from torchcss.io.export.bvh import BvhStyle, bvh_text
 from torchcss.io.export.c3d import write_c3d
 from torchcss.io.export.mot import mot_text
-from torchcss.io.export.selection import Selection, camera_up, select
+from torchcss.io.export.selection import Selection, SelectionChoice, select
 from torchcss.io.export.smpl import smpl_arrays
 from torchcss.io.export.tables import csv_text, joint_covariances, npz_arrays
 from torchcss.io.export.trc import trc_text
-from torchcss.io.fitted_body import body_beside
-from torchcss.io.run import body_of_track
-from torchcss.io.tracks import SUMMARY_NAME, TRACK_NAME, Track, load_track
-from torchcss.vision.camera import Camera
+from torchcss.io.run import Run, as_run, body_of_track
+from torchcss.io.tracks import Track
 
-__all__ = ["FORMATS", "Export", "export_track"]
+__all__ = ["FORMATS", "Export", "ExportOptions", "export"]
 
-FORMATS = ("bvh", "trc", "c3d", "mot", "csv", "npz", "npz-smpl")
+Format = Literal["bvh", "trc", "c3d", "mot", "csv", "npz", "npz-smpl"]
+FORMATS: tuple[str, ...] = ("bvh", "trc", "c3d", "mot", "csv", "npz", "npz-smpl")
 
 _NAMES = {"csv": "track_joints.csv", "npz": "track_joints.npz", "npz-smpl": "track_smpl.npz"}
 _Y_UP = ("bvh", "trc", "mot")  # formats whose readers take Y for up
-_BODILESS = ("trc", "c3d")
 _TABLES = ("csv", "npz", "npz-smpl")
-_BVH_DEFAULTS = {
-    "rotation_order": "ZXY",
-    "scale": 1.0,
-    "t_pose_frame": False,
-    "rest_pose": "hanging",
-}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions:
+    """What goes into a file, and how.
+
+    Attributes:
+        selection: Which modes and frames.
+        frame: "world", the track's world as it is, or "y-up", turned so that Y is up; by default
+            y-up for BVH, TRC and MOT.
+        bvh: How a BVH is written; only for that format.
+    """
+
+    selection: SelectionChoice = field(default_factory=SelectionChoice)
+    frame: Literal["world", "y-up"] | None = None
+    bvh: BvhStyle = field(default_factory=BvhStyle)
 
 
 class Export(NamedTuple):
@@ -67,121 +75,77 @@ class Export(NamedTuple):
     report: tuple[str, ...]
 
 
-def export_track(
-    track: Track | str | os.PathLike[str],
+def export(
+    run: Run | Track | str | os.PathLike[str],
+    path: str | os.PathLike[str] | None = None,
     *,
-    to: str,
-    mode: str | int = "best",
-    out: str | os.PathLike[str] | None = None,
-    follow: bool = False,
-    start: int | None = None,
-    stop: int | None = None,
-    stride: int = 1,
-    frame: Literal["world", "y-up"] | None = None,
-    world_up: str = "auto",
-    body: BodyModel | None = None,
-    rotation_order: str = "ZXY",
-    scale: float = 1.0,
-    t_pose_frame: bool = False,
-    rest_pose: str = "hanging",
+    to: str | None = None,
+    options: ExportOptions | None = None,
 ) -> Export:
     """Write a track in the format of another program.
 
     Args:
-        track: The track, its file, or the folder that it is in.
-        to: The format, a member of `FORMATS`.
-        mode: "best", the rank of a mode from 0, or "all".
-        out: The file, or a folder for files of the usual names; by default the track's folder.
+        run: The run, its folder or track's file, or a track in memory.
+        path: The file, or a folder for files of the usual names; by default the run's folder.
             Several files get `_mode0`, `_mode1`, ... before the suffix.
-        follow: Take the ancestors of the modes of the last frame instead of each frame's ranks.
-        start: First frame, counted as in the video.
-        stop: Frame before which to end.
-        stride: Take every so many of the track's frames.
-        frame: "world", the track's world as it is, or "y-up", turned so that Y is up; by default
-            y-up for BVH, TRC and MOT.
-        world_up: Which axis of the world is up (x, y, z, -x, -y or -z); "auto": the one nearest to
-            the body's mean upward direction, or, for an arm or a robot, to that of the pictures.
-        body: The body that was tracked; by default that of the `body.npz` beside the track's file,
-            if there is one, else one that ships.
-        rotation_order: BVH: order of the rotation channels.
-        scale: BVH: units of the file per metre.
-        t_pose_frame: BVH: begin with a frame of the T-pose.
-        rest_pose: BVH: the pose of zero channels, "hanging" or "t-pose".
+        to: The format, a member of `FORMATS`; by default that of the file's suffix.
+        options: What goes into the file.
 
     Returns:
         The files and what was decided.
 
     Raises:
-        TrackFileError: If the track is missing or damaged, or its body cannot be told.
+        TrackFileError: If the track is missing or damaged, or does not say which body it is of.
         ConfigurationError: If an option makes no sense, or no frame or mode is left.
         MissingExtraError: If C3D is wanted and ezc3d is not installed.
         OutputError: If a file cannot be written.
     """
-    given = {
-        "rotation_order": rotation_order,
-        "scale": scale,
-        "t_pose_frame": t_pose_frame,
-        "rest_pose": rest_pose,
-    }
+    options = options or ExportOptions()
+    to = to or ("" if path is None else Path(path).suffix.removeprefix("."))
     if to not in FORMATS:
         raise ConfigurationError(f"to: expected {', '.join(FORMATS)}, got {to!r}")
-    if frame not in (None, "world", "y-up"):
-        raise ConfigurationError(f"frame: expected world or y-up, got {frame!r}")
-    idle = [name for name, value in given.items() if value != _BVH_DEFAULTS[name]]
+    if options.frame not in (None, "world", "y-up"):
+        raise ConfigurationError(f"frame: expected world or y-up, got {options.frame!r}")
+    plain = asdict(BvhStyle())
+    idle = [name for name, value in asdict(options.bvh).items() if value != plain[name]]
     if idle and to != "bvh":
         raise ConfigurationError(f"{', '.join(idle)}: only for bvh, not for {to}; leave it out")
-    source = picture_up = None
-    if not isinstance(track, Track):
-        source = Path(track)
-        track = load_track(source)
-        body = body_beside(source) if body is None else body
-        source = source / TRACK_NAME if source.is_dir() else source
-        picture_up = camera_up(_own_camera(source.parent))
+    if isinstance(run, Track):
+        track, source = run, None
+    else:
+        run = as_run(run)
+        track, source = run.track, run.path
     selection = select(
         track,
-        mode=mode,
-        follow=follow,
-        start=start,
-        stop=stop,
-        stride=stride,
-        y_up=frame == "y-up" or (frame is None and to in _Y_UP),
-        world_up=world_up,
-        picture_up=picture_up,
+        options.selection,
+        y_up=options.frame == "y-up" or (options.frame is None and to in _Y_UP),
     )
-    if body is not None or to not in _BODILESS:
-        body = body_of_track(track, body)
     one_file = to in _TABLES
-    paths = _paths(source, to, [""] if one_file and mode == "all" else selection.labels, out)
+    labels = [""] if one_file and options.selection.mode == "all" else selection.labels
+    paths = _paths(source, to, labels, path)
     report = list(selection.report)
-    if to in ("bvh", "mot") and not selection.present.all():
-        report.append(f"{to} cannot leave frames out: there the mode's nearest pose stands")
+    if to in ("trc", "c3d"):  # the formats of places, which need no body
+        for index, file in enumerate(paths):
+            if to == "trc":
+                _write_text(file, trc_text(selection, index, file.name))
+            else:
+                with replace_file(file) as partial:
+                    write_c3d(partial, selection, index)
+        return Export(tuple(paths), tuple(report))
+    body = body_of_track(track)
     if one_file:
-        assert body is not None
         _write_table(paths[0], to, selection, body)
         return Export(tuple(paths), tuple(report))
-    for index, path in enumerate(paths):
-        if to == "c3d":
-            with replace_file(path) as partial:
-                write_c3d(partial, selection, index)
-            continue
-        if to == "trc":
-            text = trc_text(selection, index, path.name)
+    if not selection.present.all():
+        report.append(f"{to} cannot leave frames out: there the mode's nearest pose stands")
+    for index, file in enumerate(paths):
+        if to == "mot":
+            _write_text(file, mot_text(selection, index, body))
         else:
-            assert body is not None
-            if to == "mot":
-                text = mot_text(selection, index, body)
-            else:
-                text, notes = bvh_text(selection, index, body, **given)
-                report += [note for note in notes if note not in report]
-        _write_text(path, text)
+            text, notes = bvh_text(selection, index, body, options.bvh)
+            report += [note for note in notes if note not in report]
+            _write_text(file, text)
     return Export(tuple(paths), tuple(report))
-
-
-def _own_camera(folder: Path) -> Camera | None:
-    """The camera in the summary beside a track, if there is one that can be read."""
-    with suppress(TorchcssError):
-        return read_camera(folder / SUMMARY_NAME).camera
-    return None
 
 
 def _write_table(path: Path, to: str, selection: Selection, body: BodyModel) -> None:
@@ -203,18 +167,18 @@ def _write_text(path: Path, text: str) -> None:
 
 
 def _paths(
-    source: Path | None, to: str, labels: list[str] | tuple[str, ...], out: object
+    source: Path | None, to: str, labels: Sequence[str], out: str | os.PathLike[str] | None
 ) -> list[Path]:
     """The files to write, one per label, in a folder that can be written."""
     usual = Path(_NAMES.get(to, f"track.{to}"))
     if out is None and source is None:
-        raise ConfigurationError("out: a track in memory has no folder; give a file or a folder")
+        raise ConfigurationError("path: a track in memory has no folder; give a file or a folder")
     target = source.parent if out is None and source is not None else Path(str(out))
     is_folder = target.is_dir() or not target.suffix
     name = usual if is_folder else Path(target.name)
     if name.suffix.lower() != usual.suffix:
         raise ConfigurationError(
-            f"out: {target} is no name for {to}; expected a folder or a name in {usual.suffix}"
+            f"path: {target} is no name for {to}; expected a folder or a name in {usual.suffix}"
         )
     folder = target if is_folder else target.parent
     # A single mode goes where the caller says; several, or the usual name, tell which mode it is.
@@ -224,6 +188,6 @@ def _paths(
         for label in labels
     ]
     if source is not None and any(path.exists() and path.samefile(source) for path in paths):
-        raise ConfigurationError(f"out: {source} is the track itself; choose another name")
+        raise ConfigurationError(f"path: {source} is the track itself; choose another name")
     prepare_output_folder(folder)
     return paths

@@ -12,7 +12,8 @@ Call `bvh_text`.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -23,7 +24,23 @@ from torchcss.io.export.rotations import ROTATION_ORDERS, euler_angles
 from torchcss.io.export.selection import Selection
 from torchcss.io.export.skeleton import Skeleton, make_skeleton, node_poses, t_pose
 
-REST_POSES = ("hanging", "t-pose")
+
+@dataclass(frozen=True, kw_only=True)
+class BvhStyle:
+    """How a BVH is written.
+
+    Attributes:
+        rotation_order: Order of the rotation channels of a BVH.
+        scale: Units of a BVH per metre: 1 for metres, 100 for centimetres.
+        t_pose: Begin a BVH with a frame of the T-pose, which the motion then follows.
+        rest_pose: The pose of a BVH in which all channels are zero: "hanging" (arms at the sides,
+            H-Anim) or "t-pose".
+    """
+
+    rotation_order: Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"] = "ZXY"
+    scale: float = 1.0
+    t_pose: bool = False
+    rest_pose: Literal["hanging", "t-pose"] = "hanging"
 
 
 class Bvh(NamedTuple):
@@ -38,63 +55,51 @@ class Bvh(NamedTuple):
     report: tuple[str, ...]
 
 
-def bvh_text(
-    selection: Selection,
-    mode: int,
-    body: BodyModel,
-    *,
-    rotation_order: str = "ZXY",
-    scale: float = 1.0,
-    t_pose_frame: bool = False,
-    rest_pose: str = "hanging",
-) -> Bvh:
+def bvh_text(selection: Selection, mode: int, body: BodyModel, style: BvhStyle) -> Bvh:
     """Write one mode as BVH.
 
     Args:
         selection: The frames.
         mode: Which of its modes.
         body: The body, on the origin.
-        rotation_order: Order of the rotation channels, a member of `ROTATION_ORDERS`.
-        scale: Units of the file per metre: 1 for metres, 100 for centimetres.
-        t_pose_frame: Begin with a frame of the T-pose, which the motion then follows.
-        rest_pose: The pose in which all channels are zero: "hanging" (arms at the sides, H-Anim)
-            or "t-pose".
+        style: How.
 
     Raises:
-        ConfigurationError: If an option is unknown, the scale not positive, or a T-pose is wanted
-            of a body without shoulders.
+        ConfigurationError: If the style makes no sense, or a T-pose is wanted of a body without
+            shoulders.
     """
-    if rotation_order not in ROTATION_ORDERS:
-        raise ConfigurationError(
-            f"rotation order: expected {', '.join(ROTATION_ORDERS)}, got {rotation_order!r}"
-        )
-    if rest_pose not in REST_POSES:
-        raise ConfigurationError(f"rest pose: expected {', '.join(REST_POSES)}, got {rest_pose!r}")
-    if not 0 < scale < np.inf:
-        raise ConfigurationError(f"scale: expected a positive number, got {scale}")
+    for name, value, known in (
+        ("rotation order", style.rotation_order, ROTATION_ORDERS),
+        ("rest pose", style.rest_pose, ("hanging", "t-pose")),
+    ):
+        if value not in known:
+            raise ConfigurationError(f"{name}: expected {', '.join(known)}, got {value!r}")
+    if not 0 < style.scale < np.inf:
+        raise ConfigurationError(f"scale: expected a positive number, got {style.scale}")
+    scale, hung = style.scale, style.rest_pose == "hanging"
     skeleton = make_skeleton(body)
     shoulders = {"l_shoulder", "r_shoulder"} & set(skeleton.names)
-    if (t_pose_frame or rest_pose == "t-pose") and not shoulders:
+    if (style.t_pose or not hung) and not shoulders:
         raise ConfigurationError(f"{body.name} has no shoulders, and no T-pose; leave it out")
     rotation, place = node_poses(skeleton, body, selection.state[:, mode], selection.base[:, mode])
     lifted = t_pose(skeleton)
-    rest = lifted if rest_pose == "t-pose" else np.tile(np.eye(3), (len(lifted), 1, 1))
+    rest = np.tile(np.eye(3), (len(lifted), 1, 1)) if hung else lifted
     rotation = rotation @ rest.swapaxes(-1, -2)
     offsets, report = _offsets(skeleton, rotation, place)
     root = place[:, 0]
-    if t_pose_frame:
+    if style.t_pose:
         standing = selection.upright @ lifted @ rest.swapaxes(-1, -2)
         rotation = np.concatenate([standing[None], rotation])
         root = np.concatenate([root[:1], root])
         report.append("frame 1 is the T-pose; the motion begins with frame 2")
-    angles = np.degrees(euler_angles(_local(skeleton, rotation), rotation_order))
+    angles = np.degrees(euler_angles(_local(skeleton, rotation), style.rotation_order))
     channels = np.concatenate([scale * root, angles.reshape(len(angles), -1)], axis=1)
 
     # Lengths to a micrometre whatever the unit, angles to a millionth of a degree.
     decimals = max(0, round(6 - np.log10(scale)))
     lines = [
         "HIERARCHY",
-        *_hierarchy(skeleton, scale * offsets, decimals, rotation_order),
+        *_hierarchy(skeleton, scale * offsets, decimals, style.rotation_order),
         "MOTION",
     ]
     lines += [f"Frames: {len(channels)}", f"Frame Time: {1 / selection.rate:.8f}"]

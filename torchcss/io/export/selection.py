@@ -14,7 +14,8 @@ Call `select`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -86,39 +87,42 @@ class Selection(NamedTuple):
         return self.rank >= 0
 
 
-def select(
-    track: Track,
-    *,
-    mode: str | int = "best",
-    follow: bool = False,
-    start: int | None = None,
-    stop: int | None = None,
-    stride: int = 1,
-    y_up: bool = False,
-    world_up: str = "auto",
-    picture_up: Float[np.ndarray, "3"] | None = None,
-) -> Selection:
+@dataclass(frozen=True, kw_only=True)
+class SelectionChoice:
+    """Which modes and frames go into a file, and what is up.
+
+    Attributes:
+        mode: best, a rank in every frame (0 is the best), or all: one file each, or one table.
+        follow: Take the ancestors of the modes of the last frame instead of each frame's ranks.
+        start: First frame, counted as in the video.
+        stop: Frame before which to end.
+        stride: Take every so many of the track's frames.
+        world_up: Which axis of the world is up; auto: the one nearest to the body's mean upward
+            direction, or, for an arm or a robot, to that of the pictures.
+    """
+
+    mode: Literal["best", "all"] | int = "best"
+    follow: bool = False
+    start: int | None = None
+    stop: int | None = None
+    stride: int = 1
+    world_up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
+
+
+def select(track: Track, choice: SelectionChoice | None = None, *, y_up: bool = False) -> Selection:
     """Choose modes and frames, and turn them into the file's frame of reference.
 
     Args:
         track: The track.
-        mode: "best", a rank from 0, or "all".
-        follow: Take the ancestors of the modes of the last frame instead of ranks.
-        start: First frame, counted as in the video.
-        stop: Frame before which to end.
-        stride: Take every so many of the track's frames.
+        choice: Which of its modes and frames.
         y_up: Turn the world so that Y is up.
-        world_up: Which axis of the world is up, one of `UP_AXES`, or "auto": the one nearest to
-            the body's mean upward direction.
-        picture_up: What is up in the pictures, world frame, for a body that does not tell.
 
     Raises:
-        ConfigurationError: If an option makes no sense, or no frame or mode is left.
+        ConfigurationError: If the choice makes no sense, or no frame or mode is left.
     """
-    if world_up != "auto" and world_up not in UP_AXES:
-        raise ConfigurationError(f"world_up: expected auto or {', '.join(UP_AXES)}, got {world_up}")
-    if stride < 1:
-        raise ConfigurationError(f"stride: expected at least 1, got {stride}")
+    choice = choice or SelectionChoice()
+    _check(choice)
+    start, stop, stride = choice.start, choice.stop, choice.stride
     first, last = track.frames.min(initial=0), track.frames.max(initial=0)
     inside = np.flatnonzero(
         (track.frames >= (first if start is None else start))
@@ -131,10 +135,10 @@ def select(
         )
     report: list[str] = []
     kept = inside[::stride]
-    wanted = _wanted_ranks(track, mode, int(track.num_modes[inside].max(initial=0)))
+    wanted = _wanted_ranks(choice.mode, int(track.num_modes[inside].max(initial=0)))
     ranks = (
         _followed(track, wanted, inside)[::stride]
-        if follow
+        if choice.follow
         else np.where(wanted < track.num_modes[kept, None], wanted, -1)
     )
     seen = (ranks >= 0).any(axis=0)
@@ -143,12 +147,12 @@ def select(
             f"mode {wanted[np.argmin(seen)]}: no chosen frame has it; the track has up to "
             f"{track.num_modes[kept].max(initial=0)} modes, counted from 0"
         )
-    labels = ("",) if mode == "best" else tuple(f"mode{rank}" for rank in wanted)
+    labels = ("",) if choice.mode == "best" else tuple(f"mode{rank}" for rank in wanted)
     for label, column in zip(labels, ranks.T, strict=True):
         missing = int((column < 0).sum())
         if missing:
             report.append(f"{label or 'best mode'}: absent in {missing} of {len(kept)} frames")
-    turn, upright = _frame_of_file(track, kept, y_up, world_up, picture_up, report)
+    turn, upright = _frame_of_file(track, kept, y_up, choice.world_up, report)
     rate = _rate(track.times[kept], report)
 
     present = ranks >= 0
@@ -181,14 +185,22 @@ def select(
     )
 
 
-def _wanted_ranks(track: Track, mode: str | int, available: int) -> np.ndarray:
-    if mode == "all":
-        return np.arange(available)
-    if mode == "best":
-        return np.zeros(1, dtype=np.int64)
-    if isinstance(mode, bool) or not isinstance(mode, (int, np.integer)) or mode < 0:
-        raise ConfigurationError(f"mode: expected best, all or a number from 0, got {mode!r}")
-    return np.array([mode])
+def _check(choice: SelectionChoice) -> None:
+    if choice.world_up not in ("auto", *UP_AXES):
+        raise ConfigurationError(
+            f"world_up: expected auto or {', '.join(UP_AXES)}, got {choice.world_up}"
+        )
+    if choice.stride < 1:
+        raise ConfigurationError(f"stride: expected at least 1, got {choice.stride}")
+    rank = isinstance(choice.mode, (int, np.integer)) and not isinstance(choice.mode, bool)
+    if choice.mode not in ("best", "all") and not (rank and int(choice.mode) >= 0):
+        raise ConfigurationError(
+            f"mode: expected best, all or a number from 0, got {choice.mode!r}"
+        )
+
+
+def _wanted_ranks(mode: str | int, available: int) -> np.ndarray:
+    return np.arange(available) if mode == "all" else np.array([0 if mode == "best" else int(mode)])
 
 
 def _followed(track: Track, wanted: np.ndarray, inside: np.ndarray) -> np.ndarray:
@@ -213,12 +225,12 @@ def _frame_of_file(
     kept: np.ndarray,
     y_up: bool,
     world_up: str,
-    picture_up: np.ndarray | None,
     report: list[str],
 ) -> tuple[np.ndarray, np.ndarray]:
     """The file's frame from the world's, and a standing body's orientation in it."""
     axis = world_up
     if world_up == "auto":
+        picture_up = camera_up(track.cameras[0].camera if track.cameras else None)
         axis, agreement = up_axis(
             track.joint_names, track.joints_world[kept, 0], track.base_transform[kept], picture_up
         )
@@ -285,10 +297,6 @@ def _rate(times: np.ndarray, report: list[str]) -> float:
         step = float(times[-1] - times[0]) / len(steps)
     rate = 1.0 / step
     return float(round(rate)) if abs(rate - round(rate)) < 1e-6 * rate else rate
-
-
-_ABOVE = np.radians(15.0)
-"""The eye's place about the body: so far to the camera's right, and so far up."""
 
 
 def camera_up(camera: Camera | None) -> np.ndarray | None:
