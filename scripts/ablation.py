@@ -15,6 +15,7 @@ import contextlib
 import io
 import sys
 import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -164,7 +165,7 @@ def clip(config: Config, sequence: str, row: str) -> dict[str, Any]:
         contextlib.redirect_stderr(silent),
         contextlib.redirect_stdout(silent),
     ):
-        summary = track_video(
+        run = track_video(
             folder / f"{camera}.mp4",
             camera=folder / "cameras.json",
             keypoints=folder / f"keypoints2d_{camera}.npz",
@@ -181,11 +182,11 @@ def clip(config: Config, sequence: str, row: str) -> dict[str, Any]:
         "procrustes_best_of_modes_mm": errors["pa_mpjpe_best_of_modes_mm"],
         "frames_lost": errors["num_frames_lost"],
         "first_frame_lost": int(lost[0]) if lost.size else None,
-        **_shares(summary),
+        **_shares(run.summary),
     }
 
 
-def _shares(summary: dict[str, Any]) -> dict[str, Any]:
+def _shares(summary: Mapping[str, Any]) -> dict[str, Any]:
     names = ("seconds_per_frame", "share_of_cost_by_term", "share_of_search_time_by_term")
     return {name: summary[name] for name in names}
 

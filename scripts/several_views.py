@@ -32,7 +32,7 @@ from evaluate_track import common_name, read_reference
 from jaxtyping import Float
 from torch import Tensor
 
-from torchcss.app.track import track_video
+from torchcss.app.track import TrackOptions, track_video
 from torchcss.body.catalog import BodySpecification, MarkerSpecification, root_joints
 from torchcss.body.model import BodyModel
 from torchcss.body.root import move_base, root_pose
@@ -166,9 +166,9 @@ def person(config: Config, folder: Path) -> dict[str, Any]:
         settings = Settings(
             keypoints_use=config.keypoints_use, samples=config.samples, seed=config.seed
         )
-        summary = track_video(
+        run = track_video(
             files[0].video, camera=folder / "cameras.json", keypoints=files[0].keypoints, out=out,
-            stop=config.frames, settings=settings, others=files[1:],
+            stop=config.frames, settings=settings, options=TrackOptions(others=files[1:]),
         )  # fmt: skip
         track = load_track(out)
         tracked = [common_name(name) for name in track.joint_names]
@@ -200,7 +200,7 @@ def person(config: Config, folder: Path) -> dict[str, Any]:
             "pa_mm": errors.procrustes.mean_mm,
             "frames": len(track.frames),
             "frames_lost": int(errors.lost.sum()),
-            "seconds_per_frame": summary["seconds_per_frame"],
+            "seconds_per_frame": run.summary["seconds_per_frame"],
             **sums.report(REFERENCE_M[BEAM]),
         }
     return rows

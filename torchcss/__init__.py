@@ -6,7 +6,7 @@ of poses with covariances and weights (covariance scaled sampling, Sminchisescu 
 """
 
 from torchcss.app.smooth import smooth
-from torchcss.app.track import track_video
+from torchcss.app.track import TrackOptions, resume, track_video
 from torchcss.app.v01 import (
     export_track,
     smooth_file,
@@ -22,8 +22,9 @@ from torchcss.initialise.result import Initialisation
 from torchcss.io.export import export
 from torchcss.io.run import Run
 from torchcss.io.tracks import Track, load_track
+from torchcss.io.view_files import ViewFiles
 from torchcss.solve.inverse_kinematics import Solutions, inverse_kinematics
-from torchcss.tracking.session import Observation, Posterior, TrackingSession
+from torchcss.tracking.session import Observation, Posterior, SessionState, TrackingSession
 from torchcss.tracking.settings import Settings
 from torchcss.tracking.view import CameraView
 from torchcss.types import Keypoints
@@ -39,16 +40,20 @@ __all__ = [
     "Observation",
     "Posterior",
     "Run",
+    "SessionState",
     "Settings",
     "Solutions",
     "Track",
+    "TrackOptions",
     "TrackingSession",
+    "ViewFiles",
     "export",
     "export_track",
     "initialise",
     "inverse_kinematics",
     "load_body",
     "load_track",
+    "resume",
     "smooth",
     "smooth_file",
     "smooth_track",

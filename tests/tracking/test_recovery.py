@@ -15,8 +15,8 @@ from made_sessions import seen_by, session_at
 import torchcss
 from torchcss.app.recorder import Recorder
 from torchcss.inference.loss_monitor import LossMonitor
+from torchcss.io.view_files import RecordedCamera
 from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
-from torchcss.tracking.presets import make_tracker
 from torchcss.tracking.recovery import OBSERVATIONS, Recovery
 from torchcss.tracking.session import Posterior
 from torchcss.tracking.settings import Settings
@@ -80,14 +80,14 @@ def test_parents_are_modes_of_the_frame_before(tracked: list[Posterior]):
 def test_losses_come_out_in_the_summary(
     sequence: SyntheticSequence, tracked: list[Posterior], tmp_path: Path
 ):
+    session = session_at(SETTINGS, sequence.body, sequence.states[0], seen_by(sequence.camera))
     recorder = Recorder(
         folder=tmp_path,
-        settings=SETTINGS,
-        tracker=make_tracker("css", "arm8", num_samples=4, num_modes=2),
-        camera=sequence.camera,
-        frame_rate=25.0,
+        session=session,
+        recorded=[RecordedCamera(sequence.camera)],
+        frame_interval=1 / 25,
     )
-    summary = recorder.run(iter(tracked), tracked[0].body, len(tracked))
+    summary = recorder.run(tracked, len(tracked))
     on_disk = json.loads((tmp_path / "summary.json").read_text())
     lost = [frame.lost for frame in tracked]
     assert on_disk["frames_searched_widely"] == summary["frames_searched_widely"] == sum(lost)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import math
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ import torch
 from made_sessions import seen_by, session_at
 
 import torchcss
-from torchcss.app.track import _first_pose_from_file, track_video
+from torchcss.app.track import TrackOptions, _first_pose_from_file, track_video
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.errors import ConfigurationError, OutputError, VideoError
@@ -90,21 +91,21 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def run(clip: Path, out: Path, **settings) -> dict:
+def run(clip: Path, out: Path, **settings) -> Mapping[str, Any]:
     """Track the clip from a first pose that is found once, in small images."""
     settings = {"working_size": 160, **settings}
     return track_video(
         clip / "video.mp4",
         camera=clip / "cameras.json",
         keypoints=clip / "keypoints.npz",
-        init=clip / "first" / "body.npz",
         out=out,
         settings=Settings(body="arm7", samples=6, modes=2, overlay=False, **settings),
-    )
+        options=TrackOptions(init=clip / "first" / "body.npz"),
+    ).summary
 
 
 @pytest.fixture(scope="module")
-def tracked(clip: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
+def tracked(clip: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Mapping[str, Any]]:
     """A folder that the clip was tracked into, with all defaults, and the summary."""
     folder = tmp_path_factory.mktemp("tracked")
     return folder, track_video(
@@ -113,12 +114,12 @@ def tracked(clip: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path,
         keypoints=clip / "keypoints.npz",
         out=folder,
         settings=Settings(body="arm7", samples=6, modes=2),
-    )
+    ).summary
 
 
-def test_writes_what_the_design_says(tracked: tuple[Path, dict]):
+def test_writes_what_the_design_says(tracked: tuple[Path, Mapping[str, Any]]):
     folder, summary = tracked
-    names = {"track.npz", "summary.json", "overlay.mp4", "body.npz"}
+    names = {"track.npz", "summary.json", "checkpoint.npz", "overlay.mp4", "body.npz"}
     assert {p.name for p in folder.iterdir()} == names
     track = torchcss.load_track(folder)
     assert track.frames.tolist() == list(range(FRAMES))
@@ -146,7 +147,9 @@ def test_writes_what_the_design_says(tracked: tuple[Path, dict]):
     assert (track.parent[0] == -1).all()
 
 
-def test_the_body_lies_beside_the_track(clip: Path, tracked: tuple[Path, dict], tmp_path: Path):
+def test_the_body_lies_beside_the_track(
+    clip: Path, tracked: tuple[Path, Mapping[str, Any]], tmp_path: Path
+):
     """What was fitted, and again where it was given; the user's own file stays as it is."""
     fitted = read_fitted_body(tracked[0])
     body = body_of_track(torchcss.load_track(tracked[0]), fitted.body)
@@ -162,7 +165,7 @@ def test_the_body_lies_beside_the_track(clip: Path, tracked: tuple[Path, dict], 
             camera=clip / "cameras.json",
             keypoints=clip / "keypoints.npz",
             out=out,
-            init=init,
+            options=TrackOptions(init=init),
             settings=Settings(body="arm7", samples=2, modes=1, overlay=False, terms=("joints",)),
             stop=1,
         )
@@ -227,7 +230,7 @@ def test_a_new_run_replaces_what_belongs_to_the_last_one(clip: Path, tmp_path: P
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before
     run(clip, out, seed=3)
     assert sorted(path.name for path in out.iterdir()) == [
-        "body.npz", "overlay_of_mine.mp4", "summary.json", "track.npz",
+        "body.npz", "checkpoint.npz", "overlay_of_mine.mp4", "summary.json", "track.npz",
     ]  # fmt: skip
     assert (out / "track.npz").read_bytes() != before["track.npz"]
 
@@ -396,8 +399,7 @@ def test_masks_are_read_along_with_the_video(clip: Path, tmp_path: Path):
                 keypoints=clip / "keypoints.npz",
                 out=tmp_path / "track",
                 settings=settings,
-                masks=masks,
-                init=clip / "first" / "body.npz",
+                options=TrackOptions(masks=masks, init=clip / "first" / "body.npz"),
             )
     assert torchcss.load_track(tmp_path / "track").frames.tolist() == [0, 1]
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 from made_sessions import seen_by, session_at
 
-from torchcss.app.track import track_video
+from torchcss.app.track import TrackOptions, track_video
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.errors import CameraError, VideoError
 from torchcss.io.cameras import read_camera
@@ -161,8 +161,8 @@ def test_from_files(folder: Path, tmp_path: Path, sequence: SyntheticSequence):
     other = ViewFiles(video=folder / "side.mp4", keypoints=folder / "side.npz", offset=2)
     summary = track_video(
         folder / "front.mp4", camera=folder / "cameras.json", keypoints=folder / "front.npz",
-        out=tmp_path, settings=settings, others=[other],
-    )  # fmt: skip
+        out=tmp_path, settings=settings, options=TrackOptions(others=[other]),
+    ).summary  # fmt: skip
     assert summary["other_views"] == [{"video": str(folder / "side.mp4"), "camera": "side"}]
     # The summary is a camera file of both.
     for name in ("front", "side"):
@@ -187,7 +187,9 @@ def test_bad_views_are_refused(folder: Path, tmp_path: Path):
         track_video(
             folder / "front.mp4", camera=folder / camera, keypoints=folder / "front.npz",
             out=tmp_path, settings=Settings(body="arm8"),
-            others=[ViewFiles(**{"video": folder / "side.mp4", "keypoints": None, **files})],  # type: ignore[arg-type]
+            options=TrackOptions(
+                others=[ViewFiles(**{"video": folder / "side.mp4", "keypoints": None, **files})],  # type: ignore[arg-type]
+            ),
         )  # fmt: skip
 
     with pytest.raises(CameraError, match=r"one world, in metres.*front\.mp4"):

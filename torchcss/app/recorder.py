@@ -1,21 +1,25 @@
-"""Writes a run as it goes: `track.npz`, `summary.json` and `overlay.mp4`.
+"""Writes a run as it goes, so that it can be interrupted at any moment and goes on where it was.
 
-`Recorder.run` takes what `TrackingSession.track` yields; a run that is interrupted
-keeps what it has. Whatever else should see the frames as they come is a `Sink`: the overlay's film
-is one, the live viewer (`torchcss.app.live`) another. `draw_modes` draws one frame of the overlay.
+`Recorder.run` takes what `TrackingSession.track` yields. From time to time, at the end, and on
+Ctrl-C or SIGTERM it writes `track.npz`, then `summary.json`, then `checkpoint.npz`, each whole or
+not at all; the checkpoint says how many frames of the track belong to it. Whatever else should see
+the frames as they come is a `Sink`, such as the live viewer (`torchcss.app.live`). What cannot be
+written piecemeal, the overlay film, is made at the end by `torchcss.app.overlay`.
 """
 
 from __future__ import annotations
 
 import platform
+import signal
+import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, nullcontext, suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass, field
 from functools import cached_property, partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -23,55 +27,21 @@ from jaxtyping import UInt8
 from torch import Tensor
 from tqdm import tqdm
 
+from torchcss.app.overlay import caption, draw_modes
 from torchcss.app.smooth import SMOOTH_NAME
-from torchcss.body.model import BodyModel
 from torchcss.files import output_error
-from torchcss.inference.tracker import SequenceTracker, stated_evidence
+from torchcss.inference.tracker import stated_evidence
 from torchcss.io.cameras import calibration
-from torchcss.io.checkpoint import remove_checkpoint
+from torchcss.io.checkpoint import Checkpoint, remove_checkpoint, write_checkpoint
 from torchcss.io.tracks import TRACK_NAME, FrameModes, Track, TrackWriter, write_summary
-from torchcss.io.video import VideoWriter
 from torchcss.io.view_files import RecordedCamera
-from torchcss.show.overlay import draw_overlay, project_body
-from torchcss.tracking.session import Posterior
-from torchcss.tracking.settings import Settings
+from torchcss.tracking.checkpoint import state_tensors
+from torchcss.tracking.session import Posterior, TrackingSession
 from torchcss.types import Status
 from torchcss.vision.camera import Camera
 
-_SAVE_SHARE = 0.05
-"""Share of the time that may go into saving the track as it grows: a full disk then leaves nearly
-all of it, since a save replaces the last good file only when it is complete."""
-
-
-def draw_modes(
-    tracked: Posterior,
-    camera: Camera,
-    *,
-    image: UInt8[np.ndarray, "h w 3"] | None = None,
-    rings: int = 16,
-    meridians: int = 20,
-) -> UInt8[np.ndarray, "h w 3"]:
-    """Draw the best mode as a shaded body and the others as outlines over the frame.
-
-    Args:
-        tracked: A tracked frame.
-        camera: Camera of the full-size image.
-        image: What that camera took; by default the first camera's image.
-        rings: Latitudes of the drawn mesh.
-        meridians: Longitudes of the drawn mesh.
-    """
-    body, mixture = tracked.body, tracked.state.mixture
-    modes = project_body(body, mixture.mean, camera, rings=rings, meridians=meridians)
-    text = (
-        f"frame {tracked.frame.index}   {len(modes)} modes   cost {float(tracked.info.cost[0]):.1f}"
-    )
-    picture = draw_overlay(
-        torch.from_numpy(np.ascontiguousarray(tracked.frame.image if image is None else image)),
-        modes,
-        weights=mixture.weight,
-        text=text,
-    )
-    return picture.numpy()
+CHECKPOINT_EVERY = 10.0
+"""Seconds of wall time between checkpoints."""
 
 
 class Picture:
@@ -88,7 +58,9 @@ class Picture:
     @cached_property
     def image(self) -> UInt8[np.ndarray, "h w 3"]:
         """The frame with its modes drawn over it."""
-        return draw_modes(self._frame, self.camera)
+        frame = self._frame
+        text = caption(frame.frame.index, frame.info.cost)
+        return draw_modes(frame.frame.image, frame.body, frame.state.mixture, self.camera, text)
 
 
 class Sink(Protocol):
@@ -108,200 +80,216 @@ class Sink(Protocol):
         ...
 
 
-class Film:
-    """The sink that writes `overlay.mp4`.
+class Terminated(KeyboardInterrupt):
+    """The process was asked to end (SIGTERM)."""
 
-    Args:
-        path: The file.
-        frame_rate: Frames per second.
+
+class Begun(NamedTuple):
+    """What an interrupted run has left.
+
+    Attributes:
+        track: Its frames up to the checkpoint.
+        notes: What its recorder put into the checkpoint.
     """
 
-    def __init__(self, path: Path, frame_rate: float) -> None:
-        self._writer = VideoWriter(path, frame_rate)
-
-    def add(self, frame: Posterior, picture: Picture) -> None:
-        """Append the picture."""
-        self._writer.write(picture.image)
-
-    def close(self) -> None:
-        """Complete the file."""
-        self._writer.close()
-
-
-class OtherFilm:
-    """The sink that writes the overlay of a further camera.
-
-    Args:
-        path: The file.
-        frame_rate: Frames per second.
-        camera: The camera of its full-size images.
-        place: Which of `Posterior.others` it took.
-    """
-
-    def __init__(self, path: Path, frame_rate: float, camera: Camera, place: int) -> None:
-        self._writer = VideoWriter(path, frame_rate)
-        self._camera, self._place = camera, place
-
-    def add(self, frame: Posterior, picture: Picture) -> None:
-        """Append the picture; a black one where the camera has ended."""
-        del picture
-        own = frame.others[self._place]
-        width, height = self._camera.image_size_wh
-        image = np.zeros((height, width, 3), np.uint8) if own is None else own.image
-        self._writer.write(draw_modes(frame, self._camera, image=image))
-
-    def close(self) -> None:
-        """Complete the file."""
-        self._writer.close()
+    track: Track
+    notes: Mapping[str, Any]
 
 
 @dataclass(kw_only=True)
 class Recorder:
-    """Writes a run as it goes: track, summary and overlay.
+    """Writes a run as it goes.
 
     Attributes:
         folder: The output folder.
-        settings: What is run.
-        tracker: The tracker that the settings made, for its numbers.
-        camera: Camera of the full-size images, for the overlay.
-        frame_rate: Frames per second of the overlay.
-        video: What that camera took, if it was read from a file.
-        others: Further cameras and their videos.
-        recorded: All cameras with their files, for the track; empty: the first camera alone.
+        session: What is run.
+        recorded: The cameras with their files.
+        frame_interval: Seconds between frames.
         notes: Lines for the user, also in the summary.
-        extra: Further entries of the summary.
+        extra: Further entries of the summary, which a resumed run keeps.
         sinks: What sees the frames besides; closed at the end of the run.
         on_first_frame: Writes what else belongs to the run, when its first frame is saved.
+        checkpoint_every: Seconds of wall time between checkpoints.
+        begun: The run that is gone on with; None: it starts.
     """
 
     folder: Path
-    settings: Settings
-    tracker: SequenceTracker
-    camera: Camera
-    frame_rate: float
-    video: Path | None = None
-    others: Sequence[tuple[Camera, Path]] = ()
-    recorded: Sequence[RecordedCamera] = ()
-    notes: list[str] = field(default_factory=list)
-    extra: dict[str, Any] = field(default_factory=dict)
+    session: TrackingSession
+    recorded: Sequence[RecordedCamera]
+    frame_interval: float
+    notes: Sequence[str] = ()
+    extra: Mapping[str, Any] = field(default_factory=dict)
     sinks: Sequence[Sink] = ()
     on_first_frame: Callable[[], None] | None = None
+    checkpoint_every: float = CHECKPOINT_EVERY
+    begun: Begun | None = None
 
-    def run(self, frames: Iterator[Posterior], body: BodyModel, total: int | None) -> dict:
+    def __post_init__(self) -> None:
+        session, begun = self.session, self.begun
+        self._wall, self._began = 0.0, time.perf_counter()
+        self._totals = _Totals()
+        self._state = session.checkpoint()
+        if begun is None:
+            body = session.state.body
+            track = Track.empty(
+                body.state_names,
+                body.joint_names,
+                likelihood_power=stated_evidence(session.plan.tracker),
+                body=body,
+                cameras=self.recorded,
+                settings=asdict(session.settings),
+            )
+        else:
+            track = begun.track
+            self._wall = begun.notes["wall_s"]
+            self._totals = _Totals.from_plain(begun.notes["totals"])
+            self.notes, self.extra = begun.notes["notes"], begun.notes["extra"]
+        self._writer = TrackWriter(self.folder / TRACK_NAME, track)
+
+    def run(self, frames: Iterable[Posterior], total: int | None) -> dict[str, Any]:
         """Track to the end, or to an interruption, which is recorded and raised again.
 
         Args:
             frames: What `TrackingSession.track` yields.
-            body: The body, for the names in the file.
-            total: Number of frames, for the progress bar.
+            total: Number of frames of the whole run, for the progress bar.
 
         Returns:
             The summary.
         """
-        writer = TrackWriter(
-            self.folder / TRACK_NAME,
-            Track.empty(
-                body.state_names,
-                body.joint_names,
-                likelihood_power=stated_evidence(self.tracker),
-                body=body,
-                cameras=self.recorded or [RecordedCamera(self.camera)],
-                settings=asdict(self.settings),
-            ),
-        )
-        totals = _Totals()
-        ended, began = "interrupted", time.perf_counter()
-        saved, took = began, 0.0
-        summary: dict[str, Any] = {}
+        ended, writer = "interrupted", self._writer
+        self._began = saved = time.perf_counter()
         with ExitStack() as stack:
-            sinks = list(self.sinks)
-            if self.settings.overlay:
-                sinks.insert(0, Film(self.folder / "overlay.mp4", self.frame_rate))
-            for sink in sinks:
+            stack.enter_context(_ended_by_sigterm())
+            for sink in self.sinks:
                 stack.push(partial(_close, sink))
-            bar = stack.enter_context(tqdm(frames, total=total, unit="frame", dynamic_ncols=True))
+            bar = stack.enter_context(
+                tqdm(frames, total=total, initial=len(writer), unit="frame", dynamic_ncols=True)
+            )
             try:
                 for frame in bar:
-                    self._append(writer, frame)
-                    if len(writer) == 1:
-                        remove_checkpoint(self.folder)
-                        writer.save()
-                        self._replace_last_run()
-                    drawn = time.perf_counter()
-                    picture = Picture(frame, self.camera)
-                    for sink in sinks:
-                        sink.add(frame, picture)
-                    totals.add(frame, overlay_s=time.perf_counter() - drawn)
+                    self._take(frame)
                     bar.set_postfix(
                         cost=f"{float(frame.info.cost[0]):.1f}",
                         modes=len(frame.state.mixture.mean),
                     )
-                    start = time.perf_counter()
-                    if _SAVE_SHARE * (start - saved) >= took:
-                        writer.save()
+                    first = len(writer) == 1
+                    if first or time.perf_counter() - saved >= self.checkpoint_every:
+                        self._save(ended)
                         saved = time.perf_counter()
-                        took = saved - start
                 ended = "complete"
             finally:
                 if len(writer):
-                    writer.save()
-                    wall = time.perf_counter() - began
-                    summary = self._summary(ended, len(writer), wall, totals)
-                    write_summary(self.folder, summary)
-        return summary
+                    self._save(ended)
+        return self.summary(ended)
+
+    def summary(self, ended: str) -> dict[str, Any]:
+        """What `summary.json` holds.
+
+        Args:
+            ended: "complete" or "interrupted".
+        """
+        settings, plan = self.session.settings, self.session.plan
+        wall = self._wall + time.perf_counter() - self._began
+        return {
+            "ended": ended,
+            "body": settings.body,
+            "preset": settings.preset,
+            "seed": settings.seed,
+            "samples": plan.tracker.num_samples,
+            "modes": plan.tracker.num_modes,
+            "settings": asdict(settings),
+            "versions": {
+                "python": platform.python_version(),
+                **{name: version(name) for name in ("torchcss", "torch", "kornia", "numpy")},
+            },
+            "num_frames": len(self._writer),
+            "frame_interval_s": self.frame_interval,
+            "seconds_per_frame": wall / max(len(self._writer), 1),
+            **self._totals.summary(len(self._writer)),
+            "notes": list(self.notes),
+            # As in a camera file, so that this file is one.
+            **calibration(
+                *(
+                    (camera, None if files is None else files.video)
+                    for camera, files in self.recorded
+                )
+            ),
+            **self.extra,
+        }
+
+    def _take(self, frame: Posterior) -> None:
+        """Add a frame, and show it to the sinks."""
+        if not len(self._writer):
+            self._replace_last_run()
+        self._writer.append(_modes_of(frame, is_first=not len(self._writer)))
+        # The session may be one frame ahead when an interruption comes; its state then is not.
+        self._state = self.session.checkpoint()
+        self._totals.add(frame)
+        picture = Picture(frame, self.recorded[0].camera)
+        for sink in self.sinks:
+            sink.add(frame, picture)
+
+    def _save(self, ended: str) -> None:
+        """Write track, summary and checkpoint, in this order: the checkpoint is never ahead."""
+        first = len(self._writer) == 1
+        self._writer.save()
+        if first and self.on_first_frame is not None:
+            self.on_first_frame()
+        write_summary(self.folder, self.summary(ended))
+        notes = {
+            "wall_s": self._wall + time.perf_counter() - self._began,
+            "totals": self._totals.plain(),
+            "notes": list(self.notes),
+            "extra": dict(self.extra),
+        }
+        tensors = state_tensors(self._state)
+        write_checkpoint(self.folder, Checkpoint(len(self._writer), tensors, notes))
 
     def _replace_last_run(self) -> None:
-        """Remove what belongs to another track, now that there is one in its place."""
+        """Remove what belongs to another track, now that there will be one in its place."""
+        remove_checkpoint(self.folder)
         for old in (self.folder / SMOOTH_NAME, *self.folder.glob("overlay*.mp4")):
             if old.stem in ("smooth", "overlay") or old.stem.removeprefix("overlay_").isdigit():
                 try:
                     old.unlink(missing_ok=True)
                 except OSError as error:
                     raise output_error(old, error) from error
-        if self.on_first_frame is not None:
-            self.on_first_frame()
 
-    def _append(self, writer: TrackWriter, frame: Posterior) -> None:
-        base = np.eye(4)
-        base[:3, :3] = frame.body.base_rotation.cpu().numpy()
-        base[:3, 3] = frame.body.base_translation.cpu().numpy()
-        mixture = frame.state.mixture
-        parent = frame.info.parent
-        writer.append(
-            FrameModes(
-                frame=frame.frame.index,
-                time_s=frame.frame.time_s,
-                state=mixture.mean,
-                covariance=frame.covariance,
-                log_weight=mixture.log_weight,
-                cost=frame.info.cost,
-                parent=parent if len(writer) else torch.full_like(parent, -1),
-                joints_world=frame.joints_world,
-                base_transform=base,
-            )
-        )
 
-    def _summary(self, ended: str, num_frames: int, wall: float, totals: _Totals) -> dict[str, Any]:
-        return {
-            "ended": ended,
-            "body": self.settings.body,
-            "preset": self.settings.preset,
-            "seed": self.settings.seed,
-            "samples": self.tracker.num_samples,
-            "modes": self.tracker.num_modes,
-            "settings": asdict(self.settings),
-            "versions": {
-                "python": platform.python_version(),
-                **{name: version(name) for name in ("torchcss", "torch", "kornia", "numpy")},
-            },
-            "num_frames": num_frames,
-            "seconds_per_frame": wall / num_frames,
-            **totals.summary(num_frames),
-            "notes": self.notes,
-            # As in a camera file, so that this file is one.
-            **calibration((self.camera, self.video), *self.others),
-            **self.extra,
-        }
+def _modes_of(frame: Posterior, *, is_first: bool) -> FrameModes:
+    """A frame as the track takes it."""
+    base = np.eye(4)
+    base[:3, :3] = frame.body.base_rotation.cpu().numpy()
+    base[:3, 3] = frame.body.base_translation.cpu().numpy()
+    mixture, parent = frame.state.mixture, frame.info.parent
+    return FrameModes(
+        frame=frame.frame.index,
+        time_s=frame.frame.time_s,
+        state=mixture.mean,
+        covariance=frame.covariance,
+        log_weight=mixture.log_weight,
+        cost=frame.info.cost,
+        parent=torch.full_like(parent, -1) if is_first else parent,
+        joints_world=frame.joints_world,
+        base_transform=base,
+    )
+
+
+@contextmanager
+def _ended_by_sigterm() -> Iterator[None]:
+    """A request to end interrupts as Ctrl-C does; handlers belong to the main thread."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def end(*_: object) -> None:
+        raise Terminated
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _close(sink: Sink, kind: type[BaseException] | None, *_: object) -> None:
@@ -336,10 +324,10 @@ class _Totals:
     statuses: Tensor = field(default_factory=lambda: torch.zeros(len(Status), dtype=torch.long))
     events: list[dict[str, Any]] = field(default_factory=list)
 
-    def add(self, frame: Posterior, *, overlay_s: float) -> None:
-        """Take in a frame, and how long the sinks took, drawing included."""
+    def add(self, frame: Posterior) -> None:
+        """Take in a frame."""
         for into, values in (
-            (self.seconds, {**frame.seconds, "overlay": overlay_s}),
+            (self.seconds, frame.seconds),
             (self.terms, frame.terms),
             (self.term_seconds, frame.term_seconds),
         ):
@@ -360,6 +348,15 @@ class _Totals:
                     "deviations": frame.loss_score,
                 }
             )
+
+    def plain(self) -> dict[str, Any]:
+        """The same as JSON knows it."""
+        return {**asdict(self), "statuses": self.statuses.tolist()}
+
+    @classmethod
+    def from_plain(cls, plain: Mapping[str, Any]) -> _Totals:
+        """What `plain` has taken apart."""
+        return cls(**{**plain, "statuses": torch.tensor(plain["statuses"])})
 
     def summary(self, num_frames: int) -> dict[str, Any]:
         """The entries of the summary.

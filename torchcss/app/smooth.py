@@ -9,10 +9,9 @@ from typing import Any
 
 import torch
 
-from torchcss.app.view_files import moments, open_view
+from torchcss.app.view_files import Selection, moments, open_view
 from torchcss.errors import ConfigurationError, TrackFileError
 from torchcss.files import prepare_output_folder
-from torchcss.io.cameras import LoadedCamera
 from torchcss.io.run import Run, as_run
 from torchcss.io.tracks import TRACK_NAME, save_track, write_summary
 from torchcss.tracking.settings import Settings
@@ -79,7 +78,7 @@ def _with_images(run: Run, choice: Smoothing) -> SmoothedTrack:
         )
     first, stop = int(track.frames[0]), int(track.frames[-1]) + 1
     views = [
-        open_view(each.files, LoadedCamera(each.camera, True, None, None), start=first, stop=stop)
+        open_view(each.files, each.camera, Selection(start=first, stop=stop))
         for each in run.cameras
         if each.files is not None
     ]

@@ -1,14 +1,17 @@
 """From files to files: video, camera and keypoints in, a first pose found, the track written.
 
-`track_video` is what `torchcss track` calls. The loop itself is
-`torchcss.tracking.session.track_frames`, which takes any images; `torchcss.app.recorder.Recorder`
-writes what comes out as it goes, so that a stopped run keeps what it has.
+`track_video` is what `torchcss track` calls, `resume` what it calls with `--resume`. The loop
+itself is `TrackingSession`, which takes any images; `torchcss.app.recorder.Recorder` writes what
+comes out as it goes.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -16,53 +19,30 @@ import torch
 from tqdm import tqdm
 
 from torchcss.app.init import initialise_video
-from torchcss.app.recorder import OtherFilm, Recorder, Sink
-from torchcss.app.view_files import OpenView, moments, open_view
+from torchcss.app.overlay import write_overlays
+from torchcss.app.recorder import CHECKPOINT_EVERY, Begun, Recorder, Sink
+from torchcss.app.view_files import OpenView, Selection, moments, open_view
 from torchcss.cost.view import View
-from torchcss.errors import CameraError, ConfigurationError
+from torchcss.errors import CameraError, ConfigurationError, TrackFileError
 from torchcss.initialise.result import Initialisation
 from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body, write_fitted_body
 from torchcss.io.keypoints.read import Scale
-from torchcss.io.tracks import prepare_output_folder
+from torchcss.io.run import Run
+from torchcss.io.tracks import TRACK_NAME, prepare_output_folder
 from torchcss.io.view_files import RecordedCamera, ViewFiles
+from torchcss.tracking.checkpoint import state_from_tensors
 from torchcss.tracking.session import TrackingSession
-from torchcss.tracking.settings import (
-    Settings,
-)
+from torchcss.tracking.settings import Settings, settings_from_plain
 from torchcss.vision.camera import Camera
 
 
-def track_video(
-    video: Path,
-    *,
-    camera: Path,
-    keypoints: Path,
-    out: Path,
-    settings: Settings | None = None,
-    camera_name: str | None = None,
-    start: int = 0,
-    stop: int | None = None,
-    stride: int = 1,
-    layout: str | None = None,
-    normalised: bool | Scale = False,
-    masks: Path | None = None,
-    init: Path | None = None,
-    others: Sequence[ViewFiles] = (),
-    live: Sink | None = None,
-) -> dict[str, Any]:
-    """Track a body through a video file.
+@dataclass(frozen=True, kw_only=True)
+class TrackOptions:
+    """What else there is to say about the files of a run, beside its settings.
 
-    Args:
-        video: A video, or a folder of images.
-        camera: Calibration file, see `torchcss.io.cameras`.
-        keypoints: 2D joints, see `torchcss.io.keypoints.read`.
-        out: Folder for `track.npz`, `summary.json`, `overlay.mp4`, and the body at its first pose,
-            `body.npz`, by which `torchcss.tracking.smooth_images` knows its flesh.
-        settings: How to track.
-        camera_name: Which camera of the file; by default the one of this video.
-        start: First frame.
-        stop: Frame before which to end.
+    Attributes:
         stride: Every how many frames to track.
+        camera_name: Which camera of the file; by default the one of this video.
         layout: Layout of a keypoint file that does not name its joints.
         normalised: Whether keypoints are fractions of the image, and which, see
             `torchcss.io.keypoints.read.Scale`.
@@ -74,101 +54,226 @@ def track_video(
             long. Their overlays are `overlay_2.mp4` and so on.
         live: What wants to see the frames while they are tracked, such as a
             `torchcss.app.live.LiveViewer`; closed at the end.
+        resume: Go on with what an interrupted run of the same settings left in the folder; start
+            where there is nothing.
+        checkpoint_every: Seconds of wall time between checkpoints.
+    """
+
+    stride: int = 1
+    camera_name: str | None = None
+    layout: str | None = None
+    normalised: Scale = "pixels"
+    masks: Path | None = None
+    init: Path | None = None
+    others: Sequence[ViewFiles] = ()
+    live: Sink | None = None
+    resume: bool = False
+    checkpoint_every: float = CHECKPOINT_EVERY
+
+    def __post_init__(self) -> None:
+        if not self.checkpoint_every >= 0:
+            raise ConfigurationError(
+                f"checkpoint_every must be at least 0 seconds, got {self.checkpoint_every}"
+            )
+
+
+def track_video(
+    video: str | os.PathLike[str],
+    *,
+    camera: str | os.PathLike[str],
+    keypoints: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    settings: Settings | None = None,
+    start: int = 0,
+    stop: int | None = None,
+    options: TrackOptions | None = None,
+) -> Run:
+    """Track a body through a video file.
+
+    Args:
+        video: A video, or a folder of images.
+        camera: Calibration file, see `torchcss.io.cameras`.
+        keypoints: 2D joints, see `torchcss.io.keypoints`.
+        out: Folder for `track.npz`, `summary.json`, `checkpoint.npz`, `overlay.mp4`, and the body
+            at its first pose, `body.npz`.
+        settings: How to track.
+        start: First frame.
+        stop: Frame before which to end.
+        options: What else there is to say about the files.
 
     Returns:
-        The summary.
+        The run; its `summary` says what was run and what it cost.
 
     Raises:
         TorchcssError: With one line that says what was wrong, for any bad input.
     """
-    settings = settings or Settings()
-    out = Path(out)
-    prepare_output_folder(out)
-    fitted_path = out / FITTED_BODY_NAME
-    files = ViewFiles(
-        video=Path(video),
-        keypoints=Path(keypoints),
-        camera_name=camera_name,
-        masks=masks,
-        layout=layout,
-        normalised=normalised,
+    settings, options = settings or Settings(), options or TrackOptions()
+    out = prepare_output_folder(Path(out))
+    selection = Selection(start=start, stop=stop, stride=options.stride)
+    if options.resume and (begun := _begun(out)) is not None:
+        return _go_on(begun, settings, selection, options)
+    files = (
+        ViewFiles(
+            video=Path(video),
+            keypoints=Path(keypoints),
+            camera_name=options.camera_name,
+            masks=options.masks,
+            layout=options.layout,
+            normalised=options.normalised,
+        ),
+        *options.others,
     )
-    view, *beside = (
-        open_view(each, camera, start=start, stop=stop, stride=stride) for each in (files, *others)
-    )
-    for each, opened in zip((files, *others), (view, *beside), strict=True):
-        if others and not opened.camera.metric:
+    views = [open_view(each, Path(camera), selection) for each in files]
+    for each, opened in zip(files, views, strict=True):
+        if len(files) > 1 and not opened.camera.metric:
             raise CameraError(
                 f"{camera}: several cameras need their places in one world, in metres; that of "
                 f"{each.video} is not known so: give R and t"
             )
-    reader, sigma, seen = view.reader, view.sigma, view.keypoints
-    assert seen is not None
     generator = torch.Generator().manual_seed(settings.seed)
-    dtype, device = settings.torch_dtype, settings.device
-    notes = [note for opened in (view, *beside) for note in opened.notes]
-    eye = view.camera.camera.to(dtype=dtype, device=device)
-    if init is not None:
-        first = _first_pose_from_file(init, eye, settings)
+    eye = views[0].camera.camera.to(dtype=settings.torch_dtype, device=settings.device)
+    if options.init is not None:
+        first = _first_pose_from_file(options.init, eye, settings)
     else:
-        first = initialise_video(
-            video,
-            seen,
-            eye,
-            settings,
-            start=start,
-            sigma=sigma,
-            generator=generator,
-            others=[_first_view(each, start, sigma, settings) for each in beside],
-        )
-    notes += first.report
+        first = _first_pose(views, files[0].video, eye, settings, start, generator)
+    notes = [*(note for opened in views for note in opened.notes), *first.report]
     for note in notes:
         tqdm.write(note)
-    # What it was read from stays as it is, be it in the same folder.
-    own = init is None or Path(init).resolve() not in (out.resolve(), fitted_path.resolve())
-
-    interval = stride / float(reader.info.frame_rate)
+    interval = options.stride / float(views[0].reader.info.frame_rate)
     session = TrackingSession(
         settings,
         first,
-        [opened.view(first.body.tie) for opened in (view, *beside)],
+        [opened.view(first.body.tie) for opened in views],
         frame_interval=interval,
         generator=generator,
     )
-    films = [
-        OtherFilm(out / f"overlay_{place + 2}.mp4", 1 / interval, opened.camera.camera, place)
-        for place, opened in enumerate(beside)
-        if settings.overlay
-    ]
     recorder = Recorder(
         folder=out,
-        settings=settings,
-        tracker=session.plan.tracker,
-        camera=eye,
-        frame_rate=1 / interval,
-        video=video,
+        session=session,
         recorded=[
             RecordedCamera(opened.camera.camera, each)
-            for each, opened in zip((files, *others), (view, *beside), strict=True)
+            for each, opened in zip(files, views, strict=True)
         ],
-        others=[
-            (opened.camera.camera, each.video) for each, opened in zip(others, beside, strict=True)
-        ],
+        frame_interval=interval,
         notes=notes,
-        extra={
-            "video": str(video),
-            "camera": eye.name,
-            "other_views": [
-                {"video": str(each.video), "camera": opened.camera.camera.name}
-                for each, opened in zip(others, beside, strict=True)
-            ],
-            "world_is_metric": view.camera.metric,
-            "body_lengths_m": first.body.lengths,
-        },
-        sinks=films if live is None else [*films, live],
-        on_first_frame=partial(write_fitted_body, fitted_path, first, eye) if own else None,
+        extra=_description(files, views, first, selection),
+        sinks=() if options.live is None else (options.live,),
+        on_first_frame=_writes_body(out, options.init, first, eye),
+        checkpoint_every=options.checkpoint_every,
     )
-    return recorder.run(session.track(moments((view, *beside))), first.body, reader.num_selected)
+    recorder.run(session.track(moments(views)), views[0].reader.num_selected)
+    return _finish(out, settings, interval)
+
+
+def resume(run: Run | str | os.PathLike[str], *, live: Sink | None = None) -> Run:
+    """Go on with an interrupted run, as if it had never been interrupted.
+
+    Args:
+        run: The run, or its folder.
+        live: What wants to see the frames while they are tracked.
+
+    Returns:
+        The run as it is then; a complete one is left as it is.
+
+    Raises:
+        TorchcssError: If it left no checkpoint, or its files are gone.
+    """
+    run = run if isinstance(run, Run) else Run.open(run)
+    if run.checkpoint is None:
+        raise TrackFileError(
+            f"{run.folder}: no checkpoint to go on from; track again, without --resume"
+        )
+    known = run.checkpoint.notes["extra"]["frames_selected"]
+    settings = settings_from_plain(run.settings)
+    return _go_on(run, settings, Selection(**known), TrackOptions(live=live))
+
+
+def _begun(out: Path) -> Run | None:
+    """The run that was interrupted in a folder; None if there is none to go on with."""
+    if not (out / TRACK_NAME).is_file():
+        return None
+    run = Run.open(out)
+    return None if run.checkpoint is None else run
+
+
+def _go_on(run: Run, settings: Settings, selection: Selection, options: TrackOptions) -> Run:
+    """Track the frames that a run has not got to."""
+    checkpoint, out = run.checkpoint, run.folder
+    assert checkpoint is not None
+    _check_same(run, settings, selection, checkpoint.notes["extra"]["frames_selected"])
+    views = [open_view(each.files, each.camera, selection) for each in run.cameras if each.files]
+    body = run.body.to(dtype=settings.torch_dtype, device=settings.device)
+    state = state_from_tensors(checkpoint.tensors, body)
+    interval = selection.stride / float(views[0].reader.info.frame_rate)
+    session = TrackingSession.resume(
+        state, settings, [opened.view(body.tie) for opened in views], frame_interval=interval
+    )
+    recorder = Recorder(
+        folder=out,
+        session=session,
+        recorded=run.cameras,
+        frame_interval=interval,
+        sinks=() if options.live is None else (options.live,),
+        checkpoint_every=options.checkpoint_every,
+        begun=Begun(run.track.first(checkpoint.num_frames), checkpoint.notes),
+    )
+    left = islice(moments(views), checkpoint.num_frames, None)
+    recorder.run(session.track(left), views[0].reader.num_selected)
+    return _finish(out, settings, interval)
+
+
+def _finish(out: Path, settings: Settings, interval: float) -> Run:
+    """What is made when all frames are tracked."""
+    run = Run.open(out)
+    if settings.overlay:
+        write_overlays(run, 1 / interval)
+    return run
+
+
+def _check_same(run: Run, settings: Settings, selection: Selection, known: dict[str, Any]) -> None:
+    """Refuse to go on with other settings or frames than a run was begun with."""
+    plain = asdict(settings_from_plain(run.settings))
+    other = [
+        f"{name} {plain[name]}, now {value}"
+        for name, value in asdict(settings).items()
+        if name != "overlay" and plain[name] != value
+    ]
+    other += [
+        f"{name} {known[name]}, now {value}"
+        for name, value in asdict(selection).items()
+        if name != "stop" and known[name] != value
+    ]
+    if other:
+        raise ConfigurationError(
+            f"{run.folder}: the run was begun with {'; '.join(other)}; give the same, or leave "
+            "--resume out to start anew"
+        )
+
+
+def _first_pose(
+    views: Sequence[OpenView],
+    video: Path,
+    eye: Camera,
+    settings: Settings,
+    start: int,
+    generator: torch.Generator,
+) -> Initialisation:
+    """Fit the body to the keypoints and the image of the first frame."""
+    view, *beside = views
+    if view.keypoints is None:
+        raise ConfigurationError(
+            f"{video}: the first camera needs keypoints, from which the first pose is found"
+        )
+    return initialise_video(
+        video,
+        view.keypoints,
+        eye,
+        settings,
+        start=start,
+        sigma=view.sigma,
+        generator=generator,
+        others=[_first_view(each, start, view.sigma, settings) for each in beside],
+    )
 
 
 def _first_view(opened: OpenView, start: int, sigma: float, settings: Settings) -> View:
@@ -196,3 +301,37 @@ def _first_pose_from_file(path: Path, camera: Camera, settings: Settings) -> Ini
     return Initialisation(
         fitted.body, fitted.mixture, fitted.cost, (note,), fitted.lengths, fitted.scale
     )
+
+
+def _writes_body(
+    out: Path, init: Path | None, first: Initialisation, eye: Camera
+) -> partial[None] | None:
+    """Writes `body.npz`; None where it is what was started from, which stays as it is."""
+    path = out / FITTED_BODY_NAME
+    if init is not None and Path(init).resolve() in (out.resolve(), path.resolve()):
+        return None
+    return partial(write_fitted_body, path, first, eye)
+
+
+def _description(
+    files: Sequence[ViewFiles],
+    views: Sequence[OpenView],
+    first: Initialisation,
+    selection: Selection,
+) -> dict[str, Any]:
+    """Entries of the summary about the files."""
+    (video, *videos), (camera, *cameras) = (
+        [str(each.video) for each in files],
+        [opened.camera.camera.name for opened in views],
+    )
+    return {
+        "video": video,
+        "camera": camera,
+        "other_views": [
+            {"video": video, "camera": camera}
+            for video, camera in zip(videos, cameras, strict=True)
+        ],
+        "world_is_metric": views[0].camera.metric,
+        "body_lengths_m": dict(first.body.lengths),
+        "frames_selected": asdict(selection),
+    }

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Container, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,6 +20,7 @@ from torchcss.io.video import VideoReader
 from torchcss.io.view_files import ViewFiles
 from torchcss.tracking.view import CameraView
 from torchcss.types import Frame, Keypoints
+from torchcss.vision.camera import Camera
 
 
 class OpenView(NamedTuple):
@@ -97,26 +98,35 @@ def moments(
         yield (frame, *(next(other, None) for other in others))
 
 
+@dataclass(frozen=True, kw_only=True)
+class Selection:
+    """Which frames of the first camera's video.
+
+    Attributes:
+        start: First frame.
+        stop: Frame before which to end; None: to the last.
+        stride: Every how many frames to read.
+    """
+
+    start: int = 0
+    stop: int | None = None
+    stride: int = 1
+
+
 def open_view(
-    files: ViewFiles,
-    camera: Path | LoadedCamera,
-    *,
-    start: int = 0,
-    stop: int | None = None,
-    stride: int = 1,
+    files: ViewFiles, camera: Path | Camera, selection: Selection | None = None
 ) -> OpenView:
     """Open the files of a view.
 
     Args:
         files: The files.
-        camera: The calibration, or what was read from it.
-        start: First frame, of the first camera's video.
-        stop: Frame before which to end, of the same.
-        stride: Every how many frames to read.
+        camera: The calibration file, or the camera.
+        selection: Which frames; None: all.
 
     Raises:
         TorchcssError: If a file cannot be read, or two of them do not belong together.
     """
+    start, stop, stride = astuple(selection or Selection())
     if start < 0:
         raise VideoError(f"{files.video}: start must be at least 0, got {start}")
     start, stop = start + files.offset, None if stop is None else stop + files.offset
@@ -135,11 +145,10 @@ def open_view(
                 f"{files.masks}: masks must have the video's size {width} x {height}, these have "
                 f"{masks.info.width} x {masks.info.height}"
             )
-    loaded = (
-        camera
-        if isinstance(camera, LoadedCamera)
-        else read_camera(camera, camera_name=files.camera_name, video=files.video)
-    )
+    if isinstance(camera, Camera):
+        loaded = LoadedCamera(camera, metric=True, units_note=None, video=None)
+    else:
+        loaded = read_camera(camera, camera_name=files.camera_name, video=files.video)
     check_image_size(loaded.camera, width, height)
     if files.keypoints is None:
         return OpenView(reader, masks, loaded, None, 1.0, files.offset)

@@ -39,7 +39,7 @@ class ViewFiles:
     camera_name: str | None = None
     masks: Path | None = None
     layout: str | None = None
-    normalised: bool | Scale = False
+    normalised: bool | Scale = "pixels"
     offset: int = 0
 
 

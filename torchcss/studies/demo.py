@@ -13,11 +13,14 @@ from typing import Any
 import numpy as np
 import torch
 
+from torchcss.app.overlay import write_overlays
 from torchcss.app.recorder import Recorder
 from torchcss.initialise.fit import initialise
 from torchcss.initialise.options import InitialiseOptions
+from torchcss.io.run import Run
 from torchcss.io.tracks import load_track, prepare_output_folder, write_summary
 from torchcss.io.video import VideoWriter
+from torchcss.io.view_files import RecordedCamera, ViewFiles
 from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
 from torchcss.tracking.session import TrackingSession
 from torchcss.tracking.settings import (
@@ -27,6 +30,7 @@ from torchcss.tracking.view import CameraView
 from torchcss.types import Frame, Keypoints
 
 KEYPOINT_NOISE_PX = 1.5
+DEMO_SETTINGS = Settings(body="arm8", keypoints_use="first")
 
 
 def run_demo(
@@ -47,7 +51,7 @@ def run_demo(
         ConfigurationError: If there is to be no frame.
         OutputError: If the folder cannot be written.
     """
-    settings = settings or Settings(body="arm8", keypoints_use="first")
+    settings = settings or DEMO_SETTINGS
     generator = torch.Generator().manual_seed(settings.seed)
     prepare_output_folder(out)
     sequence = arm_sequence(generator=generator, num_frames=num_frames)
@@ -98,15 +102,17 @@ def track_sequence(
         generator=generator,
     )
     frames = (Frame(i, i * interval, image) for i, image in enumerate(sequence.frames))
+    film = ViewFiles(video=out / "video.mp4", keypoints=None)
     recorder = Recorder(
         folder=out,
-        settings=settings,
-        tracker=session.plan.tracker,
-        camera=camera_there,
-        frame_rate=sequence.frame_rate,
-        notes=list(first.report),
+        session=session,
+        recorded=[RecordedCamera(camera, film)],
+        frame_interval=interval,
+        notes=first.report,
     )
-    summary = recorder.run(session.track(frames), first.body, len(sequence.frames))
+    summary = recorder.run(session.track(frames), len(sequence.frames))
+    if settings.overlay:
+        write_overlays(Run.open(out), sequence.frame_rate)
     track = load_track(out)
     reference = truth.cpu().numpy()[track.frames]
     error = np.linalg.norm(track.joints_world - reference[:, None], axis=-1).mean(-1)

@@ -70,7 +70,7 @@ def state_from_tensors(tensors: Mapping[str, Tensor], body: BodyModel) -> Sessio
     try:
         body = copy.deepcopy(body)
         own = {name.removeprefix("body."): t for name, t in tensors.items() if name[:5] == "body."}
-        body.load_state_dict({name: value.to(like.device) for name, value in own.items()})
+        body.load_state_dict({n: value.to(like.device) for n, value in own.items()}, assign=True)
         mixture = _get(GaussianMixture, tensors, "tracker.mixture", like)
         assert mixture is not None
         tracker = TrackerState(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -214,6 +214,24 @@ class Settings:
     def torch_dtype(self) -> torch.dtype:
         """The floating type."""
         return torch.float32 if self.dtype == "float32" else torch.float64
+
+
+def settings_from_plain(plain: Mapping[str, Any]) -> Settings:
+    """Settings from what a run's folder holds of them, also one of an older version.
+
+    Args:
+        plain: Numbers, strings and lists by name; names that are no longer known are left out.
+
+    Raises:
+        ConfigurationError: If they are not those of a tracker.
+    """
+    known = {field.name for field in fields(Settings)}
+    try:
+        return Settings(**{name: value for name, value in plain.items() if name in known})
+    except (TypeError, AttributeError) as error:
+        raise ConfigurationError(
+            f"the run's settings are not those of torchcss: {error}"
+        ) from error
 
 
 def check_seed(seed: int) -> None:

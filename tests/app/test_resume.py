@@ -1,0 +1,191 @@
+"""Interrupted at any moment and gone on with, a run ends as if it had never been interrupted."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from made_sequences import write_arm
+
+from torchcss.app.recorder import Picture
+from torchcss.app.track import TrackOptions, resume, track_video
+from torchcss.cli import main as cli
+from torchcss.errors import ConfigurationError, OutputError, TrackFileError
+from torchcss.io.run import Run
+from torchcss.tracking.session import Posterior
+from torchcss.tracking.settings import Settings
+
+SETTINGS = Settings(
+    body="arm8", samples=4, modes=2, working_size=160, prediction="surface", limb_jumps=1
+)
+FRAMES = 8
+WALL_TIMES = {
+    *("seconds_per_frame", "seconds_per_frame_by_stage", "share_of_search_time_by_term"),
+}
+
+
+class Stumbling:
+    """A sink that ends the run at a frame."""
+
+    def __init__(self, at: int, trouble: BaseException) -> None:
+        self._at, self._trouble = at, trouble
+
+    def add(self, frame: Posterior, picture: Picture) -> None:
+        if frame.frame.index == self._at:
+            raise self._trouble
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("clip")
+    write_arm(folder, FRAMES)
+    return folder
+
+
+def follow(clip: Path, out: Path, settings: Settings = SETTINGS, **options: Any) -> Run:
+    return track_video(
+        clip / "video.mp4",
+        camera=clip / "cameras.json",
+        keypoints=clip / "keypoints2d.npz",
+        out=out,
+        settings=settings,
+        options=TrackOptions(**options),
+    )
+
+
+@pytest.fixture(scope="module")
+def whole(clip: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """The run that nobody interrupted."""
+    return follow(clip, tmp_path_factory.mktemp("whole"))
+
+
+def assert_same_run(one: Path, other: Path) -> None:
+    """The same files, wall times apart."""
+    assert {p.name for p in one.iterdir()} == {p.name for p in other.iterdir()}
+    assert (one / "overlay.mp4").read_bytes() == (other / "overlay.mp4").read_bytes()
+    for name in ("track.npz", "body.npz", "checkpoint.npz"):
+        ours, theirs = (np.load(folder / name) for folder in (one, other))
+        assert set(ours.files) == set(theirs.files)
+        for key in ours.files:
+            if (name, key) != ("checkpoint.npz", "notes"):
+                np.testing.assert_array_equal(ours[key], theirs[key], err_msg=f"{name}: {key}")
+    summaries = [json.loads((folder / "summary.json").read_text()) for folder in (one, other)]
+    for summary in summaries:
+        assert summary["ended"] == "complete"
+        for name in WALL_TIMES:
+            del summary[name]
+    assert summaries[0] == summaries[1]
+
+
+@pytest.mark.parametrize("trouble", [KeyboardInterrupt(), OutputError("disk full")])
+@pytest.mark.parametrize("at", [0, 4])
+def test_an_interrupted_run_goes_on(
+    clip: Path, whole: Run, tmp_path: Path, at: int, trouble: BaseException
+) -> None:
+    with pytest.raises(type(trouble)):
+        follow(clip, tmp_path, live=Stumbling(at, trouble))
+    assert Run.open(tmp_path).summary["ended"] == "interrupted"
+    run = follow(clip, tmp_path, resume=True)
+    assert len(run.track.frames) == FRAMES
+    assert_same_run(whole.folder, tmp_path)
+
+
+def test_frames_after_the_last_checkpoint_are_tracked_again(
+    clip: Path, whole: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A track may be ahead of its checkpoint, where the disk was full in between."""
+    write = torchcss_recorder().write_checkpoint
+
+    def refusing(folder: Path, checkpoint: Any) -> None:
+        if checkpoint.num_frames > 3:
+            raise OutputError("disk full")
+        write(folder, checkpoint)
+
+    monkeypatch.setattr("torchcss.app.recorder.write_checkpoint", refusing)
+    with pytest.raises(OutputError):
+        follow(clip, tmp_path, checkpoint_every=0)
+    monkeypatch.undo()
+    left = Run.open(tmp_path)
+    assert left.checkpoint is not None
+    assert left.checkpoint.num_frames == 3
+    assert len(left.track.frames) > 3
+    follow(clip, tmp_path, resume=True)
+    assert_same_run(whole.folder, tmp_path)
+
+
+def torchcss_recorder() -> Any:
+    return sys.modules["torchcss.app.recorder"]
+
+
+def command(clip: Path, out: Path, *more: str) -> list[str]:
+    return [
+        *("track", str(clip / "video.mp4"), "--camera", str(clip / "cameras.json")),
+        *("--keypoints", str(clip / "keypoints2d.npz"), "--out", str(out), "--body", "arm8"),
+        *("--samples", "4", "--modes", "2", "--working-size", "160", "--prediction", "surface"),
+        *("--limb-jumps", "1", *more),
+    ]
+
+
+@pytest.mark.parametrize("kill", [signal.SIGKILL, signal.SIGTERM])
+def test_a_killed_process_loses_nothing(
+    clip: Path, whole: Run, tmp_path: Path, kill: signal.Signals
+) -> None:
+    script = "import sys; from torchcss.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    more = ("--checkpoint-every", "0")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    environment["OMP_NUM_THREADS"] = str(torch.get_num_threads())
+    with subprocess.Popen(
+        [sys.executable, "-c", script, *command(clip, tmp_path, *more)],
+        env=environment,
+        stderr=subprocess.DEVNULL,
+    ) as process:
+        while not (tmp_path / "checkpoint.npz").exists() and process.poll() is None:
+            time.sleep(0.01)
+        process.send_signal(kill)
+        ended = process.wait()
+    assert ended in ({-signal.SIGKILL} if kill is signal.SIGKILL else {143, 0})
+    assert cli.main(command(clip, tmp_path, "--resume")) == 0
+    assert_same_run(whole.folder, tmp_path)
+
+
+def test_a_complete_run_stays_as_it_is(clip: Path, whole: Run) -> None:
+    before = (whole.folder / "track.npz").read_bytes()
+    assert len(resume(whole.folder).track.frames) == FRAMES
+    assert (whole.folder / "track.npz").read_bytes() == before
+
+
+def test_a_run_is_gone_on_with_by_itself(clip: Path, whole: Run, tmp_path: Path) -> None:
+    """The folder knows its video, keypoints, cameras and settings."""
+    with pytest.raises(KeyboardInterrupt):
+        follow(clip, tmp_path, live=Stumbling(5, KeyboardInterrupt()))
+    resume(tmp_path)
+    assert_same_run(whole.folder, tmp_path)
+
+
+def test_where_nothing_was_begun_it_begins(clip: Path, tmp_path: Path) -> None:
+    few = replace(SETTINGS, samples=1, modes=1, terms=("joints",), overlay=False)
+    run = follow(clip, tmp_path / "new", few, resume=True)
+    assert run.summary["ended"] == "complete"
+    (tmp_path / "new" / "checkpoint.npz").unlink()
+    with pytest.raises(TrackFileError, match="no checkpoint to go on from"):
+        resume(run.folder)
+
+
+def test_other_settings_are_refused(clip: Path, whole: Run) -> None:
+    with pytest.raises(ConfigurationError, match="samples 4, now 5"):
+        follow(clip, whole.folder, replace(SETTINGS, samples=5), resume=True)
+    with pytest.raises(ConfigurationError, match="stride 1, now 2"):
+        follow(clip, whole.folder, stride=2, resume=True)

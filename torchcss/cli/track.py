@@ -1,0 +1,144 @@
+"""The verb `torchcss track`: a video, its camera and its keypoints to a run."""
+
+from __future__ import annotations
+
+from contextlib import closing, nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from torchcss.app.live import LiveViewer
+from torchcss.app.recorder import CHECKPOINT_EVERY
+from torchcss.app.smooth import report, smooth
+from torchcss.app.track import TrackOptions, track_video
+from torchcss.cli.options import SettingsOptions
+from torchcss.errors import ConfigurationError
+from torchcss.io.keypoints.read import Scale
+from torchcss.io.view_files import ViewFiles
+from torchcss.tracking.settings import Settings
+
+
+@dataclass(frozen=True, kw_only=True)
+class Track:
+    """Track a body through a video, and write track.npz, summary.json and overlay.mp4."""
+
+    video: Annotated[Path, tyro.conf.Positional]
+    """A video in any container, or a folder of images."""
+    camera: Path
+    """Calibration: cameras.json, a Pose2Sim .toml, or EasyMocap's intri.yml."""
+    keypoints: Path
+    """2D joints: OpenPose folder, COCO, AlphaPose, MediaPipe or clicked joints as JSON, CSV (also
+    DeepLabCut's), NPZ (also VideoPose3D's: FILE.npz#SUBJECT/ACTION/CAMERA)."""
+    out: Path = Path("out/track")
+    """Output folder."""
+    init: Path | None = None
+    """A fitted body that `torchcss init` wrote for the first frame, to start from."""
+    camera_name: str | None = None
+    """Camera in the file; by default the one whose video this is."""
+    layout: str | None = None
+    """Layout of a keypoint file that does not name its joints, e.g. BODY_25."""
+    normalised: Scale = "pixels"
+    """Whether keypoints are pixels, or fractions of the image from 0 to 1 or from -1 to 1."""
+    start: int = 0
+    """First frame."""
+    stop: int | None = None
+    """Frame before which to end."""
+    stride: int = 1
+    """Track every so many frames."""
+    masks: Path | None = None
+    """Foreground of every frame: a video or a folder of images of the video's size."""
+    other_videos: tuple[Path, ...] = ()
+    """Videos of further synchronised cameras of the same calibration file."""
+    other_keypoints: tuple[Path, ...] = ()
+    """2D joints of each of them; none: their pictures speak alone."""
+    other_offsets: tuple[int, ...] = ()
+    """Frame of each of them at the time of the first video's frame 0, by default 0."""
+    other_cameras: tuple[str, ...] = ()
+    """Camera of each of them in the file; by default the one whose video it is."""
+    resume: bool = False
+    """Go on with what the same command, interrupted, left in the output folder."""
+    checkpoint_every: float = CHECKPOINT_EVERY
+    """Seconds of wall time between checkpoints."""
+    live: bool = False
+    """Watch in the rerun viewer while tracking."""
+    live_connect: str | None = None
+    """Watch in a viewer that runs, by its address, such as rerun+http://127.0.0.1:9876/proxy."""
+    live_save: Path | None = None
+    """Write what would be watched as FILE.rrd, which grows while tracking."""
+    smooth: bool = False
+    """When done, write smooth.npz as well: one smooth trajectory through the modes of all frames,
+    as torchcss smooth does."""
+    smooth_images: bool = False
+    """The same, and fit that trajectory to the images again: a second pass over the video."""
+    settings: SettingsOptions = field(default_factory=Settings)
+
+    def run(self) -> None:
+        """Run the verb."""
+        others = self.others()
+        live = None
+        if self.live or self.live_connect is not None or self.live_save is not None:
+            live = LiveViewer(
+                self.out.name,
+                save=self.live_save,
+                connect=self.live_connect,
+                spawn=self.live and self.live_connect is None,
+            )
+        with nullcontext() if live is None else closing(live):
+            options = TrackOptions(
+                stride=self.stride,
+                camera_name=self.camera_name,
+                layout=self.layout,
+                normalised=self.normalised,
+                masks=self.masks,
+                init=self.init,
+                others=others,
+                live=live,
+                resume=self.resume,
+                checkpoint_every=self.checkpoint_every,
+            )
+            run = track_video(
+                self.video,
+                camera=self.camera,
+                keypoints=self.keypoints,
+                out=self.out,
+                settings=self.settings,
+                start=self.start,
+                stop=self.stop,
+                options=options,
+            )
+        print(
+            f"{run.summary['num_frames']} frames, {run.summary['seconds_per_frame']:.2f} s each; "
+            f"track, summary{' and overlay' if self.settings.overlay else ''} are in {self.out}"
+        )
+        if self.smooth or self.smooth_images:
+            done = smooth(run, images=self.smooth_images)
+            print(report(done.summary["smoothed"]))
+
+    def others(self) -> list[ViewFiles]:
+        """What the further cameras recorded."""
+        count = len(self.other_videos)
+        for name in ("other_keypoints", "other_offsets", "other_cameras"):
+            if len(getattr(self, name)) not in (0, count):
+                raise ConfigurationError(
+                    f"--{name.replace('_', '-')}: expected one for each of the {count} other "
+                    f"videos, or none at all; got {len(getattr(self, name))}"
+                )
+        return [
+            ViewFiles(
+                video=video,
+                keypoints=keypoints,
+                camera_name=name,
+                layout=self.layout,
+                normalised=self.normalised,
+                offset=offset,
+            )
+            for video, keypoints, offset, name in zip(
+                self.other_videos,
+                self.other_keypoints or (None,) * count,
+                self.other_offsets or (0,) * count,
+                self.other_cameras or (None,) * count,
+                strict=True,
+            )
+        ]
