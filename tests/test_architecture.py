@@ -133,13 +133,13 @@ def test_every_module_says_what_it_is() -> None:
         assert page.splitlines()[0].endswith((".", ":", "?")), path
 
 
-def test_only_the_kinematics_know_pytorch_kinematics() -> None:
+def test_only_the_chain_knows_pytorch_kinematics() -> None:
     users = {
         path.relative_to(PACKAGE).as_posix()
         for path in modules()
         if any(name.split(".")[0] == "pytorch_kinematics" for name in imports_of(path))
     }
-    assert users == {"body/kinematics.py"}
+    assert users == {"body/chain.py"}
 
 
 @pytest.mark.parametrize("library", ["av"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,8 @@ from reference import kinematics as reference
 from torch import Tensor
 
 from torchcss.body.catalog import BODY_NAMES
-from torchcss.body.kinematics import JointSpecification, KinematicTree
+from torchcss.body.chain import JointSpecification
+from torchcss.body.kinematics import KinematicTree
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.errors import BodyError, ShapeError
@@ -71,10 +73,45 @@ def trees() -> list:
 @pytest.mark.parametrize("tree", trees())
 def test_poses_are_those_of_rodrigues(tree: KinematicTree, generator: torch.Generator) -> None:
     q = 3 * torch.randn(4, tree.num_joints, generator=generator, dtype=torch.float64)
-    rotation, translation = tree.link_poses(q)
+    rotation, translation, *_ = tree(q)
     expected_rotation, expected_translation = by_hand(tree, q)
     torch.testing.assert_close(rotation, expected_rotation, rtol=0, atol=1e-13)
     torch.testing.assert_close(translation, expected_translation, rtol=0, atol=1e-12)
+
+
+BODIES = [*BODY_NAMES, *(f"robot_models/{name}.urdf" for name in ROBOTS)]
+BODIES += ["mocap_cmu/01_01.bvh", "mocap_cmu/scaled_131_01.bvh"]
+BODIES += [f"robot_models/{name}.xml" for name in ("humanoid_gym", "humanoid_CMU")]
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_the_evaluation_has_the_poses_of_the_chain(
+    name: str, shared_data: Path, generator: torch.Generator
+) -> None:
+    """`BodyModel.pose` is the twin of pytorch-kinematics' forward kinematics, on every body."""
+    if name.endswith(".xml"):
+        pytest.importorskip("mujoco", reason="comes with the extra [mjcf]")
+    body = load_body(name if name in BODY_NAMES else shared_data / name)
+    turn = torch.linalg.matrix_exp(reference.skew(torch.tensor([1.0, -0.2, 0.7]).double()))
+    body = body.with_base(turn, torch.tensor([0.3, -2.0, 1.0]))
+    x = torch.randn(2, 3, body.num_parameters, generator=generator, dtype=torch.float64)
+    theirs, ours = body.forward_kinematics(x), body.pose(x).tree
+    torch.testing.assert_close(ours.rotation, theirs[..., :3, :3], rtol=0, atol=1e-12)
+    torch.testing.assert_close(ours.translation, theirs[..., :3, 3], rtol=0, atol=1e-12)
+    single = body.to(torch.float32).forward_kinematics(x[0, 0].float())
+    torch.testing.assert_close(single, theirs[0, 0].float(), rtol=0, atol=1e-4)
+    with pytest.raises(ShapeError):
+        body.forward_kinematics(x[..., 1:])
+
+
+def test_first_derivatives_of_the_chain_are_the_same_either_way() -> None:
+    tree = load_body("arm8").tree
+    q = torch.linspace(-1, 1, tree.num_joints, dtype=torch.float64).requires_grad_()
+    slopes = [
+        torch.autograd.grad(tree.link_poses(q, twice=twice).sin().sum(), q)[0]
+        for twice in (True, False)
+    ]
+    torch.testing.assert_close(slopes[0], slopes[1])
 
 
 @pytest.mark.parametrize("tree", trees())
@@ -103,7 +140,11 @@ def test_twists_move_points_as_autograd_says(
     assert tree.joint_ancestors.diagonal().all()
 
 
-def test_second_derivatives_are_those_of_finite_differences(generator: torch.Generator) -> None:
+@pytest.mark.parametrize("poses", [lambda tree, q: tree(q).translation,
+                                   lambda tree, q: tree.link_poses(q)[..., :3, 3]])  # fmt: skip
+def test_second_derivatives_are_those_of_finite_differences(
+    poses: Callable[[KinematicTree, Tensor], Tensor], generator: torch.Generator
+) -> None:
     """The trap of pytorch-kinematics' default backward: see section 0 of the field notes."""
     tree = load_body("arm8").tree
     q = torch.randn(tree.num_joints, generator=generator, dtype=torch.float64)
@@ -111,7 +152,7 @@ def test_second_derivatives_are_those_of_finite_differences(generator: torch.Gen
 
     def gradient(q: Tensor, create_graph: bool = False) -> Tensor:
         q = q if q.requires_grad else q.detach().requires_grad_()
-        value = (weight * tree.link_poses(q)[1]).sum().square()
+        value = (weight * poses(tree, q)).sum().square()
         return torch.autograd.grad(value, q, create_graph=create_graph)[0]
 
     leaf = q.clone().requires_grad_()
@@ -160,7 +201,7 @@ def test_robots_load_and_agree_with_pytorch_kinematics(
     assert list(tree.joint_names) == theirs.get_joint_parameter_names()
     q = torch.randn(6, tree.num_joints, generator=generator, dtype=torch.float64)
     expected = theirs.forward_kinematics(q)
-    rotation, translation = tree.link_poses(q)
+    rotation, translation, *_ = tree(q)
     assert set(tree.link_names) == set(expected)
     for link, pose in expected.items():
         matrix = pose.get_matrix()

@@ -10,11 +10,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchcss.body.chain import JointSpecification
 from torchcss.body.files.default_shape import bone_parts, rest_poses, solid_shape, touching_parts
-from torchcss.body.kinematics import JointSpecification
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
-from torchcss.body.root import ROOT_NAMES, has_root, root_angles
+from torchcss.body.root import ROOT_NAMES, has_root
+from torchcss.body.rotations import root_angles
 from torchcss.body.surface import implicit
 from torchcss.cost.visibility import ContourPredictor
 from torchcss.errors import BodyError

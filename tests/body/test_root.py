@@ -10,14 +10,8 @@ from torch import Tensor
 
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
-from torchcss.body.root import (
-    ROOT_NAMES,
-    has_root,
-    move_base,
-    root_angles,
-    root_pose,
-    root_rotation,
-)
+from torchcss.body.root import ROOT_NAMES, has_root, move_base, root_pose
+from torchcss.body.rotations import root_angles, root_rotation
 
 
 def rotation(*turn: float) -> Tensor:

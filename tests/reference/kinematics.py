@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchcss.body.kinematics import JointSpecification, TreePose
+from torchcss.body.chain import JointSpecification
+from torchcss.body.kinematics import TreePose
 from torchcss.types import LocalModel, PointCost
 
 

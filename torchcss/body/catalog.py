@@ -30,7 +30,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from torchcss.body.kinematics import JointSpecification
+from torchcss.body.chain import JointSpecification
 from torchcss.errors import BodyError
 
 Vector = tuple[float, float, float]

@@ -1,73 +1,31 @@
-"""Kinematic trees: link poses and world twists, the only user of pytorch-kinematics.
+"""Kinematic trees: link poses and world twists for the evaluation of costs.
 
 A tree is a set of links joined by joints of one degree of freedom. `KinematicTree.forward(q)` gives
 the pose of every link, eq. 1 [IJRR] (the map A), and the world twist `(omega_j, v_j)` of every
 joint: a point p carried by a link below joint j moves with `dp/dq_j = omega_j x p + v_j`.
 
-Trees come from a list of `JointSpecification` (the catalogue of bodies does that) or from any URDF
-file. pytorch-kinematics reads the files and puts joints and links in order; nobody else calls it.
-The poses are computed here: it takes one joint after the other, and its default backward pass drops
-the second-order terms. Joints at the same depth of the tree are turned together instead, in frames
-whose z axis is the joint's, so that a turn mixes two columns. Numbers are laid out with the batch
-innermost, as runs that a processor streams through; what is returned are views of that memory.
+pytorch-kinematics owns the chain (`torchcss.body.chain`): it puts joints and links in order, and
+`KinematicTree.link_poses` and `BodyModel.forward_kinematics` are its forward kinematics. `forward`
+is the faster twin that the cost is evaluated with, tested against it on every body. Joints at the
+same depth of the tree are turned together, in frames whose z axis is the joint's, so that a turn
+mixes two columns. Numbers are laid out with the batch innermost, as runs that a processor streams
+through; what is returned are views of that memory.
 """
 
 from __future__ import annotations
 
-import math
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import pytorch_kinematics as pk
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from torchcss.body.chain import JointSpecification, link_poses, make_chain, offset_matrix
+from torchcss.body.rotations import frame_along
 from torchcss.errors import BodyError, ShapeError, check_shape
-from torchcss.files import read_bytes
 from torchcss.types import Bounds
-
-_MOVING = ("revolute", "prismatic")
-_FAR = 1e6
-_URDF_TYPES = {
-    "revolute": "revolute",
-    "continuous": "revolute",
-    "prismatic": "prismatic",
-    "fixed": "fixed",
-}
-
-
-@dataclass(frozen=True, kw_only=True)
-class JointSpecification:
-    """One joint and the link below it.
-
-    Attributes:
-        name: Name of the joint.
-        link: Name of the link that the joint carries.
-        parent: Name of the link above, or None for the root link's own entry.
-        kind: "revolute", "prismatic" or "fixed".
-        translation: Origin of the joint in the parent link's frame, metres.
-        rotation: Orientation of the joint frame in the parent link's frame, 3 x 3.
-        axis: Joint axis in the joint frame.
-        lower: Least value (radians or metres); `-inf` if there is none.
-        upper: Greatest value; `inf` if there is none.
-        mimic: `(joint, multiplier, offset)` when the joint only follows another one.
-    """
-
-    name: str
-    link: str
-    parent: str | None
-    kind: str = "fixed"
-    translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    rotation: tuple[tuple[float, ...], ...] = ((1.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0))
-    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    lower: float = -math.inf
-    upper: float = math.inf
-    mimic: tuple[str, float, float] | None = None
 
 
 class TreePose(NamedTuple):
@@ -96,6 +54,8 @@ class KinematicTree(nn.Module):
         BodyError: On duplicate names, unknown parents or kinds, loops, or zero axes.
 
     Attributes:
+        specifications: The joints that it was made of.
+        chain: The library's chain, for forward kinematics.
         joint_names: Names of the moving joints, depth first; the order of `q`.
         link_names: Names of the links; the order of axis `l`.
         ancestors: `[q l]`, True where the joint moves the link.
@@ -118,14 +78,13 @@ class KinematicTree(nn.Module):
 
     def __init__(self, joints: Sequence[JointSpecification]) -> None:
         super().__init__()
-        _check_specifications(joints)
         self.specifications = tuple(joints)
-        chain = pk.Chain(_build_frames(joints), dtype=torch.float64)
+        self.chain = make_chain(joints)
         by_name = {joint.name: joint for joint in joints}
-        self.joint_names = tuple(chain.get_joint_parameter_names())
+        self.joint_names = tuple(self.chain.get_joint_parameter_names())
         moving = [by_name[name] for name in self.joint_names]
-        index = chain.frame_to_idx
-        self.link_names = tuple(sorted(index, key=lambda name: index[name]))
+        place_of = self.chain.frame_to_idx
+        self.link_names = tuple(sorted(place_of, key=lambda link: place_of[link]))
         parents = {joint.link: joint.parent for joint in joints}
         ancestors = torch.zeros(len(moving), len(self.link_names), dtype=torch.bool)
         for column, link in enumerate(self.link_names):
@@ -161,13 +120,14 @@ class KinematicTree(nn.Module):
         constant: dict[str, np.ndarray] = {}
         for joint in self.specifications:
             above = None if joint.parent is None else carrier[joint.parent]
-            offset = _offset_matrix(joint)
+            offset = offset_matrix(joint)
             if joint.parent is not None:
                 offset = fixed[joint.parent] @ offset
             if joint.kind == "fixed":
                 carrier[joint.link], fixed[joint.link] = above, offset
                 continue
-            aligned = _frame_along(joint.axis)
+            aligned = np.eye(4)
+            aligned[:3, :3] = frame_along(joint.axis)
             carrier[joint.link], fixed[joint.link] = joint.name, aligned.T
             parent[joint.name], constant[joint.name] = above, offset @ aligned
             depth[joint.name] = 1 if above is None else depth[above] + 1
@@ -203,25 +163,6 @@ class KinematicTree(nn.Module):
             "link_place", indices([place[carrier[name]] for name in self.link_names])
         )
 
-    @classmethod
-    def from_urdf(cls, source: str | Path) -> KinematicTree:
-        """Load the kinematics of a URDF file; meshes and inertias are ignored.
-
-        Args:
-            source: Path of the file.
-
-        Raises:
-            BodyError: If the file cannot be read, is no URDF, has joints of more than one degree of
-                freedom, duplicate names, or more than one root link.
-        """
-        path = Path(source)
-        data = read_bytes(path, BodyError)
-        specifications = _read_urdf(data, str(path))
-        try:
-            return cls(specifications)
-        except BodyError as error:
-            raise BodyError(f"{path}: {error}") from error
-
     @property
     def num_joints(self) -> int:
         """Number of moving joints."""
@@ -243,11 +184,16 @@ class KinematicTree(nn.Module):
         return self.link_names.index(name)
 
     def link_poses(
-        self, q: Float[Tensor, "*batch q"]
-    ) -> tuple[Float[Tensor, "*batch l 3 3"], Float[Tensor, "*batch l 3"]]:
-        """Orientation and origin of every link in the tree's base frame; twice differentiable."""
-        rotation, translation, _, _ = self.forward(q)
-        return rotation, translation
+        self, q: Float[Tensor, "*batch q"], *, twice: bool = True
+    ) -> Float[Tensor, "*batch l 4 4"]:
+        """Pose of every link in the tree's base frame, by pytorch-kinematics.
+
+        Args:
+            q: Joint values, radians and metres.
+            twice: Whether the poses can be differentiated twice; once is quicker.
+        """
+        check_shape("q", q, self.num_joints)
+        return link_poses(self.chain, q, twice=twice)
 
     def forward(
         self,
@@ -366,205 +312,3 @@ def _followed_by(
     for column, row in zip(frames[:, :, 1:].split(1, dim=2), rows[1:], strict=True):
         product = torch.addcmul(product, column, row)
     return product
-
-
-def _offset_matrix(joint: JointSpecification) -> np.ndarray:
-    """Where a joint sits in the link above, 4 x 4, its rotation made orthonormal."""
-    left, _, right = np.linalg.svd(np.asarray(joint.rotation, dtype=np.float64))
-    matrix = np.eye(4)
-    matrix[:3, :3] = left @ right
-    matrix[:3, 3] = joint.translation
-    return matrix
-
-
-def _frame_along(axis: Sequence[float]) -> np.ndarray:
-    """A rotation, 4 x 4, whose third column is the direction of an axis."""
-    z = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
-    helper = np.eye(3)[np.argmin(np.abs(z))]
-    x = np.cross(helper, z)
-    x /= np.linalg.norm(x)
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
-    return matrix
-
-
-def _check_specifications(joints: Sequence[JointSpecification]) -> None:
-    names = [joint.name for joint in joints if joint.parent is not None]
-    links = [joint.link for joint in joints]
-    for what, values in (("joint", names), ("link", links)):
-        duplicates = sorted({value for value in values if values.count(value) > 1})
-        if duplicates:
-            raise BodyError(f"{what} names must be unique; repeated: {', '.join(duplicates)}")
-    roots = [joint.link for joint in joints if joint.parent is None]
-    if len(roots) != 1:
-        raise BodyError(f"expected exactly one root link, found {len(roots)}: {', '.join(roots)}")
-    seen: set[str] = set()
-    for joint in joints:
-        if joint.parent is not None and joint.parent not in seen:
-            raise BodyError(
-                f"joint {joint.name!r} hangs on link {joint.parent!r}, which does not come before "
-                "it: the links must form one tree"
-            )
-        if joint.kind not in (*_MOVING, "fixed"):
-            raise BodyError(
-                f"joint {joint.name!r} is of type {joint.kind!r}; supported are revolute, "
-                "continuous, prismatic and fixed (split others into joints of one axis)"
-            )
-        numbers = np.concatenate([np.ravel(joint.rotation), joint.translation, joint.axis])
-        # Beyond this nothing is a body's, and squares would overflow.
-        far = not (np.abs(numbers) < _FAR).all()
-        if far or (joint.kind != "fixed" and np.linalg.norm(joint.axis) < 1 / _FAR):
-            raise BodyError(
-                f"joint {joint.name!r}: origin and axis must be finite, below {_FAR:g} metres, and "
-                "the axis not zero"
-            )
-        if not joint.lower <= joint.upper:
-            raise BodyError(f"joint {joint.name!r}: lower limit {joint.lower} > {joint.upper}")
-        seen.add(joint.link)
-
-
-def _build_frames(joints: Sequence[JointSpecification]) -> pk.Frame:
-    frames: dict[str, pk.Frame] = {}
-    root = None
-    for joint in joints:
-        matrix = torch.from_numpy(_offset_matrix(joint))
-        frame = pk.Frame(
-            joint.link,
-            link=pk.frame.Link(joint.link),
-            joint=pk.frame.Joint(
-                joint.name,
-                offset=pk.Transform3d(matrix=matrix[None], dtype=torch.float64),
-                joint_type=joint.kind,
-                axis=joint.axis,
-                dtype=torch.float64,
-            ),
-        )
-        frames[joint.link] = frame
-        if joint.parent is None:
-            root = frame
-        else:
-            frames[joint.parent].add_child(frame)
-    assert root is not None
-    return root
-
-
-def _read_urdf(data: bytes, name: str) -> list[JointSpecification]:
-    try:
-        xml = ElementTree.fromstring(data)
-    except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise BodyError(f"{name}: not a URDF, the XML does not parse ({error})") from error
-    if xml.tag != "robot" or xml.find("link") is None:
-        raise BodyError(f"{name}: not a URDF, expected <robot> with links, found <{xml.tag}>")
-    elements = {element.get("name", ""): element for element in xml.findall("joint")}
-    if len(elements) != len(xml.findall("joint")):
-        raise BodyError(f"{name}: two joints have the same name, or one has none")
-    for joint_name, element in elements.items():
-        if element.get("type") not in _URDF_TYPES:
-            raise BodyError(
-                f"{name}: joint {joint_name!r} is of type {element.get('type')!r}; supported are "
-                f"{', '.join(_URDF_TYPES)} (split others into joints of one axis)"
-            )
-    children = [_child(element, "child", name) for element in elements.values()]
-    parents = [_child(element, "parent", name) for element in elements.values()]
-    links = [link.get("name", "") for link in xml.findall("link")]
-    unknown = {*children, *parents} - set(links)
-    if unknown:
-        raise BodyError(f"{name}: joints name links that do not exist: {sorted(unknown)}")
-    if len(set(children)) != len(children) or len(set(links)) != len(links):
-        raise BodyError(f"{name}: a link occurs twice, or hangs on two joints")
-    reached = [link for link in links if link not in children]
-    if len(reached) != 1:
-        raise BodyError(f"{name}: expected exactly one root link, found {sorted(reached)}")
-    for link in reached:  # grows while it is walked: breadth first
-        reached += [below for below, above in zip(children, parents, strict=True) if above == link]
-    if len(reached) != len(links):
-        raise BodyError(f"{name}: the links {sorted(set(links) - set(reached))} form a loop")
-    if not elements:
-        return [JointSpecification(name="root", link=links[0], parent=None)]
-    try:
-        chain = pk.build_chain_from_urdf(ElementTree.tostring(_kinematics_only(xml)))
-    except Exception as error:  # the parser raises many kinds, all of them mean a bad file
-        reason = " ".join(str(error).split())
-        raise BodyError(f"{name}: pytorch-kinematics cannot read this URDF ({reason})") from error
-
-    specifications: list[JointSpecification] = []
-
-    def visit(frame: pk.Frame, parent: str | None) -> None:
-        element = elements.get(frame.joint.name or "")
-        link_offset, joint_offset = frame.link.offset, frame.joint.offset
-        matrix = torch.eye(4, dtype=torch.float64)
-        for offset in (link_offset, joint_offset):
-            if offset is not None:
-                matrix = matrix @ offset.get_matrix()[0].double()
-        axis = tuple(frame.joint.axis.double().tolist())
-        if element is not None and element.find("axis") is None:
-            axis = (1.0, 0.0, 0.0)  # the URDF's default; pytorch-kinematics takes z
-        lower, upper = _limits(element, name)
-        specifications.append(
-            JointSpecification(
-                name=frame.joint.name or "root",
-                link=frame.name,
-                parent=parent,
-                kind=frame.joint.joint_type,
-                translation=tuple(matrix[:3, 3].tolist()),
-                rotation=tuple(tuple(row) for row in matrix[:3, :3].tolist()),
-                axis=axis,
-                lower=lower,
-                upper=upper,
-                mimic=_mimic(element, name),
-            )
-        )
-        for child in frame.children:
-            visit(child, frame.name)
-
-    visit(chain._root, None)
-    return specifications
-
-
-def _kinematics_only(xml: ElementTree.Element) -> ElementTree.Element:
-    """The robot without meshes, inertias and limits, which the parser would only stumble over."""
-    robot = ElementTree.Element("robot", name="robot")
-    for link in xml.findall("link"):
-        ElementTree.SubElement(robot, "link", name=link.get("name", ""))
-    for joint in xml.findall("joint"):
-        bare = ElementTree.SubElement(robot, "joint", dict(joint.attrib))
-        # Files often give fixed joints the axis 0 0 0.
-        wanted = ("parent", "child", "origin", "axis")[: 3 if joint.get("type") == "fixed" else 4]
-        bare.extend(part for part in joint if part.tag in wanted)
-    return robot
-
-
-def _child(element: ElementTree.Element, tag: str, name: str) -> str:
-    child = element.find(tag)
-    if child is None or not child.get("link"):
-        raise BodyError(f"{name}: joint {element.get('name')!r} has no <{tag} link=...>")
-    return child.get("link", "")
-
-
-def _limits(element: ElementTree.Element | None, name: str) -> tuple[float, float]:
-    limit = None if element is None else element.find("limit")
-    if element is None or limit is None or element.get("type") == "continuous":
-        return -math.inf, math.inf
-    if limit.get("lower") is None and limit.get("upper") is None:
-        return -math.inf, math.inf
-    try:
-        return float(limit.get("lower", 0.0)), float(limit.get("upper", 0.0))
-    except ValueError as error:
-        raise BodyError(f"{name}: joint {element.get('name')!r}: {error}") from error
-
-
-def _mimic(element: ElementTree.Element | None, name: str) -> tuple[str, float, float] | None:
-    mimic = None if element is None else element.find("mimic")
-    if element is None or mimic is None:
-        return None
-    try:
-        multiplier = float(mimic.get("multiplier", 1.0))
-        offset = float(mimic.get("offset", 0.0))
-    except ValueError as error:
-        raise BodyError(f"{name}: joint {element.get('name')!r}: {error}") from error
-    if not (math.isfinite(multiplier) and math.isfinite(offset) and multiplier != 0):
-        raise BodyError(
-            f"{name}: joint {element.get('name')!r} mimics with multiplier {multiplier} and offset "
-            f"{offset}; expected finite numbers and a multiplier that is not zero"
-        )
-    return mimic.get("joint", ""), multiplier, offset

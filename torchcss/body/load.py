@@ -17,7 +17,6 @@ Call `read_skeleton`; `torchcss.load_body` does.
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +26,7 @@ import numpy as np
 import torch
 
 from torchcss.body.catalog import (
+    ARM_NAMES,
     BODY_NAMES,
     BodySpecification,
     MarkerSpecification,
@@ -35,12 +35,15 @@ from torchcss.body.catalog import (
     scaled,
     specification,
 )
+from torchcss.body.chain import JointSpecification
 from torchcss.body.files.bvh import Skeleton, read_bvh_skeleton
 from torchcss.body.files.default_shape import as_vector, bone_parts, rest_poses, touching_parts
 from torchcss.body.files.mjcf import read_mjcf
-from torchcss.body.files.urdf import read_urdf_solids
-from torchcss.body.kinematics import JointSpecification, KinematicTree
+from torchcss.body.files.urdf import read_urdf
+from torchcss.body.files.xml import parse_xml
+from torchcss.body.kinematics import KinematicTree
 from torchcss.body.model import BodyModel
+from torchcss.body.root import has_root
 from torchcss.errors import BodyError, MotionCaptureError
 from torchcss.files import one_line, read_bytes
 from torchcss.joint_names import skeleton_joint_names
@@ -142,21 +145,13 @@ def _read(
     if units is not None:
         raise BodyError(f"{path}: units are for BVH files; this format is in metres (see scale)")
     data = read_bytes(path, BodyError)
-    if path.suffix.lower() != ".urdf" and _root_tag(data) in ("mujoco", "mujocoinclude"):
+    root = parse_xml(path, data, "a URDF")
+    if path.suffix.lower() != ".urdf" and root.tag in ("mujoco", "mujocoinclude"):
         return *read_mjcf(path), _Y_UP
-    tree = KinematicTree.from_urdf(path)
-    skeleton = Skeleton(
-        tree.specifications, {}, ("limits, axes and solids: as the URDF says",), tree.link_names,
-        False,
-    )  # fmt: skip
-    return skeleton, read_urdf_solids(path, data), _Y_UP
-
-
-def _root_tag(data: bytes) -> str:
-    try:
-        return ElementTree.fromstring(data).tag
-    except (ElementTree.ParseError, ValueError, LookupError):
-        return ""  # reading it as a URDF says what is wrong
+    joints, solids = read_urdf(path, root)
+    links = KinematicTree(joints).link_names
+    note = "limits, axes and solids: as the URDF says"
+    return Skeleton(joints, {}, (note,), links, False), solids, _Y_UP
 
 
 def _middle_of_hips(
@@ -250,3 +245,17 @@ def load_body(
     except (BodyError, RecursionError) as error:  # a tree that cannot be: only a file has one
         raise BodyError(f"{path}: {one_line(error)}") from error
     return model.to(dtype=dtype, device=device)
+
+
+def has_free_root(name_or_path: str | Path) -> bool:
+    """Whether a body moves about in the world, as people do, or stands in one place, as an arm.
+
+    Args:
+        name_or_path: As for `load_body`, which asks the file by default.
+
+    Raises:
+        BodyError: As `load_body`.
+    """
+    if str(name_or_path) in BODY_NAMES:
+        return str(name_or_path) not in ARM_NAMES
+    return has_root(load_body(name_or_path))

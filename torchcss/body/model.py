@@ -224,8 +224,24 @@ class BodyModel(nn.Module):
         other._buffers["base_translation"] = translation.to(self.tie)
         return other
 
+    def forward_kinematics(
+        self, x: Float[Tensor, "*batch n"], *, twice: bool = True
+    ) -> Float[Tensor, "*batch l 4 4"]:
+        """Pose of every link in the world, by pytorch-kinematics; in the order `tree.link_names`.
+
+        Args:
+            x: State, radians and metres.
+            twice: Whether the poses can be differentiated twice; once is quicker.
+        """
+        check_shape("x", x, self.num_parameters)
+        base = torch.eye(4, dtype=x.dtype, device=x.device)
+        base[:3, :3], base[:3, 3] = self.base_rotation.to(x), self.base_translation.to(x)
+        return base @ self.tree.link_poses(x @ self.tie.T.to(x) + self.offset.to(x), twice=twice)
+
     def pose(self, x: Float[Tensor, "*batch n"]) -> BodyPose:
-        """Pose the body: the map A of eq. 1 [IJRR].
+        """Pose the body for the evaluation of a cost: the map A of eq. 1 [IJRR].
+
+        The poses are those of `forward_kinematics`; the twists say how they move.
 
         Args:
             x: State, radians and metres.

@@ -14,35 +14,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.body.model import BodyModel
+from torchcss.body.rotations import root_angles, root_rotation
 from torchcss.types import Bounds
 
 ROOT_NAMES = ("root_x", "root_y", "root_z", "root_yaw", "root_pitch", "root_roll")
-
-
-def root_rotation(angles: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation matrix of yaw, pitch and roll (radians)."""
-    a, b, c = angles.unbind(-1)
-    zero, one = torch.zeros_like(a), torch.ones_like(a)
-
-    def matrix(*entries: Tensor) -> Tensor:
-        return torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
-
-    yaw = matrix(a.cos(), zero, a.sin(), zero, one, zero, -a.sin(), zero, a.cos())
-    pitch = matrix(one, zero, zero, zero, b.cos(), -b.sin(), zero, b.sin(), b.cos())
-    roll = matrix(c.cos(), -c.sin(), zero, c.sin(), c.cos(), zero, zero, zero, one)
-    return yaw @ pitch @ roll
-
-
-def root_angles(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
-    """Yaw, pitch and roll of a rotation; pitch lies in [-pi/2, pi/2].
-
-    At a pitch of a right angle only the sum or difference of yaw and roll is determined: the angles
-    returned still give the rotation, but their derivatives are not finite.
-    """
-    yaw = torch.atan2(rotation[..., 0, 2], rotation[..., 2, 2])
-    pitch = torch.asin((-rotation[..., 1, 2]).clamp(-1, 1))
-    roll = torch.atan2(rotation[..., 1, 0], rotation[..., 1, 1])
-    return torch.stack([yaw, pitch, roll], dim=-1)
 
 
 def has_root(body: BodyModel) -> bool:

@@ -21,8 +21,7 @@ from dataclasses import replace
 
 import torch
 
-from torchcss.body.catalog import ARM_NAMES
-from torchcss.body.load import load_body
+from torchcss.body.load import has_free_root, load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.root import has_root, move_base, root_pose
 from torchcss.cost.joints import JointTargets, match_joints
@@ -143,7 +142,7 @@ def _with_lengths_held(
     starts = columns_of(free, body, candidates)
     body, starts, _ = move_base(body, *root_pose(body, starts[0]), starts)
     refined = refine(replace(cost, body=body), starts, options.search)
-    if free.name in ARM_NAMES:
+    if not has_free_root(free.name):
         # The root of the best fit becomes the arm's base, and only its angles are searched.
         best = refined.mean[int(refined.cost.nan_to_num(math.inf).argmin())]
         arm = with_lengths(free, lengths, scale, free_root=None).with_base(*root_pose(body, best))

@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
+from torchcss.body.rotations import from_axis_angle
 from torchcss.errors import CameraError
 from torchcss.files import load_json, one_line, read_text, real_numbers, shortened
 from torchcss.io.video import VideoReader
@@ -338,13 +339,7 @@ def rotation_matrix(vector: np.ndarray, where: str = "rotation") -> np.ndarray:
             f"{where}: a rotation vector of {shortened(vector.tolist())} turns more than twice "
             "around; expected radians"
         )
-    x, y, z = vector
-    angle = float(np.linalg.norm(vector))
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    # sin(a) / a and (1 - cos(a)) / a^2, both regular at zero.
-    first = np.sinc(angle / np.pi)
-    second = 0.5 * np.sinc(0.5 * angle / np.pi) ** 2
-    return np.eye(3) + first * cross + second * (cross @ cross)
+    return from_axis_angle(vector)
 
 
 INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"

@@ -191,11 +191,7 @@ def link_pose(
     body: BodyModel, link: str, x: Float[Tensor, "*batch n"]
 ) -> Float[Tensor, "*batch 4 4"]:
     """Frame of a link in the world."""
-    index, tree = body.tree.link_index(link), body.pose(x).tree
-    pose = torch.eye(4, dtype=x.dtype, device=x.device).repeat(*x.shape[:-1], 1, 1)
-    pose[..., :3, :3] = tree.rotation[..., index, :, :]
-    pose[..., :3, 3] = tree.translation[..., index, :]
-    return pose
+    return body.forward_kinematics(x)[..., body.tree.link_index(link), :, :]
 
 
 def pose_errors(

@@ -38,7 +38,8 @@ from torch import Tensor
 from torchcss.body.catalog import BODY_NAMES, LENGTHS, PROPORTION_RANGE
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
-from torchcss.body.root import ROOT_NAMES, free_turns, has_root, root_angles, root_rotation
+from torchcss.body.root import ROOT_NAMES, free_turns, has_root
+from torchcss.body.rotations import root_angles, root_rotation
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.errors import ConfigurationError

@@ -42,7 +42,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from torchcss.body.catalog import ARM_NAMES
+from torchcss.body.load import has_free_root
 from torchcss.errors import ConfigurationError
 from torchcss.inference.dynamics import ConstantVelocity
 from torchcss.inference.particle import AnnealedParticleFilter, ParticleFilter
@@ -324,7 +324,7 @@ def make_tracker(
     if preset not in PRESETS:
         raise ConfigurationError(f"no tracker {preset!r}; there are {', '.join(PRESETS)}")
     row = PRESETS[preset]
-    arm = body_name in ARM_NAMES
+    arm = not has_free_root(body_name)
     num_samples = num_samples or (row.samples_arm if arm else row.samples_body)
     num_modes = num_modes or (row.modes_arm if arm else row.modes_body)
     noise = (

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchcss.body.catalog import ARM_NAMES
+from torchcss.body.load import has_free_root
 from torchcss.body.model import BodyModel
 from torchcss.cost.anthropometric import Anthropometric
 from torchcss.cost.contour import ContourTerm
@@ -280,7 +280,7 @@ def make_choice(settings: Settings, sigma: float) -> CostChoice:
     has = settings.terms.__contains__
     repels = has("interpenetration") if row.interpenetration is None else row.interpenetration
     descends = row.particles is None
-    whole = settings.body not in ARM_NAMES
+    whole = has_free_root(settings.body)
     potential: dict[str, Any] = {} if row.robust else {"potential_kind": Quadratic}
     contour = ContourTerm(**potential)
     # The weights of motion boundaries make the wells of a fitted model shallower; what is back-
@@ -328,7 +328,7 @@ def make_settings_tracker(settings: Settings, motion: Float[Tensor, " n"]) -> Se
         return tracker  # `Settings` has refused what follows
     evidence = settings.evidence
     marked = settings.keypoints_use == "all" and "joints" in settings.terms
-    if evidence is None and marked and settings.body not in ARM_NAMES:
+    if evidence is None and marked and has_free_root(settings.body):
         evidence = PRESETS[settings.preset].evidence_keypoints
     if evidence is not None:
         tracker = replace(tracker, evidence=evidence, covariance_evidence=tracker.evidence)

@@ -14,8 +14,8 @@ from reference.bvh import BvhFile, read_bvh
 from torchcss import Track, load_body
 from torchcss.body.catalog import BODY_NAMES
 from torchcss.body.model import BodyModel
+from torchcss.body.rotations import ROTATION_ORDERS, about, axis_angle, euler_angles
 from torchcss.errors import ConfigurationError
-from torchcss.io.export.rotations import ROTATION_ORDERS, about, axis_angle, euler_angles
 from torchcss.io.tracks import load_track, save_track
 
 LENGTHS = {"thigh": 0.44, "upper_arm": 0.29, "trunk": 0.51, "foot": 0.18}

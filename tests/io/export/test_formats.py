@@ -17,7 +17,7 @@ from reference.c3d import read_c3d
 
 from torchcss import load_body
 from torchcss.body.model import BodyModel
-from torchcss.body.root import root_rotation
+from torchcss.body.rotations import root_rotation
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.errors import ConfigurationError, MissingExtraError
 from torchcss.io.export.mot import mot_header

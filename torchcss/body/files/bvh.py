@@ -25,9 +25,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from torchcss.body.chain import JointSpecification
 from torchcss.body.files.bvh_parser import Segment, Turn, parse_bvh
 from torchcss.body.files.default_shape import as_rows, as_vector
-from torchcss.body.kinematics import JointSpecification
+from torchcss.body.rotations import about
 from torchcss.errors import MotionCaptureError
 
 BASE: Final = "world_frame"
@@ -107,7 +108,7 @@ def read_bvh_skeleton(path: Path, *, units: str | float | None = None) -> Skelet
             )
             if has_motion and not moves[turn.column]:
                 held.append(name)
-                turned = as_rows(_turn(turn.axis, float(angles[0])))
+                turned = as_rows(about(turn.axis, angles[0]))
                 joints.append(replace(joint, rotation=turned))
             else:
                 lower, upper = _limits(angles, has_motion, locks and place == 1)
@@ -223,12 +224,3 @@ def _limits_line(num_frames: int, has_motion: bool, held: Sequence[str]) -> str:
         f"{num_frames} frames of the file, whose mean and deviation are the stabilisers"
     )
     return line + (f"; {len(held)} that never move are held" if held else "")
-
-
-def _turn(axis: int, angle: float) -> Float[np.ndarray, "3 3"]:
-    """Rotation about one coordinate axis."""
-    matrix = np.eye(3)
-    j, k = (axis + 1) % 3, (axis + 2) % 3
-    matrix[j, j] = matrix[k, k] = math.cos(angle)
-    matrix[k, j], matrix[j, k] = math.sin(angle), -math.sin(angle)
-    return matrix

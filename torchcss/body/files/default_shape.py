@@ -25,7 +25,8 @@ import torch
 from jaxtyping import Float
 
 from torchcss.body.catalog import PartSpecification, Vector
-from torchcss.body.kinematics import JointSpecification
+from torchcss.body.chain import JointSpecification
+from torchcss.body.rotations import frame_along
 from torchcss.body.surface import angular_grid, implicit, surface_points
 
 GIRTHS: dict[tuple[str, str], tuple[str, float]] = {
@@ -128,7 +129,7 @@ def bone_parts(
                 name=_unused(_bone_name(bone), [part.name for part in parts]),
                 link=bone.carrier,
                 translation=as_vector(turn.T @ middle),
-                rotation=as_rows(turn.T @ _frame(bone.bone, side)),
+                rotation=as_rows(turn.T @ frame_along(bone.bone, side)),
                 shape=(*axes, 0.7, 0.9 if side is not None else 1.0, 0.0, 0.0, 0.0, 0.0),
             )
         )
@@ -278,19 +279,6 @@ def _capsule_exponent(radius: float, half: float) -> float:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if volume(middle) > wanted else (low, middle)
     return 0.5 * (low + high)
-
-
-def _frame(
-    along: Float[np.ndarray, "3"], side: Float[np.ndarray, "3"] | None = None
-) -> Float[np.ndarray, "3 3"]:
-    """A rotation whose z axis runs along a bone, and whose x axis is nearest to `side`."""
-    z = along / np.linalg.norm(along)
-    helper = np.eye(3)[int(np.argmin(np.abs(z)))] if side is None else side
-    x = helper - z * (helper @ z)
-    if np.linalg.norm(x) < 1e-6 * np.linalg.norm(helper):
-        return _frame(along)
-    x = x / np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z], axis=1)
 
 
 def _unused(name: str, used: Sequence[str]) -> str:

@@ -22,9 +22,9 @@ import numpy as np
 from jaxtyping import Float
 
 from torchcss.body.catalog import PartSpecification
+from torchcss.body.chain import JointSpecification
 from torchcss.body.files.bvh import BASE, Skeleton
 from torchcss.body.files.default_shape import as_rows, as_vector, solid_shape
-from torchcss.body.kinematics import JointSpecification
 from torchcss.errors import BodyError
 from torchcss.files import one_line, read_bytes, shortened
 

@@ -1,23 +1,30 @@
-"""Simple solids of a URDF as parts: boxes, cylinders, spheres (and capsules, which some write).
+"""A body from a URDF file: its tree, limits and simple solids; meshes and inertias are ignored.
 
-The visual solids of a link, or where it has none those for collisions; meshes are left out. The
-tree itself is read by `torchcss.body.kinematics`. Call `read_urdf_solids`.
+pytorch-kinematics reads the joints (`torchcss.body.chain.urdf_joints`). Limits and mimic joints,
+which it leaves out, are read here, and the file is screened before it sees it. Solids are boxes,
+cylinders, spheres and capsules: the visual ones of a link, or where it has none those for
+collisions.
+
+Call `read_urdf`; `torchcss.load_body("x.urdf")` does.
 """
 
 from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 
-import numpy as np
-
 from torchcss.body.catalog import PartSpecification
+from torchcss.body.chain import JointSpecification, urdf_joints
 from torchcss.body.files.default_shape import as_rows, solid_shape
+from torchcss.body.rotations import about_fixed_axes
 from torchcss.errors import BodyError
 from torchcss.files import shortened
 
+_TYPES = ("revolute", "continuous", "prismatic", "fixed")
 _SIZES = {
     "box": ("size",),
     "sphere": ("radius",),
@@ -26,25 +33,129 @@ _SIZES = {
 }
 
 
-def read_urdf_solids(path: Path, data: bytes) -> tuple[PartSpecification, ...]:
-    """Parts of a URDF that has been read as a tree already.
+def read_urdf(
+    path: Path, robot: ElementTree.Element
+) -> tuple[tuple[JointSpecification, ...], tuple[PartSpecification, ...]]:
+    """Joints and solids of a URDF.
 
     Args:
         path: The file, for messages.
-        data: Its content.
+        robot: Its root element.
 
     Raises:
-        BodyError: If a size or place is not of numbers.
+        BodyError: If it is no URDF, has joints of more than one degree of freedom, repeats a name,
+            is not one tree, or has a number that is none.
     """
+    if robot.tag != "robot" or robot.find("link") is None:
+        raise BodyError(f"{path}: not a URDF, expected <robot> with links, found <{robot.tag}>")
+    elements = {element.get("name", ""): element for element in robot.findall("joint")}
+    _check_tree(path, robot, elements)
+    if not elements:
+        name = robot.findall("link")[0].get("name", "")
+        joints = [JointSpecification(name="root", link=name, parent=None)]
+    else:
+        try:
+            joints = urdf_joints(ElementTree.tostring(_kinematics_only(robot)))
+        except BodyError as error:
+            raise BodyError(f"{path}: {error}") from error
+    completed = (
+        joint if joint.parent is None else _completed(path, joint, elements[joint.name])
+        for joint in joints
+    )
+    return tuple(completed), _solids(path, robot)
+
+
+def _check_tree(
+    path: Path, robot: ElementTree.Element, joints: Mapping[str, ElementTree.Element]
+) -> None:
+    """Names, types, and that the links form one tree."""
+    if len(joints) != len(robot.findall("joint")):
+        raise BodyError(f"{path}: two joints have the same name, or one has none")
+    for name, element in joints.items():
+        if element.get("type") not in _TYPES:
+            raise BodyError(
+                f"{path}: joint {name!r} is of type {element.get('type')!r}; supported are "
+                f"{', '.join(_TYPES)} (split others into joints of one axis)"
+            )
+    children, parents = (
+        [_link(path, element, tag) for element in joints.values()] for tag in ("child", "parent")
+    )
+    links = [link.get("name", "") for link in robot.findall("link")]
+    unknown = {*children, *parents} - set(links)
+    if unknown:
+        raise BodyError(f"{path}: joints name links that do not exist: {sorted(unknown)}")
+    if len(set(children)) != len(children) or len(set(links)) != len(links):
+        raise BodyError(f"{path}: a link occurs twice, or hangs on two joints")
+    reached = [link for link in links if link not in children]
+    if len(reached) != 1:
+        raise BodyError(f"{path}: expected exactly one root link, found {sorted(reached)}")
+    for link in reached:  # grows while it is walked: breadth first
+        reached += [below for below, above in zip(children, parents, strict=True) if above == link]
+    if len(reached) != len(links):
+        raise BodyError(f"{path}: the links {sorted(set(links) - set(reached))} form a loop")
+
+
+def _link(path: Path, element: ElementTree.Element, tag: str) -> str:
+    """The link that a joint names as its child or parent."""
+    child = element.find(tag)
+    if child is None or not child.get("link"):
+        raise BodyError(f"{path}: joint {element.get('name')!r} has no <{tag} link=...>")
+    return child.get("link", "")
+
+
+def _kinematics_only(robot: ElementTree.Element) -> ElementTree.Element:
+    """The robot without meshes, inertias and limits, which the parser would only stumble over."""
+    bare = ElementTree.Element("robot", name="robot")
+    for link in robot.findall("link"):
+        ElementTree.SubElement(bare, "link", name=link.get("name", ""))
+    for joint in robot.findall("joint"):
+        # Files often give fixed joints the axis 0 0 0.
+        wanted = ("parent", "child", "origin", "axis")[: 3 if joint.get("type") == "fixed" else 4]
+        ElementTree.SubElement(bare, "joint", dict(joint.attrib)).extend(
+            part for part in joint if part.tag in wanted
+        )
+    return bare
+
+
+def _completed(
+    path: Path, joint: JointSpecification, element: ElementTree.Element
+) -> JointSpecification:
+    """A joint with its limits, with what it mimics, and with the axis that a URDF means by none."""
+    where = f"{path}: joint {joint.name!r}"
+    if element.find("axis") is None:
+        joint = replace(joint, axis=(1.0, 0.0, 0.0))  # pytorch-kinematics takes z
+    limit, mimic = element.find("limit"), element.find("mimic")
+    try:
+        if (
+            limit is not None
+            and element.get("type") != "continuous"
+            and {"lower", "upper"} & set(limit.keys())
+        ):
+            lower, upper = (float(limit.get(end, 0.0)) for end in ("lower", "upper"))
+            joint = replace(joint, lower=lower, upper=upper)
+        if mimic is None:
+            return joint
+        multiplier, offset = float(mimic.get("multiplier", 1.0)), float(mimic.get("offset", 0.0))
+    except ValueError as error:
+        raise BodyError(f"{where}: {error}") from error
+    if not (math.isfinite(multiplier) and math.isfinite(offset) and multiplier != 0):
+        raise BodyError(
+            f"{where} mimics with multiplier {multiplier} and offset {offset}; expected finite "
+            "numbers and a multiplier that is not zero"
+        )
+    return replace(joint, mimic=(mimic.get("joint", ""), multiplier, offset))
+
+
+def _solids(path: Path, robot: ElementTree.Element) -> tuple[PartSpecification, ...]:
+    """The simple solids of all links."""
     parts: list[PartSpecification] = []
-    links = ElementTree.fromstring(data).findall("link")
+    links = robot.findall("link")
     # A link's first solid has its name, also that of a link further on.
     names = {link.get("name", "") for link in links}
     for link in links:
         name = link.get("name", "")
         free = (other for n in count(2) if (other := f"{name}_{n}") not in names)
-        solids = [found for tag in ("visual", "collision") if (found := _solids(link, tag))]
-        for number, (element, solid) in enumerate(solids[0] if solids else [], start=1):
+        for number, (element, solid) in enumerate(_simple_solids(link), start=1):
             where = f"{path}: link {name!r}: <{solid.tag}>"
             size: list[float] = []
             for key in _SIZES[solid.tag]:
@@ -58,7 +169,7 @@ def read_urdf_solids(path: Path, data: bytes) -> tuple[PartSpecification, ...]:
             origin = element.find("origin")
             values = {} if origin is None else origin.attrib
             x, y, z = _numbers(where, "xyz", values.get("xyz", "0 0 0"), 3)
-            turn = _turn(_numbers(where, "rpy", values.get("rpy", "0 0 0"), 3))
+            turn = about_fixed_axes(_numbers(where, "rpy", values.get("rpy", "0 0 0"), 3), "XYZ")
             parts.append(
                 PartSpecification(
                     name=name if number == 1 else next(free),
@@ -71,17 +182,21 @@ def read_urdf_solids(path: Path, data: bytes) -> tuple[PartSpecification, ...]:
     return tuple(parts)
 
 
-def _solids(
-    link: ElementTree.Element, tag: str
+def _simple_solids(
+    link: ElementTree.Element,
 ) -> list[tuple[ElementTree.Element, ElementTree.Element]]:
-    """Elements of a link that have a simple solid, with it."""
-    return [
-        (element, solid)
-        for element in link.findall(tag)
-        for geometry in element.findall("geometry")
-        for solid in geometry
-        if solid.tag in _SIZES
-    ]
+    """Elements of a link that have a simple solid, with it: visual ones or else for collisions."""
+    for tag in ("visual", "collision"):
+        found = [
+            (element, solid)
+            for element in link.findall(tag)
+            for geometry in element.findall("geometry")
+            for solid in geometry
+            if solid.tag in _SIZES
+        ]
+        if found:
+            return found
+    return []
 
 
 def _numbers(where: str, key: str, text: str, size: int) -> list[float]:
@@ -92,15 +207,3 @@ def _numbers(where: str, key: str, text: str, size: int) -> list[float]:
     if len(values) != size or not all(abs(value) < 1e9 for value in values):
         raise BodyError(f"{where}: {key}: expected {size} numbers, found {shortened(text)}")
     return values
-
-
-def _turn(rpy: list[float]) -> np.ndarray:
-    """Roll, pitch, yaw about fixed axes."""
-    (cr, cp, cy), (sr, sp, sy) = ([f(angle) for angle in rpy] for f in (math.cos, math.sin))
-    return np.array(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [-sp, cp * sr, cp * cr],
-        ]
-    )

@@ -19,8 +19,8 @@ import numpy as np
 from jaxtyping import Float
 
 from torchcss.body.model import BodyModel
+from torchcss.body.rotations import ROTATION_ORDERS, euler_angles
 from torchcss.errors import ConfigurationError
-from torchcss.io.export.rotations import ROTATION_ORDERS, euler_angles
 from torchcss.io.export.selection import Selection
 from torchcss.io.export.skeleton import Skeleton, make_skeleton, node_poses, t_pose
 

@@ -17,8 +17,8 @@ import numpy as np
 import torch
 
 from torchcss.body.model import BodyModel
-from torchcss.body.root import ROOT_NAMES, has_root, root_rotation
-from torchcss.io.export.rotations import euler_angles
+from torchcss.body.root import ROOT_NAMES, has_root
+from torchcss.body.rotations import euler_angles, root_rotation
 from torchcss.io.export.selection import Selection
 
 

@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Float
 
 from torchcss.body.model import BodyModel
-from torchcss.io.export.rotations import about
+from torchcss.body.rotations import about
 from torchcss.io.track_body import pose_track
 
 # Where H-Anim hangs what we fix in the link below. Both ends turn alike, so only the picture of
@@ -200,7 +200,7 @@ def node_poses(
         Orientations and, in metres, places.
     """
     tree = pose_track(body, torch.from_numpy(state), torch.from_numpy(base)).tree
-    zero, _ = body.tree.link_poses(body.offset)
+    zero = body.tree.link_poses(body.offset)[:, :3, :3]
     link = [node.link for node in skeleton.nodes]
     point = torch.tensor([node.point for node in skeleton.nodes], dtype=torch.float64)
     rotation = tree.rotation[:, link]

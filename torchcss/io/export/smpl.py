@@ -22,8 +22,8 @@ from __future__ import annotations
 import numpy as np
 
 from torchcss.body.model import BodyModel
+from torchcss.body.rotations import axis_angle
 from torchcss.errors import ConfigurationError
-from torchcss.io.export.rotations import axis_angle
 from torchcss.io.export.selection import Selection
 from torchcss.io.export.skeleton import make_skeleton, node_poses, t_pose
 

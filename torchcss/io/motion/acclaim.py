@@ -8,7 +8,6 @@ Call `parse_acclaim`; BVH, the other format, is parsed in `torchcss.body.files.b
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -17,9 +16,9 @@ import numpy as np
 from jaxtyping import Float
 
 from torchcss.body.files.bvh_parser import Segment, Turn, axis_of, bad, count, numbers
+from torchcss.body.rotations import about_fixed_axes
 from torchcss.errors import MotionCaptureError
 from torchcss.files import Line, read_lines
-from torchcss.io.export.rotations import about
 
 
 class _Acclaim(NamedTuple):
@@ -102,7 +101,7 @@ def _parse_asf(path: Path, lines: list[Line]) -> _Acclaim:
             raise bad(path, root[key].number, "three numbers", " ".join(words))
         return values[0], values[1], values[2]
 
-    order, axes = root["order"], _euler(vector("orientation"), "XYZ", radians)
+    order, axes = root["order"], _turned(vector("orientation"), "XYZ", radians)
     turns = turns_of("root", order.number, order.words[1:])
     segments = [Segment("root", -1, vector("position"), axes, turns, False)]
     index = {"root": 0}
@@ -178,18 +177,13 @@ def _bone(path: Path, block: Sequence[Line], radians: bool) -> tuple[str, _Bone]
     x, y, z = (length * value for value in direction)
     freedom = tuple(entries["dof"].words[1:]) if "dof" in entries else ()
     return entries["name"].words[1], _Bone(
-        entries.get("dof", block[0]).number, (x, y, z), _euler(axis, order, radians), freedom
+        entries.get("dof", block[0]).number, (x, y, z), _turned(axis, order, radians), freedom
     )
 
 
-def _euler(angles: Sequence[float], order: str, radians: bool) -> Float[np.ndarray, "3 3"]:
+def _turned(angles: Sequence[float], order: str, radians: bool) -> Float[np.ndarray, "3 3"]:
     """Rotations about fixed axes, in the order of the letters."""
-    matrix = np.eye(3)
-    for angle, letter in zip(angles, order, strict=True):
-        matrix = (
-            about(axis_of(letter), np.array(angle if radians else math.radians(angle))) @ matrix
-        )
-    return matrix
+    return about_fixed_axes(angles if radians else np.radians(angles).tolist(), order.upper())
 
 
 def _hierarchy(path: Path, section: tuple[Line, list[Line]], bones: set[str]) -> dict[str, str]:

@@ -35,9 +35,9 @@ from jaxtyping import Float
 
 from torchcss.body.files.bvh import UNITS, guess_units, rest_positions, skeleton_span
 from torchcss.body.files.bvh_parser import Segment, parse_bvh
+from torchcss.body.rotations import about
 from torchcss.errors import ConfigurationError, MotionCaptureError
 from torchcss.files import shortened
-from torchcss.io.export.rotations import about
 from torchcss.io.motion.acclaim import parse_acclaim
 from torchcss.joint_names import canonical_joint_name
 

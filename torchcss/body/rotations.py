@@ -1,12 +1,22 @@
-"""Rotation matrices as the angles that files hold: Euler angles in any order, and axis-angle.
+"""Rotation matrices, and the angles and vectors that stand for them.
 
-Call `euler_angles` for BVH and MOT, `axis_angle` for SMPL, `about` for the matrix of one axis.
+| call | for |
+|---|---|
+| `about`, `about_fixed_axes` | turns about coordinate axes: URDF, BVH, Acclaim |
+| `euler_angles` | angles in any order, continuous over frames: BVH, MOT |
+| `axis_angle`, `from_axis_angle` | rotation vectors: SMPL, OpenCV |
+| `root_rotation`, `root_angles` | yaw, pitch, roll of a body's root, as tensors |
+| `frame_along` | a frame whose z axis has a direction |
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+import torch
 from jaxtyping import Float
+from torch import Tensor
 
 ROTATION_ORDERS = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
 
@@ -21,6 +31,40 @@ def about(axis: int, angle: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*
     matrix[..., k, j] = np.sin(angle)
     matrix[..., j, k] = -np.sin(angle)
     return matrix
+
+
+def about_fixed_axes(angles: Sequence[float], order: str) -> Float[np.ndarray, "3 3"]:
+    """Turns about fixed axes one after the other, in the order of the letters, radians."""
+    matrix = np.eye(3)
+    for angle, letter in zip(angles, order, strict=True):
+        matrix = about("XYZ".index(letter), np.array(angle)) @ matrix
+    return matrix
+
+
+def from_axis_angle(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Rotation about a vector by its length in radians (Rodrigues' formula)."""
+    x, y, z = vector
+    angle = float(np.linalg.norm(vector))
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    # sin(a) / a and (1 - cos(a)) / a^2, both regular at zero.
+    first = np.sinc(angle / np.pi)
+    second = 0.5 * np.sinc(0.5 * angle / np.pi) ** 2
+    return np.eye(3) + first * cross + second * (cross @ cross)
+
+
+def frame_along(
+    direction: Sequence[float] | np.ndarray, side: Float[np.ndarray, "3"] | None = None
+) -> Float[np.ndarray, "3 3"]:
+    """A rotation whose third column is a direction, and whose first one is nearest to `side`."""
+    z = np.asarray(direction, dtype=np.float64) / np.linalg.norm(direction)
+    if side is None:
+        x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
+    else:
+        x = side - z * (side @ z)
+        if np.linalg.norm(x) < 1e-6 * np.linalg.norm(side):
+            return frame_along(direction)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)
 
 
 def euler_angles(
@@ -92,3 +136,29 @@ def axis_angle(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "
     angle = 2.0 * np.arctan2(sine, quaternion[..., :1])
     ratio = np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0)
     return ratio * quaternion[..., 1:]
+
+
+def root_rotation(angles: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation matrix of yaw, pitch and roll (radians)."""
+    a, b, c = angles.unbind(-1)
+    zero, one = torch.zeros_like(a), torch.ones_like(a)
+
+    def matrix(*entries: Tensor) -> Tensor:
+        return torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
+
+    yaw = matrix(a.cos(), zero, a.sin(), zero, one, zero, -a.sin(), zero, a.cos())
+    pitch = matrix(one, zero, zero, zero, b.cos(), -b.sin(), zero, b.sin(), b.cos())
+    roll = matrix(c.cos(), -c.sin(), zero, c.sin(), c.cos(), zero, zero, zero, one)
+    return yaw @ pitch @ roll
+
+
+def root_angles(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
+    """Yaw, pitch and roll of a rotation; pitch lies in [-pi/2, pi/2].
+
+    At a pitch of a right angle only the sum or difference of yaw and roll is determined: the angles
+    returned still give the rotation, but their derivatives are not finite.
+    """
+    yaw = torch.atan2(rotation[..., 0, 2], rotation[..., 2, 2])
+    pitch = torch.asin((-rotation[..., 1, 2]).clamp(-1, 1))
+    roll = torch.atan2(rotation[..., 1, 0], rotation[..., 1, 1])
+    return torch.stack([yaw, pitch, roll], dim=-1)

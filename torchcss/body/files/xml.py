@@ -1,0 +1,45 @@
+"""XML files of strangers, screened before a parser of robots sees them.
+
+Call `parse_xml`.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+from xml.parsers import expat
+
+from torchcss.errors import BodyError
+from torchcss.files import one_line
+
+_MOST_BYTES = 50_000_000
+
+
+def parse_xml(path: Path, data: bytes, what: str) -> ElementTree.Element:
+    """The root element of an XML file.
+
+    Args:
+        path: The file, for messages.
+        data: Its content.
+        what: What the file should be, for messages.
+
+    Raises:
+        BodyError: If it is very large, declares entities, or does not parse.
+    """
+    if len(data) > _MOST_BYTES:
+        raise BodyError(f"{path}: {len(data):,} bytes; expected {what} of {_MOST_BYTES:,} at most")
+
+    def refuse(*_: object) -> None:
+        raise BodyError(f"{path}: declares XML entities, which {what} does not need; remove them")
+
+    try:
+        screen = expat.ParserCreate()
+        screen.EntityDeclHandler = refuse
+        screen.Parse(data, True)
+        return ElementTree.fromstring(data)
+    except (ElementTree.ParseError, expat.ExpatError, ValueError, LookupError) as error:
+        if isinstance(error, BodyError):
+            raise
+        raise BodyError(
+            f"{path}: not {what}, the XML does not parse ({one_line(error)})"
+        ) from error
