@@ -13,7 +13,7 @@ from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.root import has_root
 
-mujoco = pytest.importorskip("mujoco", reason="the peer comes with the extra [bench]")
+mujoco = pytest.importorskip("mujoco", reason="comes with the extra [mjcf]")
 
 TOLERANCE = 1e-9
 """Metres and radians."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from torchcss.body.root import ROOT_NAMES, has_root
 from torchcss.body.rotations import root_angles
 from torchcss.body.surface import implicit
 from torchcss.cost.visibility import ContourPredictor
-from torchcss.errors import BodyError
+from torchcss.errors import BodyError, MissingExtraError
 from torchcss.io.motion.positions import read_motion_capture
 from torchcss.types import Curvature, PointCost
 
@@ -126,6 +127,18 @@ MJCF = """<mujoco>
   </worldbody>
 </mujoco>
 """
+
+FINGER = """<mujoco><compiler angle="radian"/><worldbody><body name="finger" pos="0 0 .1">
+  <joint name="curl" axis="0 1 0" range="0 1.5"/><geom type="mesh" mesh="of some file"/>
+  <geom name="tip" size=".01" pos="0 0 .05"/></body></worldbody></mujoco>"""
+ATTACHED = """<mujoco><asset><model name="finger" file="finger.xml"/></asset><worldbody>
+  <body name="palm"><joint name="turn"/>
+  <frame pos="-.1 0 0"><attach model="finger" body="finger" prefix="a_"/></frame>
+  <frame pos=".1 0 0"><attach model="finger" body="finger" prefix="b_"/></frame>
+  </body></worldbody></mujoco>"""
+REPLICATED = """<mujoco><worldbody><body name="palm"><joint name="turn"/>
+  <replicate count="3" offset=".1 0 0"><body name="finger"><joint name="curl" axis="0 1 0"/>
+  <geom size=".01"/></body></replicate></body></worldbody></mujoco>"""
 
 
 def robot(shared_data: Path, name: str) -> Path:
@@ -332,6 +345,33 @@ def test_mjcf_by_hand(tmp_path: Path, generator: torch.Generator) -> None:
     ] == [3, 0]
 
 
+def test_mjcf_that_the_compiler_expands(tmp_path: Path) -> None:
+    write(tmp_path / "finger.xml", FINGER)
+    body = load_body(write(tmp_path / "a.xml", ATTACHED))
+    assert body.state_names == ("turn", "a_curl", "b_curl")
+    assert float(body.upper[1]) == pytest.approx(1.5)
+    assert {"a_tip", "b_tip"} <= set(body.part_names)
+    joints = body.pose(body.rest).joints
+    apart = joints[body.joint_index("b_finger")] - joints[body.joint_index("a_finger")]
+    torch.testing.assert_close(apart, torch.tensor([0.2, 0.0, 0.0]).double())
+    body = load_body(write(tmp_path / "b.xml", REPLICATED))
+    assert body.state_names == ("turn", "curl0", "curl1", "curl2")
+
+
+def test_mjcf_may_include_a_file_twice(tmp_path: Path) -> None:
+    write(tmp_path / "solid.xml", '<mujocoinclude><geom size=".1"/></mujocoinclude>')
+    include = '<include file="solid.xml"/>'
+    text = f'<mujoco><worldbody><body name="a">{include}<body name="b" pos="0 0 1">{include}'
+    body = load_body(write(tmp_path / "a.xml", text + "</body></body></worldbody></mujoco>"))
+    assert body.part_names == ("a", "b")
+
+
+def test_mjcf_without_mujoco(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'torchcss\[mjcf\]'"):
+        load_body(write(tmp_path / "a.xml", MJCF))
+
+
 def test_a_free_root_is_upright_and_at_the_body(tmp_path: Path, shared_data: Path) -> None:
     body = load_body(write(tmp_path / "a.xml", MJCF))
     assert has_root(body)
@@ -467,24 +507,30 @@ def test_solids_have_their_length_girth_and_volume(kind: str, size: tuple[float,
         ("a.xml", "", "the file is empty"),
         ("a.xml", BVH, "the XML does not parse"),
         ("a.xml", "<html/>", "expected <robot> with links, found <html>"),
+        ("a.urdf", f"<!DOCTYPE r [<!ENTITY a 'b'>]>{MJCF}", "declares XML entities"),
+        ("a.xml", f"<!DOCTYPE r [<!ENTITY a 'b'>]>{MJCF}", "declares XML entities"),
         ("a.xml", "<mujoco/>", "no <body>"),
         ("a.xml", "<mujoco><worldbody/></mujoco>", "no <body>"),
-        ("a.xml", MJCF.replace(".1 .2 .3", ".1 .2"), "<body name='arm'>: expected 3 numbers"),
-        ("a.xml", MJCF.replace(".1 .2 .3", ".1 nan .3"), "<body name='arm'>: expected 3 numbers"),
-        ("a.xml", MJCF.replace(".1 .2 .3", ".1 1e30 .3"), "<body name='arm'>: expected 3 numbers"),
-        ("a.xml", MJCF.replace('type="slide"', 'type="screw"'), "'slide'.* type hinge, slide"),
-        ("a.xml", MJCF.replace('axis="1 0 0"', 'axis="0 0 0"'), "'slide'.*not zero"),
+        ("a.xml", MJCF.replace(".1 .2 .3", ".1 .2"), "'pos' does not have enough data"),
+        ("a.xml", MJCF.replace(".1 .2 .3", ".1 nan .3"), "'arm'>: pos: expected num"),
+        ("a.xml", MJCF.replace(".1 .2 .3", ".1 1e30 .3"), "below 1e.06 metres"),
+        ("a.xml", MJCF.replace('type="slide"', 'type="screw"'), "invalid keyword: 'screw'"),
+        ("a.xml", MJCF.replace('axis="1 0 0"', 'axis="0 0 0"'), "axis too small .*'slide'"),
         ("a.xml", MJCF.replace('"-1 2"', '"2 -1"'), "joint 'turn': expected a range"),
-        ("a.xml", MJCF.replace("XYZ", "XYW"), "compiler: expected eulerseq"),
-        ("a.xml", MJCF.replace("childclass=\"big\"", 'childclass="small"'), "a default class"),
-        ("a.xml", MJCF.replace('size=".1 .05 .02"', 'size=".1 0 .02"'), "'arm': expected 3 pos"),
-        ("a.xml", MJCF.replace(' size=".05 .1"', ""), "'trunk': expected 2 positive numbers as si"),
-        ("a.xml", MJCF.replace('type="box"', 'type="cone"', 1), "'arm': expected type sphere"),
-        ("a.xml", MJCF.replace('name="slide"', 'name="turn"'), "a.xml: joint names must be unique"),
-        ("a.xml", MJCF.replace("frame", "replicate"), "needs MuJoCo's compiler"),
+        ("a.xml", MJCF.replace("XYZ", "XYW"), "euler sequence can only"),
+        ("a.xml", MJCF.replace("childclass=\"big\"", 'childclass="small"'), "default childclass"),
+        ("a.xml", MJCF.replace('size=".1 .05 .02"', 'size=".1 0 .02"'), "size 1 must be positive"),
+        ("a.xml", MJCF.replace(' size=".05 .1"', ""), "size 0 must be positive .*'trunk'"),
+        ("a.xml", MJCF.replace('type="box"', 'type="cone"', 1), "invalid keyword: 'cone'"),
+        ("a.xml", MJCF.replace('name="slide"', 'name="turn"'), "repeated name 'turn' in joint"),
+        ("a.xml", MJCF.replace("frame", "replicate"), "missing: 'count'"),
         ("a.xml", '<mujoco><include file="b.xml"/></mujoco>', "b.xml: there is no such file"),
         ("a.xml", '<mujoco><include file="a.xml"/></mujoco>', "includes: do they loop"),
-        ("a.xml", MJCF.replace("<freejoint/>", "<freejoint/><joint/>"), "a free joint alone"),
+        ("a.xml", '<mujoco><include file="../b.xml"/></mujoco>', "which is not in its folder"),
+        ("a.xml", REPLICATED.replace("3", "100000"), "expands to more than 10,000 bodies"),
+        ("a.xml", ATTACHED.replace("finger.xml", "a.xml"), "expands to more than 10,000 bodies"),
+        ("a.xml", MJCF.replace('size=".1 .05 .02"', 'size=".1 1e-9 .02"'), "sizes above 1e-6"),
+        ("a.xml", MJCF.replace("<freejoint/>", "<freejoint/><joint/>"), "more than 6 dofs"),
     ],
 )  # fmt: skip
 def test_bad_files(tmp_path: Path, name: str, text: str, match: str) -> None:

@@ -15,13 +15,15 @@ Call `read_mjcf`; `torchcss.load_body("x.xml")` does.
 
 from __future__ import annotations
 
+import importlib
 import math
+import re
 import warnings
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -33,10 +35,7 @@ from torchcss.body.files.default_shape import as_rows, as_vector, solid_shape
 from torchcss.body.files.xml import parse_xml
 from torchcss.body.rotations import from_axis_angle
 from torchcss.errors import BodyError, MissingExtraError
-from torchcss.files import one_line, read_bytes
-
-if TYPE_CHECKING:
-    import mujoco
+from torchcss.files import one_line, read_bytes, shortened
 
 _SOLIDS = {2: ("sphere", 1), 3: ("capsule", 2), 4: ("ellipsoid", 3), 5: ("cylinder", 2),
            6: ("box", 3)}  # fmt: skip
@@ -51,6 +50,7 @@ _BELOW = {
 }
 """What is kept at the top of a file, and below an element."""
 
+_NAMES = ("name", "class", "childclass", "prefix", "mesh", "hfield", "model", "body", "file")
 _MOST_FILES, _MOST_BODIES, _FAR = 50, 10_000, 1e6
 _LIGHT = 1e-6
 """Mass and inertia that every body has at least: the compiler refuses moving ones without."""
@@ -115,6 +115,7 @@ class _Screen:
             elif child.tag in wanted:
                 for reference in ("material", *(["file"] if child.tag == "flexcomp" else [])):
                     child.attrib.pop(reference, None)
+                self._check_numbers(child)
                 self._strip(child, _BELOW.get(child.tag, ()))
                 children.append(child)
         element[:] = children
@@ -123,6 +124,16 @@ class _Screen:
             if child.tag == "model" and name not in self.attached:
                 self.attached[name] = child  # in case that the file attaches itself
                 self.attached[name] = self.read(name)
+
+    def _check_numbers(self, element: ElementTree.Element) -> None:
+        """Refuse what is not a number: the compiler warns of it in a log file of its own."""
+        for key, value in element.items():
+            words = value.lower().split()
+            if key not in _NAMES and any(word.lstrip("+-").startswith("nan") for word in words):
+                raise BodyError(
+                    f"{self.path}: <{element.tag} name={element.get('name', '')!r}>: {key}: "
+                    f"expected numbers, found {shortened(value)}"
+                )
 
     def num_bodies(self, root: ElementTree.Element) -> float:
         """How many bodies a file expands to."""
@@ -151,10 +162,10 @@ def _product(words: str) -> float:
         return 1  # the compiler says what is wrong
 
 
-def _compiled(path: Path) -> mujoco.MjModel:
+def _compiled(path: Path) -> Any:
     """The file as MuJoCo compiles it, meshes left out."""
     try:
-        import mujoco
+        mujoco: Any = importlib.import_module("mujoco")
     except ImportError as error:
         raise MissingExtraError(
             f"{path}: an MJCF file is read by MuJoCo; install it: pip install 'torchcss[mjcf]'"
@@ -180,7 +191,8 @@ def _compiled(path: Path) -> mujoco.MjModel:
             spec.compiler.boundmass = spec.compiler.boundinertia = _LIGHT
             return spec.compile()
     except (ValueError, mujoco.FatalError) as error:
-        raise BodyError(f"{path}: MuJoCo cannot read this MJCF: {one_line(error)}") from error
+        reason = re.sub(r",? line \d+", "", one_line(error))  # of what was handed over
+        raise BodyError(f"{path}: MuJoCo cannot read this MJCF: {reason}") from error
 
 
 class _Place(NamedTuple):
@@ -193,7 +205,7 @@ class _Place(NamedTuple):
 class _Reader:
     """Makes links and parts of one body of a compiled model."""
 
-    def __init__(self, path: Path, model: mujoco.MjModel) -> None:
+    def __init__(self, path: Path, model: Any) -> None:
         self.path, self.model = path, model
         self.joints = [JointSpecification(name=BASE, link=BASE, parent=None)]
         self.parts: list[PartSpecification] = []
