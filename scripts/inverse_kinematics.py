@@ -37,7 +37,7 @@ import torch
 import tyro
 from torch import Tensor
 
-from torchcss.body.load import load_body
+from torchcss.body.load import FileOptions, load_body
 from torchcss.body.model import BodyModel
 from torchcss.cost.targets import pose_targets
 from torchcss.errors import ConfigurationError, TorchcssError
@@ -152,7 +152,7 @@ def weld(robot: ElementTree.Element, name: str, value: float) -> None:
 def make_problem(config: Config, case: str, number: int) -> Problem:
     """A pose that some state within the limits has."""
     file, link, joint = CASES[case]
-    body = load_body(config.data / file, flesh="none")
+    body = load_body(config.data / file, file=FileOptions(shape="none"))
     generator = torch.Generator().manual_seed(1000 * config.seed + number)
     share = torch.rand(body.num_parameters, generator=generator, dtype=torch.float64)
     x = body.lower + share * (body.upper - body.lower)

@@ -23,7 +23,7 @@ import torch
 import tyro
 from torch import Tensor
 
-from torchcss.body.load import load_body
+from torchcss.body.load import FileOptions, load_body
 from torchcss.body.model import BodyModel
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.targets import PointTargets
@@ -68,7 +68,7 @@ class Config:
 
 def load_quadruped(path: Path) -> BodyModel:
     """On a free root, its legs within a turn, standing as its usual pose."""
-    body = load_body(path, free_root=True, flesh="none")
+    body = load_body(path, free_root=True, file=FileOptions(shape="none"))
     usual = stand(body)
     legs = torch.tensor(["_" in n and not n.startswith("root") for n in body.state_names])
     # Three turns of freedom, as the file has them, are one pose of a leg three times.

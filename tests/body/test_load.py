@@ -1,4 +1,4 @@
-"""Bodies from files of others: tree, limits and flesh against what the files say."""
+"""Bodies from files of others: tree, limits and shape against what the files say."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchcss.body.chain import JointSpecification
 from torchcss.body.files.default_shape import bone_parts, rest_poses, solid_shape, touching_parts
-from torchcss.body.load import load_body
+from torchcss.body.load import FileOptions, load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, has_root
 from torchcss.body.rotations import root_angles
@@ -170,7 +170,7 @@ def check_lift(body: BodyModel, generator: torch.Generator) -> None:
         torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
 
 
-def check_flesh(body: BodyModel) -> None:
+def check_shape(body: BodyModel) -> None:
     """Parts exist, are finite, hang on the body, and can be seen."""
     assert body.num_parts
     assert len(set(body.part_names)) == body.num_parts
@@ -192,7 +192,7 @@ def test_robots_of_others(shared_data: Path, name: str, generator: torch.Generat
     assert body.num_parameters == FILES[name]
     assert has_root(body) == (name == "humanoid_CMU.xml")
     assert body.notes
-    check_flesh(body)
+    check_shape(body)
     if body.num_parameters < 25:
         check_lift(body, generator)
 
@@ -211,7 +211,7 @@ def test_a_bvh_body_moves_as_its_file_does(shared_data: Path, name: str) -> None
     assert {"l_hip", "r_knee", "l_ankle", "r_shoulder", "l_elbow", "r_wrist", "skull_tip"} <= set(
         body.joint_names
     )
-    check_flesh(body)
+    check_shape(body)
 
 
 def states_of(body: BodyModel, path: Path, frames: list[int]) -> Tensor:
@@ -248,7 +248,7 @@ def states_of(body: BodyModel, path: Path, frames: list[int]) -> Tensor:
 def test_what_a_bvh_does_not_say(tmp_path: Path, generator: torch.Generator) -> None:
     body = load_body(write(tmp_path / "a.bvh", BVH))
     check_lift(body, generator)
-    check_flesh(body)
+    check_shape(body)
     # Only what moves in the file moves, 60 degrees beyond it, and the file's mean is the rest.
     assert body.state_names[6:] == (
         "LeftUpLeg_x", "LeftLeg_x", "RightUpLeg_z", "Spine_x", "LeftArm_y", "RightArm_y",
@@ -289,19 +289,23 @@ def test_a_bvh_without_motion(tmp_path: Path) -> None:
 
 def test_units_of_a_bvh(tmp_path: Path) -> None:
     path = write(tmp_path / "a.bvh", BVH)
-    for options, metres in (({}, 0.43), ({"units": "inch"}, 43 * 0.0254), ({"units": 2.0}, 86.0)):
-        body = load_body(path, **options)
+    for options, metres in (
+        (None, 0.43),
+        (FileOptions(units="inch"), 43 * 0.0254),
+        (FileOptions(units=2.0), 86.0),
+    ):
+        body = load_body(path, file=options)
         joints = body.pose(body.rest).joints
         length = joints[body.joint_index("l_knee")] - joints[body.joint_index("l_hip")]
         assert float(length.norm()) == pytest.approx(metres)
     small = write(tmp_path / "b.bvh", BVH.replace("43", "4.3e6"))
     with pytest.raises(BodyError, match="no person's"):
         load_body(small)
-    assert load_body(small, units="mm").num_parameters
+    assert load_body(small, file=FileOptions(units="mm")).num_parameters
     with pytest.raises(BodyError, match="units: expected m, cm"):
-        load_body(path, units="furlong")
+        load_body(path, file=FileOptions(units="furlong"))
     with pytest.raises(BodyError, match="positive metres"):
-        load_body(path, units=-1.0)
+        load_body(path, file=FileOptions(units=-1.0))
 
 
 def test_mjcf_by_hand(tmp_path: Path, generator: torch.Generator) -> None:
@@ -341,7 +345,8 @@ def test_mjcf_by_hand(tmp_path: Path, generator: torch.Generator) -> None:
         rtol=0.2, atol=0.0,
     )  # fmt: skip
     assert [
-        len(load_body(tmp_path / "a.xml", flesh=how).part_names) for how in ("bones", "none")
+        len(load_body(tmp_path / "a.xml", file=FileOptions(shape=how)).part_names)
+        for how in ("bones", "none")
     ] == [3, 0]
 
 
@@ -420,9 +425,9 @@ def test_primitives_of_a_urdf(tmp_path: Path) -> None:
         body.part_rotation[0] @ torch.tensor([0.0, 0.0, 1.0]).double(),
         torch.tensor([1.0, 0.0, 0.0]).double(), rtol=0.0, atol=1e-6,
     )  # fmt: skip
-    bones = load_body(tmp_path / "a.urdf", flesh="bones")
+    bones = load_body(tmp_path / "a.urdf", file=FileOptions(shape="bones"))
     assert bones.part_names == ("b",)
-    assert load_body(tmp_path / "a.urdf", flesh="none").num_parts == 0
+    assert load_body(tmp_path / "a.urdf", file=FileOptions(shape="none")).num_parts == 0
     double = load_body(tmp_path / "a.urdf", scale=2.0)
     torch.testing.assert_close(double.part_shape[:, :3], 2 * body.part_shape[:, :3])
     # In an xml file it is still a URDF.
@@ -543,12 +548,12 @@ def test_bad_files(tmp_path: Path, name: str, text: str, match: str) -> None:
 
 def test_bad_requests(tmp_path: Path) -> None:
     path = write(tmp_path / "a.xml", MJCF)
-    with pytest.raises(BodyError, match="flesh: expected file, bones or none"):
-        load_body(path, flesh="muscle")  # type: ignore[arg-type]
+    with pytest.raises(BodyError, match="shape: expected file, bones or none"):
+        load_body(path, file=FileOptions(shape="muscle"))  # type: ignore[arg-type]
     with pytest.raises(BodyError, match="scale must be positive"):
         load_body(path, scale=0.0)
     with pytest.raises(BodyError, match="units are for BVH"):
-        load_body(path, units="cm")
+        load_body(path, file=FileOptions(units="cm"))
     with pytest.raises(BodyError, match="own lengths"):
         load_body(path, lengths={"thigh": 0.4})
     path.write_bytes(MJCF.encode("utf-16"))

@@ -109,7 +109,7 @@ def test_leading_shapes_and_types(
 
 
 def test_surface_is_the_posed_mesh(generator: torch.Generator) -> None:
-    body = load_body("arm8", rings=4, meridians=6)
+    body = BodyModel(specification("arm8"), rings=4, meridians=6)
     pose = body.pose(random_states(body, generator=generator))
     surface, mesh = body.surface(pose), body.mesh()
     assert mesh.points.shape == (4, 4, 6, 3)

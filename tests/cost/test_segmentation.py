@@ -10,7 +10,7 @@ import torch
 from painted import a_body_before_a_camera, layers, moved, painted
 from torch import Tensor
 
-from torchcss.body.load import load_body
+from torchcss.body.load import FileOptions, load_body
 from torchcss.body.model import BodyModel
 from torchcss.cost.flow import FlowTerm
 from torchcss.cost.frame import FrameCosts
@@ -222,7 +222,7 @@ def test_a_body_without_flesh_shows_nothing(tmp_path: Path, dtype: torch.dtype) 
         "<robot name='r'><link name='a'/><link name='b'/><joint name='j' type='continuous'>"
         "<parent link='a'/><child link='b'/><origin xyz='0 0 0.3'/></joint></robot>"
     )
-    body = load_body(path, flesh="none", dtype=dtype)
+    body = load_body(path, file=FileOptions(shape="none"), dtype=dtype)
     body = body.with_base(torch.eye(3), torch.tensor([0.0, 0.0, 2.0]))
     camera = Camera.pinhole(40, 30, focal_px=40.0)
     x = torch.zeros(2, 3, 1, dtype=dtype)

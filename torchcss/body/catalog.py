@@ -167,12 +167,12 @@ class MarkerSpecification:
 
 @dataclass(frozen=True, kw_only=True)
 class BodySpecification:
-    """Everything that `BodyModel` needs: joints, flesh, landmarks, ties and weak parameters.
+    """Everything that `BodyModel` needs: joints, parts, landmarks, ties and weak parameters.
 
     Attributes:
         name: Name of the body.
         joints: The tree.
-        parts: The flesh.
+        parts: Their shapes.
         markers: Named joint centres.
         ties: Joint name to (state parameter, factor): joints that share one parameter.
         sticky: State parameter to (rest value, standard deviation): the stabilisers of section

@@ -1,6 +1,6 @@
-"""Bodies that are not in the catalogue: any URDF, MJCF or BVH file, with flesh and a root.
+"""Make a body: one of the catalogue, or one from a URDF, MJCF or BVH file.
 
-| file | tree and limits | flesh |
+| file | tree and limits | shape |
 |---|---|---|
 | `.urdf` | the file's | its boxes, cylinders, spheres; along the bones where a link has none |
 | `.xml` | MJCF's, or URDF's if the file is one | its solids; along the bones likewise |
@@ -12,13 +12,13 @@ turned accordingly, by their root link. A fixed body stands in the frame of its 
 Joints that have a name of ours (`torchcss.joint_names.skeleton_joint_names`) are landmarks under
 that name, the others under the file's; the middle of the hips is one if one link carries both.
 
-Call `read_skeleton`; `torchcss.load_body` does.
+Call `load_body`; `has_free_root` tells bodies that move about from arms.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -48,10 +48,6 @@ from torchcss.errors import BodyError, MotionCaptureError
 from torchcss.files import one_line, read_bytes
 from torchcss.joint_names import skeleton_joint_names
 
-Flesh = Literal["file", "bones", "none"]
-"""Flesh of a body from a file: the file's solids and the bones of links without; the bones of all
-links; none."""
-
 BODY_SUFFIXES = (".urdf", ".xml", ".mjcf", ".bvh")
 
 _AS_IT_IS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -59,35 +55,100 @@ _Y_UP = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
 """Robots are Z up and face +X: to Y up, facing +Z."""
 
 
-def read_skeleton(
-    path: Path,
+@dataclass(frozen=True, kw_only=True)
+class FileOptions:
+    """What is made of a body's file beyond its tree.
+
+    Attributes:
+        shape: "file" for the solids that it describes, and along the bones of links without;
+            "bones" for all bones; "none".
+        units: Metres per unit of a BVH, or "m", "cm", "mm", "inch", "cmu"; None: guessed.
+    """
+
+    shape: Literal["file", "bones", "none"] = "file"
+    units: str | float | None = None
+
+    def __post_init__(self) -> None:
+        if self.shape not in ("file", "bones", "none"):
+            raise BodyError(f"shape: expected file, bones or none, got {self.shape!r}")
+
+
+def load_body(
+    name_or_path: str | Path,
     *,
-    flesh: Flesh = "file",
-    free_root: bool | None = None,
+    dtype: torch.dtype = torch.float64,
+    device: torch.device | str = "cpu",
+    lengths: Mapping[str, float] | None = None,
     scale: float = 1.0,
-    units: str | float | None = None,
-) -> BodySpecification:
-    """Read a body from a file.
+    free_proportions: bool = False,
+    free_root: bool | None = None,
+    file: FileOptions | None = None,
+) -> BodyModel:
+    """Make a body: one that ships, or that of a URDF, MJCF or BVH file.
 
     Args:
-        path: A URDF, MJCF or BVH file.
-        flesh: Where its parts come from.
-        free_root: Give the body six root parameters; None: if the file lets it move freely (BVH,
-            MJCF with a free joint).
-        scale: Factor on all lengths.
-        units: Metres per unit of a BVH, or a name of `torchcss.body.files.bvh.UNITS`; None:
-            guessed.
+        name_or_path: "arm7", "arm8", "body30", "body32", "body34", or the path of a file.
+        dtype: Floating type.
+        device: Where its tensors live.
+        lengths: Lengths that differ from the standard humanoid's, metres; not for files.
+        scale: Overall scale of the standard humanoid (stature 1.75 m), or of the file.
+        free_proportions: Make the lengths parameters too (for fitting). The lengths of a file stay
+            as they are.
+        free_root: Six root parameters or none; by default bodies have them and arms do not, and
+            bodies from files if the file lets them move freely.
+        file: How a file is read.
 
     Raises:
-        BodyError: If the file is missing, damaged or of another format, or its tree cannot be used.
+        BodyError: If there is no such body, or the file cannot be used.
+        MissingExtraError: If the file is an MJCF and MuJoCo is not installed.
     """
-    if flesh not in ("file", "bones", "none"):
-        raise BodyError(f"flesh: expected file, bones or none, got {flesh!r}")
-    if not 0 < scale < np.inf:
-        raise BodyError(f"scale must be positive and finite, got {scale}")
-    skeleton, solids, turn = _read(path, units)
-    rooted = skeleton.has_root if free_root is None else free_root
-    if rooted:
+    path = Path(name_or_path)
+    try:
+        if str(name_or_path) in BODY_NAMES:
+            body = specification(
+                str(name_or_path),
+                lengths=lengths,
+                scale=scale,
+                free_proportions=free_proportions,
+                free_root=free_root,
+            )
+            return BodyModel(body).to(dtype=dtype, device=device)
+        if path.suffix.lower() not in BODY_SUFFIXES:
+            raise BodyError(
+                f"no body {str(name_or_path)!r}; expected one of {', '.join(BODY_NAMES)} or the "
+                f"path of a file that ends in {', '.join(BODY_SUFFIXES)}"
+            )
+        if lengths:
+            raise BodyError(f"{path}: a body from a file has its own lengths; use scale")
+        if not 0 < scale < np.inf:
+            raise BodyError(f"scale must be positive and finite, got {scale}")
+        body = scaled(_from_file(path, file or FileOptions(), free_root), scale)
+    except RecursionError as error:
+        raise BodyError(f"{path}: links hundreds deep; expected a body or a robot") from error
+    try:
+        return BodyModel(body).to(dtype=dtype, device=device)
+    except (BodyError, RecursionError) as error:  # a tree that cannot be
+        raise BodyError(f"{path}: {one_line(error)}") from error
+
+
+def has_free_root(name_or_path: str | Path) -> bool:
+    """Whether a body moves about in the world, as people do, or stands in one place, as an arm.
+
+    Args:
+        name_or_path: As for `load_body`, with its defaults.
+
+    Raises:
+        BodyError: As `load_body`.
+    """
+    if str(name_or_path) in BODY_NAMES:
+        return str(name_or_path) not in ARM_NAMES
+    return has_root(load_body(name_or_path))
+
+
+def _from_file(path: Path, options: FileOptions, free_root: bool | None) -> BodySpecification:
+    """Joints, parts and landmarks of a file, hung on a root if it has or shall have one."""
+    skeleton, solids, turn = _read(path, options.units)
+    if skeleton.has_root if free_root is None else free_root:
         root, base = root_joints(), skeleton.joints[0]
         # The root moves the first body that the file names, wherever the file puts that.
         start = rest_poses(skeleton.joints)[skeleton.places[0]][:3, 3]
@@ -103,12 +164,12 @@ def read_skeleton(
     landmarks = {
         link: name for link, name in zip(skeleton.places, known, strict=True) if name is not None
     }
-    parts = solids if flesh == "file" else ()
-    if flesh != "none":
+    parts = solids if options.shape == "file" else ()
+    if options.shape != "none":
         # The world is no bone, nor is what carries the body in it or lies between its joints.
         bare = {joint.link for joint in joints} - set(skeleton.places)
-        fleshy = frozenset(part.link for part in parts) | bare
-        for part in bone_parts(joints, landmarks, skip=fleshy):
+        shaped = frozenset(part.link for part in parts) | bare
+        for part in bone_parts(joints, landmarks, skip=shaped):
             name, taken = part.name, {other.name for other in parts}
             while name in taken:
                 name += "_bone"
@@ -116,19 +177,16 @@ def read_skeleton(
     markers = [
         MarkerSpecification(name=landmarks.get(link, link), link=link) for link in skeleton.places
     ]
-    return scaled(
-        BodySpecification(
-            name=str(path),
-            joints=joints,
-            parts=parts,
-            markers=(*_middle_of_hips(joints, landmarks), *markers),
-            ties={},
-            sticky=skeleton.sticky,
-            neighbours=touching_parts(joints, parts),
-            lengths={},
-            notes=tuple(f"{path.name}: {note}" for note in skeleton.notes),
-        ),
-        scale,
+    return BodySpecification(
+        name=str(path),
+        joints=joints,
+        parts=parts,
+        markers=(*_middle_of_hips(joints, landmarks), *markers),
+        ties={},
+        sticky=skeleton.sticky,
+        neighbours=touching_parts(joints, parts),
+        lengths={},
+        notes=tuple(f"{path.name}: {note}" for note in skeleton.notes),
     )
 
 
@@ -149,7 +207,10 @@ def _read(
     if path.suffix.lower() != ".urdf" and root.tag in ("mujoco", "mujocoinclude"):
         return *read_mjcf(path), _Y_UP
     joints, solids = read_urdf(path, root)
-    links = KinematicTree(joints).link_names
+    try:
+        links = KinematicTree(joints).link_names
+    except BodyError as error:
+        raise BodyError(f"{path}: {error}") from error
     note = "limits, axes and solids: as the URDF says"
     return Skeleton(joints, {}, (note,), links, False), solids, _Y_UP
 
@@ -182,80 +243,3 @@ def _middle_of_hips(
     middle = 0.5 * (poses[link_of["l_hip"]] + poses[link_of["r_hip"]])[:3, 3] - poses[common][:3, 3]
     x, y, z = (poses[common][:3, :3].T @ middle).tolist()
     return [MarkerSpecification(name="HumanoidRoot", link=common, translation=(x, y, z))]
-
-
-def load_body(
-    name_or_path: str | Path,
-    *,
-    dtype: torch.dtype = torch.float64,
-    device: torch.device | str = "cpu",
-    lengths: Mapping[str, float] | None = None,
-    scale: float = 1.0,
-    free_proportions: bool = False,
-    free_root: bool | None = None,
-    flesh: Flesh = "file",
-    units: str | float | None = None,
-    rings: int = 8,
-    meridians: int = 12,
-) -> BodyModel:
-    """Make a body: one that ships, or that of a URDF, MJCF or BVH file.
-
-    Args:
-        name_or_path: "arm7", "arm8", "body30", "body32", "body34", or the path of a file.
-        dtype: Floating type.
-        device: Where its tensors live.
-        lengths: Lengths that differ from the standard humanoid's, metres; not for files.
-        scale: Overall scale of the standard humanoid (stature 1.75 m), or of the file.
-        free_proportions: Make the lengths parameters too (for fitting). The lengths of a file stay
-            as they are.
-        free_root: Six root parameters or none; by default bodies have them and arms do not, and
-            bodies from files if the file lets them move freely.
-        flesh: Flesh of a body from a file: "file" for the solids that it describes, and along the
-            bones of links without; "bones" for all bones; "none".
-        units: Metres per unit of a BVH, or "m", "cm", "mm", "inch", "cmu"; by default guessed.
-        rings: Latitudes of the mesh of each part.
-        meridians: Longitudes of the mesh of each part.
-
-    Raises:
-        BodyError: If there is no such body, or the file cannot be used.
-    """
-    path = Path(name_or_path)
-    if str(name_or_path) in BODY_NAMES:
-        body = specification(
-            str(name_or_path),
-            lengths=lengths,
-            scale=scale,
-            free_proportions=free_proportions,
-            free_root=free_root,
-        )
-    elif path.suffix.lower() in BODY_SUFFIXES:
-        if lengths:
-            raise BodyError(f"{path}: a body from a file has its own lengths; use scale")
-        try:
-            body = read_skeleton(path, flesh=flesh, free_root=free_root, scale=scale, units=units)
-        except RecursionError as error:
-            raise BodyError(f"{path}: links hundreds deep; expected a body or a robot") from error
-    else:
-        raise BodyError(
-            f"no body {str(name_or_path)!r}; expected one of {', '.join(BODY_NAMES)} or the path "
-            f"of a file that ends in {', '.join(BODY_SUFFIXES)}"
-        )
-    try:
-        model = BodyModel(body, rings=rings, meridians=meridians)
-    except (BodyError, RecursionError) as error:  # a tree that cannot be: only a file has one
-        raise BodyError(f"{path}: {one_line(error)}") from error
-    return model.to(dtype=dtype, device=device)
-
-
-def has_free_root(name_or_path: str | Path) -> bool:
-    """Whether a body moves about in the world, as people do, or stands in one place, as an arm.
-
-    Args:
-        name_or_path: As for `load_body`, which asks the file by default.
-
-    Raises:
-        BodyError: As `load_body`.
-    """
-    if str(name_or_path) in BODY_NAMES:
-        return str(name_or_path) not in ARM_NAMES
-    return has_root(load_body(name_or_path))

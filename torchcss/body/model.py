@@ -1,4 +1,4 @@
-"""BodyModel: tree, flesh and state layout in one object; the map from x to 3D of eq. 1 [IJRR].
+"""BodyModel: tree, parts and state layout in one object; the map from x to 3D of eq. 1 [IJRR].
 
 A state x is a vector of named parameters. It drives the joints through a linear tie `q = q0 + E x`
 (left-right symmetry, mimic joints). `pose(x)` gives link poses and joint centres, `surface(pose)`
@@ -43,7 +43,7 @@ class BodyPose(NamedTuple):
 
 
 class BodyModel(nn.Module):
-    """An articulated body with flesh, in the type and on the device of its buffers.
+    """An articulated body of superquadric parts, in the type and on the device of its buffers.
 
     Args:
         body: Rows of the catalogue, or a specification made from a file.
@@ -56,7 +56,7 @@ class BodyModel(nn.Module):
         notes: What was assumed when it was read from a file, one line each.
         state_names: Names of the parameters, the order of x.
         joint_names: Names of the joint centres, the order of `BodyPose.joints`.
-        part_names: Names of the parts of flesh.
+        part_names: Names of the parts.
         lengths: Lengths that the body was built with, metres.
         base_rotation: Orientation of the root link in the world (design decision 11).
         base_translation: Origin of the root link in the world, metres.
@@ -277,7 +277,7 @@ class BodyModel(nn.Module):
     def part_poses(
         self, pose: BodyPose
     ) -> tuple[Float[Tensor, "*batch parts 3 3"], Float[Tensor, "*batch parts 3"]]:
-        """World orientation and centre of every part of flesh."""
+        """World orientation and centre of every part."""
         rotation = pose.tree.rotation[..., self.part_link, :, :]
         centre = (rotation * self.part_translation[:, None, :]).sum(-1)
         return rotation @ self.part_rotation, centre + pose.tree.translation[..., self.part_link, :]

@@ -1,4 +1,4 @@
-"""Superquadric ellipsoids with tapering and bending (Barr 1984): the flesh of section 2 [IJRR].
+"""Superquadric ellipsoids with tapering and bending (Barr 1984): the parts of section 2 [IJRR].
 
 A part is described by nine numbers in its own frame, whose z axis runs along the part:
 

@@ -9,7 +9,7 @@ shoulders, elbows and wrists. A body is therefore fitted to where these are, fra
    search of section 4.1 [IJRR]: squared distances in space and the sticky prior of section 3.2.2
    on what the joints do not tell (the twist of a straight arm).
 3. *One path* through the poses found in every frame, that of least cost and motion, and
-4. *all frames together*: states, limits and accelerations, flesh kept out of flesh (section 3.2.4
+4. *all frames together*: states, limits and accelerations, parts kept apart (section 3.2.4
    [IJRR]); both by `torchcss.inference.smoothing`. What the joints tell stays, to less than one
    millimetre on a known motion (tested); what they do not tell, the frames before and after do.
 
@@ -77,8 +77,8 @@ class Retargeting:
         num_starts: Starting poses per frame.
         settling_s: Seconds in which everyday speed (`BodyModel.motion_rate`) is reached or lost:
             the scale of accelerations; larger is smoother.
-        repulsion: What keeps flesh out of flesh, or None: a source of other proportions has its
-            arms where our trunk is. At this weight a dance of the CMU database has flesh more than
+        repulsion: What keeps parts apart, or None: a source of other proportions has its
+            arms where our trunk is. At this weight a dance of the CMU database has parts more than
             10 mm deep in 8 % of frames instead of 76 %, 21 mm at most instead of 109 mm, for 1.7 mm
             of mean error (measured).
         max_steps: Iterations of a descent.
@@ -113,7 +113,7 @@ class Retargeted(NamedTuple):
         source: All joints of the source, in the same world.
         error: Distances between body and source, metres.
         at_limit: Angles that a limit holds.
-        depth: How deep the flesh of one part is inside another, metres; 0 if nowhere.
+        depth: How deep one part is inside another, metres; 0 if nowhere.
         report: What was found, one line each.
     """
 
@@ -605,10 +605,10 @@ def _findings(
         named = [pair for pair, is_deep in zip(pairs, deep.tolist(), strict=True) if is_deep]
         common = max(set(named), key=named.count)
         lines.append(
-            f"flesh more than {1000 * _DEEP:.0f} mm inside other flesh in "
+            f"parts more than {1000 * _DEEP:.0f} mm inside others in "
             f"{100 * float(deep.double().mean()):.0f} % of frames, {1000 * float(depth.max()):.0f} "
             f"mm at most ({pairs[int(depth.argmax())]}), most often {common}"
         )
     else:
-        lines.append(f"no flesh more than {1000 * _DEEP:.0f} mm inside other flesh")
+        lines.append(f"no part more than {1000 * _DEEP:.0f} mm inside another")
     return lines

@@ -1,4 +1,4 @@
-"""Flesh for a bare skeleton: superquadric parts along its bones, and from simple solids.
+"""The default shape of a bare skeleton: superquadric parts along its bones, and from simple solids.
 
 A bone runs from one place where joints sit to the next, and is carried by the link between them.
 Its part is a rounded, capsule-like superquadric. How thick: a share of its length, that of the
@@ -102,7 +102,7 @@ def bone_parts(
         joints: The tree, parents first.
         landmarks: Joint of a person (`torchcss.joint_names`) that stands at the origin of a link,
             for the links where one does.
-        skip: Links that have flesh of their own: the bones that they carry get none.
+        skip: Links that have parts of their own: the bones that they carry get none.
     """
     places, reach = _places(joints, landmarks)
     bones = [place for place in places if place.above is not None]

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchcss.body.load import load_body
+from torchcss.body.load import FileOptions, load_body
 from torchcss.body.model import BodyModel
 from torchcss.errors import BodyError
 from torchcss.studies.render.clutter import clutter_background
@@ -62,7 +62,7 @@ def robot_arm(
     Raises:
         BodyError: If the file cannot be used or describes no links of any length.
     """
-    body = load_body(path, flesh="bones", dtype=dtype)
+    body = load_body(path, file=FileOptions(shape="bones"), dtype=dtype)
     if not body.num_parts:
         raise BodyError(f"{path}: no link has a length; expected an arm")
     upright = body.tie.new_tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
