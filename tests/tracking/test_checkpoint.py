@@ -1,0 +1,111 @@
+"""A session's state as tensors: twenty frames are ten, a file, another process, and ten more."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from made_sessions import INTERVAL, seen_by, start_at
+
+from torchcss.errors import ConfigurationError, TrackFileError
+from torchcss.io.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from torchcss.studies.render.sequences import arm_sequence
+from torchcss.tracking.checkpoint import state_from_tensors, state_tensors
+from torchcss.tracking.session import TrackingSession
+from torchcss.tracking.settings import ALL_TERMS, Settings
+from torchcss.types import Frame
+
+SETTINGS = Settings(
+    body="arm8", samples=4, modes=2, working_size=120, terms=ALL_TERMS, prediction="surface",
+    limb_jumps=1,
+)  # fmt: skip
+FRAMES = 20
+
+
+def sequence_and_session(settings: Settings) -> tuple[list[Frame], TrackingSession]:
+    made = arm_sequence(generator=torch.Generator().manual_seed(3), num_frames=FRAMES)
+    view = seen_by(made.camera, made.joints_world, made.body.joint_names)
+    first = start_at(made.body, made.states[0])
+    session = TrackingSession(settings, first, [view], frame_interval=INTERVAL)
+    return [Frame(i, i * INTERVAL, image) for i, image in enumerate(made.frames)], session
+
+
+def go_on(folder: str) -> None:
+    """What the other process does: frames 10 to 19, its last state into a file."""
+    frames, begun = sequence_and_session(SETTINGS)
+    checkpoint = read_checkpoint(Path(folder))
+    assert checkpoint is not None
+    state = state_from_tensors(checkpoint.tensors, begun.state.body)
+    views = [observer.view for observer in begun._observers]
+    session = TrackingSession.resume(state, SETTINGS, views, frame_interval=INTERVAL)
+    for _ in session.track(frames[checkpoint.num_frames :]):
+        pass
+    write_checkpoint(Path(folder), Checkpoint(FRAMES, state_tensors(session.checkpoint())))
+
+
+def test_another_process_goes_on_bit_for_bit(tmp_path: Path) -> None:
+    frames, session = sequence_and_session(SETTINGS)
+    for _ in session.track(frames[:10]):
+        pass
+    write_checkpoint(tmp_path, Checkpoint(10, state_tensors(session.checkpoint())))
+    for _ in session.track(frames[10:]):
+        pass
+    whole = state_tensors(session.checkpoint())
+    here = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([*here, *filter(None, sys.path)])}
+    environment["OMP_NUM_THREADS"] = str(torch.get_num_threads())
+    script = "import sys, test_checkpoint; test_checkpoint.go_on(sys.argv[1])"
+    subprocess.run([sys.executable, "-c", script, str(tmp_path)], env=environment, check=True)
+    resumed = read_checkpoint(tmp_path)
+    assert resumed is not None
+    assert set(resumed.tensors) == set(whole)
+    for name, value in whole.items():
+        np.testing.assert_array_equal(resumed.tensors[name].numpy(), value.numpy(), err_msg=name)
+
+
+def test_everything_that_the_next_frame_needs_is_in_it() -> None:
+    frames, session = sequence_and_session(SETTINGS)
+    for _ in session.track(frames[:2]):
+        pass
+    names = set(state_tensors(session.checkpoint()))
+    for name in (
+        *("tracker.mixture.mean", "tracker.velocity", "tracker.generator_state"),
+        *("body.base_rotation", "body.part_shape", "monitor.sums"),
+        *("views.0.picture", "views.0.contrast.coefficients", "views.0.appearance.inside"),
+    ):
+        assert name in names
+
+
+def test_observing_ahead_changes_nothing() -> None:
+    frames, session = sequence_and_session(SETTINGS)
+    _, ahead = sequence_and_session(SETTINGS)
+    seen = ahead.observe(frames[0])
+    for frame, following in pairwise(frames[:4]):
+        expected = session.step(session.observe(frame))
+        later = ahead.observe(following)
+        posterior, seen = ahead.step(seen), later
+        assert torch.equal(posterior.state.mixture.mean, expected.state.mixture.mean)
+    # And the state that is kept is that of the frame that was searched.
+    ours, theirs = (state_tensors(each.checkpoint()) for each in (session, ahead))
+    assert all(torch.equal(value, theirs[name]) for name, value in ours.items())
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    _, session = sequence_and_session(SETTINGS)
+    tensors, body = state_tensors(session.checkpoint()), session.state.body
+    with pytest.raises(TrackFileError, match="does not fit the run"):
+        state_from_tensors({**tensors, "body.tie": torch.zeros(2, 2)}, body)
+    del tensors["tracker.velocity"]
+    with pytest.raises(TrackFileError, match="does not fit the run"):
+        state_from_tensors(tensors, body)
+    views = [observer.view for observer in session._observers]
+    with pytest.raises(ConfigurationError, match="same views"):
+        TrackingSession.resume(session.state, SETTINGS, [*views, *views])
+    with pytest.raises(ConfigurationError, match="at least one camera"):
+        TrackingSession(SETTINGS, start_at(body, body.rest), [])
