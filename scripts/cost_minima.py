@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import sys
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,13 +26,15 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 import tyro
+from jaxtyping import Float
+from matplotlib.figure import Figure
 
 from torchcss.cost.total import CostChoice, TrackingCost
 from torchcss.errors import TorchcssError
 from torchcss.io.tracks import prepare_output_folder, write_summary
 from torchcss.robust import Leclerc, Lorentzian, Quadratic
-from torchcss.show.style import save_figure
-from torchcss.studies import slice_plots as plots
+from torchcss.show.style import OKABE_ITO, save_figure
+from torchcss.studies import plots
 from torchcss.studies.scenes import Scene, arm_scenes, clip_scenes
 from torchcss.studies.slices import PROMINENCE, find_minima, num_spurious
 from torchcss.tracking.settings import Settings, make_choice
@@ -50,6 +52,7 @@ ON_BODY += ("r_hip_flexion", "r_knee_flexion", "l_knee_flexion", "eigen 0", "eig
 STATED = (0.0, 0.005, 0.01, PROMINENCE, 0.05, 0.1)  # least prominences; 0 counts every ripple
 LEAST = sorted({*STATED, *np.geomspace(0.002, 0.1, 25).tolist()})  # of the figure
 SILENT = CostChoice(contour=None, joints=None, stabiliser=None, temporal=None)
+PERCENTS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)  # ticks of the figure
 FIRST, DRAWN, MISLEADING = ("quadratic", 0.0), "r_shoulder_swing", 0.1
 
 
@@ -146,7 +149,7 @@ def measure(scene: Scene, config: Config, curves: Curves) -> None:
                     curves[body, terms, name, k].append(taken)
         if line.name == DRAWN and config.out is not None:
             title = f"Contour term of {scene.name}, {plots.title_of(line)}"
-            figure = plots.curves_figure(offsets, shown, plots.unit_of(line), title)
+            figure = curves_figure(offsets, shown, plots.unit_of(line), title)
             save_figure(figure, config.out / f"variants_{scene.slug}.png")
 
 
@@ -182,15 +185,114 @@ def print_table(rows: list[dict[str, Any]]) -> None:
 
 
 def draw_counts(rows: list[dict[str, Any]], out: Path) -> None:
-    figures: dict[str, dict[str, list[plots.CountCurve]]] = defaultdict(lambda: defaultdict(list))
+    figures: dict[str, dict[str, list[CountCurve]]] = defaultdict(lambda: defaultdict(list))
     for row in rows:
         if row["k"] in EMPHASES[:2]:
             label = f"{row['potential']}, {'motion boundaries' if row['k'] else 'plain edges'}"
             look = POTENTIALS[row["potential"]][2], row["k"] == 0, row["share_of_first"][1:]
-            figures[row["body"]][row["terms"]].append(plots.CountCurve(label, *look))
+            figures[row["body"]][row["terms"]].append(CountCurve(label, *look))
     for body, panels in figures.items():
-        figure = plots.counts_figure(np.array(LEAST[1:]), panels, f"Spurious minima of {body}")
+        figure = counts_figure(np.array(LEAST[1:]), panels, f"Spurious minima of {body}")
         save_figure(figure, out / f"minima_{body}.png")
+
+
+def curves_figure(
+    offsets: Float[np.ndarray, " s"],
+    panels: Mapping[str, Mapping[str, Float[np.ndarray, " s"]]],
+    unit: plots.Unit,
+    title: str,
+    *,
+    prominence: float = PROMINENCE,
+) -> Figure:
+    """Variants of one cost along one line: a panel per name, curves scaled to their own ranges.
+
+    Args:
+        offsets: Offsets of the samples; the truth is at zero.
+        panels: Curves by panel and label, at most three to a panel.
+        unit: How to show the offsets.
+        title: What the whole figure shows.
+        prominence: Least prominence of a marked minimum.
+    """
+    figure = Figure(figsize=(9.0, 0.9 + 1.9 * len(panels)), layout="constrained")
+    column = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+    t = unit.factor * offsets
+    for axes, (name, curves) in zip(column, panels.items(), strict=True):
+        for (label, curve), colour in zip(
+            curves.items(), ("vermilion", "blue", "green"), strict=False
+        ):
+            height = (curve - curve.min()) / max(float(np.ptp(curve)), np.finfo(float).tiny)
+            at = find_minima(height).above(prominence).sample
+            axes.plot(t, height, color=OKABE_ITO[colour], lw=1.3, label=f"{label}: {len(at)}")
+            axes.plot(t[at], height[at], "o", mfc="none", mec=OKABE_ITO[colour], ms=5)
+        plots.decorate(axes, unit if axes is column[-1] else plots.Unit(""))
+        axes.set_xlim(t[0], t[-1])
+        axes.set_title(name, fontsize=10, loc="left")
+        axes.set_ylabel("share of\nthe range", fontsize=9)
+        axes.legend(
+            loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False, title="minima"
+        )
+    figure.suptitle(
+        f"{title}\ndotted: the truth; circles: minima with a prominence above "
+        f"{100 * prominence:g} % of the range",
+        fontsize=10,
+    )
+    return figure
+
+
+class CountCurve(NamedTuple):
+    """Number of minima of one variant, by least prominence.
+
+    Attributes:
+        label: The variant.
+        colour: A name in `OKABE_ITO`.
+        dashed: Whether the line is dashed.
+        share: Its minima as a share of those of the variant that all are compared with.
+    """
+
+    label: str
+    colour: str
+    dashed: bool
+    share: Float[np.ndarray, " m"]
+
+
+def counts_figure(
+    thresholds: Float[np.ndarray, " m"],
+    panels: Mapping[str, Sequence[CountCurve]],
+    title: str,
+    *,
+    prominence: float = PROMINENCE,
+) -> Figure:
+    """How many minima the variants have compared with the first, whatever counts as a minimum.
+
+    Args:
+        thresholds: Least prominences, shares of the range.
+        panels: Variants by panel.
+        title: What the whole figure shows.
+        prominence: The one that tables state, marked by a vertical line.
+    """
+    figure = Figure(figsize=(4.6 * len(panels), 4.6), layout="constrained")
+    ticks = [t for t in PERCENTS if thresholds[0] <= t / 100 <= thresholds[-1]]
+    row = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    for axes, (name, curves) in zip(row, panels.items(), strict=True):
+        for curve in curves:
+            axes.plot(
+                100 * thresholds, curve.share, color=OKABE_ITO[curve.colour], lw=1.6,
+                ls="--" if curve.dashed else "-", label=curve.label,
+            )  # fmt: skip
+        plots.decorate(axes, plots.Unit("least prominence counted (% of the slice's range)"))
+        axes.axvline(100 * prominence, color=plots.GREY, lw=0.8, ls=":")
+        axes.axhline(1.0, color=plots.GREY, lw=0.8)
+        axes.set_xscale("log")
+        axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+        axes.minorticks_off()
+        axes.set_xlim(100 * thresholds[0], 100 * thresholds[-1])
+        axes.set_ylim(0.0, 2.0)
+        axes.set_title(name, fontsize=10)
+    row[0].set_ylabel("number of minima, as a share of\nthose of the first variant")
+    handles, labels = row[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+    figure.suptitle(title, fontsize=10)
+    return figure
 
 
 if __name__ == "__main__":

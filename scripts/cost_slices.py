@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,14 +25,16 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
+from matplotlib.artist import Artist
+from matplotlib.figure import Figure
 
 from torchcss.errors import TorchcssError
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.io.tracks import prepare_output_folder, write_summary
-from torchcss.show.style import save_figure
-from torchcss.studies import slice_plots as plots
+from torchcss.show.style import OKABE_ITO, save_figure
+from torchcss.studies import plots
 from torchcss.studies.scenes import Scene, arm_scenes, clip_scenes
-from torchcss.studies.slices import PROMINENCE, Line, sample_slice
+from torchcss.studies.slices import PROMINENCE, Line, Slice, sample_slice
 from torchcss.tracking.settings import Settings
 
 # As in [IJRR]: keypoints only say where to start, and so does the frame before.
@@ -126,7 +128,7 @@ def look(scene: Scene, config: Config) -> list[dict[str, Any]]:
             drawn.append(pair)
     if config.out is not None:
         title = f"Cost of {scene.name}, by terms"
-        figure = plots.slices_figure(drawn, title, prominence=config.prominence)
+        figure = slices_figure(drawn, title, prominence=config.prominence)
         save_figure(figure, config.out / f"slices_{scene.slug}.png")
     return rows
 
@@ -182,9 +184,93 @@ def displaced_minimum(scene: Scene, config: Config) -> dict[str, Any] | None:
     expansion = float(slope[mode, joint]), float(model.hessian[mode, joint, joint])
     if config.out is not None:
         title = f"{scene.name}: a minimum displaced by the limit of {plots.title_of(line)}"
-        figure = plots.limit_figure(taken, plots.unit_of(line), (low, high), expansion, title)
+        figure = limit_figure(taken, plots.unit_of(line), (low, high), expansion, title)
         save_figure(figure, config.out / f"limit_{scene.slug}.png")
     return {"line": name, "slope_nats_per_radian": expansion[0], "cost_nats": modes.cost[mode]}
+
+
+def slices_figure(
+    rows: Sequence[tuple[tuple[Slice, plots.Unit], tuple[Slice, plots.Unit]]],
+    title: str,
+    *,
+    centre: str = "mode",
+    prominence: float = PROMINENCE,
+) -> Figure:
+    """One row per line: a small slice on the left, a large one on the right.
+
+    Args:
+        rows: The slices and how to show them.
+        title: What the whole figure shows.
+        centre: What is at offset zero.
+        prominence: See `draw_slice`.
+    """
+    figure = Figure(figsize=(9.0, 0.9 + 1.9 * len(rows)), layout="constrained")
+    grid = figure.subplots(len(rows), 2, squeeze=False)
+    for axes_row, row in zip(grid, rows, strict=True):
+        for axes, (sampled, unit) in zip(axes_row, row, strict=True):
+            plots.draw_slice(axes, sampled, unit, prominence=prominence)
+        axes_row[0].set_ylabel(f"cost above that\nat the {centre} (nats)", fontsize=9)
+        for axes, scale in zip(axes_row, ("close", "as far as the limits admit"), strict=True):
+            axes.set_title(f"{plots.title_of(row[0][0].line)}, {scale}", fontsize=10)
+    entries: dict[str, Artist] = {}
+    for axes in grid.flat:
+        handles, labels = axes.get_legend_handles_labels()
+        entries |= dict(zip(labels, handles, strict=True))
+    entries = {"sum": entries.pop("sum"), **entries}
+    figure.legend(
+        list(entries.values()), list(entries), loc="outside lower center", ncols=len(entries),
+        frameon=False, fontsize=9,
+    )  # fmt: skip
+    figure.suptitle(
+        f"{title}\ndotted: the {centre}; circles: minima of the sum with a prominence above "
+        f"{100 * prominence:g} % of its range",
+        fontsize=10,
+    )
+    return figure
+
+
+def limit_figure(
+    sampled: Slice,
+    unit: plots.Unit,
+    admissible: tuple[float, float],
+    expansion: tuple[float, float],
+    title: str,
+) -> Figure:
+    """A minimum displaced by a joint limit, as Fig. 4 (a) [IJRR].
+
+    Args:
+        sampled: A slice through a mode at a limit that goes on beyond it.
+        unit: How to show its offsets.
+        admissible: The offsets between which the limits hold.
+        expansion: Slope and curvature at offset zero of the second-order expansion.
+        title: What the figure shows.
+    """
+    figure = Figure(figsize=(6.5, 3.8), layout="constrained")
+    axes = figure.subplots()
+    t, curve = sampled.fine_offsets, sampled.fine_values["sum"]
+    curve = curve - np.interp(0.0, t, curve)
+    inside = (t >= admissible[0]) & (t <= admissible[1])
+    shown = unit.factor
+    for mask, style, label in ((inside, "-", "cost"), (~inside, "--", "cost, not admissible")):
+        axes.plot(shown * t[mask], curve[mask], style, color="black", lw=1.6, label=label)
+    slope, curvature = expansion
+    parabola = slope * t + 0.5 * curvature * t**2
+    seen = (parabola > curve.min() - 0.3 * np.ptp(curve)) & (parabola < curve.max())
+    axes.plot(
+        shown * t[seen],
+        parabola[seen],
+        color=OKABE_ITO["blue"],
+        lw=1.3,
+        label="second-order expansion",
+    )
+    plots.decorate(axes, unit)
+    at_zero = min(admissible, key=abs)
+    axes.axvline(shown * at_zero, color=OKABE_ITO["vermilion"], lw=1.3, label="joint limit")
+    axes.plot(0, 0, "o", mfc="none", mec="black", ms=7, zorder=4, label="constrained minimum")
+    axes.set_ylabel("cost above that at the mode (nats)")
+    axes.set_title(title, fontsize=10)
+    axes.legend(fontsize=8, framealpha=0.9)
+    return figure
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import tyro
+from peers.published import PUBLISHED
 from tqdm import tqdm
 
 from torchcss.errors import ConfigurationError, TorchcssError
@@ -31,8 +32,7 @@ from torchcss.io.tracks import prepare_output_folder, read_summary, write_summar
 from torchcss.show.style import save_figure
 from torchcss.studies.comparison import Run, Start, find_start, track_together
 from torchcss.studies.evaluation import Thresholds, over_seeds, summarise
-from torchcss.studies.failure_plots import error_curves, failure_figure
-from torchcss.studies.published import PUBLISHED
+from torchcss.studies.plots import error_curves, failure_figure
 from torchcss.studies.sequences import RecordedSequence, read_sequence
 from torchcss.tracking.presets import PRESETS
 from torchcss.tracking.settings import TERMS, Settings, named_terms

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,14 +25,22 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
+from jaxtyping import Float
+from matplotlib.figure import Figure
 
 from torchcss.errors import ConfigurationError, TorchcssError
 from torchcss.files import load_json, real_numbers
 from torchcss.inference.proposals import CovarianceScaled, Spherical
 from torchcss.io.tracks import prepare_output_folder, write_summary
-from torchcss.studies import study_plots
+from torchcss.show.style import OKABE_ITO
 from torchcss.studies.reprojection import ReprojectionProblem
-from torchcss.studies.sampling_study import TABLE1, SamplerRun, run_sampler, spectrum, study_problem
+from torchcss.studies.sampling_study import (
+    Lengths,
+    SamplerRun,
+    run_sampler,
+    spectrum,
+    study_problem,
+)
 
 COLUMNS = ("minima", "distance_raw", "distance", "deviations_raw", "deviations", "cost_raw", "cost")
 CHECKS = {
@@ -41,6 +50,23 @@ CHECKS = {
 }  # fmt: skip
 """Minima when the duplicate distance is halved and doubled, those not joined by low paths, those at
 most `cheap` nats above the start, those below it; shares of the samples that pass each test."""
+
+TABLE1 = {
+    ("CSS", 1.0): (8, 1.148, 2.552, 10.94, 47.60, 117.0, 8.497),
+    ("CSS", 4.0): (59, 3.212, 2.947, 35.29, 55.32, 1995.0, 6.981),
+    ("CSS", 8.0): (180, 4.969, 3.347, 75.11, 109.8, 16201.0, 7.099),
+    ("SS", 1.0): (0, 0.199, math.nan, 24.53, math.nan, 273.5, math.nan),
+    ("SS", 4.0): (11, 0.767, 2.049, 96.15, 39.07, 4291.0, 6.280),
+    ("SS", 8.0): (42, 1.473, 2.549, 188.2, 56.83, 16856.0, 6.965),
+}
+"""Table 1 [IJRR] by method and scale: number of minima, then medians of parameter distance,
+standard deviations and cost, each of the raw samples and of the minima."""
+
+LABELS = {
+    "distance": "parameter distance from the start",
+    "deviations": "standard deviations from the start",
+    "cost": "cost (nats)",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,9 +187,9 @@ def run_seed(config: Config, seed: int) -> dict[str, Any]:
         folder = prepare_output_folder(config.figures)
         title = f"{config.body}, seed {seed}, scale {config.scales[-1]:g}, {config.samples} samples"
         figures = {
-            "fig1": study_plots.minima_and_costs_figure(last, title),
-            "fig5": study_plots.spectra_figure(spectra),
-            "fig13": study_plots.samples_and_minima_figure(last, title),
+            "fig1": minima_and_costs_figure(last, title),
+            "fig5": spectra_figure(spectra),
+            "fig13": samples_and_minima_figure(last, title),
         }
         for name, figure in figures.items():
             figure.savefig(folder / f"{name}_seed{seed}.png", dpi=90)
@@ -205,6 +231,87 @@ def main(config: Config) -> dict[str, Any]:
     if config.out is not None:
         write_summary(prepare_output_folder(config.out.parent) / config.out.name, report)
     return report
+
+
+def samples_and_minima_figure(runs: Mapping[str, SamplerRun], title: str = "") -> Figure:
+    """Fig. 13: histograms of raw samples and minima over distance, deviations and cost.
+
+    Args:
+        runs: By the sampler's name.
+        title: Above all.
+    """
+    colours = list(OKABE_ITO.values())
+    figure = Figure(figsize=(12, 4.4 * len(runs)), layout="constrained")
+    grid = figure.subplots(2 * len(runs), 3, squeeze=False)
+    for number, (name, run) in enumerate(runs.items()):
+        for kind, lengths in enumerate((run.minima, run.raw)):
+            row = grid[2 * number + kind]
+            for axis, (key, label) in zip(row, LABELS.items(), strict=True):
+                log, values = key == "cost", _values(lengths, key)
+                axis.hist(values, bins=_bins(values, log=log), color=colours[number])
+                axis.set(xlabel=label, xscale="log" if log and len(values) else "linear")
+            row[0].set_ylabel(f"{name}: {('minima', 'samples')[kind]}")
+            row[1].set_title(f"{len(lengths.cost)} {('minima', 'raw samples')[kind]}")
+    figure.suptitle(title)
+    return figure
+
+
+def minima_and_costs_figure(runs: Mapping[str, SamplerRun], title: str = "") -> Figure:
+    """Fig. 1: (a) how far the minima lie from the start, (b) at what cost samples are placed.
+
+    Args:
+        runs: By the sampler's name.
+        title: Above all.
+    """
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for axis, key, kind in ((left, "distance", "minima"), (right, "cost", "raw")):
+        values = {name: _values(getattr(run, kind), key) for name, run in runs.items()}
+        bins = _bins(np.concatenate(list(values.values())), log=key == "cost")
+        for colour, (name, own) in zip(OKABE_ITO.values(), values.items(), strict=False):
+            axis.hist(own, bins=bins, histtype="step", color=colour, label=name, lw=1.8)
+        axis.set(xlabel=LABELS[key], ylabel="minima" if kind == "minima" else "samples")
+        axis.legend(frameon=False)
+    left.set_title("(a) minima")
+    right.set(title="(b) raw samples", xscale="log")
+    figure.suptitle(title)
+    return figure
+
+
+def spectra_figure(spectra: Mapping[str, Sequence[float]]) -> Figure:
+    """Fig. 5: standard deviations along the eigenvectors of a mode's covariance, on a log scale.
+
+    Args:
+        spectra: Deviations, the widest first, by the body's name.
+    """
+    figure = Figure(figsize=(4.5 * len(spectra), 4), layout="constrained")
+    for axis, (name, values) in zip(
+        figure.subplots(1, len(spectra), squeeze=False)[0], spectra.items(), strict=True
+    ):
+        axis.semilogy(range(1, len(values) + 1), values, "o-", color=OKABE_ITO["blue"])
+        axis.set(
+            title=f"{name}: largest over smallest {values[0] / values[-1]:.0f}",
+            xlabel="eigen-direction",
+            ylabel="standard deviation (m, rad)",
+        )
+        axis.grid(alpha=0.3)
+    return figure
+
+
+def _values(lengths: Lengths, key: str) -> Float[np.ndarray, " s"]:
+    """The finite ones."""
+    values = getattr(lengths, key).numpy(force=True)
+    return values[np.isfinite(values)]
+
+
+def _bins(values: Float[np.ndarray, " s"], *, log: bool) -> Float[np.ndarray, " b"] | int:
+    """Edges of bins: equal steps, or equal ratios."""
+    if not len(values):
+        return 40
+    if not log:
+        return np.histogram_bin_edges(values, 40)
+    low, high = max(float(values.min()), 1e-9), float(values.max())
+    return np.geomspace(low * 0.999, max(high, low) * 1.001, 41)
 
 
 if __name__ == "__main__":

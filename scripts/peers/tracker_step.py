@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from peers.fixed_step import FixedStepState, fixed_step, refill, scaled_draw, start
 from torch import Tensor
 from torch._dynamo.utils import counters
 from torch._inductor.utils import fresh_inductor_cache
@@ -19,7 +20,6 @@ from torch.profiler import ProfilerActivity, profile
 
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.total import CostChoice, TrackingCost
-from torchcss.studies.fixed_step import FixedStepState, fixed_step, refill, scaled_draw, start
 from torchcss.studies.reprojection import reprojection_problem
 from torchcss.types import Keypoints
 

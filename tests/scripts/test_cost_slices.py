@@ -20,6 +20,8 @@ def test_small_mode(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFi
     assert list(report["frames"]) == ["arm, frame 3"]
     frame = report["frames"]["arm, frame 3"]
     assert (out / "slices_arm_frame_3.png").stat().st_size > 10_000
+    drawn = (out / "limit_arm_frame_3.png").exists()
+    assert drawn == (frame["displaced_minimum"] is not None)
     lines = [row["line"] for row in frame["slices"] if row["scale"] == "far"]
     assert lines == ["r_shoulder_swing", "r_elbow_flexion", "eigen 0", "eigen 1", "eigen 7"]
     names = set(frame["slices"][0]["terms"])

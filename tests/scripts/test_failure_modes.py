@@ -11,10 +11,10 @@ from types import ModuleType
 import numpy as np
 import pytest
 from made_sequences import write_arm
+from peers.published import PUBLISHED
 
 from torchcss.errors import ConfigurationError
-from torchcss.studies.failure_plots import ErrorCurves, error_curves, failure_figure
-from torchcss.studies.published import PUBLISHED
+from torchcss.studies.plots import ErrorCurves, error_curves, failure_figure
 from torchcss.tracking.presets import PRESETS
 from torchcss.tracking.settings import TERMS
 

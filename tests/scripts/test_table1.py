@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+import torch
+
+from torchcss.inference.proposals import CovarianceScaled
+from torchcss.studies.sampling_study import run_sampler, spectrum, study_problem
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "table1.py"
 
@@ -56,3 +61,21 @@ def test_medians_and_a_given_pose(script: ModuleType, tmp_path: Path) -> None:
     index = problem.cost.body.state_index("r_elbow_flexion")
     assert float(problem.truth[index]) == 1.2
     assert bool(problem.bounds.lower.isinf().all())
+
+
+def test_figures_of_runs_with_and_without_minima(script: ModuleType) -> None:
+    problem = study_problem("arm8", generator=torch.Generator().manual_seed(0))
+    proposal = CovarianceScaled(deviation_scale=4, include_modes=False)
+    run = run_sampler(problem, proposal, 100, generator=torch.Generator().manual_seed(1))
+    runs = {"CSS": run, "SS": run}
+    assert len(script.samples_and_minima_figure(runs, "title").axes) == 12
+    assert len(script.minima_and_costs_figure(runs).axes) == 2
+    nothing = run._replace(minima=type(run.minima)(*(part[:0] for part in run.minima)))
+    for made in (
+        script.samples_and_minima_figure({"SS": nothing}),
+        script.minima_and_costs_figure({"SS": nothing}),
+    ):
+        made.canvas.draw()
+    spectra = script.spectra_figure({"arm8": spectrum(problem.start.covariance).tolist()})
+    shown = spectra.axes[0].lines[0].get_ydata()[0]
+    assert math.isclose(shown, float(spectrum(problem.start.covariance)[0]))

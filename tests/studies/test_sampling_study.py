@@ -1,5 +1,3 @@
-import math
-
 import pytest
 import torch
 
@@ -11,11 +9,6 @@ from torchcss.studies.sampling_study import (
     run_sampler,
     spectrum,
     study_problem,
-)
-from torchcss.studies.study_plots import (
-    minima_and_costs_figure,
-    samples_and_minima_figure,
-    spectra_figure,
 )
 from torchcss.types import CostFunction, Status
 
@@ -98,20 +91,3 @@ def test_exact_steps_hide_nothing_else(problem):
     assert not hasattr(cost, "blended_model")
     x = problem.truth[None]
     assert torch.equal(cost.value(x), problem.cost.value(x))
-
-
-def test_figures(problem, run):
-    runs = {"CSS": run, "SS": run}
-    figure = samples_and_minima_figure(runs, "title")
-    assert len(figure.axes) == 12
-    assert len(minima_and_costs_figure(runs).axes) == 2
-    nothing = run._replace(minima=type(run.minima)(*(part[:0] for part in run.minima)))
-    for made in (
-        samples_and_minima_figure({"SS": nothing}),
-        minima_and_costs_figure({"SS": nothing}),
-    ):
-        made.canvas.draw()
-    spectra = spectra_figure({"arm8": spectrum(problem.start.covariance).tolist()})
-    assert math.isclose(
-        spectra.axes[0].lines[0].get_ydata()[0], float(spectrum(problem.start.covariance)[0])
-    )

@@ -7,7 +7,7 @@
 
 Modes have the colours that they have in the overlay (`torchcss.show.overlay.PALETTE`), which
 colour-blind viewers can tell apart. Every function returns a figure that belongs to nobody, see
-`torchcss.studies.slice_plots`, whose `save_figure` writes it.
+`torchcss.show.style.save_figure` writes it.
 """
 
 from __future__ import annotations

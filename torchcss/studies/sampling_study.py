@@ -57,18 +57,6 @@ ROBUST_NU = 8.0
 """Level of the outliers of the robust variant, nats per joint."""
 
 
-TABLE1 = {
-    ("CSS", 1.0): (8, 1.148, 2.552, 10.94, 47.60, 117.0, 8.497),
-    ("CSS", 4.0): (59, 3.212, 2.947, 35.29, 55.32, 1995.0, 6.981),
-    ("CSS", 8.0): (180, 4.969, 3.347, 75.11, 109.8, 16201.0, 7.099),
-    ("SS", 1.0): (0, 0.199, math.nan, 24.53, math.nan, 273.5, math.nan),
-    ("SS", 4.0): (11, 0.767, 2.049, 96.15, 39.07, 4291.0, 6.280),
-    ("SS", 8.0): (42, 1.473, 2.549, 188.2, 56.83, 16856.0, 6.965),
-}
-"""Table 1 [IJRR] by method and scale: number of minima, then medians of parameter distance,
-standard deviations and cost, each of the raw samples and of the minima."""
-
-
 @dataclass(frozen=True)
 class ExactSteps:
     """A cost whose descents take exact Hessians from the first step on.

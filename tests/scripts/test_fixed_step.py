@@ -6,10 +6,10 @@ import math
 
 import pytest
 import torch
+from peers.fixed_step import FixedStepState, fixed_step, refill, scaled_draw, start
 from torch import Tensor
 
 from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.studies.fixed_step import FixedStepState, fixed_step, refill, scaled_draw, start
 from torchcss.studies.reprojection import reprojection_problem
 from torchcss.types import Bounds, CostFunction, LocalModel
 

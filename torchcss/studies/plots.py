@@ -1,7 +1,11 @@
-"""Error against time of many trackers, one panel each, in colours that everybody can tell apart.
+"""Plots of cost slices, and of the errors of many trackers against time.
 
-Nothing opens a window or changes global state; see `torchcss.studies.slice_plots`. Call
-`error_curves`, `failure_figure`, then `save_figure` of that module.
+Every function draws into the axes that it is given, so that a notebook lays out its own page, or
+returns a `Figure` that belongs to nobody: no window opens and no global state changes, whatever
+matplotlib's backend. Colours are those that colour-blind viewers can tell apart.
+
+By default: `draw_slice` for a slice by terms; `error_curves`, then `failure_figure` for the runs of
+`scripts/failure_modes.py`; `torchcss.show.style.save_figure` writes a figure.
 """
 
 from __future__ import annotations
@@ -15,12 +19,108 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from torchcss.body.root import ROOT_NAMES
 from torchcss.show.style import OKABE_ITO
+from torchcss.studies.slices import PROMINENCE, Line, Slice
 
+_TERM_COLOURS = {
+    "sum": "black",
+    "contour": "blue",
+    "flow": "orange",
+    "joints": "green",
+    "stabiliser": "purple",
+    "temporal": "vermilion",
+    "edge_energy": "sky",
+    "interpenetration": "yellow",
+}
+GREY = "0.45"
 _COLUMNS = 4
-_GREY = "0.45"
 _ABOVE = 1.6
-"""Height of the panels as a multiple of the error from which a frame has failed."""
+"""Height of the panels of failures as a multiple of the error from which a frame has failed."""
+
+
+class Unit(NamedTuple):
+    """How the offsets of a line are shown.
+
+    Attributes:
+        label: What the axis says.
+        factor: Shown number per unit of offset.
+    """
+
+    label: str
+    factor: float = 1.0
+
+
+def unit_of(line: Line, *, close: bool = False) -> Unit:
+    """How to show offsets on a line: degrees, metres, or for eigen-directions what both mix to.
+
+    Args:
+        line: The line.
+        close: Whether the slice is so short that standard deviations say most.
+    """
+    if line.name.startswith("eigen"):
+        if close:
+            return Unit("standard deviations", 1 / line.deviation)
+        return Unit("length of the step (radians and metres)")
+    if line.name in ROOT_NAMES[:3] or line.name.endswith("_length"):
+        return Unit("metres")
+    return Unit("degrees", 180 / math.pi)
+
+
+def term_colour(name: str) -> str:
+    """The colour of a term, the same in every figure; grey for terms without a colour of theirs."""
+    return OKABE_ITO.get(_TERM_COLOURS.get(name, ""), GREY)
+
+
+def title_of(line: Line) -> str:
+    """A line's name for people."""
+    return line.name.replace("_", " ").replace("eigen", "eigen-direction")
+
+
+def draw_slice(
+    axes: Axes,
+    sampled: Slice,
+    unit: Unit,
+    *,
+    prominence: float = PROMINENCE,
+) -> None:
+    """Draw every term of a slice, and their sum in black with its minima as open circles.
+
+    All curves are relative to their value at offset zero, so that they add up by eye.
+
+    Args:
+        axes: Where to draw.
+        sampled: The slice.
+        unit: How to show its offsets.
+        prominence: Least prominence of a marked minimum, see `torchcss.studies.slices`.
+    """
+    t = sampled.offsets * unit.factor
+    for name, curve in sampled.values.items():
+        relative = curve - np.interp(0.0, sampled.offsets, curve)
+        total = name == "sum"
+        if not total and not np.ptp(curve) > 0:
+            continue  # a term that is silent here
+        axes.plot(
+            t, relative, label=name, color=term_colour(name), lw=1.6 if total else 1.1,
+            zorder=3 if total else 2,
+        )  # fmt: skip
+        if total:
+            at = sampled.minima(name, prominence).sample
+            axes.plot(t[at], relative[at], "o", mfc="none", mec="black", ms=5, zorder=4)
+    decorate(axes, unit)
+    axes.set_xlim(t[0], t[-1])
+
+
+def decorate(axes: Axes, unit: Unit | None = None) -> None:
+    """Give axes a quiet look, and say what is along the first one."""
+    if unit is not None:
+        axes.axvline(0.0, color=GREY, lw=0.8, ls=":", zorder=1)
+        axes.set_xlabel(unit.label, labelpad=1)
+    axes.grid(visible=True, color="0.92", lw=0.6)
+    axes.set_axisbelow(True)
+    axes.tick_params(labelsize=8)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
 
 
 class ErrorCurves(NamedTuple):
@@ -135,7 +235,7 @@ def _draw(axes: Axes, times: np.ndarray, tracker: ErrorCurves, failed_mm: float)
     axes.plot(
         times, nearest, color=OKABE_ITO["orange"], lw=1.3, ls="--", label="nearest mode, median"
     )
-    axes.axhline(failed_mm, color=_GREY, lw=0.8, ls=":")
+    axes.axhline(failed_mm, color=GREY, lw=0.8, ls=":")
     lost = [time for time in tracker.lost_s if not math.isnan(time)]
     if lost:
         axes.plot(
@@ -150,11 +250,7 @@ def _draw(axes: Axes, times: np.ndarray, tracker: ErrorCurves, failed_mm: float)
         )  # fmt: skip
     count = len(tracker.lost_s)
     axes.set_title(f"{tracker.name}: lost {len(lost)} of {count}", fontsize=9)
-    axes.grid(visible=True, color="0.92", lw=0.6)
-    axes.set_axisbelow(True)
-    axes.tick_params(labelsize=8)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    decorate(axes)
 
 
 def _quantiles(errors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
