@@ -138,7 +138,7 @@ def guide(out: Path, *, execute: bool) -> Iterator[tuple[str, str]]:
         yield name, (DOCS / f"{name}.md").read_text(encoding="utf-8")
     for notebook in sorted((REPOSITORY / "notebooks").glob("*.ipynb")):
         yield notebook.stem, notebook_text(notebook, out / "pictures", execute=execute)
-    for name in ("results", "figures", "from_the_papers_to_the_code", "decisions"):
+    for name in ("results", "findings", "recordings", "from_the_papers_to_the_code", "decisions"):
         yield name, (DOCS / f"{name}.md").read_text(encoding="utf-8")
     yield "scripts", scripts_text()
     for name, heading in README_PAGES.items():

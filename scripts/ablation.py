@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import sys
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,13 +20,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tyro
+from common import Table, start, write_report
 from evaluate_track import Config as Evaluation
 from evaluate_track import main as evaluate
 
 from torchcss.app.track import track_video
-from torchcss.errors import ConfigurationError, TorchcssError
-from torchcss.io.tracks import prepare_output_folder, write_summary
+from torchcss.errors import ConfigurationError
 from torchcss.studies.demo import run_demo
 from torchcss.tracking.settings import Settings
 
@@ -115,9 +113,9 @@ def main(config: Config) -> dict[str, Any]:
             "terms": {name: ROWS[name] for name in rows},
             "rows": rows,
         }
-        if config.out is not None:
-            prepare_output_folder(config.out.parent)
-            write_summary(config.out, report)
+        cells = [[n, *(cell["best_mm"] for cell in row.values())] for n, row in rows.items()]
+        table = Table("Terms switched on one by one, best mode, mm", ("terms", *sequences), cells)
+        write_report(config.out, report, table)
     return report
 
 
@@ -192,8 +190,4 @@ def _shares(summary: Mapping[str, Any]) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except TorchcssError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    start(main, Config, __doc__)

@@ -39,13 +39,11 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-import tyro
+from common import start, write_report
 from peers.autograd_cost import autograd_model, made_up_costs, made_up_frames
 from torch import Tensor
 
 from torchcss.cost.total import TrackingCost
-from torchcss.errors import TorchcssError
-from torchcss.io.tracks import prepare_output_folder, write_summary
 from torchcss.io.video import read_image
 from torchcss.stopwatch import Stopwatch
 from torchcss.types import LocalModel
@@ -180,9 +178,7 @@ def main(config: Config) -> dict[str, Any]:
     report = {"metrics": metrics, "unit": dict(zip(metrics, units, strict=True)), "config": config}
     report |= {"threads": torch.get_num_threads(), "torch": torch.__version__}
     print_table(report)
-    if config.out is not None:
-        prepare_output_folder(config.out.parent)
-        write_summary(config.out, report)
+    write_report(config.out, report)
     return report
 
 
@@ -206,8 +202,4 @@ def print_table(report: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except TorchcssError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    start(main, Config, __doc__)

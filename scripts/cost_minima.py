@@ -16,7 +16,6 @@ edge.
 
 from __future__ import annotations
 
-import sys
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,13 +24,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-import tyro
+from common import start, write_report
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from torchcss.cost.total import CostChoice, TrackingCost
-from torchcss.errors import TorchcssError
-from torchcss.io.tracks import prepare_output_folder, write_summary
+from torchcss.io.tracks import prepare_output_folder
 from torchcss.robust import Leclerc, Lorentzian, Quadratic
 from torchcss.show.style import OKABE_ITO, save_figure
 from torchcss.studies import plots
@@ -101,7 +99,7 @@ def main(config: Config) -> dict[str, Any]:
     print_table(rows)
     if config.out is not None:
         draw_counts(rows, config.out)
-        write_summary(config.out / "cost_minima.json", report)
+        write_report(config.out / "cost_minima.json", report)
     return report
 
 
@@ -296,8 +294,4 @@ def counts_figure(
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except TorchcssError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    start(main, Config, __doc__)

@@ -16,7 +16,6 @@ makes minima fewer.
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,13 +23,12 @@ from typing import Any
 
 import numpy as np
 import torch
-import tyro
+from common import start, write_report
 from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 
-from torchcss.errors import TorchcssError
 from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.io.tracks import prepare_output_folder, write_summary
+from torchcss.io.tracks import prepare_output_folder
 from torchcss.show.style import OKABE_ITO, save_figure
 from torchcss.studies import plots
 from torchcss.studies.scenes import Scene, arm_scenes, clip_scenes
@@ -93,7 +91,7 @@ def main(config: Config) -> dict[str, Any]:
         report["frames"][scene.name] = {"table": table, "slices": rows}
         report["frames"][scene.name]["displaced_minimum"] = displaced_minimum(scene, config)
     if config.out is not None:
-        write_summary(config.out / "cost_slices.json", report)
+        write_report(config.out / "cost_slices.json", report)
     return report
 
 
@@ -274,8 +272,4 @@ def limit_figure(
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except TorchcssError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    start(main, Config, __doc__)

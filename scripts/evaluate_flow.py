@@ -15,7 +15,6 @@ the Middlebury training set) is one pair. Per pair and method:
 from __future__ import annotations
 
 import importlib.util
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,12 +23,11 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-import tyro
+from common import Table, start, write_report
 from torch import Tensor
 from torch.nn import functional
 
-from torchcss.errors import FlowFileError, TorchcssError
-from torchcss.io.tracks import prepare_output_folder, write_summary
+from torchcss.errors import FlowFileError
 from torchcss.io.video import read_image
 from torchcss.robust import Quadratic
 from torchcss.studies.flow_files import read_flow
@@ -95,11 +93,11 @@ def main(config: Config) -> None:
             values = (row.get(column) for column in COLUMNS)
             cells = ("-" if value is None else f"{value:.3f}" for value in values)
             print(f"{name:<20}" + "".join(f"{cell:>11}" for cell in cells))
-    if config.out:
-        setting = {key: getattr(config, key) for key in ("jump", "near", "tolerance", "small")}
-        setting |= {"torch": torch.__version__, "threads": torch.get_num_threads()}
-        prepare_output_folder(config.out.parent)
-        write_summary(config.out, {"setting": setting, "rows": rows})
+    setting = {key: getattr(config, key) for key in ("jump", "near", "tolerance", "small")}
+    setting |= {"torch": torch.__version__, "threads": torch.get_num_threads()}
+    cells = [[row["pair"], row["method"], *map(row.get, COLUMNS)] for row in rows]
+    table = Table("Optical flow", ("pair", "method", *COLUMNS), cells)
+    write_report(config.out, {"setting": setting, "rows": rows}, table)
 
 
 def timed(method: Method, pair: Pair) -> tuple[OpticalFlow | Tensor, float]:
@@ -194,8 +192,4 @@ def widened(mask: Tensor, radius: int) -> Tensor:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except TorchcssError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    start(main, Config, __doc__)

@@ -13,7 +13,6 @@ start, without limits, or without robust potential. Seconds are the processor's.
 from __future__ import annotations
 
 import math
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -22,16 +21,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-import tyro
+from common import Table, start, write_report
 
-from torchcss.errors import TorchcssError
 from torchcss.initialise.fit import initialise
 from torchcss.initialise.keypoint_checks import default_sigma
 from torchcss.initialise.multi_start import SINGLE_START, Search
 from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
 from torchcss.io.cameras import read_camera
 from torchcss.io.keypoints.read import read_keypoints
-from torchcss.io.tracks import prepare_output_folder, write_summary
 from torchcss.joint_names import canonical_joint_name
 from torchcss.robust import Quadratic
 from torchcss.studies.metrics import LIMB_JOINTS, pa_mpjpe_mm, root_aligned_mpjpe_mm
@@ -94,6 +91,7 @@ class Case(NamedTuple):
 def main(config: Config) -> dict[str, Any]:
     """Fit, print and write the table; return what is written."""
     rows: list[dict[str, Any]] = []
+    shown: list[list[str | float]] = []
     report = {"unit": "mm, %, s", "direction": "lower is better; params and joints: 95 is right",
               "setting": config, "rows": rows}  # fmt: skip
     conditions = [*SYNTHETIC, *(CLIPS if config.data else ())]
@@ -106,11 +104,11 @@ def main(config: Config) -> dict[str, Any]:
             mean = {key: mean_known([fit[key] for fit in fits]) for key in fits[0]}
             rows.append({"variant": variant, "condition": condition, "count": len(fits), **mean,
                          "per_case": fits})  # fmt: skip
+            shown.append([condition, variant, *mean.values()])
             cells = "".join(f"{value:9.1f}" for value in mean.values())
             print(f"{variant:16}{condition:22}{cells}", flush=True)
-            if config.out is not None:
-                prepare_output_folder(config.out.parent)
-                write_summary(config.out, report)
+            table = Table("First pose", ("condition", "fit", *HEADS), shown)
+            write_report(config.out, report, table)
     return report
 
 
@@ -194,8 +192,4 @@ def fit(case: Case, variant: str, config: Config, seed: int) -> dict[str, float]
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except TorchcssError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    start(main, Config, __doc__)

@@ -12,21 +12,19 @@ the nearest fit.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-import tyro
+from common import Table, start, write_report
 
-from torchcss.errors import ConfigurationError, TorchcssError
+from torchcss.errors import ConfigurationError
 from torchcss.initialise.fit import initialise
 from torchcss.initialise.multi_start import Search
 from torchcss.initialise.options import InitialiseOptions
 from torchcss.initialise.result import Initialisation
-from torchcss.io.tracks import prepare_output_folder, write_summary
 from torchcss.io.video import VideoReader
 from torchcss.studies.evaluation import silhouette
 from torchcss.studies.metrics import mask_overlap, root_aligned_mpjpe_mm
@@ -69,13 +67,13 @@ def main(config: Config) -> dict[str, Any]:
             for name, (contours, colours) in COMPARED.items():
                 row = fit(sequence, int(index), config, contours, colours)
                 report["rows"].append(
-                    {"sequence": sequence.name, "frame": index, "by": name, **row}
+                    {"sequence": sequence.name, "frame": int(index), "by": name, **row}
                 )
                 cells = "".join(f"{value:9.2f}" for value in row.values())
                 print(f"{sequence.name:22}{index:6}  {name:14}{cells}", flush=True)
-    if config.out is not None:
-        prepare_output_folder(config.out.parent)
-        write_summary(config.out, report)
+    columns = ("sequence", "frame", "by", "overlap", "area", "root mm", "of all mm")
+    table = Table("Outline of the first pose", columns, [[*r.values()] for r in report["rows"]])
+    write_report(config.out, report, table)
     return report
 
 
@@ -118,8 +116,4 @@ def joint_errors(found: Initialisation, sequence: RecordedSequence, index: int) 
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except TorchcssError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    start(main, Config, __doc__)

@@ -9,17 +9,17 @@ errors there are and what they need is in `torchcss.studies.metrics`.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import tyro
+from common import start, write_report
 
-from torchcss.errors import ConfigurationError, TorchcssError, TrackFileError
+from torchcss.errors import ConfigurationError, TrackFileError
 from torchcss.files import load_arrays
-from torchcss.io.tracks import load_track, prepare_output_folder, write_summary
+from torchcss.io.tracks import load_track
 from torchcss.joint_names import canonical_joint_name
 from torchcss.studies.metrics import LIMB_JOINTS, LOST_MM, TrackErrors, track_errors
 
@@ -89,9 +89,7 @@ def main(config: Config) -> dict[str, Any]:
     left_out = [name for name in wanted if name not in common]
     report = report_of(errors, config, track.frames, present, left_out)
     print_table(report)
-    if config.out is not None:
-        prepare_output_folder(config.out.parent)
-        write_summary(config.out, report)
+    write_report(config.out, report)
     return report
 
 
@@ -174,8 +172,4 @@ def print_table(report: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except TorchcssError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    start(main, Config, __doc__)

@@ -17,18 +17,17 @@ interrupted loses the runs that were under way.
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import tyro
+from common import Table, start, write_report
 from peers.published import PUBLISHED
 from tqdm import tqdm
 
-from torchcss.errors import ConfigurationError, TorchcssError
-from torchcss.io.tracks import prepare_output_folder, read_summary, write_summary
+from torchcss.errors import ConfigurationError
+from torchcss.io.tracks import read_summary
 from torchcss.show.style import save_figure
 from torchcss.studies.comparison import Run, Start, find_start, track_together
 from torchcss.studies.evaluation import Thresholds, over_seeds, summarise
@@ -131,8 +130,8 @@ def main(config: Config) -> dict[str, Any]:
         for run in follow(config, sequence, together, thresholds):
             runs.append(entry_of(run, thresholds, 1 / sequence.frame_rate))
             report = write(config, study, runs)
-    print_table(report["table"], sequence.name)
-    if config.plot is not None and report["table"]:
+    print_table(report["by_tracker"], sequence.name)
+    if config.plot is not None and report["by_tracker"]:
         told = {row.preset: row.times_s for row in report["published"]}
         order = [name for name in PRESETS if name in config.presets]
         shown = [run for name in order for run in runs if run["preset"] == name]
@@ -196,9 +195,17 @@ def write(config: Config, study: dict[str, Any], runs: list[dict[str, Any]]) -> 
             errors = sum(run["ended"].startswith("error") for run in own)
             table[name] = {**over_seeds(measured), "errors": errors}
     published = [row for row in PUBLISHED if row.sequence == study["sequence"]]
-    report = {"study": study, "published": published, "runs": runs, "table": table}
-    if config.out is not None:
-        write_summary(prepare_output_folder(config.out.parent) / config.out.name, report)
+    report = {"study": study, "published": published, "runs": runs, "by_tracker": table}
+    cells = []
+    for name, row in table.items():
+        lost = f"{row['lost']} of {row['seeds']}", row["lost_s"][0]
+        shown = (
+            factor * row[key][0] if key in row else None for key, factor, _ in COLUMNS.values()
+        )
+        cells.append([name, *lost, *shown])
+    title = f"Trackers on {study['sequence']}, medians over seeds"
+    columns = ("tracker", "lost", "lost at s", *COLUMNS)
+    write_report(config.out, report, Table(title, columns, cells))
     return report
 
 
@@ -261,8 +268,4 @@ def print_table(table: dict[str, dict[str, Any]], sequence: str) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except TorchcssError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    start(main, Config, __doc__)

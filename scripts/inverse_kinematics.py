@@ -24,7 +24,6 @@ of single exact states per second of descents.
 from __future__ import annotations
 
 import math
-import sys
 import time
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass, field
@@ -34,15 +33,14 @@ from typing import Any
 import numpy as np
 import pytorch_kinematics as pk
 import torch
-import tyro
+from common import Table, start, write_report
 from torch import Tensor
 
 from torchcss.body.load import FileOptions, load_body
 from torchcss.body.model import BodyModel
 from torchcss.cost.targets import pose_targets
-from torchcss.errors import ConfigurationError, TorchcssError
+from torchcss.errors import ConfigurationError
 from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.io.tracks import prepare_output_folder, write_summary
 from torchcss.solve.inverse_kinematics import (
     Search,
     Solutions,
@@ -296,9 +294,14 @@ def main(config: Config) -> dict[str, Any]:
         rows = [run_pose(config, case, number) for number in range(config.poses)]
         report["cases"][case] = {"poses": rows, **summarise(rows)}
         print_row(case, report["cases"][case])
-    if config.out is not None:
-        prepare_output_folder(config.out.parent)
-        write_summary(config.out, report)
+    columns = ("arm", "solutions", "checked", "recall", "error", "seconds", "peer finds")
+    keys = ("solutions", "reference", "recall", "error", "seconds", "peer_solutions")
+    rows = [
+        [name, *(case[key] for key in keys), case["ratio_quantiles"][1]]
+        for name, case in report["cases"].items()
+    ]
+    table = Table("Inverse kinematics", (*columns, "rate over peer"), rows)
+    write_report(config.out, report, table)
     return report
 
 
@@ -331,8 +334,4 @@ def print_row(case: str, total: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except TorchcssError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    start(main, Config, __doc__)

@@ -18,7 +18,6 @@ A sequence is `demo:SEED`, the arm of `torchcss demo` in a room of its own, or a
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,19 +25,18 @@ from typing import Any
 
 import numpy as np
 import torch
-import tyro
+from common import start, write_report
 from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
 
 from torchcss.body.model import BodyModel
 from torchcss.cost.frame import FrameCosts
-from torchcss.errors import ConfigurationError, TorchcssError
+from torchcss.errors import ConfigurationError
 from torchcss.inference.implicit import TermWeights, weighted_minimum
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.initialise.result import Initialisation
-from torchcss.io.tracks import prepare_output_folder, write_summary
 from torchcss.io.video import VideoReader
 from torchcss.studies.render.sequences import arm_sequence
 from torchcss.studies.sequences import read_sequence
@@ -149,9 +147,7 @@ def main(config: Config) -> dict[str, Any]:
         for when, factors in (("before", before), ("after", weights.factors())):
             report[f"track_{when}_mm"] = tracked_error(test, settings, factors, config.seed)
     print_report(report)
-    if config.out is not None:
-        prepare_output_folder(config.out.parent)
-        write_summary(config.out, report)
+    write_report(config.out, report)
     return report
 
 
@@ -318,8 +314,4 @@ def print_report(report: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except TorchcssError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    start(main, Config, __doc__)

@@ -11,14 +11,14 @@ A motion file holds `body` (a name), `state_names [n]`, `states [T n]` and `fram
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
+from common import start
 
-from torchcss.errors import ConfigurationError, TorchcssError, TrackFileError
+from torchcss.errors import ConfigurationError, TrackFileError
 from torchcss.files import load_arrays
 from torchcss.studies.render.motions import read_motion
 from torchcss.studies.render.sequences import STYLES, Shot, shot, shot_of_motion
@@ -70,7 +70,7 @@ def main(config: Config) -> dict[str, Any]:
     """Render, write, and say what was written."""
     chosen = make_shot(config)
     folder = write_sequence(config.out, chosen, noise_px=config.noise_px, progress=True)
-    return {
+    made = {
         "folder": str(folder),
         "name": chosen.name,
         "body": chosen.body.name,
@@ -78,11 +78,9 @@ def main(config: Config) -> dict[str, Any]:
         "frame_rate": chosen.frame_rate,
         "image_size_wh": list(chosen.camera.image_size_wh),
     }
+    print(json.dumps(made, indent=1))
+    return made
 
 
 if __name__ == "__main__":
-    try:
-        print(json.dumps(main(tyro.cli(Config, description=__doc__)), indent=1))
-    except TorchcssError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    start(main, Config, __doc__)

@@ -32,7 +32,6 @@ Hessian, since a matrix that is only just definite passes its rounding on (1e-9 
 from __future__ import annotations
 
 import math
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -42,12 +41,11 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-import tyro
+from common import start, write_report
 from matplotlib.figure import Figure
 from peers.tracker_step import Step, Work, compile_step, make_frames, profiled, tracker_step
 
-from torchcss.errors import TorchcssError
-from torchcss.io.tracks import prepare_output_folder, write_summary
+from torchcss.io.tracks import prepare_output_folder
 
 QUARTILES = {"lower_quartile": 0.25, "median": 0.5, "upper_quartile": 0.75}
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
@@ -184,15 +182,9 @@ def main(config: Config) -> dict[str, Any]:
     report = {"rows": rows, "config": config, "torch": torch.__version__}
     if config.folder is not None:
         picture(rows).savefig(config.folder / "profile.png", dpi=100)
-    if config.out is not None:
-        prepare_output_folder(config.out.parent)
-        write_summary(config.out, report)
+    write_report(config.out, report)
     return report
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except TorchcssError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    start(main, Config, __doc__)

@@ -22,7 +22,6 @@ up, the middle of the path over the origin, floor at height 0) holds
 from __future__ import annotations
 
 import json
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,12 +30,13 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 import tyro
+from common import start, write_report
 from matplotlib.figure import Figure
 
-from torchcss.errors import ConfigurationError, TorchcssError
+from torchcss.errors import ConfigurationError
 from torchcss.files import replace_file
 from torchcss.io.motion.positions import MotionCapture, read_motion_capture, resample
-from torchcss.io.tracks import prepare_output_folder, write_summary
+from torchcss.io.tracks import prepare_output_folder
 from torchcss.solve.retarget import Retargeted, retarget
 
 
@@ -93,8 +93,7 @@ def main(config: Config) -> dict[str, Any]:
     write_motion(config.out, config, result)
     if config.reference is not None:
         write_reference(config.reference, config, result)
-    if config.report is not None:
-        write_summary(config.report, report)
+    write_report(config.report, report)
     if config.picture is not None:
         with replace_file(config.picture) as partial:
             picture(motion, result).savefig(partial, dpi=80)
@@ -222,8 +221,4 @@ def picture(motion: MotionCapture, result: Retargeted, columns: int = 7) -> Figu
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except TorchcssError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    start(main, Config, __doc__)

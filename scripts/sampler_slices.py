@@ -16,24 +16,22 @@ sets it.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-import tyro
+from common import start, write_report
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from torch import Tensor
 
-from torchcss.errors import TorchcssError
 from torchcss.inference.mixture import GaussianMixture, distinct_modes
 from torchcss.inference.proposals import ChamRehg, Condensation, CovarianceScaled, Proposal
 from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.io.tracks import prepare_output_folder, write_summary
+from torchcss.io.tracks import prepare_output_folder
 from torchcss.linalg import squared_mahalanobis
 from torchcss.studies.sampling_study import study_problem
 from torchcss.types import Bounds, CostFunction, LocalModel, Modes, Status
@@ -163,13 +161,9 @@ def main(config: Config) -> dict[str, Any]:
     if config.out is not None:
         folder = prepare_output_folder(config.out)
         picture(config, plane, own, noise, runs).savefig(folder / "fig8d.png", dpi=90)
-        write_summary(folder / "sampler_slices.json", report)
+        write_report(folder / "sampler_slices.json", report)
     return report
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except TorchcssError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    start(main, Config, __doc__)

@@ -18,7 +18,6 @@ shrink with them, and the shares stay.
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import zip_longest
@@ -27,7 +26,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-import tyro
+from common import Table, start, write_report
 from evaluate_track import common_name, read_reference
 from jaxtyping import Float
 from torch import Tensor
@@ -50,7 +49,7 @@ from torchcss.io.cameras import read_camera
 from torchcss.io.fitted_body import read_fitted_body
 from torchcss.io.run import body_of_track
 from torchcss.io.track_body import pose_track
-from torchcss.io.tracks import load_track, prepare_output_folder, write_summary
+from torchcss.io.tracks import load_track
 from torchcss.io.video import VideoReader
 from torchcss.io.view_files import ViewFiles
 from torchcss.linalg import squared_mahalanobis
@@ -145,9 +144,7 @@ def main(config: Config) -> dict[str, Any]:
             report[name] = study(config, config.data / name)
     for name, rows in report.items():
         print_table(name, rows)
-    if config.out is not None:
-        prepare_output_folder(config.out.parent)
-        write_summary(config.out, report)
+    write_report(config.out, report, table_of(report))
     return report
 
 
@@ -325,6 +322,14 @@ def place(
     return body, GaussianMixture(mean, covariance, torch.log_softmax(-best.cost, 0))
 
 
+def table_of(report: dict[str, Any]) -> Table:
+    """One row per set of cameras."""
+    named = {f"{clip}, {views}": row for clip in report for views, row in report[clip].items()}
+    columns = list(dict.fromkeys(column for row in named.values() for column in row))
+    rows = [[name, *map(row.get, columns)] for name, row in named.items()]
+    return Table("Several cameras", ("cameras", *columns), rows)
+
+
 def print_table(name: str, rows: dict[str, Any]) -> None:
     """One line per set of cameras."""
     columns = [column for column in next(iter(rows.values())) if column != "per_frame"]
@@ -337,8 +342,4 @@ def print_table(name: str, rows: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except TorchcssError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    start(main, Config, __doc__)

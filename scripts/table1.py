@@ -16,7 +16,6 @@ the raw samples, and over the minima. `--figures DIR` draws Figs. 1, 5 and 13.
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,14 +23,14 @@ from typing import Any
 
 import numpy as np
 import torch
-import tyro
+from common import Table, start, write_report
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from torchcss.errors import ConfigurationError, TorchcssError
+from torchcss.errors import ConfigurationError
 from torchcss.files import load_json, real_numbers
 from torchcss.inference.proposals import CovarianceScaled, Spherical
-from torchcss.io.tracks import prepare_output_folder, write_summary
+from torchcss.io.tracks import prepare_output_folder
 from torchcss.show.style import OKABE_ITO
 from torchcss.studies.reprojection import ReprojectionProblem
 from torchcss.studies.sampling_study import (
@@ -228,8 +227,9 @@ def main(config: Config) -> dict[str, Any]:
              for scale in config.scales}  # fmt: skip
     print("minima of CSS over those of SS by scale:", times)
     report = {"config": config, "runs": runs, "median": table, "css_over_ss": times}
-    if config.out is not None:
-        write_summary(prepare_output_folder(config.out.parent) / config.out.name, report)
+    cells = [[f"{row['method']} {row['scale']:g}", *(row[c] for c in COLUMNS)] for row in table]
+    shown = Table("Table 1 of [IJRR], medians over poses", ("method, scale", *COLUMNS), cells)
+    write_report(config.out, report, shown)
     return report
 
 
@@ -315,8 +315,4 @@ def _bins(values: Float[np.ndarray, " s"], *, log: bool) -> Float[np.ndarray, " 
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except TorchcssError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    start(main, Config, __doc__)

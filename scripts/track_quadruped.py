@@ -13,14 +13,13 @@ millimetres.
 from __future__ import annotations
 
 import math
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
-import tyro
+from common import Table, start, write_report
 from torch import Tensor
 
 from torchcss.body.load import FileOptions, load_body
@@ -29,11 +28,9 @@ from torchcss.cost.joints import JointTerm
 from torchcss.cost.targets import PointTargets
 from torchcss.cost.temporal import TemporalPrior
 from torchcss.cost.total import CostChoice, TrackingCost
-from torchcss.errors import TorchcssError
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.tracker import CostFactory
 from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.io.tracks import prepare_output_folder, write_summary
 from torchcss.studies.render.robots import stand, trot
 from torchcss.studies.render.sequences import look_at
 from torchcss.tracking.presets import make_tracker
@@ -167,15 +164,12 @@ def main(config: Config) -> dict[str, Any]:
         f"(worst frame {report['worst_frame_mm']:.1f}), base {report['base_mm']:.1f} mm, "
         f"feet {report['feet_mm']:.1f} mm; last frames {np.round(links[-3:].mean(-1).numpy(), 1)}"
     )
-    if config.out is not None:
-        prepare_output_folder(config.out.parent)
-        write_summary(config.out, report)
+    columns = ("links mm", "worst frame mm", "base mm", "feet mm")
+    cells = [report[c.replace(" ", "_")] for c in columns]
+    table = Table("A trotting quadruped", ("marks", *columns), [[config.marks, *cells]])
+    write_report(config.out, report, table)
     return report
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except TorchcssError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    start(main, Config, __doc__)

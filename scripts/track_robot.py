@@ -19,18 +19,17 @@ optical flow alone, if at all. The table tells the joints apart.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-import tyro
+from common import start, write_report
 from torch import Tensor
 
 from torchcss.body.model import BodyModel
-from torchcss.errors import ConfigurationError, TorchcssError
+from torchcss.errors import ConfigurationError
 from torchcss.io.tracks import load_track, prepare_output_folder, write_summary
 from torchcss.solve.inverse_kinematics import link_pose, pose_errors
 from torchcss.studies.demo import track_sequence
@@ -160,7 +159,7 @@ def main(config: Config) -> dict[str, Any]:
     pose = None if middle is None else torch.tensor(middle, dtype=torch.float64)
     rows = [run_seed(config, path, link, pose, seed) for seed in config.seeds]
     report = {"runs": rows, "config": config}
-    write_summary(config.out, report)
+    write_report(config.out / "summary.json", report)
     print_table(rows)
     return report
 
@@ -183,8 +182,4 @@ def print_table(rows: list[dict[str, Any]]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except TorchcssError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    start(main, Config, __doc__)

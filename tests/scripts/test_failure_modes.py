@@ -55,7 +55,7 @@ def test_small_mode_and_resume(
     for run in report["runs"]:
         assert run["ended"] == "complete"
         assert run["num_frames"] == len(run["per_frame"]["time_s"]) == 3
-    rows = report["table"]
+    rows = report["by_tracker"]
     assert set(rows) == set(presets)
     row = rows["robust_single"]
     assert (row["seeds"], row["lost"], row["errors"]) == (2, 0, 0)
@@ -118,7 +118,7 @@ def test_a_lost_track_in_the_table(
     ]
     config = script.Config(sequence=arm, presets=("single",))
     report = script.write(config, {"sequence": "arm"}, runs)
-    script.print_table(report["table"], "arm")
+    script.print_table(report["by_tracker"], "arm")
     text = capsys.readouterr().out
     assert "1/2" in text
     assert "- (0.0..-)" in text

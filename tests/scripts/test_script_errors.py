@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import datetime
 import importlib
+import json
+import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import common
 import pytest
 
 from torchcss.errors import TorchcssError
@@ -14,11 +19,49 @@ SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 NOWHERE = Path("/nonexistent")
 
 
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """What a script may be asked."""
+
+    seed: int = 0
+    """A seed."""
+
+
 @pytest.mark.parametrize("path", sorted(SCRIPTS.glob("*.py")), ids=lambda path: path.stem)
 def test_every_script_prints_its_errors_and_explains_itself(path: Path) -> None:
     _, ending = path.read_text(encoding="utf-8").split('if __name__ == "__main__":')
-    assert "except TorchcssError as error:" in ending
-    assert "tyro.cli(Config, description=__doc__)" in ending
+    assert ending == "\n    start(main, Config, __doc__)\n"
+
+
+def test_an_error_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fails(config: Options) -> None:
+        raise TorchcssError(f"seed {config.seed}: no such luck")
+
+    monkeypatch.setattr("sys.argv", ["script.py", "--seed", "3"])
+    with pytest.raises(SystemExit) as left:
+        common.start(fails, Options, "A page.")
+    assert left.value.code == 2
+    assert capsys.readouterr().err == "error: seed 3: no such luck\n"
+
+
+def test_a_report_says_how_it_was_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", [str(SCRIPTS / "table1.py"), "--seed", "3"])
+    table = common.Table("Errors", ("clip", "mm"), [["turn", 12.34], ["beam", math.nan]])
+    common.write_report(tmp_path / "new" / "report.json", {"rows": [1]}, table)
+    report = json.loads((tmp_path / "new" / "report.json").read_text())
+    assert report["command"] == "python scripts/table1.py --seed 3"
+    assert report["version"]
+    assert datetime.date.fromisoformat(report["date"])
+    assert report["table"]["rows"] == [["turn", 12.34], ["beam", None]]
+    table.print()
+    assert capsys.readouterr().out == "Errors\nclip    mm\nturn  12.3\nbeam      \n"
+    common.write_report(None, {})
+    with pytest.raises(TorchcssError, match="expected a file to write, found a folder"):
+        common.write_report(tmp_path, {})
 
 
 @pytest.mark.parametrize(

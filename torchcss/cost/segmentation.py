@@ -11,7 +11,7 @@ It has no derivatives in the pose, and is dear. It therefore stays out of the de
 of the minima that they find, where the weights are made (step 3 of Fig. 6 [IJRR]):
 `TrackingCost.unsearched`. The papers have no such term; section 8 [IJRR] expects help of
 silhouettes. Here it tells good modes from bad ones better than the weights of all other terms do
-(`docs/figures.md`).
+(`docs/findings.md`).
 
 It asks for a body that is modelled whole. Of an arm alone it would be led astray by the rest of
 the person, who wears the same shirt: `make_choice` gives arms none.

@@ -12,7 +12,7 @@ image decides what remains: it is a jump as in `torchcss.tracking.flip_moves`, f
 An arm that is hidden, or out of the picture, explains nothing either; it is found when it comes out
 elsewhere than expected. Legs are left alone. Arms swing, but legs stand: where one is astray, the
 body has turned or gone, and a leg put elsewhere explains what the trunk has left uncovered (tried:
-`docs/figures.md`).
+`docs/findings.md`).
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ own shadow moves along and is no part of the body.
 Of places that were covered so far there is only a guess: what does not change may be background.
 Nothing is kept when the camera moves (`learn`) or most of the picture changes (`holds`): a wrong
 background is worse than none. Clothes that look like the wall behind them are taken for it, so that
-in the dark a body is tracked worse than without (`docs/figures.md`).
+in the dark a body is tracked worse than without (`docs/findings.md`).
 
 By default: `Background.unknown`, then per frame `Appearance.likeness(colour, background)`, and
 `learn` once the body is found; `torchcss.tracking.view.Watcher` does it.
