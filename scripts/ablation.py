@@ -15,18 +15,17 @@ import contextlib
 import io
 import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import Table, start, write_report
-from evaluate_track import Config as Evaluation
-from evaluate_track import main as evaluate
+from common import Table, Tracking, start, write_report
 
 from torchcss.app.track import track_video
 from torchcss.errors import ConfigurationError
 from torchcss.studies.demo import run_demo
+from torchcss.studies.evaluation import evaluate
 from torchcss.tracking.settings import Settings
 
 BASE = ("joints", "stabiliser", "temporal")
@@ -54,6 +53,8 @@ ROWS = {
 }
 SEQUENCES = ("demo", "cam01:all", "cam03:all", "cam01:first", "cam03:first")
 SMALL_SAMPLES = 8
+TRACKING = Settings(overlay=False)
+"""How this script tracks, where nothing else is said."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,6 +73,9 @@ class Config:
     """Frames of the demo."""
     clip_frames: int = 100
     """Frames of the clips."""
+    tracking: Tracking = TRACKING
+    """How to track. The seed is the first of the seeds; terms are those of the rows, the body is
+    the demo's where that is tracked, and where keypoints are used the sequence says."""
     small: bool = False
     """Four frames of the demo, and two of a clip, with few samples, to see that it runs."""
     out: Path | None = None
@@ -119,18 +123,18 @@ def main(config: Config) -> dict[str, Any]:
     return report
 
 
+def settings_of(config: Config, **varied: Any) -> Settings:
+    """How a cell is tracked."""
+    settings = replace(config.tracking, **varied)
+    return replace(settings, samples=SMALL_SAMPLES) if config.small else settings
+
+
 def demo(config: Config, terms: tuple[str, ...]) -> dict[str, Any]:
     """Mean over seeds of the demo's errors."""
     runs = []
-    for seed in range(1 if config.small else config.seeds):
-        settings = Settings(
-            body="arm8",
-            keypoints_use="first",
-            terms=terms,
-            seed=seed,
-            samples=SMALL_SAMPLES if config.small else None,
-            overlay=False,
-        )
+    first = config.tracking.seed
+    for seed in range(first, first + (1 if config.small else config.seeds)):
+        settings = settings_of(config, body="arm8", keypoints_use="first", terms=terms, seed=seed)
         with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stderr(io.StringIO()):
             runs.append(
                 run_demo(
@@ -151,11 +155,8 @@ def clip(config: Config, sequence: str, row: str) -> dict[str, Any]:
     camera, use = sequence.split(":")
     assert config.data is not None
     folder = config.data / "balance_beam_4cam"
-    settings = Settings(
-        terms=ROWS[row],
-        keypoints_use="first" if use == "first" else "all",
-        samples=SMALL_SAMPLES if config.small else None,
-        overlay=False,
+    settings = settings_of(
+        config, terms=ROWS[row], keypoints_use="first" if use == "first" else "all"
     )
     silent = io.StringIO()
     with (
@@ -171,14 +172,14 @@ def clip(config: Config, sequence: str, row: str) -> dict[str, Any]:
             settings=settings,
             stop=2 if config.small else config.clip_frames,
         )
-        errors = evaluate(Evaluation(track=Path(out), reference=folder / "reference3d.npz"))
-    lost = np.asarray(errors["frames_lost"])
+        found = evaluate(out, folder / "reference3d.npz")
+    errors, lost = found.errors, found.frames[found.errors.lost]
     return {
-        "best_mm": errors["root_aligned_mpjpe_mm"],
-        "best_of_modes_mm": errors["root_aligned_mpjpe_best_of_modes_mm"],
-        "procrustes_mm": errors["pa_mpjpe_mm"],
-        "procrustes_best_of_modes_mm": errors["pa_mpjpe_best_of_modes_mm"],
-        "frames_lost": errors["num_frames_lost"],
+        "best_mm": errors.root_aligned.mean_mm,
+        "best_of_modes_mm": errors.root_aligned_best_of_modes.mean_mm,
+        "procrustes_mm": errors.procrustes.mean_mm,
+        "procrustes_best_of_modes_mm": errors.procrustes_best_of_modes.mean_mm,
+        "frames_lost": len(lost),
         "first_frame_lost": int(lost[0]) if lost.size else None,
         **_shares(run.summary),
     }

@@ -4,7 +4,8 @@
 
 The reference is an NPZ file with `joints [T J 3]` in metres, NaN where unknown, and `joint_names`;
 its row i belongs to frame i of the video. Names may be spelt as any detector spells them. Which
-errors there are and what they need is in `torchcss.studies.metrics`.
+errors there are and what they need is in `torchcss.studies.metrics`; in Python it is
+`torchcss.evaluate`.
 """
 
 from __future__ import annotations
@@ -13,15 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import tyro
-from common import start, write_report
+from common import Table, start, write_report
 
-from torchcss.errors import ConfigurationError, TrackFileError
-from torchcss.files import load_arrays
-from torchcss.io.tracks import load_track
-from torchcss.joint_names import canonical_joint_name
-from torchcss.studies.metrics import LIMB_JOINTS, LOST_MM, TrackErrors, track_errors
+from torchcss.errors import ConfigurationError
+from torchcss.studies.evaluation import Evaluation, evaluate
+from torchcss.studies.metrics import LIMB_JOINTS, LOST_MM
 
 FRAMES_NOTE = (
     "MPJPE means something only if track and reference share one world frame, root-aligned MPJPE "
@@ -56,73 +54,25 @@ def main(config: Config) -> dict[str, Any]:
     """Evaluate, print, write; return what is written."""
     if config.out is not None and config.out.is_dir():
         raise ConfigurationError(f"--out {config.out}: expected a file to write, found a folder")
-    track = load_track(config.track)
-    if not len(track.frames):
-        raise TrackFileError(f"{config.track}: the track has no frames; nothing to evaluate")
-    positions, names = read_reference(config.reference, config.reference_array)
-    if track.frames.min() < 0 or track.frames.max() >= len(positions):
-        raise ConfigurationError(
-            f"{config.reference}: has {len(positions)} frames, the track covers frames "
-            f"{track.frames.min()} to {track.frames.max()}; use the reference of the whole video"
-        )
-    tracked_names = [common_name(name) for name in track.joint_names]
-    common = [name for name in dict.fromkeys(tracked_names) if name in names]
-    wanted = list(dict.fromkeys(common_name(name) for name in config.joints))
-    compared = [name for name in wanted if name in common]
-    if not compared:
-        raise ConfigurationError(
-            f"no common joints: asked for {', '.join(wanted)}; the track has "
-            f"{', '.join(track.joint_names)}; the reference has {', '.join(names)}; "
-            "choose with --joints"
-        )
-    root = None if config.root is None else common_name(config.root)
-    needed = ["l_hip", "r_hip"] if root is None else [root]
-    if not set(needed) <= set(common):
-        raise ConfigurationError(
-            f"cannot align the roots: track and reference do not both have {' and '.join(needed)}; "
-            f"choose one of {', '.join(common)} with --root"
-        )
-    reference = positions[track.frames][:, [names.index(name) for name in common]]
-    tracked = track.joints_world[:, :, [tracked_names.index(name) for name in common]]
-    present = track.log_weight > -np.inf
-    errors = track_errors(tracked, reference, common, present=present, compared=compared, root=root)
-    left_out = [name for name in wanted if name not in common]
-    report = report_of(errors, config, track.frames, present, left_out)
+    found = evaluate(
+        config.track,
+        config.reference,
+        joints=config.joints,
+        root=config.root,
+        array=config.reference_array,
+    )
+    report = report_of(found, config)
     print_table(report)
-    write_report(config.out, report)
+    columns = [key + suffix for suffix in ("", "_best_of_modes") for key in KINDS]
+    cells = [*(report[f"{column}_mm"] for column in columns), report["num_frames_lost"]]
+    table = Table("A track", ("track", *columns, "lost"), [[str(config.track), *cells]])
+    write_report(config.out, report, table)
     return report
 
 
-def common_name(name: str) -> str:
-    """The catalogue's name of a joint, or its own where the catalogue has none (robots)."""
-    return canonical_joint_name(name) or name
-
-
-def read_reference(path: Path, array: str) -> tuple[np.ndarray, list[str]]:
-    """Positions [T J 3] in metres and the joints' names."""
-    arrays = load_arrays(path, TrackFileError)
-    missing = [name for name in (array, "joint_names") if name not in arrays]
-    if missing:
-        raise TrackFileError(
-            f"{path}: not a reference: expected {array} and joint_names, found "
-            f"{', '.join(arrays) or 'no arrays'}; name the positions with --reference-array"
-        )
-    positions, names = arrays[array], [common_name(str(name)) for name in arrays["joint_names"]]
-    if positions.shape[1:] != (len(names), 3) or positions.dtype.kind != "f":
-        raise TrackFileError(
-            f"{path}: {array}: expected shape [frames, {len(names)}, 3] in floating point, "
-            f"got {positions.dtype} {list(positions.shape)}"
-        )
-    units = str(arrays.get("units", "m"))
-    if units.lower() not in ("m", "metre", "metres", "meter", "meters"):
-        raise TrackFileError(f"{path}: units: expected metres, got {units!r}; convert the file")
-    return positions, names
-
-
-def report_of(
-    errors: TrackErrors, config: Config, frames: np.ndarray, present: np.ndarray, left_out: list
-) -> dict[str, Any]:
+def report_of(found: Evaluation, config: Config) -> dict[str, Any]:
     """What is printed and written."""
+    errors, frames = found.errors, found.frames
     report: dict[str, Any] = {
         "track": config.track,
         "reference": config.reference,
@@ -132,10 +82,11 @@ def report_of(
         "direction": "lower is better",
         "note": FRAMES_NOTE,
         "joint_names": errors.joint_names,
-        "joints_left_out": left_out,
+        "joints_left_out": found.left_out,
         "num_frames": len(frames),
         "num_frames_measured": errors.num_measured,
-        "num_modes": int(present.sum(axis=1).max()),
+        "num_modes": found.num_modes,
+        "inside": {f"{100 * level:g} %": share for level, share in found.inside().items()},
         "lost_threshold_mm": LOST_MM,
         "num_frames_lost": int(errors.lost.sum()),
         "frames_lost": frames[errors.lost],
@@ -166,6 +117,9 @@ def print_table(report: dict[str, Any]) -> None:
     print(f"{'mean':>16} |" + "".join(f" {mean:8.1f}" for mean in means))
     lost = f"{report['num_frames_lost']} of {report['num_frames_measured']} measured frames lost"
     print(f"{report['num_frames']} frames tracked, {lost} (root-aligned > {LOST_MM:g} mm)")
+    if report["inside"]:
+        shares = ", ".join(f"{100 * s:.0f} % in {level}" for level, s in report["inside"].items())
+        print(f"true joints inside the stated regions: {shares}")
     if report["joints_left_out"]:
         print(f"left out, not in both: {', '.join(report['joints_left_out'])}")
     print(FRAMES_NOTE)

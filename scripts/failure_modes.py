@@ -20,9 +20,9 @@ import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from common import Table, start, write_report
+from common import Table, Tracking, start, write_report
 from peers.published import PUBLISHED
 from tqdm import tqdm
 
@@ -34,7 +34,7 @@ from torchcss.studies.evaluation import Thresholds, over_seeds, summarise
 from torchcss.studies.plots import error_curves, failure_figure
 from torchcss.studies.sequences import RecordedSequence, read_sequence
 from torchcss.tracking.presets import PRESETS
-from torchcss.tracking.settings import TERMS, Settings, named_terms
+from torchcss.tracking.settings import Settings
 
 COLUMNS = {
     # title: entry, factor, decimals
@@ -55,6 +55,8 @@ COLUMNS = {
     "s/frame": ("search_s_per_frame", 1, 2),
 }
 """What is printed: until the loss, the last two over all frames."""
+TRACKING = Settings(keypoints_use="first", overlay=False)
+"""How this script tracks, where nothing else is said."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,23 +71,9 @@ class Config:
     """Trackers."""
     seeds: int = 3
     """Runs per tracker."""
-    first_seed: int = 0
-    """The first of the seeds."""
-    body: str = "body34"
-    """Body to track, where the sequence does not say which one moved."""
-    keypoints_use: Literal["first", "all"] = "first"
-    """Where keypoints are used: for the first pose only, as in the paper, or in all frames."""
-    prediction: Literal["velocity", "surface"] = "velocity"
-    """Where trunks are expected, see `torchcss.tracking.settings.Settings`; not for particle
-    filters."""
-    terms: tuple[str, ...] = TERMS
-    """Terms and priors of the cost; `default` stands for the default ones, `still` for those for a
-    camera that stands still, `papers` for those of the papers."""
-    evidence: float | None = None
-    """How much one frame counts in the weights of modes; the presets' numbers by default."""
-    limb_jumps: int = 0
-    """Most poses that join the search for an arm for which the colours do not speak; not for
-    particle filters."""
+    tracking: Tracking = TRACKING
+    """How to track. The seed is the first of the seeds; the body counts where the sequence does not
+    say which one moved; the trackers are those of --presets."""
     start: int = 0
     """First frame."""
     frames: int | None = None
@@ -96,10 +84,6 @@ class Config:
     """How many runs go side by side, of several seeds too; all of one seed by default."""
     small: bool = False
     """Four frames with few samples and small images, to see that it runs."""
-    device: str = "cpu"
-    """Where to compute."""
-    dtype: Literal["float64", "float32"] = "float64"
-    """Type of the numbers."""
     out: Path | None = None
     """JSON file to write."""
     resume: bool = False
@@ -144,7 +128,7 @@ def main(config: Config) -> dict[str, Any]:
 
 def groups_of(config: Config, done: set[tuple[str, int]]) -> Iterator[list[tuple[str, int]]]:
     """Presets and seeds that are still to be run, in groups that run side by side."""
-    seeds = range(config.first_seed, config.first_seed + config.seeds)
+    seeds = range(config.tracking.seed, config.tracking.seed + config.seeds)
     of_seeds = [[(name, seed) for name in config.presets] for seed in seeds]
     groups = [[run for run in group if run not in done] for group in of_seeds]
     if config.together is not None:
@@ -156,15 +140,15 @@ def groups_of(config: Config, done: set[tuple[str, int]]) -> Iterator[list[tuple
 
 def study_of(config: Config, sequence: RecordedSequence, thresholds: Thresholds) -> dict[str, Any]:
     """What all runs of a file have in common."""
-    tracked = ("keypoints_use", "prediction", "evidence", "limb_jumps", "dtype")
-    shared = (*tracked, "start", "frames", "stop_when_lost", "small")
+    shared = ("start", "frames", "stop_when_lost", "small")
+    tracked = {k: v for k, v in asdict(config.tracking).items() if k not in ("seed", "preset")}
     return {
         "sequence": sequence.name,
         "num_frames": sequence.num_frames,
         "frame_rate": sequence.frame_rate,
-        "body": config.body if sequence.truth is None else sequence.truth.body.name,
+        "body": config.tracking.body if sequence.truth is None else sequence.truth.body.name,
         "thresholds": asdict(thresholds),
-        "terms": list(named_terms(config.terms)),
+        "settings": {**tracked, "terms": list(config.tracking.terms)},
         **{name: getattr(config, name) for name in shared},
     }
 
@@ -211,11 +195,7 @@ def write(config: Config, study: dict[str, Any], runs: list[dict[str, Any]]) -> 
 
 def settings_of(config: Config, body: str, preset: str, seed: int) -> Settings:
     """How one tracker runs."""
-    settings = Settings(
-        body=body, preset=preset, seed=seed, keypoints_use=config.keypoints_use,
-        prediction=config.prediction, terms=named_terms(config.terms), evidence=config.evidence,
-        limb_jumps=config.limb_jumps, device=config.device, dtype=config.dtype, overlay=False,
-    )  # fmt: skip
+    settings = replace(config.tracking, body=body, preset=preset, seed=seed)
     if not config.small:
         return settings
     return replace(settings, samples=min(PRESETS[preset].samples_arm, 6), working_size=320)

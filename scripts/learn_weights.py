@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from common import start, write_report
+from common import Tracking, start, write_report
 from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
@@ -58,6 +58,8 @@ OPTIMISER = TrustRegionNewton(max_steps=30, tolerance=1e-6)
 PERSISTENCE = PRESETS["single"].persistence
 LOST_M = 0.15
 """Mean error of the joints from which a mode has lost the body, metres."""
+TRACKING = Settings(body="arm8", keypoints_use="first", working_size=320)
+"""How this script tracks, where nothing else is said."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,16 +83,16 @@ class Config:
     largest: float = 0.02
     """Norm at which the gradient of a frame is cut off, metres: a minimum that is nearly flat along
     some direction moves very far along it, and says little."""
-    terms: tuple[str, ...] = ("contour", "region", "flow", "temporal")
+    learnt: tuple[str, ...] = ("contour", "region", "flow", "temporal")
     """Terms and priors whose weights are learnt; not segmentation, which has no derivatives and
     moves no minimum. What keeps a search from far-away poses, as the
     stabiliser does, cannot be learnt from modes that stay near the truth."""
     begin: dict[str, float] | None = None
     """Weights to begin with by term; by default those of the tracker, which count as one."""
-    working_size: int = 320
-    """Longer side of the pictures."""
-    seed: int = 0
-    """Seed of the noise and of the order of the frames."""
+    tracking: Tracking = TRACKING
+    """How the test sequence is tracked; its terms are also those of the cost that is learnt from.
+    The body is that of the sequences, the weights are those that are learnt; the seed is also that
+    of the noise and of the order of the frames."""
     track: bool = True
     """Track the test sequence with the weights before and after."""
     out: Path | None = None
@@ -118,20 +120,19 @@ class Truth:
 
 def main(config: Config) -> dict[str, Any]:
     """Learn, measure, print, write; return what is written."""
-    if "segmentation" in config.terms:
+    if "segmentation" in config.learnt:
         raise ConfigurationError(
-            "terms: segmentation has no derivatives and moves no minimum; its weight is not learnt"
+            "learnt: segmentation has no derivatives and moves no minimum; its weight is not learnt"
         )
-    settings = Settings(body="arm8", keypoints_use="first", working_size=config.working_size)
-    generator = torch.Generator().manual_seed(config.seed)
+    generator = torch.Generator().manual_seed(config.tracking.seed)
     train, test = (load(name, config.frames) for name in (config.train, config.test))
-    settings = replace(settings, body=train.body.name)
+    settings = replace(config.tracking, body=train.body.name)
     if test.body.name != train.body.name:
         raise ConfigurationError(
             f"{config.test}: has {test.body.name}, {config.train} has {train.body.name}; the "
             "weights of one body say little of another"
         )
-    weights = TermWeights(config.terms, config.begin)
+    weights = TermWeights(config.learnt, config.begin)
     before = weights.factors()
     exam, lesson = Lesson(test, settings), Lesson(train, settings)
     report: dict[str, Any] = {
@@ -145,7 +146,7 @@ def main(config: Config) -> dict[str, Any]:
     report["test_after_mm"] = mean_error(exam, weights, config)
     if config.track:
         for when, factors in (("before", before), ("after", weights.factors())):
-            report[f"track_{when}_mm"] = tracked_error(test, settings, factors, config.seed)
+            report[f"track_{when}_mm"] = tracked_error(test, settings, factors)
     print_report(report)
     write_report(config.out, report)
     return report
@@ -238,7 +239,7 @@ class Lesson:
 
 def mean_error(lesson: Lesson, weights: TermWeights, config: Config) -> float:
     """Mean error of the modes, millimetres; the same noise every time."""
-    generator = torch.Generator().manual_seed(config.seed)
+    generator = torch.Generator().manual_seed(config.tracking.seed)
     with torch.no_grad():
         return 1000 * float(torch.cat(list(lesson.errors(weights, config, generator))).mean())
 
@@ -273,10 +274,10 @@ def learn(
 
 
 def tracked_error(
-    truth: Truth, settings: Settings, weights: Mapping[str, float], seed: int
+    truth: Truth, settings: Settings, weights: Mapping[str, float]
 ) -> dict[str, float]:
     """Mean error of a whole track from the true first pose, of the best mode and of all, mm."""
-    settings = replace(settings, weights=dict(weights), seed=seed)
+    settings = replace(settings, weights=dict(weights))
     n = truth.body.num_parameters
     mixture = GaussianMixture(
         truth.states[:1], 0.01 * torch.eye(n).double()[None], torch.zeros(1).double()

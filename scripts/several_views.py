@@ -19,15 +19,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from common import Table, start, write_report
-from evaluate_track import common_name, read_reference
+from common import Table, Tracking, start, write_report
 from jaxtyping import Float
 from torch import Tensor
 
@@ -46,18 +45,12 @@ from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.initialise.outliers import best_distinct
 from torchcss.initialise.result import Initialisation
 from torchcss.io.cameras import read_camera
-from torchcss.io.fitted_body import read_fitted_body
-from torchcss.io.run import body_of_track
-from torchcss.io.track_body import pose_track
-from torchcss.io.tracks import load_track
 from torchcss.io.video import VideoReader
 from torchcss.io.view_files import ViewFiles
 from torchcss.linalg import squared_mahalanobis
 from torchcss.studies.metrics import (
-    LIMB_JOINTS,
     coverage,
     probability_within,
-    track_errors,
 )
 from torchcss.tracking.session import TrackingSession
 from torchcss.tracking.settings import Settings
@@ -70,6 +63,8 @@ CORNER_NOISE_PX = 1.2
 """Reprojection error of the board's corners (its README), which have no other measure of noise."""
 REFERENCE_M = {BEAM: 0.02, BOARD: 0.0027}
 """What the reference itself is good to, standard deviation in metres (the recordings' READMEs)."""
+TRACKING = Settings()
+"""How this script tracks, where nothing else is said."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,12 +79,9 @@ class Config:
     """Frames from the start; all by default."""
     beam_cameras: tuple[str, ...] = ("cam01", "cam03", "cam01+cam03")
     """Cameras of the person, each entry tracked by itself."""
-    keypoints_use: Literal["first", "all"] = "all"
-    """Keypoints of the person in every frame, or for the first pose only."""
-    samples: int | None = None
-    """Samples per frame; the preset's number by default."""
-    seed: int = 0
-    """Seed of all random numbers."""
+    tracking: Tracking = TRACKING
+    """How to track. The board has its own body and terms, 40 samples and 3 modes where no numbers
+    are given, and features 1280 pixels wide."""
     tracks: Path = Path("out/several_views")
     """Folder for the person's tracks."""
     out: Path | None = None
@@ -150,7 +142,6 @@ def main(config: Config) -> dict[str, Any]:
 
 def person(config: Config, folder: Path) -> dict[str, Any]:
     """The person on the beam, from each camera and from both."""
-    positions, names = read_reference(folder / "reference3d.npz", "joints")
     rows: dict[str, Any] = {}
     for row_name in config.beam_cameras:
         views = row_name.split("+")
@@ -160,42 +151,24 @@ def person(config: Config, folder: Path) -> dict[str, Any]:
         ]
         assert files[0].keypoints is not None
         out = config.tracks / "+".join(views)
-        settings = Settings(
-            keypoints_use=config.keypoints_use, samples=config.samples, seed=config.seed
-        )
         run = track_video(
             files[0].video, camera=folder / "cameras.json", keypoints=files[0].keypoints, out=out,
-            stop=config.frames, settings=settings, options=TrackOptions(others=files[1:]),
+            stop=config.frames, settings=config.tracking, options=TrackOptions(others=files[1:]),
         )  # fmt: skip
-        track = load_track(out)
-        tracked = [common_name(name) for name in track.joint_names]
-        common = [name for name in tracked if name in names]
-        wanted = [name for name in LIMB_JOINTS if name in common]
-        reference = positions[track.frames][:, [names.index(name) for name in common]]
-        joints = track.joints_world[:, :, [tracked.index(name) for name in common]]
-        errors = track_errors(
-            joints, reference, common, present=track.log_weight > -np.inf, compared=wanted
-        )
-        body = body_of_track(track, read_fitted_body(out / "body.npz").body)
-        pose = pose_track(
-            body, torch.from_numpy(track.state[:, 0]), torch.from_numpy(track.base_transform)
-        )
-        spread = joint_covariance(body, pose, torch.from_numpy(track.covariance[:, 0]))
+        found = evaluate(out, folder / "reference3d.npz")
+        errors = found.errors
+        assert found.covariance is not None
         # One camera's depth is wrong by the person's size; their shape is what can be compared.
-        column = [common.index(name) for name in wanted]
-        hips = [common.index(name) for name in ("l_hip", "r_hip")]
-        away = joints[:, 0] - reference
-        away = torch.from_numpy(away[:, column] - away[:, hips].mean(1, keepdims=True))
         camera = read_camera(folder / "cameras.json", camera_name=views[0]).camera
         sums = Sums()
-        for row, each in enumerate(away):
-            sums.add(each, spread[row, [tracked.index(name) for name in wanted]], camera)
+        for away, spread in zip(found.away_m, found.covariance, strict=True):
+            sums.add(torch.from_numpy(away), torch.from_numpy(spread), camera)
         rows[" + ".join(views)] = {
             "absolute_mm": errors.absolute.mean_mm,
             "root_aligned_mm": errors.root_aligned.mean_mm,
             "root_aligned_best_of_modes_mm": errors.root_aligned_best_of_modes.mean_mm,
             "pa_mm": errors.procrustes.mean_mm,
-            "frames": len(track.frames),
+            "frames": len(found.frames),
             "frames_lost": int(errors.lost.sum()),
             "seconds_per_frame": run.summary["seconds_per_frame"],
             **sums.report(REFERENCE_M[BEAM]),
@@ -219,19 +192,19 @@ def board(config: Config, folder: Path) -> dict[str, Any]:
         i for i in range(len(truth)) if all(np.isfinite(m[i]).all() for m in marks.values())
     )
     stop = len(truth) if config.frames is None else min(len(truth), start + config.frames)
+    settings = replace(
+        config.tracking, body="board", terms=("joints", "temporal"), working_size=1280,
+        samples=config.tracking.samples or 40, modes=config.tracking.modes or 3,
+    )  # fmt: skip
     rows: dict[str, Any] = {}
     for views in (("cam_0",), ("cam_2",), ("cam_0", "cam_2")):
         cameras = [read_camera(folder / "cameras.json", camera_name=v).camera for v in views]
-        settings = Settings(
-            body="board", terms=("joints", "temporal"), samples=config.samples or 40, modes=3,
-            working_size=1280, seed=config.seed,
-        )  # fmt: skip
         seen = [
             CameraView(camera, corner_keypoints(body, marks[view]), CORNER_NOISE_PX)
             for view, camera in zip(views, cameras, strict=True)
         ]
         readers = [VideoReader(folder / f"{view}.mp4", start=start, stop=stop) for view in views]
-        generator = torch.Generator().manual_seed(config.seed)
+        generator = torch.Generator().manual_seed(settings.seed)
         placed, mixture = place(body, seen, start, generator)
         session = TrackingSession(
             settings,

@@ -19,13 +19,13 @@ optical flow alone, if at all. The table tells the joints apart.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from common import start, write_report
+from common import Tracking, start, write_report
 from torch import Tensor
 
 from torchcss.body.model import BodyModel
@@ -42,6 +42,14 @@ ROBOTS: dict[str, tuple[str, tuple[float, ...]]] = {
     "ur5": ("tool0", (-0.3, -1.1, 1.3, -1.6, -1.4, 0.0)),
 }
 """End effector, and a usual pose of each arm about which it swings."""
+TRACKING = Settings(
+    samples=60,
+    modes=5,
+    keypoints_use="first",
+    # Neighbouring links of an arm run into each other as capsules.
+    terms=tuple(term for term in TERMS if term != "interpenetration"),
+)
+"""How this script tracks, where nothing else is said."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,14 +71,8 @@ class Config:
     """Frames, 25 a second."""
     seeds: tuple[int, ...] = (0,)
     """Seeds of motion, room, noise and samples."""
-    samples: int = 60
-    """Samples per frame."""
-    modes: int = 5
-    """Modes kept."""
-    preset: str = "css"
-    """Tracker, see `torchcss/tracking/presets.py`."""
-    working_size: int = 640
-    """Longer side at which features are computed, pixels."""
+    tracking: Tracking = TRACKING
+    """How to track; body and seeds are those above."""
     out: Path = Path("out/robot")
     """Folder of the results."""
 
@@ -86,17 +88,7 @@ def run_seed(config: Config, path: Path, link: str, middle: Tensor | None, seed:
         amplitude=config.amplitude,
         num_frames=config.frames,
     )
-    settings = Settings(
-        body=str(path),
-        preset=config.preset,
-        samples=config.samples,
-        modes=config.modes,
-        keypoints_use="first",
-        # Neighbouring links of an arm run into each other as capsules.
-        terms=tuple(term for term in TERMS if term != "interpenetration"),
-        working_size=config.working_size,
-        seed=seed,
-    )
+    settings = replace(config.tracking, body=str(path), seed=seed)
     folder = config.out / f"seed{seed}"
     summary = track_sequence(sequence, folder, settings, generator=generator)
     errors = compare(body, link, sequence.states, folder)

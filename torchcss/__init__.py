@@ -24,6 +24,7 @@ from torchcss.io.run import Run
 from torchcss.io.tracks import Track, load_track
 from torchcss.io.view_files import ViewFiles
 from torchcss.solve.inverse_kinematics import Solutions, inverse_kinematics
+from torchcss.studies.evaluation import Evaluation, evaluate
 from torchcss.tracking.session import Observation, Posterior, SessionState, TrackingSession
 from torchcss.tracking.settings import Settings
 from torchcss.tracking.view import CameraView
@@ -34,6 +35,7 @@ __all__ = [
     "BodyModel",
     "Camera",
     "CameraView",
+    "Evaluation",
     "Initialisation",
     "InitialiseOptions",
     "Keypoints",
@@ -47,6 +49,7 @@ __all__ = [
     "TrackOptions",
     "TrackingSession",
     "ViewFiles",
+    "evaluate",
     "export",
     "export_track",
     "initialise",

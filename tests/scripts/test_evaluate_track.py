@@ -10,7 +10,10 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+import torch
 
+import torchcss
+from torchcss.body.load import load_body
 from torchcss.errors import ConfigurationError, ShapeError, TrackFileError
 from torchcss.io.tracks import FrameModes, Track, TrackWriter
 from torchcss.studies.metrics import LIMB_JOINTS
@@ -117,7 +120,7 @@ def test_joints_array_and_root_can_be_chosen(
     )
     report = script.main(config)
     assert report["joint_names"] == ("l_wrist", "l_elbow")
-    assert report["joints_left_out"] == ["nose"]
+    assert report["joints_left_out"] == ("nose",)
     assert report["mpjpe_mm"] == pytest.approx(10 * 3**0.5)
     assert report["root_aligned_mpjpe_mm"] == pytest.approx(0.0, abs=1e-9)
     assert "left out, not in both: nose" in capsys.readouterr().out
@@ -157,6 +160,47 @@ def test_bad_input_is_a_typed_error(
     with pytest.raises(error, match=message) as caught:
         script.main(script.Config(**options))
     assert "\n" not in str(caught.value)
+
+
+def test_calibration_is_told_of_a_run_that_knows_its_body(
+    script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Errors drawn from the stated covariance lie inside its regions as often as they should."""
+    generator = torch.Generator().manual_seed(0)
+    body, count = load_body("body34", dtype=torch.float64), 300
+    n = body.num_parameters
+    spread = torch.diag(torch.where(torch.arange(n) < 6, 1e-8, 4e-4).double())
+    writer = TrackWriter(
+        tmp_path / "track.npz", Track.empty(body.state_names, body.joint_names, body=body)
+    )
+    tracked = body.pose(body.rest).joints
+    for row in range(count):
+        writer.append(
+            FrameModes(
+                frame=row,
+                time_s=row / 25,
+                state=body.rest[None].numpy(),
+                covariance=spread[None].numpy(),
+                log_weight=np.zeros(1),
+                cost=np.zeros(1),
+                parent=np.full(1, -1),
+                base_transform=np.eye(4),
+                joints_world=tracked[None].numpy(),
+            )
+        )
+    writer.save()
+    noise = torch.randn(count, n, generator=generator, dtype=torch.float64) @ spread.sqrt()
+    joints = body.pose(body.rest + noise).joints.numpy()
+    reference = write_reference(tmp_path / "r.npz", joints, list(body.joint_names))
+    found = torchcss.evaluate(tmp_path, reference)
+    shares = found.inside(reference_m=0.001)
+    assert set(shares) == {0.5, 0.9, 0.95}
+    # Limbs' ends move on surfaces, whose third direction has no error.
+    assert 0.5 < shares[0.5] < 0.85
+    assert 0.85 < shares[0.9] < 1
+    report = script.main(script.Config(track=tmp_path, reference=reference))
+    assert report["inside"]["90 %"] >= shares[0.9]
+    assert "inside the stated regions" in capsys.readouterr().out
 
 
 def test_other_units_are_refused(script: ModuleType, joints: np.ndarray, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from peers.published import PUBLISHED
 from torchcss.errors import ConfigurationError
 from torchcss.studies.plots import ErrorCurves, error_curves, failure_figure
 from torchcss.tracking.presets import PRESETS
-from torchcss.tracking.settings import TERMS
+from torchcss.tracking.settings import TERMS, Settings
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "failure_modes.py"
 
@@ -72,7 +72,9 @@ def test_small_mode_and_resume(
     assert "0/2" in text
     assert "never" in text
 
-    for change in ({"start": 1}, {"terms": ("default", "background")}, {"prediction": "surface"}):
+    for changed in ({"terms": ("default", "background")}, {"prediction": "surface"}, None):
+        tracking = Settings(keypoints_use="first", overlay=False, **(changed or {}))
+        change = {"tracking": tracking} if changed else {"start": 1}
         with pytest.raises(ConfigurationError, match="another study"):
             script.main(script.Config(resume=True, **change, **options))
     with pytest.raises(ConfigurationError, match="at least 1, got 0"):
@@ -92,10 +94,10 @@ def test_small_mode_and_resume(
 
 
 def test_how_trackers_are_set_up_can_be_chosen(script: ModuleType, arm: Path) -> None:
-    config = script.Config(
-        sequence=arm, terms=("default", "silhouette"), evidence=0.3, prediction="surface",
-        limb_jumps=2,
-    )  # fmt: skip
+    tracking = Settings(
+        terms=("default", "silhouette"), evidence=0.3, prediction="surface", limb_jumps=2
+    )
+    config = script.Config(sequence=arm, tracking=tracking)
     settings = script.settings_of(config, "body34", "css", 1)
     assert settings.terms == (*TERMS, "silhouette")
     assert (settings.evidence, settings.prediction, settings.seed) == (0.3, "surface", 1)

@@ -9,13 +9,15 @@ import learn_weights as script
 import pytest
 
 from torchcss.errors import ConfigurationError, TorchcssError
+from torchcss.tracking.settings import Settings
 
-SMALL = script.Config(frames=2, epochs=2, starts=2, working_size=160, track=True)
+SMALL = script.Config(frames=2, epochs=2, starts=2, track=True,
+    tracking=Settings(body="arm8", keypoints_use="first", working_size=160))  # fmt: skip
 
 
 def test_in_small(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     report = script.main(script.replace(SMALL, out=tmp_path / "j" / "report.json"))
-    assert set(report["weights_after"]) == set(SMALL.terms)
+    assert set(report["weights_after"]) == set(SMALL.learnt)
     assert report["weights_after"] != report["weights_before"]
     assert all(weight > 0 for weight in report["weights_after"].values())
     assert len(report["train_mm"]) == 3
@@ -33,4 +35,4 @@ def test_bad_sequences_are_refused(tmp_path: Path):
     with pytest.raises(ConfigurationError, match="no terms"):
         script.main(script.replace(SMALL, begin={"joints": 1.0}))
     with pytest.raises(ConfigurationError, match="segmentation has no derivatives"):
-        script.main(script.replace(SMALL, terms=("contour", "segmentation")))
+        script.main(script.replace(SMALL, learnt=("contour", "segmentation")))

@@ -9,10 +9,16 @@ import pytest
 import several_views as script
 import torch
 
+from torchcss.tracking.settings import Settings
+
 
 def test_board_in_small(shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     config = script.Config(
-        data=shared_data, what=("handheld_board",), frames=3, samples=8, out=tmp_path / "j.json"
+        data=shared_data,
+        what=("handheld_board",),
+        frames=3,
+        tracking=Settings(samples=8),
+        out=tmp_path / "j.json",
     )
     rows = script.main(config)["handheld_board"]
     assert list(rows) == ["cam_0", "cam_2", "cam_0 + cam_2"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -21,9 +22,7 @@ def test_small_mode(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFi
             urdf=write_arm(tmp_path / "seven.urdf"),
             link="tip",
             frames=2,
-            samples=6,
-            modes=2,
-            working_size=240,
+            tracking=replace(script.Config().tracking, samples=6, modes=2, working_size=240),
             out=tmp_path / "out",
         )
     )

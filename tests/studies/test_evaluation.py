@@ -21,9 +21,9 @@ from torchcss.cost.interpenetration import InterpenetrationPairs
 from torchcss.errors import ConfigurationError
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.studies.evaluation import (
+    Evaluator,
     FrameMeasures,
     Thresholds,
-    Yardstick,
     compared_joints,
     num_evaluations,
     number,
@@ -94,9 +94,9 @@ def arm_and_states(count: int = 2) -> tuple[BodyModel, Tensor]:
 def test_the_truth_has_no_error() -> None:
     body, states = arm_and_states()
     sequence = recorded(body, states)
-    yardstick = Yardstick(sequence, body, Thresholds.of(sequence))
-    assert yardstick.compared == ("r_shoulder", "r_elbow", "r_wrist", "r_hand_tip")
-    measures = yardstick(tracked(body, states[1:2], index=1), START, 0.125)
+    evaluator = Evaluator(sequence, body, Thresholds.of(sequence))
+    assert evaluator.compared == ("r_shoulder", "r_elbow", "r_wrist", "r_hand_tip")
+    measures = evaluator(tracked(body, states[1:2], index=1), START, 0.125)
     assert (measures.frame, measures.time_s, measures.failed) == (1, 0.04, False)
     for errors in (measures.absolute_mm, measures.root_aligned_mm, measures.procrustes_mm):
         np.testing.assert_allclose(errors, 0, atol=1e-6)
@@ -115,7 +115,7 @@ def test_an_arm_is_measured_where_it_is_and_modes_one_by_one() -> None:
     away = states[0].clone()
     away[body.state_index("r_shoulder_raising")] += 0.3
     modes = torch.stack([away, states[0]])
-    measures = Yardstick(sequence, body, Thresholds.of(sequence))(
+    measures = Evaluator(sequence, body, Thresholds.of(sequence))(
         tracked(body, modes, deviation=0.1, weight=(0.8, 0.2)), START, 0.0
     )
     step = body.pose(away).joints - body.pose(states[0]).joints
@@ -140,14 +140,14 @@ def test_frames_fail_by_error_or_by_overlap() -> None:
     frame = tracked(body, away)
 
     def failed(sequence: RecordedSequence, **figures: float) -> bool:
-        return Yardstick(sequence, body, Thresholds(**figures))(frame, START, 0.0).failed
+        return Evaluator(sequence, body, Thresholds(**figures))(frame, START, 0.0).failed
 
     assert not failed(sequence, lost_mm=1000, least_overlap=0.0)
     assert failed(sequence, lost_mm=50, least_overlap=0.0)
     assert failed(sequence, lost_mm=1000, least_overlap=0.9)
     without = sequence._replace(mask=None)
     assert not failed(without, lost_mm=1000, least_overlap=0.9)
-    assert math.isnan(Yardstick(without, body, Thresholds())(frame, START, 0.0).overlap)
+    assert math.isnan(Evaluator(without, body, Thresholds())(frame, START, 0.0).overlap)
 
 
 def test_true_joints_are_in_the_stated_regions_as_often_as_stated() -> None:
@@ -170,7 +170,7 @@ def test_true_joints_are_in_the_stated_regions_as_often_as_stated() -> None:
         np.testing.assert_allclose(share, level, atol=4 * (level * (1 - level) / count) ** 0.5)
     sequence = recorded(body, states, mask=None)
     frame = tracked(body, mean, covariance=covariance)
-    deviations = Yardstick(sequence, body, Thresholds())(frame, START, 0.0).angle_deviations
+    deviations = Evaluator(sequence, body, Thresholds())(frame, START, 0.0).angle_deviations
     # The mean of chi-square over its 8 dimensions.
     assert (deviations**2).mean() == pytest.approx(1, abs=4 * (2 / 8 / count) ** 0.5)
 
@@ -214,19 +214,19 @@ def test_a_body_is_measured_alike_on_any_base() -> None:
         body, states, joint_names=tuple(names),
         joints_world=body.pose(states).joints[:, index].numpy(),
     )  # fmt: skip
-    yardstick = Yardstick(sequence, body, Thresholds.of(sequence))
-    assert yardstick.compared == LIMB_JOINTS
+    evaluator = Evaluator(sequence, body, Thresholds.of(sequence))
+    assert evaluator.compared == LIMB_JOINTS
     mean = states[1:2] + 0.03 * noise[2]
     mean[:, 0] += 0.5  # beside where it is
     covariance = 1e-4 * torch.eye(34, dtype=torch.float64)[None]
-    here = yardstick(tracked(body, mean, covariance=covariance, index=1), START, 0.0)
+    here = evaluator(tracked(body, mean, covariance=covariance, index=1), START, 0.0)
     skew = torch.tensor([[0, -0.4, 0.2], [0.4, 0, 0.1], [-0.2, -0.1, 0]], dtype=torch.float64)
     turn = torch.linalg.matrix_exp(skew)
     other, there, spread = move_base(
         body, turn, torch.tensor([0.3, -1.0, 0.2]).double(), mean, covariance
     )
     assert spread is not None
-    moved = yardstick(tracked(other, there, covariance=spread, index=1), START, 0.0)
+    moved = evaluator(tracked(other, there, covariance=spread, index=1), START, 0.0)
     for one, two in zip(here[4:8], moved[4:8], strict=True):
         np.testing.assert_allclose(one, two, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(here.angle_deviations, moved.angle_deviations, rtol=1e-2)
@@ -243,12 +243,12 @@ def test_what_cannot_be_measured() -> None:
     reference = body.pose(states).joints.numpy()
     names = tuple("far" if name == "l_hip" else name for name in body.joint_names)
     with pytest.raises(ConfigurationError, match="no l_hip"):
-        Yardstick(recorded(body, states, joint_names=names), body, Thresholds())
+        Evaluator(recorded(body, states, joint_names=names), body, Thresholds())
     with pytest.raises(ConfigurationError, match="in view"):
-        Yardstick(recorded(body, states, joints_world=reference + 100), body, Thresholds())
+        Evaluator(recorded(body, states, joints_world=reference + 100), body, Thresholds())
     holes = reference.copy()
     holes[:, body.joint_index("l_wrist")] = np.nan
-    partly = Yardstick(recorded(body, states, joints_world=holes, truth=None), body, Thresholds())
+    partly = Evaluator(recorded(body, states, joints_world=holes, truth=None), body, Thresholds())
     assert set(LIMB_JOINTS) - set(partly.compared) == {"l_wrist"}
     measures = partly(tracked(body, states[:1]), START, 0.0)
     assert np.isnan(measures.angle_deviations).all()
@@ -274,7 +274,7 @@ def test_limits_of_bodies_without_roots() -> None:
     sequence = recorded(body, states)
     x = states[:1].clone()
     x[:, body.state_index("r_elbow_flexion")] = -math.radians(4)
-    measures = Yardstick(sequence, body, Thresholds.of(sequence))(tracked(body, x), START, 0.0)
+    measures = Evaluator(sequence, body, Thresholds.of(sequence))(tracked(body, x), START, 0.0)
     assert measures.outside_degrees == pytest.approx(4.0)
 
 

@@ -21,7 +21,7 @@ from torchcss.initialise.keypoint_checks import typical_sigma
 from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
 from torchcss.initialise.result import Initialisation
 from torchcss.io.video import VideoReader
-from torchcss.studies.evaluation import FrameMeasures, Thresholds, Yardstick, loss
+from torchcss.studies.evaluation import Evaluator, FrameMeasures, Thresholds, loss
 from torchcss.studies.sequences import RecordedSequence
 from torchcss.tracking.session import TrackingSession
 from torchcss.tracking.settings import Settings
@@ -118,7 +118,7 @@ def track_together(
         (
             Run(settings, [], "complete"),
             session_of(sequence, settings, begin),
-            Yardstick(sequence, begin.first.body, thresholds),
+            Evaluator(sequence, begin.first.body, thresholds),
         )
         for settings, begin in runs
     ]
@@ -127,18 +127,18 @@ def track_together(
     for frame in reader:
         observation, first = eye.observe(frame), first or frame
         left = []
-        for run, session, yardstick in going:
+        for run, session, evaluator in going:
             ended = None
             try:
                 posterior = session.step(observation)
-                run.measures.append(yardstick(posterior, first, observation.seconds))
+                run.measures.append(evaluator(posterior, first, observation.seconds))
             except (TorchcssError, RuntimeError, ArithmeticError) as error:
                 # The others go on: a study takes hours. The table says that this one ended.
                 ended = f"error: {type(error).__name__}: {error}"
             if ended is None and stop_when_lost and loss(run.measures, thresholds) is not None:
                 ended = "lost"
             if ended is None:
-                left.append((run, session, yardstick))
+                left.append((run, session, evaluator))
             else:
                 yield run._replace(ended=ended)
         going = left

@@ -1,8 +1,8 @@
 """How well a tracker follows a sequence whose truth is known, frame by frame and as a row.
 
-`Yardstick` measures every frame of a tracker, `summarise` makes a run one row of numbers, and
-`over_seeds` the rows of several runs one of medians. What the words mean (the figures are those of
-`Thresholds`):
+`evaluate` compares a finished run with joints in space. For runs under way, `Evaluator` measures
+every frame of a tracker, `summarise` makes a run one row of numbers, and `over_seeds` the rows of
+several runs one of medians. What the words mean (the figures are those of `Thresholds`):
 
 * A frame has *failed* if the best mode's mean root-aligned error exceeds 250 mm, or if its
   silhouette overlaps the true one by less than half (intersection over union; good tracks reach
@@ -27,13 +27,15 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchcss.body.model import BodyModel, BodyPose
@@ -41,14 +43,21 @@ from torchcss.body.root import ROOT_NAMES, has_root, move_base
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.cost.interpenetration import InterpenetrationPairs
 from torchcss.cost.part_map import part_map
-from torchcss.errors import ConfigurationError
+from torchcss.errors import ConfigurationError, TrackFileError
+from torchcss.files import load_arrays
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.tracker import TrackerInfo
+from torchcss.io.run import Run, as_run
+from torchcss.io.track_body import pose_track
+from torchcss.io.tracks import Track
+from torchcss.joint_names import canonical_joint_name
 from torchcss.linalg import squared_mahalanobis
 from torchcss.studies.metrics import (
+    LEVELS,
     LIMB_JOINTS,
     LOST_MM,
     REGAIN_S,
+    TrackErrors,
     absolute_errors_mm,
     acceleration_error,
     best_of_modes,
@@ -58,6 +67,7 @@ from torchcss.studies.metrics import (
     probability_within,
     procrustes_errors_mm,
     root_aligned_errors_mm,
+    track_errors,
 )
 from torchcss.studies.sequences import RecordedSequence
 from torchcss.tracking.session import Posterior
@@ -278,7 +288,7 @@ def _moved_joints(body: BodyModel) -> tuple[str, ...]:
     return tuple(name for name, moved in zip(body.joint_names, moves, strict=True) if moved)
 
 
-class Yardstick:
+class Evaluator:
     """Measures tracked frames of one sequence.
 
     Args:
@@ -566,3 +576,161 @@ def over_seeds(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 def number(value: float | None, missing: float = math.nan) -> float:
     """What a run or its file says; `missing` for NaN and for null, which stands for it."""
     return missing if value is None or math.isnan(value) else float(value)
+
+
+class Evaluation(NamedTuple):
+    """A run against a reference.
+
+    Attributes:
+        frames: Index of each frame in the video.
+        num_modes: Most modes that a frame has.
+        errors: MPJPE as it stands, root-aligned and after Procrustes, of the best mode and of the
+            best of the modes; which frames are lost.
+        left_out: Joints that were asked for and that run or reference lack.
+        away_m: Offset of the best mode's compared joints when the roots are on each other, metres;
+            NaN where the reference is unknown.
+        covariance: Covariances that the run states for these joints; None where it does not say
+            which body it was of.
+    """
+
+    frames: Int[np.ndarray, " t"]
+    num_modes: int
+    errors: TrackErrors
+    left_out: tuple[str, ...]
+    away_m: Float[np.ndarray, "t j 3"]
+    covariance: Float[np.ndarray, "t j 3 3"] | None
+
+    def inside(
+        self, reference_m: float = Thresholds.reference_m, levels: Sequence[float] = LEVELS
+    ) -> dict[float, float]:
+        """Calibration: share of the joints inside the stated regions of these probabilities.
+
+        Args:
+            reference_m: Standard deviation of the reference per coordinate, metres.
+            levels: Probabilities of the regions.
+
+        Returns:
+            Shares by probability; none where no covariances are known.
+        """
+        if self.covariance is None:
+            return {}
+        known = np.isfinite(self.away_m).all(-1)
+        spread = torch.from_numpy(self.covariance[known] + reference_m**2 * np.eye(3))
+        distance = squared_mahalanobis(torch.from_numpy(self.away_m[known]), spread)
+        return coverage(probability_within(distance.numpy(), 3), levels)
+
+
+def evaluate(
+    run: Run | str | os.PathLike[str],
+    reference: str | os.PathLike[str],
+    *,
+    joints: Sequence[str] = LIMB_JOINTS,
+    root: str | None = None,
+    array: str = "joints",
+) -> Evaluation:
+    """Errors of a run against joints in space.
+
+    Absolute errors mean something only if run and reference share one world frame, root-aligned
+    ones only if their axes agree; Procrustes errors need neither.
+
+    Args:
+        run: The run, its folder, or its track's file.
+        reference: An NPZ file with `joints [T J 3]` in metres, NaN where unknown, and
+            `joint_names`; row i belongs to frame i of the video. Names may be spelt as any detector
+            spells them.
+        joints: Joints to compare; those that run or reference lack are left out.
+        root: Joint that is aligned; None: the midpoint of the hips.
+        array: Array of the reference that holds the positions.
+
+    Raises:
+        TrackFileError: If a file is missing or malformed, or the run has no frames.
+        ConfigurationError: If the reference has too few frames, or they have too few joints in
+            common.
+        ShapeError: If nothing of the reference is known.
+    """
+    opened = as_run(run)
+    track = opened.track
+    if not len(track.frames):
+        raise TrackFileError(f"{opened.path}: the track has no frames; nothing to evaluate")
+    positions, names = read_reference(reference, array)
+    if track.frames.min() < 0 or track.frames.max() >= len(positions):
+        raise ConfigurationError(
+            f"{reference}: has {len(positions)} frames, the track covers frames "
+            f"{track.frames.min()} to {track.frames.max()}; use the reference of the whole video"
+        )
+    tracked_names = [common_name(name) for name in track.joint_names]
+    common = [name for name in dict.fromkeys(tracked_names) if name in names]
+    wanted = list(dict.fromkeys(common_name(name) for name in joints))
+    compared = [name for name in wanted if name in common]
+    if not compared:
+        raise ConfigurationError(
+            f"no common joints: asked for {', '.join(wanted)}; the track has "
+            f"{', '.join(track.joint_names)}; the reference has {', '.join(names)}; "
+            "choose with joints (--joints)"
+        )
+    roots = ["l_hip", "r_hip"] if root is None else [common_name(root)]
+    if not set(roots) <= set(common):
+        raise ConfigurationError(
+            f"cannot align the roots: track and reference do not both have {' and '.join(roots)}; "
+            f"choose one of {', '.join(common)} with root (--root)"
+        )
+    column = [tracked_names.index(name) for name in common]
+    true = positions[track.frames][:, [names.index(name) for name in common]]
+    tracked = track.joints_world[:, :, column]
+    present = np.isfinite(track.log_weight)
+    errors = track_errors(
+        tracked, true, common, present=present, compared=compared,
+        root=None if root is None else roots[0],
+    )  # fmt: skip
+    index, middle = ([common.index(name) for name in some] for some in (compared, roots))
+    away = tracked[:, 0] - true
+    away = away[:, index] - away[:, middle].mean(1, keepdims=True)
+    return Evaluation(
+        frames=track.frames,
+        num_modes=int(present.sum(axis=1).max()),
+        errors=errors,
+        left_out=tuple(name for name in wanted if name not in common),
+        away_m=away,
+        covariance=_stated(track, [column[i] for i in index]),
+    )
+
+
+def _stated(track: Track, joints: Sequence[int]) -> Float[np.ndarray, "t j 3 3"] | None:
+    """Covariances of joints of the best modes; None where the body is not known."""
+    if track.body is None:
+        return None
+    state, base, spread = (
+        torch.from_numpy(part)
+        for part in (track.state[:, 0], track.base_transform, track.covariance[:, 0])
+    )
+    pose = pose_track(track.body, state, base)
+    return joint_covariance(track.body, pose, spread)[:, list(joints)].numpy()
+
+
+def common_name(name: str) -> str:
+    """The catalogue's name of a joint, or its own where the catalogue has none (robots)."""
+    return canonical_joint_name(name) or name
+
+
+def read_reference(
+    path: str | os.PathLike[str], array: str = "joints"
+) -> tuple[Float[np.ndarray, "t j 3"], list[str]]:
+    """Positions in metres and the joints' names; see `evaluate`."""
+    arrays = load_arrays(Path(path), TrackFileError)
+    missing = [name for name in (array, "joint_names") if name not in arrays]
+    if missing:
+        raise TrackFileError(
+            f"{path}: not a reference: expected {array} and joint_names, found "
+            f"{', '.join(arrays) or 'no arrays'}; name the positions with array "
+            "(--reference-array)"
+        )
+    positions, names = arrays[array], [common_name(str(name)) for name in arrays["joint_names"]]
+    if positions.shape[1:] != (len(names), 3) or positions.dtype.kind != "f":
+        raise TrackFileError(
+            f"{path}: {array}: expected shape [frames, {len(names)}, 3] in floating point, "
+            f"got {positions.dtype} {list(positions.shape)}"
+        )
+    units = str(arrays.get("units", "m"))
+    if units.lower() not in ("m", "metre", "metres", "meter", "meters"):
+        raise TrackFileError(f"{path}: units: expected metres, got {units!r}; convert the file")
+    return positions, names
