@@ -48,6 +48,7 @@ from torchcss.io.cameras import read_camera
 from torchcss.io.video import VideoReader
 from torchcss.io.view_files import ViewFiles
 from torchcss.linalg import squared_mahalanobis
+from torchcss.studies.evaluation import evaluate
 from torchcss.studies.metrics import (
     coverage,
     probability_within,
