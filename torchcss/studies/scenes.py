@@ -26,10 +26,8 @@ from torch import Tensor
 
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES
-from torchcss.cost.frame import FrameCosts
 from torchcss.cost.total import TrackingCost
-from torchcss.errors import ConfigurationError, TrackFileError
-from torchcss.files import load_arrays
+from torchcss.errors import ConfigurationError
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.initialise.fit import initialise
 from torchcss.initialise.keypoint_checks import default_sigma
@@ -37,16 +35,14 @@ from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
 from torchcss.io.cameras import read_camera
 from torchcss.io.keypoints.read import read_keypoints
 from torchcss.io.video import VideoReader
-from torchcss.joint_names import canonical_joint_name
+from torchcss.studies.evaluation import read_reference
 from torchcss.studies.metrics import LIMB_JOINTS, root_aligned_mpjpe_mm
 from torchcss.studies.render.sequences import arm_sequence
 from torchcss.studies.slices import Line, eigen_lines, joint_lines
-from torchcss.tracking.settings import Settings, boundary_emphasis, make_choice, make_extractor
-from torchcss.types import Bounds, Modes
+from torchcss.tracking.settings import Settings, make_choice, make_plan
+from torchcss.tracking.view import NOTHING_KNOWN, NOTHING_SEEN, CameraView
+from torchcss.types import Bounds, Frame, Modes
 from torchcss.vision.features import FrameFeatures
-
-_NO_KEYPOINTS_PX = 1.0
-"""Keypoint noise of scenes without keypoints: it enters nothing."""
 
 _REACH_M = 0.5
 """How far a slice moves the body, which no limit ends; angles go half a turn at most."""
@@ -115,24 +111,12 @@ def arm_scenes(
     _check_frames(frames)
     settings = settings or Settings(body="arm8")
     sequence = arm_sequence(generator=generator, num_frames=max(frames) + 1)
-    extractor, choice = make_extractor(settings), make_choice(settings, _NO_KEYPOINTS_PX)
-    body = sequence.body.to(dtype=settings.torch_dtype)
+    body, view = sequence.body.to(dtype=settings.torch_dtype), CameraView(sequence.camera)
     states = sequence.states.to(body.tie)
-    costs = FrameCosts(
-        body,
-        extractor.working_camera(sequence.camera),
-        choice,
-        frame_interval=1 / sequence.frame_rate,
-        boundary_emphasis=boundary_emphasis(settings),
-    )
+    moments = [Frame(i, i / sequence.frame_rate, image) for i, image in enumerate(sequence.frames)]
     for index in frames:
-        features = extractor(sequence.frames[index], sequence.frames[index - 1])
-        previous, before = states[index - 1], extractor(sequence.frames[index - 1])
-        appearance = costs.learn(None, before, body, previous)
-        cost = costs(features, body=body, before=previous, appearance=appearance)
-        cost = replace(cost, parent=previous)
-        image, truth = sequence.frames[index], states[index]
-        yield _scene(f"{name}, frame {index}", image, features, cost, truth)
+        pair, known = moments[index - 1 : index + 1], states[index - 1 : index + 1].unbind()
+        yield _scene(f"{name}, frame {index}", pair, known, body, view, settings)
 
 
 def clip_scenes(
@@ -180,50 +164,44 @@ def _clip_scene(
     )
     body = first.body
     truth = _nearest(body, first.mixture.mean, folder / "reference3d.npz", frame)
-    extractor = make_extractor(settings)
-    working = extractor.working_camera(full)
-    scaled = keypoints.scaled(full.image_size_wh, working.image_size_wh).to(body.tie)
-    features = extractor(now.image, before.image)
-    sigma = default_sigma(scaled.at(frame))
+    sigma = default_sigma(keypoints.at(frame))
     alone = TrackingCost(
         body=body,
-        camera=working,
+        camera=full,
         choice=make_choice(Settings(terms=("joints", "stabiliser")), sigma),
-        keypoints=scaled.at(frame - 1),
+        keypoints=keypoints.at(frame - 1).to(body.tie),
     )
     previous = TrustRegionNewton().minimise(alone, truth[None], body.bounds).mean[0]
-    costs = FrameCosts(
-        body,
-        working,
-        make_choice(settings, sigma),
-        frame_interval=now.time_s - before.time_s,
-        boundary_emphasis=boundary_emphasis(settings),
-    )
-    cost = costs(
-        features,
-        body=body,
-        before=previous,
-        keypoints=scaled.at(frame),
-        appearance=costs.learn(None, extractor(before.image), body, previous),
-    )
-    cost = replace(cost, parent=previous)
-    return _scene(f"{view}, frame {frame}", now.image, features, cost, truth)
+    eye, states = CameraView(full, keypoints, sigma), (previous, truth)
+    return _scene(f"{view}, frame {frame}", (before, now), states, body, eye, settings)
 
 
 def _scene(
-    name: str, image: np.ndarray, features: FrameFeatures, cost: TrackingCost, truth: Tensor
+    name: str,
+    moments: Sequence[Frame],
+    states: Sequence[Float[Tensor, " n"]],
+    body: BodyModel,
+    view: CameraView,
+    settings: Settings,
 ) -> Scene:
-    mode = TrustRegionNewton().minimise(cost, truth[None], cost.body.bounds)
-    return Scene(name, image, features, cost, truth, Modes(*(part[0] for part in mode)))
+    """The second of two moments, as after a track that was at the first state in the first."""
+    (before, now), (previous, truth) = moments, states
+    observer = make_plan(settings, body, view, now.time_s - before.time_s).observer(body, view)
+    seen_before = observer.observe(before, NOTHING_SEEN)
+    seen = observer.observe(now, seen_before)
+    memory = observer.learn(NOTHING_KNOWN, seen_before, body, previous[None])
+    cost = replace(observer.cost(seen, memory, body, previous), parent=previous)
+    mode = TrustRegionNewton().minimise(cost, truth[None], body.bounds)
+    assert seen.features is not None
+    return Scene(name, now.image, seen.features, cost, truth, Modes(*(part[0] for part in mode)))
 
 
 def _nearest(body: BodyModel, fits: Float[Tensor, "k n"], reference: Path, frame: int) -> Tensor:
     """The state whose limbs are nearest the reference once the roots are on each other."""
-    arrays = load_arrays(reference, TrackFileError)
-    names = [canonical_joint_name(str(name)) for name in arrays["joint_names"]]
+    positions, names = read_reference(reference)
     common = [name for name in LIMB_JOINTS if name in names and name in body.joint_names]
     fitted = body.pose(fits).joints[:, [body.joint_index(name) for name in common]]
-    true = arrays["joints"][frame, [names.index(name) for name in common]]
+    true = positions[frame, [names.index(name) for name in common]]
     return fits[int(np.argmin(root_aligned_mpjpe_mm(fitted.cpu(), true, common)))]
 
 
