@@ -20,9 +20,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import Table, Tracking, start, write_report
+from common import Table, start, write_report
 
 from torchcss.app.track import track_video
+from torchcss.cli.options import SettingsOptions
 from torchcss.errors import ConfigurationError
 from torchcss.studies.demo import run_demo
 from torchcss.studies.evaluation import evaluate
@@ -73,7 +74,7 @@ class Config:
     """Frames of the demo."""
     clip_frames: int = 100
     """Frames of the clips."""
-    tracking: Tracking = TRACKING
+    tracking: SettingsOptions = TRACKING
     """How to track. The seed is the first of the seeds; terms are those of the rows, the body is
     the demo's where that is tracked, and where keypoints are used the sequence says."""
     small: bool = False

@@ -22,10 +22,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from common import Table, Tracking, start, write_report
+from common import Table, start, write_report
 from peers.published import PUBLISHED
 from tqdm import tqdm
 
+from torchcss.cli.options import SettingsOptions
 from torchcss.errors import ConfigurationError
 from torchcss.io.tracks import read_summary
 from torchcss.show.style import save_figure
@@ -71,7 +72,7 @@ class Config:
     """Trackers."""
     seeds: int = 3
     """Runs per tracker."""
-    tracking: Tracking = TRACKING
+    tracking: SettingsOptions = TRACKING
     """How to track. The seed is the first of the seeds; the body counts where the sequence does not
     say which one moved; the trackers are those of --presets."""
     start: int = 0

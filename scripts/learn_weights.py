@@ -25,12 +25,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from common import Tracking, start, write_report
+from common import start, write_report
 from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
 
 from torchcss.body.model import BodyModel
+from torchcss.cli.options import SettingsOptions
 from torchcss.cost.frame import FrameCosts
 from torchcss.errors import ConfigurationError
 from torchcss.inference.implicit import TermWeights, weighted_minimum
@@ -89,7 +90,7 @@ class Config:
     stabiliser does, cannot be learnt from modes that stay near the truth."""
     begin: dict[str, float] | None = None
     """Weights to begin with by term; by default those of the tracker, which count as one."""
-    tracking: Tracking = TRACKING
+    tracking: SettingsOptions = TRACKING
     """How the test sequence is tracked; its terms are also those of the cost that is learnt from.
     The body is that of the sequences, the weights are those that are learnt; the seed is also that
     of the noise and of the order of the frames."""

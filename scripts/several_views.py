@@ -26,7 +26,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from common import Table, Tracking, start, write_report
+from common import Table, start, write_report
 from jaxtyping import Float
 from torch import Tensor
 
@@ -35,6 +35,7 @@ from torchcss.body.catalog import BodySpecification, MarkerSpecification, root_j
 from torchcss.body.model import BodyModel
 from torchcss.body.root import move_base, root_pose
 from torchcss.body.uncertainty import joint_covariance
+from torchcss.cli.options import SettingsOptions
 from torchcss.cost.frame import beside
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.total import CostChoice, TrackingCost
@@ -80,7 +81,7 @@ class Config:
     """Frames from the start; all by default."""
     beam_cameras: tuple[str, ...] = ("cam01", "cam03", "cam01+cam03")
     """Cameras of the person, each entry tracked by itself."""
-    tracking: Tracking = TRACKING
+    tracking: SettingsOptions = TRACKING
     """How to track. The board has its own body and terms, 40 samples and 3 modes where no numbers
     are given, and features 1280 pixels wide."""
     tracks: Path = Path("out/several_views")

@@ -25,10 +25,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from common import Tracking, start, write_report
+from common import start, write_report
 from torch import Tensor
 
 from torchcss.body.model import BodyModel
+from torchcss.cli.options import SettingsOptions
 from torchcss.errors import ConfigurationError
 from torchcss.io.tracks import load_track, prepare_output_folder, write_summary
 from torchcss.solve.inverse_kinematics import link_pose, pose_errors
@@ -71,7 +72,7 @@ class Config:
     """Frames, 25 a second."""
     seeds: tuple[int, ...] = (0,)
     """Seeds of motion, room, noise and samples."""
-    tracking: Tracking = TRACKING
+    tracking: SettingsOptions = TRACKING
     """How to track; body and seeds are those above."""
     out: Path = Path("out/robot")
     """Folder of the results."""

@@ -14,21 +14,16 @@ import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import tyro
 
 from torchcss.errors import ConfigurationError, TorchcssError
 from torchcss.io.tracks import prepare_output_folder, write_summary
-from torchcss.tracking.settings import Settings
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
 Config = TypeVar("Config")
-
-Tracking = Annotated[Settings, tyro.conf.arg(name="")]
-"""All of `Settings` as options of a script, under the names that they have there: `--samples` and
-so on. Whatever tracks takes them whole; what a script varies by itself it says in its help."""
 
 
 def start(main: Callable[[Config], Any], config: type[Config], page: str | None) -> None:
