@@ -79,7 +79,7 @@ def tracked(
         info=info,
         covariance=covariance,
         joints_world=body.pose(mean).joints,
-        seconds={"features": 0.25, "search": 0.5},
+        seconds={"features": 0.375, "search": 0.5},
     )
 
 
