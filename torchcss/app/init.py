@@ -36,7 +36,8 @@ from torchcss.io.keypoints.one_image import read_joints
 from torchcss.io.keypoints.read import Scale
 from torchcss.io.tracks import write_summary
 from torchcss.io.video import read_frame
-from torchcss.show.initialisation_views import draw_fit, draw_hypotheses, proportion_table
+from torchcss.show.initialisation_views import draw_hypotheses, proportion_table
+from torchcss.show.overlay import draw_poses
 from torchcss.tracking.settings import Settings, check_seed
 from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
@@ -222,14 +223,14 @@ def initialise_video(
 
 def _draw(out: Path, found: Initialisation, picture: Any, camera: Camera, known: Tensor) -> None:
     pictures = {
-        f"stage{number}.png": draw_fit(
+        f"stage{number}.png": draw_poses(
             picture, stage.body, stage.state[None], camera, keypoints=known,
             text=f"stage {number}: {stage.name}",
         )
         for number, stage in enumerate(found.stages, start=1)
     }  # fmt: skip
     mixture, shown = found.mixture, found.mixture.mean[:NUM_DRAWN]
-    pictures["hypotheses.png"] = draw_fit(
+    pictures["hypotheses.png"] = draw_poses(
         picture, found.body, shown, camera, weights=mixture.weight[:NUM_DRAWN],
         text=f"{len(shown)} of {len(mixture.mean)} hypotheses",
     )  # fmt: skip

@@ -100,20 +100,6 @@ def write_fitted_body(path: str | os.PathLike[str], found: Initialisation, camer
         np.savez(partial, **arrays)
 
 
-def body_beside(track: str | os.PathLike[str]) -> BodyModel | None:
-    """The body that was tracked, where `body.npz` lies beside its track; None where it does not.
-
-    Args:
-        track: A track's file, or the folder that it is in.
-
-    Raises:
-        BodyError: If the file cannot be read.
-    """
-    folder = Path(track)
-    fitted = (folder if folder.is_dir() else folder.parent) / FITTED_BODY_NAME
-    return read_fitted_body(fitted).body if fitted.is_file() else None
-
-
 def read_fitted_body(
     path: str | os.PathLike[str],
     *,

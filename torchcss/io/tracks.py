@@ -77,7 +77,15 @@ SCHEMA_VERSION = 2
 TRACK_NAME = "track.npz"
 SUMMARY_NAME = "summary.json"
 
-_PER_MODE = ("state", "covariance", "log_weight", "cost", "parent", "joints_world")
+_PER_MODE: dict[str, tuple[str | int, ...]] = {
+    "state": ("n",), "covariance": ("n", "n"), "log_weight": (), "cost": (), "parent": (),
+    "joints_world": ("j", 3),
+}  # fmt: skip
+"""What a frame has of each mode, and of which shape."""
+
+_ABSENT = {"log_weight": -np.inf, "cost": np.inf, "parent": -1}
+"""What stands where there is no mode, if not zero."""
+
 _POWER_KEY = "evidence"
 """Name of `Track.likelihood_power` in the file, as version 1 has it."""
 
@@ -167,16 +175,10 @@ class Track(NamedTuple):
             cameras: What watches it.
             settings: What the tracker is told.
         """
-        n, j = len(state_names), len(joint_names)
-        shapes = {"state": (n,), "covariance": (n, n), "joints_world": (j, 3)}
-        modes = {name: np.zeros((0, 0, *shapes.get(name, ()))) for name in _PER_MODE}
         return cls(
-            frames=np.zeros(0, dtype=np.int64),
-            times=np.zeros(0),
+            **_stacked([], len(state_names), len(joint_names)),
             state_names=tuple(state_names),
             joint_names=tuple(joint_names),
-            base_transform=np.zeros((0, 4, 4)),
-            **{**modes, "parent": np.zeros((0, 0), dtype=np.int64)},
             likelihood_power=float(likelihood_power),
             body=None if body is None else on_origin(body),
             cameras=tuple(cameras),
@@ -190,14 +192,39 @@ class Track(NamedTuple):
 
     def first(self, num_frames: int) -> Track:
         """The same track up to a frame, as when no more had been tracked."""
-        most = int(self.num_modes[:num_frames].max(initial=0))
-        return self._replace(
-            **{name: getattr(self, name)[:num_frames, :most] for name in _PER_MODE},
-            **{name: getattr(self, name)[:num_frames] for name in _PER_FRAME},
-        )
+        n, j = len(self.state_names), len(self.joint_names)
+        return self._replace(**_stacked(self.rows()[:num_frames], n, j))
+
+    def rows(self) -> list[FrameModes]:
+        """The frames as they were appended."""
+        return [
+            FrameModes(
+                frame=int(self.frames[row]),
+                time_s=float(self.times[row]),
+                base_transform=self.base_transform[row],
+                **{name: getattr(self, name)[row, :k] for name in _PER_MODE},
+            )
+            for row, k in enumerate(self.num_modes)
+        ]
 
 
-_PER_FRAME = ("frames", "times", "base_transform")
+def _stacked(rows: Sequence[FrameModes], n: int, j: int) -> dict[str, Any]:
+    """The arrays of a track from its frames, filled up to the largest number of modes."""
+    t, k = len(rows), max((len(np.asarray(row.cost)) for row in rows), default=0)
+    sizes: dict[str | int, int] = {"n": n, "j": j, 3: 3}
+    arrays: dict[str, Any] = {
+        "frames": np.array([row.frame for row in rows], dtype=np.int64),
+        "times": np.array([row.time_s for row in rows], dtype=np.float64),
+        "base_transform": np.array([row.base_transform for row in rows]).reshape(-1, 4, 4),
+    }
+    for name, shape in _PER_MODE.items():
+        kind = np.int64 if name == "parent" else np.float64
+        full = (t, k, *(sizes[size] for size in shape))
+        arrays[name] = np.full(full, _ABSENT.get(name, 0), dtype=kind)
+        for index, row in enumerate(rows):
+            values = np.asarray(getattr(row, name))
+            arrays[name][index, : len(values)] = values
+    return arrays
 
 
 class TrackWriter:
@@ -211,12 +238,11 @@ class TrackWriter:
     def __init__(self, path: str | os.PathLike[str], begun: Track) -> None:
         self.path = Path(path)
         self._begun = begun
-        self._modes: list[FrameModes] = []
-        self._last_frame = int(begun.frames[-1]) if len(begun.frames) else -1
-        self._rank_of_parent = np.arange(begun.num_modes[-1] if len(begun.frames) else 0)
+        self._rows = begun.rows()
+        self._rank_of_parent = np.arange(begun.num_modes[-1] if self._rows else 0)
 
     def __len__(self) -> int:
-        return len(self._begun.frames) + len(self._modes)
+        return len(self._rows)
 
     def append(self, modes: FrameModes) -> None:
         """Add one frame; its modes may be in any order and of any number, but at least one.
@@ -230,21 +256,16 @@ class TrackWriter:
         Raises:
             ShapeError: If a shape does not fit, or a number that must be finite is not.
         """
-        num_parameters, num_joints = len(self._begun.state_names), len(self._begun.joint_names)
-        frame = int(modes.frame)
-        weights = _array("log_weight", modes.log_weight, (None,), finite=False)
+        frame, weights = int(modes.frame), _array("log_weight", modes.log_weight, (None,))
         (k,) = weights.shape
-        cost = _array("cost", modes.cost, (k,), finite=False)
-        parents = _array("parent", modes.parent, (k,)).astype(np.int64)
+        sizes: dict[str | int, int] = {
+            "n": len(self._begun.state_names), "j": len(self._begun.joint_names), 3: 3,
+        }  # fmt: skip
         per_mode = {
-            "state": _array("state", modes.state, (k, num_parameters)),
-            "covariance": _array(
-                "covariance", modes.covariance, (k, num_parameters, num_parameters)
-            ),
-            "log_weight": weights,
-            "cost": cost,
-            "joints_world": _array("joints_world", modes.joints_world, (k, num_joints, 3)),
+            name: _array(name, getattr(modes, name), (k, *(sizes[size] for size in shape)))
+            for name, shape in _PER_MODE.items()
         }
+        cost, parents = per_mode["cost"], per_mode["parent"].astype(np.int64)
         base = _array("base_transform", modes.base_transform, (4, 4))
         if np.isnan(weights).any() or (weights == np.inf).any() or not (weights > -np.inf).any():
             raise ShapeError(
@@ -256,7 +277,7 @@ class TrackWriter:
                 f"frame {frame}: cost: expected finite numbers, or inf for all modes of a frame "
                 f"that said nothing, got {cost.tolist()}"
             )
-        if not math.isfinite(modes.time_s) or (len(self) and frame <= self._last_frame):
+        if not math.isfinite(modes.time_s) or (self._rows and frame <= self._rows[-1].frame):
             raise ShapeError(
                 f"frame {frame} at {modes.time_s} s: expected frames in rising order, at finite "
                 "times"
@@ -272,37 +293,14 @@ class TrackWriter:
         order = order[weights[order] > -np.inf]
         self._rank_of_parent = np.full(k, -1)
         self._rank_of_parent[order] = np.arange(len(order))
-        self._last_frame = frame
         ordered = {name: values[order] for name, values in per_mode.items()}
-        self._modes.append(FrameModes(frame, float(modes.time_s), base_transform=base, **ordered))
+        self._rows.append(FrameModes(frame, float(modes.time_s), base_transform=base, **ordered))
 
     def track(self) -> Track:
         """Return all frames so far."""
-        begun, new = self._begun, self._modes
-        old = len(begun.frames)
-        k = max([begun.state.shape[1], *(len(np.asarray(modes.cost)) for modes in new)])
-        n, j = len(begun.state_names), len(begun.joint_names)
-        t = old + len(new)
-        track = begun._replace(
-            frames=np.append(begun.frames, [modes.frame for modes in new]).astype(np.int64),
-            times=np.append(begun.times, [modes.time_s for modes in new]),
-            state=np.zeros((t, k, n)),
-            covariance=np.zeros((t, k, n, n)),
-            log_weight=np.full((t, k), -np.inf),
-            cost=np.full((t, k), np.inf),
-            parent=np.full((t, k), -1, dtype=np.int64),
-            joints_world=np.zeros((t, k, j, 3)),
-            base_transform=np.concatenate(
-                [begun.base_transform, *(np.asarray(modes.base_transform)[None] for modes in new)]
-            ),
-        )
-        for name in _PER_MODE:
-            values = getattr(track, name)
-            values[:old, : begun.state.shape[1]] = getattr(begun, name)
-            for index, modes in enumerate(new, start=old):
-                own = getattr(modes, name)
-                values[index, : len(own)] = own
-        return track
+        begun = self._begun
+        arrays = _stacked(self._rows, len(begun.state_names), len(begun.joint_names))
+        return begun._replace(**arrays)
 
     def save(self) -> None:
         """Write all frames so far; the file is replaced in one step, or stays as it was.
@@ -374,11 +372,11 @@ def _checked_arrays(arrays: Mapping[str, np.ndarray], path: Path) -> dict[str, A
         raise TrackFileError(f"{path}: not a complete track: {', '.join(missing)} missing")
     t, k = arrays["log_weight"].shape if arrays["log_weight"].ndim == 2 else (-1, -1)
     n, j = arrays["state_names"].size, arrays["joint_names"].size
-    shapes = {
-        "frames": (t,), "times": (t,), "state_names": (n,), "state": (t, k, n),
-        "covariance": (t, k, n, n), "log_weight": (t, k), "cost": (t, k), "parent": (t, k),
-        "joint_names": (j,), "joints_world": (t, k, j, 3), "base_transform": (t, 4, 4),
-        _POWER_KEY: (),
+    sizes: dict[str | int, int] = {"n": n, "j": j, 3: 3}
+    shapes: dict[str, tuple[int, ...]] = {
+        "frames": (t,), "times": (t,), "state_names": (n,), "joint_names": (j,),
+        "base_transform": (t, 4, 4), _POWER_KEY: (),
+        **{name: (t, k, *map(sizes.__getitem__, shape)) for name, shape in _PER_MODE.items()},
     }  # fmt: skip
     # A track of somebody else's may be in the world frame, and of the cost as it is.
     absent = {
@@ -473,10 +471,8 @@ def _is_folder(path: Path) -> bool:
         return False
 
 
-def _array(
-    name: str, value: Tensor | ArrayLike, shape: tuple[int | None, ...], *, finite: bool = True
-) -> np.ndarray:
-    """Return a float64 copy of checked shape."""
+def _array(name: str, value: Tensor | ArrayLike, shape: tuple[int | None, ...]) -> np.ndarray:
+    """Return a float64 copy of checked shape; only weights and costs may be infinite."""
     source: Any = value
     if isinstance(source, Tensor):
         source = source.detach().cpu().numpy()
@@ -486,7 +482,7 @@ def _array(
     ):
         wanted = ", ".join("any" if size is None else str(size) for size in shape)
         raise ShapeError(f"{name}: expected a shape [{wanted}], got {list(array.shape)}")
-    if finite and not np.isfinite(array).all():
+    if name not in ("log_weight", "cost") and not np.isfinite(array).all():
         raise ShapeError(f"{name}: expected finite numbers, got some that are not")
     return array
 

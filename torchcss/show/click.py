@@ -27,6 +27,7 @@ from matplotlib.widgets import Button
 from torchcss.body.load import load_body
 from torchcss.errors import ConfigurationError, KeypointError
 from torchcss.files import replace_file
+from torchcss.show.track_plots import bones_of, draw_bones
 from torchcss.types import Keypoints
 
 CLICKED = (
@@ -35,13 +36,6 @@ CLICKED = (
     *(f"{side}_{place}" for side in "rl" for place in ("hip", "knee", "ankle", "toe")),
 )  # fmt: skip
 """The joints that are asked for, in this order."""
-
-_BONES = (
-    ("skull_tip", "vc7"), ("r_shoulder", "l_shoulder"), ("r_hip", "l_hip"), ("vc7", "HumanoidRoot"),
-    *((f"{side}_{a}", f"{side}_{b}") for side in "rl" for a, b in (
-        ("shoulder", "elbow"), ("elbow", "wrist"), ("wrist", "hand_tip"),
-        ("hip", "knee"), ("knee", "ankle"), ("ankle", "toe"))),
-)  # fmt: skip
 
 
 class JointClicker:
@@ -92,9 +86,7 @@ class JointClicker:
             axes.set_axis_off()
         right.set_aspect("equal")
         right.margins(0.2)
-        for a, b in _BONES:
-            (ax, ay), (bx, by) = self._map[a], self._map[b]
-            right.plot([ax, bx], [ay, by], color="0.6", lw=3, zorder=1)
+        draw_bones(right, joints[:, :2] * [1, -1], bones_of(body), color="0.6", lw=3, zorder=1)
         self._image_axes, self._map_axes = left, right
         self._marks: list[Any] = []
         self._buttons = []

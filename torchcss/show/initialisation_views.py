@@ -1,6 +1,5 @@
-"""Pictures and tables of an initialisation: overlays of the stages, hypotheses from the side.
+"""Hypotheses of an initialisation from the side, and a table of the fitted lengths.
 
-* `draw_fit`: the posed body, or several poses of it, over the picture.
 * `draw_hypotheses`: the best hypotheses as stick figures, as the camera sees them and turned by 45
   and 90 degrees about the vertical: what looks one and the same in front differs in depth.
 * `proportion_table`: fitted lengths beside those of the standard humanoid.
@@ -12,53 +11,21 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-import torch
-from jaxtyping import Float, UInt8
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from jaxtyping import Float
 from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchcss.body.catalog import LENGTHS
 from torchcss.body.model import BodyModel
-from torchcss.files import replace_file
-from torchcss.show.overlay import PALETTE, draw_overlay, project_body
+from torchcss.show.style import save_figure
+from torchcss.show.track_plots import bones_of, draw_bones, in_perspective, mode_colour
 from torchcss.vision.camera import Camera
 
-_BONES = (
-    ("skull_tip", "vc7"), ("vc7", "vt1"), ("vt1", "HumanoidRoot"),
-    *((f"{side}_{a}", f"{side}_{b}") for side in "lr" for a, b in (
-        ("shoulder", "elbow"), ("elbow", "wrist"), ("wrist", "hand_tip"), ("hip", "knee"),
-        ("knee", "ankle"), ("ankle", "toe"))),
-    ("l_shoulder", "vt1"), ("r_shoulder", "vt1"), ("l_hip", "HumanoidRoot"),
-    ("r_hip", "HumanoidRoot"),
-)  # fmt: skip
-"""Lines of the stick figure; those whose ends a body lacks are left out."""
-
-
-def draw_fit(
-    image: UInt8[np.ndarray, "h w 3"],
-    body: BodyModel,
-    x: Float[Tensor, "k n"],
-    camera: Camera,
-    *,
-    weights: Float[Tensor, " k"] | None = None,
-    keypoints: Float[Tensor, "j 2"] | None = None,
-    text: str | None = None,
-) -> UInt8[np.ndarray, "h w 3"]:
-    """Draw poses of a body over the picture, the first as a shaded body.
-
-    Args:
-        image: The picture.
-        body: The body.
-        x: Its states, the best first.
-        camera: The picture's camera.
-        weights: Weight of every state.
-        keypoints: The marked joints.
-        text: A line for the lower left corner.
-    """
-    modes = project_body(body, x, camera, rings=20, meridians=24)
-    picture = torch.from_numpy(np.ascontiguousarray(image))
-    return draw_overlay(picture, modes, weights=weights, keypoints=keypoints, text=text).numpy()
+_VIEWS = {
+    "as the camera sees them": 0.0,
+    "turned by 45 degrees": 45.0,
+    "from the side (camera to the left)": 90.0,
+}
 
 
 def draw_hypotheses(
@@ -80,38 +47,26 @@ def draw_hypotheses(
     """
     joints = camera.to_camera_frame(body.pose(x).joints).detach().cpu().numpy()
     middle = joints[:1].mean(axis=1, keepdims=True)
-    seen = middle[..., 2:] * (joints / joints[..., 2:] - middle / middle[..., 2:])
-    joints = joints - middle
-    bones = [
-        (body.joint_names.index(a), body.joint_names.index(b))
-        for a, b in _BONES
-        if {a, b} <= set(body.joint_names)
-    ]
+    distance = float(middle[0, 0, 2])
+    # In perspective, as in the picture, the hypotheses coincide.
+    seen = in_perspective(joints, distance) - in_perspective(middle, distance)
+    joints, bones = joints - middle, bones_of(body)
     figure = Figure(figsize=(12, 5), layout="constrained")
-    canvas = FigureCanvasAgg(figure)
-    views = (("as the camera sees them", 0.0), ("turned by 45 degrees", 45.0),
-             ("from the side (camera to the left)", 90.0))  # fmt: skip
-    extent = 1.05 * float(max(np.abs(joints).max(), np.abs(seen[..., :2]).max()))
-    for axes, (title, degrees) in zip(figure.subplots(1, 3), views, strict=True):
+    extent = 1.05 * float(max(np.abs(joints).max(), np.abs(seen).max()))
+    for axes, (title, degrees) in zip(figure.subplots(1, 3), _VIEWS.items(), strict=True):
         turn = np.radians(degrees)
         across = np.cos(turn) * joints[..., 0] + np.sin(turn) * joints[..., 2]
-        down = joints[..., 1]
-        if degrees == 0.0:
-            # Perspective, as in the picture: there the hypotheses coincide.
-            across, down = seen[..., 0], seen[..., 1]
+        places = seen if degrees == 0.0 else np.stack([across, joints[..., 1]], axis=-1)
         for mode in reversed(range(len(joints))):
-            red, green, blue = PALETTE[mode % len(PALETTE)]
-            line = {"color": (red / 255, green / 255, blue / 255), "lw": 3 if mode == 0 else 1.5}
-            for number, (a, b) in enumerate(bones):
-                label = None if number or cost is None else f"{mode + 1}: {float(cost[mode]):.1f}"
-                axes.plot(across[mode, [a, b]], -down[mode, [a, b]], label=label, **line)
+            label = "" if cost is None else f"{mode + 1}: {float(cost[mode]):.1f}"
+            look = {"color": mode_colour(mode), "lw": 3 if mode == 0 else 1.5}
+            draw_bones(axes, places[mode], bones, label=label, **look)
         axes.set(title=title, aspect="equal", xlim=(-extent, extent), ylim=(-extent, extent))
         axes.set_xlabel("m")
     if cost is not None:
         handles, labels = figure.axes[0].get_legend_handles_labels()
         figure.legend(handles[::-1], labels[::-1], title="cost, nats", loc="outside right upper")
-    with replace_file(path) as partial, partial.open("wb") as file:
-        canvas.print_png(file)
+    save_figure(figure, path, dpi=100)
 
 
 def proportion_table(lengths: Mapping[str, float], scale: float = 1.0) -> list[dict[str, object]]:

@@ -12,8 +12,8 @@ outline, and with it an antialiased line of constant width. Only the bodies' bou
 worked on, and bodies that fill a large frame are rasterised more coarsely, so that a frame costs a
 fraction of a second whatever its size.
 
-By default project every part with the camera, and call `draw_overlay(frame, modes, weights=...)`
-with the best mode first. Pixels as everywhere: centres at integers, u counts columns.
+Call `draw_poses` with the best mode first, or `draw_overlay` with what `project_body` gives. Pixels
+as everywhere: centres at integers, u counts columns.
 """
 
 from __future__ import annotations
@@ -138,7 +138,12 @@ class _Window(NamedTuple):
 
 
 def project_body(
-    body: BodyModel, x: Float[Tensor, "k n"], camera: Camera, *, rings: int, meridians: int
+    body: BodyModel,
+    x: Float[Tensor, "k n"],
+    camera: Camera,
+    *,
+    rings: int = 16,
+    meridians: int = 20,
 ) -> list[list[ProjectedPart]]:
     """Project the surface of a body in several poses, as `draw_overlay` takes it.
 
@@ -159,6 +164,32 @@ def project_body(
             parts.append(ProjectedPart(uv, depth, valid, faces, part))
         poses.append(parts)
     return poses
+
+
+def draw_poses(
+    image: UInt8[np.ndarray, "h w 3"],
+    body: BodyModel,
+    x: Float[Tensor, "k n"],
+    camera: Camera,
+    *,
+    weights: Float[Tensor, " k"] | None = None,
+    keypoints: Float[Tensor, "j 2"] | None = None,
+    text: str | None = None,
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Draw poses of a body over the picture, the first as a shaded body.
+
+    Args:
+        image: The picture.
+        body: The body on its base.
+        x: Its states, the best first.
+        camera: The picture's camera.
+        weights: Weight of every state.
+        keypoints: The marked joints.
+        text: A line for the lower left corner.
+    """
+    modes = project_body(body, x, camera)
+    picture = torch.from_numpy(np.ascontiguousarray(image))
+    return draw_overlay(picture, modes, weights=weights, keypoints=keypoints, text=text).numpy()
 
 
 def draw_overlay(

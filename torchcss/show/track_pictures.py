@@ -18,11 +18,9 @@ from torchcss.io.cameras import check_image_size
 from torchcss.io.run import Run
 from torchcss.io.tracks import TRACK_NAME
 from torchcss.io.video import VideoReader
-from torchcss.show.overlay import draw_overlay, project_body
+from torchcss.show.overlay import draw_poses
 
 OVERLAY_NAME = "overlay.mp4"
-
-_RINGS, _MERIDIANS = 16, 20
 
 
 def known_video(run: Run) -> Path | None:
@@ -76,8 +74,7 @@ def pictures_of(
         row = place.get(frame.index)
         if row is not None:
             found += 1
-            image = np.ascontiguousarray(frame.image)
-            yield row, image if video is None else _draw_row(run, row, image)
+            yield row, frame.image if video is None else _draw_row(run, row, frame.image)
     if found < len(place):
         raise VideoError(
             f"{reader.path}: {len(place) - found} frames of the track are missing; give the video "
@@ -104,12 +101,12 @@ def _draw_row(run: Run, row: int, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np
     base = torch.from_numpy(track.base_transform[row])
     body = run.body.with_base(base[:3, :3], base[:3, 3])
     state = torch.from_numpy(track.state[row, :count])
-    modes = project_body(body, state, run.camera.double(), rings=_RINGS, meridians=_MERIDIANS)
     cost = f"   cost {track.cost[row, 0]:.1f}" if np.isfinite(track.cost[row, 0]) else ""
-    picture = draw_overlay(
-        torch.from_numpy(image),
-        modes,
+    return draw_poses(
+        image,
+        body,
+        state,
+        run.camera.double(),
         weights=torch.from_numpy(np.exp(track.log_weight[row, :count])),
         text=f"frame {track.frames[row]}   {count} mode{'s' if count > 1 else ''}{cost}",
     )
-    return picture.numpy()

@@ -132,7 +132,7 @@ def side_view_figure(
     moving = _first_of_links(body)
 
     figure = Figure(figsize=(9.5, 5.0), layout="constrained")
-    seen = _seen(joints, distance)
+    seen = in_perspective(joints, distance)
     front, side = figure.subplots(1, 2, sharey=True)
     for mode in reversed(range(count)):  # the best on top
         look = {
@@ -142,8 +142,8 @@ def side_view_figure(
             "zorder": 3 + (mode == 0),
         }
         label = f"{100 * weight[mode]:.0f} %, cost {track.cost[row, mode]:.1f}"
-        _draw_bones(front, seen[mode], bones, label=label, **look)
-        _draw_bones(side, joints[mode][:, [2, 1]], bones, **look)
+        draw_bones(front, seen[mode], bones, label=label, **look)
+        draw_bones(side, joints[mode][:, [2, 1]], bones, **look)
         for joint in moving if weight[mode] >= _LEAST_WEIGHT else ():
             ellipse = _one_deviation(joints[mode, joint, [2, 1]], spread[mode, joint])
             ellipse.set(
@@ -390,7 +390,7 @@ def _darker(mode: int) -> tuple[float, ...]:
     return tuple(0.5 * part for part in mode_colour(mode))
 
 
-def _seen(joints: np.ndarray, distance: float) -> np.ndarray:
+def in_perspective(joints: np.ndarray, distance: float) -> np.ndarray:
     """Perspective image of points of the camera's frame, in metres at a distance."""
     return distance * joints[..., :2] / joints[..., 2:]
 
@@ -420,7 +420,7 @@ def _one_deviation(centre: np.ndarray, covariance: np.ndarray) -> Ellipse:
     return Ellipse((centre[0], -centre[1]), large, small, angle=turn)
 
 
-def _draw_bones(
+def draw_bones(
     axes: Axes,
     places: np.ndarray,
     bones: Sequence[tuple[int, int]],
@@ -458,8 +458,8 @@ def _draw_reference(
     places = np.array([known[name] for pair in pairs for name in pair])
     rows = [(2 * pair, 2 * pair + 1) for pair in range(len(pairs))]
     look = {"color": "black", "lw": 1.3, "ls": "--", "zorder": 5}
-    _draw_bones(front, _seen(places, distance), rows, label="reference", **look)
-    _draw_bones(side, places[:, [2, 1]], rows, **look)
+    draw_bones(front, in_perspective(places, distance), rows, label="reference", **look)
+    draw_bones(side, places[:, [2, 1]], rows, **look)
 
 
 def tidy(axes: Axes) -> None:
