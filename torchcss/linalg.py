@@ -103,8 +103,8 @@ def inverse_on_free(
     In units of the prior's standard deviations, an eigen-direction of curvature `e > 1` gets the
     variance `1 / e`. A direction of smaller, zero or negative curvature, about which the cost says
     less than the prior does, gets the prior's variance, 1; so does every variable that is not free
-    (design decision 9). The result is positive definite whatever the Hessian. It is computed in
-    float64, by Cholesky where every curvature exceeds 1 and by eigenvectors for the other items.
+    (decision "active bounds"). The result is positive definite whatever the Hessian. It is computed
+    in float64, by Cholesky where every curvature exceeds 1 and by eigenvectors for the other items.
 
     Args:
         hessian: Second derivative of the cost in nats; need not be definite.

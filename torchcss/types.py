@@ -111,7 +111,7 @@ class Modes(NamedTuple):
 
     Attributes:
         mean: The states reached.
-        covariance: Inverse Hessian on the free variables (design decision 9).
+        covariance: Inverse Hessian on the free variables (decision "active bounds").
         cost: Cost at `mean`, nats.
         active: True where a variable ended at a bound that holds it.
         status: A `Status` per item.

@@ -68,67 +68,59 @@ reach, unlike the sideways, forward or hanging arm of the usual orders."""
 
 _DEGREE = math.pi / 180
 
-STABILISERS: dict[str, tuple[float, float]] = {
-    "lumbar_flexion": (0, 15),
-    "lumbar_bending": (0, 12),
-    "lumbar_twist": (0, 15),
-    "neck_flexion": (0, 20),
-    "neck_bending": (0, 15),
-    "neck_twist": (0, 25),
-    "clavicle_elevation": (0, 10),
-    "clavicle_protraction": (0, 10),
-    "shoulder_swing": (-10, 70),
-    "shoulder_raising": (10, 50),
-    "shoulder_twist": (0, 45),
-    "elbow_flexion": (30, 45),
-    "forearm_twist": (0, 40),
-    "wrist_flexion": (0, 20),
-    "wrist_deviation": (0, 15),
-    "hip_flexion": (15, 40),
-    "hip_abduction": (5, 18),
-    "hip_twist": (0, 20),
-    "knee_flexion": (20, 40),
-    "ankle_flexion": (0, 15),
+HABITS: dict[str, tuple[float, float, float]] = {
+    "lumbar_flexion": (0, 15, 1.0),
+    "lumbar_bending": (0, 12, 1.0),
+    "lumbar_twist": (0, 15, 1.0),
+    "neck_flexion": (0, 20, 1.0),
+    "neck_bending": (0, 15, 1.0),
+    "neck_twist": (0, 25, 1.5),
+    "clavicle_elevation": (0, 10, 0.7),
+    "clavicle_protraction": (0, 10, 0.7),
+    "shoulder_swing": (-10, 70, 3.0),
+    "shoulder_raising": (10, 50, 2.5),
+    "shoulder_twist": (0, 45, 2.5),
+    "elbow_flexion": (30, 45, 3.5),
+    "forearm_twist": (0, 40, 3.0),
+    "wrist_flexion": (0, 20, 2.5),
+    "wrist_deviation": (0, 15, 1.5),
+    "hip_flexion": (15, 40, 2.5),
+    "hip_abduction": (5, 18, 1.5),
+    "hip_twist": (0, 20, 1.5),
+    "knee_flexion": (20, 40, 3.0),
+    "ankle_flexion": (0, 15, 2.0),
 }
-"""Rest value and deviation, degrees, of the sticky priors of section 3.2.2 [IJRR]; narrow for the
-joints that are hard to see, wide for the rest. The papers give no numbers; these are a third to a
-half of each joint's range, about a relaxed upright stance."""
+"""Of every angle: rest value and deviation, degrees; deviation of its speed, radians per second.
 
+The first two are the sticky priors of section 3.2.2 [IJRR]: narrow for the joints that are hard to
+see, wide for the rest. The papers give no numbers; these are a third to a half of each joint's
+range, about a relaxed upright stance. The speed is that of everyday motion: the scale of the
+diffusion dynamics (section 4.2 [IJRR]). Brisk, not athletic; the tails of the temporal prior leave
+room for more."""
 
-MOTION_RATES: dict[str, float] = {
+_ROOT_RATES = {
     "root_x": 0.7,
     "root_y": 0.5,
     "root_z": 0.7,
     "root_yaw": 1.5,
     "root_pitch": 0.8,
     "root_roll": 0.8,
-    "lumbar_flexion": 1.0,
-    "lumbar_bending": 1.0,
-    "lumbar_twist": 1.0,
-    "neck_flexion": 1.0,
-    "neck_bending": 1.0,
-    "neck_twist": 1.5,
-    "clavicle_elevation": 0.7,
-    "clavicle_protraction": 0.7,
-    "shoulder_swing": 3.0,
-    "shoulder_raising": 2.5,
-    "shoulder_twist": 2.5,
-    "elbow_flexion": 3.5,
-    "forearm_twist": 3.0,
-    "wrist_flexion": 2.5,
-    "wrist_deviation": 1.5,
-    "hip_flexion": 2.5,
-    "hip_abduction": 1.5,
-    "hip_twist": 1.5,
-    "knee_flexion": 3.0,
-    "ankle_flexion": 2.0,
 }
-"""Standard deviation of the speed of each parameter in everyday motion, metres or radians per
-second: the scale of the diffusion dynamics (section 4.2 [IJRR]). Brisk, not athletic; the tails of
-the temporal prior leave room for more."""
+"""The same of the root, metres or radians per second."""
 
 DEFAULT_RATE = 2.0
-"""Speed assumed for a parameter that `MOTION_RATES` does not list, such as a robot's joint."""
+"""Speed assumed for any other parameter, such as a robot's joint."""
+
+
+def motion_rate(parameter: str) -> float:
+    """Deviation of the speed of a parameter, metres or radians per second."""
+    habit = HABITS.get(without_side(parameter))
+    return _ROOT_RATES.get(parameter, DEFAULT_RATE) if habit is None else habit[2]
+
+
+def without_side(name: str) -> str:
+    """A name without the prefix that says left or right."""
+    return name.removeprefix("l_").removeprefix("r_")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,9 +227,8 @@ class _Builder:
                 upper=limits[1] * scale,
             )
         )
-        rest = STABILISERS.get(name.removeprefix("l_").removeprefix("r_"))
-        if rest is not None:
-            self.sticky[name] = (rest[0] * _DEGREE, rest[1] * _DEGREE)
+        if (habit := HABITS.get(without_side(name))) is not None:
+            self.sticky[name] = (habit[0] * _DEGREE, habit[1] * _DEGREE)
         return f"{name}_link"
 
     def stretch(self, length: str, parent: str, direction: Vector, prefix: str = "") -> str:

@@ -16,11 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from torchcss.body.catalog import (
-    DEFAULT_RATE,
-    MOTION_RATES,
-    BodySpecification,
-)
+from torchcss.body.catalog import BodySpecification, motion_rate
 from torchcss.body.kinematics import KinematicTree, TreePose
 from torchcss.body.lift import lift_to_joints
 from torchcss.body.surface import SurfaceSample, angular_grid, surface_points
@@ -58,7 +54,7 @@ class BodyModel(nn.Module):
         joint_names: Names of the joint centres, the order of `BodyPose.joints`.
         part_names: Names of the parts.
         lengths: Lengths that the body was built with, metres.
-        base_rotation: Orientation of the root link in the world (design decision 11).
+        base_rotation: Orientation of the root link in the world (decision "root").
         base_translation: Origin of the root link in the world, metres.
     """
 
@@ -158,8 +154,7 @@ class BodyModel(nn.Module):
         self.register_buffer("sticky_mean", torch.tensor([r[0] for r in rest], dtype=torch.float64))
         deviation = torch.tensor([r[1] for r in rest], dtype=torch.float64)
         self.register_buffer("sticky_deviation", deviation)
-        bare = [name.removeprefix("l_").removeprefix("r_") for name in names]
-        rates = [MOTION_RATES.get(name, DEFAULT_RATE) for name in bare]
+        rates = [motion_rate(name) for name in names]
         self.register_buffer("motion_rate", torch.tensor(rates, dtype=torch.float64))
 
     @property

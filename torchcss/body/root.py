@@ -1,4 +1,4 @@
-"""The six root parameters and the base transform they hang on (design decision 11).
+"""The six root parameters and the base transform they hang on (decision "root").
 
 The root is three prismatic joints and yaw, pitch, roll (rotations about y, x, z, in that order) on
 a base transform. The base is set when tracking starts and moved when the pitch nears a right angle,

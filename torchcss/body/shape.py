@@ -29,6 +29,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchcss.body.catalog import without_side
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.surface import SHAPE_NAMES, straighten, surface_points
 from torchcss.types import Bounds, Curvature, LocalModel, PointCost
@@ -70,7 +71,7 @@ class ShapeParameters:
         rows: list[tuple[int, int]] = []
         spans: list[Tensor] = []
         for part, part_name in enumerate(body.part_names):
-            bare = part_name.removeprefix("l_").removeprefix("r_")
+            bare = without_side(part_name)
             for number in numbers:
                 k, name = SHAPE_NAMES.index(number), f"{bare}_{number}"
                 if name not in names:

@@ -24,7 +24,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from torchcss.body.catalog import PartSpecification, Vector
+from torchcss.body.catalog import PartSpecification, Vector, without_side
 from torchcss.body.chain import JointSpecification
 from torchcss.body.rotations import frame_along
 from torchcss.body.surface import angular_grid, implicit, surface_points
@@ -218,7 +218,7 @@ def _bone_kind(bone: _Place) -> tuple[str, str, float] | None:
     assert bone.above is not None
     for start in bone.above.names:
         for end in bone.names:
-            bare = [name.removeprefix("l_").removeprefix("r_") for name in (start, end)]
+            bare = [without_side(name) for name in (start, end)]
             if (known := GIRTHS.get((bare[0], bare[1]))) is not None:
                 side = end[:2] if end.startswith(("l_", "r_")) else ""
                 return side, *known
