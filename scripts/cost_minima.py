@@ -28,7 +28,9 @@ from common import start, write_report
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.cost.choice import CostChoice
+from torchcss.cost.contour import ContourTerm
+from torchcss.cost.total import TrackingCost
 from torchcss.io.tracks import prepare_output_folder
 from torchcss.robust import Leclerc, Lorentzian, Quadratic
 from torchcss.show.style import OKABE_ITO, save_figure
@@ -49,7 +51,6 @@ ON_BODY = ("root_z", "root_yaw", "r_shoulder_swing", "r_elbow_flexion", "l_elbow
 ON_BODY += ("r_hip_flexion", "r_knee_flexion", "l_knee_flexion", "eigen 0", "eigen 1", "eigen 2")
 STATED = (0.0, 0.005, 0.01, PROMINENCE, 0.05, 0.1)  # least prominences; 0 counts every ripple
 LEAST = sorted({*STATED, *np.geomspace(0.002, 0.1, 25).tolist()})  # of the figure
-SILENT = CostChoice(contour=None, joints=None, stabiliser=None, temporal=None)
 PERCENTS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)  # ticks of the figure
 FIRST, DRAWN, MISLEADING = ("quadratic", 0.0), "r_shoulder_swing", 0.1
 
@@ -117,19 +118,21 @@ def scenes(config: Config) -> Iterator[Scene]:
 def contour_of(scene: Scene, potential: type, sigma: float, k: float) -> TrackingCost:
     """A variant of the contour term; a node without match costs as many nats as by default."""
     usual = make_choice(Settings(terms=TERMS, boundary_emphasis=k), 1.0)
-    assert usual.contour is not None
-    term = replace(usual.contour, potential_kind=potential, sigma=sigma)
-    ratio = term.unmatched / usual.contour.unmatched
-    term = replace(term, fitted_level=usual.contour.fitted_level * ratio)
-    choice = replace(SILENT, contour=term, contour_weight=usual.contour_weight / ratio)
+    contour = usual.find(ContourTerm)
+    assert contour is not None
+    term = replace(contour, potential_kind=potential, sigma=sigma)
+    ratio = term.unmatched / contour.unmatched
+    level, weight = contour.fitted_level * ratio, contour.weight / ratio
+    term = replace(term, fitted_level=level, weight=weight)
     field = scene.features.edge_field(boundary_emphasis=k).to(scene.truth)
-    return replace(scene.cost, choice=choice, edge_field=field)
+    view = replace(scene.cost.views[0], edge_field=field)
+    return replace(scene.cost, choice=CostChoice(terms=(term,)), views=(view,))
 
 
 def measure(scene: Scene, config: Config, curves: Curves) -> None:
     """Add the slices of one frame; draw those along one line."""
     limits, body = scene.limits(scene.truth), scene.cost.body.name
-    flow = replace(scene.cost, choice=replace(SILENT, flow=scene.cost.choice.flow))
+    flow = replace(scene.cost, choice=scene.cost.choice.only(["flow"]))
     for line in scene.lines(scene.truth):
         if body != "arm8" and line.name not in ON_BODY:
             continue

@@ -70,7 +70,7 @@ class Config:
     prominence: float = PROMINENCE
     """Least prominence of a minimum that counts, share of the slice's range."""
     terms: tuple[str, ...] = TERMS
-    """Terms of the cost, see `torchcss.tracking.settings.ALL_TERMS`."""
+    """Terms of the cost, see `torchcss.tracking.settings.all_terms`."""
     small: bool = False
     """The arm alone, few lines and samples: for tests."""
     out: Path | None = None

@@ -69,6 +69,10 @@ class Slice:
     origin: Tensor  # [n]
     basis: Tensor  # [n 2]
 
+    def take(self, items: Tensor) -> Slice:
+        """The same cost for all items."""
+        return self
+
     def value(self, x: Tensor) -> Tensor:
         """Cost in nats."""
         return self.cost.value(self.origin + x @ self.basis.mT)

@@ -36,9 +36,10 @@ from torchcss.body.model import BodyModel
 from torchcss.body.root import move_base, root_pose
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.cli.options import SettingsOptions
-from torchcss.cost.frame import beside
+from torchcss.cost.choice import CostChoice
+from torchcss.cost.context import FrameContext
 from torchcss.cost.joints import JointTerm
-from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.cost.total import TrackingCost
 from torchcss.errors import TorchcssError
 from torchcss.files import load_arrays
 from torchcss.inference.mixture import GaussianMixture
@@ -276,15 +277,12 @@ def place(
     x[:, 3:] = 3.0 * torch.randn(100, 3, generator=generator, dtype=torch.float64).clamp(-1, 1)
     modes = None
     for scale in (30.0, 6.0, 1.0):
-        choice = CostChoice(
-            contour=None, stabiliser=None, anthropometric=None, temporal=None,
-            joints=JointTerm(sigma=scale * CORNER_NOISE_PX),
-        )  # fmt: skip
-        cost = beside(
-            [
-                TrackingCost(body=body, camera=view.camera, choice=choice, keypoints=keypoints)
+        cost = TrackingCost(
+            choice=CostChoice(terms=(JointTerm(sigma=scale * CORNER_NOISE_PX),)),
+            views=tuple(
+                FrameContext(body=body, camera=view.camera, keypoints=keypoints)
                 for view, keypoints in zip(views, seen, strict=True)
-            ]
+            ),
         )
         modes = TrustRegionNewton(max_steps=60, tolerance=1e-6).minimise(cost, x, body.bounds)
         x = modes.mean

@@ -13,7 +13,7 @@ millimetres.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,12 +24,15 @@ from torch import Tensor
 
 from torchcss.body.load import FileOptions, load_body
 from torchcss.body.model import BodyModel
+from torchcss.cost.choice import CostChoice
+from torchcss.cost.context import FrameContext
 from torchcss.cost.joints import JointTerm
+from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.targets import PointTargets
 from torchcss.cost.temporal import TemporalPrior
-from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.cost.total import TrackingCost
 from torchcss.inference.mixture import GaussianMixture
-from torchcss.inference.tracker import CostFactory
+from torchcss.inference.problem import SearchProblem
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.studies.render.robots import stand, trot
 from torchcss.studies.render.sequences import look_at
@@ -78,7 +81,7 @@ def load_quadruped(path: Path) -> BodyModel:
 
 def make_costs(
     config: Config, body: BodyModel, truth: Tensor, generator: torch.Generator
-) -> tuple[list[CostFunction | CostFactory], CostFunction]:
+) -> tuple[list[SearchProblem], CostFunction]:
     """The cost of every frame, and that of the first frame without a past."""
     names = [n for n in body.joint_names if n.rsplit("_", 1)[-1] in MARKED]
     index = torch.tensor([body.joint_index(name) for name in names])
@@ -99,26 +102,26 @@ def make_costs(
             )
             for places in exact + sigma * noise
         ]
-        return [*spatial], spatial[0]
+        return [SearchProblem(cost) for cost in spatial], spatial[0]
     sigma = config.noise or 1.5
     camera = look_at((1.6, 0.7, 3.2), (0.1, -0.2, 0.5), focal_px=1300, image_size_wh=(1280, 720))
     uv = camera.project(exact).uv + sigma * noise[..., :2]
-    choice = CostChoice(
-        contour=None, anthropometric=None, joints=JointTerm(sigma=sigma), temporal=TemporalPrior()
-    )
+    terms = (JointTerm(sigma=sigma), Stabiliser(lengths=True), TemporalPrior())
     costs = [
         TrackingCost(
-            body=body,
-            camera=camera,
-            choice=choice,
-            keypoints=Keypoints(place, torch.ones_like(place[:, 0]), tuple(names)),
-            deviation=body.motion_rate / RATE,
+            choice=CostChoice(terms=terms),
+            views=(
+                FrameContext(
+                    body=body,
+                    camera=camera,
+                    keypoints=Keypoints(marks, torch.ones_like(marks[:, 0]), tuple(names)),
+                    deviation=body.motion_rate / RATE,
+                ),
+            ),
         )
-        for place in uv
+        for marks in uv
     ]
-    return [cost.of_children for cost in costs], replace(
-        costs[0], choice=replace(choice, temporal=None)
-    )
+    return [cost.problem() for cost in costs], costs[0]
 
 
 def first_mixture(

@@ -3,40 +3,54 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
-from torchcss.cost.edge_energy import EdgeEnergyTerm, edge_energy_field
-from torchcss.cost.flow import FlowTerm, InteriorNodes, flow_targets
-from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
+from torchcss.cost.choice import CostChoice
+from torchcss.cost.context import FrameContext
+from torchcss.cost.edge_energy import EdgeEnergyTerm
+from torchcss.cost.flow import FlowTerm
+from torchcss.cost.interpenetration import Interpenetration
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.temporal import MixturePrior
-from torchcss.cost.total import CostChoice, TrackingCost
-from torchcss.cost.visibility import ContourPredictor
+from torchcss.cost.term import OnStates, Term
+from torchcss.cost.total import TrackingCost
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
+from torchcss.vision.features import FrameFeatures
 
 WIDTH, HEIGHT = 160, 120
 
 
-JOINTS_ONLY = CostChoice(contour=None, stabiliser=None, temporal=None)
+JOINTS_ONLY = CostChoice(terms=(JointTerm(),))
 
 
-EVERYTHING = CostChoice(joints=JointTerm(sigma=2.0))
+EVERYTHING = CostChoice().having(JointTerm(sigma=2.0))
 
 
-FULL = replace(
-    EVERYTHING,
-    edge_energy=EdgeEnergyTerm(),
-    flow=FlowTerm(),
-    temporal_mixture=MixturePrior(),
-    interpenetration=Interpenetration(),
-)
+FULL = EVERYTHING.having(EdgeEnergyTerm(), FlowTerm(), MixturePrior(), Interpenetration())
+
+
+@dataclass(frozen=True, eq=False)
+class Ready(Term):
+    """A term that is bound already, whatever the frame."""
+
+    term: Term
+    bound: Any
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "name", self.term.name)
+        object.__setattr__(self, "kind", self.term.kind)
+        object.__setattr__(self, "screens", self.term.screens)
+
+    def prepare(self, context: FrameContext) -> Any:
+        return self.bound
 
 
 def random_states(body: BodyModel, *batch: int, generator: torch.Generator) -> Tensor:
@@ -76,17 +90,31 @@ def make_cost(
     parents = random_states(
         body, *(() if own_parents is None else (own_parents,)), generator=generator
     )
-    body = body.to(dtype)
-    return TrackingCost(
+    body, parents = body.to(dtype), parents.to(dtype)
+    view = FrameContext(
         body=body,
         camera=camera.to(dtype),
-        choice=choice,
-        predictor=ContourPredictor(body),
         edge_field=field.to(dtype),
         keypoints=Keypoints(keypoints.to(dtype), confidence.to(dtype), body.joint_names),
-        parent=parents.to(dtype),
+        modes=parents.reshape(-1, body.num_parameters),
         deviation=body.motion_rate / 25,
     )
+    cost = TrackingCost(choice=choice, views=(view,))
+    if own_parents is None:
+        return cost.of_mode(parents)
+    return cost.of_children(torch.arange(own_parents), mixture_at(parents))
+
+
+def mixture_at(mean: Tensor) -> GaussianMixture:
+    """Modes of equal weight and unit covariance."""
+    k, n = mean.shape
+    return GaussianMixture(mean, torch.eye(n).to(mean).expand(k, n, n), mean.new_zeros(k))
+
+
+def changed(cost: TrackingCost, **fields: Any) -> TrackingCost:
+    """A cost of one view with other things in the view."""
+    view, past = (replace(context, **fields) for context in (cost.views[0], cost.past[0]))
+    return replace(cost, views=(view, *cost.views[1:]), past=(past,))
 
 
 def make_full_cost(
@@ -95,13 +123,11 @@ def make_full_cost(
     """The same with every term and prior, and what they compare with."""
     cost = make_cost(name, FULL, dtype=dtype, own_parents=own_parents)
     generator = torch.Generator().manual_seed(2)
-    body, parent = cost.body, cost.parent
-    assert parent is not None
-    assert cost.edge_field is not None
+    body, field = cost.body, cost.views[0].edge_field
+    assert field is not None
     small = torch.randn(1, 2, 4, 5, generator=generator, dtype=torch.float64)
     flow = 3 * torch.nn.functional.interpolate(small, (HEIGHT, WIDTH), mode="bicubic")[0]
-    interior = InteriorNodes(body)
-    targets = flow_targets(interior, body, parent, cost.camera, flow.to(dtype))
+    features = FrameFeatures(field[0], field.norm(dim=0), field, flow=flow.to(dtype))
     mean = random_states(load_body(name), 3, generator=generator).to(dtype)
     spread = 0.1 + torch.rand(3, body.num_parameters, generator=generator, dtype=torch.float64)
     previous = GaussianMixture(
@@ -109,11 +135,7 @@ def make_full_cost(
         torch.diag_embed(spread.to(dtype)),
         torch.tensor([0.0, -1.0, -2.0]).to(dtype).log_softmax(0),
     )
-    return replace(
-        cost,
-        energy=edge_energy_field(cost.edge_field),
-        interior=interior,
-        targets=targets,
-        pairs=InterpenetrationPairs(body),
-        previous=MixturePrior().density(previous),
-    )
+    density = MixturePrior().density(previous)
+    bound = OnStates(lambda posed: MixturePrior().local_model(posed.x, density))
+    choice = cost.choice.having(Ready(MixturePrior(), bound))
+    return replace(changed(cost, features=features), choice=choice)

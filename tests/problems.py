@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -21,8 +22,15 @@ def unbounded(n: int, dtype: torch.dtype = torch.float64) -> Bounds:
     return box(n, -torch.inf, torch.inf, dtype)
 
 
+class Alike:
+    """A cost that is the same for all items."""
+
+    def take(self, items: Tensor) -> Self:
+        return self
+
+
 @dataclass(frozen=True)
-class AutogradCost:
+class AutogradCost(Alike):
     """Any scalar function of one state, differentiated by autograd: the reference for the rest."""
 
     function: Callable[[Tensor], Tensor]
@@ -41,7 +49,7 @@ class AutogradCost:
 
 
 @dataclass(frozen=True)
-class Bowl:
+class Bowl(Alike):
     """A quadratic: its minimum is `minimum`, its covariance the inverse of `hessian`."""
 
     hessian: Tensor
@@ -84,7 +92,7 @@ class ItemBowls:
 
 
 @dataclass(frozen=True)
-class Rosenbrock:
+class Rosenbrock(Alike):
     """The curved valley in n dimensions; the minimum at ones has the value zero."""
 
     steepness: float = 100.0
@@ -112,7 +120,7 @@ class Rosenbrock:
 
 
 @dataclass(frozen=True)
-class CosineSum:
+class CosineSum(Alike):
     """Waves of random direction in a wide bowl: full of minima, saddles and maxima."""
 
     frequency: Tensor  # [m n]
@@ -148,7 +156,7 @@ class CosineSum:
 
 
 @dataclass(frozen=True)
-class DoubleWell:
+class DoubleWell(Alike):
     """A long valley along the first parameter with two equal minima, as a limb flipped in depth.
 
     ``f(u, v) = barrier ((u / distance)^2 - 1)^2 + (v - slope u)^2 / (2 width^2) + tilt u``;
@@ -185,7 +193,7 @@ class DoubleWell:
 
 
 @dataclass(frozen=True)
-class Jumping:
+class Jumping(Alike):
     """A cost whose value jumps by up to `height`, as when an edge match changes; smooth model."""
 
     smooth: CosineSum
@@ -203,7 +211,7 @@ class Jumping:
 
 
 @dataclass(frozen=True)
-class ReprojectedLimbs:
+class ReprojectedLimbs(Alike):
     """Limbs on a free root seen by one camera: joint centres against their image positions.
 
     The state is the root's translation and rotation, then `joints` angles for each of `limbs`

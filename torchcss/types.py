@@ -126,15 +126,8 @@ class Modes(NamedTuple):
     num_steps: Int[Tensor, "*batch"]
 
 
-@runtime_checkable
-class CostFunction(Protocol):
-    """Anything that the optimiser and the tracker can search: the negative log posterior, eq. 3.
-
-    A cost whose items differ (each sample compared with its own parent mode, say) also has a
-    method `take(items)` that returns the cost restricted to those items of the leading batch
-    dimension; the optimiser calls it when it drops finished items. What has no derivatives and
-    counts among modes only is a method `unsearched(x)`, in nats.
-    """
+class Differentiable(Protocol):
+    """Anything that gives a cost and its derivatives, item by item."""
 
     def value(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
         """Cost in nats; a pure function of `x`."""
@@ -142,6 +135,26 @@ class CostFunction(Protocol):
 
     def local_model(self, x: Float[Tensor, "*batch n"]) -> LocalModel:
         """Cost, gradient and Hessian at `x`, image matches held fixed."""
+        ...
+
+
+@runtime_checkable
+class CostFunction(Differentiable, Protocol):
+    """Anything that the optimiser can search: the negative log posterior, eq. 3."""
+
+    def take(self, items: Int[Tensor, " m"]) -> CostFunction:
+        """The cost of some items of the batch; itself, where all items have the same cost."""
+        ...
+
+
+@runtime_checkable
+class BlendedCost(CostFunction, Protocol):
+    """A cost with a Hessian that is positive far from the minimum, and exact at it."""
+
+    def blended_model(
+        self, x: Float[Tensor, "*batch n"], share: Float[Tensor, "*batch"]
+    ) -> LocalModel:
+        """Cost, gradient and a share, 0 to 1, of the second-order parts of the Hessian."""
         ...
 
 

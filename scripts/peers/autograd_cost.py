@@ -14,14 +14,17 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchcss.body.load import load_body
-from torchcss.body.model import BodyPose, differentiate_twice
-from torchcss.cost.flow import FlowTerm, InteriorNodes, flow_targets
-from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
-from torchcss.cost.joints import JointTerm, match_joints
-from torchcss.cost.total import CostChoice, TrackingCost
-from torchcss.cost.visibility import ContourPredictor, front_facing, visible_nodes
+from torchcss.cost.choice import CostChoice
+from torchcss.cost.context import BodyTables, FrameContext
+from torchcss.cost.contour import ContourTerm
+from torchcss.cost.flow import FlowTerm
+from torchcss.cost.interpenetration import Interpenetration
+from torchcss.cost.joints import JointTerm
+from torchcss.cost.stabiliser import Stabiliser
+from torchcss.cost.total import TrackingCost
+from torchcss.cost.visibility import ContourPredictor
 from torchcss.joint_names import ALIASES
-from torchcss.types import Keypoints, LocalModel
+from torchcss.types import Curvature, Keypoints, LocalModel
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor
 
@@ -41,21 +44,21 @@ def made_up_costs(
     joints = body.pose(body.rest).joints[[body.joint_index(name) for name in names]]
     uv = camera.project(joints).uv
     uv = uv + 3.0 * torch.randn(uv.shape, generator=generator, dtype=dtype)
-    keypoints = Keypoints(uv, torch.ones_like(uv[:, 0]), names)
-    choice = CostChoice(contour=None, joints=JointTerm(), stabiliser=None, temporal=None)
-    alone = TrackingCost(body=body, camera=camera, choice=choice, keypoints=keypoints)
-    edges = FeatureExtractor().to(dtype)(made_up_frames(size_wh)[1]).edge_field()
-    interior = InteriorNodes(body)
-    full = replace(
-        alone,
-        choice=CostChoice(flow=FlowTerm(), interpenetration=Interpenetration(), temporal=None),
-        predictor=ContourPredictor(body, rings=14, meridians=6),
+    observation = Keypoints(uv, torch.ones_like(uv[:, 0]), names)
+    features = FeatureExtractor().to(dtype)(made_up_frames(size_wh)[1])
+    edges = features.edge_field()
+    view = FrameContext(
+        body=body,
+        camera=camera,
+        tables=BodyTables(body, ContourPredictor(body, rings=14, meridians=6)),
+        features=features._replace(flow=torch.full_like(edges, -3.0)),
         edge_field=edges,
-        interior=interior,
-        targets=flow_targets(interior, body, body.rest, camera, torch.full_like(edges, -3.0)),
-        pairs=InterpenetrationPairs(body),
+        keypoints=observation,
+        modes=body.rest[None],
     )
-    return alone, full, x
+    alone = TrackingCost(choice=CostChoice(terms=(JointTerm(),)), views=(view,))
+    terms = (ContourTerm(), JointTerm(), Stabiliser(), FlowTerm(), Interpenetration())
+    return alone, TrackingCost(choice=CostChoice(terms=terms), views=(view,)), x
 
 
 def made_up_frames(size_wh: tuple[int, int]) -> tuple[Tensor, Tensor]:
@@ -71,72 +74,6 @@ def made_up_frames(size_wh: tuple[int, int]) -> tuple[Tensor, Tensor]:
 
 
 def autograd_model(cost: TrackingCost, x: Tensor) -> LocalModel:
-    """Value (but for a constant), gradient and Hessian of joints, contour, flow and two priors."""
-    choice, body, camera, keypoints = cost.choice, cost.body, cost.camera, cost.keypoints
-    leaf = x.detach().requires_grad_()
-    pose = body.pose(leaf)
-    value = torch.zeros_like(x[:, 0])
-    if choice.joints is not None and keypoints is not None:
-        targets = match_joints(keypoints, body.joint_names)
-        projection = camera.project(pose.joints[:, targets.joint])
-        value = value + choice.joints.value(projection, targets).sum(-1)
-    if choice.contour is not None:
-        value = value + contour(cost, body.pose(x), pose)
-    if choice.flow is not None:
-        value = value + flow(cost, body.pose(x), pose)
-    if choice.interpenetration is not None and cost.pairs is not None:
-        value = value + choice.interpenetration.value(body, pose, cost.pairs)
-    if choice.stabiliser is not None:
-        sticky = body.sticky_mean, body.sticky_deviation
-        value = value + choice.stabiliser.local_model(leaf, *sticky).value
-    return differentiate_twice(value, leaf)
-
-
-def contour(cost: TrackingCost, found: BodyPose, pose: BodyPose) -> Tensor:
-    """Wells of the edges that were found at one pose, at another."""
-    term, predictor, field, camera = (
-        cost.choice.contour,
-        cost.predictor,
-        cost.edge_field,
-        cost.camera,
-    )
-    assert term is not None
-    assert predictor is not None
-    assert field is not None
-    nodes = predictor(cost.body, found, camera.centre_world)
-    model = camera.project_with_derivatives(nodes.points)
-    normal = camera.image_normals(model, nodes.normals)
-    node, distance, weight = term.search(model.uv, normal, field)
-    weight = weight * (nodes.visible * nodes.exists).flatten()[node]
-
-    uv = camera.project(carried(found, pose, nodes.points, predictor.node_link)).uv
-    moved = ((uv - model.uv) * normal).sum(-1).flatten()[node]
-    rho = term.potential((distance - moved).square()).rho
-    wells = torch.zeros_like(uv[..., 0]).flatten()
-    wells = wells.index_add(0, node, weight * (term.unmatched - 0.5 * rho)).reshape(uv.shape[:-1])
-    return -cost.choice.contour_weight / (predictor.num_nodes * term.nu) * wells.sum(-1)
-
-
-def flow(cost: TrackingCost, found: BodyPose, pose: BodyPose) -> Tensor:
-    """Residuals of the nodes that were seen at one pose, at another."""
-    term, interior, targets, camera = cost.choice.flow, cost.interior, cost.targets, cost.camera
-    assert term is not None
-    assert interior is not None
-    assert targets is not None
-    nodes = interior(cost.body, found)
-    eye = camera.centre_world
-    facing = front_facing(nodes.points, nodes.normals, eye)
-    seen = facing * visible_nodes(
-        cost.body, found, eye, nodes.points, interior.node_part, wanted=facing
-    )
-    uv = camera.project(carried(found, pose, nodes.points, interior.node_link)).uv
-    rho = term.potential(targets.weight * (uv - targets.uv).square().sum(-1)).rho
-    return cost.choice.flow_weight / (interior.num_nodes * term.nu) * (seen * 0.5 * rho).sum(-1)
-
-
-def carried(found: BodyPose, pose: BodyPose, points: Tensor, link: Tensor) -> Tensor:
-    """Where points that lie on links at one pose are at another."""
-    away = points - found.tree.translation[:, link]
-    local = (found.tree.rotation[:, link] * away[..., :, None]).sum(-2)
-    moved = (pose.tree.rotation[:, link] * local[..., None, :]).sum(-1)
-    return moved + pose.tree.translation[:, link]
+    """Value, gradient and Hessian by differentiating the cost as a function of x, matches held."""
+    autograd = replace(cost.choice, curvature=Curvature.AUTOGRAD)
+    return replace(cost, choice=autograd).local_model(x)

@@ -18,8 +18,11 @@ from torch._dynamo.utils import counters
 from torch._inductor.utils import fresh_inductor_cache
 from torch.profiler import ProfilerActivity, profile
 
+from torchcss.cost.choice import CostChoice
+from torchcss.cost.context import FrameContext
 from torchcss.cost.joints import JointTerm
-from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.cost.total import TrackingCost
+from torchcss.inference.mixture import GaussianMixture
 from torchcss.studies.reprojection import reprojection_problem
 from torchcss.types import Keypoints
 
@@ -61,24 +64,21 @@ def make_frames(body_name: str, pool: int, like: Tensor, seed: int) -> Iterator[
     body, camera = problem.body.to(like), problem.camera.to(like)
     factor = torch.linalg.cholesky(problem.start.covariance).to(like)
     factor = factor.expand(pool, -1, -1).contiguous()
-    choice = CostChoice(contour=None, joints=JointTerm())
+    choice = CostChoice().without("contour").having(JointTerm())
     motion = FRAME_INTERVAL * body.motion_rate
     while True:
         uv = problem.observed + torch.randn(problem.observed.shape, generator=generator)
         uv = uv.to(like)
-        keypoints = Keypoints(uv, torch.ones_like(uv[:, 0]), problem.joint_names)
+        observation = Keypoints(uv, torch.ones_like(uv[:, 0]), problem.joint_names)
         modes = torch.randn(NUM_MODES, len(motion), generator=generator).to(like)
         modes = problem.start.mean.to(like) + 0.5 * motion * modes
         mean = modes[torch.arange(pool, device=like.device) % NUM_MODES]
         noise = torch.randn(mean.shape, generator=generator).to(like)
-        cost = TrackingCost(
-            body=body,
-            camera=camera,
-            choice=choice,
-            keypoints=keypoints,
-            parent=mean,
-            deviation=motion,
-        )
+        view = FrameContext(body=body, camera=camera, keypoints=observation, deviation=motion)
+        alike = torch.eye(len(motion)).to(mean).expand(len(mean), -1, -1)
+        parents = GaussianMixture(mean, alike, mean.new_zeros(len(mean)))
+        cost = TrackingCost(choice=choice, views=(view,))
+        cost = cost.of_children(torch.arange(len(mean), device=mean.device), parents)
         yield Frame(cost, mean, factor, noise)
 
 

@@ -12,7 +12,8 @@ from torch import Tensor
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.surface import implicit
-from torchcss.cost.flow import FlowTargets, FlowTerm, InteriorNodes, flow_targets
+from torchcss.cost.flow import FlowTargets, FlowTerm, flow_targets
+from torchcss.cost.interior import InteriorNodes
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.robust import Leclerc, Lorentzian
 from torchcss.studies.render.sequences import arm_sequence

@@ -336,6 +336,9 @@ class FistCost:
     evidence: str
     term: Interpenetration | None
 
+    def take(self, items: Tensor) -> FistCost:
+        return self
+
     def value(self, x: Tensor) -> Tensor:
         return self.local_model(x).value
 

@@ -7,18 +7,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from made_costs import Ready
 from painted import a_body_before_a_camera, layers, moved, painted
 from torch import Tensor
 
 from torchcss.body.load import FileOptions, load_body
 from torchcss.body.model import BodyModel
+from torchcss.cost.choice import CostChoice
+from torchcss.cost.context import FrameContext
 from torchcss.cost.flow import FlowTerm
 from torchcss.cost.frame import FrameCosts
 from torchcss.cost.part_map import bare_pixels, part_map
 from torchcss.cost.region import RegionTerm
-from torchcss.cost.segmentation import SegmentationImages, SegmentationTerm
-from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.cost.segmentation import BoundSegmentation, SegmentationImages, SegmentationTerm
+from torchcss.cost.total import TrackingCost
 from torchcss.inference.mixture import GaussianMixture
+from torchcss.inference.problem import SearchProblem
 from torchcss.inference.proposals import CovarianceScaled
 from torchcss.inference.tracker import Tracker
 from torchcss.tracking.view import NOTHING_KNOWN, NOTHING_SEEN, CameraView, Observer
@@ -110,20 +114,19 @@ def test_the_whole_cost_leaves_it_out_and_adds_it_where_it_is_asked() -> None:
     term = SegmentationTerm()
     truth = moved(body, 0.9)
     images = term.images(painted(body, camera, truth), layers(body)[1], camera, body, truth)
-    choice = CostChoice(segmentation=term, contour=None, joints=None, interpenetration=None)
-    cost = TrackingCost(body=body, camera=camera, choice=choice, segmentation=images)
-    without = TrackingCost(body=body, camera=camera, choice=choice)
+    view, plain = FrameContext(body=body, camera=camera), CostChoice().without("contour", "joints")
+    choice = plain.having(Ready(term, BoundSegmentation(term, images)))
+    cost = TrackingCost(choice=choice, views=(view,))
+    without = TrackingCost(choice=plain.having(term), views=(view,))
     x = torch.stack([truth, moved(body, 0.2)])
     torch.testing.assert_close(cost.value(x), without.value(x), rtol=0, atol=0)
-    assert not without.unsearched(x).any()
-    expected = choice.segmentation_weight * term.value(body, x, images)
-    torch.testing.assert_close(cost.unsearched(x), expected)
+    assert not without.weight_only(x).any()
+    expected = SegmentationTerm().weight * term.value(body, x, images)
+    torch.testing.assert_close(cost.weight_only(x), expected)
     halved = cost.with_weights({"segmentation": 0.5})
-    torch.testing.assert_close(halved.unsearched(x), 0.5 * expected)
-    from_two = TrackingCost(
-        body=body, camera=camera, choice=choice, segmentation=images, others=(cost.alone,)
-    )
-    torch.testing.assert_close(from_two.unsearched(x), 2 * expected)
+    torch.testing.assert_close(halved.weight_only(x), 0.5 * expected)
+    from_two = TrackingCost(choice=choice, views=(view, FrameContext(body=body, camera=camera)))
+    torch.testing.assert_close(from_two.weight_only(x), 2 * expected)
 
 
 def test_what_a_frame_taught_weighs_the_poses_of_the_next() -> None:
@@ -133,18 +136,18 @@ def test_what_a_frame_taught_weighs_the_poses_of_the_next() -> None:
     seen = part_map(body, truth, camera) >= 0
     image = torch.where(seen[..., None], torch.tensor([180, 60, 40]), torch.tensor([40, 90, 160]))
     features = FeatureExtractor(working_size=600, colour=True)(image.to(torch.uint8).numpy())
-    choice = CostChoice(segmentation=SegmentationTerm(), contour=None, joints=None)
+    choice = CostChoice(terms=(SegmentationTerm(),))
     costs = FrameCosts(body, camera, choice)
     unknown = costs(features, body=body, before=truth[None])
-    assert unknown.segmentation is None
+    assert not unknown.weighs
     appearance = costs.learn(None, features, body, truth)
     cost = costs(features, body=body, before=truth[None], appearance=appearance)
-    right, wrong = cost.unsearched(torch.stack([truth, hidden])).tolist()
-    assert 0 < right < 0.4 * choice.segmentation_weight
-    assert right < wrong - 0.05 * choice.segmentation_weight
+    right, wrong = cost.weight_only(torch.stack([truth, hidden])).tolist()
+    assert 0 < right < 0.4 * SegmentationTerm().weight
+    assert right < wrong - 0.05 * SegmentationTerm().weight
     # A frame without a frame before it has no unit of area, and one without a picture says nothing.
-    assert costs(features, body=body, appearance=appearance).segmentation is None
-    assert costs(None, body=body, before=truth[None], appearance=appearance).segmentation is None
+    assert not costs(features, body=body, appearance=appearance).weighs
+    assert not costs(None, body=body, before=truth[None], appearance=appearance).weighs
 
 
 def before_a_wall(body: BodyModel, camera: Camera, state: Tensor) -> np.ndarray:
@@ -166,9 +169,8 @@ def test_a_camera_that_stands_still_knows_what_was_behind(dtype: torch.dtype) ->
     before, after = moved(body, 0.0), moved(body, 1.2)
     gaps = {}
     for asked in (False, True):
-        choice = CostChoice(
-            region=RegionTerm(), segmentation=SegmentationTerm(), background=asked, joints=None
-        )
+        terms = (RegionTerm(background=asked), SegmentationTerm(background=asked))
+        choice = CostChoice().without("joints").having(*terms)
         costs = FrameCosts(body, camera, choice)
         extractor = FeatureExtractor(colour=True).to(dtype)
         observer = Observer(view=CameraView(camera), costs=costs, extractor=extractor)
@@ -185,7 +187,7 @@ def test_a_camera_that_stands_still_knows_what_was_behind(dtype: torch.dtype) ->
         prior = GaussianMixture(before[None], torch.eye(len(before))[None].to(before), before[:1])
         both = torch.stack([after, before])
         cost = cost.of_children(where, prior)
-        shown = cost.unsearched(both) + cost.terms(both)["region"]
+        shown = cost.weight_only(both) + cost.terms(both)["region"]
         assert shown.dtype == dtype
         gaps[asked] = float(shown[1] - shown[0])
     assert gaps[True] > gaps[False] + 20
@@ -229,13 +231,12 @@ def test_a_body_without_flesh_shows_nothing(tmp_path: Path, dtype: torch.dtype) 
     assert torch.equal(part_map(body, x, camera), torch.full((2, 3, 30, 40), -1))
     noise = torch.rand(30, 40, 3, generator=torch.Generator().manual_seed(0)).numpy()
     features = FeatureExtractor(colour=True, flow=TRACKING)(noise, noise)
-    choice = CostChoice(region=RegionTerm(), segmentation=SegmentationTerm(), flow=FlowTerm())
+    choice = CostChoice().having(RegionTerm(), SegmentationTerm(), FlowTerm())
     costs = FrameCosts(body, camera, choice)
     appearance = costs.learn(None, features, body, x[0, 0])
     assert appearance is None
     cost = costs(features, body=body, before=x[0, :1], appearance=appearance)
-    cost = cost.of_parents(torch.zeros(6, dtype=torch.long))
-    for part in (cost.value(x), cost.unsearched(x), *cost.local_model(x)):
+    for part in (cost.value(x), cost.weight_only(x), *cost.local_model(x)):
         assert part.dtype == dtype
         assert not part.any()
 
@@ -252,8 +253,8 @@ class _TwoWells:
         hessian = 40.0 * torch.eye(x.shape[-1]).to(x).expand(*x.shape, x.shape[-1])
         return LocalModel(20.0 * gap.square().sum(-1), 40.0 * gap, hessian)
 
-    def unsearched(self, x: Tensor) -> Tensor:
-        return torch.where(x[..., 0] > 0, 0.0, 3.0)
+    def take(self, items: Tensor) -> _TwoWells:
+        return self
 
 
 def test_the_tracker_counts_it_among_modes() -> None:
@@ -265,7 +266,8 @@ def test_the_tracker_counts_it_among_modes() -> None:
     )
     bounds = Bounds(*(torch.full((1,), side, dtype=torch.float64) for side in (-9.0, 9.0)))
     start = tracker.init(mixture, generator=torch.Generator().manual_seed(0))
-    state, info = tracker.step(start, _TwoWells(), bounds)
+    problem = SearchProblem(_TwoWells(), weight_only=lambda x: torch.where(x[..., 0] > 0, 0.0, 3.0))
+    state, info = tracker.step(start, problem, bounds)
     torch.testing.assert_close(
         state.mixture.mean[:, 0], torch.tensor([1.0, -1.0], dtype=torch.float64), atol=1e-3, rtol=0
     )

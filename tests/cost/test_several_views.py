@@ -6,15 +6,23 @@ from dataclasses import replace
 
 import pytest
 import torch
-from made_costs import EVERYTHING, JOINTS_ONLY, make_cost, make_full_cost, random_states
+from made_costs import (
+    EVERYTHING,
+    JOINTS_ONLY,
+    changed,
+    make_cost,
+    make_full_cost,
+    mixture_at,
+    random_states,
+)
 from torch import Tensor
 
 from torchcss.body.model import differentiate_twice
-from torchcss.cost.frame import beside
-from torchcss.cost.joints import JointTerm, match_joints
-from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.cost.choice import CostChoice
+from torchcss.cost.context import FrameContext
+from torchcss.cost.joints import JointTerm
+from torchcss.cost.total import TrackingCost, beside
 from torchcss.cost.view import View
-from torchcss.inference.mixture import GaussianMixture
 from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
 
@@ -37,21 +45,22 @@ def two_views(choice: CostChoice = EVERYTHING, name: str = "arm8") -> tuple[Trac
     truth = random_states(first.body, generator=generator)
     uv = camera.project(first.body.pose(truth).joints).uv
     seen = torch.ones(len(uv)).double()
-    assert first.edge_field is not None
-    second = replace(
+    edges, names = first.views[0].edge_field, first.body.joint_names
+    assert edges is not None
+    second = changed(
         first,
         camera=camera,
-        edge_field=first.edge_field.flip(-1)[:, :100, :128].contiguous(),
-        keypoints=Keypoints(uv, seen, first.body.joint_names, relative_noise=0.7),
+        edge_field=edges.flip(-1)[:, :100, :128].contiguous(),
+        keypoints=Keypoints(uv, seen, names, relative_noise=0.7),
     )
     return first, second, beside([first, second])
 
 
-@pytest.mark.parametrize("choice", [EVERYTHING, JOINTS_ONLY, replace(EVERYTHING, contour=None)])
+@pytest.mark.parametrize("choice", [EVERYTHING, JOINTS_ONLY, EVERYTHING.without("contour")])
 def test_what_cameras_see_adds_up(choice: CostChoice, generator: torch.Generator) -> None:
     first, second, both = two_views(choice)
     x = random_states(first.body, 5, generator=generator)
-    priors = replace(choice, contour=None, joints=None)
+    priors = choice.without("contour", "joints")
     alone = replace(first, choice=priors)
     for method in ("value", "local_model"):
         sums = [getattr(cost, method)(x) for cost in (first, second, alone, both)]
@@ -64,18 +73,17 @@ def test_what_cameras_see_adds_up(choice: CostChoice, generator: torch.Generator
 
 def test_derivatives_over_both_views(generator: torch.Generator) -> None:
     """The lift of both views' points at once, against autograd through both projections."""
-    first, second, both = two_views(JOINTS_ONLY)
+    first, _, both = two_views(JOINTS_ONLY)
     x = random_states(first.body, 3, generator=generator)
-    term = JOINTS_ONLY.joints
+    term = JOINTS_ONLY.find(JointTerm)
     assert term is not None
 
     def value(x: Tensor) -> Tensor:
         joints, total = first.body.pose(x).joints, 0.0
-        for view in (first, second):
+        for view in both.views:
             assert view.keypoints is not None
-            targets = match_joints(view.keypoints, first.body.joint_names)
-            there = joints[..., targets.joint, :]
-            total = total + term.value(view.camera.project(there), targets).sum(-1)
+            there = joints[..., view.keypoints.index, :]
+            total = total + term.value(view.camera.project(there), view.keypoints).sum(-1)
         return torch.as_tensor(total)
 
     leaf = x.clone().requires_grad_()
@@ -87,13 +95,11 @@ def test_derivatives_over_both_views(generator: torch.Generator) -> None:
 
 def test_a_second_view_narrows_depth() -> None:
     """The variance along the first camera's line of sight falls, by far more than across it."""
-    first, second, _ = two_views(replace(JOINTS_ONLY, joints=JointTerm(sigma=1.0)), "body34")
+    first, _, both = two_views(JOINTS_ONLY.having(JointTerm(sigma=1.0)), "body34")
     assert first.keypoints is not None
     # At the pose that both see, so that no potential is past its bend.
     x = random_states(first.body, generator=torch.Generator().manual_seed(5))
-    exact = first.camera.project(first.body.pose(x).joints).uv
-    first = replace(first, keypoints=first.keypoints._replace(positions=exact))
-    both = beside([first, second])
+    first.keypoints.target = first.camera.project(first.body.pose(x).joints).uv
     depth, across = (first.body.state_index(name) for name in ("root_z", "root_x"))
     deviations = [
         (cost.local_model(x).hessian + torch.eye(len(x))).inverse().diagonal().sqrt()
@@ -106,40 +112,28 @@ def test_a_second_view_narrows_depth() -> None:
 
 def test_a_view_without_pictures_and_marks_says_nothing(generator: torch.Generator) -> None:
     first, second, _ = two_views()
-    out = View(camera=second.camera)
+    out = FrameContext(body=second.body, camera=second.camera)
     x = random_states(first.body, 4, generator=generator)
-    with_it = replace(first, others=(out,))
+    with_it = replace(first, views=(*first.views, out))
     torch.testing.assert_close(with_it.value(x), first.value(x), rtol=0, atol=0)
     # The first camera may be the one that is out.
-    other_first = replace(first, edge_field=None, keypoints=None, others=(second.alone,))
+    other_first = beside([changed(first, edge_field=None, keypoints=None), second])
     expected = second.value(x)
     torch.testing.assert_close(other_first.value(x), expected, rtol=1e-12, atol=1e-12)
     assert other_first.coarse() is not None
-    assert replace(first, keypoints=None, others=(out,)).coarse() is None
+    assert changed(with_it, keypoints=None).coarse() is None
 
 
 def test_samples_keep_their_own_targets_in_every_view(generator: torch.Generator) -> None:
     first = make_full_cost()
-    second = replace(
-        first, camera=from_the_side(first.camera, first.body.base_translation, (96, 96))
-    )
-    both = beside([first, second])
-    k = 3
-    modes = random_states(first.body, k, generator=generator)
-    n = modes.shape[-1]
-    assert first.targets is not None
-
-    def of_modes(cost: TrackingCost) -> TrackingCost:
-        assert cost.targets is not None
-        uv = cost.targets.uv.expand(k, -1, -1) + torch.arange(k)[:, None, None]
-        targets = cost.targets._replace(uv=uv, weight=cost.targets.weight.expand(k, -1))
-        return replace(cost, targets=targets)
-
-    prior = GaussianMixture(modes, torch.eye(n).double().expand(k, n, n), torch.zeros(k).double())
+    modes = random_states(first.body, 3, generator=generator)
+    first = changed(first, modes=modes)
+    aside = from_the_side(first.camera, first.body.base_translation, (160, 120))
+    second, prior = changed(first, camera=aside), mixture_at(modes)
     parent = torch.tensor([2, 0, 1, 1])
     x = random_states(first.body, 4, generator=generator)
-    both = beside([of_modes(first), of_modes(second)]).of_children(parent, prior)
-    apart = [of_modes(cost).of_children(parent, prior) for cost in (first, second)]
+    both = beside([first, second]).of_children(parent, prior)
+    apart = [cost.of_children(parent, prior) for cost in (first, second)]
     flows = [cost.terms(x)["flow"] for cost in (*apart, both)]
     torch.testing.assert_close(flows[0] + flows[1], flows[2], rtol=1e-10, atol=1e-10)
     items = torch.tensor([3, 0])
@@ -148,11 +142,10 @@ def test_samples_keep_their_own_targets_in_every_view(generator: torch.Generator
 
 def test_keypoints_of_a_view_in_a_picture_of_another_size() -> None:
     first, _, _ = two_views()
-    small = first.of_keypoints(0.6)
+    small = View(first.camera, first.keypoints).of_keypoints(0.6)
     assert small.camera.image_size_wh == (96, 72)
-    assert small.edge_field is None
-    assert small.keypoints is not None
+    assert small.observation is not None
     assert first.keypoints is not None
-    known = first.keypoints.confidence > 0
-    place = first.camera.undistort(first.keypoints.positions[known])
-    torch.testing.assert_close(small.camera.undistort(small.keypoints.positions[known]), place)
+    known = first.keypoints.weight > 0
+    place = first.camera.undistort(first.keypoints.target[known])
+    torch.testing.assert_close(small.camera.undistort(small.observation.target[known]), place)

@@ -15,12 +15,14 @@ from torchcss.body.shape import (
     with_shape,
 )
 from torchcss.body.surface import surface_points
+from torchcss.cost.choice import CostChoice
+from torchcss.cost.context import FrameContext
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.frame import FrameCosts
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.region import RegionTerm
 from torchcss.cost.shaped import Outline, ShapedCost
-from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.cost.total import TrackingCost
 from torchcss.cost.visibility import ContourPredictor
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.initialise.shape import fit_shape
@@ -80,20 +82,20 @@ def problem(thicker: float, by: str) -> tuple[ShapedCost, torch.Tensor, ShapePar
     ).image  # fmt: skip
     features = FeatureExtractor(colour=True)(picture.numpy())
     joints = camera.project(body.pose(x).joints).uv
+    seen = torch.ones(len(joints)).double()
+    keypoints = Keypoints(joints, seen, body.joint_names)
     base = TrackingCost(
-        body=body,
-        camera=camera,
-        choice=CostChoice(contour=None, temporal=None, joints=JointTerm(sigma=1.0)),
-        keypoints=Keypoints(joints, torch.ones(len(joints)).double(), body.joint_names),
+        choice=CostChoice().without("contour", "temporal").having(JointTerm(sigma=1.0)),
+        views=(FrameContext(body=body, camera=camera, keypoints=keypoints),),
     )
     if by == "edges":
         outline = Outline(ContourTerm(), features.edge_field().double(), 150.0)
     else:
-        costs = FrameCosts(body, camera, CostChoice(contour=None, region=RegionTerm()))
+        term = RegionTerm()
+        costs = FrameCosts(body, camera, CostChoice(terms=(term,)))
         known = costs.learn(None, features, body, x, fitted=False)
-        images = costs(features, body=body, appearance=known).region
-        assert images is not None
-        outline = Outline(RegionTerm(), images, 400.0)
+        cost = costs(features, body=body, appearance=known)
+        outline = Outline(term, cost.bound[term, cost.views[0]].image, 400.0)
     cost = ShapedCost(base=base, parameters=parameters, outlines=(outline,))
     return cost, torch.cat([x, torch.zeros_like(z)]), parameters
 
@@ -161,7 +163,7 @@ def test_slope_is_that_of_nodes_that_keep_their_angles(by: str):
         body.part_shape[part], ((nodes.points[0] - centre)[:, None] @ rotation)[:, 0]
     )
     ((term, image, weight),) = cost.outlines
-    force = term.point_cost(nodes, camera, image).gradient[0]  # type: ignore[arg-type]
+    force = term.point_cost(nodes, camera, image).gradient[0]
     step = 1e-6
     for column in range(len(parameters.names)):
         z = torch.zeros_like(start[n:])

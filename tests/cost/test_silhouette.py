@@ -7,20 +7,23 @@ from dataclasses import replace
 
 import pytest
 import torch
+from made_costs import Ready
 from torch import Tensor
 from torch.func import hessian, jacrev, vmap
 
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
-from torchcss.cost.flow import InteriorNodes
+from torchcss.cost.choice import CostChoice
+from torchcss.cost.context import FrameContext
 from torchcss.cost.frame import FrameCosts
+from torchcss.cost.interior import InteriorNodes
 from torchcss.cost.part_map import part_map
-from torchcss.cost.silhouette import SilhouetteImages, SilhouetteTerm
-from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.cost.silhouette import BoundSilhouette, SilhouetteImages, SilhouetteTerm
+from torchcss.cost.total import TrackingCost, beside
 from torchcss.vision.appearance import Appearance
 from torchcss.vision.background import Background
 from torchcss.vision.camera import Camera
-from torchcss.vision.features import FeatureExtractor
+from torchcss.vision.features import FeatureExtractor, FrameFeatures
 
 
 def a_body_before_a_camera(dtype: torch.dtype = torch.float64) -> tuple[BodyModel, Camera]:
@@ -174,10 +177,9 @@ def raising_force(
     body: BodyModel, camera: Camera, term: SilhouetteTerm, images: SilhouetteImages, x: Tensor
 ) -> float:
     """Nats per radian by which the cost raises the right arm."""
-    choice = CostChoice(silhouette=term, contour=None, joints=None, interpenetration=None)
-    cost = TrackingCost(
-        body=body, camera=camera, choice=choice, interior=InteriorNodes(body), silhouette=images
-    )
+    bound = Ready(term, BoundSilhouette(term, InteriorNodes(body), images))
+    view = FrameContext(body=body, camera=camera)
+    cost = TrackingCost(choice=CostChoice(terms=(bound,)), views=(view,))
     return -float(cost.gradients(x)["silhouette"][body.state_index("r_shoulder_raising")])
 
 
@@ -218,27 +220,26 @@ def test_the_whole_cost_has_its_derivatives_and_chunks() -> None:
     body, camera = a_body_before_a_camera()
     term = SilhouetteTerm()
     images = the_silhouette_of(body, camera, moved(body, 0.9), body.rest, term)
-    choice = CostChoice(
-        silhouette=term, contour=None, joints=None, interpenetration=None, stabiliser=None
-    )
-    cost = TrackingCost(
-        body=body, camera=camera, choice=choice, interior=InteriorNodes(body), silhouette=images
-    )
+    bound = BoundSilhouette(term, InteriorNodes(body), images)
+    view = FrameContext(body=body, camera=camera)
+    cost = TrackingCost(choice=CostChoice(terms=(Ready(term, bound),)), views=(view,))
     x = torch.stack([moved(body, 0.1), moved(body, 1.4), body.rest])
     model = cost.local_model(x)
-    gradient = torch.stack([jacrev(lambda y: cost._values(y[None])["silhouette"][0])(y) for y in x])
+    gradient = torch.stack([jacrev(lambda y: cost.terms(y[None])["silhouette"][0])(y) for y in x])
     torch.testing.assert_close(model.gradient, gradient, rtol=1e-7, atol=1e-8)
     torch.testing.assert_close(model.value, cost.value(x))
     torch.testing.assert_close(cost.take(torch.arange(3)).value(x), model.value)
     halved = cost.with_weights({"silhouette": 0.5})
     torch.testing.assert_close(halved.value(x), 0.5 * model.value)
-    twice = replace(cost, others=(cost.alone,))
+    twice = beside([cost, cost])
     torch.testing.assert_close(twice.value(x), 2 * model.value)
     # Of a large silhouette fewer samples are looked at together.
     large = images._replace(points=images.points.repeat(9, 1), weight=images.weight.repeat(9) / 9)
-    assert replace(cost, silhouette=large)._chunk < cost._chunk
-    torch.testing.assert_close(replace(cost, silhouette=large).value(x), model.value)
-    assert cost.screening().choice.silhouette is None
+    ready = Ready(term, replace(bound, images=large))
+    larger = replace(cost, choice=CostChoice(terms=(ready,)))
+    assert larger._chunk < cost._chunk
+    torch.testing.assert_close(larger.value(x), model.value)
+    assert not cost.screening().choice.terms
 
 
 def test_a_frame_needs_a_background_or_a_mask_and_a_pose_before() -> None:
@@ -250,7 +251,8 @@ def test_a_frame_needs_a_background_or_a_mask_and_a_pose_before() -> None:
     extract = FeatureExtractor(working_size=600, flow=None, colour=True).to(torch.float64)
     features = extract(before.numpy())
     assert features.colour is not None
-    choice = CostChoice(silhouette=SilhouetteTerm(), flow=None, background=True)
+    term = SilhouetteTerm()
+    choice = CostChoice(terms=(term,))
     costs = FrameCosts(body, camera, choice)
     inside = torch.stack([drawn] * costs.num_layers)
     seen = Appearance.unknown(costs.num_layers, like=features.colour)
@@ -258,17 +260,18 @@ def test_a_frame_needs_a_background_or_a_mask_and_a_pose_before() -> None:
     wall = torch.full_like(features.colour, 40 / 255)
     known = Background.unknown(wall).learn(wall, torch.ones_like(drawn))
     args = {"body": body, "before": truth[None], "appearance": seen, "background": known}
-    images = costs(features, **args).silhouette
-    assert images is not None
+
+    def found(costs: FrameCosts, features: FrameFeatures | None, **args: Any) -> Any:
+        cost = costs(features, **args)
+        return cost.bound[term, cost.views[0]]
+
+    images = found(costs, features, **args).images
     assert len(images.points) > 50
     value = SilhouetteTerm().value(nodes(body, truth), images).sum()
     assert float(value) < 0.1
     for missing in ("before", "appearance", "background"):
-        assert costs(features, **{**args, missing: None}).silhouette is None
-    assert costs(None, **args).silhouette is None
+        assert found(costs, features, **{**args, missing: None}) is None
+    assert found(costs, None, **args) is None
     masked = extract(before.numpy(), mask=drawn.numpy())
-    images = costs(masked, body=body, before=truth[None]).silhouette
-    assert images is not None
+    images = found(costs, masked, body=body, before=truth[None]).images
     assert float(SilhouetteTerm().value(nodes(body, truth), images).sum()) < 0.1
-    without = FrameCosts(body, camera, replace(choice, silhouette=None))
-    assert without(masked, **args).silhouette is None

@@ -14,6 +14,7 @@ from made_costs import (
     EVERYTHING,
     JOINTS_ONLY,
     WIDTH,
+    changed,
     make_cost,
     make_full_cost,
     random_states,
@@ -24,18 +25,22 @@ from torch import Tensor
 from torchcss.body.load import load_body
 from torchcss.body.model import differentiate_twice
 from torchcss.cost import total
-from torchcss.cost.anthropometric import proportion_columns
-from torchcss.cost.edge_energy import edge_energy_field
+from torchcss.cost.anthropometric import Anthropometric, proportion_columns
+from torchcss.cost.choice import CostChoice
+from torchcss.cost.context import BodyTables
+from torchcss.cost.contour import ContourTerm
 from torchcss.cost.frame import FrameCosts
-from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.cost.joints import JointTerm
+from torchcss.cost.stabiliser import Stabiliser
+from torchcss.cost.total import TrackingCost
 from torchcss.cost.visibility import ContourPredictor
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.stopwatch import Stopwatch
 from torchcss.types import CostFunction, Curvature, LocalModel
 from torchcss.vision.camera import Camera
 
-CONTOUR_ONLY = CostChoice(joints=None, stabiliser=None, temporal=None)
-NOTHING = CostChoice(contour=None, joints=None, stabiliser=None, temporal=None)
+CONTOUR_ONLY = CostChoice(terms=(ContourTerm(),))
+NOTHING = CostChoice(terms=())
 FULL_NAMES = {
     *("contour", "edge_energy", "flow", "joints"),
     *("stabiliser", "temporal", "temporal_mixture", "interpenetration"),
@@ -59,13 +64,7 @@ def test_value_is_that_of_the_model_and_the_sum_of_terms(
     value, model, terms = cost.value(x), cost.local_model(x), cost.terms(x)
     torch.testing.assert_close(value, model.value, rtol=1e-12, atol=1e-12)
     torch.testing.assert_close(value, torch.stack(list(terms.values())).sum(dim=0))
-    names = {
-        "contour": choice.contour,
-        "joints": choice.joints,
-        "stabiliser": choice.stabiliser,
-        "temporal": choice.temporal,
-    }
-    expected = {name for name, term in names.items() if term is not None}
+    expected = {term.name for term in choice.terms} - {"anthropometric"}
     assert set(terms) == (expected or {"none"})
     assert torch.isfinite(model.hessian).all()
     if choice is NOTHING:
@@ -97,7 +96,7 @@ def test_leading_shapes_and_types(
 def test_the_camera_may_be_more_precise_than_the_body(generator: torch.Generator) -> None:
     cost, double = make_cost(dtype=torch.float32), make_cost()
     x = random_states(double.body, 3, generator=generator).float()
-    mixed = replace(cost, camera=double.camera)
+    mixed = changed(cost, camera=double.camera)
     assert mixed.value(x).dtype == torch.float32
     assert_same(mixed.local_model(x), cost.local_model(x), 1e-3)
 
@@ -124,15 +123,13 @@ def test_each_item_keeps_its_own_parent(generator: torch.Generator) -> None:
         LocalModel(*(part[items] for part in cost.local_model(x))),
         1e-6,
     )
-    assert cost.parent is not None
+    prior = cost.past[0].prior
+    assert prior is not None
     for item in range(7):
-        alone = replace(cost, parent=cost.parent[item])
+        alone = cost.of_mode(prior.mean[item])
         torch.testing.assert_close(alone.value(x[item]), cost.value(x)[item], rtol=1e-6, atol=1e-6)
-    shared = replace(cost, parent=cost.parent[0])
-    assert shared.take(items).parent is shared.parent
-    without = replace(cost, parent=None)
-    assert without.take(items).parent is None
-    assert "temporal" not in without.terms(x)
+        assert alone.take(items).parent is None
+    assert "temporal" not in replace(cost, past=(), parent=None).terms(x)
 
 
 def test_items_of_a_batch_do_not_meet(generator: torch.Generator) -> None:
@@ -150,7 +147,7 @@ def test_items_of_a_batch_do_not_meet(generator: torch.Generator) -> None:
 def test_without_image_search_the_model_is_that_of_autograd(
     name: str, generator: torch.Generator
 ) -> None:
-    cost = make_cost(name, replace(EVERYTHING, contour=None))
+    cost = make_cost(name, EVERYTHING.without("contour"))
     x = random_states(cost.body, 3, generator=generator).requires_grad_()
     expected = differentiate_twice(cost.value(x), x)
     assert_same(cost.local_model(x.detach()), expected, 1e-10)
@@ -161,16 +158,16 @@ def test_contours_are_differentiated_with_visibility_and_matches_held_fixed(
     name: str, generator: torch.Generator
 ) -> None:
     cost = make_cost(name, CONTOUR_ONLY)
-    body, term, predictor = cost.body, cost.choice.contour, cost.predictor
+    body, term, field = cost.body, cost.choice.find(ContourTerm), cost.views[0].edge_field
+    predictor = ContourPredictor(body)
     assert term is not None
-    assert predictor is not None
-    assert cost.edge_field is not None
+    assert field is not None
     x = random_states(body, 2, generator=generator)
     pose = body.pose(x)
     nodes = predictor(body, pose, cost.camera.centre_world)
     model = cost.camera.project_with_derivatives(nodes.points)
     normal = cost.camera.image_normals(model, nodes.normals)
-    found = term.search(model.uv, normal, cost.edge_field)
+    found = term.search(model.uv, normal, field)
     link = predictor.node_link
     away = nodes.points - pose.tree.translation[..., link, :]
     local = (pose.tree.rotation[..., link, :, :] * away[..., :, None]).sum(-2)
@@ -179,7 +176,7 @@ def test_contours_are_differentiated_with_visibility_and_matches_held_fixed(
     points = (tree.rotation[..., link, :, :] * local[..., None, :]).sum(-1)
     points = points + tree.translation[..., link, :]
     value = cost_of_fixed_matches(term, nodes, cost.camera, found, model.uv, normal, points)
-    scale = cost.choice.contour_weight / (predictor.num_nodes * term.nu)
+    scale = term.weight / (predictor.num_nodes * term.nu)
     expected = differentiate_twice(scale * value.sum(-1), leaf)
     assert expected.gradient.any()
     assert_same(cost.local_model(x), expected, 1e-9)
@@ -204,7 +201,8 @@ def test_autograd_curvature_is_the_exact_one(
 
 def test_weights_scale_their_terms(generator: torch.Generator) -> None:
     cost = make_cost()
-    heavy = replace(cost, choice=replace(EVERYTHING, contour_weight=300.0, joint_weight=3.0))
+    terms = (ContourTerm(weight=300.0), JointTerm(sigma=2.0, weight=3.0))
+    heavy = replace(cost, choice=EVERYTHING.having(*terms))
     x = random_states(cost.body, 4, generator=generator)
     light, terms = cost.terms(x), heavy.terms(x)
     torch.testing.assert_close(terms["contour"], 2 * light["contour"])
@@ -215,10 +213,10 @@ def test_weights_scale_their_terms(generator: torch.Generator) -> None:
 def test_terms_are_silent_without_their_data(generator: torch.Generator) -> None:
     cost = make_cost()
     x = random_states(cost.body, 2, generator=generator)
-    assert set(replace(cost, keypoints=None).terms(x)) == {"contour", "stabiliser", "temporal"}
-    assert set(replace(cost, edge_field=None).terms(x)) == {"joints", "stabiliser", "temporal"}
-    assert set(replace(cost, predictor=None).terms(x)) == {"joints", "stabiliser", "temporal"}
-    bare = replace(cost, keypoints=None, edge_field=None, parent=None)
+    assert set(changed(cost, keypoints=None).terms(x)) == {"contour", "stabiliser", "temporal"}
+    assert set(changed(cost, edge_field=None).terms(x)) == {"joints", "stabiliser", "temporal"}
+    bare = changed(cost, keypoints=None, edge_field=None, prior=None)
+    assert bare.views[0].is_out
     assert set(bare.terms(x)) == {"stabiliser"}
     assert torch.isfinite(bare.local_model(x).hessian).all()
 
@@ -246,17 +244,18 @@ def test_the_coarse_cost_is_the_keypoints_without_outliers(generator: torch.Gene
     assert coarse is not None
     assert set(coarse.terms(x)) == {"joints", "stabiliser", "temporal"}
     # Well placed joints are judged alike, and what is far off is pulled as by the noise.
-    assert cost.choice.joints is not None
-    assert coarse.choice.joints is not None
-    sigma = cost.choice.joints.sigma
+    own, trusted = (each.choice.find(JointTerm) for each in (cost, coarse))
+    assert own is not None
+    assert trusted is not None
+    sigma = own.sigma
     squared = (sigma * torch.tensor([0.01, 10.0], dtype=torch.float64)).square()
-    fine = cost.choice.joints.potential(squared).first * sigma**2
-    trusting = coarse.choice.joints.potential(squared).first * sigma**2
+    fine = own.potential(squared).first * sigma**2
+    trusting = trusted.potential(squared).first * sigma**2
     assert fine.tolist() == pytest.approx([1, 0.074], abs=1e-3)
     assert trusting.tolist() == pytest.approx([1, 0.742], abs=1e-3)
     assert (coarse.terms(x)["joints"] >= cost.terms(x)["joints"]).all()
-    assert replace(cost, keypoints=None).coarse() is None
-    assert replace(cost, choice=replace(EVERYTHING, joints=None)).coarse() is None
+    assert changed(cost, keypoints=None).coarse() is None
+    assert replace(cost, choice=EVERYTHING.without("joints")).coarse() is None
 
 
 def test_a_body_without_flesh_has_no_contour(tmp_path: Path) -> None:
@@ -266,8 +265,8 @@ def test_a_body_without_flesh_has_no_contour(tmp_path: Path) -> None:
         "<parent link='a'/><child link='b'/></joint></robot>"
     )
     body = load_body(path)
-    cost = replace(make_cost(), body=body, keypoints=None, parent=None, deviation=None)
-    cost = replace(cost, predictor=ContourPredictor(body))
+    given = {"tables": BodyTables(body), "keypoints": None, "prior": None, "deviation": None}
+    cost = changed(make_cost(), body=body, **given)
     x = torch.zeros(3, 1, dtype=torch.float64)
     assert not cost.value(x).any()
     assert not cost.local_model(x).hessian.any()
@@ -321,7 +320,7 @@ def test_no_place_around_the_camera_gives_nan(
     body = cost.body.with_base(cost.body.base_rotation, torch.tensor(place).to(dtype))
     x = cost.body.rest.clone()
     x[body.state_index("root_yaw")] = yaw
-    assert_no_nan(replace(cost, body=body), x)
+    assert_no_nan(cost.with_body(body), x)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -369,23 +368,19 @@ def test_no_nan_leaves_a_term(
     cost = FULL_COSTS[dtype]
     generator = torch.Generator().manual_seed(seed)
     body = cost.body
-    assert cost.edge_field is not None
+    edges = cost.views[0].edge_field
+    assert edges is not None
     noise = torch.randn(3, body.num_parameters, generator=generator, dtype=torch.float64)
     wild = (scale * noise).nan_to_num(0.0, math.inf, -math.inf).to(dtype)
     x = body.bounds.project(wild).clamp(-1e30, 1e30)
     base = body.base_translation + torch.tensor([0.0, 0.0, shift]).to(dtype)
     field = {
-        "noise": cost.edge_field,
-        "black": torch.zeros_like(cost.edge_field),
-        "white": torch.full_like(cost.edge_field, 0.7),
-        "one line": cost.edge_field * (torch.arange(WIDTH) == 80),
+        "noise": edges,
+        "black": torch.zeros_like(edges),
+        "white": torch.full_like(edges, 0.7),
+        "one line": edges * (torch.arange(WIDTH) == 80),
     }[kind]
-    cost = replace(
-        cost,
-        body=body.with_base(body.base_rotation, base),
-        edge_field=field,
-        energy=edge_energy_field(field),
-    )
+    cost = changed(cost, body=body.with_base(body.base_rotation, base), edge_field=field)
     for name, value in cost.terms(x).items():
         assert torch.isfinite(value).all(), name
     for part in cost.local_model(x):
@@ -405,8 +400,9 @@ def test_screening_is_the_edges_alone(generator: torch.Generator) -> None:
 def test_lengths_belong_to_the_anthropometric_prior(generator: torch.Generator) -> None:
     """It takes the stabiliser's place there, which would otherwise count them twice."""
     body = load_body("body34", free_proportions=True)
-    cost = replace(make_cost(choice=NOTHING), body=body, deviation=None, parent=None)
-    both = replace(cost, choice=CostChoice(contour=None, joints=None))
+    given = {"tables": BodyTables(body), "deviation": None, "prior": None}
+    cost = changed(make_cost(choice=NOTHING), body=body, **given)
+    both = replace(cost, choice=CostChoice(terms=(Stabiliser(), Anthropometric())))
     x = random_states(body, 4, generator=generator)
     terms = both.terms(x)
     assert set(terms) == {"stabiliser", "anthropometric"}
@@ -416,7 +412,7 @@ def test_lengths_belong_to_the_anthropometric_prior(generator: torch.Generator) 
     after = both.terms(moved)
     torch.testing.assert_close(after["stabiliser"], terms["stabiliser"])
     assert (after["anthropometric"] != terms["anthropometric"]).all()
-    without = replace(both, choice=CostChoice(contour=None, joints=None, anthropometric=None))
+    without = replace(both, choice=CostChoice(terms=(Stabiliser(lengths=True),)))
     assert (without.terms(moved)["stabiliser"] != without.terms(x)["stabiliser"]).all()
 
 

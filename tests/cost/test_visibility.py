@@ -15,7 +15,7 @@ from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.surface import surface_points
 from torchcss.cost.contour import ContourTerm
-from torchcss.cost.flow import InteriorNodes
+from torchcss.cost.interior import InteriorNodes
 from torchcss.cost.visibility import (
     ContourNodes,
     ContourPredictor,

@@ -42,7 +42,7 @@ def attached(cost: TrackingCost, modes: Modes, weights: Tensor) -> Tensor:
 @pytest.mark.parametrize("name", ["arm8", "body30"])
 def test_derivatives_are_those_of_the_constrained_minimum(name: str) -> None:
     generator = torch.Generator().manual_seed(4)
-    cost = make_cost(name, replace(EVERYTHING, contour=None))
+    cost = make_cost(name, EVERYTHING.without("contour"))
     start = random_states(cost.body, 3, generator=generator)
     weights = torch.tensor([1.0, 2.0, 0.7], dtype=torch.float64, requires_grad=True)
     # Bounds that cut into the free minimum, so that several variables are held.
@@ -78,7 +78,7 @@ def test_derivatives_are_those_of_the_constrained_minimum(name: str) -> None:
 def test_weights_are_learnt_from_where_the_minimum_should_be() -> None:
     """Descent on the weights finds those that a minimum was made with."""
     generator = torch.Generator().manual_seed(4)
-    cost = make_cost("arm8", replace(EVERYTHING, contour=None))
+    cost = make_cost("arm8", EVERYTHING.without("contour"))
     start = random_states(cost.body, 4, generator=generator)
     true = {"joints": 1.0, "stabiliser": 5.0, "temporal": 0.2}
     bounds = cost.body.bounds

@@ -161,7 +161,7 @@ def test_every_tracker_of_the_table_searches_more_widely(preset: str, generator:
         assert isinstance(narrow, Tracker)
         assert isinstance(wide, Tracker)
         assert wide.num_modes == 4
-        assert wide.memory == 0
+        assert wide.forgetting == 0
         assert not wide.soft_matching
         assert wide.dynamics == narrow.dynamics
         before, after = narrow.proposal, wide.proposal

@@ -8,6 +8,7 @@ from torchcss.errors import ConfigurationError
 from torchcss.inference.dynamics import ConstantVelocity, Diffusion
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.particle import AnnealedParticleFilter, ParticleFilter
+from torchcss.inference.problem import SearchProblem
 from torchcss.inference.tracker import Particles
 from torchcss.types import LocalModel, Status
 
@@ -52,7 +53,9 @@ def test_it_is_the_kalman_filter_where_that_is_exact(options, generator):
     mean, covariance = single().mean[0], single().covariance[0]
     noise = torch.diag(torch.tensor(STEP).double().square())
     state = tracker.init(single(), generator=generator)
-    for cost, (now, info) in zip(costs, tracker.track(state, costs, FREE), strict=True):
+    for cost, (now, info) in zip(
+        costs, tracker.track(state, map(SearchProblem, costs), FREE), strict=True
+    ):
         information = torch.linalg.inv(covariance + noise)
         covariance = torch.linalg.inv(information + cost.hessian)
         mean = covariance @ (information @ mean + cost.hessian @ cost.minimum)
@@ -67,7 +70,9 @@ def test_it_is_the_kalman_filter_where_that_is_exact(options, generator):
 
 @pytest.mark.parametrize("tracker", FILTERS)
 def test_the_mixture_sums_the_particles_up(tracker, generator):
-    state, info = tracker.step(tracker.init(single(), generator=generator), bowl(0.3, 0.2), FREE)
+    state, info = tracker.step(
+        tracker.init(single(), generator=generator), SearchProblem(bowl(0.3, 0.2)), FREE
+    )
     for got, expected in zip(state.mixture.moments(), moments(state.particles), strict=True):
         torch.testing.assert_close(got, expected)
     share = [
@@ -88,7 +93,7 @@ def test_two_separate_wells_are_two_components(tracker, generator):
         well.minima, 0.01 * torch.eye(2).double().expand(2, 2, 2), torch.zeros(2).double()
     )
     state = tracker.init(both, generator=generator)
-    state, info = tracker.step(state, well, BOUNDS)
+    state, info = tracker.step(state, SearchProblem(well), BOUNDS)
     best = state.mixture.mean[:2]
     best = best[best[:, 0].argsort()]
     torch.testing.assert_close(best, well.minima, rtol=0, atol=0.25)
@@ -100,9 +105,9 @@ def test_annealing_drifts_into_a_minimum_that_resampling_misses(generator):
     """Far away and narrow: one layer leaves next to no survivor, many find the way."""
     far = problems.Bowl(400 * torch.eye(2).double(), torch.tensor([2.0, 1.5]).double())
     state = make(ParticleFilter).init(single(variance=(0.01, 0.01)), generator=generator)
-    _, plain = make(ParticleFilter, num_samples=200).step(state, far, FREE)
+    _, plain = make(ParticleFilter, num_samples=200).step(state, SearchProblem(far), FREE)
     annealed = make(AnnealedParticleFilter, num_samples=200, num_layers=10)
-    _, info = annealed.step(state, far, FREE)
+    _, info = annealed.step(state, SearchProblem(far), FREE)
     assert float(info.cost.min()) < 1 < float(plain.cost.min())
     assert float(plain.survival.effective_sample_size) < 5
     assert float(info.survival.survival_rate) > 0.49
@@ -116,7 +121,10 @@ def test_bounds_type_and_repeatability(tracker, dtype):
     runs = []
     for _ in range(2):
         state = tracker.init(mixture, generator=torch.Generator().manual_seed(4))
-        states = [state for state, _ in tracker.track(state, [bowl(1.0, 1.0)] * 2, bounds)]
+        states = [
+            state
+            for state, _ in tracker.track(state, map(SearchProblem, [bowl(1.0, 1.0)] * 2), bounds)
+        ]
         runs.append(states[-1])
     a, b = runs
     assert torch.equal(a.particles.x, b.particles.x)
@@ -129,14 +137,14 @@ def test_bounds_type_and_repeatability(tracker, dtype):
 def test_saved_and_restored_runs_continue_exactly(tracker, generator):
     costs = [bowl(0.1 * t, 0.2) for t in range(6)]
     state = tracker.init(single(), generator=generator)
-    whole = [s for s, _ in tracker.track(state, costs, FREE)][-1]
-    half = [s for s, _ in tracker.track(state, costs[:3], FREE)][-1]
+    whole = [s for s, _ in tracker.track(state, map(SearchProblem, costs), FREE)][-1]
+    half = [s for s, _ in tracker.track(state, map(SearchProblem, costs[:3]), FREE)][-1]
     file = io.BytesIO()
     torch.save([half.mixture._asdict(), *half[1:4], half.particles._asdict()], file)
     file.seek(0)
     mixture, *rest, particles = torch.load(file)
     resumed = type(half)(GaussianMixture(**mixture), *rest, Particles(**particles))
-    end = [s for s, _ in tracker.track(resumed, costs[3:], FREE)][-1]
+    end = [s for s, _ in tracker.track(resumed, map(SearchProblem, costs[3:]), FREE)][-1]
     for a, b in zip(
         (*whole.mixture, *whole.particles), (*end.mixture, *end.particles), strict=True
     ):
@@ -145,8 +153,10 @@ def test_saved_and_restored_runs_continue_exactly(tracker, generator):
 
 @pytest.mark.parametrize("tracker", FILTERS)
 def test_dropped_particles_are_drawn_from_the_mixture(tracker, generator):
-    state, _ = tracker.step(tracker.init(single(), generator=generator), bowl(0.3, 0.2), FREE)
-    again, _ = tracker.step(state._replace(particles=None), bowl(0.3, 0.2), FREE)
+    state, _ = tracker.step(
+        tracker.init(single(), generator=generator), SearchProblem(bowl(0.3, 0.2)), FREE
+    )
+    again, _ = tracker.step(state._replace(particles=None), SearchProblem(bowl(0.3, 0.2)), FREE)
     assert float((again.mixture.moments()[0] - state.mixture.moments()[0]).norm()) < 0.3
 
 
@@ -158,12 +168,14 @@ class Nowhere(problems.Bowl):
 @pytest.mark.parametrize("tracker", FILTERS)
 def test_no_finite_cost(tracker, generator):
     nowhere = Nowhere(torch.eye(2).double(), torch.zeros(2).double())
-    state, info = tracker.step(tracker.init(single(), generator=generator), nowhere, FREE)
+    state, info = tracker.step(
+        tracker.init(single(), generator=generator), SearchProblem(nowhere), FREE
+    )
     assert int(info.status_counts[Status.NON_FINITE]) == tracker.num_samples
     assert int(info.num_distinct) == 0
     assert bool(info.cost.isinf().all())
     assert float(info.survival.effective_sample_size) == 0
-    _, info = tracker.step(state, bowl(0.0, 0.0), FREE)
+    _, info = tracker.step(state, SearchProblem(bowl(0.0, 0.0)), FREE)
     assert float(info.cost.min()) < 0.5
 
 
@@ -171,10 +183,12 @@ def test_no_finite_cost(tracker, generator):
 @pytest.mark.parametrize("variance", [0.0, 1e-14, 1e14])
 def test_awkward_priors(tracker, variance, generator):
     state = tracker.init(single(variance=(variance, variance)), generator=generator)
-    for state, _ in tracker.track(state, [bowl(0.0, 0.0)] * 2, BOUNDS):  # noqa: B020
+    for state, _ in tracker.track(state, map(SearchProblem, [bowl(0.0, 0.0)] * 2), BOUNDS):  # noqa: B020
         assert all(bool(field.isfinite().all()) for field in state.mixture)
     still = make(type(tracker), num_samples=50, dynamics=Diffusion())
-    state, _ = still.step(still.init(single(), generator=generator), bowl(0.0, 0.0), BOUNDS)
+    state, _ = still.step(
+        still.init(single(), generator=generator), SearchProblem(bowl(0.0, 0.0)), BOUNDS
+    )
     assert 1 <= len(state.mixture.mean) <= 3
 
 
@@ -188,7 +202,7 @@ def test_velocity_carries_particles_on(generator):
     for dynamics in (ConstantVelocity(deviation=0.05), Diffusion(deviation=0.05)):
         tracker = make(ParticleFilter, dynamics=dynamics)
         state = tracker.init(single(variance=(0.01, 0.01)), generator=generator)
-        *_, (state, _) = tracker.track(state, path, FREE)
+        *_, (state, _) = tracker.track(state, map(SearchProblem, path), FREE)
         behind.append(float(path[-1].minimum[0] - state.mixture.moments()[0][0]))
     assert abs(behind[0]) < 0.05 < behind[1]
     assert float(state.velocity[0, 0]) == pytest.approx(0.2, abs=0.1)
@@ -198,13 +212,16 @@ def test_parents_are_the_modes_of_the_last_frame(generator):
     tracker = make(ParticleFilter, num_samples=100)
     seen = []
 
-    def cost(parent, prior):
+    def children(parent, prior):
         seen.append((parent, prior))
-        return problems.ItemBowls(torch.ones(len(parent), 1).double(), prior.mean[parent])
+        minima = prior.mean[parent]
+        return SearchProblem(problems.ItemBowls(torch.ones(len(parent), 1).double(), minima))
+
+    problem = SearchProblem(bowl(0.0, 0.0), of_children=children)
 
     state = tracker.init(single(), generator=generator)
-    state, _ = tracker.step(state, cost, FREE)
-    state, info = tracker.step(state, cost, FREE)
+    state, _ = tracker.step(state, problem, FREE)
+    state, info = tracker.step(state, problem, FREE)
     for parent, prior in seen:
         assert int(parent.max()) < len(prior.mean)
     assert len(seen) == 4

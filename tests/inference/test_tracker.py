@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.inference.dynamics import ConstantVelocity, Diffusion
 from torchcss.inference.mixture import GaussianMixture
+from torchcss.inference.problem import SearchProblem
 from torchcss.inference.proposals import CovarianceScaled, EigenDirectionGrid, Samples
-from torchcss.inference.tracker import Tracker, stated_evidence
+from torchcss.inference.tracker import Tracker
 from torchcss.types import LocalModel, Status
 
 BOUNDS = problems.box(2, -6, 6)
@@ -26,7 +27,9 @@ def single(mean=(2.0, 1.0), variance=(1.0, 0.25)) -> GaussianMixture:
 def test_both_wells_are_found_and_followed(generator):
     state = CSS.init(single(), generator=generator)
     wells = [problems.DoubleWell(slope=0.5 + 0.02 * t) for t in range(5)]
-    for well, (now, info) in zip(wells, CSS.track(state, wells, BOUNDS), strict=True):
+    for well, (now, info) in zip(
+        wells, CSS.track(state, map(SearchProblem, wells), BOUNDS), strict=True
+    ):
         state = now
         found = state.mixture.mean[state.mixture.mean[:, 0].argsort()]
         torch.testing.assert_close(found, well.minima, rtol=0, atol=0.02)
@@ -47,13 +50,15 @@ def test_both_wells_are_found_and_followed(generator):
 
 def test_weights_are_those_of_the_costs(generator):
     well = problems.DoubleWell(tilt=0.4)
-    state, info = CSS.step(CSS.init(single(), generator=generator), well, BOUNDS)
+    state, info = CSS.step(CSS.init(single(), generator=generator), SearchProblem(well), BOUNDS)
     # One prior mode: its weight is one, and the posterior that of the likelihood.
     expected = (-info.cost).softmax(0)
     torch.testing.assert_close(state.mixture.weight, expected)
     assert info.parent.tolist() == [0, -1]
     evidence = Tracker(proposal=CSS.proposal, num_samples=40, num_modes=3, laplace_evidence=True)
-    state, info = evidence.step(evidence.init(single(), generator=generator), well, BOUNDS)
+    state, info = evidence.step(
+        evidence.init(single(), generator=generator), SearchProblem(well), BOUNDS
+    )
     expected = (-info.cost + 0.5 * state.mixture.covariance.logdet()).softmax(0)
     torch.testing.assert_close(state.mixture.weight, expected)
 
@@ -67,14 +72,14 @@ def test_saved_and_restored_runs_continue_exactly(generator):
         dynamics=ConstantVelocity(deviation=0.01),
     )
     state = tracker.init(single(), generator=generator)
-    whole = [s for s, _ in tracker.track(state, wells, BOUNDS)][-1]
-    half = [s for s, _ in tracker.track(state, wells[:3], BOUNDS)][-1]
+    whole = [s for s, _ in tracker.track(state, map(SearchProblem, wells), BOUNDS)][-1]
+    half = [s for s, _ in tracker.track(state, map(SearchProblem, wells[:3]), BOUNDS)][-1]
     file = io.BytesIO()
     torch.save([half.mixture._asdict(), half.velocity, half.generator_state, half.frame], file)
     file.seek(0)
     mixture, *rest = torch.load(file)
     resumed = type(half)(GaussianMixture(**mixture), *rest)
-    end = [s for s, _ in tracker.track(resumed, wells[3:], BOUNDS)][-1]
+    end = [s for s, _ in tracker.track(resumed, map(SearchProblem, wells[3:]), BOUNDS)][-1]
     assert whole.particles is end.particles is None
     for a, b in zip((*whole.mixture, *whole[1:4]), (*end.mixture, *end[1:4]), strict=True):
         assert torch.equal(a, b)
@@ -82,14 +87,14 @@ def test_saved_and_restored_runs_continue_exactly(generator):
 
 def test_a_step_is_a_pure_function_of_the_state(generator):
     state = CSS.init(single(), generator=generator)
-    a, _ = CSS.step(state, problems.DoubleWell(), BOUNDS)
-    b, _ = CSS.step(state, problems.DoubleWell(), BOUNDS)
+    a, _ = CSS.step(state, SearchProblem(problems.DoubleWell()), BOUNDS)
+    b, _ = CSS.step(state, SearchProblem(problems.DoubleWell()), BOUNDS)
     assert torch.equal(a.mixture.mean, b.mixture.mean)
     assert torch.equal(generator.get_state(), state.generator_state)
 
 
 @dataclass(frozen=True)
-class FarWells:
+class FarWells(problems.Alike):
     """Two wells that have moved ten widths away from the modes; the smoother self reaches them."""
 
     width: float = 0.1
@@ -109,8 +114,8 @@ class FarWells:
     def local_model(self, x):
         return self._cost().local_model(x)
 
-    def coarse(self):
-        return None if self.width > 1 else replace(self, width=2.0)
+    def problem(self):
+        return SearchProblem(self, coarse=replace(self, width=2.0))
 
 
 @pytest.mark.parametrize("num_samples", [12, 3, 2])
@@ -120,7 +125,9 @@ def test_every_mode_descends_on_the_smoother_cost(num_samples, generator):
     covariance = 1e-4 * torch.eye(2).double().expand(2, 2, 2)
     mixture = GaussianMixture(mean, covariance, torch.tensor([0.0, -30.0]).double())
     tracker = replace(CSS, num_samples=num_samples, num_modes=4, coarse_every=3)
-    state, info = tracker.step(tracker.init(mixture, generator=generator), FarWells(), BOUNDS)
+    state, info = tracker.step(
+        tracker.init(mixture, generator=generator), FarWells().problem(), BOUNDS
+    )
     found = torch.cdist(FarWells.centres, state.mixture.mean) < 1e-3
     assert int(info.num_samples) == num_samples
     if num_samples == 12:
@@ -132,7 +139,7 @@ def test_every_mode_descends_on_the_smoother_cost(num_samples, generator):
     else:  # one is drawn, or none, and the best mode begins
         assert found.any(1).tolist() == [True, False]
     never = replace(tracker, coarse_every=0)
-    state, _ = never.step(never.init(mixture, generator=generator), FarWells(), BOUNDS)
+    state, _ = never.step(never.init(mixture, generator=generator), FarWells().problem(), BOUNDS)
     assert not (torch.cdist(FarWells.centres, state.mixture.mean) < 0.5).any()
 
 
@@ -152,7 +159,7 @@ def test_the_order_of_the_samples_is_irrelevant(generator):
     other = Tracker(proposal=Shuffled(), num_samples=40, num_modes=3)
     well = problems.DoubleWell(tilt=0.3)
     state = CSS.init(single(), generator=generator)
-    a, b = (t.step(state, well, BOUNDS)[0].mixture for t in (CSS, other))
+    a, b = (t.step(state, SearchProblem(well), BOUNDS)[0].mixture for t in (CSS, other))
     torch.testing.assert_close(a.mean, b.mean, rtol=1e-6, atol=1e-6)
     torch.testing.assert_close(a.log_weight, b.log_weight, rtol=1e-6, atol=1e-6)
 
@@ -170,7 +177,8 @@ def test_awkward_covariances(variance, num_modes, single_precision, seed):
     mixture = GaussianMixture(*(x.to(dtype) for x in mixture))
     tracker = Tracker(proposal=CSS.proposal, num_samples=15, num_modes=num_modes)
     state = tracker.init(mixture, generator=torch.Generator().manual_seed(seed))
-    for state, info in tracker.track(state, [problems.DoubleWell(tilt=0.2)] * 3, BOUNDS):  # noqa: B020
+    frames = [SearchProblem(problems.DoubleWell(tilt=0.2))] * 3
+    for state, info in tracker.track(state, frames, BOUNDS):  # noqa: B020
         assert 1 <= len(state.mixture.mean) <= num_modes
         assert all(bool(x.isfinite().all()) for x in state.mixture)
         assert state.mixture.mean.dtype == dtype
@@ -180,7 +188,7 @@ def test_awkward_covariances(variance, num_modes, single_precision, seed):
 
 def test_all_samples_in_one_minimum(generator):
     bowl = problems.Bowl(4 * torch.eye(2).double(), torch.tensor([0.5, 0.0]).double())
-    state, info = CSS.step(CSS.init(single(), generator=generator), bowl, BOUNDS)
+    state, info = CSS.step(CSS.init(single(), generator=generator), SearchProblem(bowl), BOUNDS)
     assert state.mixture.mean.shape == (1, 2)
     assert float(state.mixture.log_weight) == 0
     assert int(info.num_distinct) == 1
@@ -197,13 +205,13 @@ def test_no_sample_with_a_finite_cost_carries_the_prior_over(generator):
         proposal=CSS.proposal, num_samples=10, num_modes=3, dynamics=Diffusion(deviation=0.5)
     )
     start = tracker.init(single(), generator=generator)
-    state, info = tracker.step(start, Nowhere(), BOUNDS)
+    state, info = tracker.step(start, SearchProblem(Nowhere()), BOUNDS)
     assert torch.equal(state.mixture.mean, start.mixture.mean)
     assert bool((state.mixture.covariance - start.mixture.covariance).diagonal(0, 1, 2).gt(0).all())
     assert int(info.status_counts[Status.NON_FINITE]) == 10
     assert int(info.num_distinct) == 0
     assert info.cost.tolist() == [torch.inf]
-    state, info = tracker.step(state, problems.DoubleWell(), BOUNDS)
+    state, info = tracker.step(state, SearchProblem(problems.DoubleWell()), BOUNDS)
     assert float(info.cost.min()) < 0.01
 
 
@@ -215,7 +223,7 @@ def test_weights_do_not_underflow(generator):
         well.minima, 0.01 * torch.eye(2).double().expand(2, 2, 2), torch.zeros(2).double()
     )
     state = tracker.init(both, generator=generator)
-    *_, (state, _) = tracker.track(state, [well] * 100, BOUNDS)
+    *_, (state, _) = tracker.track(state, map(SearchProblem, [well] * 100), BOUNDS)
     assert len(state.mixture.mean) == 2
     assert -5000 < float(state.mixture.log_weight[1]) < -3000
 
@@ -231,7 +239,11 @@ def test_a_cost_made_from_the_samples_parents(generator):
         return Sticky(torch.ones(len(parent), 1).double(), prior.mean[parent])
 
     state = CSS.init(single(), generator=generator)
-    state, _ = CSS.step(state, make, BOUNDS)
+    problem = SearchProblem(
+        problems.Bowl(torch.eye(2).double(), torch.zeros(2).double()),
+        of_children=lambda parent, prior: SearchProblem(make(parent, prior)),
+    )
+    state, _ = CSS.step(state, problem, BOUNDS)
     parent, prior = seen[0]
     assert parent.shape == (40,)
     assert torch.equal(prior.mean, single().mean)
@@ -245,7 +257,7 @@ def test_bad_input(generator):
         CSS.init(single()._replace(covariance=torch.eye(3)[None]), generator=generator)
     state = CSS.init(single(), generator=generator)
     with pytest.raises(ShapeError, match="bounds"):
-        CSS.step(state, problems.DoubleWell(), problems.box(3, -1, 1))
+        CSS.step(state, SearchProblem(problems.DoubleWell()), problems.box(3, -1, 1))
 
 
 @pytest.mark.parametrize("screened", [False, True])
@@ -258,19 +270,16 @@ def test_oversampling_descends_from_the_best_alone(generator, screened):
             starts.append(x)
             return super().local_model(x)
 
-    class Screened(Watched):
-        def screening(self):
-            return problems.Bowl(torch.eye(2).double(), torch.tensor([-2.0, 1.0]).double())
-
-    cost = Screened() if screened else Watched()
+    screening = problems.Bowl(torch.eye(2).double(), torch.tensor([-2.0, 1.0]).double())
+    problem = SearchProblem(Watched(), screening=screening if screened else None)
     many = replace(CSS, num_samples=6, oversampling=20)
     state = many.init(single(), generator=generator)
     again = torch.Generator()
     again.set_state(state.generator_state)
     drawn = many.proposal.sample(state.mixture, 120, BOUNDS, generator=again).x
-    score = cost.screening().value(drawn) if screened else problems.DoubleWell().value(drawn)
+    score = screening.value(drawn) if screened else problems.DoubleWell().value(drawn)
     starts.clear()
-    _, info = many.step(state, cost, BOUNDS)
+    _, info = many.step(state, problem, BOUNDS)
     assert int(info.num_samples) == 6
     first = next(x for x in starts if len(x) == 6)
     # The mode that goes on from the last frame comes first, whatever it costs.
@@ -278,15 +287,15 @@ def test_oversampling_descends_from_the_best_alone(generator, screened):
     torch.testing.assert_close(first, drawn[score.argsort()[:6].sort().values])
 
 
-@pytest.mark.parametrize("finalists", [0, 3])
-def test_oversampling_keeps_the_modes_of_the_last_frame(generator, finalists):
+@pytest.mark.parametrize("survivors", [0, 3])
+def test_oversampling_keeps_the_modes_of_the_last_frame(generator, survivors):
     """A mode of little weight in the other well, where hardly a sample falls."""
     well = problems.DoubleWell()
     two = GaussianMixture(
         well.minima, 0.01 * torch.eye(2).double().expand(2, 2, 2), torch.tensor([0.0, -9.0])
     ).normalise()
-    tracker = replace(CSS, num_samples=8, oversampling=10, finalists=finalists)
-    state, _ = tracker.step(tracker.init(two, generator=generator), well, BOUNDS)
+    tracker = replace(CSS, num_samples=8, oversampling=10, survivors=survivors)
+    state, _ = tracker.step(tracker.init(two, generator=generator), SearchProblem(well), BOUNDS)
     assert len(state.mixture.mean) == 2
 
 
@@ -300,7 +309,7 @@ def test_modes_that_see_nothing_come_to_rest_inside_the_bounds(generator):
     state = tracker.init(five, generator=generator)
     state = state._replace(velocity=torch.tensor([[0.4, -0.4]]).double().expand(5, 2))
     for _ in range(12):
-        state, info = tracker.step(state, Nowhere(), BOUNDS)
+        state, info = tracker.step(state, SearchProblem(Nowhere()), BOUNDS)
         assert len(state.mixture.mean) == len(info.cost) == 1
         assert torch.equal(BOUNDS.project(state.mixture.mean), state.mixture.mean)
     # 0.2 + 0.1 + ...: half of the velocity goes on each time.
@@ -313,25 +322,33 @@ def test_modes_that_see_nothing_come_to_rest_inside_the_bounds(generator):
 def test_evidence_is_the_power_of_the_likelihood(generator):
     well = problems.DoubleWell(tilt=0.4)
     for evidence in (1.0, 0.1):
-        tracker = replace(CSS, evidence=evidence)
-        state, info = tracker.step(tracker.init(single(), generator=generator), well, BOUNDS)
+        tracker = replace(CSS, likelihood_power=evidence)
+        state, info = tracker.step(
+            tracker.init(single(), generator=generator), SearchProblem(well), BOUNDS
+        )
         torch.testing.assert_close(state.mixture.weight, (-evidence * info.cost).softmax(0))
         assert info.parent.tolist() == [0, -1]
         # The covariances that are stated may have another; the weights do not change with it.
-        other = replace(tracker, covariance_evidence=0.5)
-        assert (stated_evidence(tracker), stated_evidence(other)) == (evidence, 0.5)
-        same, _ = other.step(other.init(single(), generator=generator), well, BOUNDS)
+        other = replace(tracker, covariance_power=0.5)
+        assert (tracker.stated_power, other.stated_power) == (evidence, 0.5)
+        same, _ = other.step(other.init(single(), generator=generator), SearchProblem(well), BOUNDS)
         assert torch.equal(same.mixture.weight, state.mixture.weight)
     # Frame after frame it adds up: the odds of two modes are those of all costs so far.
     assert float(info.cost[1] - info.cost[0]) > 0.5
     both = GaussianMixture(
         well.minima, 0.01 * torch.eye(2).double().expand(2, 2, 2), torch.zeros(2).double()
     )
-    tracker = Tracker(proposal=EigenDirectionGrid(), num_samples=20, num_modes=2, evidence=0.1)
+    tracker = Tracker(
+        proposal=EigenDirectionGrid(), num_samples=20, num_modes=2, likelihood_power=0.1
+    )
     state = tracker.init(both, generator=generator)
-    *_, (state, info) = tracker.track(state, [well] * 30, BOUNDS)
+    *_, (state, info) = tracker.track(state, map(SearchProblem, [well] * 30), BOUNDS)
     odds = state.mixture.log_weight[0] - state.mixture.log_weight[1]
     torch.testing.assert_close(odds, 3 * (info.cost[1] - info.cost[0]), rtol=1e-3, atol=1e-3)
+
+
+def with_landmarks(cost) -> SearchProblem:
+    return SearchProblem(cost, landmarks=cost.landmarks)
 
 
 class Comb(problems.AutogradCost):
@@ -344,7 +361,7 @@ class Comb(problems.AutogradCost):
         )
 
 
-class CombWithLandmarks(Comb):
+class LandmarkedComb(Comb):
     """The landmark is where the state is; a second one never moves, and does not count."""
 
     def landmarks(self, x):
@@ -359,15 +376,15 @@ def test_separation_keeps_modes_whose_landmarks_differ(generator):
         # In multiples of the distance between two minima, the best mode first.
         return (state.mixture.mean[:, 0] / 1.5).round().int().tolist()
 
-    assert found(CombWithLandmarks(), 0.0, 5) == [0, 1, -1, 2, -2]
+    assert found(with_landmarks(LandmarkedComb()), 0.0, 5) == [0, 1, -1, 2, -2]
     # Next neighbours' landmarks are 1.5 apart, every second one's 3.
-    assert found(CombWithLandmarks(), 1.4, 3) == [0, 1, -1]
-    assert found(CombWithLandmarks(), 2.8, 3) == [0, 2, -2]
+    assert found(with_landmarks(LandmarkedComb()), 1.4, 3) == [0, 1, -1]
+    assert found(with_landmarks(LandmarkedComb()), 2.8, 3) == [0, 2, -2]
     # Places left go to the best of those alike; the order is that of the weights.
-    assert found(CombWithLandmarks(), 2.8, 4) == [0, 1, 2, -2]
-    assert found(CombWithLandmarks(), 50.0, 3) == [0, 1, -1]
+    assert found(with_landmarks(LandmarkedComb()), 2.8, 4) == [0, 1, 2, -2]
+    assert found(with_landmarks(LandmarkedComb()), 50.0, 3) == [0, 1, -1]
     # A cost without landmarks is not concerned.
-    assert found(Comb(), 2.8, 3) == [0, 1, -1]
+    assert found(SearchProblem(Comb()), 2.8, 3) == [0, 1, -1]
 
 
 def step_of_rivals(generator, *, soft_matching: bool, evidence: float = 1.0):
@@ -378,7 +395,7 @@ def step_of_rivals(generator, *, soft_matching: bool, evidence: float = 1.0):
         num_modes=2,
         separation=1.6,
         soft_matching=soft_matching,
-        evidence=evidence,
+        likelihood_power=evidence,
     )
     past = GaussianMixture(
         torch.tensor([[1.4, 0.0], [0.0, 0.0]]).double(),
@@ -386,7 +403,7 @@ def step_of_rivals(generator, *, soft_matching: bool, evidence: float = 1.0):
         torch.tensor([0.0, -18.0]).double(),
     )
     state = tracker.init(past, generator=generator)
-    state, info = tracker.step(state, CombWithLandmarks(), problems.box(2, -3.7, 3.7))
+    state, info = tracker.step(state, with_landmarks(LandmarkedComb()), problems.box(2, -3.7, 3.7))
     return (state.mixture.mean[:, 0] / 1.5).round().int().tolist(), state, info
 
 
@@ -413,27 +430,27 @@ def test_with_soft_matching_who_weighs_most_is_kept(separation, kept, generator)
     """At 3, where the past is; three poses are cheaper, by half a nat, and new."""
     tracker = replace(
         CSS, num_samples=80, num_modes=len(kept), separation=separation, soft_matching=True,
-        evidence=0.1,
+        likelihood_power=0.1,
     )  # fmt: skip
     start = tracker.init(single((3.0, 0.0), (0.8, 0.1)), generator=generator)
-    state, info = tracker.step(start, CombWithLandmarks(), problems.box(2, -3.7, 3.7))
+    state, info = tracker.step(start, with_landmarks(LandmarkedComb()), problems.box(2, -3.7, 3.7))
     assert (state.mixture.mean[:, 0] / 1.5).round().int().tolist() == kept
     assert int(info.parent[0]) == 0
     assert int(info.num_distinct) >= 4
     hard = replace(tracker, soft_matching=False)
-    state, _ = hard.step(start, CombWithLandmarks(), problems.box(2, -3.7, 3.7))
+    state, _ = hard.step(start, with_landmarks(LandmarkedComb()), problems.box(2, -3.7, 3.7))
     without = (state.mixture.mean[:, 0] / 1.5).round().int().tolist()
     assert (2 in without) == (separation == 1.6 and len(kept) > 1)
 
 
-def test_a_race_leaves_the_best_minima_and_takes_fewer_evaluations(generator):
-    def run(finalists: int):
-        tracker = replace(CSS, num_samples=200, num_modes=5, finalists=finalists)
+def test_halving_leaves_the_best_minima_and_takes_fewer_evaluations(generator):
+    def run(survivors: int):
+        tracker = replace(CSS, num_samples=200, num_modes=5, survivors=survivors)
         start = tracker.init(single((0.0, 0.0), (0.6, 0.1)), generator=generator)
-        return tracker.step(start, Comb(), problems.box(2, -3.7, 3.7))
+        return tracker.step(start, SearchProblem(Comb()), problems.box(2, -3.7, 3.7))
 
-    (every, all_of_them), (raced, info) = run(0), run(20)
-    torch.testing.assert_close(raced.mixture.mean[:3], every.mixture.mean[:3], rtol=0, atol=1e-3)
+    (every, all_of_them), (halved, info) = run(0), run(20)
+    torch.testing.assert_close(halved.mixture.mean[:3], every.mixture.mean[:3], rtol=0, atol=1e-3)
     assert int(info.num_samples) == int(all_of_them.num_samples) == 200
     assert int(info.status_counts.sum()) <= 20
     assert int(info.num_steps.sum()) < 0.8 * int(all_of_them.num_steps.sum())
@@ -471,34 +488,36 @@ class FromThePlaces:
         return torch.zeros_like(x[..., 0])
 
 
-def test_a_race_leaves_what_is_unlike(generator):
+def test_halving_leaves_what_is_unlike(generator):
     """Four places: the crowd of the best minima alone would fill them."""
 
     def found(separation: float) -> list[float]:
         tracker = replace(CSS, proposal=FromThePlaces(), num_samples=12, num_modes=4)
-        tracker = replace(tracker, finalists=4, separation=separation)
+        tracker = replace(tracker, survivors=4, separation=separation)
         start = tracker.init(single((0.0, 0.0), (1e-4, 0.1)), generator=generator)
-        state, _ = tracker.step(start, Crowded(), problems.box(2, -3.7, 3.7))
+        state, _ = tracker.step(start, with_landmarks(Crowded()), problems.box(2, -3.7, 3.7))
         return sorted(state.mixture.mean[:, 0].mul(10).round().int().tolist())  # decimetres
 
     assert found(0.0) == [0, 0, 0, 0]
     assert found(0.5) == [-20, 0, 20, 30]
 
 
-@pytest.mark.parametrize(("finalists", "left"), [(4, 4), (2, 3)])
-def test_a_race_never_drops_modes_for_being_alike(generator, finalists, left):
+@pytest.mark.parametrize(("survivors", "left"), [(4, 4), (2, 3)])
+def test_halving_never_drops_modes_for_being_alike(generator, survivors, left):
     """Nor for want of places."""
     near = torch.tensor([[0.01, 0.0], [-0.02, 0.0], [0.03, 0.0]]).double()
     three = GaussianMixture(
         near, 1e-4 * torch.eye(2).double().expand(3, 2, 2), torch.zeros(3).double()
     )
-    tracker = replace(CSS, num_samples=30, num_modes=6, finalists=finalists, separation=0.5)
-    _, info = tracker.step(tracker.init(three, generator=generator), Crowded(), BOUNDS)
+    tracker = replace(CSS, num_samples=30, num_modes=6, survivors=survivors, separation=0.5)
+    _, info = tracker.step(
+        tracker.init(three, generator=generator), with_landmarks(Crowded()), BOUNDS
+    )
     assert int(info.status_counts.sum()) == left
     assert {0, 1, 2} <= set(info.origin.tolist())
 
 
-def test_a_race_never_drops_the_modes_that_go_on(generator):
+def test_halving_never_drops_the_modes_that_go_on(generator):
     """The lesser well is the worst of all starts once half of the samples are near the better."""
     well = problems.DoubleWell(tilt=0.4)
     both = GaussianMixture(
@@ -506,8 +525,8 @@ def test_a_race_never_drops_the_modes_that_go_on(generator):
         1e-4 * torch.eye(2).double().expand(2, 2, 2),
         torch.tensor([0.0, -9.0]).double(),
     )
-    tracker = replace(CSS, num_samples=60, num_modes=2, finalists=4)
-    state, _ = tracker.step(tracker.init(both, generator=generator), well, BOUNDS)
+    tracker = replace(CSS, num_samples=60, num_modes=2, survivors=4)
+    state, _ = tracker.step(tracker.init(both, generator=generator), SearchProblem(well), BOUNDS)
     torch.testing.assert_close(
         state.mixture.mean.sort(dim=0).values, well.minima.sort(dim=0).values, rtol=0, atol=0.05
     )

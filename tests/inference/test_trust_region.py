@@ -254,7 +254,7 @@ def test_jumping_costs_stop(height, generator):
 def test_a_concave_potential_does_not_shorten_the_steps(generator):
     """The Gauss-Newton model promises too little there; that is no reason to distrust it."""
 
-    class Ramp:
+    class Ramp(problems.Alike):
         """|x|, smoothed: its quadratic upper bound promises half of the decrease."""
 
         def value(self, x):

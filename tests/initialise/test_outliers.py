@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
 
 from torchcss.cost.anthropometric import Anthropometric
+from torchcss.cost.choice import CostChoice
+from torchcss.cost.context import FrameContext
 from torchcss.cost.joints import JointTerm
-from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.cost.stabiliser import Stabiliser
+from torchcss.cost.total import TrackingCost
 from torchcss.initialise.multi_start import Search
 from torchcss.initialise.outliers import (
     best_distinct,
@@ -28,12 +30,9 @@ def person_and_cost(seed: int = 0, **options) -> tuple[Person, TrackingCost]:
     """A person and the cost of the marks, lengths known."""
     someone = random_person(generator=torch.Generator().manual_seed(seed), **options)
     keypoints = Keypoints(someone.keypoints, someone.confidence, someone.joint_names)
-    choice = CostChoice(
-        contour=None, joints=JointTerm(sigma=2.0), temporal=None, anthropometric=Anthropometric()
-    )
-    return someone, TrackingCost(
-        body=someone.body, camera=someone.camera, choice=choice, keypoints=keypoints
-    )
+    choice = CostChoice(terms=(JointTerm(sigma=2.0), Stabiliser(), Anthropometric()))
+    view = FrameContext(body=someone.body, camera=someone.camera, keypoints=keypoints)
+    return someone, TrackingCost(choice=choice, views=(view,))
 
 
 def moved(cost: TrackingCost, mark: int, pixels: tuple[float, float]) -> TrackingCost:
@@ -41,7 +40,7 @@ def moved(cost: TrackingCost, mark: int, pixels: tuple[float, float]) -> Trackin
     assert cost.keypoints is not None
     places = cost.keypoints.positions.clone()
     places[mark] += places.new_tensor(pixels)
-    return replace(cost, keypoints=cost.keypoints._replace(positions=places))
+    return cost.with_keypoints(cost.keypoints._replace(positions=places))
 
 
 def test_price_is_that_of_a_place_anywhere_in_the_image():
@@ -73,7 +72,7 @@ def test_where_very_many_marks_do_not_fit_none_is_left_out(generator: torch.Gene
     assert cost.keypoints is not None
     size = torch.tensor(cost.camera.image_size_wh)
     anywhere = size * torch.rand(14, 2, generator=generator).double()
-    scattered = replace(cost, keypoints=cost.keypoints._replace(positions=anywhere))
+    scattered = cost.with_keypoints(cost.keypoints._replace(positions=anywhere))
     search = Search()
     fits = best_distinct(refine(scattered, someone.state[None], search))
     assert not bool(find_outliers(scattered, fits, search).any())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Self
 
 import pytest
 import torch
@@ -10,8 +11,11 @@ from torch import Tensor
 
 from torchcss.body.load import load_body
 from torchcss.body.model import differentiate_twice
+from torchcss.cost.choice import CostChoice
+from torchcss.cost.context import FrameContext
 from torchcss.cost.joints import JointTerm
-from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.cost.stabiliser import Stabiliser
+from torchcss.cost.total import TrackingCost
 from torchcss.errors import BodyError, CameraError, ShapeError
 from torchcss.inference.trust_region import TrustRegionNewton, default_prior_variance
 from torchcss.linalg import covariance_factor
@@ -72,11 +76,10 @@ def test_a_slow_twin_agrees() -> None:
     """The tracker's cost with nothing but joints and priors."""
     names = ("l_wrist", "r_wrist", "l_elbow", "r_knee", "l_ankle")
     problem = make(potential=ROBUST, joint_names=names, pixel_noise=2.0)
-    keypoints = Keypoints(problem.observed, torch.ones(len(names)).double(), names)
-    choice = CostChoice(contour=None, temporal=None, joints=JointTerm(sigma=2.0, nu=8.0))
-    twin = TrackingCost(
-        body=problem.body, camera=problem.camera, choice=choice, keypoints=keypoints
-    )
+    observation = Keypoints(problem.observed, torch.ones(len(names)).double(), names)
+    choice = CostChoice(terms=(JointTerm(sigma=2.0, nu=8.0), Stabiliser()))
+    view = FrameContext(body=problem.body, camera=problem.camera, keypoints=observation)
+    twin = TrackingCost(choice=choice, views=(view,))
     x = starts(problem, 20, spread=0.3)
     assert bool((problem.body.pose(x).joints[..., 2] < -0.1).all()), "all before the camera"
     for got, want in zip(problem.cost.local_model(x), twin.local_model(x), strict=True):
@@ -196,6 +199,9 @@ def test_fewer_evaluations_than_with_either_hessian() -> None:
 
         def __init__(self, cost: ReprojectionCost) -> None:
             self.value, self.local_model = cost.value, cost.local_model
+
+        def take(self, items: Tensor) -> Self:
+            return self
 
     class GaussNewton(Exact):
         def __init__(self, cost: ReprojectionCost) -> None:

@@ -10,18 +10,19 @@ import pytest
 import torch
 from made_sessions import seen_by, session_at
 
+from torchcss.cost.region import RegionTerm
 from torchcss.cost.total import TrackingCost
 from torchcss.errors import ConfigurationError
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.studies.render.sequences import arm_sequence
 from torchcss.studies.scenes import Scene, arm_scenes, clip_scenes
 from torchcss.tracking.settings import (
-    ALL_TERMS,
     Settings,
+    all_terms,
 )
 from torchcss.types import Frame
 
-TERMS = tuple(term for term in ALL_TERMS if term not in ("temporal_mixture", "region"))
+TERMS = tuple(term for term in all_terms() if term not in ("temporal_mixture", "region"))
 SETTINGS = Settings(body="arm8", terms=TERMS)
 
 
@@ -82,7 +83,7 @@ def test_colours_are_those_of_the_frame_before() -> None:
     assert not first.terms(x).get("region", torch.zeros(1)).any(), "nothing is known at first"
     torch.testing.assert_close(scene.cost.terms(x)["region"], second.terms(x)["region"])
     # A fitted outline costs less than half, which is what colours that say nothing cost.
-    share = float(scene.cost.terms(x)["region"]) / scene.cost.choice.region_weight
+    share = float(scene.cost.terms(x)["region"]) / RegionTerm().weight
     assert 0 < share < 0.4
 
 

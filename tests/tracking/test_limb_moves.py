@@ -6,14 +6,17 @@ from dataclasses import replace
 
 import pytest
 import torch
+from made_costs import Ready
 from painted import a_body_before_a_camera, layers, moved, painted
 from torch import Tensor
 
 from torchcss.body.flips import Limb, Segments
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
-from torchcss.cost.segmentation import SegmentationTerm
-from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.cost.choice import CostChoice
+from torchcss.cost.context import FrameContext
+from torchcss.cost.segmentation import BoundSegmentation, SegmentationTerm
+from torchcss.cost.total import TrackingCost
 from torchcss.inference.dynamics import ConstantVelocity
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.proposals import CovarianceScaled
@@ -42,15 +45,10 @@ def cost_of(
     truth, term = moved(body, angle), SegmentationTerm()
     likeness = painted(body, camera, truth, missing)
     images = term.images(likeness, layers(body)[1], camera, body, truth)
-    choice = CostChoice(segmentation=term, contour=None, joints=None, interpenetration=None)
-    cost = TrackingCost(
-        body=body,
-        camera=camera,
-        choice=choice,
-        segmentation=images,
-        deviation=body.motion_rate / 25,
-    )
-    return body, replace(cost, others=(cost.alone,) * (views - 1))
+    colours = Ready(term, BoundSegmentation(term, images))
+    choice = CostChoice().without("contour", "joints").having(colours)
+    view = FrameContext(body=body, camera=camera, deviation=body.motion_rate / 25)
+    return body, TrackingCost(choice=choice, views=(view,) * views)
 
 
 def state_at(body: BodyModel, x: Tensor, *others: Tensor) -> TrackerState:
@@ -103,7 +101,7 @@ def test_it_is_found_where_it_looks_like_itself():
     elbow = body.joint_index("r_elbow")
     missed = [float((each[elbow] - uv[1][elbow]).norm()) for each in (uv[0], *uv[2:])]
     assert missed[1] < 0.3 * missed[0]
-    assert bool((cost.unsearched(poses) < cost.unsearched(x) - 5).all())
+    assert bool((cost.weight_only(poses) < cost.weight_only(x) - 5).all())
     joints = body.pose(poses).joints
     apart = (joints[:, None] - joints).norm(dim=-1).amax(-1)
     assert float((apart + torch.eye(len(poses))).min()) > 0.15
@@ -130,9 +128,10 @@ def test_what_cannot_be_seen_is_left_alone():
         away.mixture.mean[:, body.state_index(column)] += shift
         assert names(astray_limbs(cost, body, away.mixture.mean[0])) == ["l_arm", "r_arm"]
         assert with_limbs(away, body, cost, DYNAMICS, body.bounds, num=4) is away
-    blind = replace(cost, choice=replace(cost.choice, segmentation=None))
+    blind = replace(cost, choice=cost.choice.without("segmentation"))
     assert astray_limbs(blind, body, moved(body, 0.5)) == []
-    assert astray_limbs(replace(cost, segmentation=None), body, moved(body, 0.5)) == []
+    unknown = replace(cost, choice=cost.choice.having(SegmentationTerm()))
+    assert astray_limbs(unknown, body, moved(body, 0.5)) == []
 
 
 def test_an_arm_before_the_chest_is_found_where_it_is():
@@ -179,7 +178,7 @@ def test_a_tracker_goes_on_with_the_arm_that_it_had_lost():
     body, cost = cost_of(1.4)
     tracker = Tracker(
         proposal=CovarianceScaled(covariance_scale=1.0), num_samples=12, num_modes=4,
-        dynamics=DYNAMICS, evidence=0.3, soft_matching=True, coarse_every=0,
+        dynamics=DYNAMICS, likelihood_power=0.3, soft_matching=True, coarse_every=0,
     )  # fmt: skip
     elbow, truth = body.joint_index("r_elbow"), moved(body, 1.4)
     missed = []
@@ -188,7 +187,7 @@ def test_a_tracker_goes_on_with_the_arm_that_it_had_lost():
         for _ in range(2):
             if num:
                 state = with_limbs(state, body, cost, DYNAMICS, body.bounds, num=num)
-            state, _ = tracker.step(state, cost.of_children, body.bounds)
+            state, _ = tracker.step(state, cost.problem(), body.bounds)
         places = body.pose(torch.stack([state.mixture.mean[0], truth])).joints[:, elbow]
         uv = cost.camera.project(places).uv
         missed.append(float((uv[0] - uv[1]).norm()))
@@ -198,6 +197,7 @@ def test_a_tracker_goes_on_with_the_arm_that_it_had_lost():
 def test_an_arm_alone_has_no_colours_to_go_by():
     body = load_body("arm7")
     _, camera = a_body_before_a_camera()
-    cost = TrackingCost(body=body, camera=camera, choice=CostChoice(contour=None, joints=None))
+    view = FrameContext(body=body, camera=camera)
+    cost = TrackingCost(choice=CostChoice().without("contour", "joints"), views=(view,))
     state = state_at(body, body.rest)
     assert with_limbs(state, body, cost, DYNAMICS, body.bounds, num=4) is state

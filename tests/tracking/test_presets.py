@@ -8,6 +8,7 @@ from torchcss.errors import ConfigurationError
 from torchcss.inference.dynamics import ConstantVelocity
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.particle import AnnealedParticleFilter, ParticleFilter
+from torchcss.inference.problem import SearchProblem
 from torchcss.inference.proposals import ChamRehg, Condensation, CovarianceScaled, Samples
 from torchcss.inference.tracker import Tracker
 from torchcss.tracking.presets import PRESETS, Preset, make_tracker
@@ -26,7 +27,7 @@ def test_every_tracker_follows_a_minimum(name, body, generator):
     bounds = PRESETS[name].bounds(problems.box(2, -6, 6))
     state = tracker.init(START, generator=generator)
     wells = [problems.DoubleWell(width=0.3, tilt=-0.02 * t) for t in range(4)]
-    for state, info in tracker.track(state, wells, bounds):  # noqa: B020
+    for state, info in tracker.track(state, map(SearchProblem, wells), bounds):  # noqa: B020
         assert 1 <= len(state.mixture.mean) <= tracker.num_modes
         assert float(state.mixture.weight.sum()) == pytest.approx(1)
         assert state.mixture.log_weight.argmax() == 0
@@ -72,13 +73,13 @@ def test_weights_of_css_and_of_figure_6():
     arm, body = (make_tracker("css", name) for name in ("arm8", "body34"))
     assert isinstance(arm, Tracker)
     assert isinstance(body, Tracker)
-    assert (arm.evidence, body.evidence) == (0.05, 0.1)
+    assert (arm.likelihood_power, body.likelihood_power) == (0.05, 0.1)
     assert arm.soft_matching
     assert body.soft_matching
     for name in ("arm8", "body34"):
         printed = make_tracker("css_figure_6", name)
         assert isinstance(printed, Tracker)
-        assert (printed.evidence, printed.memory) == (1.0, 1.0)
+        assert (printed.likelihood_power, printed.forgetting) == (1.0, 1.0)
         assert not printed.soft_matching
 
 

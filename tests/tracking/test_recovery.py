@@ -17,9 +17,9 @@ from torchcss.app.recorder import Recorder
 from torchcss.inference.loss_monitor import LossMonitor
 from torchcss.io.view_files import RecordedCamera
 from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
-from torchcss.tracking.recovery import OBSERVATIONS, Recovery
+from torchcss.tracking.recovery import Recovery
 from torchcss.tracking.session import Posterior
-from torchcss.tracking.settings import Settings
+from torchcss.tracking.settings import Settings, watched_terms
 from torchcss.types import Frame
 
 ELSEWHERE = range(6, 8)
@@ -144,4 +144,4 @@ def test_only_what_compares_with_the_image_is_judged():
 
 def test_every_term_of_the_images_is_judged():
     images = {"contour", "edge_energy", "region", "flow", "joints"}
-    assert set(OBSERVATIONS) == images
+    assert set(watched_terms()) == images

@@ -30,7 +30,6 @@ from tqdm import tqdm
 from torchcss.app.overlay import caption, draw_modes
 from torchcss.app.smooth import SMOOTH_NAME
 from torchcss.files import output_error
-from torchcss.inference.tracker import stated_evidence
 from torchcss.io.cameras import calibration
 from torchcss.io.checkpoint import Checkpoint, remove_checkpoint, write_checkpoint
 from torchcss.io.tracks import TRACK_NAME, FrameModes, Track, TrackWriter, write_summary
@@ -134,7 +133,7 @@ class Recorder:
             track = Track.empty(
                 body.state_names,
                 body.joint_names,
-                likelihood_power=stated_evidence(session.plan.tracker),
+                likelihood_power=session.plan.tracker.stated_power,
                 body=body,
                 cameras=self.recorded,
                 settings=asdict(session.settings),

@@ -35,6 +35,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -42,6 +43,8 @@ from torch import Tensor
 
 from torchcss.body.catalog import PROPORTIONS
 from torchcss.body.model import BodyModel
+from torchcss.cost.context import FrameContext
+from torchcss.cost.term import Kind, OnStates, Term
 from torchcss.errors import ConfigurationError
 from torchcss.types import LocalModel
 
@@ -68,13 +71,16 @@ def proportion_columns(body: BodyModel) -> dict[str, int]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Anthropometric:
+class Anthropometric(Term):
     """The Gaussian prior on internal proportions.
 
     Attributes:
         stature: Relative standard deviation of the common scale.
         individual: Factor on the relative deviations of the single lengths, `INDIVIDUAL`.
     """
+
+    name: ClassVar[str] = "anthropometric"
+    kind: ClassVar[Kind] = "prior"
 
     stature: float = 0.039
     individual: float = 1.0
@@ -85,6 +91,13 @@ class Anthropometric:
                 "Anthropometric: expected a stature that is not negative and a positive individual "
                 f"factor, got {self.stature} and {self.individual}; leave them out for the defaults"
             )
+
+    def prepare(self, context: FrameContext) -> OnStates | None:
+        """Bind the prior to a body; None if it has no free lengths."""
+        body = context.body
+        if not proportion_columns(body):
+            return None
+        return OnStates(lambda posed: self.local_model(posed.x, body))
 
     def covariance(self, body: BodyModel) -> Float[Tensor, "m m"]:
         """Sigma of the free lengths in the order of `proportion_columns`, square metres."""

@@ -23,13 +23,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchcss.cost.visibility import ContourNodes, places
+from torchcss.cost.context import FrameContext
+from torchcss.cost.term import Kind, Posed, Term
+from torchcss.cost.visibility import ContourNodes, ContourPredictor, contour_nodes, places
 from torchcss.robust import Lorentzian, RobustPotential
 from torchcss.types import PointCost
 from torchcss.vision.camera import Camera
@@ -63,10 +65,11 @@ _FADE = 0.25
 
 
 @dataclass(frozen=True, kw_only=True)
-class ContourTerm:
+class ContourTerm(Term):
     """The robust edge-matching cost of occluding contours.
 
     Attributes:
+        weight: Nats per nu of the mean cost per node.
         sigma: Scale of the distance between model and image contour, pixels.
         nu: Level of the outliers of one node (its unit only: the sum is normalised by N nu).
         window: Half length of the search line, pixels. Of 4.8 sigmas, as here, a node without a
@@ -80,6 +83,12 @@ class ContourTerm:
         potential_kind: The potential rho.
     """
 
+    name: ClassVar[str] = "contour"
+    kind: ClassVar[Kind] = "image"
+    watched: ClassVar[bool] = True
+    screens: ClassVar[bool] = True
+
+    weight: float = 150.0
     sigma: float = 2.5
     nu: float = 1.0
     window: float = 12.0
@@ -97,6 +106,13 @@ class ContourTerm:
     def unmatched(self) -> float:
         """U, the cost of a visible node without assignment."""
         return 0.5 * float(self.potential(torch.tensor(self.window**2, dtype=torch.float64)).rho)
+
+    def prepare(self, context: FrameContext) -> OnContour | None:
+        """Bind the term to the edges of a frame; None without a picture."""
+        field = context.edge_field
+        if field is None:
+            return None
+        return OnContour(self, context.tables.of(ContourPredictor), field)
 
     def search(
         self,
@@ -180,7 +196,11 @@ class ContourTerm:
         return depth, slope, curvature
 
     def value(
-        self, nodes: ContourNodes, camera: Camera, edge_field: Float[Tensor, "2 h w"]
+        self,
+        nodes: ContourNodes,
+        camera: Camera,
+        edge_field: Float[Tensor, "2 h w"],
+        at: Float[Tensor, "*batch p 3"] | None = None,
     ) -> Float[Tensor, "*batch p"]:
         """Cost of every node, in units of nu.
 
@@ -188,11 +208,20 @@ class ContourTerm:
             nodes: Nodes on the predicted contours, with what is seen of them.
             camera: The camera of the image.
             edge_field: Edge energy times gradient direction of the image.
+            at: Where the nodes have moved since their edges were found.
         """
         seen, index = seen_nodes(nodes)
         model = camera.project_with_derivatives(seen.points)
         normal = camera.image_normals(model, seen.normals)
-        depth, _, _ = self._wells(model.uv, normal, edge_field)
+        if at is None:
+            depth, _, _ = self._wells(model.uv, normal, edge_field)
+        else:
+            uv = camera.project(at.flatten(0, -2).index_select(0, index)).uv
+            moved = ((uv - model.uv) * normal).sum(-1)
+            node, distance, weight = self.search(model.uv, normal, edge_field)
+            rho = self.potential((distance - moved.index_select(0, node)).square()).rho
+            wells = weight * (self.unmatched - 0.5 * rho)
+            depth = torch.zeros_like(moved).index_add(0, node, wells)
         return self._compose(nodes, spread(model.valid * depth, index, nodes))
 
     def point_cost(
@@ -229,6 +258,71 @@ class ContourTerm:
     ) -> Float[Tensor, "*batch p"]:
         matched = self.unmatched - depth
         return nodes.cost(matched, self.fitted_level * self.nu, self.occlusion_factor)
+
+
+class OutlineTerm(Protocol):
+    """What the terms of the contour nodes have in common; see `ContourTerm`."""
+
+    @property
+    def weight(self) -> float:
+        """Nats per nu of the mean cost per node."""
+        ...
+
+    @property
+    def nu(self) -> float:
+        """Level of the outliers of one node."""
+        ...
+
+    def value(
+        self, nodes: ContourNodes, camera: Camera, image: Any, at: Tensor | None = None, /
+    ) -> Float[Tensor, "*batch p"]:
+        """Cost of every node."""
+        ...
+
+    def point_cost(
+        self, nodes: ContourNodes, camera: Camera, image: Any, /, *, gauss_newton: bool = False
+    ) -> PointCost:
+        """The same with first and second derivatives in the nodes' positions."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class OnContour:
+    """A term of the contour nodes and the image that it looks at; a `BoundImage`."""
+
+    term: OutlineTerm
+    nodes: ContourPredictor
+    image: Any
+
+    @property
+    def scale(self) -> float:
+        """Nats per unit of a node's cost."""
+        return self.term.weight / (max(self.size, 1) * self.term.nu)
+
+    @property
+    def link(self) -> Int[Tensor, " p"]:
+        """The link of each node."""
+        return self.nodes.node_link
+
+    @property
+    def size(self) -> int:
+        """Number of nodes."""
+        return self.nodes.num_nodes
+
+    def points(self, posed: Posed) -> Float[Tensor, "*batch p 3"]:
+        """The nodes."""
+        return posed.of(contour_nodes).points
+
+    def value(
+        self, posed: Posed, at: Float[Tensor, "*batch p 3"] | None = None
+    ) -> Float[Tensor, "*batch p"]:
+        """Cost of every node."""
+        return self.term.value(posed.of(contour_nodes), posed.camera, self.image, at)
+
+    def point_cost(self, posed: Posed, *, gauss_newton: bool = False) -> PointCost:
+        """Cost and derivatives of every node."""
+        nodes = posed.of(contour_nodes)
+        return self.term.point_cost(nodes, posed.camera, self.image, gauss_newton=gauss_newton)
 
 
 def seen_nodes(nodes: ContourNodes) -> tuple[ContourNodes, Int[Tensor, " k"]]:

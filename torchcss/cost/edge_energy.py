@@ -27,13 +27,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import kornia
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchcss.cost.visibility import ContourNodes
+from torchcss.cost.context import FrameContext
+from torchcss.cost.contour import OnContour
+from torchcss.cost.term import Kind, Term
+from torchcss.cost.visibility import ContourNodes, ContourPredictor
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.robust import Lorentzian, RobustPotential
 from torchcss.types import PointCost
@@ -84,10 +88,11 @@ def edge_energy_field(edge_field: Float[Tensor, "2 h w"], *, smoothing: float = 
 
 
 @dataclass(frozen=True, kw_only=True)
-class EdgeEnergyTerm:
+class EdgeEnergyTerm(Term):
     """The robust potential of the edge energy at occluding contours.
 
     Attributes:
+        weight: Nats per nu of the mean cost per node.
         sigma: Scale of the square root of the missing energy: an edge weighs the more the nearer it
             comes to 1, within about the square of sigma.
         nu: Level of the outliers of one node (its unit only: the sum is normalised by N nu).
@@ -97,6 +102,12 @@ class EdgeEnergyTerm:
         potential_kind: The potential rho.
     """
 
+    name: ClassVar[str] = "edge_energy"
+    kind: ClassVar[Kind] = "image"
+    watched: ClassVar[bool] = True
+    screens: ClassVar[bool] = True
+
+    weight: float = 150.0
     sigma: float = 0.5
     nu: float = 1.0
     fitted_level: float = 0.45
@@ -113,8 +124,19 @@ class EdgeEnergyTerm:
         """The cost of a visible node without an edge, or outside the image."""
         return 0.5 * float(self.potential(torch.ones((), dtype=torch.float64)).rho)
 
+    def prepare(self, context: FrameContext) -> OnContour | None:
+        """Make the edge energy of a frame smooth; None without a picture."""
+        if context.edge_field is None:
+            return None
+        field = edge_energy_field(context.edge_field)
+        return OnContour(self, context.tables.of(ContourPredictor), field)
+
     def value(
-        self, nodes: ContourNodes, camera: Camera, field: SplineField
+        self,
+        nodes: ContourNodes,
+        camera: Camera,
+        field: SplineField,
+        at: Float[Tensor, "*batch p 3"] | None = None,
     ) -> Float[Tensor, "*batch p"]:
         """Cost of every node, in units of nu.
 
@@ -122,8 +144,9 @@ class EdgeEnergyTerm:
             nodes: Nodes on the predicted contours, with what is seen of them.
             camera: The camera of the image.
             field: The edge energy as a smooth function of the image.
+            at: Where the nodes have moved since, as they were seen before.
         """
-        projection = camera.project(nodes.points)
+        projection = camera.project(nodes.points if at is None else at)
         energy = field.value(projection.uv) * projection.valid
         return self._compose(nodes, self.potential((1 - energy).clamp(min=0)).rho)
 

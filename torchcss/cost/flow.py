@@ -30,16 +30,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
-from torchcss.body.model import BodyModel, BodyPose
-from torchcss.body.surface import SurfaceSample, surface_points
-from torchcss.cost.visibility import front_facing
-from torchcss.errors import ConfigurationError, ShapeError, check_shape
+from torchcss.body.model import BodyModel
+from torchcss.cost.context import FrameContext
+from torchcss.cost.interior import InteriorNodes, interior_nodes, interior_visibility
+from torchcss.cost.term import Kind, Need, Posed, Term
+from torchcss.cost.visibility import front_facing, visible_nodes
+from torchcss.errors import ShapeError, check_shape
 from torchcss.robust import Lorentzian, RobustPotential
 from torchcss.types import PointCost
 from torchcss.vision.camera import Camera
@@ -50,72 +52,6 @@ _NEAR_RAMP = 0.1
 
 _UNKNOWN_FLOW = 1.0e9
 """Displacements from here on mean "unknown" in flow files."""
-
-
-class InteriorNodes(nn.Module):
-    """A sparse, even choice of surface nodes, fixed in the parts of a body.
-
-    Args:
-        body: The body.
-        rings: Latitudes on each part.
-        meridians: Nodes on each latitude; every other latitude is turned by half a step.
-
-    Attributes:
-        node_part: The part of each node.
-        node_link: The link of each node.
-        points_part: The nodes in the frames of their parts, metres.
-        normals_part: Their unit outward normals.
-    """
-
-    node_part: Int[Tensor, " p"]
-    node_link: Int[Tensor, " p"]
-    points_part: Float[Tensor, "parts c 3"]
-    normals_part: Float[Tensor, "parts c 3"]
-
-    def __init__(self, body: BodyModel, *, rings: int = 4, meridians: int = 4) -> None:
-        super().__init__()
-        if rings < 1 or meridians < 1:
-            raise ConfigurationError(
-                f"interior nodes: rings and meridians must be at least 1, got {rings}, {meridians}"
-            )
-        real, device = torch.float64, body.tie.device
-        heights = (torch.arange(rings, dtype=real, device=device) + 0.5) * (2 / rings) - 1
-        around = torch.arange(meridians, dtype=real, device=device)
-        turned = 0.5 * (torch.arange(rings, device=device) % 2)
-        omega = (around + turned[:, None] + 0.25) * (2 * torch.pi / meridians) - torch.pi
-        eta = heights.asin()[:, None].expand_as(omega)
-        full = (body.num_parts, rings * meridians)
-        sample = surface_points(
-            body.part_shape.to(real)[:, None, :],
-            eta.flatten().expand(full),
-            omega.flatten().expand(full),
-        )
-        parts = torch.arange(body.num_parts, device=device)
-        for name, value in (
-            ("node_part", parts.repeat_interleave(rings * meridians)),
-            ("node_link", body.part_link.repeat_interleave(rings * meridians)),
-            ("points_part", sample.points.to(body.dtype)),
-            ("normals_part", sample.normals.to(body.dtype)),
-        ):
-            self.register_buffer(name, value, persistent=False)
-
-    @property
-    def num_nodes(self) -> int:
-        """Number of nodes."""
-        return len(self.node_part)
-
-    def forward(self, body: BodyModel, pose: BodyPose) -> SurfaceSample:
-        """World positions and unit outward normals of the nodes, in the order of `node_part`.
-
-        Args:
-            body: The body that the nodes were chosen on (its base may have moved).
-            pose: Any number of posed bodies.
-        """
-        rotation, centre = body.part_poses(pose)
-        turn = rotation.transpose(-1, -2)
-        points = self.points_part @ turn + centre[..., None, :]
-        normals = self.normals_part @ turn
-        return SurfaceSample(points.flatten(-3, -2), normals.flatten(-3, -2))
 
 
 class FlowTargets(NamedTuple):
@@ -185,10 +121,13 @@ def flow_targets(
 
 
 @dataclass(frozen=True, kw_only=True)
-class FlowTerm:
+class FlowTerm(Term):
     """The robust cost of the interior nodes' displacement from the previous frame.
 
     Attributes:
+        weight: Nats per nu of the mean cost per node. At 50 it holds real limbs a little better,
+            but where the flow misses a fast hand, as on the demo, it holds that back; at 20 the
+            edges win.
         sigma: Scale of the difference between predicted and measured place, pixels. The flow is
             good to some tenths of a pixel; a wide scale lets a mode lag by as much in every frame.
         nu: Level of the outliers of one node (its unit only: the sum is normalised by N nu).
@@ -199,11 +138,39 @@ class FlowTerm:
         potential_kind: The potential rho.
     """
 
+    name: ClassVar[str] = "flow"
+    kind: ClassVar[Kind] = "image"
+    watched: ClassVar[bool] = True
+
+    weight: float = 20.0
     sigma: float = 0.5
     nu: float = 1.0
     fitted_level: float = 0.3
     occlusion_factor: float = 1.1
     potential_kind: type = Lorentzian
+
+    @property
+    def needs(self) -> frozenset[Need]:
+        """Optical flow."""
+        return frozenset(("flow",))
+
+    def prepare(self, context: FrameContext) -> BoundFlow | None:
+        """Follow the nodes of the modes before; None without flow or modes."""
+        features, modes, body = context.features, context.modes, context.body
+        if features is None or features.flow is None or modes is None:
+            return None
+        nodes, pose = context.tables.of(InteriorNodes), body.pose(modes)
+        points, eye = nodes(body, pose).points, context.camera.centre_world
+        targets = flow_targets(
+            nodes,
+            body,
+            modes,
+            context.camera,
+            features.flow.to(body.tie),
+            None if features.flow_outlier is None else features.flow_outlier.to(body.tie),
+            visible_nodes(body, pose, eye, points, nodes.node_part),
+        )
+        return BoundFlow(self, nodes, targets)
 
     @property
     def potential(self) -> RobustPotential:
@@ -217,6 +184,7 @@ class FlowTerm:
         visible: Float[Tensor, "*#batch p"],
         camera: Camera,
         targets: FlowTargets,
+        at: Float[Tensor, "*batch p 3"] | None = None,
     ) -> Float[Tensor, "*batch p"]:
         """Cost of every node, in units of nu.
 
@@ -226,11 +194,14 @@ class FlowTerm:
             visible: 1 where no other part is in front of the node, 0 where one is, or between.
             camera: Camera of this frame, at the size of the flow.
             targets: Targets of each sample's own parent, or of one for all.
+            at: Where the nodes have moved since, as they faced the camera before.
         """
         projection = camera.project(points_world)
+        near = _in_front(projection.depth, projection.valid, camera)
+        if at is not None:
+            projection = camera.project(at)
         squared = targets.weight * (projection.uv - targets.uv).square().sum(-1)
         facing = front_facing(points_world, normals_world, camera.centre_world)
-        near = _in_front(projection.depth, projection.valid, camera)
         rho = self.potential(squared).rho
         return self._compose(rho, facing, visible, near, camera, targets)
 
@@ -285,6 +256,51 @@ class FlowTerm:
         unhidden = visible * (0.5 * rho + untold) + (1 - visible) * hidden
         in_front = facing * unhidden + (1 - facing) * back_facing
         return near * in_front + (1 - near) * (0.5 * far + untold)
+
+
+@dataclass(frozen=True, eq=False)
+class BoundFlow:
+    """The flow term with the targets of the modes before; a `BoundImage`."""
+
+    term: FlowTerm
+    nodes: InteriorNodes
+    targets: FlowTargets
+
+    @property
+    def scale(self) -> float:
+        """Nats per unit of a node's cost."""
+        return self.term.weight / (max(self.size, 1) * self.term.nu)
+
+    @property
+    def link(self) -> Int[Tensor, " p"]:
+        """The link of each node."""
+        return self.nodes.node_link
+
+    @property
+    def size(self) -> int:
+        """Number of nodes."""
+        return self.nodes.num_nodes
+
+    def points(self, posed: Posed) -> Float[Tensor, "*batch p 3"]:
+        """The nodes."""
+        posed.of(interior_visibility)
+        return posed.of(interior_nodes).points
+
+    def value(
+        self, posed: Posed, at: Float[Tensor, "*batch p 3"] | None = None
+    ) -> Float[Tensor, "*batch p"]:
+        """Cost of every node, see `FlowTerm.value`."""
+        return self.term.value(*self._arguments(posed), at)
+
+    def point_cost(self, posed: Posed, *, gauss_newton: bool = False) -> PointCost:
+        """Cost and derivatives of every node."""
+        return self.term.point_cost(*self._arguments(posed), gauss_newton=gauss_newton)
+
+    def _arguments(self, posed: Posed) -> tuple[Tensor, Tensor, Tensor, Camera, FlowTargets]:
+        targets = FlowTargets(*(posed.of_parent(part) for part in self.targets))
+        seen = posed.of(interior_visibility)
+        points, normals = posed.of(interior_nodes)
+        return points, normals, seen, posed.camera, targets
 
 
 def _in_front(depth: Tensor, valid: Tensor, camera: Camera) -> Float[Tensor, "*batch p"]:

@@ -44,7 +44,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -52,6 +52,8 @@ from torch import Tensor, nn
 
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.surface import surface_points
+from torchcss.cost.context import FrameContext
+from torchcss.cost.term import Kind, Posed, Term
 from torchcss.errors import ConfigurationError
 from torchcss.types import Curvature, LocalModel
 
@@ -393,7 +395,7 @@ def _combine(a: Tensor, b: Tensor, exponent: Tensor) -> tuple[Tensor, Tensor, Te
 
 
 @dataclass(frozen=True, kw_only=True)
-class Interpenetration:
+class Interpenetration(Term):
     """The repulsive potential between parts of flesh.
 
     Attributes:
@@ -404,6 +406,9 @@ class Interpenetration:
         sharpness: Scale of the inside-outside function: the potential falls to `1/e` about
             `1/(2 sharpness)` of a part's radius outside its surface.
     """
+
+    name: ClassVar[str] = "interpenetration"
+    kind: ClassVar[Kind] = "prior"
 
     weight: float = 5.0
     p: float = 1.0
@@ -420,6 +425,10 @@ class Interpenetration:
                 f"sharpness^p at most 20, got {self.weight}, {self.sharpness} and p = {self.p}; "
                 "leave them out for the defaults"
             )
+
+    def prepare(self, context: FrameContext) -> BoundInterpenetration:
+        """Bind the repulsion to the pairs of a body."""
+        return BoundInterpenetration(self, context.tables.of(InterpenetrationPairs))
 
     @property
     def reach(self) -> float:
@@ -492,3 +501,19 @@ class Interpenetration:
         value = paper - last * (1 + END - u)
         inside = f < end
         return tuple(torch.where(inside, scale * part, 0.0) for part in (value, first, second))  # type: ignore[return-value]
+
+
+@dataclass(frozen=True, eq=False)
+class BoundInterpenetration:
+    """The repulsion between the parts of a body; a `BoundPrior`."""
+
+    term: Interpenetration
+    pairs: InterpenetrationPairs
+
+    def value(self, posed: Posed) -> Float[Tensor, "*batch"]:
+        """Cost, nats."""
+        return self.term.value(posed.body, posed.pose, self.pairs)
+
+    def local_model(self, posed: Posed, curvature: Curvature) -> LocalModel:
+        """Cost and derivatives in the state."""
+        return self.term.local_model(posed.body, posed.pose, self.pairs, curvature=curvature)

@@ -10,14 +10,16 @@ one that lies farther off, since the Lorentzian grows without end.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchcss.cost.context import FrameContext
+from torchcss.cost.term import Kind, Posed, Term
 from torchcss.robust import Lorentzian, RobustPotential
 from torchcss.types import Keypoints, PointCost
 from torchcss.vision.camera import Camera, Projection
@@ -39,6 +41,10 @@ SPREAD = {
 }
 """Spread of a keypoint relative to a wrist's, by the joint's name without its side. Detectors mark
 hips and face on the surface, not at the joint (measured in the data's READMEs: 10 px against 6)."""
+
+COARSE_SCALE = 6.0
+"""How much farther off a keypoint may be in the coarse cost before it counts as an outlier. Their
+noise stays what it is: were it so much wider, the temporal prior would hold every limb back."""
 
 OUTLIER_LENGTHS = 10.0
 _FAR_PX = 1e8
@@ -97,15 +103,21 @@ def _spread(name: str) -> float:
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointTerm:
+class JointTerm(Term):
     """The robust joint-correspondence cost.
 
     Attributes:
+        weight: Factor on the cost, whose nu is in nats already.
         sigma: Scale of the keypoint noise of a wrist, pixels.
         nu: Level of the outliers, nats per joint: the cost grows as nu log(error / sigma).
         potential_kind: The potential rho.
     """
 
+    name: ClassVar[str] = "joints"
+    kind: ClassVar[Kind] = "image"
+    watched: ClassVar[bool] = True
+
+    weight: float = 1.0
     sigma: float = 3.0
     nu: float = 8.0
     potential_kind: type = Lorentzian
@@ -114,6 +126,17 @@ class JointTerm:
     def potential(self) -> RobustPotential:
         """`rho` on the squared error in pixels; its curvature at zero is that of sigma."""
         return self.potential_kind(nu=self.nu, sigma=self.sigma * self.nu**0.5)
+
+    def coarse(self) -> JointTerm:
+        """The same term for which hardly a keypoint is an outlier, see `COARSE_SCALE`."""
+        return replace(self, nu=COARSE_SCALE**2 * self.nu)
+
+    def prepare(self, context: FrameContext) -> BoundJoints | None:
+        """Bind the term to the keypoints of a frame; None without any."""
+        if context.keypoints is None:
+            return None
+        targets = match_joints(context.keypoints, context.body.joint_names)
+        return BoundJoints(self, targets, context.body.marker_link[targets.joint])
 
     def value(self, projection: Projection, targets: JointTargets) -> Float[Tensor, "*batch m"]:
         """Cost of every correspondence, nats.
@@ -159,3 +182,40 @@ class JointTerm:
     def _unseen(self, targets: JointTargets) -> Tensor:
         far = targets.weight * (OUTLIER_LENGTHS * self.sigma) ** 2
         return self.potential(far).rho
+
+
+@dataclass(frozen=True, eq=False)
+class BoundJoints:
+    """The keypoints of a frame; a `BoundImage`."""
+
+    term: JointTerm
+    targets: JointTargets
+    link: Int[Tensor, " m"]
+    size: int = 0
+
+    @property
+    def scale(self) -> float:
+        """Factor on the nats of a joint."""
+        return self.term.weight
+
+    def points(self, posed: Posed) -> Float[Tensor, "*batch m 3"]:
+        """The joint centres that have keypoints."""
+        return posed.pose.joints[..., self.targets.joint, :]
+
+    def value(
+        self, posed: Posed, at: Float[Tensor, "*batch m 3"] | None = None
+    ) -> Float[Tensor, "*batch m"]:
+        """Cost of every joint."""
+        points = self.points(posed) if at is None else at
+        return self.term.value(posed.camera.project(points), self._of_samples(posed))
+
+    def point_cost(self, posed: Posed, *, gauss_newton: bool = False) -> PointCost:
+        """Cost and derivatives of every joint."""
+        targets, points = self._of_samples(posed), self.points(posed)
+        return self.term.point_cost(points, posed.camera, targets, gauss_newton=gauss_newton)
+
+    def _of_samples(self, posed: Posed) -> JointTargets:
+        joint, position, weight = self.targets
+        if weight.dim() == 1:
+            return self.targets
+        return JointTargets(joint, posed.of_parent(position), posed.of_parent(weight))

@@ -26,7 +26,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from types import EllipsisType
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import kornia
 import torch
@@ -36,9 +36,11 @@ from torch.nn import functional
 
 from torchcss.body.model import BodyModel
 from torchcss.body.root import has_root
-from torchcss.cost.contour import seen_nodes, spread
+from torchcss.cost.context import FrameContext
+from torchcss.cost.contour import OnContour, seen_nodes, spread
 from torchcss.cost.part_map import grow, part_map
-from torchcss.cost.visibility import ContourNodes
+from torchcss.cost.term import Kind, Need, Term
+from torchcss.cost.visibility import ContourNodes, ContourPredictor
 from torchcss.types import PointCost
 from torchcss.vision.camera import Camera
 from torchcss.vision.spline import SplineField, spline_field
@@ -75,6 +77,11 @@ def part_layers(body: BodyModel) -> tuple[tuple[str, ...], tuple[int, ...]]:
     names = [name.removeprefix("l_").removeprefix("r_") for name in body.part_names]
     layers = tuple(dict.fromkeys(names))
     return layers, tuple(layers.index(name) for name in names)
+
+
+def layer_of_part(body: BodyModel) -> Int[Tensor, " parts"]:
+    """The layer of each part, see `part_layers`."""
+    return torch.tensor(part_layers(body)[1], dtype=torch.long, device=body.tie.device)
 
 
 def region_field(likeness: Float[Tensor, "layers h w"], *, smoothing: float = 3.0) -> SplineField:
@@ -174,10 +181,12 @@ class RegionImages(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RegionTerm:
+class RegionTerm(Term):
     """The cost of what the image looks like on either side of the contour.
 
     Attributes:
+        weight: Nats per nu of the mean cost per node.
+        background: Whether it knows what is behind the body, see `torchcss.vision.background`.
         offset: Distance d of the two places from the contour, pixels.
         nu: Level of the cost of one node (its unit only: the sum is normalised by N nu).
         fitted_level: Cost of a node where there is no contour, as a share of nu: the mean error per
@@ -185,13 +194,38 @@ class RegionTerm:
         occlusion_factor: k of `nu_occ = k nu_bf`, see `ContourTerm`.
     """
 
+    name: ClassVar[str] = "region"
+    kind: ClassVar[Kind] = "image"
+    watched: ClassVar[bool] = True
+    screens: ClassVar[bool] = True
+
+    weight: float = 400.0
+    background: bool = False
     offset: float = 5.0
     nu: float = 1.0
     fitted_level: float = 0.3
     occlusion_factor: float = 1.1
 
+    @property
+    def needs(self) -> frozenset[Need]:
+        """Colours, and what is behind them where that is asked for."""
+        return frozenset(("appearance", "background") if self.background else ("appearance",))
+
+    def prepare(self, context: FrameContext) -> OnContour | None:
+        """Make the foreground of a frame smooth; None where no colours are known."""
+        foreground = context.foreground(background=self.background)
+        if foreground is None:
+            return None
+        nodes = context.tables.of(ContourPredictor)
+        layer = context.tables.of(layer_of_part)[nodes.node_part]
+        return OnContour(self, nodes, RegionImages(region_field(foreground), layer))
+
     def value(
-        self, nodes: ContourNodes, camera: Camera, images: RegionImages
+        self,
+        nodes: ContourNodes,
+        camera: Camera,
+        images: RegionImages,
+        at: Float[Tensor, "*batch p 3"] | None = None,
     ) -> Float[Tensor, "*batch p"]:
         """Cost of every node.
 
@@ -199,13 +233,16 @@ class RegionTerm:
             nodes: Nodes on the predicted contours, with what is seen of them.
             camera: The camera of the image.
             images: What the pixels look like.
+            at: Where the nodes have moved since, as they were seen before.
         """
         seen, index = seen_nodes(nodes)
         layer = images.layer[index % len(images.layer)]
         model = camera.project_with_derivatives(seen.points)
-        step = self.offset * camera.image_normals(model, seen.normals)
-        inside = images.field.value(model.uv - step, layer)
-        outside = images.field.value(model.uv + step, layer)
+        step, uv = self.offset * camera.image_normals(model, seen.normals), model.uv
+        if at is not None:
+            uv = camera.project(at.flatten(0, -2).index_select(0, index)).uv
+        inside = images.field.value(uv - step, layer)
+        outside = images.field.value(uv + step, layer)
         return self._compose(nodes, spread((inside - outside) * model.valid, index, nodes))
 
     def point_cost(

@@ -22,14 +22,17 @@ What to call: `SegmentationTerm.images` once a frame, then `value` at any number
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
 from torchcss.body.model import BodyModel
+from torchcss.cost.context import FrameContext
 from torchcss.cost.part_map import part_map
+from torchcss.cost.region import layer_of_part
+from torchcss.cost.term import Kind, Need, Posed, Term
 from torchcss.vision.camera import Camera
 
 _FEWEST_PIXELS = 20
@@ -54,18 +57,40 @@ class SegmentationImages(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SegmentationTerm:
+class SegmentationTerm(Term):
     """The likeness of all covered pixels, against the area of the body.
 
     Attributes:
+        weight: Nats per share of the body's area.
+        background: Whether it knows what is behind the body, see `torchcss.vision.background`.
         reduction: Pixels of the image, along each side, to one that is looked at.
         rings: Latitudes of the mesh of each part.
         meridians: Longitudes of the mesh of each part.
     """
 
+    name: ClassVar[str] = "segmentation"
+    kind: ClassVar[Kind] = "weight-only"
+
+    weight: float = 400.0
+    background: bool = False
     reduction: int = 4
     rings: int = 6
     meridians: int = 10
+
+    @property
+    def needs(self) -> frozenset[Need]:
+        """Colours, and what is behind them where that is asked for."""
+        return frozenset(("appearance", "background") if self.background else ("appearance",))
+
+    def prepare(self, context: FrameContext) -> BoundSegmentation | None:
+        """Reduce the foreground of a frame; None without colours, or without a pose before it."""
+        foreground = context.foreground(background=self.background)
+        if foreground is None or context.modes is None:
+            return None
+        layer = context.tables.of(layer_of_part)
+        expected = context.modes[0]
+        images = self.images(foreground, layer, context.camera, context.body, expected)
+        return BoundSegmentation(self, images)
 
     def images(
         self,
@@ -113,3 +138,20 @@ class SegmentationTerm:
 
     def _parts(self, body: BodyModel, x: Tensor, camera: Camera) -> Tensor:
         return part_map(body, x, camera, rings=self.rings, meridians=self.meridians)
+
+
+@dataclass(frozen=True, eq=False)
+class BoundSegmentation:
+    """The segmentation of a frame; a `BoundWeight`."""
+
+    term: SegmentationTerm
+    images: SegmentationImages
+
+    @property
+    def scale(self) -> float:
+        """Nats per share of the body's area."""
+        return self.term.weight
+
+    def value(self, posed: Posed) -> Float[Tensor, "*batch"]:
+        """See `SegmentationTerm.value`."""
+        return self.term.value(posed.body, posed.x, self.images)

@@ -15,7 +15,7 @@ give it to the optimiser; hold variables by bounds of no width.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -28,8 +28,7 @@ from torchcss.body.shape import (
     surface_derivatives,
     with_shape,
 )
-from torchcss.cost.contour import ContourTerm
-from torchcss.cost.region import RegionImages, RegionTerm
+from torchcss.cost.contour import OutlineTerm
 from torchcss.cost.total import TrackingCost
 from torchcss.cost.visibility import ContourPredictor
 from torchcss.types import Bounds, LocalModel, PointCost
@@ -44,8 +43,8 @@ class Outline(NamedTuple):
         weight: Nats per nu of the mean cost per node.
     """
 
-    term: ContourTerm | RegionTerm
-    image: Float[Tensor, "2 h w"] | RegionImages
+    term: OutlineTerm
+    image: Any
     weight: float
 
 
@@ -106,7 +105,7 @@ class ShapedCost:
         costs = []
         for term, image, weight in self.outlines:
             scale = weight / (max(predictor.num_nodes, 1) * term.nu)
-            cost = term.point_cost(nodes, camera, image)  # type: ignore[arg-type]
+            cost = term.point_cost(nodes, camera, image)
             costs.append([scale * field[0] for field in cost])
         cost = PointCost(*(sum(fields) for fields in zip(*costs, strict=True)))  # type: ignore[arg-type]
         pose, points, part = body.pose(x), nodes.points[0], predictor.node_part

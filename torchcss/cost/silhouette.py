@@ -29,18 +29,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import kornia
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from torchcss.cost.part_map import grow
+from torchcss.cost.context import FrameContext
+from torchcss.cost.interior import InteriorNodes, interior_nodes
+from torchcss.cost.part_map import grow, part_map
+from torchcss.cost.term import Kind, Need, Posed, Term
 from torchcss.types import PointCost
 from torchcss.vision.camera import Camera
 from torchcss.vision.spline import SplineField, spline_field
+
+_PAIRS = 64
+"""Pairs of a node and a point of the silhouette that take as much memory as one node."""
 
 _FEWEST_POINTS = 5.0
 """A body that is expected to have fewer counts as if it had so many."""
@@ -65,10 +71,11 @@ class SilhouetteImages(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SilhouetteTerm:
+class SilhouetteTerm(Term):
     """The disagreement of the body with the silhouette. Lengths are for a person.
 
     Attributes:
+        weight: Nats per nu, for a body of which nothing is covered.
         sigma: How far from a node a point is covered, metres at the body's distance: of who is seen
             close the nodes are farther apart. Points feel nodes within three times as much.
         epsilon: The least that a point counts as covered.
@@ -82,6 +89,10 @@ class SilhouetteTerm:
         nu: Level of the cost (its unit only).
     """
 
+    name: ClassVar[str] = "silhouette"
+    kind: ClassVar[Kind] = "image"
+
+    weight: float = 800.0
     sigma: float = 0.11
     epsilon: float = 0.01
     beta: float = 0.5
@@ -91,6 +102,41 @@ class SilhouetteTerm:
     reduction: int = 4
     spacing: float = 0.5
     nu: float = 1.0
+
+    @property
+    def needs(self) -> frozenset[Need]:
+        """Colours, and what is behind them."""
+        return frozenset(("appearance", "background"))
+
+    def prepare(self, context: FrameContext) -> BoundSilhouette | None:
+        """Find the silhouette of a frame.
+
+        None without a mask or a known background, or without a pose before it.
+        """
+        features, modes, body = context.features, context.modes, context.body
+        nodes = context.tables.of(InteriorNodes)
+        if features is None or modes is None or nodes.num_nodes == 0:
+            return None
+        foreground = None
+        if features.mask is not None:
+            foreground = 2 * features.mask - 1
+        elif context.background is not None:
+            foreground = context.foreground(background=True)
+            if foreground is not None:
+                sure = context.background.sure
+                foreground = foreground.amax(0).masked_fill(~sure, torch.nan)
+        if foreground is None:
+            return None
+        parts = part_map(
+            body, modes[0], context.camera.scaled(1 / self.reduction), rings=6, meridians=10
+        )
+        images = self.images(
+            foreground.to(body.tie),
+            context.camera,
+            nodes(body, body.pose(modes)).points.flatten(0, -2),
+            float((parts >= 0).sum()) * self.reduction**2,
+        )
+        return BoundSilhouette(self, nodes, images)
 
     def images(
         self,
@@ -213,3 +259,41 @@ class SilhouetteTerm:
         return kornia.filters.gaussian_blur2d(
             distance[None, None], (5, 5), (1.0, 1.0), border_type="replicate"
         )[0, 0]
+
+
+@dataclass(frozen=True, eq=False)
+class BoundSilhouette:
+    """The silhouette of a frame; a `BoundImage`."""
+
+    term: SilhouetteTerm
+    nodes: InteriorNodes
+    images: SilhouetteImages
+
+    @property
+    def scale(self) -> float:
+        """Nats per nu."""
+        return self.term.weight / self.term.nu
+
+    @property
+    def link(self) -> Int[Tensor, " p"]:
+        """The link of each node."""
+        return self.nodes.node_link
+
+    @property
+    def size(self) -> int:
+        """Rows of memory for pairs of nodes and points."""
+        return math.ceil(self.nodes.num_nodes * len(self.images.points) / _PAIRS)
+
+    def points(self, posed: Posed) -> Float[Tensor, "*batch p 3"]:
+        """The nodes."""
+        return posed.of(interior_nodes).points
+
+    def value(
+        self, posed: Posed, at: Float[Tensor, "*batch p 3"] | None = None
+    ) -> Float[Tensor, "*batch p"]:
+        """See `SilhouetteTerm.value`."""
+        return self.term.value(self.points(posed) if at is None else at, self.images)
+
+    def point_cost(self, posed: Posed, *, gauss_newton: bool = False) -> PointCost:
+        """See `SilhouetteTerm.point_cost`."""
+        return self.term.point_cost(self.points(posed), self.images, gauss_newton=gauss_newton)

@@ -8,12 +8,17 @@ a strong observation can unstick the parameter and turn the prior off.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchcss.cost.anthropometric import proportion_columns
+from torchcss.cost.context import FrameContext
+from torchcss.cost.term import Kind, OnStates, Term
 from torchcss.robust import Lorentzian
 from torchcss.types import LocalModel
 
@@ -41,14 +46,30 @@ def long_tailed(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stabiliser:
+class Stabiliser(Term):
     """The sticky prior of a body's hard-to-see parameters.
 
     Attributes:
         nu: Height of the tails, nats; the prior lets go at `sqrt(nu)` deviations.
+        lengths: Whether free lengths are among the parameters; False: they have a prior of their
+            own (`torchcss.cost.anthropometric`), and would count twice.
     """
 
+    name: ClassVar[str] = "stabiliser"
+    kind: ClassVar[Kind] = "prior"
+
     nu: float = 9.0
+    lengths: bool = False
+
+    def prepare(self, context: FrameContext) -> OnStates:
+        """Bind the prior to the rest values of a body."""
+        body = context.body
+        mean, deviation = body.sticky_mean, body.sticky_deviation
+        lengths = list(proportion_columns(body).values())
+        if lengths and not self.lengths:
+            deviation = deviation.clone()
+            deviation[lengths] = math.inf
+        return OnStates(lambda posed: self.local_model(posed.x, mean, deviation))
 
     def local_model(
         self,

@@ -52,6 +52,10 @@ class PointTargets:
     columns: Int[Tensor, " m"]
     held: Float[Tensor, " n"]
 
+    def take(self, items: Int[Tensor, " b"]) -> PointTargets:
+        """The same cost: all items have the same targets."""
+        return self
+
     def whole(self, x: Float[Tensor, "*batch m"]) -> Float[Tensor, "*batch n"]:
         """States of the body: x, and what is held."""
         check_shape("x", x, len(self.columns))

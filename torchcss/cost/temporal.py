@@ -10,13 +10,15 @@ impossible. `TemporalPrior`, the default, is evaluated per sample against its ow
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchcss.cost.context import FrameContext
 from torchcss.cost.stabiliser import long_tailed
+from torchcss.cost.term import Kind, OnStates, Term
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.types import LocalModel
 
@@ -24,14 +26,26 @@ _LEAST_VARIANCE = 1e-12
 
 
 @dataclass(frozen=True, kw_only=True)
-class TemporalPrior:
+class TemporalPrior(Term):
     """Long-tailed prior about the parent mode.
 
     Attributes:
         nu: Height of the tails, nats.
     """
 
+    name: ClassVar[str] = "temporal"
+    kind: ClassVar[Kind] = "prior"
+
     nu: float = 4.0
+
+    def prepare(self, context: FrameContext) -> OnStates | None:
+        """Bind the prior to the modes before; None without them or without a known motion."""
+        prior, deviation = context.prior, context.deviation
+        if prior is None or deviation is None:
+            return None
+        return OnStates(
+            lambda posed: self.local_model(posed.x, posed.of_parent(prior.mean), deviation)
+        )
 
     def local_model(
         self,
@@ -64,7 +78,7 @@ class MixtureDensity(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MixturePrior:
+class MixturePrior(Term):
     """The whole of `p(x_t | R_{t-1})`: the modes of the previous frame, widened by the motion.
 
         f(x) = -log( e^-nu + sum_k a_k exp(-1/2 (x - mu_k)^T P_k (x - mu_k)) )
@@ -77,7 +91,17 @@ class MixturePrior:
         nu: Height of the tails, nats.
     """
 
+    name: ClassVar[str] = "temporal_mixture"
+    kind: ClassVar[Kind] = "prior"
+
     nu: float = 12.0
+
+    def prepare(self, context: FrameContext) -> OnStates | None:
+        """Bind the prior to the modes before; None without them."""
+        if context.prior is None:
+            return None
+        density = self.density(context.prior)
+        return OnStates(lambda posed: self.local_model(posed.x, density))
 
     def density(self, predicted: GaussianMixture) -> MixtureDensity:
         """Prepare the prior of a frame.

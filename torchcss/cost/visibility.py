@@ -42,6 +42,7 @@ from torch import Tensor, nn
 
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.surface import SurfaceSample, surface_points
+from torchcss.cost.term import Posed
 
 _TINY = 1e-12
 _FAR = 1e6
@@ -220,6 +221,12 @@ class ContourPredictor(nn.Module):
             ramp=self.ramp,
         )
         return ContourNodes(points, normals, exists * free, visible)
+
+
+def contour_nodes(posed: Posed) -> ContourNodes:
+    """The contour nodes of posed bodies."""
+    predictor = posed.context.tables.of(ContourPredictor)
+    return predictor(posed.body, posed.pose, posed.camera.centre_world)
 
 
 def front_facing(

@@ -20,7 +20,7 @@ from torch import Tensor
 from torchcss.errors import ConfigurationError
 from torchcss.inference.band import Band, least_in_box
 from torchcss.linalg import mask_free, symmetric_part
-from torchcss.types import Bounds, CostFunction, LocalModel, Status
+from torchcss.types import Bounds, Differentiable, LocalModel, Status
 
 Changes = Mapping[int, Callable[[Tensor], Tensor]]
 """By the index of a frame, a differentiable map `[*batch n] -> [*batch n]` from the coordinates of
@@ -162,7 +162,7 @@ class ChainSum(NamedTuple):
         dtype: Type in which the costs are evaluated.
     """
 
-    cost: CostFunction
+    cost: Differentiable
     evidence: float
     times: Float[Tensor, " t"]
     transition: Transition

@@ -141,6 +141,6 @@ def widened(
         proposal=proposal,
         num_samples=samples * tracker.num_samples,
         num_modes=modes * tracker.num_modes,
-        memory=0.0,
+        forgetting=0.0,
         soft_matching=False,
     )

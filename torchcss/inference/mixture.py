@@ -254,7 +254,7 @@ def tempered(
 
     Args:
         covariance: Covariances C of the modes.
-        power: e, as `stated_evidence` tells it; at one they stay as they are.
+        power: e, `SequenceTracker.stated_power`; at one they stay as they are.
         prior_variance: Variance of each parameter before the image is seen.
     """
     if power == 1.0:

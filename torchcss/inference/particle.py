@@ -44,9 +44,9 @@ from torchcss.inference.importance import (
     tempered_log_weight,
 )
 from torchcss.inference.mixture import GaussianMixture, standard_normal
+from torchcss.inference.problem import SearchProblem
 from torchcss.inference.proposals import CovarianceScaled
 from torchcss.inference.tracker import (
-    CostFactory,
     Particles,
     TrackerInfo,
     TrackerState,
@@ -54,7 +54,7 @@ from torchcss.inference.tracker import (
 )
 from torchcss.inference.trust_region import check_bounds
 from torchcss.linalg import covariance_factor, squared_mahalanobis
-from torchcss.types import Bounds, CostFunction, Status
+from torchcss.types import Bounds, Status
 
 
 class _Weighed(NamedTuple):
@@ -98,13 +98,18 @@ class _Filter(ABC):
                     f"got {getattr(self, name)}"
                 )
 
+    @property
+    def stated_power(self) -> float:
+        """Particles state the covariances of the posterior as it is."""
+        return 1.0
+
     @abstractmethod
     def _weigh(
         self,
         particles: Particles,
         moved: GaussianMixture,
         prior: GaussianMixture,
-        cost: CostFunction | CostFactory,
+        problem: SearchProblem,
         bounds: Bounds,
         generator: torch.Generator,
     ) -> _Weighed:
@@ -117,7 +122,7 @@ class _Filter(ABC):
     def step(
         self,
         state: TrackerState,
-        cost: CostFunction | CostFactory,
+        problem: SearchProblem,
         bounds: Bounds,
         *,
         scale: Float[Tensor, " n"] | None = None,
@@ -127,8 +132,7 @@ class _Filter(ABC):
 
         Args:
             state: Where the last frame left off.
-            cost: The frame's cost, or what makes it from the samples' parents and the prior. A
-                particle's parent is the mode that sums up its ancestor.
+            problem: The frame. A particle's parent is the mode that sums up its ancestor.
             bounds: Box limits on the state.
             scale: Not used; nothing descends.
             prior_variance: Not used.
@@ -154,14 +158,14 @@ class _Filter(ABC):
         )
         prior = self.dynamics.predict(mixture, state.velocity)
 
-        weighed = self._weigh(particles, moved, prior, cost, bounds, generator)
+        weighed = self._weigh(particles, moved, prior, problem, bounds, generator)
         some = bool((weighed.log_weight > -torch.inf).any())
         log_weight = normalised_log_weight(weighed.log_weight)
         parent = particles.component[weighed.ancestor]
         component, summary, best = self._sum_up(weighed.x, log_weight, moved.covariance[0])
         # Every mode's parent is that of its heaviest particle.
         origin = parent[best]
-        energy = _energy(cost, origin, prior, summary.mean)
+        energy = _energy(problem, origin, prior, summary.mean)
         finite = int((weighed.log_weight > -torch.inf).sum())
         status_counts = torch.zeros(len(Status), dtype=torch.long, device=weighed.x.device)
         status_counts[Status.NON_FINITE] = len(weighed.x) - finite
@@ -182,20 +186,23 @@ class _Filter(ABC):
             num_distinct=torch.tensor(len(summary.mean) if some else 0),
             effective_sample_size=survival(summary.log_weight).effective_sample_size,
             survival=survival(weighed.log_weight),
+            prior=prior,
         )
 
     def track(
         self,
         state: TrackerState,
-        costs: Iterable[CostFunction | CostFactory],
+        problems: Iterable[SearchProblem],
         bounds: Bounds,
         *,
         scale: Float[Tensor, " n"] | None = None,
         prior_variance: Float[Tensor, " n"] | None = None,
     ) -> Iterator[tuple[TrackerState, TrackerInfo]]:
-        """Step through a sequence, one cost a frame; yields what `step` returns."""
-        for cost in costs:
-            state, info = self.step(state, cost, bounds, scale=scale, prior_variance=prior_variance)
+        """Step through a sequence, one problem a frame; yields what `step` returns."""
+        for problem in problems:
+            state, info = self.step(
+                state, problem, bounds, scale=scale, prior_variance=prior_variance
+            )
             yield state, info
 
     def _sum_up(
@@ -265,7 +272,7 @@ class ParticleFilter(_Filter):
         particles: Particles,
         moved: GaussianMixture,
         prior: GaussianMixture,
-        cost: CostFunction | CostFactory,
+        problem: SearchProblem,
         bounds: Bounds,
         generator: torch.Generator,
     ) -> _Weighed:
@@ -279,7 +286,7 @@ class ParticleFilter(_Filter):
         noise = torch.where(factor.any(-2), noise, 0.0)
         step = (factor @ noise[..., None])[..., 0]
         x = bounds.project(moved.mean[ancestor] + self.noise_scale**0.5 * step)
-        energy = _energy(cost, particles.component[ancestor], prior, x)
+        energy = _energy(problem, particles.component[ancestor], prior, x)
         correction = (1 - self.dilution) * particles.log_weight[ancestor]
         # The ratio of the two Gaussians where it was drawn, up to a constant.
         correction = correction - 0.5 * (self.noise_scale - 1) * noise.square().sum(-1)
@@ -324,7 +331,7 @@ class AnnealedParticleFilter(_Filter):
         particles: Particles,
         moved: GaussianMixture,
         prior: GaussianMixture,
-        cost: CostFunction | CostFactory,
+        problem: SearchProblem,
         bounds: Bounds,
         generator: torch.Generator,
     ) -> _Weighed:
@@ -338,19 +345,17 @@ class AnnealedParticleFilter(_Filter):
                 spread = spread * self.survival_rate**0.5
             noise = standard_normal(x.shape, x, generator=generator)
             x = bounds.project(x + spread * (factor[ancestor] @ noise[..., None])[..., 0])
-            energy = _energy(cost, particles.component[ancestor], prior, x)
+            energy = _energy(problem, particles.component[ancestor], prior, x)
             log_weight, _ = tempered_log_weight(-energy, self.survival_rate)
         return _Weighed(x, log_weight, ancestor, num_weighed=self.num_layers * len(x))
 
 
 def _energy(
-    cost: CostFunction | CostFactory,
+    problem: SearchProblem,
     parent: Int[Tensor, " s"],
     prior: GaussianMixture,
     x: Float[Tensor, "s n"],
 ) -> Float[Tensor, " s"]:
     """The frame's cost of states with these parents; infinite where it is not finite."""
-    if not isinstance(cost, CostFunction):
-        cost = cost(parent, prior)
-    value = cost.value(x).detach()
+    value = problem.children(parent, prior).cost.value(x).detach()
     return torch.where(value.isfinite(), value, torch.inf)

@@ -54,7 +54,7 @@ from torchcss.inference.chain import (
 )
 from torchcss.inference.trust_region import default_prior_variance
 from torchcss.linalg import symmetric_part, whitener
-from torchcss.types import Bounds, CostFunction, LocalModel, Status
+from torchcss.types import Bounds, Differentiable, LocalModel, Status
 
 __all__ = [
     "Changes",
@@ -103,7 +103,7 @@ class Refined(NamedTuple):
 
 
 class GaussianEvidence(NamedTuple):
-    """Frames of which each says `1/2 (x - mean)^T precision (x - mean)`; a `CostFunction`.
+    """Frames of which each says `1/2 (x - mean)^T precision (x - mean)`; a `Differentiable`.
 
     Attributes:
         mean: What each frame says that the state is.
@@ -234,7 +234,7 @@ def best_path(
 
 
 def refine(
-    cost: CostFunction,
+    cost: Differentiable,
     start: Float[Tensor, "t n"],
     times: Float[Tensor, " t"],
     transition: Transition,
@@ -286,7 +286,7 @@ def refine(
 
 
 def refine_in_windows(
-    costs: Iterable[CostFunction],
+    costs: Iterable[Differentiable],
     start: Float[Tensor, "t n"],
     times: Float[Tensor, " t"],
     transition: Transition,
@@ -466,7 +466,7 @@ def _second_order_viterbi(
 class _FrameByFrame(NamedTuple):
     """The costs of single frames as the cost of all of them; None costs nothing."""
 
-    costs: list[CostFunction | None]
+    costs: list[Differentiable | None]
 
     def value(self, x: Float[Tensor, "t n"]) -> Float[Tensor, " t"]:
         """Cost of every frame, nats."""

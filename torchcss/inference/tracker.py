@@ -1,4 +1,4 @@
-"""Covariance scaled sampling over a sequence of costs: Fig. 6 of [IJRR], line by line.
+"""Covariance scaled sampling over a sequence of frames: Fig. 6 of [IJRR], line by line.
 
 For every frame: spread the prior's modes by the proposal, descend from every sample, discard the
 minima found twice, weigh the rest by their likelihood, keep the best K, and multiply in the weight
@@ -12,18 +12,19 @@ and could never recover.
         proposal=CovarianceScaled(covariance_scale=8), num_samples=100, num_modes=7
     )
     state = tracker.init(mixture, generator=generator)
-    for state, info in tracker.track(state, costs, bounds):
+    for state, info in tracker.track(state, problems, bounds):
         ...
 
-The state is a record of tensors: `step` is a pure function of it, so that a run that was saved and
-restored continues exactly as one that was never interrupted.
+A frame is a `SearchProblem`: the cost, and what else is known of it. The state is a record of
+tensors: `step` is a pure function of it, so that a run that was saved and restored continues
+exactly as one that was never interrupted.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
@@ -41,24 +42,20 @@ from torchcss.inference.mixture import (
     representatives,
     separated,
 )
+from torchcss.inference.problem import SearchProblem
 from torchcss.inference.proposals import Proposal, Samples
 from torchcss.inference.trust_region import TrustRegionNewton, TrustRegionState, check_bounds
 from torchcss.linalg import log_determinant
-from torchcss.types import Bounds, CostFunction, Modes, Status
+from torchcss.types import Bounds, Modes, Status
 
-CostFactory = Callable[[Tensor, GaussianMixture], CostFunction]
-"""Makes a frame's cost from the samples' parents `[s]` and the prior mixture that they index, for
-costs that compare a sample with the mode that it came from. The cost then has `take` (see
-`CostFunction`)."""
+_ROUNDS = ((0, 2.0), (3, 1.0))
+"""Rounds of successive halving: steps of descent, and how many samples are left then, in multiples
+of `Tracker.survivors`."""
 
-
-_HEATS = ((0, 2.0), (3, 1.0))
-"""The race for the places of `Tracker.finalists`: steps of descent, and how many are left then, in
-multiples of the finalists."""
 _CROWDED = 0.5
 """Share of `Tracker.separation` within which all but the best go on only if places are left. What
 descends from 1000 samples ends in a few minima, the lowest of them again and again: without this,
-60 finalists of an arm end in 3 to 5 of the lowest twenty minima, and with it 40 in 9 to 11."""
+60 survivors of an arm end in 3 to 5 of the lowest twenty minima, and with it 40 in 9 to 11."""
 
 
 class Particles(NamedTuple):
@@ -101,20 +98,21 @@ class TrackerInfo(NamedTuple):
     """What one step did.
 
     Attributes:
-        cost: Cost of each mode kept, what is `unsearched` included, nats; `inf` where a mode was
+        cost: Cost of each mode kept, weight-only cost included, nats; `inf` where a mode was
             carried over (no sample had a finite cost).
         parent: Prior mode matched with each mode (Fig. 6 step 5), or next to it where matching is
             soft; -1 for none.
         origin: Prior mode whose sample descended to each mode.
         status_counts: How many samples ended with each `Status`, by its number.
         num_steps: Optimiser iterations of every descent, those that were given up
-            (`Tracker.finalists`) last.
+            (`Tracker.survivors`) last.
         num_samples: Samples optimised, or weighed, a scalar.
         num_distinct: Distinct modes found before pruning, a scalar; 0 if modes were carried over.
         effective_sample_size: `1 / sum w^2` over the weights of the distinct modes, a scalar: how
             many modes share the posterior.
         survival: How evenly the samples' importance weights are spread: those back to the prior
             for samples that descend (section 8 [IJRR]), those of the posterior for particles.
+        prior: The prior of the frame: the modes before, one frame ahead.
     """
 
     cost: Float[Tensor, " k"]
@@ -126,10 +124,11 @@ class TrackerInfo(NamedTuple):
     num_distinct: Int[Tensor, ""]
     effective_sample_size: Float[Tensor, ""]
     survival: Survival
+    prior: GaussianMixture
 
 
 class SequenceTracker(Protocol):
-    """Anything that follows a mixture through a sequence of costs, one a frame.
+    """Anything that follows a mixture through a sequence of frames.
 
     `Tracker`, `ParticleFilter` and `AnnealedParticleFilter` are; see `Tracker` for the arguments.
     """
@@ -144,6 +143,11 @@ class SequenceTracker(Protocol):
         """Modes kept."""
         ...
 
+    @property
+    def stated_power(self) -> float:
+        """Power of a frame's likelihood in the covariances that are stated, see `tempered`."""
+        ...
+
     def init(self, mixture: GaussianMixture, *, generator: torch.Generator) -> TrackerState:
         """Start from a mixture."""
         ...
@@ -151,7 +155,7 @@ class SequenceTracker(Protocol):
     def step(
         self,
         state: TrackerState,
-        cost: CostFunction | CostFactory,
+        problem: SearchProblem,
         bounds: Bounds,
         *,
         scale: Float[Tensor, " n"] | None = None,
@@ -163,7 +167,7 @@ class SequenceTracker(Protocol):
     def track(
         self,
         state: TrackerState,
-        costs: Iterable[CostFunction | CostFactory],
+        problems: Iterable[SearchProblem],
         bounds: Bounds,
         *,
         scale: Float[Tensor, " n"] | None = None,
@@ -201,25 +205,58 @@ def initial_state(mixture: GaussianMixture, *, generator: torch.Generator) -> Tr
     )
 
 
-def _coarse(cost: CostFunction) -> Any:
-    """The smoother self of a cost, or None."""
-    return getattr(cost, "coarse", lambda: None)()
-
-
 def _unperturbed(samples: Samples, num_modes: int) -> Bool[Tensor, " s"]:
     """The modes of the prior among its samples: they come first, and were not drawn at random."""
     first = torch.arange(len(samples.x), device=samples.parent.device) < num_modes
     return first & (samples.log_weight == -torch.inf)
 
 
-def stated_evidence(tracker: SequenceTracker) -> float:
-    """Power of a frame's likelihood in the covariances that a tracker states, see `tempered`.
+class _Space(NamedTuple):
+    """The state's space: limits, and what `TrustRegionNewton` may be told of its parameters."""
 
-    Args:
-        tracker: One with `covariance_evidence` or `evidence`; for others it is 1.
+    bounds: Bounds
+    scale: Float[Tensor, " n"] | None
+    prior_variance: Float[Tensor, " n"] | None
+
+
+class _Search(NamedTuple):
+    """Samples on their way down.
+
+    Attributes:
+        problem: The problem of these samples.
+        samples: Where they came from.
+        descents: Where they have got to.
+        is_mode: Which of them are modes of the prior, unperturbed.
+        given_up: Steps of those that were given up.
     """
-    power = getattr(tracker, "covariance_evidence", None)
-    return getattr(tracker, "evidence", 1.0) if power is None else power
+
+    problem: SearchProblem
+    samples: Samples
+    descents: TrustRegionState
+    is_mode: Bool[Tensor, " s"]
+    given_up: Int[Tensor, " r"]
+
+    def take(self, items: Int[Tensor, " k"]) -> _Search:
+        """Go on with some of the samples."""
+        others = torch.ones_like(self.is_mode).index_fill(0, items, False)
+        return _Search(
+            self.problem.take(items),
+            Samples(*(part[items] for part in self.samples)),
+            self.descents.take(items),
+            self.is_mode[items],
+            torch.cat([self.given_up, self.descents.num_steps[others]]),
+        )
+
+
+class _Kept(NamedTuple):
+    """The posterior of a frame, the best mode first; see `TrackerInfo`."""
+
+    mixture: GaussianMixture
+    velocity: Float[Tensor, "k n"]
+    cost: Float[Tensor, " k"]
+    parent: Int[Tensor, " k"]
+    origin: Int[Tensor, " k"]
+    effective_sample_size: Float[Tensor, ""]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,26 +272,26 @@ class Tracker:
         duplicate_distance: See `distinct_modes`.
         laplace_evidence: Weigh a mode by its Laplace evidence, likelihood times
             `sqrt(det Sigma)`, instead of the likelihood at the mode alone (design decision 5).
-        memory: Power of the prior's weights in step 5. One is Fig. 6; below one, old evidence is
-            forgotten by degrees.
-        evidence: Power of a frame's likelihood in the weights, step 3. One is Fig. 6, which takes
-            frames as independent evidence. They are not: what a body model lacks, clutter and
+        forgetting: Power of the prior's weights in step 5. One is Fig. 6; below one, old evidence
+            is forgotten by degrees.
+        likelihood_power: Power of a frame's likelihood in the weights, step 3. One is Fig. 6, which
+            takes frames as independent evidence. They are not: what a body model lacks, clutter and
             occlusion cost the same modes in frame after frame. With a sharp likelihood the first
-            frames then decide for good, or, where memory is short, each frame anew.
-        covariance_evidence: The same power in the covariances that are stated, see
-            `stated_evidence`; None: that of the weights. How fast the best mode changes is one
-            question, how far off all of them are together is another.
-        coarse_every: If the cost has a method `coarse()` that returns a smoother cost (or None),
-            every so many samples descend on that first, so that what moved farther than the cost's
-            own basin reaches is found again; 0 for never. As many of them as there are modes begin
-            at the modes: one that is seldom sampled would else be left behind by a fast limb.
+            frames then decide for good, or, where much is forgotten, each frame anew.
+        covariance_power: The same power in the covariances that are stated; None: that of the
+            weights. How fast the best mode changes is one question, how far off all of them are
+            together is another.
+        coarse_every: If the problem has a coarse cost, every so many samples descend on that first,
+            so that what moved farther than the cost's own basin reaches is found again; 0 for
+            never. As many of them as there are modes begin at the modes: one that is seldom sampled
+            would else be left behind by a fast limb.
         oversampling: How many times as many samples are drawn as descend: above one, the best
-            `num_samples` are kept, by the cost's `screening()` if it has that cheaper self. Section
-            4.2 [RR] scores sampled hypotheses by their edges alone.
-        finalists: With more samples than these, those whose first step promises most descend a few
-            steps, and so many to the end: a sample that starts far up seldom overtakes. Of those
-            within half the `separation` of each other the best goes first. Zero: all descend to
-            the end, as in Fig. 6.
+            `num_samples` are kept, by the problem's screening cost. Section 4.2 [RR] scores sampled
+            hypotheses by their edges alone.
+        survivors: Of more samples than these, successive halving keeps so many: those whose first
+            step promises most descend a few steps, and the best of them to the end, since a sample
+            that starts far up seldom overtakes. Of those within half the `separation` of each other
+            the best goes first. Zero: all descend to the end, as in Fig. 6.
         standard_bhattacharyya: Match modes by the distance of the literature instead of the one
             printed (design decision 4).
         soft_matching: In step 5, multiply in the prior's weight at the place of each mode, see
@@ -265,8 +302,8 @@ class Tracker:
         separation: Modes of which no landmark is this far apart are one explanation, of which one
             alone is kept as long as there are others. Zero: the K best modes are kept however
             alike they are, as in Fig. 6. Clutter makes many minima within a hand's breadth, which
-            crowd out all that differ. In the unit of the cost's `landmarks(x)`; costs without that
-            method are not concerned.
+            crowd out all that differ. In the unit of the problem's landmarks; problems without
+            them are not concerned.
     """
 
     proposal: Proposal
@@ -276,12 +313,12 @@ class Tracker:
     dynamics: Dynamics = field(default_factory=Diffusion)
     duplicate_distance: float = 1.0
     laplace_evidence: bool = False
-    memory: float = 1.0
-    evidence: float = 1.0
-    covariance_evidence: float | None = None
+    forgetting: float = 1.0
+    likelihood_power: float = 1.0
+    covariance_power: float | None = None
     coarse_every: int = 3
     oversampling: int = 1
-    finalists: int = 0
+    survivors: int = 0
     standard_bhattacharyya: bool = False
     soft_matching: bool = False
     separation: float = 0.0
@@ -292,8 +329,15 @@ class Tracker:
                 raise ConfigurationError(
                     f"Tracker.{name}: expected a positive number, got {getattr(self, name)}"
                 )
-        if not 0 <= self.memory <= 1:
-            raise ConfigurationError(f"Tracker.memory: expected 0 to 1, got {self.memory}")
+        if not 0 <= self.forgetting <= 1:
+            raise ConfigurationError(f"Tracker.forgetting: expected 0 to 1, got {self.forgetting}")
+
+    @property
+    def stated_power(self) -> float:
+        """Power of a frame's likelihood in the covariances that are stated, see `tempered`."""
+        if self.covariance_power is None:
+            return self.likelihood_power
+        return self.covariance_power
 
     def init(self, mixture: GaussianMixture, *, generator: torch.Generator) -> TrackerState:
         """Start from a mixture, see `initial_state`."""
@@ -302,7 +346,7 @@ class Tracker:
     def step(
         self,
         state: TrackerState,
-        cost: CostFunction | CostFactory,
+        problem: SearchProblem,
         bounds: Bounds,
         *,
         scale: Float[Tensor, " n"] | None = None,
@@ -312,7 +356,7 @@ class Tracker:
 
         Args:
             state: Where the last frame left off.
-            cost: The frame's cost, or what makes it from the samples' parents and the prior.
+            problem: The frame.
             bounds: Box limits on the state.
             scale: See `TrustRegionNewton.init`.
             prior_variance: See `TrustRegionNewton.minimise`.
@@ -322,104 +366,77 @@ class Tracker:
             are carried over, inside the bounds.
         """
         check_bounds(bounds, state.mixture.mean.shape[-1])
-        generator = torch.Generator()
+        generator, space = torch.Generator(), _Space(bounds, scale, prior_variance)
         generator.set_state(state.generator_state)
 
         # 1: the prior, one frame ahead; the proposal inflates it.
         prior = self.dynamics.predict(state.mixture, state.velocity)
 
         # 2.1, 2.2: choose components and sample them, inside the bounds.
+        samples, spread = self._sample(problem, prior, bounds, generator)
+        samples = self._descend_coarsely(problem, samples, prior, space)
+        started = len(samples.x)
+
+        # 2.3: descend from every sample, and discard minima found before.
+        search = self._halve(self._begin(problem, samples, prior), space)
+        modes, distinct = self._minima(search, space)
+        if len(distinct):
+            # 3: weights by the likelihood at the modes. 4 to 6: the best K, with their pasts.
+            found = search.problem.take(distinct), Modes(*(part[distinct] for part in modes))
+            kept = self._posterior(state, prior, *found, search.samples.parent[distinct])
+        else:
+            kept = self._carry_over(state, prior, bounds)
+
+        info = TrackerInfo(
+            cost=kept.cost,
+            parent=kept.parent,
+            origin=kept.origin,
+            status_counts=torch.bincount(modes.status, minlength=len(Status)),
+            num_steps=torch.cat([modes.num_steps, search.given_up]),
+            num_samples=torch.tensor(started),
+            num_distinct=torch.tensor(len(distinct)),
+            effective_sample_size=kept.effective_sample_size,
+            survival=spread,
+            prior=prior,
+        )
+        frame = state.frame + 1
+        return TrackerState(kept.mixture, kept.velocity, generator.get_state(), frame), info
+
+    def _sample(
+        self,
+        problem: SearchProblem,
+        prior: GaussianMixture,
+        bounds: Bounds,
+        generator: torch.Generator,
+    ) -> tuple[Samples, Survival]:
+        """Draw samples; of more than are wanted, keep the best by the screening cost."""
         drawn = self.num_samples * self.oversampling
         samples = self.proposal.sample(prior, drawn, bounds, generator=generator)
         spread = survival(samples.log_weight)
-        make_cost = cost if not isinstance(cost, CostFunction) else lambda *_, cost=cost: cost
-        cost = make_cost(samples.parent, prior)
         if self.oversampling > 1:
-            score = getattr(cost, "screening", lambda cost=cost: cost)().value(samples.x)
-            score = score.nan_to_num(torch.inf)
+            problem = problem.children(samples.parent, prior)
+            score = (problem.screening or problem.cost).value(samples.x).nan_to_num(torch.inf)
             score[_unperturbed(samples, len(prior.mean))] = -torch.inf
             best = score.argsort(stable=True)[: self.num_samples].sort().values
             samples = Samples(*(part[best] for part in samples))
-            cost = make_cost(samples.parent, prior)
+        return samples, spread
 
-        # Before 2.3, if the cost has a smoother self, every so many samples descend on that first.
-        if self.coarse_every and _coarse(cost) is not None:
-            samples, some = self._modes_among(samples, prior)
-            cost = make_cost(samples.parent, prior)
-            coarse = _coarse(cost)
-            part = coarse.take(some) if hasattr(coarse, "take") else coarse
-            rough = self.optimiser.minimise(part, samples.x[some], bounds, scale=scale)
-            samples = samples._replace(x=samples.x.index_copy(0, some, rough.mean))
-
-        started = len(samples.x)
-        cost, samples, descents, raced = self._race(cost, samples, len(prior.mean), bounds, scale)
-
-        # 2.3: descend from every sample, and discard minima found before.
-        descents = self.optimiser.descend(cost, descents, bounds, scale=scale)
-        modes = self.optimiser.modes(descents, bounds, prior_variance=prior_variance)
-        energy = torch.where(modes.status == Status.NON_FINITE, torch.inf, modes.cost)
-        distinct = distinct_modes(
-            modes.mean, modes.covariance, energy, distance=self.duplicate_distance
-        )
-        if len(distinct):
-            # 3: weights by the likelihood at the modes, and by what descents cannot follow.
-            found = energy[distinct]
-            if (unsearched := getattr(cost, "unsearched", None)) is not None:
-                found = found + unsearched(modes.mean[distinct])
-            volume = torch.zeros_like(found)
-            if self.laplace_evidence:
-                volume = 0.5 * log_determinant(modes.covariance[distinct])
-            unpruned = GaussianMixture(
-                modes.mean[distinct], modes.covariance[distinct], volume - self.evidence * found
-            ).normalise()
-
-            # 4: keep the best K. 5, 6: multiply in the prior's weights, and normalise.
-            tempered = prior._replace(log_weight=self.memory * prior.normalise().log_weight)
-            past = prior_at(unpruned, tempered) if self.soft_matching else None
-            order = self._explanations(cost, unpruned, volume - found, past)
-            pruned, kept, found = unpruned.take(order).normalise(), distinct[order], found[order]
-            if past is None:
-                mixture, parent = match_to_prior(
-                    pruned, tempered, standard=self.standard_bhattacharyya
-                )
-            else:
-                weighted = pruned.log_weight + past.log_weight[order]
-                mixture = pruned._replace(log_weight=weighted).normalise()
-                parent = past.parent[order]
-            best_first = mixture.log_weight.argsort(descending=True, stable=True)
-            mixture, parent, kept = mixture.take(best_first), parent[best_first], kept[best_first]
-            mode_cost, origin = found[best_first], samples.parent[kept]
-            moved = mixture.mean - state.mixture.mean[parent.clamp(min=0)]
-            velocity = torch.where((parent >= 0)[:, None], moved, 0.0)
-            effective = (-(2 * unpruned.log_weight).logsumexp(0)).exp()
-        else:
-            best = prior.log_weight.argsort(descending=True, stable=True)[: self.num_modes]
-            mixture = prior.take(best).normalise()
-            mixture = mixture._replace(mean=bounds.project(mixture.mean))
-            # What they move now they go on with, so that they come to rest.
-            velocity = mixture.mean - state.mixture.mean[best]
-            mode_cost = torch.full_like(mixture.log_weight, torch.inf)
-            parent = origin = best
-            effective = torch.zeros_like(prior.log_weight[0])
-
-        info = TrackerInfo(
-            cost=mode_cost,
-            parent=parent,
-            origin=origin,
-            status_counts=torch.bincount(modes.status, minlength=len(Status)),
-            num_steps=torch.cat([modes.num_steps, raced]),
-            num_samples=torch.tensor(started),
-            num_distinct=torch.tensor(len(distinct)),
-            effective_sample_size=effective,
-            survival=spread,
-        )
-        state = TrackerState(mixture, velocity, generator.get_state(), state.frame + 1)
-        return state, info
+    def _descend_coarsely(
+        self, problem: SearchProblem, samples: Samples, prior: GaussianMixture, space: _Space
+    ) -> Samples:
+        """Let every so many samples descend on the coarse cost, if the frame has one."""
+        if not self.coarse_every or problem.children(samples.parent, prior).coarse is None:
+            return samples
+        samples, some = self._modes_among(samples, prior)
+        coarse = problem.children(samples.parent, prior).take(some).coarse
+        assert coarse is not None
+        rough = self.optimiser.minimise(coarse, samples.x[some], space.bounds, scale=space.scale)
+        return samples._replace(x=samples.x.index_copy(0, some, rough.mean))
 
     def _modes_among(
         self, samples: Samples, prior: GaussianMixture
     ) -> tuple[Samples, Int[Tensor, " c"]]:
-        """Choose the samples that descend on the smoother cost, every mode's own copy among them.
+        """Choose the samples that descend on the coarse cost, every mode's own copy among them.
 
         They are taken from those that were drawn, so that the modes descend as they are, too; where
         none was drawn, from the modes.
@@ -436,9 +453,107 @@ class Tracker:
             samples.log_weight.index_fill(0, first, -torch.inf),
         ), some
 
+    def _begin(self, problem: SearchProblem, samples: Samples, prior: GaussianMixture) -> _Search:
+        return _Search(
+            problem.children(samples.parent, prior),
+            samples,
+            self.optimiser.start(samples.x),
+            _unperturbed(samples, len(prior.mean)),
+            samples.parent[:0],
+        )
+
+    def _halve(self, search: _Search, space: _Space) -> _Search:
+        """Successive halving: give up what falls behind in descending, round by round."""
+        optimiser, bounds, scale = self.optimiser, space.bounds, space.scale
+        if not self.survivors or len(search.samples.x) <= self.survivors:
+            return search
+        descents = optimiser.init(search.problem.cost, search.samples.x, bounds, scale=scale)
+        search = search._replace(descents=descents)
+        for max_steps, multiple in _ROUNDS:
+            size = round(multiple * self.survivors)
+            if len(search.samples.x) <= size:
+                continue
+            if max_steps:
+                short = replace(optimiser, max_steps=min(max_steps, optimiser.max_steps))
+                cost, descents = search.problem.cost, search.descents
+                descents = short.descend(cost, descents, bounds, scale=scale)
+                search = search._replace(descents=descents)
+                modes = optimiser.modes(descents, bounds)
+            else:
+                modes = optimiser.promised(search.descents, bounds)
+            search = search.take(self._promising(search, modes, size))
+        return search
+
+    def _promising(self, search: _Search, modes: Modes, size: int) -> Int[Tensor, " k"]:
+        """Which samples go on, in their order; the modes of the last frame are never given up."""
+        energy, is_mode = _finite_cost(modes), search.is_mode
+        lowest = energy.nan_to_num(posinf=0.0).amin()
+        energy = torch.where(is_mode, lowest - 1, energy)
+        order = energy.argsort(stable=True)
+        order = order[energy[order].isfinite()]
+        if self.separation and search.problem.landmarks is not None:
+            points = search.problem.landmarks(modes.mean[order])
+            order = order[separated(points, _CROWDED * self.separation, size)]
+        # Samples in one minimum count as one, or the best would take all places.
+        distinct = distinct_modes(
+            modes.mean[order],
+            modes.covariance[order],
+            energy[order],
+            distance=self.duplicate_distance,
+            most=size,
+        )
+        own, best = is_mode.nonzero()[:, 0], order[distinct]
+        best = torch.cat([own, best[~is_mode[best]]])
+        return best[: max(size, len(own))].sort().values
+
+    def _minima(self, search: _Search, space: _Space) -> tuple[Modes, Int[Tensor, " m"]]:
+        """Descend to the end; all ends, and which are distinct, by ascending cost."""
+        bounds = space.bounds
+        descents = self.optimiser.descend(
+            search.problem.cost, search.descents, bounds, scale=space.scale
+        )
+        modes = self.optimiser.modes(descents, bounds, prior_variance=space.prior_variance)
+        return modes, distinct_modes(
+            modes.mean, modes.covariance, _finite_cost(modes), distance=self.duplicate_distance
+        )
+
+    def _posterior(
+        self,
+        state: TrackerState,
+        prior: GaussianMixture,
+        problem: SearchProblem,
+        modes: Modes,
+        origin: Int[Tensor, " m"],
+    ) -> _Kept:
+        """Steps 3 to 6: weigh the distinct modes, keep the best, and multiply in their pasts."""
+        cost = modes.cost
+        if problem.weight_only is not None:
+            cost = cost + problem.weight_only(modes.mean)
+        volume = torch.zeros_like(cost)
+        if self.laplace_evidence:
+            volume = 0.5 * log_determinant(modes.covariance)
+        log_weight = volume - self.likelihood_power * cost
+        unpruned = GaussianMixture(modes.mean, modes.covariance, log_weight).normalise()
+        remembered = self.forgetting * prior.normalise().log_weight
+        tempered = prior._replace(log_weight=remembered)
+        past = prior_at(unpruned, tempered) if self.soft_matching else None
+        kept = self._explanations(problem, unpruned, volume - cost, past)
+        pruned = unpruned.take(kept).normalise()
+        if past is None:
+            mixture, parent = match_to_prior(pruned, tempered, standard=self.standard_bhattacharyya)
+        else:
+            weighted = pruned.log_weight + past.log_weight[kept]
+            mixture, parent = pruned._replace(log_weight=weighted).normalise(), past.parent[kept]
+        best_first = mixture.log_weight.argsort(descending=True, stable=True)
+        mixture, parent, kept = mixture.take(best_first), parent[best_first], kept[best_first]
+        moved = mixture.mean - state.mixture.mean[parent.clamp(min=0)]
+        velocity = torch.where((parent >= 0)[:, None], moved, 0.0)
+        effective = (-(2 * unpruned.log_weight).logsumexp(0)).exp()
+        return _Kept(mixture, velocity, cost[kept], parent, origin[kept], effective)
+
     def _explanations(
         self,
-        cost: CostFunction,
+        problem: SearchProblem,
         modes: GaussianMixture,
         log_likelihood: Float[Tensor, " m"],
         past: Past | None,
@@ -451,100 +566,53 @@ class Tracker:
         their pasts say: of poses that hardly differ in cost, that of the better past.
         """
         order = modes.log_weight.argsort(descending=True, stable=True)
-        landmarks = getattr(cost, "landmarks", None)
-        if not self.separation or landmarks is None:
+        if not self.separation or problem.landmarks is None:
             return order[: self.num_modes]
         if past is not None:
             heaviest = (modes.log_weight + past.log_weight).argmax()
             order = torch.cat([heaviest[None], order[order != heaviest]])
-        points = landmarks(modes.mean[order])
+        points = problem.landmarks(modes.mean[order])
         chosen = separated(points, self.separation, self.num_modes)
         if past is None:
             return order[chosen]
-        score = (log_likelihood + self.evidence * past.log_weight)[order]
+        score = (log_likelihood + self.likelihood_power * past.log_weight)[order]
         score[0] = torch.inf
         return order[representatives(points, self.separation, chosen, score)]
 
-    def _race(
-        self,
-        cost: CostFunction,
-        samples: Samples,
-        num_modes: int,
-        bounds: Bounds,
-        scale: Float[Tensor, " n"] | None,
-    ) -> tuple[CostFunction, Samples, TrustRegionState, Int[Tensor, " r"]]:
-        """Drop what falls behind in descending, until the finalists are left.
-
-        Returns:
-            The cost of the finalists, their samples, where they have got to, and the steps that the
-            others took.
-        """
-        optimiser, nobody = self.optimiser, samples.parent[:0]
-        if not self.finalists or len(samples.x) <= self.finalists:
-            return cost, samples, optimiser.start(samples.x), nobody
-        known_modes, dropped = _unperturbed(samples, num_modes), [nobody]
-        descents = optimiser.init(cost, samples.x, bounds, scale=scale)
-        for max_steps, multiple in _HEATS:
-            size = round(multiple * self.finalists)
-            if len(samples.x) <= size:
-                continue
-            if max_steps:
-                heat = replace(optimiser, max_steps=min(max_steps, optimiser.max_steps))
-                descents = heat.descend(cost, descents, bounds, scale=scale)
-                modes = optimiser.modes(descents, bounds)
-            else:
-                modes = optimiser.promised(descents, bounds)
-            best = self._promising(cost, modes, known_modes, size)
-            others = torch.ones_like(known_modes).index_fill(0, best, False)
-            dropped.append(descents.num_steps[others])
-            descents, known_modes = descents.take(best), known_modes[best]
-            samples = Samples(*(part[best] for part in samples))
-            restrict = getattr(cost, "take", None)
-            cost = cost if restrict is None else restrict(best)
-        return cost, samples, descents, torch.cat(dropped)
-
-    def _promising(
-        self, cost: CostFunction, modes: Modes, known: Bool[Tensor, " s"], size: int
-    ) -> Int[Tensor, " k"]:
-        """Which samples go on, in their order; the modes of the last frame are never dropped."""
-        energy = torch.where(modes.status == Status.NON_FINITE, torch.inf, modes.cost)
-        lowest = energy.nan_to_num(posinf=0.0).amin()
-        energy = torch.where(known, lowest - 1, energy)
-        order = energy.argsort(stable=True)
-        order = order[energy[order].isfinite()]
-        landmarks = getattr(cost, "landmarks", None)
-        if self.separation and landmarks is not None:
-            order = order[separated(landmarks(modes.mean[order]), _CROWDED * self.separation, size)]
-        # Samples in one minimum count as one, or the best would take all places.
-        distinct = distinct_modes(
-            modes.mean[order],
-            modes.covariance[order],
-            energy[order],
-            distance=self.duplicate_distance,
-            most=size,
-        )
-        own, best = known.nonzero()[:, 0], order[distinct]
-        best = torch.cat([own, best[~known[best]]])
-        return best[: max(size, len(own))].sort().values
+    def _carry_over(self, state: TrackerState, prior: GaussianMixture, bounds: Bounds) -> _Kept:
+        """The best of the prior, in a frame in which nothing has a finite cost."""
+        best = prior.log_weight.argsort(descending=True, stable=True)[: self.num_modes]
+        mixture = prior.take(best).normalise()
+        mixture = mixture._replace(mean=bounds.project(mixture.mean))
+        # What they move now they go on with, so that they come to rest.
+        velocity = mixture.mean - state.mixture.mean[best]
+        cost = torch.full_like(mixture.log_weight, torch.inf)
+        return _Kept(mixture, velocity, cost, best, best, torch.zeros_like(prior.log_weight[0]))
 
     def track(
         self,
         state: TrackerState,
-        costs: Iterable[CostFunction | CostFactory],
+        problems: Iterable[SearchProblem],
         bounds: Bounds,
         *,
         scale: Float[Tensor, " n"] | None = None,
         prior_variance: Float[Tensor, " n"] | None = None,
     ) -> Iterator[tuple[TrackerState, TrackerInfo]]:
-        """Step through a sequence, one cost a frame; yields what `step` returns.
+        """Step through a sequence, one problem a frame; yields what `step` returns.
 
         Args:
             state: Where to begin.
-            costs: The frames' costs, or what makes them.
+            problems: The frames.
             bounds: Box limits on the state.
             scale: See `TrustRegionNewton.init`.
             prior_variance: See `TrustRegionNewton.minimise`.
         """
-        for cost in costs:
-            state, info = self.step(state, cost, bounds, scale=scale, prior_variance=prior_variance)
+        for problem in problems:
+            state, info = self.step(
+                state, problem, bounds, scale=scale, prior_variance=prior_variance
+            )
             yield state, info
+
+
+def _finite_cost(modes: Modes) -> Float[Tensor, " s"]:
+    return torch.where(modes.status == Status.NON_FINITE, torch.inf, modes.cost)

@@ -20,7 +20,7 @@ decrease predicted for the step that was actually taken. Each iteration evaluate
 once, at the candidate: its value decides on acceptance, its derivatives are kept if accepted.
 
 No item of a batch influences another: radius, damping, acceptance and `Status` are per item, and
-`minimise` drops items as they finish (and restricts the cost by `cost.take(items)` if it has that).
+`minimise` drops items as they finish, and restricts the cost to those that are left.
 
 An item stops as
 
@@ -52,7 +52,7 @@ from torchcss.linalg import (
     solve_lower,
     wall,
 )
-from torchcss.types import Bounds, CostFunction, LocalModel, Modes, Status
+from torchcss.types import BlendedCost, Bounds, CostFunction, LocalModel, Modes, Status
 
 
 class TrustRegionState(NamedTuple):
@@ -215,13 +215,13 @@ class TrustRegionNewton:
         bounds, weight = _like(bounds, state.x), _weight(state.x, scale)
         running, value = state.status == Status.RUNNING, state.model.value
         candidate = bounds.project(state.x + state.step)
-        blended = getattr(cost, "blended_model", None)
-        if blended is None:
+        blends = isinstance(cost, BlendedCost)
+        if blends:
+            share = _share_of_second_order(value, state.predicted)
+            model = cost.blended_model(candidate, share)
+        else:
             share = torch.ones_like(value)
             model = cost.local_model(candidate)
-        else:
-            share = _share_of_second_order(value, state.predicted)
-            model = blended(candidate, share)
         # Contiguous, because sums over other layouts round differently in other batches.
         model = LocalModel(*(part.detach().contiguous() for part in model))
         finite = _is_finite(model) & candidate.isfinite().all(-1)
@@ -231,7 +231,7 @@ class TrustRegionNewton:
         accepted = running & finite & (stays | ((decrease >= 0) & (ratio > _LEAST_RATIO)))
         length = (weight * state.step.square()).sum(-1).sqrt()
         radius = _next_radius(state.radius, length, ratio, accepted)
-        if blended is not None:
+        if blends:
             radius = radius.clamp(max=self.initial_radius)
         unusable = running & value.isinf() & ~accepted
         state = TrustRegionState(
@@ -266,8 +266,8 @@ class TrustRegionNewton:
         """Descend from every start until it stops, and return the modes with their covariances.
 
         Args:
-            cost: What to minimise. It is called with one leading dimension, the batch flattened;
-                if it has a method `take(items)`, that restricts it to the items still running.
+            cost: What to minimise. It is called with one leading dimension, the batch flattened,
+                and restricted to the items still running.
             x0: Starts; those outside the bounds are projected onto them first.
             bounds: Box limits; they hold exactly, in the dtype of `x0`.
             scale: See `init`.
@@ -324,8 +324,7 @@ class TrustRegionNewton:
         queue = torch.nonzero(status == Status.RUNNING)[:, 0]
         items, queue = queue[:size], queue[size:]
         pool = result.take(items)
-        restrict = getattr(cost, "take", None)
-        part = cost if restrict is None or len(items) == len(status) else restrict(items)
+        part = cost if len(items) == len(status) else cost.take(items)
         while len(items):
             pool, _ = self.step(part, pool, bounds, scale=scale)
             done = torch.nonzero(pool.status != Status.RUNNING)[:, 0]
@@ -342,7 +341,7 @@ class TrustRegionNewton:
                 kept = torch.ones_like(items, dtype=torch.bool).index_fill(0, left, False)
                 kept = torch.nonzero(kept)[:, 0]
                 items, pool = items[kept], pool.take(kept)
-            part = cost if restrict is None else restrict(items)
+            part = cost.take(items)
         return result
 
     def modes(

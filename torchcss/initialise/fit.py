@@ -25,13 +25,14 @@ from torch import Tensor
 from torchcss.body.model import BodyModel
 from torchcss.body.root import has_root
 from torchcss.body.shape import WHOLE_SHAPE, ShapeParameters, with_shape
-from torchcss.cost.contour import ContourTerm
+from torchcss.cost.context import FrameContext
+from torchcss.cost.contour import ContourTerm, OnContour
 from torchcss.cost.frame import FrameCosts
+from torchcss.cost.joints import JointTerm
 from torchcss.cost.region import RegionTerm
 from torchcss.cost.shaped import Outline
-from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.cost.total import TrackingCost
 from torchcss.cost.view import View
-from torchcss.cost.visibility import ContourPredictor
 from torchcss.errors import CameraError
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.initialise.from_joints import fit_joints
@@ -121,17 +122,23 @@ def initialise(
     first = fit_joints(body, view, generator=generator, options=options, others=others)
     given = keypoints.only(first.body.joint_names).to(first.body.tie)
     alone = TrackingCost(
-        body=first.body, camera=camera, choice=options.joint_choice, keypoints=given
+        choice=options.joint_choice,
+        views=(FrameContext(body=first.body, camera=camera, keypoints=given),),
     )
     notes = (*notes, *swapped_sides(alone, first.mixture.mean[0], generator))
     first = first._replace(report=(*notes, *first.report))
     if image is None or not options.contours or isinstance(body, BodyModel):
         return first
     left_out = torch.tensor([name in first.left_out for name in given.names])
-    view = replace(view, keypoints=given.without(left_out.to(options.device)))
+    view = view._replace(keypoints=given.without(left_out.to(options.device)))
     cost = _contour_cost(image, first, view, options)
     scaled = (each.of_keypoints(_factor(view.camera, cost.camera)) for each in others)
-    return _with_contours(first, replace(cost, others=tuple(scaled)), options)
+    beside = (
+        replace(cost.views[0], camera=each.camera, keypoints=each.keypoints, edge_field=None,
+                features=None, appearance=None)
+        for each in scaled
+    )  # fmt: skip
+    return _with_contours(first, replace(cost, views=(*cost.views, *beside)), options)
 
 
 def _factor(camera: Camera, working: Camera) -> float:
@@ -151,18 +158,13 @@ def _contour_cost(
     working = extractor.working_camera(view.camera)
     factor = _factor(view.camera, working)
     choice = options.joint_choice
-    assert choice.joints is not None
-    costs = FrameCosts(
-        first.body,
-        working,
-        replace(
-            choice,
-            contour=ContourTerm(),
-            region=RegionTerm() if options.colours else None,
-            contour_weight=_BESIDE_COLOURS if options.colours else CostChoice.contour_weight,
-            joints=replace(choice.joints, sigma=factor * choice.joints.sigma),
-        ),
-    )
+    joints = choice.find(JointTerm)
+    assert joints is not None
+    beside = (ContourTerm(weight=_BESIDE_COLOURS), RegionTerm())
+    outlines = beside if options.colours else (ContourTerm(),)
+    choice = choice.having(replace(joints, sigma=factor * joints.sigma))
+    choice = replace(choice, terms=(*outlines, *choice.terms))
+    costs = FrameCosts(first.body, working, choice)
     return costs(
         features,
         body=first.body,
@@ -180,10 +182,10 @@ def _with_contours(
     loose = load(first.lengths, free_proportions=True)
     rivals = first.mixture.mean[first.cost <= first.cost[0] + _RIVALS]
     parameters = ShapeParameters(loose, WHOLE_SHAPE)
-    bones = replace(cost.choice, contour=None, region=None)
+    bones = cost.choice.without("contour", "region")
     sections, whole = fit_shape(
-        replace(cost, body=loose, choice=bones), spread_to(first.body, loose, rivals), parameters,
-        _outlines(cost), bounds=search.bounds(loose),
+        replace(cost, choice=bones).with_body(loose), spread_to(first.body, loose, rivals),
+        parameters, _outlines(cost), bounds=search.bounds(loose),
     )  # fmt: skip
     lengths = {**first.lengths, **fitted_lengths(loose, whole.state, options.stature)}
 
@@ -191,21 +193,18 @@ def _with_contours(
         offset = (fit.shape @ parameters.tie.T).unflatten(-1, body.part_shape.shape)
         return with_shape(body, body.part_shape + offset)
 
-    def cost_of(body: BodyModel) -> TrackingCost:
-        return replace(cost, body=body, predictor=ContourPredictor(body))
-
     body = shaped(load(lengths), whole)
     best = columns_of(loose, body, whole.state[None])
     starts = torch.cat([best, first.mixture.mean])
     fits = TrustRegionNewton(max_steps=40, tolerance=1e-2).minimise(
-        cost_of(body), starts, search.bounds(body)
+        cost.with_body(body), starts, search.bounds(body)
     )
     kept = best_distinct(fits, options.num_modes)
     if rooted:
         body, kept = hang_on_best(body, kept)
         free = shaped(load(lengths, free_proportions=True), whole)
         free = free.with_base(body.base_rotation, body.base_translation)
-        kept = with_unknown_lengths(cost_of(free), body, kept, search)
+        kept = with_unknown_lengths(cost.with_body(free), body, kept, search)
     result = as_initialisation(body, kept, first.report)
     second = Stage(
         "cross-sections, with contours", shaped(first.body, sections),
@@ -229,15 +228,11 @@ def _with_contours(
 
 
 def _outlines(cost: TrackingCost) -> tuple[Outline, ...]:
-    choice = cost.choice
-    compared = (
-        (choice.contour, cost.edge_field, choice.contour_weight),
-        (choice.region, cost.region, choice.region_weight),
-    )
+    bound = (cost.bound[term, cost.views[0]] for term in cost.choice.terms if term.kind == "image")
     return tuple(
-        Outline(term, image, weight)
-        for term, image, weight in compared
-        if term is not None and image is not None
+        Outline(each.term, each.image, each.term.weight)
+        for each in bound
+        if isinstance(each, OnContour)
     )
 
 

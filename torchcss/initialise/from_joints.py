@@ -17,13 +17,13 @@ or the view of another camera, else the anthropometric prior does.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import torch
 
 from torchcss.body.load import has_free_root, load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.root import has_root, move_base, root_pose
+from torchcss.cost.context import FrameContext
 from torchcss.cost.joints import JointTargets, match_joints
 from torchcss.cost.total import TrackingCost
 from torchcss.cost.view import View
@@ -89,18 +89,18 @@ def fit_joints(
     keypoints = keypoints.without(~keypoints.positions.isfinite().all(-1))
     notes = (*free.notes, *check_joints(free.name, keypoints, view.camera, options.least_joints))
     cost = TrackingCost(
-        body=free,
-        camera=view.camera,
         choice=options.joint_choice,
-        keypoints=keypoints,
-        others=others,
+        views=tuple(
+            FrameContext(body=free, camera=each.camera, keypoints=each.keypoints)
+            for each in (View(view.camera, keypoints), *others)
+        ),
     )
     if isinstance(body, BodyModel):
         _check_in_view(body, view.camera)
         fits = multi_start_fits(cost, search=options.search, generator=generator)
         return as_initialisation(body, best_distinct(fits, options.num_modes), notes)
     free = _hang_before_camera(free, view.camera, match_joints(keypoints, free.joint_names))
-    cost = replace(cost, body=free)
+    cost = cost.with_body(free)
     fits, outliers = fits_and_outliers(cost, search=options.search, generator=generator)
     left_out = tuple(
         name for name, out in zip(keypoints.names, outliers.tolist(), strict=True) if out
@@ -112,7 +112,7 @@ def fit_joints(
     held, kept = _with_lengths_held(cost, fits, lengths, scale, options)
     result = as_initialisation(held, kept, notes)
     report = [*result.report, scale_report(options.stature, lengths, num_views=1 + len(others))]
-    if (line := undetermined_line(held, kept, joints=replace(cost, body=held))) is not None:
+    if (line := undetermined_line(held, kept, joints=cost.with_body(held))) is not None:
         report.append(line)
     fits = Modes(*(field[: options.num_modes] for field in fits))
     return result._replace(
@@ -141,19 +141,19 @@ def _with_lengths_held(
     body = with_lengths(free, lengths, scale, free_root=True)
     starts = columns_of(free, body, candidates)
     body, starts, _ = move_base(body, *root_pose(body, starts[0]), starts)
-    refined = refine(replace(cost, body=body), starts, options.search)
+    refined = refine(cost.with_body(body), starts, options.search)
     if not has_free_root(free.name):
         # The root of the best fit becomes the arm's base, and only its angles are searched.
         best = refined.mean[int(refined.cost.nan_to_num(math.inf).argmin())]
         arm = with_lengths(free, lengths, scale, free_root=None).with_base(*root_pose(body, best))
         starts = columns_of(body, arm, refined.mean)
-        body, refined = arm, refine(replace(cost, body=arm), starts, options.search)
+        body, refined = arm, refine(cost.with_body(arm), starts, options.search)
     kept = best_distinct(refined, num)
     if not has_root(body):
         return body, kept
     body, kept = hang_on_best(body, kept)
     loose = with_lengths(body, lengths, scale, free_root=True, free_proportions=True)
-    return body, with_unknown_lengths(replace(cost, body=loose), body, kept, options.search)
+    return body, with_unknown_lengths(cost.with_body(loose), body, kept, options.search)
 
 
 def _check_in_view(body: BodyModel, camera: Camera) -> None:

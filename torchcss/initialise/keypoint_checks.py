@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -149,7 +148,7 @@ def swapped_sides(
     for what, places in _SIDED.items():
         names = tuple(_other_side(name, places) for name in given.names)
         if names != given.names:
-            swapped = replace(cost, keypoints=given._replace(names=names))
+            swapped = cost.with_keypoints(given._replace(names=names))
             fits = multi_start_fits(swapped, search=quick, generator=generator)
             costs[what] = float(capped_cost(swapped, fits.mean).min())
     what = min(costs, key=lambda name: costs[name], default="")

@@ -33,6 +33,7 @@ from torchcss.body.flips import Segments
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, has_root
 from torchcss.cost.anthropometric import proportion_columns
+from torchcss.cost.joints import JointTerm
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.total import TrackingCost
 from torchcss.errors import ConfigurationError
@@ -176,10 +177,10 @@ def descend(
 
 
 def _widened(cost: TrackingCost, factor: float) -> TrackingCost:
-    joints = cost.choice.joints
+    joints = cost.choice.find(JointTerm)
     assert joints is not None
     wide = replace(joints, sigma=factor * joints.sigma)
-    return replace(cost, choice=replace(cost.choice, joints=wide))
+    return replace(cost, choice=cost.choice.having(wide))
 
 
 def _starts(body: BodyModel, num: int, generator: torch.Generator) -> Float[Tensor, "b n"]:

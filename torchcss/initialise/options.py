@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 import torch
 
 from torchcss.cost.anthropometric import Anthropometric
+from torchcss.cost.choice import CostChoice
 from torchcss.cost.joints import JointTerm
-from torchcss.cost.total import CostChoice
+from torchcss.cost.stabiliser import Stabiliser
 from torchcss.errors import ConfigurationError
 from torchcss.initialise.multi_start import Search
 from torchcss.robust import Lorentzian
@@ -60,8 +61,9 @@ class InitialiseOptions:
         assert self.sigma is not None
         known = self.stature is not None
         return CostChoice(
-            contour=None,
-            joints=JointTerm(sigma=self.sigma, potential_kind=self.potential_kind),
-            temporal=None,
-            anthropometric=Anthropometric(stature=0.0) if known else Anthropometric(),
+            terms=(
+                JointTerm(sigma=self.sigma, potential_kind=self.potential_kind),
+                Stabiliser(),
+                Anthropometric(stature=0.0) if known else Anthropometric(),
+            )
         )

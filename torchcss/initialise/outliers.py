@@ -118,7 +118,7 @@ def _put_back(
 
 def _matched(cost: TrackingCost) -> tuple[JointTerm, JointTargets]:
     """The joint term of a cost, and its keypoints matched to the body."""
-    joints, keypoints = cost.choice.joints, cost.keypoints
+    joints, keypoints = cost.choice.find(JointTerm), cost.keypoints
     assert joints is not None
     assert keypoints is not None
     return joints, match_joints(keypoints, cost.body.joint_names)
@@ -136,7 +136,7 @@ def capped_cost(cost: TrackingCost, x: Float[Tensor, "*batch n"]) -> Float[Tenso
     """Cost in nats if no keypoint costs more than leaving it out."""
     joints, targets = _matched(cost)
     projection = cost.camera.project(cost.body.pose(x).joints[..., targets.joint, :])
-    each = cost.choice.joint_weight * joints.value(projection, targets)
+    each = joints.weight * joints.value(projection, targets)
     return cost.value(x) - (each - price_of_leaving_out(cost)).clamp(min=0.0).sum(-1)
 
 
@@ -145,7 +145,9 @@ def without(cost: TrackingCost, outliers: Bool[Tensor, "*b j"]) -> TrackingCost:
     keypoints = cost.keypoints
     assert keypoints is not None
     places = keypoints.positions.expand(*outliers.shape, 2)
-    return replace(cost, keypoints=keypoints._replace(positions=places).without(outliers))
+    if outliers.dim() > 1:
+        cost = replace(cost, parent=torch.arange(len(outliers), device=outliers.device))
+    return cost.with_keypoints(keypoints._replace(positions=places).without(outliers))
 
 
 def refine(cost: TrackingCost, x: Float[Tensor, "b n"], search: Search) -> Modes:

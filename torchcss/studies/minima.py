@@ -85,9 +85,8 @@ class _NearPlane:
     stiffness: Float[Tensor, " b"]
 
     def take(self, items: Int[Tensor, " m"]) -> _NearPlane:
-        restrict = getattr(self.cost, "take", None)
         return _NearPlane(
-            self.cost if restrict is None else restrict(items),
+            self.cost.take(items),
             self.point[items],
             self.normal[items],
             self.stiffness[items],

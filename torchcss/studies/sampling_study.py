@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchcss.body.model import BodyModel
@@ -78,6 +78,10 @@ class ExactSteps:
     def local_model(self, x: Float[Tensor, "*batch n"]) -> LocalModel:
         """Cost, gradient and exact Hessian."""
         return self.cost.local_model(x)
+
+    def take(self, items: Int[Tensor, " m"]) -> ExactSteps:
+        """The cost of some items."""
+        return ExactSteps(self.cost.take(items))
 
 
 class Lengths(NamedTuple):

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,6 +25,7 @@ from torch import Tensor
 
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES
+from torchcss.cost.context import FrameContext
 from torchcss.cost.total import TrackingCost
 from torchcss.errors import ConfigurationError
 from torchcss.inference.trust_region import TrustRegionNewton
@@ -166,10 +166,10 @@ def _clip_scene(
     truth = _nearest(body, first.mixture.mean, folder / "reference3d.npz", frame)
     sigma = default_sigma(keypoints.at(frame))
     alone = TrackingCost(
-        body=body,
-        camera=full,
         choice=make_choice(Settings(terms=("joints", "stabiliser")), sigma),
-        keypoints=keypoints.at(frame - 1).to(body.tie),
+        views=(
+            FrameContext(body=body, camera=full, keypoints=keypoints.at(frame - 1).to(body.tie)),
+        ),
     )
     previous = TrustRegionNewton().minimise(alone, truth[None], body.bounds).mean[0]
     eye, states = CameraView(full, keypoints, sigma), (previous, truth)

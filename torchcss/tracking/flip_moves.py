@@ -16,8 +16,10 @@ from torch import Tensor
 
 from torchcss.body.flips import Segments
 from torchcss.body.model import BodyModel
+from torchcss.cost.choice import CostChoice
+from torchcss.cost.context import FrameContext
 from torchcss.cost.joints import JointTerm
-from torchcss.cost.total import CostChoice, TrackingCost
+from torchcss.cost.total import TrackingCost
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.tracker import TrackerState
 from torchcss.initialise.multi_start import flips
@@ -111,11 +113,10 @@ def flipped_poses(
         return nothing
     extent = float((uv[valid].amax(0) - uv[valid].amin(0)).max())
     sigma = max(1.0, _NOISE * extent)
+    keypoints = Keypoints(uv, valid.to(uv), body.joint_names)
     cost = TrackingCost(
-        body=body,
-        camera=camera,
-        choice=CostChoice(contour=None, joints=JointTerm(sigma=sigma)),
-        keypoints=Keypoints(uv, valid.to(uv), body.joint_names),
+        choice=CostChoice().without("contour", "temporal").having(JointTerm(sigma=sigma)),
+        views=(FrameContext(body=body, camera=camera, keypoints=keypoints),),
     )
     poses = flips(cost, segments, x[None], body.bounds, _ALL)
     places = body.pose(poses).joints

@@ -94,10 +94,10 @@ def astray_limbs(cost: TrackingCost, body: BodyModel, x: Float[Tensor, " n"]) ->
         body: The body on this frame's base.
         x: A pose.
     """
-    if not cost.knows_segmentation:
+    if not cost.weighs:
         return []
     arms = (limb for limb in Segments(body).limbs if limb.name.endswith(_SWINGING))
-    looks = float(cost.unsearched(x))
+    looks = float(cost.weight_only(x))
     return [arm for arm in arms if looks > _without(cost, body, arm, x) - GAIN]
 
 
@@ -136,9 +136,9 @@ def other_poses(
     drawn[:, columns] += torch.special.ndtri(share.to(x)) * deviation
     drawn = bounds.project(drawn)
     every = torch.cat([x[None], drawn])
-    choice = replace(cost.choice, flow=None, temporal=None, temporal_mixture=None)
+    choice = cost.choice.without("flow", "temporal", "temporal_mixture")
     of_mode = replace(cost, choice=choice).of_children(every.new_zeros(len(every)).long(), prior)
-    colours = cost.unsearched(every)
+    colours = cost.weight_only(every)
     apart = (every - x)[:, columns] / deviation
     value = of_mode.value(every) + colours + 0.5 * apart.square().sum(-1)
     speak = colours < _without(cost, body, limb, x) - GAIN
@@ -159,4 +159,4 @@ def _without(cost: TrackingCost, body: BodyModel, limb: Limb, x: Float[Tensor, "
     beyond = (ancestors[:, body.part_link] >= hung[:, None]).all(0)
     shape = body.part_shape.clone()
     shape[beyond, :3] = 1e-3
-    return float(replace(cost, body=with_shape(body, shape)).unsearched(x))
+    return float(cost.weight_only(x, body=with_shape(body, shape)))

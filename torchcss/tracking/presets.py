@@ -68,25 +68,26 @@ class Preset:
         proposal: Where samples go, for trackers that descend from them; one that searches by
             dynamical noise gets its `deviation` from `noise`.
         particles: The particle filter instead; its numbers and dynamics are filled in.
-        samples_arm: Samples per frame for an arm. With 160 that race for 40 places instead of 40
-            (`finalists_arm`) css takes a fifth more evaluations; on the rendered arm none of five
+        samples_arm: Samples per frame for an arm. With 160 halved to 40 instead of 40
+            (`survivors_arm`) css takes a fifth more evaluations; on the rendered arm none of five
             seeds is lost; with 40 two were.
         samples_body: Samples per frame for a body.
         modes_arm: Modes kept for an arm.
         modes_body: Modes kept for a body.
-        memory: See `Tracker`.
-        evidence: See `Tracker`. On the rendered arm 0.1 instead of 1 (with a memory of 0.98 and
-            matching as in Fig. 6) took the best mode's error from 128 to 59 mm: of two poses that
-            look alike the one that was right so far stays the best.
-        finalists_arm: `Tracker.finalists` for an arm; they matter with many samples only.
-        finalists_body: The same for a body.
+        forgetting: See `Tracker`.
+        likelihood_power: See `Tracker`. On the rendered arm 0.1 instead of 1 (with a forgetting of
+            0.98 and matching as in Fig. 6) took the best mode's error from 128 to 59 mm: of
+            two poses that look alike the one that was right so far stays the best.
+        survivors_arm: `Tracker.survivors` for an arm.
+        survivors_body: The same for a body.
         proposal_arm: Where samples go for an arm, if elsewhere than for a body.
-        evidence_arm: `evidence` for an arm, if other than for a body. Its modes cost the same for
-            longer, since it has no `segmentation`: the rest of its person looks the same.
-        evidence_keypoints: `evidence` of a body with keypoints in every frame, if other than
+        power_arm: `likelihood_power` for an arm, if other than for a body. Its modes cost the same
+            for longer, since it has no `segmentation`: the rest of its person looks the same.
+        power_keypoints: `likelihood_power` of a body with keypoints in every frame, if other than
             without: they tell in every frame anew which modes are wrong, and who was right for long
-            leads on less. (An arm does not gain.) The covariances stay those of `evidence`: with
-            0.3, half of the true joints are in the 90 % regions, with 0.1 three quarters.
+            leads on less. (An arm does not gain.) The covariances stay those of
+            `likelihood_power`: with 0.3, half of the true joints are in the 90 %
+            regions, with 0.1 three quarters.
         persistence: Share of its last motion that a mode goes on with: 0 is driftless diffusion, 1
             constant velocity. The papers' trackers have 0. With 0.8 a mode does not lag behind a
             limb whose flow is underestimated: on the beam clip it doubles the time that limbs are
@@ -113,13 +114,13 @@ class Preset:
     samples_body: int
     modes_arm: int = 3
     modes_body: int = 7
-    memory: float = 1.0
-    evidence: float = 1.0
-    finalists_arm: int = 0
-    finalists_body: int = 0
+    forgetting: float = 1.0
+    likelihood_power: float = 1.0
+    survivors_arm: int = 0
+    survivors_body: int = 0
     proposal_arm: Proposal | None = None
-    evidence_arm: float | None = None
-    evidence_keypoints: float | None = None
+    power_arm: float | None = None
+    power_keypoints: float | None = None
     persistence: float = 0.0
     noise: float = 1.0
     robust: bool = True
@@ -163,12 +164,12 @@ _CSS = Preset(
     proposal=CovarianceScaled(covariance_scale=8.0, max_deviation=1.0),
     samples_arm=160,
     samples_body=60,
-    memory=0.98,
-    evidence=0.1,
-    evidence_arm=0.05,
-    evidence_keypoints=0.2,
-    finalists_arm=40,
-    finalists_body=60,
+    forgetting=0.98,
+    likelihood_power=0.1,
+    power_arm=0.05,
+    power_keypoints=0.2,
+    survivors_arm=40,
+    survivors_body=60,
     persistence=_PERSISTENCE,
     separation=0.12,
     soft_matching=True,
@@ -221,13 +222,13 @@ PRESETS: dict[str, Preset] = {
     "css_figure_6": replace(
         _CSS,
         what="css as printed: weights multiplied, minima however alike, no jumps to flips",
-        memory=1.0,
-        evidence=1.0,
-        evidence_arm=None,
-        evidence_keypoints=None,
+        forgetting=1.0,
+        likelihood_power=1.0,
+        power_arm=None,
+        power_keypoints=None,
         samples_arm=40,
-        finalists_arm=0,
-        finalists_body=0,
+        survivors_arm=0,
+        survivors_body=0,
         separation=0.0,
         soft_matching=False,
         jumps_every=0,
@@ -253,7 +254,7 @@ PRESETS: dict[str, Preset] = {
         proposal_arm=EigenDirectionGrid(num_directions=1, num_steps=1),
         samples_arm=9,  # 3 modes and 2 steps from each
         samples_body=49,  # 7 modes and 6 steps from each
-        memory=0.0,
+        forgetting=0.0,
         persistence=_PERSISTENCE,
     ),
     "single": _SINGLE,
@@ -340,7 +341,7 @@ def make_tracker(
         )
     proposal = (row.proposal_arm if arm else None) or row.proposal
     assert proposal is not None
-    evidence = row.evidence_arm if arm and row.evidence_arm is not None else row.evidence
+    evidence = row.power_arm if arm and row.power_arm is not None else row.likelihood_power
     # Who searches by noise adds it in the proposal; the dynamics themselves then add none.
     if isinstance(proposal, (ChamRehg, Condensation)):
         proposal, dynamics = replace(proposal, deviation=noise), replace(dynamics, deviation=0.0)
@@ -349,9 +350,9 @@ def make_tracker(
         num_samples=num_samples,
         num_modes=num_modes,
         optimiser=TrustRegionNewton(max_steps=17, tolerance=1e-2, initial_radius=_FIRST_RADIUS),
-        memory=row.memory,
-        evidence=evidence,
-        finalists=row.finalists_arm if arm else row.finalists_body,
+        forgetting=row.forgetting,
+        likelihood_power=evidence,
+        survivors=row.survivors_arm if arm else row.survivors_body,
         dynamics=dynamics,
         separation=row.separation,
         soft_matching=row.soft_matching,

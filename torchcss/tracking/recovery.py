@@ -13,14 +13,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from torchcss.body.model import BodyModel
+from torchcss.cost.choice import TERM_TABLE
 from torchcss.inference.loss_monitor import LossMonitor, MonitorState, widened
 from torchcss.inference.tracker import SequenceTracker, TrackerState
 from torchcss.tracking.flip_moves import with_flips
 from torchcss.vision.camera import Camera
-
-OBSERVATIONS = ("contour", "edge_energy", "region", "flow", "joints")
-"""The terms of the cost that compare with the image in the same way in every frame. What looks at
-the silhouette changes with what is known of the background; the rest are priors."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +44,7 @@ class Recovery:
 
     def judge(self, state: MonitorState, terms: Mapping[str, float]) -> tuple[MonitorState, bool]:
         """Take in what the terms of a frame cost at the best mode; see `LossMonitor.update`."""
-        observed = {name: cost for name, cost in terms.items() if name in OBSERVATIONS}
+        observed = {name: cost for name, cost in terms.items() if TERM_TABLE[name].watched}
         return self.monitor.update(state, observed)
 
     def widened(self, tracker: SequenceTracker) -> SequenceTracker:

@@ -30,18 +30,15 @@ from torch import Tensor
 
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, has_root, move_base, root_pose
-from torchcss.cost.frame import beside
-from torchcss.cost.total import TrackingCost
+from torchcss.cost.total import TrackingCost, beside
 from torchcss.errors import ConfigurationError
 from torchcss.inference.loss_monitor import MonitorState
 from torchcss.inference.mixture import GaussianMixture, tempered
 from torchcss.inference.tracker import (
-    CostFactory,
     SequenceTracker,
     Tracker,
     TrackerInfo,
     TrackerState,
-    stated_evidence,
 )
 from torchcss.inference.trust_region import default_prior_variance
 from torchcss.initialise.result import Initialisation
@@ -98,8 +95,8 @@ class Posterior(NamedTuple):
         state: The tracker's state, best mode first.
         info: What the step did.
         covariance: Covariances of the modes that the tracker states, with the likelihood to a
-            power, `stated_evidence`. Those in the state are of the cost as it is, by which it
-            samples.
+            power, `SequenceTracker.stated_power`. Those in the state are of the cost as it
+            is, by which it samples.
         joints_world: Joint centres of the modes, metres.
         terms: Cost of the best mode by term, nats.
         seconds: Wall time of the frame by stage.
@@ -276,8 +273,7 @@ class TrackingSession:
             if len(found.mixture.mean) > len(prior.mixture.mean):
                 prior, cost = found, self._cost(observation, memory, found, stopwatch)
         tracker = self._told_by_pictures(tracker, prior, observation, cost)
-        asked: list[GaussianMixture] = []
-        after, info = tracker.step(prior, _noting(cost, asked), self._bounds)
+        after, info = tracker.step(prior, cost.problem(), self._bounds)
         num_known = len(before.tracker.mixture.mean)
         if len(prior.mixture.mean) > num_known:
             # A mode that was jumped to goes back to the best one, from which the jump was made.
@@ -286,7 +282,7 @@ class TrackingSession:
         term_seconds = dict(stopwatch.seconds)
 
         modes = after.mixture
-        terms = self._terms_of_best(cost.of_children(info.origin[:1], asked[0]), modes)
+        terms = self._terms_of_best(cost.of_children(info.origin[:1], info.prior), modes)
         monitor, lost = before.monitor, False
         if plan.recovery is not None and monitor is not None:
             monitor, lost = plan.recovery.judge(monitor, _per_view(terms, observation))
@@ -305,7 +301,7 @@ class TrackingSession:
             info=info,
             covariance=tempered(
                 modes.covariance,
-                stated_evidence(plan.tracker),
+                plan.tracker.stated_power,
                 default_prior_variance(self._bounds),
             ),
             joints_world=body.pose(modes.mean).joints,
@@ -381,27 +377,15 @@ class TrackingSession:
             before=mean,
             velocity=prior.velocity,
             expected=tracker.dynamics.predict(prior.mixture, prior.velocity).mean,
-            deviation=cost.deviation,
+            deviation=cost.views[0].deviation,
         )
         return replace(tracker, dynamics=Displaced(tracker.dynamics, expected - mean))
 
     def _terms_of_best(self, cost: TrackingCost, modes: GaussianMixture) -> dict[str, float]:
         """What the best mode costs by term, about the prior that the search had."""
         best = modes.mean[:1]
-        values = cost.terms(best)
-        if cost.choice.segmentation is not None:
-            values["segmentation"] = cost.unsearched(best)
+        values = cost.terms(best) | cost.weight_only_terms(best)
         return {name: float(value[0]) for name, value in values.items()}
-
-
-def _noting(cost: TrackingCost, priors: list[GaussianMixture]) -> CostFactory:
-    """`cost.of_children`, which puts down the priors that it is asked about."""
-
-    def of_children(parent: Tensor, prior: GaussianMixture) -> TrackingCost:
-        priors.append(prior)
-        return cost.of_children(parent, prior)
-
-    return of_children
 
 
 def _per_view(terms: dict[str, float], observation: Observation) -> dict[str, float]:

@@ -17,24 +17,20 @@ from torch import Tensor
 
 from torchcss.body.load import has_free_root
 from torchcss.body.model import BodyModel
-from torchcss.cost.anthropometric import Anthropometric
+from torchcss.cost.choice import TERM_TABLE, CostChoice
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.edge_energy import EdgeEnergyTerm
 from torchcss.cost.flow import FlowTerm
 from torchcss.cost.frame import FrameCosts
-from torchcss.cost.interpenetration import Interpenetration
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.region import RegionTerm
 from torchcss.cost.segmentation import SegmentationTerm
-from torchcss.cost.silhouette import SilhouetteTerm
 from torchcss.cost.stabiliser import Stabiliser
-from torchcss.cost.temporal import MixturePrior, TemporalPrior
-from torchcss.cost.total import CostChoice
 from torchcss.errors import ConfigurationError
 from torchcss.inference.tracker import SequenceTracker, Tracker
-from torchcss.robust import Quadratic
+from torchcss.robust import Lorentzian, Quadratic
 from torchcss.tracking.presets import PRESETS, make_tracker
-from torchcss.tracking.recovery import OBSERVATIONS, Recovery
+from torchcss.tracking.recovery import Recovery
 from torchcss.tracking.view import CameraView, Observer
 from torchcss.types import Bounds, Curvature
 from torchcss.vision.features import FeatureExtractor
@@ -58,18 +54,20 @@ PAPER_TERMS = (
 """What the papers' cost has ([IJRR] sections 3.1 and 3.2, [RR] section 3): edges weighed by motion
 boundaries, flow and priors; no colours, and joints in the first frame only."""
 
-ALL_TERMS = (
-    *("contour", "motion_boundaries", "edge_energy", "region", "segmentation", "flow", "joints"),
-    *("stabiliser", "anthropometric", "interpenetration", "temporal", "temporal_mixture"),
-    *("background", "silhouette"),
-)
-"""Terms and priors that can be chosen; see `torchcss.cost.total`. `motion_boundaries` weighs the
-edges of `contour` and `edge_energy` by the motion boundaries, `W = 1 - k S_p`. `background` tells
-`region` and `segmentation` what a camera that stands still sees behind the body; `silhouette` asks
-for it, or for masks."""
+_NO_COST = ("motion_boundaries", "background")
+"""Names in `Settings.terms` that have no cost of their own. `motion_boundaries` weighs the edges of
+`contour` and `edge_energy` by the motion boundaries, `W = 1 - k S_p`; `background` tells `region`
+and `segmentation` what a camera that stands still sees behind the body."""
 
-_NO_TERMS = ("motion_boundaries", "background")
-"""Of these: what has no cost of its own."""
+
+def all_terms() -> tuple[str, ...]:
+    """What can be in `Settings.terms`: the names of `torchcss.cost.choice.TERM_TABLE`, and more."""
+    return (*TERM_TABLE, *_NO_COST)
+
+
+def watched_terms() -> tuple[str, ...]:
+    """The terms that compare with the image in every frame, and so tell a loss of the track."""
+    return tuple(name for name, term in TERM_TABLE.items() if term.watched)
 
 
 _SETS = {"default": TERMS, "still": STILL_TERMS, "papers": PAPER_TERMS}
@@ -112,7 +110,7 @@ class Settings:
             reference.
         working_size: Longer side, in pixels, at which features are computed; larger images are
             reduced to it.
-        contour_weight: Temperature of the contour term, see `CostChoice`.
+        contour_weight: Temperature of the contour term, see `ContourTerm`.
         weights: Further factors on terms and priors by name; `scripts/learn_weights.py` learns
             some.
         boundary_emphasis: k of `W = 1 - k S_p`, for the term `motion_boundaries`.
@@ -148,17 +146,17 @@ class Settings:
         object.__setattr__(self, "terms", named_terms(self.terms))
         if self.preset not in PRESETS:
             raise ConfigurationError(f"no tracker {self.preset!r}; there are {', '.join(PRESETS)}")
-        unknown = sorted(set(self.terms) - set(ALL_TERMS))
+        unknown = sorted(set(self.terms) - set(all_terms()))
         if unknown:
-            raise ConfigurationError(f"unknown terms {unknown}; there are {', '.join(ALL_TERMS)}")
-        if not set(self.terms) & set(OBSERVATIONS):
+            raise ConfigurationError(f"unknown terms {unknown}; there are {', '.join(all_terms())}")
+        if not set(self.terms) & set(watched_terms()):
             raise ConfigurationError(
-                f"terms: expected at least one of {', '.join(OBSERVATIONS)}, which compare a pose "
-                f"with the image; got {', '.join(self.terms) or 'none'}"
+                f"terms: expected at least one of {', '.join(watched_terms())}, which compare a "
+                f"pose with the image; got {', '.join(self.terms) or 'none'}"
             )
-        weighed = [name for name in ALL_TERMS if name not in _NO_TERMS]
-        if strange := sorted(set(self.weights) - set(weighed)):
-            raise ConfigurationError(f"weights: no terms {strange}; there are {', '.join(weighed)}")
+        if strange := sorted(set(self.weights) - set(TERM_TABLE)):
+            known = ", ".join(TERM_TABLE)
+            raise ConfigurationError(f"weights: no terms {strange}; there are {known}")
         for name, weight in self.weights.items():
             if not 0 <= weight < math.inf:
                 raise ConfigurationError(f"weights: {name}: expected at least 0, got {weight}")
@@ -246,12 +244,13 @@ def check_seed(seed: int) -> None:
 
 def make_extractor(settings: Settings) -> FeatureExtractor:
     """The features that the settings ask for, in their type and on their device."""
-    moving = {"flow", "motion_boundaries"} & set(settings.terms)
-    flow = TRACKING if moving else None
+    kinds = [kind for name, kind in TERM_TABLE.items() if name in settings.terms]
+    needs = {need for kind in kinds for need in kind().needs}
+    flow = TRACKING if "flow" in needs or "motion_boundaries" in settings.terms else None
     extractor = FeatureExtractor(
         working_size=settings.working_size,
         flow=flow,
-        colour=bool({"region", "segmentation", "silhouette"} & set(settings.terms)),
+        colour="appearance" in needs,
     )
     return extractor.to(dtype=settings.torch_dtype, device=settings.device)
 
@@ -277,31 +276,33 @@ def make_choice(settings: Settings, sigma: float) -> CostChoice:
         sigma: Keypoint noise in pixels of the working image.
     """
     row = PRESETS[settings.preset]
-    has = settings.terms.__contains__
-    repels = has("interpenetration") if row.interpenetration is None else row.interpenetration
-    descends = row.particles is None
-    whole = has_free_root(settings.body)
-    potential: dict[str, Any] = {} if row.robust else {"potential_kind": Quadratic}
-    contour = ContourTerm(**potential)
+    potential = Lorentzian if row.robust else Quadratic
+    chosen = set(settings.terms)
+    if row.interpenetration is not None:
+        chosen.discard("interpenetration")
+        chosen |= {"interpenetration"} if row.interpenetration else set()
+    if row.particles is not None:
+        chosen -= {"segmentation", "temporal", "temporal_mixture"}
+    if not has_free_root(settings.body):
+        chosen -= {"segmentation", "background", "silhouette"}
+    contour = ContourTerm(weight=settings.contour_weight, potential_kind=potential)
     # The weights of motion boundaries make the wells of a fitted model shallower; what is back-
     # facing or hidden must not become cheaper than that. 0.3 takes 12 % on the demo's true states.
     shallower = 0.4 * boundary_emphasis(settings)
     level = contour.unmatched - (1 - shallower) * (contour.unmatched - contour.fitted_level)
+    background = "background" in chosen
+    set_up = (
+        replace(contour, fitted_level=level),
+        EdgeEnergyTerm(potential_kind=potential),
+        RegionTerm(background=background),
+        SegmentationTerm(background=background),
+        FlowTerm(potential_kind=potential),
+        JointTerm(sigma=sigma, potential_kind=potential),
+        Stabiliser(lengths="anthropometric" not in chosen),
+    )
+    terms = {**{name: kind() for name, kind in TERM_TABLE.items()}, **{t.name: t for t in set_up}}
     return CostChoice(
-        contour=replace(contour, fitted_level=level) if has("contour") else None,
-        edge_energy=EdgeEnergyTerm(**potential) if has("edge_energy") else None,
-        region=RegionTerm() if has("region") else None,
-        segmentation=SegmentationTerm() if has("segmentation") and whole and descends else None,
-        background=has("background") and whole,
-        silhouette=SilhouetteTerm() if has("silhouette") and whole else None,
-        flow=FlowTerm(**potential) if has("flow") else None,
-        joints=JointTerm(sigma=sigma, **potential) if has("joints") else None,
-        stabiliser=Stabiliser() if has("stabiliser") else None,
-        anthropometric=Anthropometric() if has("anthropometric") else None,
-        temporal=TemporalPrior() if has("temporal") and descends else None,
-        temporal_mixture=MixturePrior() if has("temporal_mixture") and descends else None,
-        interpenetration=Interpenetration() if repels else None,
-        contour_weight=settings.contour_weight,
+        terms=tuple(term for name, term in terms.items() if name in chosen),
         weights=dict(settings.weights),
         curvature=row.curvature if settings.curvature is None else Curvature(settings.curvature),
     )
@@ -329,9 +330,11 @@ def make_settings_tracker(settings: Settings, motion: Float[Tensor, " n"]) -> Se
     evidence = settings.evidence
     marked = settings.keypoints_use == "all" and "joints" in settings.terms
     if evidence is None and marked and has_free_root(settings.body):
-        evidence = PRESETS[settings.preset].evidence_keypoints
+        evidence = PRESETS[settings.preset].power_keypoints
     if evidence is not None:
-        tracker = replace(tracker, evidence=evidence, covariance_evidence=tracker.evidence)
+        tracker = replace(
+            tracker, likelihood_power=evidence, covariance_power=tracker.likelihood_power
+        )
     return replace(tracker, oversampling=settings.oversampling)
 
 

@@ -16,15 +16,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
 from tqdm import tqdm
 
 from torchcss.body.root import free_turns
-from torchcss.cost.frame import beside
-from torchcss.cost.total import TrackingCost
+from torchcss.cost.total import TrackingCost, beside
 from torchcss.errors import VideoError
 from torchcss.inference.smoothing import refine_in_windows
 from torchcss.io.run import body_of_track
@@ -77,7 +75,7 @@ def smooth_frames(
     )
     changes = base_changes(body, bases)
     plan = make_plan(settings, body, views[0], 0.0)
-    cost = replace(plan.choice, temporal=None, temporal_mixture=None, segmentation=None)
+    cost = plan.choice.without("temporal", "temporal_mixture", "segmentation")
     plan = plan._replace(choice=cost, surface_prediction=False)
     observers = [plan.observer(body, view) for view in views]
     at_start: list[float] = []

@@ -31,7 +31,7 @@ from torch import Tensor
 from torchcss.body.catalog import PROPORTIONS
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.root import ROOT_NAMES, has_root
-from torchcss.cost.flow import InteriorNodes
+from torchcss.cost.interior import InteriorNodes
 from torchcss.cost.surface import SurfaceTargets, SurfaceTerm, surface_targets
 from torchcss.cost.visibility import visible_nodes
 from torchcss.inference.dynamics import Dynamics

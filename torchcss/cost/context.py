@@ -1,0 +1,104 @@
+"""What a term is bound to: one view of one frame, and tables of the body that all frames share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, TypeVar
+
+from jaxtyping import Float
+from torch import Tensor
+
+from torchcss.body.model import BodyModel
+from torchcss.inference.mixture import GaussianMixture
+from torchcss.types import Keypoints
+from torchcss.vision.appearance import Appearance
+from torchcss.vision.background import Background
+from torchcss.vision.camera import Camera
+from torchcss.vision.features import FrameFeatures
+
+_T = TypeVar("_T")
+
+
+class BodyTables:
+    """Tables of a body, such as its contour predictor, each made when it is first asked for.
+
+    Args:
+        body: The body; its base may move afterwards, its shape may not.
+        known: Tables that have been made already.
+    """
+
+    def __init__(self, body: BodyModel, *known: object) -> None:
+        self.body = body
+        self._made: dict[Any, Any] = {type(table): table for table in known}
+
+    def of(self, make: Callable[[BodyModel], _T]) -> _T:
+        """The table that a class or function makes of a body."""
+        if make not in self._made:
+            self._made[make] = make(self.body)
+        return self._made[make]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FrameContext:
+    """One view of one frame. What is None says nothing.
+
+    Attributes:
+        body: The body, hung on its base.
+        camera: The camera, at the size of the features.
+        tables: Tables of the body; by default made when a term asks for them.
+        features: Features of the picture; None: the picture is missing.
+        edge_field: Edge energy times gradient direction.
+        keypoints: Those of the frame, in the features' pixels, or one set for each of the modes.
+        appearance: What the body's parts and their surroundings look like.
+        background: What is behind the body.
+        modes: Modes of the frame before, the best first.
+        prior: The same one frame ahead, for priors; None: not known.
+        deviation: Expected motion of every parameter in one frame; None: not known.
+        sequence: Which of the sequences that are evaluated together this is a frame of.
+    """
+
+    body: BodyModel
+    camera: Camera
+    tables: BodyTables = field(default=None)  # type: ignore[assignment]
+    features: FrameFeatures | None = None
+    edge_field: Float[Tensor, "2 h w"] | None = None
+    keypoints: Keypoints | None = None
+    appearance: Appearance | None = None
+    background: Background | None = None
+    modes: Float[Tensor, "k n"] | None = None
+    prior: GaussianMixture | None = None
+    deviation: Float[Tensor, " n"] | None = None
+    sequence: int = 0
+
+    def __post_init__(self) -> None:
+        if self.tables is None:
+            object.__setattr__(self, "tables", BodyTables(self.body))
+
+    @property
+    def is_out(self) -> bool:
+        """Whether there is no picture."""
+        return self.features is None and self.edge_field is None
+
+    def foreground(self, *, background: bool) -> Float[Tensor, "layers h w"] | None:
+        """Foreground log-likelihood ratio of every pixel for each layer of parts, through a tanh.
+
+        Args:
+            background: Whether to use what is known of the picture behind the body.
+        """
+        return self._before_background if background else self._before_surroundings
+
+    @cached_property
+    def _before_surroundings(self) -> Float[Tensor, "layers h w"] | None:
+        if self.appearance is None or self.features is None or self.features.colour is None:
+            return None
+        return self.appearance.likeness(self.features.colour)
+
+    @cached_property
+    def _before_background(self) -> Float[Tensor, "layers h w"] | None:
+        if self.background is None:
+            return self._before_surroundings
+        if self.appearance is None or self.features is None or self.features.colour is None:
+            return None
+        return self.appearance.likeness(self.features.colour, self.background)

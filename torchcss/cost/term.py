@@ -1,0 +1,206 @@
+"""The interface of a term: one cue or prior of the cost, one file.
+
+A `Term` is a frozen choice of numbers. Each frame `prepare` binds it to one view of that frame
+(`FrameContext`), or says None: this frame tells it nothing. What is bound is evaluated at batches
+of posed bodies (`Posed`):
+
+| kind | bound | gives |
+|---|---|---|
+| `image` | `BoundImage` | value and derivatives of each of its points, in the points' positions |
+| `prior` | `BoundPrior` | value and derivatives in the state x |
+| `weight-only` | `BoundWeight` | a value that counts in the weights of modes, not in the search |
+
+To add a term, write a class that derives from `Term` and add it to
+`torchcss.cost.choice.TERM_TABLE`. `differentiated` gives the derivatives of a term that has only a
+value.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, Protocol, TypeVar
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchcss.body.model import BodyModel, BodyPose
+from torchcss.cost.context import FrameContext
+from torchcss.types import Curvature, LocalModel, PointCost
+from torchcss.vision.camera import Camera
+
+Kind = Literal["image", "prior", "weight-only"]
+
+Need = Literal["flow", "appearance", "background"]
+"""What has to be computed or learnt from the pictures for a term: optical flow, the colours of the
+parts, or the picture behind the body."""
+
+_T = TypeVar("_T")
+
+
+class Term(Protocol):
+    """One cue or prior; a frozen dataclass of numbers.
+
+    Attributes:
+        name: Its name in the table, in results and in `CostChoice.weights`.
+        kind: What `prepare` returns.
+        watched: Whether its cost tells a loss of the track (`torchcss.inference.loss_monitor`).
+        screens: Whether it counts where samples are screened ([RR] section 4.2: edges alone).
+    """
+
+    name: ClassVar[str]
+    kind: ClassVar[Kind]
+    watched: ClassVar[bool] = False
+    screens: ClassVar[bool] = False
+
+    @property
+    def needs(self) -> frozenset[Need]:
+        """What the pictures have to be prepared for."""
+        return frozenset()
+
+    def coarse(self) -> Term | None:
+        """The term in the coarse cost that finds what moved too fast; None: it is left out."""
+        return self if self.kind == "prior" else None
+
+    def prepare(self, context: FrameContext) -> BoundImage | BoundPrior | BoundWeight | None:
+        """Bind the term to one view of one frame; None: the frame says nothing to it."""
+        ...
+
+
+class BoundImage(Protocol):
+    """An image term that knows its frame."""
+
+    @property
+    def scale(self) -> float:
+        """Nats per unit of a point's value: the temperature over N nu, eq. 5 [IJRR]."""
+        ...
+
+    @property
+    def link(self) -> Int[Tensor, " p"]:
+        """The link that carries each point."""
+        ...
+
+    @property
+    def size(self) -> int:
+        """Rows of memory that a sample takes, in points."""
+        ...
+
+    def points(self, posed: Posed) -> Float[Tensor, "*batch p 3"]:
+        """Positions of the points, metres."""
+        ...
+
+    def value(
+        self, posed: Posed, at: Float[Tensor, "*batch p 3"] | None = None
+    ) -> Float[Tensor, "*batch p"]:
+        """Value of each point.
+
+        Args:
+            posed: Where visibility and matches are found.
+            at: Where the points have moved since, with all that was found held; None: nowhere.
+        """
+        ...
+
+    def point_cost(self, posed: Posed, *, gauss_newton: bool = False) -> PointCost:
+        """Value of each point and its derivatives in the point's position, all else held."""
+        ...
+
+
+class BoundPrior(Protocol):
+    """A prior that knows its frame."""
+
+    def value(self, posed: Posed) -> Float[Tensor, "*batch"]:
+        """Cost, nats."""
+        ...
+
+    def local_model(self, posed: Posed, curvature: Curvature) -> LocalModel:
+        """Cost and derivatives in the state."""
+        ...
+
+
+class BoundWeight(Protocol):
+    """A weight-only term that knows its frame."""
+
+    @property
+    def scale(self) -> float:
+        """Nats per unit of the value."""
+        ...
+
+    def value(self, posed: Posed) -> Float[Tensor, "*batch"]:
+        """Value of each pose."""
+        ...
+
+
+class Posed:
+    """A batch of posed bodies before one camera, and what several terms need of it.
+
+    Args:
+        context: The view.
+        body: The body.
+        pose: The posed bodies.
+        parent: The mode of the frame before that each sample descends from; None: the first.
+    """
+
+    def __init__(
+        self,
+        context: FrameContext,
+        body: BodyModel,
+        pose: BodyPose,
+        parent: Int[Tensor, " b"] | None = None,
+    ) -> None:
+        self.context, self.body, self.pose, self.parent = context, body, pose, parent
+        self._found: dict[Any, Any] = {}
+
+    @property
+    def camera(self) -> Camera:
+        """The camera that looks on."""
+        return self.context.camera
+
+    @property
+    def x(self) -> Float[Tensor, "*batch n"]:
+        """The states."""
+        return self.pose.x
+
+    def of(self, find: Callable[[Posed], _T]) -> _T:
+        """What a function finds at these poses, found once for all terms that ask."""
+        if find not in self._found:
+            self._found[find] = find(self)
+        return self._found[find]
+
+    def of_parent(self, values: Float[Tensor, "k *rest"]) -> Float[Tensor, "*b *rest"]:
+        """The rows of each sample's parent, of what has one row a mode."""
+        return values[0] if self.parent is None else values[self.parent]
+
+
+@dataclass(frozen=True, eq=False)
+class OnStates:
+    """A prior whose derivatives cost next to nothing; a `BoundPrior`.
+
+    Attributes:
+        model: Cost and derivatives.
+    """
+
+    model: Callable[[Posed], LocalModel]
+
+    def value(self, posed: Posed) -> Float[Tensor, "*batch"]:
+        """Cost, nats."""
+        return self.model(posed).value
+
+    def local_model(self, posed: Posed, curvature: Curvature) -> LocalModel:
+        """Cost and derivatives in the state."""
+        return self.model(posed)
+
+
+def differentiated(term: BoundImage, posed: Posed) -> PointCost:
+    """Value and derivatives of a bound term by autograd, each point in its own position."""
+    with torch.enable_grad():
+        at = term.points(posed).detach().requires_grad_()
+        value = term.value(posed, at)
+        (gradient,) = torch.autograd.grad(value.sum(), at, create_graph=True)
+        rows = [
+            torch.autograd.grad(part.sum(), at, retain_graph=True, materialize_grads=True)[0]
+            for part in gradient.unbind(-1)
+            if part.requires_grad
+        ]
+    hessian = torch.stack(rows, dim=-2) if rows else at.new_zeros(*at.shape, 3)
+    return PointCost(value.detach(), gradient.detach(), hessian.detach())

@@ -1,0 +1,62 @@
+"""What a tracker searches: a cost, and what else is known of the same frame.
+
+A `SearchProblem` has named parts, of which only the cost has to be there. The search never looks
+inside them:
+
+| part | what it is for |
+|---|---|
+| `cost` | what samples descend on |
+| `coarse` | a smoother cost, on which some samples descend first |
+| `screening` | a cheaper cost, by which more samples than descend are sorted out |
+| `weight_only` | what has no derivatives and counts among modes, nats |
+| `landmarks` | points by whose distance two states are told apart |
+| `restrict` | the problem of some of the samples |
+| `of_children` | the problem of samples of the modes before, where they are compared with them |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchcss.inference.mixture import GaussianMixture
+from torchcss.types import CostFunction
+
+
+class SearchProblem(NamedTuple):
+    """The posterior of one frame, as a tracker sees it; see the module's table.
+
+    Attributes:
+        cost: Negative log posterior.
+        coarse: A smoother one; None: there is none.
+        screening: A cheaper one; None: the cost itself.
+        weight_only: Cost in nats of what counts in the weights of modes alone.
+        landmarks: Points of each state.
+        restrict: Makes the problem of some samples, by index; None: by the costs' `take`.
+        of_children: Makes the problem of samples from their parents and the prior, one frame ahead,
+            that these index; None: the samples' parents do not matter.
+    """
+
+    cost: CostFunction
+    coarse: CostFunction | None = None
+    screening: CostFunction | None = None
+    weight_only: Callable[[Float[Tensor, "b n"]], Float[Tensor, " b"]] | None = None
+    landmarks: Callable[[Float[Tensor, "b n"]], Float[Tensor, "b m d"]] | None = None
+    restrict: Callable[[Int[Tensor, " m"]], SearchProblem] | None = None
+    of_children: Callable[[Int[Tensor, " s"], GaussianMixture], SearchProblem] | None = None
+
+    def children(self, parent: Int[Tensor, " s"], prior: GaussianMixture) -> SearchProblem:
+        """The problem of samples of a prior's modes."""
+        return self if self.of_children is None else self.of_children(parent, prior)
+
+    def take(self, items: Int[Tensor, " m"]) -> SearchProblem:
+        """The problem of some of the samples."""
+        if self.restrict is not None:
+            return self.restrict(items)
+        coarse, screening = (
+            None if cost is None else cost.take(items) for cost in (self.coarse, self.screening)
+        )
+        return self._replace(cost=self.cost.take(items), coarse=coarse, screening=screening)
