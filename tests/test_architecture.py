@@ -6,9 +6,12 @@ Every module is parsed, not imported, so that imports inside functions count too
 from __future__ import annotations
 
 import ast
+import importlib
+import inspect
 from pathlib import Path
 
 import pytest
+from typing_extensions import is_protocol
 
 PACKAGE = Path(__file__).resolve().parents[1] / "torchcss"
 
@@ -158,3 +161,37 @@ def test_the_parser_sees_every_kind_of_import() -> None:
         *("torchcss.io.video", "torchcss.cli", "torchcss.cost"),
         *("torchcss.body.model", "torchcss.tracking.session"),
     }
+
+
+def test_searches_and_costs_have_complete_interfaces() -> None:
+    """Nothing asks at run time whether an object happens to have a method."""
+    found = []
+    for path in modules():
+        if room_of(path) not in ("inference", "cost", "tracking"):
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+                name = node.func.id
+                if name == "hasattr" or (name == "getattr" and len(node.args) > 2):
+                    found.append((path.name, node.lineno))
+            if isinstance(node, ast.ExceptHandler) and "AttributeError" in ast.dump(node):
+                found.append((path.name, node.lineno))
+    assert not found
+
+
+def test_concrete_classes_are_not_subclassed() -> None:
+    """A class of the package is derived from only if it is abstract: a protocol, or with gaps."""
+    wrong = set()
+    for path in modules():
+        if room_of(path) not in ("inference", "body", "vision", "cost", "initialise", "tracking"):
+            continue
+        name = ".".join(["torchcss", *path.relative_to(PACKAGE).with_suffix("").parts])
+        for one in vars(importlib.import_module(name)).values():
+            if inspect.isclass(one) and one.__module__ == name:
+                wrong |= {
+                    (one.__name__, base.__name__)
+                    for base in one.__bases__
+                    if base.__module__.startswith("torchcss.")
+                    and not (inspect.isabstract(base) or is_protocol(base))
+                }
+    assert not wrong

@@ -20,7 +20,7 @@ from torch import Tensor
 from torchcss.body.model import differentiate_twice
 from torchcss.cost.choice import CostChoice
 from torchcss.cost.context import FrameContext
-from torchcss.cost.joints import JointTerm
+from torchcss.cost.joints import JointTerm, match_joints
 from torchcss.cost.total import TrackingCost, beside
 from torchcss.cost.view import View
 from torchcss.types import Keypoints
@@ -82,8 +82,9 @@ def test_derivatives_over_both_views(generator: torch.Generator) -> None:
         joints, total = first.body.pose(x).joints, 0.0
         for view in both.views:
             assert view.keypoints is not None
-            there = joints[..., view.keypoints.index, :]
-            total = total + term.value(view.camera.project(there), view.keypoints).sum(-1)
+            targets = match_joints(view.keypoints, first.body.joint_names)
+            there = joints[..., targets.joint, :]
+            total = total + term.value(view.camera.project(there), targets).sum(-1)
         return torch.as_tensor(total)
 
     leaf = x.clone().requires_grad_()
@@ -95,11 +96,13 @@ def test_derivatives_over_both_views(generator: torch.Generator) -> None:
 
 def test_a_second_view_narrows_depth() -> None:
     """The variance along the first camera's line of sight falls, by far more than across it."""
-    first, _, both = two_views(JOINTS_ONLY.having(JointTerm(sigma=1.0)), "body34")
+    first, second, _ = two_views(JOINTS_ONLY.having(JointTerm(sigma=1.0)), "body34")
     assert first.keypoints is not None
     # At the pose that both see, so that no potential is past its bend.
     x = random_states(first.body, generator=torch.Generator().manual_seed(5))
-    first.keypoints.target = first.camera.project(first.body.pose(x).joints).uv
+    exact = first.camera.project(first.body.pose(x).joints).uv
+    first = first.with_keypoints(first.keypoints._replace(positions=exact))
+    both = beside([first, second])
     depth, across = (first.body.state_index(name) for name in ("root_z", "root_x"))
     deviations = [
         (cost.local_model(x).hessian + torch.eye(len(x))).inverse().diagonal().sqrt()
@@ -144,8 +147,8 @@ def test_keypoints_of_a_view_in_a_picture_of_another_size() -> None:
     first, _, _ = two_views()
     small = View(first.camera, first.keypoints).of_keypoints(0.6)
     assert small.camera.image_size_wh == (96, 72)
-    assert small.observation is not None
+    assert small.keypoints is not None
     assert first.keypoints is not None
-    known = first.keypoints.weight > 0
-    place = first.camera.undistort(first.keypoints.target[known])
-    torch.testing.assert_close(small.camera.undistort(small.observation.target[known]), place)
+    known = first.keypoints.confidence > 0
+    place = first.camera.undistort(first.keypoints.positions[known])
+    torch.testing.assert_close(small.camera.undistort(small.keypoints.positions[known]), place)
