@@ -190,7 +190,7 @@ def _scene(
     seen_before = observer.observe(before, NOTHING_SEEN)
     seen = observer.observe(now, seen_before)
     memory = observer.learn(NOTHING_KNOWN, seen_before, body, previous[None])
-    cost = replace(observer.cost(seen, memory, body, previous), parent=previous)
+    cost = observer.cost(seen, memory, body, previous).of_mode(previous)
     mode = TrustRegionNewton().minimise(cost, truth[None], body.bounds)
     assert seen.features is not None
     return Scene(name, now.image, seen.features, cost, truth, Modes(*(part[0] for part in mode)))
