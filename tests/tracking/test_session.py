@@ -30,7 +30,7 @@ from torchcss.inference.tracker import Tracker, TrackerState
 from torchcss.initialise.result import Initialisation
 from torchcss.io import tracks
 from torchcss.io.fitted_body import read_fitted_body, write_fitted_body
-from torchcss.io.track_body import body_of_track
+from torchcss.io.run import body_of_track
 from torchcss.io.video import VideoWriter
 from torchcss.robust import Quadratic
 from torchcss.studies.demo import run_demo
