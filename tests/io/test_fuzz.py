@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from made_tracks import make_track
 
 from torchcss.body.load import load_body
-from torchcss.errors import TorchcssError
+from torchcss.errors import TorchcssError, TrackFileError
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.initialise.result import Initialisation
 from torchcss.io.cameras import read_camera
@@ -167,6 +167,12 @@ def beside(reader: Callable[[Path], object]) -> Callable[[Path], object]:
     return lambda path: reader(path.parent)
 
 
+def checkpoint(path: Path) -> Checkpoint:
+    if (found := read_checkpoint(path.parent)) is None:
+        raise TrackFileError(f"{path}: there is none, which a run may be told")
+    return found
+
+
 READERS = (
     Reader("keypoints.npz", keypoints),
     Reader("coco.json", keypoints),
@@ -190,7 +196,7 @@ READERS = (
     Reader("robot.xml", load_body),
     Reader("a.flo", read_flow),
     Reader("track.npz", load_track),
-    Reader("checkpoint.npz", beside(read_checkpoint)),
+    Reader("checkpoint.npz", checkpoint),
     Reader("summary.json", read_summary),
     Reader("body.npz", read_fitted_body, slow=True),
     Reader("film.mp4", pictures, slow=True),

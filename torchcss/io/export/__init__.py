@@ -125,27 +125,38 @@ def export(
     paths = _paths(source, to, labels, path)
     report = list(selection.report)
     if to in ("trc", "c3d"):  # the formats of places, which need no body
-        for index, file in enumerate(paths):
-            if to == "trc":
-                _write_text(file, trc_text(selection, index, file.name))
-            else:
-                with replace_file(file) as partial:
-                    write_c3d(partial, selection, index)
-        return Export(tuple(paths), tuple(report))
-    body = body_of_track(track)
-    if one_file:
-        _write_table(paths[0], to, selection, body)
-        return Export(tuple(paths), tuple(report))
+        _write_places(paths, to, selection)
+    elif one_file:
+        _write_table(paths[0], to, selection, body_of_track(track))
+    else:
+        report += _write_turns(paths, to, selection, body_of_track(track), options.bvh)
+    return Export(tuple(paths), tuple(report))
+
+
+def _write_places(paths: Sequence[Path], to: str, selection: Selection) -> None:
+    for index, path in enumerate(paths):
+        if to == "trc":
+            _write_text(path, trc_text(selection, index, path.name))
+            continue
+        with replace_file(path) as partial:
+            write_c3d(partial, selection, index)
+
+
+def _write_turns(
+    paths: Sequence[Path], to: str, selection: Selection, body: BodyModel, style: BvhStyle
+) -> list[str]:
+    """Write BVH or MOT; returns what to report."""
+    report: list[str] = []
     if not selection.present.all():
         report.append(f"{to} cannot leave frames out: there the mode's nearest pose stands")
-    for index, file in enumerate(paths):
+    for index, path in enumerate(paths):
         if to == "mot":
-            _write_text(file, mot_text(selection, index, body))
+            _write_text(path, mot_text(selection, index, body))
         else:
-            text, notes = bvh_text(selection, index, body, options.bvh)
+            text, notes = bvh_text(selection, index, body, style)
             report += [note for note in notes if note not in report]
-            _write_text(file, text)
-    return Export(tuple(paths), tuple(report))
+            _write_text(path, text)
+    return report
 
 
 def _write_table(path: Path, to: str, selection: Selection, body: BodyModel) -> None:

@@ -135,18 +135,7 @@ def select(track: Track, choice: SelectionChoice | None = None, *, y_up: bool = 
         )
     report: list[str] = []
     kept = inside[::stride]
-    wanted = _wanted_ranks(choice.mode, int(track.num_modes[inside].max(initial=0)))
-    ranks = (
-        _followed(track, wanted, inside)[::stride]
-        if choice.follow
-        else np.where(wanted < track.num_modes[kept, None], wanted, -1)
-    )
-    seen = (ranks >= 0).any(axis=0)
-    if not seen.all():
-        raise ConfigurationError(
-            f"mode {wanted[np.argmin(seen)]}: no chosen frame has it; the track has up to "
-            f"{track.num_modes[kept].max(initial=0)} modes, counted from 0"
-        )
+    wanted, ranks = _ranks(track, choice, inside)
     labels = ("",) if choice.mode == "best" else tuple(f"mode{rank}" for rank in wanted)
     for label, column in zip(labels, ranks.T, strict=True):
         missing = int((column < 0).sum())
@@ -199,8 +188,26 @@ def _check(choice: SelectionChoice) -> None:
         )
 
 
-def _wanted_ranks(mode: str | int, available: int) -> np.ndarray:
-    return np.arange(available) if mode == "all" else np.array([0 if mode == "best" else int(mode)])
+def _ranks(
+    track: Track, choice: SelectionChoice, inside: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The wanted ranks `[m]`, and which of the modes that is in every kept frame `[t m]`."""
+    kept = inside[:: choice.stride]
+    if choice.mode == "all":
+        wanted = np.arange(track.num_modes[inside].max(initial=0))
+    else:
+        wanted = np.array([0 if choice.mode == "best" else int(choice.mode)])
+    if choice.follow:
+        ranks = _followed(track, wanted, inside)[:: choice.stride]
+    else:
+        ranks = np.where(wanted < track.num_modes[kept, None], wanted, -1)
+    seen = (ranks >= 0).any(axis=0)
+    if not seen.all():
+        raise ConfigurationError(
+            f"mode {wanted[np.argmin(seen)]}: no chosen frame has it; the track has up to "
+            f"{track.num_modes[kept].max(initial=0)} modes, counted from 0"
+        )
+    return wanted, ranks
 
 
 def _followed(track: Track, wanted: np.ndarray, inside: np.ndarray) -> np.ndarray:
