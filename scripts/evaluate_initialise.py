@@ -135,7 +135,7 @@ def cases(config: Config, condition: str) -> Iterator[tuple[int, Case]]:
         return
     assert config.data is not None
     folder, video, file = CLIPS[condition]
-    camera = read_camera(config.data / folder / "cameras.json", video=video).camera
+    camera = read_camera(config.data / folder / "cameras.json", video=video)
     keypoints = read_keypoints(config.data / folder / file, image_size_wh=camera.image_size_wh)
     reference = np.load(config.data / folder / "reference3d.npz")
     names = [canonical_joint_name(str(name)) for name in reference["joint_names"]]

@@ -162,7 +162,7 @@ def person(config: Config, folder: Path) -> dict[str, Any]:
         errors = found.errors
         assert found.covariance is not None
         # One camera's depth is wrong by the person's size; their shape is what can be compared.
-        camera = read_camera(folder / "cameras.json", camera_name=views[0]).camera
+        camera = read_camera(folder / "cameras.json", views[0])
         sums = Sums()
         for away, spread in zip(found.away_m, found.covariance, strict=True):
             sums.add(torch.from_numpy(away), torch.from_numpy(spread), camera)
@@ -201,7 +201,7 @@ def board(config: Config, folder: Path) -> dict[str, Any]:
     )  # fmt: skip
     rows: dict[str, Any] = {}
     for views in (("cam_0",), ("cam_2",), ("cam_0", "cam_2")):
-        cameras = [read_camera(folder / "cameras.json", camera_name=v).camera for v in views]
+        cameras = [read_camera(folder / "cameras.json", v) for v in views]
         seen = [
             CameraView(camera, corner_keypoints(body, marks[view]), CORNER_NOISE_PX)
             for view, camera in zip(views, cameras, strict=True)

@@ -19,7 +19,10 @@ from torchcss.body.model import BodyModel
 from torchcss.initialise.fit import initialise
 from torchcss.initialise.options import InitialiseOptions
 from torchcss.initialise.result import Initialisation
+from torchcss.io.cameras import read_camera, read_cameras
 from torchcss.io.export import export
+from torchcss.io.keypoints.read import read_keypoints
+from torchcss.io.motion.positions import read_motion_capture
 from torchcss.io.run import Run
 from torchcss.io.tracks import Track, load_track
 from torchcss.io.view_files import ViewFiles
@@ -56,6 +59,10 @@ __all__ = [
     "inverse_kinematics",
     "load_body",
     "load_track",
+    "read_camera",
+    "read_cameras",
+    "read_keypoints",
+    "read_motion_capture",
     "resume",
     "smooth",
     "smooth_file",

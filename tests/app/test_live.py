@@ -16,7 +16,7 @@ from torchcss.app.recorder import Picture
 from torchcss.app.track import TrackOptions, track_video
 from torchcss.body.load import load_body
 from torchcss.cli import main as cli
-from torchcss.io.cameras import read_camera
+from torchcss.io.cameras import load_camera, read_camera
 from torchcss.io.tracks import load_track, read_summary
 from torchcss.io.video import VideoReader, VideoWriter
 from torchcss.show.track_plots import bones_of
@@ -138,8 +138,8 @@ def test_a_stopped_run_closes_its_sinks_and_keeps_what_it_has(files: Path) -> No
 
 def test_the_summary_is_a_camera_file(files: Path) -> None:
     assert track(files, "--no-overlay") == 0
-    ours = read_camera(files / "out" / "summary.json")
-    theirs = read_camera(files / "cameras.json").camera
+    ours = load_camera(files / "out" / "summary.json")
+    theirs = read_camera(files / "cameras.json")
     assert ours.metric
     assert ours.camera.K.tolist() == theirs.K.tolist()
     assert ours.camera.name == "one"

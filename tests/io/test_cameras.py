@@ -14,7 +14,14 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from torchcss.errors import CameraError
-from torchcss.io.cameras import check_image_size, read_camera, rotation_matrix
+from torchcss.io.cameras import (
+    check_image_size,
+    load_camera,
+    read_camera,
+    read_cameras,
+    rotation_matrix,
+)
+from torchcss.io.video import VideoWriter
 from torchcss.vision.camera import Camera
 
 K = [[800.0, 0.0, 319.5], [0.0, 810.0, 239.5], [0.0, 0.0, 1.0]]
@@ -63,7 +70,7 @@ error = 0.0
 
 
 def test_json_camera(tmp_path: Path) -> None:
-    loaded = read_camera(write(tmp_path / "a.json", {"one": entry()}))
+    loaded = load_camera(write(tmp_path / "a.json", {"one": entry()}))
     camera = loaded.camera
     assert (loaded.metric, loaded.units_note, loaded.video) == (True, None, "a.mp4")
     assert camera.name == "one"
@@ -77,15 +84,15 @@ def test_json_camera(tmp_path: Path) -> None:
 
 
 def test_distortion_may_be_absent_or_short(tmp_path: Path) -> None:
-    camera = read_camera(write(tmp_path / "a.json", {"one": entry(distortion=None)})).camera
+    camera = load_camera(write(tmp_path / "a.json", {"one": entry(distortion=None)})).camera
     assert camera.distortion.tolist() == [0.0] * 5
-    camera = read_camera(write(tmp_path / "a.json", {"one": entry(distortion=[1, 0, 0, 0])})).camera
+    camera = load_camera(write(tmp_path / "a.json", {"one": entry(distortion=[1, 0, 0, 0])})).camera
     assert camera.distortion.tolist() == [1.0, 0, 0, 0, 0]
 
 
 @pytest.mark.parametrize("units", ["metre, pixel", "meters", "m", " Metres , px"])
 def test_metres(tmp_path: Path, units: str) -> None:
-    assert read_camera(write(tmp_path / "a.json", {"one": entry()}, units)).metric
+    assert load_camera(write(tmp_path / "a.json", {"one": entry()}, units)).metric
 
 
 @pytest.mark.parametrize(
@@ -101,7 +108,7 @@ def test_metres(tmp_path: Path, units: str) -> None:
 def test_own_frame_where_the_world_is_not_metric(
     tmp_path: Path, units: str | None, more: dict[str, Any], words: str
 ) -> None:
-    loaded = read_camera(write(tmp_path / "a.json", {"one": entry(**more)}, units))
+    loaded = load_camera(write(tmp_path / "a.json", {"one": entry(**more)}, units))
     assert not loaded.metric
     assert loaded.units_note is not None
     assert words in loaded.units_note
@@ -118,28 +125,28 @@ def test_choice_of_the_camera(tmp_path: Path) -> None:
         "cam_03": entry(video=None),
     }
     path = write(tmp_path / "a.json", cameras)
-    assert read_camera(path, video="somewhere/b.mp4").camera.name == "right"
-    assert read_camera(path, video="somewhere/cam03.mov").camera.name == "cam_03"
-    assert read_camera(path, video="a.mp4", camera_name="right").camera.name == "right"
+    assert load_camera(path, video="somewhere/b.mp4").camera.name == "right"
+    assert load_camera(path, video="somewhere/cam03.mov").camera.name == "cam_03"
+    assert load_camera(path, video="a.mp4", name="right").camera.name == "right"
     with pytest.raises(CameraError, match=r"several cameras, left, right, cam_03"):
-        read_camera(path)
+        load_camera(path)
     with pytest.raises(CameraError, match=r"c\.mp4.*left, right, cam_03"):
-        read_camera(path, video="c.mp4")
+        load_camera(path, video="c.mp4")
     with pytest.raises(CameraError, match=r"no camera 'up'.*left, right, cam_03"):
-        read_camera(path, camera_name="up")
+        load_camera(path, name="up")
     twice = write(tmp_path / "b.json", {"left": entry(), "right": entry()})
     with pytest.raises(CameraError, match="no single camera"):
-        read_camera(twice, video="a.mp4")
+        load_camera(twice, video="a.mp4")
     single = write(tmp_path / "c.json", {"only": entry()})
-    assert read_camera(single, video="other.mp4").camera.name == "only"
+    assert load_camera(single, video="other.mp4").camera.name == "only"
     with pytest.raises(CameraError, match="no camera"):
-        read_camera(single, camera_name="other")
+        load_camera(single, name="other")
 
 
 def test_pose2sim(tmp_path: Path) -> None:
     path = tmp_path / "Calib.toml"
     path.write_text(POSE2SIM)
-    loaded = read_camera(path, video="cam01.mp4")
+    loaded = load_camera(path, video="cam01.mp4")
     expected = Camera(
         K, (640, 480), distortion=[0.1, -0.2, 0.001, 0.002, 0.0],
         R_camera_world=R, t_camera_world=[0.1, 0.2, 3.0],
@@ -148,7 +155,7 @@ def test_pose2sim(tmp_path: Path) -> None:
     points = torch.randn(7, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     torch.testing.assert_close(loaded.camera.project(points).uv, expected.project(points).uv)
     with pytest.raises(CameraError, match=r"cam_02.*fisheye"):
-        read_camera(path, camera_name="cam_02")
+        load_camera(path, name="cam_02")
 
 
 @settings(max_examples=50, deadline=None)
@@ -199,7 +206,7 @@ def test_image_size() -> None:
 def test_bad_values(tmp_path: Path, more: dict[str, Any], words: str) -> None:
     path = write(tmp_path / "a.json", {"one": entry(**more)})
     with pytest.raises(CameraError, match=words) as caught:
-        read_camera(path)
+        load_camera(path)
     message = str(caught.value)
     assert str(path) in message
     assert "one" in message
@@ -211,7 +218,7 @@ def test_bad_values(tmp_path: Path, more: dict[str, Any], words: str) -> None:
 def test_bad_json(tmp_path: Path, content: str) -> None:
     (tmp_path / "a.json").write_text(content)
     with pytest.raises(CameraError, match=r"a.json"):
-        read_camera(tmp_path / "a.json")
+        load_camera(tmp_path / "a.json")
 
 
 @pytest.mark.parametrize(
@@ -221,16 +228,16 @@ def test_bad_json(tmp_path: Path, content: str) -> None:
 def test_bad_toml(tmp_path: Path, content: str) -> None:
     (tmp_path / "a.toml").write_bytes(content.encode("latin-1"))
     with pytest.raises(CameraError, match=r"a.toml"):
-        read_camera(tmp_path / "a.toml")
+        load_camera(tmp_path / "a.toml")
 
 
 def test_missing(tmp_path: Path) -> None:
     for name in ("a.json", "a.toml"):
         with pytest.raises(CameraError, match="no such file"):
-            read_camera(tmp_path / name)
+            load_camera(tmp_path / name)
         (tmp_path / "folder" / name).mkdir(parents=True)
         with pytest.raises(CameraError):
-            read_camera(tmp_path / "folder" / name)
+            load_camera(tmp_path / "folder" / name)
 
 
 @settings(
@@ -247,7 +254,7 @@ def test_only_camera_errors_come_from_bad_bytes(tmp_path: Path, data: st.DataObj
     path.write_bytes(content)
     message = ""
     try:
-        loaded = read_camera(path, video="cam01.mp4")
+        loaded = load_camera(path, video="cam01.mp4")
     except CameraError as error:
         message = str(error)
     else:
@@ -268,7 +275,7 @@ def test_only_camera_errors_come_from_bad_bytes(tmp_path: Path, data: st.DataObj
 )
 def test_real_calibrations(shared_data: Path, video: str, metric: bool) -> None:
     path = shared_data / video
-    loaded = read_camera(path.parent / "cameras.json", video=path)
+    loaded = load_camera(path.parent / "cameras.json", video=path)
     assert loaded.video == path.name
     assert loaded.metric is metric
     assert ("board square" in (loaded.units_note or "")) is not metric
@@ -285,4 +292,167 @@ def test_real_calibrations(shared_data: Path, video: str, metric: bool) -> None:
 
 def test_real_calibration_needs_a_name(shared_data: Path) -> None:
     with pytest.raises(CameraError, match="cam01, static_cam01, cam03, static_cam03"):
-        read_camera(shared_data / "balance_beam_4cam" / "cameras.json")
+        load_camera(shared_data / "balance_beam_4cam" / "cameras.json")
+
+
+def test_all_cameras_of_a_file(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.json", {"left": entry(), "right": entry(video="b.mp4", R=None)})
+    cameras = read_cameras(path)
+    assert list(cameras) == ["left", "right"]
+    for name, camera in cameras.items():
+        assert camera.name == name
+        assert torch.equal(camera.K, read_camera(path, name).K)
+    assert not cameras["right"].t_camera_world.any()
+
+
+# The first two cameras of a file of others (the numbers of a data set for A-NeRF).
+INTRI = """%YAML:1.0
+---
+names:
+   - "2"
+   - "3"
+K_2: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 1.2705470221290213e+03, 0., 960., 0., 1.2918693479263814e+03,
+       540., 0., 0., 1. ]
+dist_2: !!opencv-matrix
+   rows: 1
+   cols: 5
+   dt: d
+   data: [ 0.1, -0.02, 0., 0., 0. ]
+K_3: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 1.2803090021884900e+03, 0., 960., 0., 1.3033885156746885e+03,
+       540., 0., 0., 1. ]
+dist_3: !!opencv-matrix
+   rows: 1
+   cols: 5
+   dt: d
+   data: [ 0., 0., 0., 0., 0. ]
+H_3: 1080.
+W_3: 1920.
+"""
+EXTRI = """%YAML:1.0
+---
+names:
+   - "2"
+   - "3"
+R_2: !!opencv-matrix
+   rows: 3
+   cols: 1
+   dt: d
+   data: [ 1.2, 0.4, -0.3 ]
+T_2: !!opencv-matrix
+   rows: 3
+   cols: 1
+   dt: d
+   data: [ 0.1, 0.9, 3.2 ]
+Rot_3: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 0., -1., 0., 1., 0., 0., 0., 0., 1. ]
+T_3: !!opencv-matrix
+   rows: 3
+   cols: 1
+   dt: d
+   data: [ 0., 0., 4. ]
+"""
+
+RECORDED = """[cam_01]
+name = "cam_01"
+size = [ 1088.0, 1920.0]
+matrix = [ [ 1681.244873046875, 0.0, 532.97369384375],
+ [ 0.0, 1681.075439453125, 948.137390140625], [ 0.0, 0.0, 1.0]]
+distortions = [ -0.000721609375, 0.002187234375, 9.5e-06, 1.078125e-05]
+rotation = [ 1.6882754799999993, 1.0483220499999997, -0.41955852000000016]
+translation = [ 0.3211048899999996, 0.9563320600000009, 2.8907130499999996]
+fisheye = false
+
+[metadata]
+adjusted = false
+error = 0.0
+"""
+
+
+@pytest.fixture
+def easymocap(tmp_path: Path) -> Path:
+    (tmp_path / "intri.yml").write_text(INTRI)
+    (tmp_path / "extri.yml").write_text(EXTRI)
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", ["", "intri.yml", "extri.yml"])
+def test_easymocap(easymocap: Path, name: str) -> None:
+    found = load_camera(easymocap / name, name="3")
+    assert found.metric
+    camera = found.camera
+    assert camera.image_size_wh == (1920, 1080)
+    assert float(camera.K[1, 1]) == 1303.3885156746885
+    expected = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).double()
+    torch.testing.assert_close(camera.R_camera_world, expected)
+    assert camera.t_camera_world.tolist() == [0, 0, 4]
+
+
+def test_easymocap_without_sizes_takes_the_videos(easymocap: Path) -> None:
+    with pytest.raises(CameraError, match="does not say the image size; give the video"):
+        load_camera(easymocap, name="2")
+    with VideoWriter(easymocap / "2.mp4", 25) as film:
+        film.write(np.zeros((108, 192, 3), np.uint8))
+    found = load_camera(easymocap, video=easymocap / "2.mp4")
+    assert found.camera.name == "2"
+    assert found.camera.image_size_wh == (192, 108)
+    assert found.camera.distortion[:2].tolist() == [0.1, -0.02]
+    turn = rotation_matrix(np.array([1.2, 0.4, -0.3]))
+    np.testing.assert_allclose(found.camera.R_camera_world, turn)
+
+
+def test_easymocap_without_extrinsics(easymocap: Path) -> None:
+    (easymocap / "extri.yml").unlink()
+    found = load_camera(easymocap, name="3")
+    assert not found.metric
+    assert "no extrinsics" in str(found.units_note)
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "words"),
+    [
+        ("intri.yml", INTRI, "", "empty"),
+        ("intri.yml", INTRI, "names: [", "cannot be read as YAML"),
+        ("intri.yml", INTRI, "- 1", "expected names"),
+        ("intri.yml", INTRI, "a: 1", "expected 'names'"),
+        ("intri.yml", 'names:\n   - "2"', "names:\n   - [2]", "expected 'names'"),
+        ("intri.yml", "rows: 3", "rows: 4", "line 5: an opencv-matrix of 4 rows"),
+        ("intri.yml", "960.", "wide", "K: expected numbers"),
+        ("intri.yml", "960.", ".nan", "camera 3: "),
+        ("intri.yml", "!!opencv-matrix", "!!python/object:os.system", "cannot be read as YAML"),
+        ("intri.yml", "K_3", "K_4", "K .matrix. is missing"),
+        ("intri.yml", "W_3: 1920.", "W_3: 1920.5", "image size"),
+        ("extri.yml", "[ 0., 0., 4. ]", "[ 0., 0. ]", "opencv-matrix of 3 rows"),
+        ("extri.yml", "[ 0., -1., 0., 1.,", "[ 0., -1., 0., 7.,", "camera 3: "),
+    ],
+)  # fmt: skip
+def test_bad_easymocap(easymocap: Path, name: str, old: str, new: str, words: str) -> None:
+    text = (easymocap / name).read_text()
+    assert old in text
+    (easymocap / name).write_text(text.replace(old, new))
+    with pytest.raises(CameraError, match=words) as caught:
+        load_camera(easymocap, name="3")
+    assert "\n" not in str(caught.value)
+    assert str(easymocap) in str(caught.value)
+
+
+def test_pose2sim_of_a_recording(shared_data: Path, tmp_path: Path) -> None:
+    """What its authors published lies within 30 mm and 2 degrees of the refined calibration."""
+    (tmp_path / "Calib.toml").write_text(RECORDED)
+    published = load_camera(tmp_path / "Calib.toml")
+    assert published.metric
+    refined = load_camera(shared_data / "balance_beam_4cam" / "cameras.json", name="cam01").camera
+    gap = published.camera.centre_world - refined.centre_world
+    assert float(gap.norm()) < 0.03
+    turn = published.camera.R_camera_world @ refined.R_camera_world.T
+    assert float(torch.rad2deg(torch.acos((turn.trace() - 1) / 2))) < 2.0

@@ -166,8 +166,8 @@ def test_from_files(folder: Path, tmp_path: Path, sequence: SyntheticSequence):
     assert summary["other_views"] == [{"video": str(folder / "side.mp4"), "camera": "side"}]
     # The summary is a camera file of both.
     for name in ("front", "side"):
-        known = read_camera(tmp_path / "summary.json", video=folder / f"{name}.mp4").camera
-        given = read_camera(folder / "cameras.json", camera_name=name).camera
+        known = read_camera(tmp_path / "summary.json", video=folder / f"{name}.mp4")
+        given = read_camera(folder / "cameras.json", name=name)
         for part in ("K", "R_camera_world", "t_camera_world"):
             torch.testing.assert_close(getattr(known, part), getattr(given, part))
     shown = Run.open(tmp_path).camera

@@ -30,7 +30,7 @@ from torchcss.files import prepare_output_folder, replace_file
 from torchcss.initialise.fit import default_camera, initialise
 from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
 from torchcss.initialise.result import Initialisation, stature_of
-from torchcss.io.cameras import check_image_size, read_camera
+from torchcss.io.cameras import check_image_size, load_camera
 from torchcss.io.fitted_body import FITTED_BODY_NAME, write_fitted_body
 from torchcss.io.keypoints.one_image import read_joints
 from torchcss.io.keypoints.read import Scale
@@ -87,7 +87,7 @@ class PictureFiles:
             return camera, [note]
         if focal is not None or angle is not None:
             raise CameraError("give a camera file, a focal length or a field of view, not several")
-        loaded = read_camera(self.camera, camera_name=self.camera_name, video=self.image)
+        loaded = load_camera(self.camera, self.camera_name, video=self.image)
         check_image_size(loaded.camera, width, height)
         notes = [f"camera: {loaded.camera.name}", loaded.units_note]
         return loaded.camera, [note for note in notes if note]

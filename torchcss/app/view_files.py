@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchcss.errors import VideoError
 from torchcss.initialise.keypoint_checks import typical_sigma
-from torchcss.io.cameras import LoadedCamera, check_image_size, read_camera
+from torchcss.io.cameras import LoadedCamera, check_image_size, load_camera
 from torchcss.io.keypoints.read import read_keypoints
 from torchcss.io.video import VideoReader
 from torchcss.io.view_files import ViewFiles
@@ -148,7 +148,7 @@ def open_view(
     if isinstance(camera, Camera):
         loaded = LoadedCamera(camera, metric=True, units_note=None, video=None)
     else:
-        loaded = read_camera(camera, camera_name=files.camera_name, video=files.video)
+        loaded = load_camera(camera, files.camera_name, video=files.video)
     check_image_size(loaded.camera, width, height)
     if files.keypoints is None:
         return OpenView(reader, masks, loaded, None, 1.0, files.offset)

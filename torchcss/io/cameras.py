@@ -4,14 +4,15 @@
 (3 x 3, pixels), `image_size_wh`, optionally `distortion` (k1 k2 p1 p2 k3), the world-to-camera `R`
 and `t`, and `video`, the name of the file that it took. Pose2Sim's file has one table per camera
 with `name`, `size`, `matrix`, `distortions`, `rotation` (Rodrigues vector) and `translation` in
-metres. EasyMocap's `intri.yml` and `extri.yml` (`torchcss.io.cameras`) often lack the image size,
+metres. EasyMocap's `intri.yml` and `extri.yml` often lack the image size,
 which is then the video's.
 
 Units are metres inside (design, decision 12). Where the extrinsics are in another unit, or absent,
 the camera is used in its own frame, x right, y down, z forward: one view needs no more than the
 intrinsics, and a made-up scale would be worse. `LoadedCamera.units_note` says so.
 
-By default: `read_camera(path, video=video_path)`, then `check_image_size(camera, width, height)`.
+By default: `read_camera(path, name)` or `read_cameras(path)`; for a video
+`load_camera(path, video=video_path)`, then `check_image_size(camera, width, height)`.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ class _Entry(NamedTuple):
     distortion: Any
     rotation: Any
     translation: Any
-    units: str | None
+    units: str | None = "metre"
     video: str | None = None
     fisheye: bool = False
     from_easymocap: bool = False
@@ -67,16 +68,31 @@ class _Entry(NamedTuple):
 
 def read_camera(
     path: str | os.PathLike[str],
+    name: str | None = None,
     *,
-    camera_name: str | None = None,
+    video: str | os.PathLike[str] | None = None,
+) -> Camera:
+    """Read one camera of a calibration file; see `load_camera`."""
+    return load_camera(path, name, video=video).camera
+
+
+def read_cameras(path: str | os.PathLike[str]) -> dict[str, Camera]:
+    """Read all cameras of a calibration file, by name; see `load_camera`."""
+    return {name: load_camera(path, name).camera for name in _read_entries(Path(path))}
+
+
+def load_camera(
+    path: str | os.PathLike[str],
+    name: str | None = None,
+    *,
     video: str | os.PathLike[str] | None = None,
 ) -> LoadedCamera:
-    """Read one camera of a calibration file.
+    """Read one camera of a calibration file, and what the file says about it.
 
     Args:
         path: A `.json` or Pose2Sim `.toml` file, EasyMocap's `intri.yml` or the folder that it is
             in.
-        camera_name: Which camera. None: the one of `video`, or the only one.
+        name: Which camera. None: the one of `video`, or the only one.
         video: The video to be tracked; the camera whose `video`, or else whose name, is the name of
             this file is taken.
 
@@ -88,9 +104,8 @@ def read_camera(
     """
     path = Path(path)
     entries = _read_entries(path)
-    name = _choose(path, entries, camera_name, None if video is None else Path(video))
-    entry = entries[name]
-    where = f"{path}: camera {name!r}"
+    name = _choose(path, entries, name, None if video is None else Path(video))
+    entry, where = entries[name], f"{path}: camera {name!r}"
     if entry.fisheye:
         raise CameraError(
             f"{where}: a fisheye lens is not supported; undistort the video first and give the "
@@ -104,21 +119,24 @@ def read_camera(
     for key, value in (("K (matrix)", entry.K), ("image_size_wh (size)", entry.image_size_wh)):
         if value is None:
             raise CameraError(f"{where}: {key} is missing")
-    intrinsics = real_numbers(entry.K, f"{where}: K", CameraError)
-    size = real_numbers(entry.image_size_wh, f"{where}: image size", CameraError)
+    given = {
+        "K": entry.K,
+        "image size": entry.image_size_wh,
+        "distortion": entry.distortion,
+        "rotation": entry.rotation,
+        "translation": entry.translation,
+    }
+    intrinsics, size, distortion, rotation, translation = (
+        None if value is None else real_numbers(value, f"{where}: {key}", CameraError)
+        for key, value in given.items()
+    )
+    assert intrinsics is not None
+    assert size is not None
     if size.shape != (2,) or not (np.isfinite(size) & (size == np.round(size))).all():
         raise CameraError(
             f"{where}: image size: expected whole numbers [width, height], "
             f"found {shortened(entry.image_size_wh)}"
         )
-    distortion, rotation, translation = (
-        None if value is None else real_numbers(value, f"{where}: {key}", CameraError)
-        for key, value in (
-            ("distortion", entry.distortion),
-            ("rotation", entry.rotation),
-            ("translation", entry.translation),
-        )
-    )
     if rotation is not None and rotation.shape == (3,):
         rotation = rotation_matrix(rotation, where)
     try:
@@ -217,16 +235,14 @@ def _own_frame_note(name: str, entry: _Entry) -> str | None:
     return f"camera {name!r} {why}: tracking in the camera's own frame (x right, y down, z forward)"
 
 
-def _choose(
-    path: Path, entries: Mapping[str, Any], camera_name: str | None, video: Path | None
-) -> str:
+def _choose(path: Path, entries: Mapping[str, _Entry], name: str | None, video: Path | None) -> str:
     names = ", ".join(entries)
     if not entries:
         raise CameraError(f"{path}: no cameras in the file")
-    if camera_name is not None:
-        if camera_name not in entries:
-            raise CameraError(f"{path}: no camera {camera_name!r}; the file has {names}")
-        return camera_name
+    if name is not None:
+        if name not in entries:
+            raise CameraError(f"{path}: no camera {name!r}; the file has {names}")
+        return name
     if len(entries) == 1:
         return next(iter(entries))
     if video is None:
@@ -249,18 +265,7 @@ def _letters(name: str) -> str:
 def _read_entries(path: Path) -> dict[str, _Entry]:
     suffix = path.suffix.lower()
     if suffix in (".yml", ".yaml") or (path.is_dir() and (path / INTRINSICS).is_file()):
-        return {
-            name: _Entry(
-                K=values["K"],
-                image_size_wh=values["size"],
-                distortion=values["dist"],
-                rotation=values["R"],
-                translation=values["T"],
-                units="metre",
-                from_easymocap=True,
-            )
-            for name, values in read_easymocap(path).items()
-        }
+        return _read_easymocap(path)
     return _read_pose2sim(path) if suffix == ".toml" else _read_json(path)
 
 
@@ -314,7 +319,6 @@ def _read_pose2sim(path: Path) -> dict[str, _Entry]:
             distortion=values.get("distortions"),
             rotation=values.get("rotation"),
             translation=values.get("translation"),
-            units="metre",
             fisheye=bool(values.get("fisheye", False)),
         )
     return entries
@@ -370,15 +374,8 @@ def _matrix(loader: yaml.SafeLoader, node: yaml.Node) -> list[Any]:
 _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)
 
 
-def read_easymocap(path: Path) -> dict[str, dict[str, Any]]:
-    """Read all cameras: `K`, `dist`, `size`, `R`, `T` by name, None for what the files do not have.
-
-    Args:
-        path: The folder, or either of the files; the other is looked for beside it.
-
-    Raises:
-        CameraError: If a file is missing or malformed.
-    """
+def _read_easymocap(path: Path) -> dict[str, _Entry]:
+    """EasyMocap's cameras: `path` is the folder, or either file; the other is beside it."""
     folder = path if path.is_dir() else path.parent
     intrinsics = path if path.name != EXTRINSICS and not path.is_dir() else folder / INTRINSICS
     extrinsics = folder / EXTRINSICS
@@ -389,17 +386,18 @@ def read_easymocap(path: Path) -> dict[str, dict[str, Any]]:
         raise CameraError(
             f"{intrinsics}: expected 'names', as EasyMocap writes them, found {shortened(names)}"
         )
-    cameras: dict[str, dict[str, Any]] = {}
+    cameras = {}
     for name in map(str, names):
         size = [first.get(f"W_{name}"), first.get(f"H_{name}")]
         rotation = second.get(f"Rot_{name}")
-        cameras[name] = {
-            "K": first.get(f"K_{name}"),
-            "dist": first.get(f"dist_{name}", first.get(f"D_{name}")),
-            "size": None if None in size else size,
-            "R": second.get(f"R_{name}") if rotation is None else rotation,
-            "T": second.get(f"T_{name}"),
-        }
+        cameras[name] = _Entry(
+            K=first.get(f"K_{name}"),
+            image_size_wh=None if None in size else size,
+            distortion=first.get(f"dist_{name}", first.get(f"D_{name}")),
+            rotation=second.get(f"R_{name}") if rotation is None else rotation,
+            translation=second.get(f"T_{name}"),
+            from_easymocap=True,
+        )
     return cameras
 
 

@@ -236,7 +236,7 @@ def _cameras(
     wanted = None if given.video is None else given.video.name
     if given.camera is not None:
         source, name, video = given.camera, given.camera_name, given.video
-        camera = read_camera(source, camera_name=name, video=video).camera
+        camera = read_camera(source, name, video=video)
         first, *others = known or (RecordedCamera(camera),)
         known = (first._replace(camera=camera), *others)
     elif given.camera_name is not None or wanted is not None:
@@ -270,7 +270,7 @@ def _cameras_of_summary(own: Path, summary: Mapping[str, Any]) -> tuple[Recorded
         video = view.get("video")
         files = None if video is None else ViewFiles(video=Path(video), keypoints=None)
         with suppress(TorchcssError):  # a summary that somebody edited: as if it had none
-            found.append(RecordedCamera(read_camera(own, camera_name=name).camera, files))
+            found.append(RecordedCamera(read_camera(own, name), files))
     return tuple(found)
 
 

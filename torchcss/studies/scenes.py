@@ -155,7 +155,7 @@ def _clip_scene(
 ) -> Scene:
     video = folder / f"{view}.mp4"
     before, now = VideoReader(video, start=frame - 1, stop=frame + 1)
-    full = read_camera(folder / "cameras.json", video=video).camera.to(settings.torch_dtype)
+    full = read_camera(folder / "cameras.json", video=video).to(settings.torch_dtype)
     path = folder / f"keypoints2d_{view}.npz"
     keypoints = read_keypoints(path, image_size_wh=full.image_size_wh)
     options = InitialiseOptions(least_joints=LEAST_JOINTS, dtype=settings.torch_dtype)

@@ -35,7 +35,7 @@ from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.errors import CameraError, KeypointError, TrackFileError, VideoError
 from torchcss.files import load_arrays, one_line
-from torchcss.io.cameras import check_image_size, read_camera
+from torchcss.io.cameras import check_image_size, load_camera
 from torchcss.io.keypoints.read import read_keypoints
 from torchcss.io.video import VideoReader
 from torchcss.joint_names import canonical_joint_name
@@ -107,7 +107,7 @@ def read_sequence(folder: str | os.PathLike[str], *, view: str | None = None) ->
     reader = VideoReader(video)
     size = (reader.info.width, reader.info.height)
     num_frames = reader.info.num_frames or reader.count_frames()
-    loaded = read_camera(folder / "cameras.json", camera_name=view, video=video)
+    loaded = load_camera(folder / "cameras.json", view, video=video)
     if loaded.units_note is not None:
         raise CameraError(
             f"{folder / 'cameras.json'}: {loaded.units_note}; a reference in 3D needs the camera "
