@@ -190,9 +190,9 @@ def layout_of_names(names: tuple[str, ...]) -> tuple[str | None, ...]:
     return tuple(found)
 
 
-_LIMBS: Final[tuple[str, ...]] = ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")
+LIMB_PLACES: Final[tuple[str, ...]] = ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")
 _SKELETONS: Final[tuple[dict[str, str], ...]] = tuple(
-    dict(zip(names, _LIMBS, strict=True))
+    dict(zip(names, LIMB_PLACES, strict=True))
     for names in (
         # MotionBuilder, Mixamo, the BVH conversions of the CMU database.
         ("upleg", "leg", "foot", "arm", "forearm", "hand"),
@@ -202,6 +202,12 @@ _SKELETONS: Final[tuple[dict[str, str], ...]] = tuple(
     )
 )
 """What skeletons call the joint in which a limb's segment starts, without side and prefix."""
+
+_ENDS: Final[dict[str, str]] = dict(
+    zip(("hipjoint", "femur", "tibia", "clavicle", "humerus", "wrist"), LIMB_PLACES, strict=True)
+)
+"""The same where joints are the ends of Acclaim's bones. `radius` and `wrist` together are the
+forearm, cut where it twists."""
 
 _SKELETON_PLACES: Final[dict[str, str]] = {
     "neck": "vt1",
@@ -216,7 +222,7 @@ _SKELETON_PLACES: Final[dict[str, str]] = {
 """Other joints of skeletons that are places of ours; `head` is where it turns, not its top."""
 
 
-def skeleton_joint_names(names: Sequence[str]) -> tuple[str | None, ...]:
+def skeleton_joint_names(names: Sequence[str], *, ends: bool = False) -> tuple[str | None, ...]:
     """Return which of the catalogue's joints the joints of a skeleton are.
 
     A skeleton's joint is called after what it moves: `LeftArm` and `lhumerus` are shoulders, and
@@ -225,12 +231,14 @@ def skeleton_joint_names(names: Sequence[str]) -> tuple[str | None, ...]:
 
     Args:
         names: The skeleton's joint names.
+        ends: Whether Acclaim's joints are the ends of the bones that they are called after.
 
     Returns:
         A member of `JOINT_NAMES`, each once, or `None`, for every joint.
     """
     candidates: list[list[str | None]] = [
-        [_skeleton_place(name, layout) for name in names] for layout in (*_SKELETONS, None)
+        [_skeleton_place(name, layout) for name in names]
+        for layout in (*((_ENDS,) if ends else ()), *_SKELETONS, None)
     ]
     best = max(candidates, key=lambda found: len({name for name in found if name}))
     return tuple(

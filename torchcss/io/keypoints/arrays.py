@@ -39,12 +39,12 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
         raise KeypointError(
             f"{path}: joint_names: expected {shape[1]} names, got {names.dtype} {list(names.shape)}"
         )
-    triples = np.dstack([keypoints, confidence]).astype(np.float64)
+    found = np.dstack([keypoints, confidence]).astype(np.float64)
     report = ["format: NPZ"]
     if "confidence" not in arrays:
         report.append("no confidence in the file: 1 for every joint that is a number")
     return People(
-        [frame[None] for frame in triples],
+        list(found[:, None]),
         None if names is None else tuple(str(name) for name in names),
         report,
     )

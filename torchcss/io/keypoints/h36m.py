@@ -20,7 +20,7 @@ import numpy as np
 
 from torchcss.errors import KeypointError
 from torchcss.files import one_line, shortened
-from torchcss.io.keypoints.people import People
+from torchcss.io.keypoints.people import People, screened
 
 _LAYOUTS = {"h36m": "H36M-17", "coco": "COCO-17"}
 _MOST_BYTES = 2**31
@@ -94,13 +94,10 @@ def read_h36m(path: Path, selection: str) -> People:
         raise KeypointError(
             f"{where}: expected numbers [frames, joints, 2], got {list(points.shape)}"
         )
-    seen = np.isfinite(points[..., 0]) & np.isfinite(points[..., 1])
-    confidence = np.where(seen, points[..., 2] if points.shape[2] == 3 else 1.0, 0.0)
-    triples = np.concatenate(
-        [np.where(seen[..., None], points[..., :2], 0.0), confidence[..., None]], axis=-1
-    )
+    places = np.where(np.isfinite(points[..., :2]), points[..., :2], np.nan)
+    found = screened(places, points[..., 2] if points.shape[2] == 3 else 1.0)
     report = [f"format: VideoPose3D's archive, {'/'.join(steps)}"]
-    return People([frame[None] for frame in triples], None, report, _layout(path, points.shape[1]))
+    return People(list(found[:, None]), None, report, _layout(path, points.shape[1]))
 
 
 def _layout(path: Path, num_joints: int) -> str | None:

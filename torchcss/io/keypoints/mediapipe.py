@@ -25,7 +25,14 @@ from jaxtyping import Float
 
 from torchcss.errors import KeypointError
 from torchcss.files import real_numbers, shortened
-from torchcss.io.keypoints.people import People, check_counts, stack
+from torchcss.io.keypoints.people import (
+    FRAME_NAMES,
+    People,
+    frame_number,
+    in_order,
+    screened,
+    stack,
+)
 from torchcss.joint_names import ALIASES
 
 LAYOUT = "MediaPipe-33"
@@ -42,13 +49,10 @@ NAMES = (
 """MediaPipe's own names, in its order."""
 
 _HOLDERS = ("landmarks", "pose_landmarks", "pose", "keypoints", "landmark")
-_FRAME_KEYS = ("frame", "frame_number", "frame_index", "frame_id", "frame_no", "frame_num", "index")
 _CONFIDENCES = ("visibility", "confidence", "score", "presence")
 
 _LARGEST_FRACTION = 3.0
 """Landmarks that MediaPipe guesses outside the image stay within this many of its sides."""
-
-_MOST_FRAMES = 1_000_000
 
 
 def is_mediapipe(content: object) -> bool:
@@ -74,30 +78,21 @@ def read_landmarks(
     if whole or (isinstance(content, dict) and any(holder in content for holder in _HOLDERS)):
         content = [content]
     if isinstance(content, dict):
-        places = [_whole_number(path, key) for key in content]
+        places = [frame_number(path, key) for key in content]
         entries = list(content.values())
     else:
         entries = list(content)
         places = [_place_of(path, entry, index) for index, entry in enumerate(entries)]
     if len(set(places)) < len(places):
         raise KeypointError(f"{path}: the same frame number twice; expected each frame once")
-    # Some count from 1, which shows where the number of the last frame is that of all frames.
-    origin = 1 if places and 0 not in places and max(places) == num_frames else 0
-    total = max(places, default=-1) + 1 - origin
-    if num_frames is not None:
-        # Frames at the end in which nobody is seen are often left out.
-        total = max(total, num_frames)
-    if total > _MOST_FRAMES:
-        raise KeypointError(f"{path}: frame {total - 1} is not a frame number")
-    frames = [np.zeros((0, 0, 3)) for _ in range(total)]
+    found: dict[int, np.ndarray] = {}
     for place, entry in zip(places, entries, strict=True):
         where = f"{path}: frame {place}"
-        people = [
-            _triples(where, person, index)
-            for index, person in enumerate(_people_of(where, _landmarks_of(entry)))
-        ]
-        frames[place - origin] = stack(path, people)
-    check_counts(path, frames)
+        people = _people_of(where, _landmarks_of(entry))
+        found[place] = stack(
+            path, [_triples(where, person, index) for index, person in enumerate(people)]
+        )
+    frames, origin = in_order(path, found, num_frames)
     report = [f"format: MediaPipe landmarks, frame {origin} is the first frame"]
     return in_pixels(path, frames, image_size_wh, report)
 
@@ -109,16 +104,14 @@ def read_landmark_array(
     size = array.shape[-1] if array.ndim == 3 else array.shape[-1] // NUM_LANDMARKS
     values = array.astype(np.float64).reshape(len(array), NUM_LANDMARKS, size)
     seen = np.isfinite(values[..., :2]).all(-1) & (values[..., :2] != 0).any(-1)
-    confidence = np.where(seen, values[..., 3] if size == 4 else 1.0, 0.0)
-    triples = np.concatenate(
-        [np.where(seen[..., None], values[..., :2], 0.0), confidence[..., None]], axis=-1
-    )
+    places = np.where(seen[..., None], values[..., :2], np.nan)
+    found = screened(places, values[..., 3] if size == 4 else 1.0)
     report = [f"format: MediaPipe landmarks, array {name}"]
     if size == 3:
         report.append(
             "three numbers per landmark taken as x, y, z: confidence 1 where there is one"
         )
-    return in_pixels(path, [frame[None] for frame in triples], image_size_wh, report)
+    return in_pixels(path, list(found[:, None]), image_size_wh, report)
 
 
 def is_landmark_array(array: np.ndarray) -> bool:
@@ -228,15 +221,8 @@ def _landmark_index(where: str, key: str) -> int:
 def _place_of(path: Path, entry: object, index: int) -> int:
     """Number of a frame in a list: its own, or its place."""
     if isinstance(entry, dict):
-        for key in _FRAME_KEYS:
+        for key in (*FRAME_NAMES, "index"):
             value = entry.get(key)
             if isinstance(value, int) and not isinstance(value, bool):
-                return _whole_number(path, str(value))
+                return frame_number(path, str(value))
     return index
-
-
-def _whole_number(path: Path, text: str) -> int:
-    digits = re.fullmatch(r"(?:[^0-9]*[^0-9-])?([0-9]{1,7})", str(text))
-    if digits is None:
-        raise KeypointError(f"{path}: expected a frame number, found {shortened(text)}")
-    return int(digits[1])

@@ -1,11 +1,10 @@
-"""Joints of one picture: all formats of `torchcss.io.keypoints.read`, CSV, MediaPipe's JSON.
+"""Joints of one picture: all formats of `torchcss.io.keypoints.read`, and CSV of a row a joint.
 
 | format | recognised by |
 |---|---|
 | CSV | suffix `.csv`: rows `joint, u, v[, confidence]`, with or without a heading |
-| MediaPipe | JSON: a list of 33 landmarks `{"x", "y", "visibility"}`, or it under `landmarks` |
 | other CSV | a first row that names the columns otherwise, as DeepLabCut's or `l_hip_x` |
-| these, OpenPose, COCO, clicked, NPZ | see `torchcss.io.keypoints.read` |
+| these, OpenPose, COCO, MediaPipe, clicked, NPZ | see `torchcss.io.keypoints.read` |
 
 Missing joints are simply missing. Call `read_joints`.
 """
@@ -23,7 +22,7 @@ import torch
 from torchcss.errors import KeypointError
 from torchcss.files import load_json
 from torchcss.io.keypoints.read import Scale, read_keypoints
-from torchcss.joint_names import ALIASES, JOINT_NAMES, canonical_joint_name
+from torchcss.joint_names import JOINT_NAMES, canonical_joint_name
 from torchcss.types import Keypoints
 
 
@@ -58,23 +57,19 @@ def read_joints(
                 )
             return _read_csv(path, rows)
     if path.suffix.lower() == ".json":
-        content = load_json(path, KeypointError)
-        if isinstance(content, dict) and "landmarks" in content:
-            content = content["landmarks"]
-        rows = content if isinstance(content, list) else []
-        if rows and isinstance(rows[0], dict) and {"x", "y"} <= set(rows[0]):
-            return _read_mediapipe(path, rows, image_size_wh)
-        if isinstance(content, dict) and content.keys() & {"joints", "people"}:
-            frame = 0
-        frame = _frame_of_single_image(content, frame)
+        frame = _frame_of_single_image(load_json(path, KeypointError), frame)
     return read_keypoints(
         path, image_size_wh=image_size_wh, layout=layout, normalised=normalised, first_frame=frame
     ).at(frame)
 
 
 def _frame_of_single_image(content: object, otherwise: int) -> int:
-    """Where COCO detections of one image are: its number counts as that of a video's frame."""
+    """Where the joints of a file of one image are; COCO's number counts as a video's frame."""
+    if isinstance(content, dict):
+        return 0 if content.keys() & {"joints", "people", "landmarks"} else otherwise
     rows = content if isinstance(content, list) else []
+    if rows and isinstance(rows[0], dict) and {"x", "y"} <= set(rows[0]):
+        return 0
     images = {str(row.get("image_id")) if isinstance(row, dict) else "" for row in rows}
     only = images.pop() if len(images) == 1 else ""
     digits = re.findall(r"[0-9]+", Path(only).stem)
@@ -144,23 +139,3 @@ def _read_csv(path: Path, rows: list[list[str]]) -> Keypoints:
         tuple(table),
         report=(f"format: CSV, {len(table)} joints",),
     )
-
-
-def _read_mediapipe(path: Path, rows: list, image_size_wh: tuple[int, int]) -> Keypoints:
-    layout = ALIASES["MediaPipe-33"]
-    if len(rows) != len(layout):
-        raise KeypointError(f"{path}: expected {len(layout)} landmarks, found {len(rows)}")
-    try:
-        numbers = torch.tensor(
-            [[row["x"], row["y"], row.get("visibility", 1.0)] for row in rows], dtype=torch.float64
-        )
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise KeypointError(
-            f"{path}: expected x, y and visibility as numbers for every landmark"
-        ) from error
-    if not bool(numbers.isfinite().all()):
-        raise KeypointError(f"{path}: a landmark is not finite; leave its visibility at 0")
-    # Fractions of the image's sides, from its corner; pixel centres are at integers.
-    uv = numbers[:, :2] * numbers.new_tensor(image_size_wh) - 0.5
-    names = tuple(name or f"MediaPipe-33[{i}]" for i, name in enumerate(layout))
-    return Keypoints(uv, numbers[:, 2].clamp(0, 1), names, report=("format: MediaPipe landmarks",))

@@ -32,9 +32,13 @@ import torch
 from torchcss.errors import KeypointError
 from torchcss.files import load_array, load_arrays, load_json, shortened
 from torchcss.io.keypoints.arrays import read_arrays
-from torchcss.io.keypoints.clicked import read_clicked
-from torchcss.io.keypoints.coco import read_coco
 from torchcss.io.keypoints.h36m import is_h36m, read_h36m
+from torchcss.io.keypoints.json_files import (
+    openpose_people,
+    read_clicked,
+    read_coco,
+    read_openpose_folder,
+)
 from torchcss.io.keypoints.mediapipe import (
     is_landmark_array,
     is_mediapipe,
@@ -42,7 +46,6 @@ from torchcss.io.keypoints.mediapipe import (
     read_landmarks,
 )
 from torchcss.io.keypoints.one_person import follow, size_of
-from torchcss.io.keypoints.openpose import openpose_people, read_openpose_folder
 from torchcss.io.keypoints.people import People
 from torchcss.io.keypoints.tables import read_table
 from torchcss.joint_names import ALIASES, JOINT_NAMES, layout_of_names

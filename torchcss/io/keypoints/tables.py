@@ -25,7 +25,7 @@ from jaxtyping import Float
 from torchcss.errors import KeypointError
 from torchcss.files import read_text, shortened
 from torchcss.io.keypoints.mediapipe import NAMES, in_pixels
-from torchcss.io.keypoints.people import People
+from torchcss.io.keypoints.people import FRAME_NAMES, People, frame_number, in_order, screened
 
 _PARTS = {
     **dict.fromkeys(("x", "u"), 0),
@@ -37,10 +37,8 @@ _PARTS = {
 }
 """What a column's name says that it is: 0, 1 coordinates, 2 confidence, 3 not used."""
 
-_FRAMES = ("frame", "frame_number", "frame_index", "frame_id", "frame_no", "frame_num", "image_id")
 _JOINTS = ("landmark", "landmark_id", "landmark_name", "landmark_index", "joint", "joint_name",
            "joint_id", "bodypart", "keypoint", "name", "id", "index")  # fmt: skip
-_MOST_FRAMES = 1_000_000
 
 
 def read_table(path: Path, num_frames: int | None, image_size_wh: tuple[int, int]) -> People:
@@ -69,19 +67,19 @@ def read_table(path: Path, num_frames: int | None, image_size_wh: tuple[int, int
     names = [re.sub(r"[\s.\-]+", "_", cell.lower()) for cell in heading]
     if not body:
         raise KeypointError(f"{path}: row 1: a heading and nothing below it; get a complete copy")
-    joint = next((names.index(name) for name in _JOINTS if name in names), None)
+    joint = _first_of(_JOINTS, names)
     if joint is not None and {"x", "y"} <= set(names):
-        joints, frames = _long(path, names, joint, body)
+        joints, found = _long(path, names, joint, body)
     else:
-        joints, frames = _wide(path, names, heading, body)
-    frames = _filled(path, frames, num_frames, len(joints))
+        joints, found = _wide(path, names, heading, body)
+    people, _ = in_order(path, found, num_frames)
     lower = [re.sub(r"[^a-z0-9]+", "_", name.lower()) for name in joints]
     if len(joints) == len(NAMES) and (set(lower) == set(NAMES) or all(map(str.isdigit, lower))):
         order = [lower.index(name) for name in NAMES] if lower[0] in NAMES else _by_number(lower)
-        people = [frame[:, order] for frame in frames]
+        people = [frame[:, order] for frame in people]
         return in_pixels(path, people, image_size_wh, ["format: CSV of MediaPipe's landmarks"])
     named = not all(map(str.isdigit, lower))
-    return People(frames, tuple(joints) if named else None, ["format: CSV, a heading per column"])
+    return People(people, tuple(joints) if named else None, ["format: CSV, a heading per column"])
 
 
 def _by_number(names: Sequence[str]) -> list[int]:
@@ -100,11 +98,9 @@ def _number(path: Path, row: int, cell: str) -> float:
     raise KeypointError(f"{path}: row {row}: expected a number, found {shortened(cell)}")
 
 
-def _frame_number(path: Path, row: int, cell: str) -> int:
-    match = re.fullmatch(r"(?:.*[^0-9-])?([0-9]{1,7})(?:\.0*|\.[A-Za-z]+)?", cell)
-    if match is None:
-        raise KeypointError(f"{path}: row {row}: expected a frame number, found {shortened(cell)}")
-    return int(match[1])
+def _first_of(wanted: Sequence[str], names: Sequence[str]) -> int | None:
+    """Where the first of some words stands among the columns."""
+    return next((names.index(name) for name in wanted if name in names), None)
 
 
 def _checked(path: Path, row: int, cells: Sequence[str], size: int) -> None:
@@ -115,35 +111,13 @@ def _checked(path: Path, row: int, cells: Sequence[str], size: int) -> None:
         )
 
 
-def _missing_where_nan(values: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3"]:
+def _with_confidence(values: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3"]:
     """Joints without a place have confidence 0, joints without confidence 1."""
-    seen = ~(np.isnan(values[..., 0]) | np.isnan(values[..., 1]))
     confidence = np.where(np.isnan(values[..., 2]), 1.0, values[..., 2])
-    return np.concatenate(
-        [
-            np.where(seen[..., None], values[..., :2], 0.0),
-            np.where(seen, confidence, 0.0)[..., None],
-        ],
-        axis=-1,
-    )
+    return screened(values[..., :2], confidence)
 
 
 Frames = dict[int, Float[np.ndarray, "p j 3"]]
-
-
-def _filled(
-    path: Path, frames: Frames, num_frames: int | None, num_joints: int
-) -> list[np.ndarray]:
-    """All frames in order; those that the file leaves out are empty."""
-    first, last = min(frames), max(frames)
-    origin = 1 if first == 1 and num_frames is not None and last == num_frames else 0
-    total = last + 1 - origin
-    if num_frames is not None and last < num_frames:
-        total = num_frames
-    if total > _MOST_FRAMES:
-        raise KeypointError(f"{path}: frame {last} is not a frame number; number them from 0")
-    nobody = np.zeros((0, num_joints, 3))
-    return [frames.get(index + origin, nobody).copy() for index in range(total)]
 
 
 def _wide(
@@ -163,18 +137,18 @@ def _wide(
             f"{path}: row 1: expected DeepLabCut's headings, or columns such as nose_x and nose_y, "
             f"found {shortened(', '.join(heading))}"
         )
-    frame_column = next((names.index(name) for name in _FRAMES if name in names), None)
+    frame_column = _first_of(FRAME_NAMES, names)
     frames: Frames = {}
     for place, (row, cells) in enumerate(body):
         _checked(path, row, cells, len(names))
         if frame_column is not None:
-            place = _frame_number(path, row, cells[frame_column])
+            place = frame_number(f"{path}: row {row}", cells[frame_column])
         values = np.full((1, len(joints), 3), np.nan)
         for index, joint in enumerate(joints):
             for part, column in columns[joint].items():
                 if part < 3:
                     values[0, index, part] = _number(path, row, cells[column])
-        values = _missing_where_nan(values)
+        values = _with_confidence(values)
         frames[place] = np.concatenate([frames[place], values]) if place in frames else values
     return joints, frames
 
@@ -196,26 +170,27 @@ def _long(
     path: Path, names: Sequence[str], joint: int, body: Sequence[tuple[int, list[str]]]
 ) -> tuple[list[str], Frames]:
     parts = {_PARTS[name]: index for index, name in enumerate(names) if name in _PARTS}
-    frame_column = next((names.index(name) for name in _FRAMES if name in names), None)
+    frame_column = _first_of(FRAME_NAMES, names)
     found: dict[int, dict[str, np.ndarray]] = {}
     joints: dict[str, None] = {}
     for row, cells in body:
         _checked(path, row, cells, len(names))
-        place = 0 if frame_column is None else _frame_number(path, row, cells[frame_column])
+        where = f"{path}: row {row}"
+        place = 0 if frame_column is None else frame_number(where, cells[frame_column])
         name = cells[joint]
         joints[name] = None
         if name in found.setdefault(place, {}):
-            raise KeypointError(f"{path}: row {row}: {name!r} is there twice in frame {place}")
+            raise KeypointError(f"{where}: {name!r} is there twice in frame {place}")
         values = np.full(3, np.nan)
         for part, column in parts.items():
             if part < 3:
                 values[part] = _number(path, row, cells[column])
-        found[place][name] = _missing_where_nan(values)
+        found[place][name] = _with_confidence(values)
     order = list(joints)
     frames: Frames = {}
-    for place, marks in found.items():
+    for place, rows in found.items():
         frames[place] = np.zeros((1, len(order), 3))
-        for name, values in marks.items():
+        for name, values in rows.items():
             frames[place][0, order.index(name)] = values
     return order, frames
 
@@ -252,10 +227,10 @@ def _read_deeplabcut(
             values[person, joint, kinds[coords[column]]] = _number(path, row, cells[column])
         # Of labelled frames the picture's name is the index; of a video's its number.
         label = cells[start - 1] if start else str(place)
-        place = _frame_number(path, row, label)
+        place = frame_number(f"{path}: row {row}", label)
         if place in frames:
             raise KeypointError(f"{path}: row {row}: frame {place} is there twice")
-        values = _missing_where_nan(values)
+        values = _with_confidence(values)
         frames[place] = values[(values[..., 2] > 0).any(-1)]
     report = [f"format: DeepLabCut, {len(people)} individual{'s' * (len(people) > 1)}"]
-    return People(_filled(path, frames, num_frames, len(joints)), tuple(joints), report)
+    return People(in_order(path, frames, num_frames)[0], tuple(joints), report)

@@ -25,7 +25,6 @@ from __future__ import annotations
 
 import math
 import os
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -39,22 +38,13 @@ from torchcss.body.rotations import about
 from torchcss.errors import ConfigurationError, MotionCaptureError
 from torchcss.files import shortened
 from torchcss.io.motion.acclaim import parse_acclaim
-from torchcss.joint_names import canonical_joint_name
+from torchcss.joint_names import LIMB_PLACES, skeleton_joint_names
 
 ACCLAIM_RATE = 120.0
 """Frames per second of an AMC, which does not say: those of the CMU database."""
 
-_LIMBS = ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")
-LIMBS: Final[tuple[str, ...]] = tuple(f"{side}_{place}" for place in _LIMBS for side in "lr")
+LIMBS: Final[tuple[str, ...]] = tuple(f"{side}_{place}" for place in LIMB_PLACES for side in "lr")
 """The joints that all skeletons have and mean alike."""
-
-_LAYOUTS: Final[tuple[tuple[str, ...], ...]] = (
-    # Ends of Acclaim's bones. 'radius' and 'wrist' together are the forearm, cut where it twists.
-    ("hipjoint", "femur", "tibia", "clavicle", "humerus", "wrist"),
-    # Starts of what animators move: MotionBuilder, Mixamo, the BVH conversions of the CMU database.
-    ("upleg", "leg", "foot", "arm", "forearm", "hand"),
-)
-"""What other skeletons call `_LIMBS`, without side and prefix."""
 
 
 class MotionCapture(NamedTuple):
@@ -186,8 +176,7 @@ def limb_positions(
     """The joints of a motion that the catalogue names too.
 
     Args:
-        motion: The motion. Its names may be Acclaim's, animators', or any spelling that
-            `canonical_joint_name` knows.
+        motion: The motion, its names such as `skeleton_joint_names` knows.
 
     Returns:
         Those of `LIMBS` that there are, which joint of the motion each is, and their positions.
@@ -195,7 +184,8 @@ def limb_positions(
     Raises:
         MotionCaptureError: If hips or shoulders are not among them.
     """
-    found = max((_match(motion.joint_names, layout) for layout in (*_LAYOUTS, None)), key=len)
+    places = skeleton_joint_names(motion.joint_names, ends=True)
+    found = {name: index for index, name in enumerate(places) if name in LIMBS}
     if not {"l_hip", "r_hip", "l_shoulder", "r_shoulder"} <= set(found):
         raise MotionCaptureError(
             "expected hips and shoulders of both sides among the joints, found "
@@ -204,24 +194,6 @@ def limb_positions(
     names = tuple(name for name in LIMBS if name in found)
     index = tuple(found[name] for name in names)
     return names, index, motion.joints[:, list(index)]
-
-
-def _match(joint_names: Sequence[str], layout: tuple[str, ...] | None) -> dict[str, int]:
-    """Limbs found by one table of names, or by the package's own."""
-    found: dict[str, int] = {}
-    for index, name in enumerate(joint_names):
-        if layout is None:
-            canonical = canonical_joint_name(name)
-            if canonical in LIMBS:
-                found.setdefault(canonical, index)
-            continue
-        bare = re.sub(r"[^a-z]", "", name.lower().split(":")[-1].removeprefix("mixamorig"))
-        for side in ("left", "right", "l", "r"):
-            place = bare.removeprefix(side)
-            if place != bare and place in layout:
-                found.setdefault(f"{side[0]}_{_LIMBS[layout.index(place)]}", index)
-                break
-    return found
 
 
 def _scale_of(units: str | float | None) -> float | None:
