@@ -27,7 +27,7 @@ def test_pixels_look_like_what_they_were_learnt_to_be(dtype: torch.dtype) -> Non
     known = Appearance.unknown(2, like=image).learn(
         image, torch.stack([thing, ~thing & False]), torch.stack([~thing, ~thing & False])
     )
-    likeness = known.likeness(image)
+    likeness = known.foreground_ratio(image)
     assert likeness.shape == (2, 40, 60)
     assert likeness.dtype == dtype
     assert float(likeness[0, 12, 25]) > 0.95
@@ -35,7 +35,7 @@ def test_pixels_look_like_what_they_were_learnt_to_be(dtype: torch.dtype) -> Non
     assert abs(float(likeness[0, 21, 25])) < 0.5, "grey is both"
     assert not likeness[1].any(), "a thing never seen looks like nothing"
     stranger = torch.full_like(image, 0.02)
-    assert float(known.likeness(stranger)[0].abs().max()) < 1e-6
+    assert float(known.foreground_ratio(stranger)[0].abs().max()) < 1e-6
 
 
 def test_the_ratio_is_that_of_the_posteriors() -> None:
@@ -44,7 +44,7 @@ def test_the_ratio_is_that_of_the_posteriors() -> None:
     thing = torch.rand(64, 64, generator=generator) < 0.3
     known = Appearance.unknown(1, like=image).learn(image, thing[None], ~thing[None])
     assert float(known.inside.sum()) == pytest.approx(1.0)
-    likeness = known.likeness(image)
+    likeness = known.foreground_ratio(image)
     assert float(likeness.abs().max()) <= 1.0
     # The same colours inside and out: nothing to tell them apart on average.
     assert abs(float(likeness[0][thing].mean() - likeness[0][~thing].mean())) < 0.6

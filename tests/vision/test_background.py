@@ -86,14 +86,14 @@ def test_what_comes_before_it_looks_like_the_body_in_the_colours_of_the_wall() -
     known = Background.unknown(picture).learn(picture, ~body)
     after = picture.clone()
     after[:, block(25, 25)] = picture[:, body]
-    blind, seeing = looks.likeness(after)[0], looks.likeness(after, known)[0]
+    blind, seeing = looks.foreground_ratio(after)[0], looks.foreground_ratio(after, known)[0]
     assert float(seeing[block(25, 25)].mean()) > float(blind[block(25, 25)].mean()) + 0.3
     assert float(seeing[block(5, 40)].mean()) < -0.8
     # Where nothing is known colours say what they said.
     torch.testing.assert_close(seeing[body], blind[body])
     assert float(seeing.abs().max()) <= 1.0
     # Of a thing never seen it is known only that it is not the background.
-    strange = Appearance.unknown(1, like=picture).likeness(after, known)[0]
+    strange = Appearance.unknown(1, like=picture).foreground_ratio(after, known)[0]
     assert float(strange[block(25, 25)].mean()) > 0.5
     assert float(strange[block(5, 40)].mean()) < -0.8
 
@@ -107,7 +107,10 @@ def test_what_never_was_bare_and_does_not_change_is_a_guess() -> None:
         assert float(known.confidence[hidden].max()) == (0.1 if frame >= 3 else 0.0)
         known = known.learn(picture, ~hidden)
     # Who stands still is not taken for the wall, but his colours count for less.
-    blind, seeing = looks.likeness(picture)[0][hidden], looks.likeness(picture, known)[0][hidden]
+    blind, seeing = (
+        looks.foreground_ratio(picture)[0][hidden],
+        looks.foreground_ratio(picture, known)[0][hidden],
+    )
     assert float(blind.min()) > 0.9
     assert float(seeing.min()) >= 0
     assert float(seeing.max()) < float(blind.min()) - 0.05
@@ -115,8 +118,8 @@ def test_what_never_was_bare_and_does_not_change_is_a_guess() -> None:
     moved = picture.clone()
     moved[:, hidden] = 1 - picture[:, hidden]
     strange = Appearance.unknown(1, like=moved).learn(moved, hidden[None], ~hidden[None])
-    again = strange.likeness(moved, known)[0][hidden]
-    torch.testing.assert_close(again, strange.likeness(moved)[0][hidden], atol=0.12, rtol=0)
+    again = strange.foreground_ratio(moved, known)[0][hidden]
+    torch.testing.assert_close(again, strange.foreground_ratio(moved)[0][hidden], atol=0.12, rtol=0)
     # Once it is bare what it showed before is forgotten.
     bare = known.learn(moved, everywhere())
     torch.testing.assert_close(bare.mean[:, hidden], moved[:, hidden])

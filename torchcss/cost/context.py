@@ -93,7 +93,7 @@ class FrameContext:
     def _before_surroundings(self) -> Float[Tensor, "layers h w"] | None:
         if self.appearance is None or self.features is None or self.features.colour is None:
             return None
-        return self.appearance.likeness(self.features.colour)
+        return self.appearance.foreground_ratio(self.features.colour)
 
     @cached_property
     def _before_background(self) -> Float[Tensor, "layers h w"] | None:
@@ -101,4 +101,4 @@ class FrameContext:
             return self._before_surroundings
         if self.appearance is None or self.features is None or self.features.colour is None:
             return None
-        return self.appearance.likeness(self.features.colour, self.background)
+        return self.appearance.foreground_ratio(self.features.colour, self.background)

@@ -5,14 +5,15 @@ of what looks at the person as a whole. Here the colours of each thing (a layer)
 surroundings are histograms, learned from frames in which it is known where the thing is, and
 forgotten by degrees. For a pixel of colour c,
 
-    likeness = tanh(1/2 log p(c | thing) / p(c | surroundings)) = P(thing | c) - P(surroundings | c)
+    tanh(1/2 log p(c | thing) / p(c | surroundings)) = P(thing | c) - P(surroundings | c)
 
-with equal prior odds: 1 where only the thing has that colour, -1 where only the surroundings have,
-0 where both or neither do. Where it is known what a pixel looks like with nobody before it
-(`torchcss.vision.background`), that density takes the place of the surroundings' as far as it is
-trusted.
+is its foreground log-likelihood ratio, squashed to -1..1 (with equal prior odds): 1 where only the
+thing has that colour, -1 where only the surroundings have, 0 where both or neither do. Where it is
+known what a pixel looks like with nobody before it (`torchcss.vision.background`), that density
+takes the place of the surroundings' as far as it is trusted.
 
-By default: `Appearance.unknown`, then per frame `likeness`, and `learn` once the thing is found.
+By default: `Appearance.unknown`, then per frame `foreground_ratio`, and `learn` once the thing is
+found.
 """
 
 from __future__ import annotations
@@ -83,10 +84,10 @@ class Appearance(NamedTuple):
             _mix(self.outside, bins, outside, outside_rate),
         )
 
-    def likeness(
+    def foreground_ratio(
         self, colour: Float[Tensor, "3 h w"], background: Background | None = None
     ) -> Float[Tensor, "layers h w"]:
-        """How much each pixel looks like each thing, in -1..1.
+        """Foreground log-likelihood ratio of each pixel for each thing, squashed to -1..1.
 
         Where no background is known, 0 for a thing never seen; of such a thing every colour is as
         likely as any other.
@@ -108,10 +109,10 @@ class Appearance(NamedTuple):
         trust = background.confidence
         behind = background.log_density(colour) + trust.log()
         either = torch.logaddexp(behind, outside + (1 - trust).log())
-        likeness = (0.5 * (inside - either)).tanh()
+        seeing = (0.5 * (inside - either)).tanh()
         # Who stands still looks the same too: a guess may silence the colours, not overrule them.
         blind = (0.5 * (inside - outside)).tanh()
-        return torch.where(background.sure, likeness, likeness.maximum(blind.clamp(max=0)))
+        return torch.where(background.sure, seeing, seeing.maximum(blind.clamp(max=0)))
 
 
 def colour_bins(colour: Float[Tensor, "3 h w"]) -> Int[Tensor, "h w"]:

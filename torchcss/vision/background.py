@@ -16,8 +16,8 @@ Nothing is kept when the camera moves (`learn`) or most of the picture changes (
 background is worse than none. Clothes that look like the wall behind them are taken for it, so that
 in the dark a body is tracked worse than without (`docs/findings.md`).
 
-By default: `Background.unknown`, then per frame `Appearance.likeness(colour, background)`, and
-`learn` once the body is found; `torchcss.tracking.view.Watcher` does it.
+By default: `Background.unknown`, then per frame `Appearance.foreground_ratio(colour,
+background)`, and `learn` once the body is found; `torchcss.tracking.view.Observer` does it.
 """
 
 from __future__ import annotations

@@ -27,7 +27,6 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import kornia
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -35,6 +34,7 @@ from torch.nn import functional
 
 from torchcss.errors import ConfigurationError, ShapeError, check_shape
 from torchcss.vision.flow import OpticalFlow
+from torchcss.vision.sampling import gaussian_blur
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,13 +90,7 @@ def motion_boundaries(
             f"smoothness_outlier: expected [..., h, w] with at least one pixel, "
             f"got {list(outlier.shape)}"
         )
-    size = 2 * math.ceil(3.0 * choice.smoothing) + 1
-    blurred = kornia.filters.gaussian_blur2d(
-        outlier.reshape(-1, 1, *outlier.shape[-2:]),
-        (size, size),
-        (choice.smoothing, choice.smoothing),
-        border_type="replicate",
-    ).reshape(outlier.shape)
+    blurred = gaussian_blur(outlier, choice.smoothing)
     squared = (math.sqrt(0.5 * math.pi) * choice.smoothing * blurred).square()
     strength = squared / (squared + choice.half_strength_line**2)
     return MotionBoundaries(strength, 1.0 - strength)

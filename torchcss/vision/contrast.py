@@ -13,10 +13,10 @@ By default: `local_contrast(grey)`.
 from __future__ import annotations
 
 from jaxtyping import Float
-from kornia.filters import gaussian_blur2d
 from torch import Tensor
 
 from torchcss.errors import ConfigurationError, check_shape
+from torchcss.vision.sampling import gaussian_blur
 
 
 def local_contrast(
@@ -38,12 +38,6 @@ def local_contrast(
         if not value > 0:
             raise ConfigurationError(f"{name} must be positive, got {value}")
     check_shape("grey", grey, None, None)
-    image = grey[None, None]
-    difference = image - _smooth(image, radius)
-    deviation = (_smooth(difference.square(), radius) + floor**2).sqrt()
-    return _smooth(difference / deviation, blur)[0, 0]
-
-
-def _smooth(image: Tensor, deviation: float) -> Tensor:
-    size = 2 * round(3 * deviation) + 1
-    return gaussian_blur2d(image, (size, size), (deviation, deviation), border_type="replicate")
+    difference = grey - gaussian_blur(grey, radius)
+    deviation = (gaussian_blur(difference.square(), radius) + floor**2).sqrt()
+    return gaussian_blur(difference / deviation, blur)

@@ -15,6 +15,9 @@ D is the local standard deviation, estimated from absolute deviations so that on
 window does not hide its neighbours; the floor is the noise below which a region counts as flat. The
 factor of g makes a clean step of h deviations have |g| = h, whatever the smoothing. E is in [0, 1).
 
+Where a mask of the foreground is known, `foreground_weight` makes of it the weight of the edges:
+one on the body and its outline, lower far from it.
+
 By default: `edge_features(grey)`; `FeatureExtractor` calls it for every frame.
 """
 
@@ -31,6 +34,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchcss.errors import ConfigurationError, ShapeError
+from torchcss.vision.sampling import gaussian_blur
 
 _ROUNDING = 1.0e-4
 """Gradients of the normalised image below this are rounding; a flat image has energy zero."""
@@ -87,16 +91,12 @@ def edge_features(
         ShapeError: If the image is not `[h, w]` with at least one pixel or not of a real floating
             point type.
     """
-    if grey.ndim != 2 or grey.numel() == 0 or not grey.is_floating_point():
-        raise ShapeError(
-            f"grey: expected a floating-point image [h, w] with at least one pixel, "
-            f"got {grey.dtype} {list(grey.shape)}"
-        )
+    _check_image("grey", grey)
     choice = configuration or EdgeConfiguration()
     height, width = grey.shape
-    smooth = _blur(grey[None, None], choice.smoothing)
-    detail = smooth - _blur(smooth, choice.window)
-    deviation = math.sqrt(0.5 * math.pi) * _blur(detail.abs(), choice.window)
+    smooth = gaussian_blur(grey[None, None], choice.smoothing)
+    detail = smooth - gaussian_blur(smooth, choice.window)
+    deviation = math.sqrt(0.5 * math.pi) * gaussian_blur(detail.abs(), choice.window)
     normalised = detail / torch.sqrt(deviation.square() + choice.floor**2)
     gradient = kornia.filters.spatial_gradient(normalised)[0, 0]
     # The border is replicated, which halves the slope across it.
@@ -117,12 +117,12 @@ def edge_features(
     return EdgeFeatures(energy, direction, gradient)
 
 
-def _blur(image: Float[Tensor, "1 1 h w"], sigma: float) -> Float[Tensor, "1 1 h w"]:
-    """Blur with a Gaussian cut at three standard deviations, the border replicated."""
-    size = 2 * math.ceil(3.0 * sigma) + 1
-    return kornia.filters.gaussian_blur2d(
-        image, (size, size), (sigma, sigma), border_type="replicate"
-    )
+def _check_image(name: str, image: Tensor) -> None:
+    if image.ndim != 2 or image.numel() == 0 or not image.is_floating_point():
+        raise ShapeError(
+            f"{name}: expected a floating-point image [h, w] with at least one pixel, "
+            f"got {image.dtype} {list(image.shape)}"
+        )
 
 
 def foreground_weight(
@@ -143,11 +143,7 @@ def foreground_weight(
         ShapeError: If the mask is not a floating-point image `[h, w]` with at least one pixel.
         ConfigurationError: If the band is not positive or the weight not in 0..1.
     """
-    if mask.ndim != 2 or mask.numel() == 0 or not mask.is_floating_point():
-        raise ShapeError(
-            f"mask: expected a floating-point image [h, w] with at least one pixel, "
-            f"got {mask.dtype} {list(mask.shape)}"
-        )
+    _check_image("mask", mask)
     if not (math.isfinite(band) and band > 0.0):
         raise ConfigurationError(f"foreground: band must be positive and finite, got {band}")
     if not 0.0 <= background <= 1.0:
@@ -157,9 +153,5 @@ def foreground_weight(
     # A square is dilated one axis after the other; beyond the border there is no foreground.
     wide = functional.max_pool2d(wide, (1, 2 * reach + 1), stride=1, padding=(0, reach))
     wide = functional.max_pool2d(wide, (2 * reach + 1, 1), stride=1, padding=(reach, 0))
-    sigma = 0.5 * band
-    size = 2 * math.ceil(3.0 * sigma) + 1
-    soft = kornia.filters.gaussian_blur2d(
-        wide, (size, size), (sigma, sigma), border_type="replicate"
-    )
-    return background + (1.0 - background) * soft[0, 0].clamp(0.0, 1.0)
+    soft = gaussian_blur(wide, 0.5 * band)[0, 0]
+    return background + (1.0 - background) * soft.clamp(0.0, 1.0)

@@ -1,4 +1,4 @@
-"""Sub-pixel sampling of images and Gaussian pyramids.
+"""Sub-pixel sampling of images, Gaussian blur and pyramids.
 
 Pixel (0, 0) is the centre of the top-left pixel, u runs along the rows of the image and v down its
 columns. An image of h x w pixels covers -1/2 <= u < w - 1/2 and -1/2 <= v < h - 1/2; a point there
@@ -13,6 +13,8 @@ image as further channels instead.
 
 from __future__ import annotations
 
+import math
+
 import kornia
 import torch
 from jaxtyping import Bool, Float
@@ -20,6 +22,21 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchcss.errors import ConfigurationError, ShapeError, check_shape
+
+
+def gaussian_blur(image: Float[Tensor, "*batch h w"], sigma: float) -> Float[Tensor, "*batch h w"]:
+    """Blur with a Gaussian cut at three standard deviations, the border replicated.
+
+    Args:
+        image: Any number of images.
+        sigma: Standard deviation, pixels.
+    """
+    size = 2 * math.ceil(3.0 * sigma) + 1
+    flat = image.reshape(-1, 1, *image.shape[-2:])
+    blurred = kornia.filters.gaussian_blur2d(
+        flat, (size, size), (sigma, sigma), border_type="replicate"
+    )
+    return blurred.reshape(image.shape)
 
 
 def sample_bilinear(
