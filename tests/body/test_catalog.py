@@ -89,7 +89,7 @@ def test_angles_turn_the_way_their_names_say() -> None:
 
 @pytest.mark.parametrize("name", ["arm7", "body34"])
 def test_shoulder_angles_do_not_lock_inside_the_limits(name: str) -> None:
-    """Decision 11: the three axes stay apart wherever the limits allow."""
+    """Decision "root": the three axes stay apart wherever the limits allow."""
     body = load_body(name)
     raising = body.state_index("r_shoulder_raising")
     steps = torch.linspace(0, 1, 41, dtype=torch.float64)

@@ -79,7 +79,8 @@ class ContourTerm(Term):
             node of a fitted model: 0.5 to 0.8 on the demo, whose surface is the model's own, 0.9 on
             the beam clip. Too low a level invites a badly fitting limb to hide.
         occlusion_factor: k of `nu_occ = k nu_bf`. [IJRR] says k > 1, [RR] k < 1; slightly above 1
-            keeps hidden nodes dearer than matched ones and cheaper than bad fits.
+            keeps hidden nodes dearer than matched ones and cheaper than bad fits (decision
+            "occlusion levels").
         potential_kind: The potential rho.
     """
 

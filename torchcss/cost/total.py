@@ -9,7 +9,8 @@ once, over all views where several cameras look on. `torchcss.cost.choice` lists
 fixed. Large batches are worked off in chunks, so memory does not grow with the number of samples.
 
 The factor 1/(N nu) of eq. 5 alone would make the posterior far too flat; `weight_t` sets its
-temperature: the nats that a term contributes per nu of mean cost per node (design decision 8).
+temperature: the nats that a term contributes per nu of mean cost per node (decision "term
+weights").
 
 Samples of several sequences (other bodies, cameras, pictures) may be evaluated together: each
 sample has the index of its sequence. One sequence is the case of one.

@@ -214,10 +214,10 @@ def distinct_modes(
 ) -> Int[Tensor, " m"]:
     """Discard modes that have been found before, Fig. 6 step 2.3.
 
-    The paper gives no threshold (design decision 6). Here a mode is a duplicate of one of lower
-    cost if its Mahalanobis distance under that mode's own covariance is at most `distance`: minima
-    closer than one standard deviation are one mode for every purpose of a mixture. Descents must
-    have converged for this; ends of curved valleys that were not followed out look distinct.
+    The paper gives no threshold (decision "distinct minima"). Here a mode is a duplicate of one of
+    lower cost if its Mahalanobis distance under that mode's own covariance is at most `distance`:
+    minima closer than one standard deviation are one mode for every purpose of a mixture. Descents
+    must have converged for this; ends of curved valleys that were not followed out look distinct.
 
     Args:
         mean: Candidates, in any order.
@@ -337,7 +337,8 @@ def bhattacharyya(
         second: Columns of the result.
         standard: False for the distance as it is printed in Fig. 6 [IJRR],
             `d^T S^-1 d + log(|A + B| / sqrt(|A| |B|)) / 2` with `S = (A + B) / 2`; True for that of
-            the literature, `d^T S^-1 d / 8 + log(|S| / sqrt(|A| |B|)) / 2` (design decision 4).
+            the literature, `d^T S^-1 d / 8 + log(|S| / sqrt(|A| |B|)) / 2` (decision "mode
+            weights").
     """
     n = _same_state("bhattacharyya", first, second)
     between = 0.5 * (first.covariance[:, None] + second.covariance[None, :])

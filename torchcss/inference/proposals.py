@@ -16,12 +16,14 @@ All proposals share one interface, `Proposal`, and differ in what a mode (mu, Si
 | `MixtureOfProposals` | those of its members, in given shares | |
 
 A scale is always named: `covariance_scale = s` multiplies the covariance (Fig. 6, s = 4 to 14),
-`deviation_scale = d` the standard deviations (Table 1; `d = sqrt(s)`). Exactly one is given.
+`deviation_scale = d` the standard deviations (Table 1; `d = sqrt(s)`). Exactly one is given
+(decision "two scales").
 
-Samples outside the bounds are projected onto them (design decision 10): each parameter for itself,
-or with `correlated_projection` to the nearest admissible state in the metric of the covariance, in
-which the others make up for what a bound takes. The latter keeps samples in their valley, at far
-lower cost, and therefore finds fewer minima (`scripts/table1.py --correlated-projection`).
+Samples outside the bounds are projected onto them (decision "inadmissible samples"): each parameter
+for itself, or with `correlated_projection` to the nearest admissible state in the metric of the
+covariance, in which the others make up for what a bound takes. The latter keeps samples in their
+valley, at far lower cost, and therefore finds fewer minima
+(`scripts/table1.py --correlated-projection`).
 
 Every sample carries its importance weight back to the mixture that it was drawn from (see
 `torchcss.inference.importance`). What to call by default: `CovarianceScaled(covariance_scale=8)`.
@@ -440,7 +442,7 @@ class Spherical(_ScaledProposal):
     """Sample a ball of the same volume as each mode's ellipsoid: the paper's control, Table 1.
 
     The ball's standard deviation is the geometric mean of those along the covariance's
-    eigen-directions (design decision 3).
+    eigen-directions (decision "matched volume").
 
     Attributes:
         covariance_scale: Factor on the variance.
@@ -554,7 +556,8 @@ class EigenDirectionGrid:
 
     Per mode: the mode, then `p deviation_scale sigma_j v_j` from it for `p = ±1, ..., ±num_steps`
     along the directions of greatest variance, one direction after another. The defaults give the
-    seven hypotheses of section 6 [RR]. The patterns of all modes form one pool (design decision 7).
+    seven hypotheses of section 6 [RR]. The patterns of all modes form one pool
+    (decision "regular sampling").
 
     Attributes:
         num_directions: How many directions, `ns`.

@@ -265,9 +265,9 @@ def refine(
             the Hessian and nowhere else.
         scale: Length of each parameter that damping counts as one; ones by default.
         prior_variance: Variance of each parameter before any image is seen: of variables that a
-            bound holds (design decision 9), and a weak prior on the others in the covariances,
-            not in the means. By default `default_prior_variance` of the least box that holds those
-            of all frames.
+            bound holds (decision "active bounds"), and a weak prior on the others in the
+            covariances, not in the means. By default `default_prior_variance` of the least box that
+            holds those of all frames.
         max_steps: Iterations, each one evaluation of all frames.
         tolerance: Expected decrease of the sum, nats, below which it is done.
 

@@ -271,7 +271,8 @@ class Tracker:
         dynamics: What happens between frames; the papers' driftless diffusion by default.
         duplicate_distance: See `distinct_modes`.
         laplace_evidence: Weigh a mode by its Laplace evidence, likelihood times
-            `sqrt(det Sigma)`, instead of the likelihood at the mode alone (design decision 5).
+            `sqrt(det Sigma)`, instead of the likelihood at the mode alone (decision "mode
+            weights").
         forgetting: Power of the prior's weights in step 5. One is Fig. 6; below one, old evidence
             is forgotten by degrees.
         likelihood_power: Power of a frame's likelihood in the weights, step 3. One is Fig. 6, which
@@ -293,7 +294,7 @@ class Tracker:
             that starts far up seldom overtakes. Of those within half the `separation` of each other
             the best goes first. Zero: all descend to the end, as in Fig. 6.
         standard_bhattacharyya: Match modes by the distance of the literature instead of the one
-            printed (design decision 4).
+            printed (decision "mode weights").
         soft_matching: In step 5, multiply in the prior's weight at the place of each mode, see
             `prior_at`, instead of that of the closest prior mode, which Fig. 6 gives to one mode
             only: a mode far from all of the prior may then be handed the best past there is, and

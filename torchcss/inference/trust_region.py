@@ -272,8 +272,8 @@ class TrustRegionNewton:
             bounds: Box limits; they hold exactly, in the dtype of `x0`.
             scale: See `init`.
             prior_variance: Variance of each parameter before the image is seen; no direction of a
-                covariance exceeds it, and a variable held by a bound gets it (design decision 9).
-                By default `default_prior_variance(bounds)`.
+                covariance exceeds it, and a variable held by a bound gets it (decision "active
+                bounds"). By default `default_prior_variance(bounds)`.
 
         Returns:
             One mode per start; no cost exceeds that of the (projected) start.

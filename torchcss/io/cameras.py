@@ -7,7 +7,7 @@ with `name`, `size`, `matrix`, `distortions`, `rotation` (Rodrigues vector) and 
 metres. EasyMocap's `intri.yml` and `extri.yml` often lack the image size,
 which is then the video's.
 
-Units are metres inside (design, decision 12). Where the extrinsics are in another unit, or absent,
+Units are metres inside (decision "units"). Where the extrinsics are in another unit, or absent,
 the camera is used in its own frame, x right, y down, z forward: one view needs no more than the
 intrinsics, and a made-up scale would be worse. `LoadedCamera.units_note` says so.
 

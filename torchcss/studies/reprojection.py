@@ -243,7 +243,7 @@ class ReprojectionProblem(NamedTuple):
         cost: What to minimise.
         bounds: The joint limits.
         start: The minimum that the truth descends to; `mean`, `covariance` (of the free variables,
-            design decision 9) and `cost` are those of the start mode.
+            decision "active bounds") and `cost` are those of the start mode.
     """
 
     body: BodyModel

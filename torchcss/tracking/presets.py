@@ -19,8 +19,8 @@ a body, 10 for Cham and Rehg's.
 | annealed | the annealed particle filter | [IJRR] section 1.2 |
 
 A row also says what the cost has to be: whether its potentials are robust, whether joint limits
-hold, whether parts repel each other, and which Hessian it gives. That is for whoever builds the
-cost; `Preset.bounds` gives the limits.
+hold, whether parts repel each other, and which Hessian it gives (decision "papers' presets"). That
+is for whoever builds the cost; `Preset.bounds` gives the limits.
 
 What [IJRR] says of the two multiple-hypothesis trackers, and what is made of it here. Both combine
 sampling as in CONDENSATION with least-squares descent from the samples, for 2D models; the paper

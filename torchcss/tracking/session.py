@@ -395,7 +395,7 @@ def _per_view(terms: dict[str, float], observation: Observation) -> dict[str, fl
 
 
 def follow_with_base(body: BodyModel, state: TrackerState) -> tuple[BodyModel, TrackerState]:
-    """Move the base under the best mode if the root's pitch nears its lock (decision: root).
+    """Move the base under the best mode if the root's pitch nears its lock (decision "root").
 
     Args:
         body: The body on its base.
