@@ -86,7 +86,8 @@ class JointClicker:
             axes.set_axis_off()
         right.set_aspect("equal")
         right.margins(0.2)
-        draw_bones(right, joints[:, :2] * [1, -1], bones_of(body), color="0.6", lw=3, zorder=1)
+        look = {"color": "0.6", "lw": 3, "zorder": 1}
+        draw_bones(right, joints[:, :2] * [1, -1], bones_of(body), look)
         self._image_axes, self._map_axes = left, right
         self._marks: list[Any] = []
         self._buttons = []

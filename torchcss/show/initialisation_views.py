@@ -60,7 +60,7 @@ def draw_hypotheses(
         for mode in reversed(range(len(joints))):
             label = "" if cost is None else f"{mode + 1}: {float(cost[mode]):.1f}"
             look = {"color": mode_colour(mode), "lw": 3 if mode == 0 else 1.5}
-            draw_bones(axes, places[mode], bones, label=label, **look)
+            draw_bones(axes, places[mode], bones, look, label=label)
         axes.set(title=title, aspect="equal", xlim=(-extent, extent), ylim=(-extent, extent))
         axes.set_xlabel("m")
     if cost is not None:

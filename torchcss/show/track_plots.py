@@ -142,8 +142,8 @@ def side_view_figure(
             "zorder": 3 + (mode == 0),
         }
         label = f"{100 * weight[mode]:.0f} %, cost {track.cost[row, mode]:.1f}"
-        draw_bones(front, seen[mode], bones, label=label, **look)
-        draw_bones(side, joints[mode][:, [2, 1]], bones, **look)
+        draw_bones(front, seen[mode], bones, look, label=label)
+        draw_bones(side, joints[mode][:, [2, 1]], bones, look)
         for joint in moving if weight[mode] >= _LEAST_WEIGHT else ():
             ellipse = _one_deviation(joints[mode, joint, [2, 1]], spread[mode, joint])
             ellipse.set(
@@ -424,9 +424,9 @@ def draw_bones(
     axes: Axes,
     places: np.ndarray,
     bones: Sequence[tuple[int, int]],
+    look: Mapping[str, Any],
     *,
     label: str = "",
-    **look: Any,
 ) -> None:
     """A stick figure in one line with gaps; the second coordinate points down."""
     ends = np.full((len(bones), 3, 2), np.nan)
@@ -458,8 +458,8 @@ def _draw_reference(
     places = np.array([known[name] for pair in pairs for name in pair])
     rows = [(2 * pair, 2 * pair + 1) for pair in range(len(pairs))]
     look = {"color": "black", "lw": 1.3, "ls": "--", "zorder": 5}
-    draw_bones(front, in_perspective(places, distance), rows, label="reference", **look)
-    draw_bones(side, places[:, [2, 1]], rows, **look)
+    draw_bones(front, in_perspective(places, distance), rows, look, label="reference")
+    draw_bones(side, places[:, [2, 1]], rows, look)
 
 
 def tidy(axes: Axes) -> None:

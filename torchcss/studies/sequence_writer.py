@@ -20,7 +20,7 @@ from __future__ import annotations
 import json
 import os
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -102,20 +102,27 @@ def write_sequence(
                 kept.append(_Joints(frame.joints, frame.uv, frame.visible, frame.in_image))
         with archive.open("occluded.npy", "w", force_zip64=True) as stream:
             np.lib.format.write_array(stream, occluded, allow_pickle=False)
-    _write_arrays(folder / "mask.npz", mask=mask)
+    _write_arrays(
+        folder / "mask.npz",
+        {
+            "mask": mask,
+        },
+    )
     _write_joints(folder, shot, kept, noise_px)
     _write_camera(folder / "cameras.json", shot.camera)
     body = shot.body
     _write_arrays(
         folder / "truth.npz",
-        body=np.array(body.name),
-        lengths=np.array(json.dumps(body.lengths)),
-        base_transform=shot.base_transform.numpy(),
-        state_names=np.array(body.state_names),
-        states=shot.states.numpy(),
-        frame_rate=np.array(shot.frame_rate),
-        seed=np.array(shot.seed),
-        description=np.array(shot.description),
+        {
+            "body": np.array(body.name),
+            "lengths": np.array(json.dumps(body.lengths)),
+            "base_transform": shot.base_transform.numpy(),
+            "state_names": np.array(body.state_names),
+            "states": shot.states.numpy(),
+            "frame_rate": np.array(shot.frame_rate),
+            "seed": np.array(shot.seed),
+            "description": np.array(shot.description),
+        },
     )
     return folder
 
@@ -130,23 +137,27 @@ def _write_joints(folder: Path, shot: Shot, frames: list[_Joints], noise_px: flo
     frame_rate = np.array(shot.frame_rate)
     _write_arrays(
         folder / "keypoints2d.npz",
-        keypoints=(exact + noise_px * noise).numpy(),
-        keypoints_exact=exact.numpy(),
-        confidence=np.where(visible, 1.0, _HIDDEN_CONFIDENCE),
-        visible=visible,
-        in_image=torch.stack([frame.in_image for frame in frames]).numpy(),
-        joint_names=names,
-        frame_rate=frame_rate,
-        noise_px=np.array(noise_px),
+        {
+            "keypoints": (exact + noise_px * noise).numpy(),
+            "keypoints_exact": exact.numpy(),
+            "confidence": np.where(visible, 1.0, _HIDDEN_CONFIDENCE),
+            "visible": visible,
+            "in_image": torch.stack([frame.in_image for frame in frames]).numpy(),
+            "joint_names": names,
+            "frame_rate": frame_rate,
+            "noise_px": np.array(noise_px),
+        },
     )
     _write_arrays(
         folder / "reference3d.npz",
-        joints=torch.stack([frame.joints for frame in frames]).numpy(),
-        joint_names=names,
-        camera_names=np.array([shot.camera.name]),
-        frame_rate=frame_rate,
-        time_s=np.arange(len(frames)) / shot.frame_rate,
-        units=np.array("m"),
+        {
+            "joints": torch.stack([frame.joints for frame in frames]).numpy(),
+            "joint_names": names,
+            "camera_names": np.array([shot.camera.name]),
+            "frame_rate": frame_rate,
+            "time_s": np.arange(len(frames)) / shot.frame_rate,
+            "units": np.array("m"),
+        },
     )
 
 
@@ -167,6 +178,6 @@ def _write_camera(path: Path, camera: Camera) -> None:
         partial.write_text(json.dumps(content, indent=1), encoding="utf-8")
 
 
-def _write_arrays(path: Path, **arrays: np.ndarray) -> None:
+def _write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     with replace_file(path) as partial:
         np.savez_compressed(partial, **arrays)  # pyright: ignore[reportArgumentType]

@@ -154,6 +154,8 @@ class Settings:
                 f"terms: expected at least one of {', '.join(watched_terms())}, which compare a "
                 f"pose with the image; got {', '.join(self.terms) or 'none'}"
             )
+        if not isinstance(self.weights, Mapping):
+            raise ConfigurationError(f"weights: expected factors by name, got {self.weights!r}")
         if strange := sorted(set(self.weights) - set(TERM_TABLE)):
             known = ", ".join(TERM_TABLE)
             raise ConfigurationError(f"weights: no terms {strange}; there are {known}")
@@ -226,7 +228,7 @@ def settings_from_plain(plain: Mapping[str, Any]) -> Settings:
     known = {field.name for field in fields(Settings)}
     try:
         return Settings(**{name: value for name, value in plain.items() if name in known})
-    except (TypeError, AttributeError) as error:
+    except TypeError as error:
         raise ConfigurationError(
             f"the run's settings are not those of torchcss: {error}"
         ) from error

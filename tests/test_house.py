@@ -1,0 +1,119 @@
+"""Rules of the house that a machine can hold: parameters, options, hidden methods, subclasses."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from code_figures import MOST_PARAMETERS, Function, count, functions, main, num_parameters
+from code_figures import Config as Figures
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+PACKAGE = REPOSITORY / "torchcss"
+
+MODULES = sorted(PACKAGE.rglob("*.py"))
+SEARCH = [path for path in MODULES if path.relative_to(PACKAGE).parts[0] in
+          ("inference", "cost", "tracking")]  # fmt: skip
+
+
+def nodes(path: Path) -> Iterator[ast.AST]:
+    return ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+
+
+def of_package(paths: list[Path], *, ids: bool = True) -> pytest.MarkDecorator:
+    names = [str(path.relative_to(REPOSITORY)) for path in paths]
+    return pytest.mark.parametrize("path", paths, ids=names if ids else None)
+
+
+@of_package(MODULES)
+def test_no_function_has_more_than_eight_parameters_or_passes_options_on(path: Path) -> None:
+    for function in functions(path.read_text(encoding="utf-8")):
+        assert num_parameters(function) <= MOST_PARAMETERS, function.name
+        assert function.args.kwarg is None, f"{function.name}: name the options"
+
+
+@of_package(MODULES)
+def test_no_bag_of_options(path: Path) -> None:
+    """A mapping of anything is what a file holds, never how a function is told what to do."""
+    for function in functions(path.read_text(encoding="utf-8")):
+        for argument in parameters(function):
+            told = argument.arg.endswith(("options", "settings", "choice", "config"))
+            kind = "" if argument.annotation is None else ast.unparse(argument.annotation)
+            plain = kind.startswith(("dict", "Dict", "Any", "Mapping"))
+            if told and plain:
+                # `settings` of a run's folder are plain data until `settings_from_plain`.
+                assert path.parent.name == "io", f"{function.name}: {argument.arg}: {kind}"
+
+
+def parameters(function: Function) -> list[ast.arg]:
+    arguments = function.args
+    return [*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs]
+
+
+@of_package(SEARCH)
+def test_interfaces_are_complete(path: Path) -> None:
+    """No method is looked for at run time."""
+    for node in nodes(path):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+            assert node.func.id != "hasattr", node.lineno
+            assert not (node.func.id == "getattr" and len(node.args) == 3), node.lineno
+        if isinstance(node, ast.ExceptHandler) and node.type is not None:
+            assert "AttributeError" not in ast.unparse(node.type), node.lineno
+
+
+def test_no_concrete_class_is_subclassed() -> None:
+    """A class of the package that has a subclass is a protocol, an error, or abstract."""
+    classes: dict[str, list[str]] = {}
+    for path in MODULES:
+        for node in nodes(path):
+            if isinstance(node, ast.ClassDef):
+                classes[node.name] = [ast.unparse(base).split("[")[0] for base in node.bases]
+    for name, bases in classes.items():
+        for base in bases:
+            if base in classes:
+                abstract = {"Protocol", "ABC", "Exception"} & set(classes[base])
+                assert abstract or base.endswith("Error"), f"{name}({base})"
+
+
+def test_only_the_session_steps_a_tracker() -> None:
+    """Everybody else tracks through it; what steps something else takes fewer arguments."""
+    for path in [*MODULES, *sorted((REPOSITORY / "scripts").rglob("*.py"))]:
+        if path.parts[-2] == "inference" or path.name == "session.py":
+            continue
+        for node in nodes(path):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+                steps = node.func.attr == "step" and len(node.args) + len(node.keywords) >= 3
+                assert not steps, f"{path}:{node.lineno}"
+
+
+def test_the_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    package = tmp_path / "torchcss"
+    many = ", ".join("abcdefghi")
+    for name, lines in {
+        "__init__.py": ['"""Page."""', "from torchcss.b.y import f"],
+        "types.py": ["X = 1"],
+        "a/x.py": [
+            '"""Two',
+            'lines."""',
+            "# comment",
+            "from torchcss.types import X",
+            "y = (X,",
+            "2)",
+        ],
+        "b/y.py": [
+            "from torchcss.a.x import y",
+            f"def f(self, {many}):",
+            "    'Doc.'",
+            "    return a",
+        ],
+    }.items():
+        (package / name).parent.mkdir(parents=True, exist_ok=True)
+        (package / name).write_text("\n".join(lines) + "\n")
+    figures = main(Figures(tree=tmp_path, out=tmp_path / "new" / "figures.json"))
+    assert figures["folders"] == {"ground": [2, 11], "a": [3, 13], "b": [3, 34]}
+    assert figures["arrows"] == ["b -> a"]
+    assert figures["many_parameters"] == [["b/y.py:2 f", 9]]
+    assert "b/y.py:2 f 9" in capsys.readouterr().out
+    assert count("x = '''a\nb'''\n").lines == {1, 2}
