@@ -36,6 +36,7 @@ from torchcss.studies.reprojection import ReprojectionProblem
 from torchcss.studies.sampling_study import (
     Lengths,
     SamplerRun,
+    StudyChoice,
     run_sampler,
     spectrum,
     study_problem,
@@ -126,11 +127,16 @@ def make_problem(config: Config, seed: int, body: str) -> ReprojectionProblem:
     """The problem of one seed, with its start mode."""
     given = config.pose if body == config.body else None
     pose = None if given is None else read_pose(given)
-    return study_problem(
-        body, generator=torch.Generator().manual_seed(seed), pixel_noise=config.pixel_noise,
-        prior_scale=config.prior_scale, widest=config.widest, limits=config.limits,
-        robust=config.robust, all_joints=config.all_joints, pose=pose,
-    )  # fmt: skip
+    choice = StudyChoice(
+        pixel_noise=config.pixel_noise,
+        prior_scale=config.prior_scale,
+        widest=config.widest,
+        limits=config.limits,
+        robust=config.robust,
+        all_joints=config.all_joints,
+    )
+    generator = torch.Generator().manual_seed(seed)
+    return study_problem(body, generator=generator, choice=choice, pose=pose)
 
 
 def row_of(config: Config, run: SamplerRun, problem: ReprojectionProblem) -> dict[str, Any]:

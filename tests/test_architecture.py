@@ -6,8 +6,6 @@ Every module is parsed, not imported, so that imports inside functions count too
 from __future__ import annotations
 
 import ast
-import importlib
-import inspect
 from pathlib import Path
 
 import pytest

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import ast
+import importlib
+import inspect
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from code_figures import MOST_PARAMETERS, Function, count, functions, main, num_parameters
 from code_figures import Config as Figures
+from typing_extensions import is_protocol
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 PACKAGE = REPOSITORY / "torchcss"
@@ -63,29 +66,16 @@ def test_interfaces_are_complete(path: Path) -> None:
             assert "AttributeError" not in ast.unparse(node.type), node.lineno
 
 
-def test_no_concrete_class_is_subclassed() -> None:
-    """A class of the package that has a subclass is a protocol, an error, or abstract."""
-    classes: dict[str, list[str]] = {}
-    for path in MODULES:
-        for node in nodes(path):
-            if isinstance(node, ast.ClassDef):
-                classes[node.name] = [ast.unparse(base).split("[")[0] for base in node.bases]
-    for name, bases in classes.items():
-        for base in bases:
-            if base in classes:
-                abstract = {"Protocol", "ABC", "Exception"} & set(classes[base])
-                assert abstract or base.endswith("Error"), f"{name}({base})"
-
-
-def test_only_the_session_steps_a_tracker() -> None:
-    """Everybody else tracks through it; what steps something else takes fewer arguments."""
-    for path in [*MODULES, *sorted((REPOSITORY / "scripts").rglob("*.py"))]:
-        if path.parts[-2] == "inference" or path.name == "session.py":
-            continue
-        for node in nodes(path):
-            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
-                steps = node.func.attr == "step" and len(node.args) + len(node.keywords) >= 3
-                assert not steps, f"{path}:{node.lineno}"
+@of_package(MODULES)
+def test_no_concrete_class_is_subclassed(path: Path) -> None:
+    """A class of the package has a subclass only if it is abstract, a protocol or an error."""
+    name = ".".join(["torchcss", *path.relative_to(PACKAGE).with_suffix("").parts])
+    for one in vars(importlib.import_module(name.removesuffix(".__init__"))).values():
+        if inspect.isclass(one) and one.__module__ == name:
+            for base in one.__bases__:
+                ours = base.__module__.startswith("torchcss.")
+                meant = inspect.isabstract(base) or is_protocol(base)
+                assert not ours or meant or issubclass(base, BaseException), (one, base)
 
 
 def test_the_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

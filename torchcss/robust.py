@@ -25,6 +25,7 @@ v = W r, the gradient rho' v and the Hessian rho' W + 2 rho'' v v^T (eq. 9 [RR])
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -75,8 +76,8 @@ class RobustPotential(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Scaled:
-    """The two parameters that every potential has, checked.
+class _Scaled(ABC):
+    """The two parameters that most potentials have, checked.
 
     Attributes:
         nu: Spread of the outliers, positive.
@@ -92,6 +93,10 @@ class _Scaled:
                 raise ConfigurationError(
                     f"{type(self).__name__}: {name} must be positive and finite, got {value}"
                 )
+
+    @abstractmethod
+    def __call__(self, s: Float[Tensor, "*batch"]) -> RobustValue:
+        """Evaluate at squared weighted errors."""
 
 
 @dataclass(frozen=True, kw_only=True)

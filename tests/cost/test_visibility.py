@@ -17,6 +17,7 @@ from torchcss.body.surface import surface_points
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.interior import InteriorNodes
 from torchcss.cost.visibility import (
+    Beside,
     ContourNodes,
     ContourPredictor,
     front_facing,
@@ -347,7 +348,12 @@ def test_line_of_sight_without_neighbours(generator: torch.Generator) -> None:
     assert torch.equal(free, torch.ones_like(free))
     # What is beside a neighbour is in front of it or behind it, and only there is it not free.
     _, free = line_of_sight(
-        body, rotation, eye, nodes.points, other=predictor.other, touching=predictor.touching
+        body,
+        rotation,
+        eye,
+        nodes.points,
+        other=predictor.other,
+        beside=Beside(predictor.touching, torch.zeros_like(nodes.points)),
     )
     by_neighbour, _ = line_of_sight(body, rotation, eye, nodes.points, other=predictor.touching)
     assert (free <= by_neighbour + 1e-3).all()

@@ -1,6 +1,7 @@
 import math
 import weakref
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,9 +10,12 @@ from reference import smoothing as plain
 
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.inference.smoothing import (
+    IN_WINDOWS,
     GaussianEvidence,
     Refined,
+    Refinement,
     Transition,
+    Windows,
     best_path,
     refine,
     refine_in_windows,
@@ -208,7 +212,7 @@ def test_gaussian_refinement_is_the_bounded_least_squares(
         times,
         Transition(velocity=velocity, acceleration=acceleration),
         interval(n, *limits),
-        prior_variance=torch.full((n,), 1e12).double(),
+        choice=Refinement(prior_variance=torch.full((n,), 1e12).double()),
     )
     matrix, right = dense(evidence, times, velocity, acceleration)
     exact = plain.bounded(matrix, right, *(np.full(t * n, limit) for limit in limits))
@@ -326,9 +330,13 @@ class Wells:
 def test_refinement_of_a_cost_with_saddles_ends_in_a_minimum(limits: tuple[float, float]):
     t, n, times, start = 7, 3, uneven_times(7), draw(7, 3, seed=4).clamp(*limits)
     found = refine(
-        Wells(), start, times, Transition(velocity=8.0, acceleration=90.0), interval(n, *limits),
-        tolerance=1e-12,
-    )  # fmt: skip
+        Wells(),
+        start,
+        times,
+        Transition(velocity=8.0, acceleration=90.0),
+        interval(n, *limits),
+        choice=Refinement(tolerance=1e-12),
+    )
     nothing = GaussianEvidence(torch.zeros(t, n).double(), torch.zeros(t, n, n).double())
     matrix, _ = (torch.from_numpy(part) for part in dense(nothing, times, 8.0, 90.0))
 
@@ -366,8 +374,8 @@ def test_refinement_across_a_change_of_coordinates(acceleration: float):
         times,
         Transition(velocity=3.0, acceleration=acceleration),
         interval(2),
+        choice=Refinement(tolerance=1e-12),
         changes={3: to_polar},
-        tolerance=1e-12,
     )
 
     def total(x: torch.Tensor) -> torch.Tensor:
@@ -403,12 +411,26 @@ def test_windows_come_near_what_all_frames_find_together(window: tuple[int, int]
     t, n, times = 14, 3, uneven_times(14)
     evidence, transition = gaussian(t, n), Transition(velocity=6.0, acceleration=40.0)
     start, bounds = evidence.mean, interval(n, -0.5, 0.4)
-    whole = refine(evidence, start, times, transition, bounds, evidence=0.5)
-    nothing = refine(evidence, start, times, transition, bounds, evidence=0.5, max_steps=0)
+    whole = refine(
+        evidence, start, times, transition, bounds, choice=Refinement(likelihood_power=0.5)
+    )
+    nothing = refine(
+        evidence,
+        start,
+        times,
+        transition,
+        bounds,
+        choice=Refinement(likelihood_power=0.5, max_steps=0),
+    )
     parts = refine_in_windows(
-        one_by_one(evidence), start, times, transition, bounds, evidence=0.5,
-        window=window[0], overlap=window[1], tolerance=1e-9,
-    )  # fmt: skip
+        one_by_one(evidence),
+        start,
+        times,
+        transition,
+        bounds,
+        choice=replace(IN_WINDOWS, likelihood_power=0.5, tolerance=1e-9),
+        windows=Windows(window=window[0], overlap=window[1]),
+    )
     gained = float(nothing.total - parts.total) / float(nothing.total - whole.total)
     if window[0] > t:
         assert parts.mean.numpy() == pytest.approx(whole.mean.numpy(), abs=1e-9)
@@ -429,9 +451,15 @@ def test_windows_across_a_change_of_coordinates():
     transition, changes = Transition(velocity=3.0, acceleration=40.0), {6: to_polar}
     whole = refine(evidence, mean, times, transition, interval(2), changes=changes)
     parts = refine_in_windows(
-        one_by_one(evidence), mean, times, transition, interval(2), changes=changes,
-        window=8, overlap=5, tolerance=1e-9,
-    )  # fmt: skip
+        one_by_one(evidence),
+        mean,
+        times,
+        transition,
+        interval(2),
+        choice=replace(IN_WINDOWS, tolerance=1e-9),
+        changes=changes,
+        windows=Windows(window=8, overlap=5),
+    )
     assert float(parts.total) == pytest.approx(float(whole.total), rel=2e-3)
 
 
@@ -457,16 +485,22 @@ def test_windows_let_costs_go():
             del cost
 
     refine_in_windows(
-        costs(), draw(30, 2), uneven_times(30), Transition(velocity=3.0), interval(2), window=6,
-        overlap=3,
-    )  # fmt: skip
+        costs(),
+        draw(30, 2),
+        uneven_times(30),
+        Transition(velocity=3.0),
+        interval(2),
+        windows=Windows(window=6, overlap=3),
+    )
     assert len(alive) == 30
 
 
 def test_bad_windows_are_refused():
     arguments = (draw(5, 2), uneven_times(5), Transition(velocity=3.0), interval(2))
     with pytest.raises(ConfigurationError, match="longer than its overlap"):
-        refine_in_windows(one_by_one(gaussian(5, 2)), *arguments, window=4, overlap=4)
+        refine_in_windows(
+            one_by_one(gaussian(5, 2)), *arguments, windows=Windows(window=4, overlap=4)
+        )
     with pytest.raises(ConfigurationError, match="5 frames, got 4"):
         refine_in_windows(one_by_one(gaussian(4, 2)), *arguments)
 

@@ -5,6 +5,7 @@ from torchcss.errors import ShapeError
 from torchcss.inference.proposals import CovarianceScaled
 from torchcss.studies.sampling_study import (
     ExactSteps,
+    StudyChoice,
     depth_flips,
     run_sampler,
     spectrum,
@@ -32,8 +33,9 @@ def test_the_start_is_a_minimum_near_the_truth(problem):
 
 
 def test_options_change_what_they_say(problem):
-    def other(**options):
-        return study_problem("arm8", generator=torch.Generator().manual_seed(0), **options)
+    def other(pose: dict[str, float] | None = None, **options):
+        generator = torch.Generator().manual_seed(0)
+        return study_problem("arm8", generator=generator, choice=StudyChoice(**options), pose=pose)
 
     torch.testing.assert_close(other().start.mean, problem.start.mean)
     noisy = other(pixel_noise=4.0)

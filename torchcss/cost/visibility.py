@@ -215,8 +215,7 @@ class ContourPredictor(nn.Module):
             eye,
             points - centre_world,
             other=self.other,
-            touching=self.touching,
-            outward=self.clearance * normals,
+            beside=Beside(self.touching, self.clearance * normals),
             wanted=(exists := exists.flatten(-2)),
             ramp=self.ramp,
         )
@@ -277,6 +276,18 @@ def visible_nodes(
     return line_of_sight(body, rotation, eye, points - centre_world, other=other, wanted=wanted)[0]
 
 
+class Beside(NamedTuple):
+    """Where neighbouring parts are looked for, beside the points.
+
+    Attributes:
+        touching: 1 where a part is a neighbour of the point's own.
+        outward: How far beside the points, metres.
+    """
+
+    touching: Float[Tensor, "p parts"]
+    outward: Float[Tensor, "*batch p 3"]
+
+
 def line_of_sight(
     body: BodyModel,
     rotation: Float[Tensor, "*batch parts 3 3"],
@@ -284,8 +295,7 @@ def line_of_sight(
     rays: Float[Tensor, "*batch p 3"],
     *,
     other: Float[Tensor, "p parts"],
-    touching: Float[Tensor, "p parts"] | None = None,
-    outward: Float[Tensor, "*batch p 3"] | None = None,
+    beside: Beside | None = None,
     wanted: Float[Tensor, "*batch p"] | None = None,
     ramp: float = 0.010,
 ) -> tuple[Float[Tensor, "*batch p"], Float[Tensor, "*batch p"]]:
@@ -299,8 +309,7 @@ def line_of_sight(
         eye: The camera's centre in the frames of the parts, metres.
         rays: From the camera's centre to the points, world axes, metres.
         other: 0 where a part cannot hide a point (its own), else 1.
-        touching: 1 where a part is a neighbour of the point's own; None: nothing is.
-        outward: How far beside the points neighbouring parts are looked for, metres.
+        beside: Where neighbouring parts are looked for; None: nowhere.
         wanted: 0 where a point is not looked at, as nothing depends on it, and gets 1.
         ramp: Width of the transition between visible and hidden, metres.
 
@@ -311,15 +320,15 @@ def line_of_sight(
     others, behind = other > 0, torch.zeros_like(other, dtype=torch.float32)
     num_nodes = rays.shape[-2]
     parts = _tabulate(body.part_shape.float(), ramp)
-    if touching is not None:
-        beside = rays if outward is None else rays + outward
-        rays, others = torch.cat([rays, beside], dim=-2), torch.cat([others, touching > 0])
+    if beside is not None:
+        rays = torch.cat([rays, rays + beside.outward], dim=-2)
+        others = torch.cat([others, beside.touching > 0])
         behind = torch.cat([behind, (_BEHIND * parts.thickness).expand_as(behind)])
         wanted = None if wanted is None else torch.cat([wanted, wanted], dim=-1)
     gaps = _sight_gaps(parts, rotation, eye, rays, others, behind, wanted)
     passed = (0.5 + gaps / ramp).clamp(0, 1)
     visible, free = passed[..., :num_nodes].to(eye), passed[..., num_nodes:].to(eye)
-    return visible, torch.ones_like(visible) if touching is None else free
+    return visible, torch.ones_like(visible) if beside is None else free
 
 
 class _Shape(NamedTuple):

@@ -34,6 +34,7 @@ t + 1. Everything is computed in float64 and returned in the type that came in.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -233,6 +234,52 @@ def best_path(
     return _second_order_viterbi(node, edge, corner)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Refinement:
+    """How all frames descend together.
+
+    Attributes:
+        likelihood_power: Factor on the costs.
+        scale: Length of each parameter that damping counts as one; ones by default.
+        prior_variance: Variance of each parameter before any image is seen: of variables that a
+            bound holds (decision: active bounds), and a weak prior on the others in the
+            covariances, not in the means. By default `default_prior_variance` of the least box that
+            holds those of all frames.
+        max_steps: Iterations, each one evaluation of all frames.
+        tolerance: Expected decrease of the sum, nats, below which it is done.
+    """
+
+    likelihood_power: float = 1.0
+    scale: Float[Tensor, " n"] | None = None
+    prior_variance: Float[Tensor, " n"] | None = None
+    max_steps: int = 50
+    tolerance: float = 1e-6
+
+
+IN_WINDOWS = Refinement(max_steps=15, tolerance=0.05)
+"""For a window of frames, which those after it will move again."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Windows:
+    """How many frames are moved together.
+
+    Attributes:
+        window: Frames of a window.
+        overlap: Frames of a window that the next one moves again.
+    """
+
+    window: int = 9
+    overlap: int = 4
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.overlap < self.window:
+            raise ConfigurationError(
+                f"Windows: expected a window longer than its overlap, got {self.window} and "
+                f"{self.overlap}"
+            )
+
+
 def refine(
     cost: Differentiable,
     start: Float[Tensor, "t n"],
@@ -240,12 +287,8 @@ def refine(
     transition: Transition,
     bounds: Bounds,
     *,
-    evidence: float = 1.0,
+    choice: Refinement = Refinement(),
     changes: Changes | None = None,
-    scale: Float[Tensor, " n"] | None = None,
-    prior_variance: Float[Tensor, " n"] | None = None,
-    max_steps: int = 50,
-    tolerance: float = 1e-6,
 ) -> Refined:
     """Move the states of all frames together to where costs and transitions are least.
 
@@ -260,16 +303,9 @@ def refine(
         transition: What motion is to be expected.
         bounds: Box limits, of shape `[n]` or, where they differ by frame, `[t n]`. Equal bounds
             hold a variable where it is.
-        evidence: Factor on the costs.
+        choice: How to descend.
         changes: Where coordinates change, see the module's page. Their curvature is neglected in
             the Hessian and nowhere else.
-        scale: Length of each parameter that damping counts as one; ones by default.
-        prior_variance: Variance of each parameter before any image is seen: of variables that a
-            bound holds (decision "active bounds"), and a weak prior on the others in the
-            covariances, not in the means. By default `default_prior_variance` of the least box that
-            holds those of all frames.
-        max_steps: Iterations, each one evaluation of all frames.
-        tolerance: Expected decrease of the sum, nats, below which it is done.
 
     Returns:
         States, covariances, costs. The sum is never above that of the start.
@@ -279,10 +315,11 @@ def refine(
         ConfigurationError: If times do not increase, or a lower bound exceeds the upper one.
     """
     x, times, limits = _checked(start, times, bounds)
-    sum_ = ChainSum(cost, evidence, times, transition, changes or {}, start.dtype)
-    weight = _damping_weight(x, scale)
-    x, chain, status, steps = descend(sum_, x, limits, weight, max_steps, tolerance)
-    return _refined(chain, x, limits, prior_variance, status, steps, evidence, start)
+    power = choice.likelihood_power
+    sum_ = ChainSum(cost, power, times, transition, changes or {}, start.dtype)
+    weight = _damping_weight(x, choice.scale)
+    ended = descend(sum_, x, limits, weight, choice.max_steps, choice.tolerance)
+    return _refined(*ended, limits, choice, start)
 
 
 def refine_in_windows(
@@ -292,14 +329,9 @@ def refine_in_windows(
     transition: Transition,
     bounds: Bounds,
     *,
-    evidence: float = 1.0,
+    choice: Refinement = IN_WINDOWS,
+    windows: Windows = Windows(),
     changes: Changes | None = None,
-    scale: Float[Tensor, " n"] | None = None,
-    prior_variance: Float[Tensor, " n"] | None = None,
-    window: int = 9,
-    overlap: int = 4,
-    max_steps: int = 15,
-    tolerance: float = 0.05,
 ) -> Refined:
     """`refine` a window of frames at a time, for costs that are dear to keep.
 
@@ -315,35 +347,24 @@ def refine_in_windows(
         times: Seconds, increasing.
         transition: What motion is to be expected.
         bounds: Box limits, of shape `[n]` or `[t n]`.
-        evidence: Factor on the costs.
+        choice: How to descend in each window.
+        windows: How many frames are moved together.
         changes: Where coordinates change.
-        scale: As in `refine`.
-        prior_variance: As in `refine`.
-        window: Frames moved together.
-        overlap: Frames of a window that the next one moves again.
-        max_steps: Iterations in a window.
-        tolerance: Expected decrease of a window's sum, nats, below which it is done.
 
     Returns:
         As `refine`; the status is the least good of the windows', the steps are all of theirs.
 
     Raises:
         ShapeError: As `refine`.
-        ConfigurationError: As `refine`, or if there are fewer costs than frames, or a window is not
-            longer than its overlap.
+        ConfigurationError: As `refine`, or if there are fewer costs than frames.
     """
     x, times, limits = _checked(start, times, bounds)
-    if not 0 <= overlap < window:
-        raise ConfigurationError(
-            f"refine_in_windows: expected a window longer than its overlap, got {window} and "
-            f"{overlap}"
-        )
-    t, weight, changes = len(x), _damping_weight(x, scale), changes or {}
+    t, weight, changes = len(x), _damping_weight(x, choice.scale), changes or {}
     queue, held = iter(costs), {}
     models: list[LocalModel] = []
     worst, steps, first = Status.CONVERGED, 0, 0
     while len(models) < t:
-        last = min(first + window, t)
+        last = min(first + windows.window, t)
         for frame in range(max([*held, first - 1]) + 1, last):
             held[frame] = next(queue, None)
             if held[frame] is None:
@@ -363,7 +384,7 @@ def refine_in_windows(
         part, chain, status, taken = descend(
             ChainSum(
                 _FrameByFrame([held.get(frame) for frame in near]),
-                evidence,
+                choice.likelihood_power,
                 times[before:after],
                 transition,
                 {step - before: change for step, change in changes.items() if step in near},
@@ -372,19 +393,19 @@ def refine_in_windows(
             part,
             box,
             weight,
-            max_steps,
-            tolerance,
+            choice.max_steps,
+            choice.tolerance,
         )
         x[before:after] = part
         worst, steps = max(worst, status), steps + taken
-        done = t if last == t else last - overlap
+        done = t if last == t else last - windows.overlap
         for frame in range(len(models), done):
             models.append(LocalModel(*(entry[frame - before] for entry in chain.frames)))
             del held[frame]
         first = done
     frames = LocalModel(*(torch.stack(entries) for entries in zip(*models, strict=True)))
     chain = Chain.of(frames, motion_terms(x, times, transition, changes))
-    return _refined(chain, x, limits, prior_variance, worst, steps, evidence, start)
+    return _refined(x, chain, worst, steps, limits, choice, start)
 
 
 # --- best path -----------------------------------------------------------------------------------
@@ -486,16 +507,16 @@ class _FrameByFrame(NamedTuple):
 
 
 def _refined(
-    chain: Chain,
     x: Float[Tensor, "t n"],
-    limits: Bounds,
-    prior_variance: Tensor | None,
+    chain: Chain,
     status: Status,
     steps: int,
-    evidence: float,
+    limits: Bounds,
+    choice: Refinement,
     like: Tensor,
 ) -> Refined:
     """The result, in the type that came in."""
+    prior_variance = choice.prior_variance
     if prior_variance is None:
         # The box that holds those of all frames: a frame that is held says nothing of the others.
         prior_variance = default_prior_variance(Bounds(limits.lower.amin(0), limits.upper.amax(0)))
@@ -503,7 +524,7 @@ def _refined(
     return Refined(
         mean=x.to(like),
         covariance=marginals(chain, ~active, prior_variance.double()).to(like),
-        cost=(chain.frames.value / evidence).to(like),
+        cost=(chain.frames.value / choice.likelihood_power).to(like),
         total=chain.value.to(like),
         active=active,
         status=torch.tensor(int(status)),

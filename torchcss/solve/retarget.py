@@ -43,7 +43,7 @@ from torchcss.body.rotations import root_angles, root_rotation
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.errors import ConfigurationError
-from torchcss.inference.smoothing import Transition, best_path, refine
+from torchcss.inference.smoothing import Refinement, Transition, best_path, refine
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.io.motion.positions import MotionCapture, limb_positions
 from torchcss.types import LocalModel, PointCost
@@ -559,7 +559,12 @@ def _fit(
         costs.append(replace(cost, repulsion=choice.repulsion, pairs=pairs))
     for stage in costs:
         states = refine(
-            stage, states, times, smooth, bounds, max_steps=choice.max_steps, tolerance=1e-2
+            stage,
+            states,
+            times,
+            smooth,
+            bounds,
+            choice=Refinement(max_steps=choice.max_steps, tolerance=1e-2),
         ).mean
     return states
 

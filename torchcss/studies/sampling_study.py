@@ -122,23 +122,11 @@ class SamplerRun(NamedTuple):
     seconds: float
 
 
-def study_problem(
-    body_name: str = "body34",
-    *,
-    generator: torch.Generator,
-    pixel_noise: float = 2.0,
-    prior_scale: float = 3.0,
-    widest: float | None = None,
-    limits: bool = True,
-    robust: bool = False,
-    all_joints: bool = False,
-    pose: dict[str, float] | None = None,
-) -> ReprojectionProblem:
-    """Make a problem of the study.
+@dataclass(frozen=True, kw_only=True)
+class StudyChoice:
+    """What the problem of a study is like.
 
-    Args:
-        body_name: A body of the catalogue.
-        generator: Source of the pose and of the noise.
+    Attributes:
         pixel_noise: Standard deviation of every image coordinate, pixels.
         prior_scale: Factor on the deviations of the stabilisers, which are a tracker's. The pose
             is drawn with the factor one.
@@ -148,28 +136,52 @@ def study_problem(
         robust: Lorentzian reprojection error instead of a quadratic one.
         all_joints: All joint centres but those of face and foot are seen, not `LIMB_JOINTS` alone;
             an arm shows all that it has.
+    """
+
+    pixel_noise: float = 2.0
+    prior_scale: float = 3.0
+    widest: float | None = None
+    limits: bool = True
+    robust: bool = False
+    all_joints: bool = False
+
+
+def study_problem(
+    body_name: str = "body34",
+    *,
+    generator: torch.Generator,
+    choice: StudyChoice | None = None,
+    pose: dict[str, float] | None = None,
+) -> ReprojectionProblem:
+    """Make a problem of the study.
+
+    Args:
+        body_name: A body of the catalogue.
+        generator: Source of the pose and of the noise.
+        choice: What it is like.
         pose: Parameters by name instead of a pose drawn; the others are zero.
 
     Returns:
-        The problem; its body, cost, bounds and start agree with the options.
+        The problem; its body, cost, bounds and start agree with the choice.
     """
+    choice = choice or StudyChoice()
     problem = reprojection_problem(
         body_name,
         generator=generator,
-        pixel_noise=pixel_noise,
-        potential=Lorentzian(nu=ROBUST_NU, sigma=ROBUST_NU**0.5) if robust else Quadratic(),
-        joint_names=None if all_joints or body_name.startswith("arm") else LIMB_JOINTS,
+        pixel_noise=choice.pixel_noise,
+        potential=Lorentzian(nu=ROBUST_NU, sigma=ROBUST_NU**0.5) if choice.robust else Quadratic(),
+        joint_names=None if choice.all_joints or body_name.startswith("arm") else LIMB_JOINTS,
     )
     cost, truth, bounds = problem.cost, problem.truth, problem.bounds
-    cost.body.sticky_deviation.mul_(prior_scale)
+    cost.body.sticky_deviation.mul_(choice.prior_scale)
     if pose is not None:
         noise = problem.observed - _project(problem, truth)
         truth = _pose(cost.body, pose)
         cost = replace(cost, target=_project(problem, truth) + noise)
-    if not limits:
+    if not choice.limits:
         infinite = torch.full_like(bounds.lower, math.inf)
         bounds = Bounds(-infinite, infinite)
-    variance = None if widest is None else torch.full_like(truth, widest**2)
+    variance = None if choice.widest is None else torch.full_like(truth, choice.widest**2)
     start = TrustRegionNewton(max_steps=1000).minimise(cost, truth, bounds, prior_variance=variance)
     return problem._replace(
         truth=truth, observed=cost.target, cost=cost, bounds=bounds, start=start

@@ -32,6 +32,7 @@ from torchcss.errors import ConfigurationError, TrackFileError
 from torchcss.inference.smoothing import (
     GaussianEvidence,
     Refined,
+    Refinement,
     Transition,
     best_path,
     refine,
@@ -134,8 +135,7 @@ def smooth_track(track: Track, *, choice: Smoothing | None = None) -> SmoothedTr
         times,
         motion_prior(body, choice),
         free_turns(body),
-        # The covariances of the track have its power already.
-        evidence=1 / (choice.persistence * track.likelihood_power),
+        choice=Refinement(likelihood_power=1 / (choice.persistence * track.likelihood_power)),
         changes=changes,
     )
     # The modes' covariances have the track's power, their costs are full nats.

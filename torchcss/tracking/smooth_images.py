@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -24,7 +25,7 @@ from tqdm import tqdm
 from torchcss.body.root import free_turns
 from torchcss.cost.total import TrackingCost, beside
 from torchcss.errors import VideoError
-from torchcss.inference.smoothing import refine_in_windows
+from torchcss.inference.smoothing import IN_WINDOWS, refine_in_windows
 from torchcss.io.run import body_of_track
 from torchcss.io.tracks import Track
 from torchcss.tracking.session import Images
@@ -119,7 +120,7 @@ def smooth_frames(
         torch.from_numpy(track.times),
         motion_prior(body, choice),
         free_turns(body),
-        evidence=1 / choice.persistence,
+        choice=replace(IN_WINDOWS, likelihood_power=1 / choice.persistence),
         changes=changes,
     )
     result = track_of(track, body, refined, cost=refined.cost)
