@@ -18,11 +18,11 @@ from torchcss.io.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from torchcss.studies.render.sequences import arm_sequence
 from torchcss.tracking.checkpoint import state_from_tensors, state_tensors
 from torchcss.tracking.session import TrackingSession
-from torchcss.tracking.settings import ALL_TERMS, Settings
+from torchcss.tracking.settings import Settings, all_terms
 from torchcss.types import Frame
 
 SETTINGS = Settings(
-    body="arm8", samples=4, modes=2, working_size=120, terms=ALL_TERMS, prediction="surface",
+    body="arm8", samples=4, modes=2, working_size=120, terms=all_terms(), prediction="surface",
     limb_jumps=1,
 )  # fmt: skip
 FRAMES = 20
