@@ -1,7 +1,7 @@
-"""A trotting quadruped on a free root, tracked from marks on its legs, in 3D or in one camera.
+"""A trotting quadruped on a free root, tracked from keypoints on its legs, in 3D or in one camera.
 
-    python scripts/track_quadruped.py --urdf DATA/robot_models/anymal_b.urdf --marks 3d
-    python scripts/track_quadruped.py --urdf DATA/robot_models/anymal_b.urdf --marks 2d
+    python scripts/track_quadruped.py --urdf DATA/robot_models/anymal_b.urdf --keypoints 3d
+    python scripts/track_quadruped.py --urdf DATA/robot_models/anymal_b.urdf --keypoints 2d
 
 ANYmal trots and turns (`torchcss.studies.render.robots.trot`); its hips, knees and feet are
 observed with noise, as places in space (`torchcss.cost.targets`) or in the image of one camera. The
@@ -52,10 +52,10 @@ class Config:
 
     urdf: Path
     """The quadruped."""
-    marks: Literal["2d", "3d"] = "3d"
-    """Where the marks are: in space, or in the image."""
+    keypoints: Literal["2d", "3d"] = "3d"
+    """Where the keypoints are: in space, or in the image."""
     noise: float | None = None
-    """Standard deviation of a mark's coordinate: metres (0.005) or pixels (1.5)."""
+    """Standard deviation of a keypoint's coordinate: metres (0.005) or pixels (1.5)."""
     frames: int = 50
     """Frames, 25 a second."""
     samples: int = 40
@@ -87,7 +87,7 @@ def make_costs(
     index = torch.tensor([body.joint_index(name) for name in names])
     exact = body.pose(truth).joints[:, index]
     noise = torch.randn(exact.shape, generator=generator, dtype=exact.dtype)
-    if config.marks == "3d":
+    if config.keypoints == "3d":
         sigma = config.noise or 0.005
         spatial = [
             PointTargets(
@@ -114,12 +114,12 @@ def make_costs(
                 FrameContext(
                     body=body,
                     camera=camera,
-                    keypoints=Keypoints(marks, torch.ones_like(marks[:, 0]), tuple(names)),
+                    keypoints=Keypoints(places, torch.ones_like(places[:, 0]), tuple(names)),
                     deviation=body.motion_rate / RATE,
                 ),
             ),
         )
-        for marks in uv
+        for places in uv
     ]
     return [cost.problem() for cost in costs], costs[0]
 
@@ -163,13 +163,13 @@ def main(config: Config) -> dict[str, Any]:
         "config": config,
     }
     print(
-        f"{config.marks} marks, {config.frames} frames: links {report['links_mm']:.1f} mm "
+        f"{config.keypoints} keypoints, {config.frames} frames: links {report['links_mm']:.1f} mm "
         f"(worst frame {report['worst_frame_mm']:.1f}), base {report['base_mm']:.1f} mm, "
         f"feet {report['feet_mm']:.1f} mm; last frames {np.round(links[-3:].mean(-1).numpy(), 1)}"
     )
     columns = ("links mm", "worst frame mm", "base mm", "feet mm")
     cells = [report[c.replace(" ", "_")] for c in columns]
-    table = Table("A trotting quadruped", ("marks", *columns), [[config.marks, *cells]])
+    table = Table("A trotting quadruped", ("keypoints", *columns), [[config.keypoints, *cells]])
     write_report(config.out, report, table)
     return report
 

@@ -1,4 +1,4 @@
-"""The tracking of a quadruped from marks, on one made here and on ANYmal if it is there."""
+"""The tracking of a quadruped from keypoints, on one made here and on ANYmal if it is there."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ def urdf(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 def test_marks_in_space(script: ModuleType, urdf: Path, tmp_path: Path) -> None:
     out = tmp_path / "out" / "quadruped.json"
     report = script.main(script.Config(urdf=urdf, frames=4, samples=10, out=out))
-    # Twelve marks of 5 mm a coordinate for 18 parameters.
+    # Twelve keypoints of 5 mm a coordinate for 18 parameters.
     assert report["links_mm"] < 9
     assert json.loads(out.read_text())["links_mm"] == pytest.approx(report["links_mm"])
 
 
 def test_marks_in_one_image(script: ModuleType, tmp_path: Path) -> None:
     urdf = write_quadruped(tmp_path / "quadruped.urdf")
-    report = script.main(script.Config(urdf=urdf, marks="2d", frames=3, samples=6))
+    report = script.main(script.Config(urdf=urdf, keypoints="2d", frames=3, samples=6))
     # Depth is known to some 3 cm a frame.
     assert report["links_mm"] < 100
 
