@@ -185,14 +185,14 @@ def board(config: Config, folder: Path) -> dict[str, Any]:
     truth, corners = torch.from_numpy(reference["corners_world"]), reference["corners_board"]
     body = board_body(corners)
     text = json.loads((folder / "cameras.json").read_text())
-    seen = {
+    pixels = {
         name: load_arrays(folder / f"corners2d_{name}.npz", TorchcssError)["corners_px"]
         for name in ("cam_0", "cam_2")
     }
     times = text["cameras"]["cam_0"]["frame_times_s"]
     interval = float(np.diff(times).mean())
     start = next(
-        i for i in range(len(truth)) if all(np.isfinite(m[i]).all() for m in seen.values())
+        i for i in range(len(truth)) if all(np.isfinite(m[i]).all() for m in pixels.values())
     )
     stop = len(truth) if config.frames is None else min(len(truth), start + config.frames)
     settings = replace(
@@ -203,7 +203,7 @@ def board(config: Config, folder: Path) -> dict[str, Any]:
     for views in (("cam_0",), ("cam_2",), ("cam_0", "cam_2")):
         cameras = [read_camera(folder / "cameras.json", v) for v in views]
         seen = [
-            CameraView(camera, corner_keypoints(body, seen[view]), CORNER_NOISE_PX)
+            CameraView(camera, corner_keypoints(body, pixels[view]), CORNER_NOISE_PX)
             for view, camera in zip(views, cameras, strict=True)
         ]
         readers = [VideoReader(folder / f"{view}.mp4", start=start, stop=stop) for view in views]
