@@ -195,8 +195,9 @@ def board(config: Config, folder: Path) -> dict[str, Any]:
         i for i in range(len(truth)) if all(np.isfinite(m[i]).all() for m in pixels.values())
     )
     stop = len(truth) if config.frames is None else min(len(truth), start + config.frames)
+    # The session tracks the body it is given; the name says that it moves about, as people do.
     settings = replace(
-        config.tracking, body="board", terms=("joints", "temporal"), working_size=1280,
+        config.tracking, body="body34", terms=("joints", "temporal"), working_size=1280,
         samples=config.tracking.samples or 40, modes=config.tracking.modes or 3,
     )  # fmt: skip
     rows: dict[str, Any] = {}
