@@ -12,16 +12,14 @@ from __future__ import annotations
 
 import ast
 import io
-import sys
 import tokenize
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import tyro
+from common import start
 
-from torchcss.errors import TorchcssError
 from torchcss.io.tracks import prepare_output_folder, write_summary
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -181,8 +179,4 @@ def print_figures(figures: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except TorchcssError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    start(main, Config, __doc__)

@@ -119,7 +119,7 @@ def test_interrupt_has_its_own_status(files: Path, monkeypatch: pytest.MonkeyPat
     def interrupted(*_args, **_kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "track_video", interrupted)
+    monkeypatch.setattr("torchcss.cli.track.track_video", interrupted)
     assert track(files) == 130
 
 

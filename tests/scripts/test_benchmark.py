@@ -10,6 +10,9 @@ from types import ModuleType
 
 import pytest
 
+from torchcss.cost.interior import InteriorNodes
+from torchcss.cost.visibility import ContourPredictor
+
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "benchmark.py"
 WAYS = {
     *("joints_value", "joints_closed", "joints_plain"),
@@ -74,7 +77,9 @@ def test_small_mode_agrees_with_autograd(
 def test_the_full_cost_has_a_thousand_nodes(script: ModuleType) -> None:
     ways, full = script.make_ways(script.Config(samples=1, size_wh=(160, 120)))
     _, x = ways["full_value"]
-    assert full.predictor.num_nodes + full.interior.num_nodes >= 1000
+    tables = full.views[0].tables
+    nodes = tables.of(ContourPredictor).num_nodes + tables.of(InteriorNodes).num_nodes
+    assert nodes >= 1000
     assert set(full.terms(x)) == TERMS - {"pose", "visibility"}
 
 

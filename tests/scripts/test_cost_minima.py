@@ -43,7 +43,7 @@ def test_variants_cost_the_same_without_a_match(script: ModuleType) -> None:
     usual = ContourTerm()
     for potential, sigma, _ in script.POTENTIALS.values():
         choice = script.contour_of(scene, potential, sigma, 0.0).choice
-        term = choice.contour
-        assert choice.contour_weight * term.unmatched == pytest.approx(150.0 * usual.unmatched)
+        term = choice.find(ContourTerm)
+        assert term.weight * term.unmatched == pytest.approx(usual.weight * usual.unmatched)
         ratio = term.fitted_level / term.unmatched
         assert ratio == pytest.approx(usual.fitted_level / usual.unmatched)

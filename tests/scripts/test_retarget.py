@@ -19,6 +19,7 @@ from torchcss import load_body
 from torchcss.errors import ConfigurationError, MotionCaptureError, OutputError
 from torchcss.io.motion.positions import LIMBS
 from torchcss.io.tracks import FrameModes, Track, TrackWriter
+from torchcss.studies.evaluation import read_reference
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 
@@ -90,7 +91,7 @@ def test_files_and_table(
     assert found["error_mm"].shape == (8,)
     assert found["error_mm"].max() < 5
 
-    positions, names = load("evaluate_track").read_reference(reference, "joints")
+    positions, names = read_reference(reference, "joints")
     assert set(names) == {*LIMBS, "HumanoidRoot", "vt1"}
     index = [body.joint_index(name) for name in names]
     assert 1000 * np.linalg.norm(positions - joints[:, index].numpy(), axis=-1).mean() < 10

@@ -41,11 +41,18 @@ class Spy:
     def init(self, mixture: GaussianMixture, *, generator: torch.Generator) -> SimpleNamespace:
         return SimpleNamespace(mixture=mixture)
 
-    def step(self, state: SimpleNamespace, cost_of, bounds):
-        self.costs.append(cost_of(torch.zeros(1, dtype=torch.long), state.mixture))
+    @property
+    def stated_power(self) -> float:
+        return 1.0
+
+    def step(self, state: SimpleNamespace, problem, bounds):
+        child = problem.children(torch.zeros(1, dtype=torch.long), state.mixture)
+        self.costs.append(child.cost)
         mean = self.truth[len(self.costs) - 1][None]
         mixture = state.mixture._replace(mean=mean)
-        return SimpleNamespace(mixture=mixture), SimpleNamespace(origin=torch.tensor([0]))
+        return SimpleNamespace(mixture=mixture), SimpleNamespace(
+            origin=torch.tensor([0]), parent=torch.tensor([0]), prior=state.mixture
+        )
 
 
 def costs_of_a_tracker_at_the_truth(settings: Settings, num_frames: int) -> list[TrackingCost]:

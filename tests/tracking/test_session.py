@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from made_sessions import seen_by, session_at
+from made_sessions import seen_by, session_at, start_at
 
 import torchcss
 from torchcss.app.track import TrackOptions, _first_pose_from_file, track_video
@@ -37,7 +37,7 @@ from torchcss.studies.demo import run_demo
 from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
 from torchcss.tracking.flip_moves import with_modes
 from torchcss.tracking.presets import PRESETS
-from torchcss.tracking.session import Posterior, follow_with_base
+from torchcss.tracking.session import Posterior, TrackingSession, follow_with_base
 from torchcss.tracking.settings import (
     TERMS,
     Settings,
@@ -210,7 +210,7 @@ def test_float32_tracks_too(clip: Path, tmp_path: Path):
     run(clip, tmp_path, dtype="float32", evidence=0.7)
     track = torchcss.load_track(tmp_path)
     assert np.isfinite(track.joints_world).all()
-    assert track.evidence == PRESETS["css"].power_arm
+    assert track.likelihood_power == PRESETS["css"].power_arm
 
 
 def test_a_new_run_replaces_what_belongs_to_the_last_one(clip: Path, tmp_path: Path):
@@ -607,3 +607,18 @@ def test_images_one_pixel_wide_and_of_odd_sizes(size: tuple[int, int]):
     for frame in tracked:
         assert torch.isfinite(frame.info.cost).all()
         assert torch.isfinite(frame.state.mixture.covariance).all()
+
+
+def test_pixels_alone_are_the_next_frame():
+    """And a camera alone is a view without keypoints."""
+    sequence = arm_sequence(generator=torch.Generator().manual_seed(0), num_frames=3)
+    settings = Settings(body="arm8", working_size=160, samples=4, modes=2, terms=("contour",))
+    first = start_at(sequence.body, sequence.states[0])
+    placed = TrackingSession(settings, first, [seen_by(sequence.camera)])
+    plain = TrackingSession(settings, first, [sequence.camera])
+    frames = [Frame(i, i / 25, image) for i, image in enumerate(sequence.frames)]
+    for one, other in zip(placed.track(frames), plain.track(sequence.frames), strict=True):
+        assert torch.equal(one.state.mixture.mean, other.state.mixture.mean)
+        assert (one.frame.index, one.frame.time_s) == (other.frame.index, other.frame.time_s)
+    with pytest.raises(ConfigurationError, match="one of each of the 1 views"):
+        plain.observe([sequence.frames[0], sequence.frames[1]])

@@ -167,7 +167,7 @@ class Posed:
             self._found[find] = find(self)
         return self._found[find]
 
-    def of_parent(self, values: Float[Tensor, "k *rest"]) -> Tensor:
+    def of_parent(self, values: Tensor) -> Tensor:
         """The rows of each sample's parent, of what has one row a mode."""
         return values[0] if self.parent is None else values[self.parent]
 

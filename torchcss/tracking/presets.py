@@ -309,6 +309,7 @@ def make_tracker(
     num_samples: int | None = None,
     num_modes: int | None = None,
     motion: tuple[float, ...] | float = 0.0,
+    free_root: bool | None = None,
 ) -> SequenceTracker:
     """Build a tracker from the table.
 
@@ -318,6 +319,7 @@ def make_tracker(
         num_samples: Samples per frame instead of the table's.
         num_modes: Modes kept instead of the table's.
         motion: Standard deviation of every parameter's motion per frame.
+        free_root: Whether the body moves about; None: told by its name.
 
     Raises:
         ConfigurationError: If there is no such tracker.
@@ -325,7 +327,7 @@ def make_tracker(
     if preset not in PRESETS:
         raise ConfigurationError(f"no tracker {preset!r}; there are {', '.join(PRESETS)}")
     row = PRESETS[preset]
-    arm = not has_free_root(body_name)
+    arm = not (has_free_root(body_name) if free_root is None else free_root)
     num_samples = num_samples or (row.samples_arm if arm else row.samples_body)
     num_modes = num_modes or (row.modes_arm if arm else row.modes_body)
     noise = (

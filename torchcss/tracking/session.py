@@ -22,8 +22,10 @@ import math
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from itertools import zip_longest
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -56,6 +58,7 @@ from torchcss.tracking.view import (
     ViewObservation,
 )
 from torchcss.types import Frame
+from torchcss.vision.camera import Camera
 
 _PITCH_LIMIT = math.radians(55)
 """The base follows once the root's pitch exceeds this, well before it locks at 90 degrees."""
@@ -63,7 +66,10 @@ _PITCH_LIMIT = math.radians(55)
 _NUM_FLIPS = 8
 """Flips of the best mode that join the search where flips are made."""
 
-Images = Frame | Sequence[Frame | None]
+Image = Frame | np.ndarray
+"""An image with its place in the video, or its pixels `[h w 3]` alone: it then is the next one."""
+
+Images = Image | Sequence[Image | None]
 """The images of one moment, one of each view; None from a camera that has ended."""
 
 
@@ -147,8 +153,8 @@ class TrackingSession:
     Args:
         settings: How to track.
         first: Where the body may be in the first frame, and the body.
-        views: The cameras that look on, in one world, the first one's video being the one that
-            counts the frames; their keypoints.
+        views: The cameras that look on, in one world, with their keypoints where there are any;
+            the first one's video is the one that counts the frames.
         frame_interval: Seconds between frames, which scales the expected motion.
         generator: Source of the samples; None: one seeded with `settings.seed`.
 
@@ -160,7 +166,7 @@ class TrackingSession:
         self,
         settings: Settings,
         first: Initialisation,
-        views: Sequence[CameraView],
+        views: Sequence[CameraView | Camera],
         *,
         frame_interval: float = 1 / 25,
         generator: torch.Generator | None = None,
@@ -175,14 +181,14 @@ class TrackingSession:
             memory=(NOTHING_KNOWN,) * nothing,
             monitor=None if self.plan.recovery is None else self.plan.recovery.monitor.init(),
         )
-        self._seen = self.state.seen
+        self._seen, self._num_seen = self.state.seen, 0
 
     @classmethod
     def resume(
         cls,
         state: SessionState,
         settings: Settings,
-        views: Sequence[CameraView],
+        views: Sequence[CameraView | Camera],
         *,
         frame_interval: float = 1 / 25,
     ) -> TrackingSession:
@@ -202,17 +208,19 @@ class TrackingSession:
                 "same views"
             )
         session.state, session._seen = state, state.seen
+        session._num_seen = int(state.tracker.frame)
         return session
 
     def _begin(
         self,
         settings: Settings,
         body: BodyModel,
-        views: Sequence[CameraView],
+        views: Sequence[CameraView | Camera],
         frame_interval: float,
     ) -> None:
         if not views:
             raise ConfigurationError("views: expected at least one camera that looks on, got none")
+        views = [CameraView(view) if isinstance(view, Camera) else view for view in views]
         self.settings = settings
         self.plan: Plan = make_plan(settings, body, views[0], frame_interval)
         self._observers = [self.plan.observer(body, view) for view in views]
@@ -242,14 +250,27 @@ class TrackingSession:
             images: One of each view, or that of the only one.
         """
         began = time.perf_counter()
-        frames = (images,) if isinstance(images, Frame) else tuple(images)
-        # Views without an image are out.
-        frames += (None,) * (len(self._observers) - len(frames))
+        given = (images,) if isinstance(images, Image) else tuple(images)
+        frames = [
+            self._placed(image, observer) for image, observer in zip_longest(given, self._observers)
+        ]
+        self._num_seen += 1
         self._seen = tuple(
             observer.observe(frame, before)
             for observer, frame, before in zip(self._observers, frames, self._seen, strict=True)
         )
         return Observation(self._seen, time.perf_counter() - began)
+
+    def _placed(self, image: Image | None, observer: Observer | None) -> Frame | None:
+        """An image with its place in its video; a view without an image is out."""
+        if observer is None:
+            raise ConfigurationError(
+                f"images: expected one of each of the {len(self._observers)} views, got more"
+            )
+        if image is None or isinstance(image, Frame):
+            return image
+        index = self._num_seen
+        return Frame(index + observer.view.offset, index * self.plan.frame_interval, image)
 
     def step(self, observation: Observation) -> Posterior:
         """Search one frame; the observations come in their order, each once.

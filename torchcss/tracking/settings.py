@@ -17,6 +17,7 @@ from torch import Tensor
 
 from torchcss.body.load import has_free_root
 from torchcss.body.model import BodyModel
+from torchcss.body.root import has_root
 from torchcss.cost.choice import TERM_TABLE, CostChoice
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.edge_energy import EdgeEnergyTerm
@@ -262,7 +263,7 @@ def boundary_emphasis(settings: Settings) -> float:
     return settings.boundary_emphasis if "motion_boundaries" in settings.terms else 0.0
 
 
-def make_choice(settings: Settings, sigma: float) -> CostChoice:
+def make_choice(settings: Settings, sigma: float, free_root: bool | None = None) -> CostChoice:
     """The cost that the settings ask for: their terms, and what their preset has to say.
 
     A particle filter gets no temporal prior: its particles are moved by `p(x_t | x_{t-1})` already,
@@ -276,6 +277,7 @@ def make_choice(settings: Settings, sigma: float) -> CostChoice:
     Args:
         settings: Which terms, and which tracker.
         sigma: Keypoint noise in pixels of the working image.
+        free_root: Whether the body moves about; None: told by its name.
     """
     row = PRESETS[settings.preset]
     potential = Lorentzian if row.robust else Quadratic
@@ -285,7 +287,7 @@ def make_choice(settings: Settings, sigma: float) -> CostChoice:
         chosen |= {"interpenetration"} if row.interpenetration else set()
     if row.particles is not None:
         chosen -= {"segmentation", "temporal", "temporal_mixture"}
-    if not has_free_root(settings.body):
+    if not (has_free_root(settings.body) if free_root is None else free_root):
         chosen -= {"segmentation", "background", "silhouette"}
     contour = ContourTerm(weight=settings.contour_weight, potential_kind=potential)
     # The weights of motion boundaries make the wells of a fitted model shallower; what is back-
@@ -310,12 +312,15 @@ def make_choice(settings: Settings, sigma: float) -> CostChoice:
     )
 
 
-def make_settings_tracker(settings: Settings, motion: Float[Tensor, " n"]) -> SequenceTracker:
+def make_settings_tracker(
+    settings: Settings, motion: Float[Tensor, " n"], free_root: bool | None = None
+) -> SequenceTracker:
     """The tracker that the settings ask for.
 
     Args:
         settings: Preset and numbers.
         motion: Standard deviation of every parameter's motion per frame.
+        free_root: Whether the body moves about; None: told by its name.
 
     Raises:
         ConfigurationError: If there is no such preset.
@@ -326,12 +331,14 @@ def make_settings_tracker(settings: Settings, motion: Float[Tensor, " n"]) -> Se
         num_samples=settings.samples,
         num_modes=settings.modes,
         motion=tuple(motion.tolist()),
+        free_root=free_root,
     )
     if not isinstance(tracker, Tracker):
         return tracker  # `Settings` has refused what follows
     evidence = settings.evidence
     marked = settings.keypoints_use == "all" and "joints" in settings.terms
-    if evidence is None and marked and has_free_root(settings.body):
+    moves = has_free_root(settings.body) if free_root is None else free_root
+    if evidence is None and marked and moves:
         evidence = PRESETS[settings.preset].power_keypoints
     if evidence is not None:
         tracker = replace(
@@ -407,8 +414,8 @@ def make_plan(settings: Settings, body: BodyModel, view: CameraView, frame_inter
     noise = _working_noise(extractor, view)
     return Plan(
         extractor=extractor,
-        choice=make_choice(settings, noise),
-        tracker=make_settings_tracker(settings, body.motion_rate * frame_interval),
+        choice=make_choice(settings, noise, has_root(body)),
+        tracker=make_settings_tracker(settings, body.motion_rate * frame_interval, has_root(body)),
         bounds=row.bounds(body.bounds),
         keypoints_first_only=settings.keypoints_use == "first",
         boundary_emphasis=boundary_emphasis(settings),

@@ -28,7 +28,6 @@ from torchcss.errors import VideoError
 from torchcss.inference.smoothing import IN_WINDOWS, refine_in_windows
 from torchcss.io.run import body_of_track
 from torchcss.io.tracks import Track
-from torchcss.tracking.session import Images
 from torchcss.tracking.settings import Settings, make_plan
 from torchcss.tracking.smooth import (
     SmoothedTrack,
@@ -49,7 +48,7 @@ do, so that motion may be freer; chosen on the same view as the other default.""
 
 def smooth_frames(
     track: Track,
-    images: Iterable[Images],
+    images: Iterable[Frame | Sequence[Frame | None]],
     *,
     settings: Settings,
     views: Sequence[CameraView],
@@ -59,7 +58,7 @@ def smooth_frames(
 
     Args:
         track: The track.
-        images: The images of its frames, in order, as `TrackingSession.observe` takes them.
+        images: The images of its frames, in order: one of each view.
         settings: How it was tracked. Temporal terms are left out, and the segmentation, which tells
             modes apart. Colours are learnt from the track that was smoothed without images.
         views: The cameras that look on.
