@@ -229,9 +229,12 @@ class TrackingCost:
         """Samples to evaluate at a time."""
         nodes = 1
         for view in self.views:
-            # Terms on the same nodes share them.
-            sizes = {(id(bound.link), bound.size) for _, bound in self._images(view)}
-            nodes += sum(size for _, size in sizes)
+            links: list[Tensor] = []
+            for _, bound in self._images(view):
+                # Terms on the same nodes share them.
+                if all(bound.link is not link for link in links):
+                    links.append(bound.link)
+                    nodes += bound.size
         return max(1, min(CHUNK, CHUNK_NODES // nodes))
 
     def _evaluated(
