@@ -129,3 +129,10 @@ def test_help(verb: str, capsys: pytest.CaptureFixture[str]):
         cli.main([verb, "--help"])
     assert ended.value.code == 0
     assert "--seed" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("option", [("--evidence", "0.3"), ("--evidence=0.3",)])
+def test_options_of_version_0_1_are_understood(files: Path, option: tuple[str, ...]):
+    assert track(files, "--no-overlay", *option) == 0
+    settings = json.loads((files / "out" / "summary.json").read_text())["settings"]
+    assert settings["likelihood_power"] == 0.3

@@ -95,7 +95,7 @@ def test_small_mode_and_resume(
 
 def test_how_trackers_are_set_up_can_be_chosen(script: ModuleType, arm: Path) -> None:
     tracking = Settings(
-        terms=("default", "silhouette"), evidence=0.3, prediction="surface", limb_jumps=2
+        terms=("default", "silhouette"), likelihood_power=0.3, prediction="surface", limb_jumps=2
     )
     config = script.Config(sequence=arm, tracking=tracking)
     settings = script.settings_of(config, "body34", "css", 1)

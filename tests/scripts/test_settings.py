@@ -23,7 +23,7 @@ SCRIPTS = PACKAGE.parent / "scripts"
 
 CHANGED: dict[str, Any] = {
     "body": "arm7", "preset": "multiple_hypothesis", "samples": 7, "modes": 2,
-    "prediction": "surface", "oversampling": 2, "evidence": 0.3, "limb_jumps": 1,
+    "prediction": "surface", "oversampling": 2, "likelihood_power": 0.3, "limb_jumps": 1,
     "keypoints_use": "first", "terms": ("contour", "region", "segmentation"),
     "curvature": "gauss-newton", "working_size": 160, "contour_weight": 120.0,
     "weights": {"region": 0.5}, "boundary_emphasis": 0.2, "seed": 3, "device": "cpu:0",

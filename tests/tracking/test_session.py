@@ -207,7 +207,7 @@ def test_all_terms_track(clip: Path, tmp_path: Path):
 
 def test_float32_tracks_too(clip: Path, tmp_path: Path):
     """And the file tells what counts in its covariances, not what counts in its weights."""
-    run(clip, tmp_path, dtype="float32", evidence=0.7)
+    run(clip, tmp_path, dtype="float32", likelihood_power=0.7)
     track = torchcss.load_track(tmp_path)
     assert np.isfinite(track.joints_world).all()
     assert track.likelihood_power == PRESETS["css"].power_arm
@@ -223,7 +223,7 @@ def test_a_new_run_replaces_what_belongs_to_the_last_one(clip: Path, tmp_path: P
     with pytest.raises(ConfigurationError, match="descend"):
         run(clip, out, preset="condensation", oversampling=2)
     with pytest.raises(ConfigurationError, match="no modes to weigh"):
-        run(clip, out, preset="condensation", evidence=0.5)
+        run(clip, out, preset="condensation", likelihood_power=0.5)
     with pytest.raises(ConfigurationError, match="no modes to jump from"):
         run(clip, out, preset="condensation", limb_jumps=4)
     (tmp_path / "empty.mp4").write_bytes(b"")
@@ -527,8 +527,8 @@ def test_awkward_frames_leave_no_nan_and_lose_nothing():
         ({"keypoints_use": "first"}, 0.1, 0.1),
         ({"terms": ("contour", "temporal")}, 0.1, 0.1),
         ({"body": "arm8"}, 0.05, 0.05),
-        ({"evidence": 0.7}, 0.7, 0.1),
-        ({"keypoints_use": "first", "evidence": 0.7}, 0.7, 0.1),
+        ({"likelihood_power": 0.7}, 0.7, 0.1),
+        ({"keypoints_use": "first", "likelihood_power": 0.7}, 0.7, 0.1),
         ({"preset": "css_heavy_tailed"}, 0.2, 0.1),
         ({"preset": "css_figure_6"}, 1.0, 1.0),
         ({"preset": "single"}, 1.0, 1.0),

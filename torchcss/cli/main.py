@@ -66,6 +66,10 @@ Verb = (
 )
 
 
+_OLD_NAMES = {"--evidence": "--likelihood-power", "--agility": "--acceleration-ratio"}
+"""Options of version 0.1 that are called otherwise now; not in the help."""
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line.
 
@@ -75,9 +79,12 @@ def main(arguments: list[str] | None = None) -> int:
     Returns:
         The exit status.
     """
+    words = sys.argv[1:] if arguments is None else arguments
+    options = [word.partition("=") for word in words]
+    words = ["".join((_OLD_NAMES.get(name, name), *value)) for name, *value in options]
     try:
         # Settings check themselves, so that reading them may fail as well.
-        verb = tyro.cli(Verb, prog="torchcss", args=arguments, description=__doc__)  # type: ignore[arg-type]
+        verb = tyro.cli(Verb, prog="torchcss", args=words, description=__doc__)  # type: ignore[arg-type]
         verb.run()
     except TorchcssError as error:
         print(f"torchcss: {error}", file=sys.stderr)

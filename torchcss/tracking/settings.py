@@ -97,8 +97,8 @@ class Settings:
             `torchcss.tracking.surface_prediction`. For trackers that descend from samples.
         oversampling: How many times as many samples are drawn; those with the best edges descend,
             see `Tracker`.
-        evidence: Power of a frame's likelihood in the weights of modes, above 0 and at most 1, see
-            `Tracker`; the preset's by default. The stated covariances keep the preset's.
+        likelihood_power: Power of a frame's likelihood in the weights of modes, above 0 and at
+            most 1, see `Tracker`; the preset's by default. The stated covariances keep its own.
         limb_jumps: How many other poses of an arm for which the colours do not speak join the
             search, see `torchcss.tracking.limb_moves`; 0 for none. For trackers that descend from
             samples.
@@ -128,7 +128,7 @@ class Settings:
     modes: int | None = None
     prediction: Literal["velocity", "surface"] = "velocity"
     oversampling: int = 1
-    evidence: float | None = None
+    likelihood_power: float | None = None
     limb_jumps: int = 0
     keypoints_use: Literal["first", "all"] = "all"
     terms: tuple[str, ...] = TERMS
@@ -188,14 +188,16 @@ class Settings:
             raise ConfigurationError(
                 f"prediction: {self.preset} moves particles, not modes; leave it at velocity"
             )
-        if self.evidence is not None:
-            if not 0 < self.evidence <= 1:
+        if self.likelihood_power is not None:
+            if not 0 < self.likelihood_power <= 1:
                 raise ConfigurationError(
-                    f"evidence must lie above 0 and at most at 1, got {self.evidence}"
+                    "likelihood_power must lie above 0 and at most at 1, got "
+                    f"{self.likelihood_power}"
                 )
             if PRESETS[self.preset].particles is not None:
                 raise ConfigurationError(
-                    f"evidence: the particles of {self.preset} have no modes to weigh; leave it out"
+                    f"likelihood_power: the particles of {self.preset} have no modes to weigh; "
+                    "leave it out"
                 )
         if self.limb_jumps < 0:
             raise ConfigurationError(f"limb_jumps must be at least 0, got {self.limb_jumps}")
@@ -217,6 +219,9 @@ class Settings:
         return torch.float32 if self.dtype == "float32" else torch.float64
 
 
+_NAMES_OF_V01 = {"evidence": "likelihood_power"}
+
+
 def settings_from_plain(plain: Mapping[str, Any]) -> Settings:
     """Settings from what a run's folder holds of them, also one of an older version.
 
@@ -227,8 +232,9 @@ def settings_from_plain(plain: Mapping[str, Any]) -> Settings:
         ConfigurationError: If they are not those of a tracker.
     """
     known = {field.name for field in fields(Settings)}
+    now = {_NAMES_OF_V01.get(name, name): value for name, value in plain.items()}
     try:
-        return Settings(**{name: value for name, value in plain.items() if name in known})
+        return Settings(**{name: value for name, value in now.items() if name in known})
     except TypeError as error:
         raise ConfigurationError(
             f"the run's settings are not those of torchcss: {error}"
@@ -335,14 +341,14 @@ def make_settings_tracker(
     )
     if not isinstance(tracker, Tracker):
         return tracker  # `Settings` has refused what follows
-    evidence = settings.evidence
+    power = settings.likelihood_power
     marked = settings.keypoints_use == "all" and "joints" in settings.terms
     moves = has_free_root(settings.body) if free_root is None else free_root
-    if evidence is None and marked and moves:
-        evidence = PRESETS[settings.preset].power_keypoints
-    if evidence is not None:
+    if power is None and marked and moves:
+        power = PRESETS[settings.preset].power_keypoints
+    if power is not None:
         tracker = replace(
-            tracker, likelihood_power=evidence, covariance_power=tracker.likelihood_power
+            tracker, likelihood_power=power, covariance_power=tracker.likelihood_power
         )
     return replace(tracker, oversampling=settings.oversampling)
 
