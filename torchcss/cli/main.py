@@ -39,9 +39,9 @@ class Demo:
     """Track an arm that moves in depth before clutter, and compare with the truth."""
 
     out: Path = Path("out/demo")
-    """Folder for track.npz, summary.json, overlay.mp4 and the rendered input."""
+    """Folder for track.npz, summary.json and overlay.mp4."""
     frames: int = 50
-    """Number of frames, 25 per second."""
+    """Frames to track, of 50, 25 per second."""
     settings: SettingsOptions = DEMO_SETTINGS
 
     def run(self) -> None:

@@ -102,16 +102,11 @@ def write_sequence(
                 kept.append(_Joints(frame.joints, frame.uv, frame.visible, frame.in_image))
         with archive.open("occluded.npy", "w", force_zip64=True) as stream:
             np.lib.format.write_array(stream, occluded, allow_pickle=False)
-    _write_arrays(
-        folder / "mask.npz",
-        {
-            "mask": mask,
-        },
-    )
+    write_arrays(folder / "mask.npz", {"mask": mask})
     _write_joints(folder, shot, kept, noise_px)
-    _write_camera(folder / "cameras.json", shot.camera)
+    write_camera(folder / "cameras.json", shot.camera)
     body = shot.body
-    _write_arrays(
+    write_arrays(
         folder / "truth.npz",
         {
             "body": np.array(body.name),
@@ -135,7 +130,7 @@ def _write_joints(folder: Path, shot: Shot, frames: list[_Joints], noise_px: flo
     visible = torch.stack([frame.visible for frame in frames]).numpy()
     names = np.array(shot.body.joint_names)
     frame_rate = np.array(shot.frame_rate)
-    _write_arrays(
+    write_arrays(
         folder / "keypoints2d.npz",
         {
             "keypoints": (exact + noise_px * noise).numpy(),
@@ -148,7 +143,7 @@ def _write_joints(folder: Path, shot: Shot, frames: list[_Joints], noise_px: flo
             "noise_px": np.array(noise_px),
         },
     )
-    _write_arrays(
+    write_arrays(
         folder / "reference3d.npz",
         {
             "joints": torch.stack([frame.joints for frame in frames]).numpy(),
@@ -161,7 +156,8 @@ def _write_joints(folder: Path, shot: Shot, frames: list[_Joints], noise_px: flo
     )
 
 
-def _write_camera(path: Path, camera: Camera) -> None:
+def write_camera(path: Path, camera: Camera) -> None:
+    """Write the camera of `video.mp4`."""
     entry = {
         "video": "video.mp4",
         **camera_entry(camera),
@@ -178,6 +174,7 @@ def _write_camera(path: Path, camera: Camera) -> None:
         partial.write_text(json.dumps(content, indent=1), encoding="utf-8")
 
 
-def _write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write arrays by name."""
     with replace_file(path) as partial:
         np.savez_compressed(partial, **arrays)  # pyright: ignore[reportArgumentType]

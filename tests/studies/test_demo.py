@@ -1,0 +1,42 @@
+"""The demo's clip: small, whole, and filmed by what the package has."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from torchcss.io.cameras import read_camera
+from torchcss.io.keypoints.read import read_keypoints
+from torchcss.io.video import VideoReader
+from torchcss.studies.demo import CLIP, KEYPOINT_NOISE_PX, write_clip
+from torchcss.studies.evaluation import read_reference
+from torchcss.studies.render.sequences import arm_sequence
+
+
+def check(folder: Path, num_frames: int) -> None:
+    """Keypoints of the first frame are the truth's, as far as their noise goes."""
+    reader = VideoReader(folder / "video.mp4")
+    assert reader.count_frames() == num_frames
+    camera = read_camera(folder / "cameras.json")
+    joints, names = read_reference(folder / "reference3d.npz")
+    assert joints.shape[0] == num_frames
+    seen = read_keypoints(folder / "keypoints.npz", image_size_wh=camera.image_size_wh)
+    assert list(seen.names) == names
+    assert bool((seen.confidence[0] == 1).all())
+    assert not bool(seen.confidence[1:].any())
+    apart = camera.project(torch.from_numpy(joints[0])).uv - seen.positions[0]
+    assert 0 < float(apart.square().mean().sqrt()) < 2 * KEYPOINT_NOISE_PX
+
+
+def test_the_clip_in_the_package_is_small_and_whole() -> None:
+    assert sum(path.stat().st_size for path in CLIP.iterdir()) < 1_000_000
+    check(CLIP, 50)
+
+
+def test_a_clip_is_written(tmp_path: Path) -> None:
+    generator = torch.Generator().manual_seed(1)
+    sequence = arm_sequence(generator=generator, num_frames=2)
+    folder = write_clip(tmp_path / "clip", sequence, generator=generator)
+    check(folder, 2)
+    assert {path.name for path in folder.iterdir()} == {path.name for path in CLIP.iterdir()}
