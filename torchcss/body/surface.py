@@ -23,6 +23,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchcss.body.superquadric import Superquadrics, radial_square, unbend
+
 SHAPE_NAMES = ("a1", "a2", "a3", "e1", "e2", "taper_x", "taper_y", "bend", "bend_direction")
 
 _SMALL = 0.1
@@ -136,29 +138,10 @@ def straighten(
         shape: The nine shape numbers.
         points: Points in the part's frame, metres.
     """
-    _, _, a3, _, _, taper_x, taper_y, bend, direction = shape.unbind(-1)
-    x, y, z = points.unbind(-1)
-    c, s = direction.cos(), direction.sin()
-    r, across = c * x + s * y, c * y - s * x
-    # In units of the radius of the bend, seen from its centre.
-    cosine, sine = 1 - bend * r, bend * z
-    # (1 - hypot) / bend, without the radius.
-    r = (2 * r - bend * (r.square() + z.square())) / (1 + torch.hypot(cosine, sine))
-    x, y = c * r - s * across, s * r + c * across
-    # atan2(sine, cosine) / bend, by its series in the tangent where that is small.
-    small = sine.abs() < _SMALL * cosine
-    of_axis = torch.where(small, cosine, torch.ones_like(cosine))
-    square = torch.where(small, sine / of_axis, torch.zeros_like(sine)).square()
-    series = torch.zeros_like(square)
-    for odd in (13, 11, 9, 7, 5, 3, 1):
-        series = 1 / odd - square * series
-    curvature = torch.where(small, torch.ones_like(bend), bend)
-    angle = torch.atan2(sine, torch.where(small, torch.ones_like(cosine), cosine))
-    z = torch.where(small, z / of_axis * series, angle / curvature)
-    # Beyond the ends the taper is held, so that it never turns the section inside out.
-    height = (z / a3).clamp(-1, 1)
-    fx, fy = (1 + taper_x * height).clamp(min=1e-3), (1 + taper_y * height).clamp(min=1e-3)
-    return torch.stack([x / fx, y / fy, z], -1)
+    rows = Superquadrics.of(shape)
+    (x, y, z), _ = unbend(rows, *points.unbind(-1))
+    height = rows.height(z * rows.ic)
+    return torch.stack([x / (1 + rows.taper_x * height), y / (1 + rows.taper_y * height), z], -1)
 
 
 def implicit(
@@ -166,17 +149,14 @@ def implicit(
 ) -> Float[Tensor, "*batch"]:
     """Inside-outside function: negative inside, zero on the surface, positive outside.
 
-    It is `F^(e1/2)`-like in distance only near the surface of an ellipsoid; use its sign, and its
-    value as the repulsion of section 3.2.4 [IJRR] does.
+    It is `R^2 - 1` with the radial function R of `torchcss.body.superquadric`.
 
     Args:
         shape: The nine shape numbers.
         points: Points in the part's frame, metres.
     """
-    a1, a2, a3, e1, e2 = shape[..., :5].unbind(-1)
-    x, y, z = straighten(shape, points).unbind(-1)
-    section = _signed_power((x / a1).abs(), 2 / e2) + _signed_power((y / a2).abs(), 2 / e2)
-    return _signed_power(section, e2 / e1) + _signed_power((z / a3).abs(), 2 / e1) - 1
+    rows = Superquadrics.of(shape)
+    return radial_square(rows, *points.unbind(-1), bent=bool((rows.bend != 0).any()))[0] - 1
 
 
 def angular_grid(

@@ -12,13 +12,11 @@ outside the surface; here its tangent at `u = c` is taken off,
 so that value and gradient vanish where the potential ends and far parts can be left out without a
 jump (at c = 6 this takes 0.02 from the 1 at the surface).
 
-The inside-outside function is `f = sharpness (R^2 - 1)`, where `R^2 = F^e1` with the superquadric's
-F (see `torchcss.body.surface`): 0 at the centre, 1 on the surface, and growing as the square of the
-distance from the centre along every ray, whatever the exponents. It has the sign and the zeros of
-`surface.implicit`, but its slope does not depend on the exponents, and it is bounded inside by
-`-sharpness`, so that the potential never exceeds `exp(sharpness^p)`, however deep. With p = 1 the
-push is strong from just outside the surface to deep inside and fades only at the very centre; any
-p > 1 makes f |f|^(p-1) flat at the surface, so that nodes are not pushed all the way out.
+The inside-outside function is `f = sharpness (R^2 - 1)` with the radial function R of
+`torchcss.body.superquadric`: its slope does not depend on the exponents, and it is bounded inside
+by `-sharpness`, so that the potential never exceeds `exp(sharpness^p)`, however deep. With p = 1
+the push is strong from just outside the surface to deep inside and fades only at the very centre;
+any p > 1 makes f |f|^(p-1) flat at the surface, so that nodes are not pushed all the way out.
 
 Pairs that touch in every pose (`BodyModel.neighbours`) are left out, and so are pairs between which
 no revolute joint lies: they cannot move against each other, other than by their lengths.
@@ -51,6 +49,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchcss.body.model import BodyModel, BodyPose
+from torchcss.body.superquadric import EXPONENTS, Superquadrics, radial_hessian
 from torchcss.body.surface import surface_points
 from torchcss.cost.context import FrameContext
 from torchcss.cost.term import Kind, Posed, Term
@@ -59,10 +58,6 @@ from torchcss.types import Curvature, LocalModel
 
 END = 6.0
 """The `c` above: the potential ends where that of the paper has fallen to `exp(-c)`."""
-
-_MOST_TAPER = 0.95
-_OVERHANG = 0.5
-"""How far a taper goes on beyond the ends of its part, in semi-axes, before it levels off."""
 
 
 class NearNodes(NamedTuple):
@@ -104,8 +99,7 @@ class NearNodes(NamedTuple):
 class InterpenetrationPairs(nn.Module):
     """Which parts may collide, the nodes that are tested, and the joints between them.
 
-    A bend of part B is neglected (no body that ships has one; its nodes as part A do have it), and
-    exponents above 1 count as 1, the ellipsoid.
+    Exponents above 1 count as 1, the ellipsoid: beyond it a second derivative is infinite.
 
     Args:
         body: The body; its base may move afterwards, its shape may not.
@@ -118,8 +112,9 @@ class InterpenetrationPairs(nn.Module):
         chain: Joints between B and A in the order in which they are met from B, `[pairs length]`.
         sign: -1 for joints that move B, +1 for joints that move A, 0 for padding.
         nodes: Nodes of every part in the part's frame, metres, `[parts nodes 3]`.
-        shape: The first seven shape numbers of every part.
-        overhang: Where the taper of a part levels off beyond its ends, in semi-axes.
+        table: The fields of `Superquadrics`, one column per part.
+        bent: Whether any part is bent.
+        extent: Half sides of a box that holds R = 1 of every part, scaled by R for others, metres.
     """
 
     first: Tensor
@@ -127,8 +122,8 @@ class InterpenetrationPairs(nn.Module):
     chain: Tensor
     sign: Tensor
     nodes: Tensor
-    shape: Tensor
-    overhang: Tensor
+    table: Tensor
+    extent: Tensor
 
     def __init__(self, body: BodyModel, *, rings: int = 4, meridians: int = 6) -> None:
         super().__init__()
@@ -139,19 +134,16 @@ class InterpenetrationPairs(nn.Module):
         for row, (_, _, joints, signs) in enumerate(pairs):
             chain[row, : len(joints)] = torch.tensor(joints)
             sign[row, : len(joints)] = torch.tensor(signs).to(sign)
-        shape = body.part_shape[:, :7].clone()
-        shape[:, 3:5] = shape[:, 3:5].clamp(max=1.0)
-        shape[:, 5:7] = shape[:, 5:7].clamp(-_MOST_TAPER, _MOST_TAPER)
-        taper = shape[:, 5:7].abs().amax(-1).clamp(min=0.1)
+        rows = Superquadrics.of(body.part_shape, exponents=(EXPONENTS[0], 1.0))
+        self.bent = bool((rows.bend != 0).any())
         for name, value in (
             ("first", torch.tensor([pair[0] for pair in pairs], dtype=torch.long)),
             ("second", torch.tensor([pair[1] for pair in pairs], dtype=torch.long)),
             ("chain", chain),
             ("sign", sign),
             ("nodes", _nodes(body, rings, meridians)),
-            ("shape", shape),
-            # Short enough that the section stays positive.
-            ("overhang", ((1 - taper) / (2 * taper)).clamp(max=_OVERHANG)),
+            ("table", torch.stack(rows)),
+            ("extent", _extent(body)),
         ):
             self.register_buffer(name, value.to(body.tie.device), persistent=False)
 
@@ -175,8 +167,7 @@ class InterpenetrationPairs(nn.Module):
         rotation, centre = body.part_poses(pose)
         items = pose.x.shape[:-1].numel()
         rotation, centre = rotation.reshape(items, parts, 3, 3), centre.reshape(items, parts, 3)
-        widest = 1 + self.shape[:, 5:7].abs() * (1 + self.overhang[:, None])
-        outer = reach * torch.cat([self.shape[:, :2] * widest, self.shape[:, 2:3]], dim=-1)
+        outer = reach * self.extent
         inner = self.nodes.abs().amax(dim=1)
         axes = rotation.transpose(-1, -2).flatten(1, 2)  # three rows for every part
         own = (rotation * centre[..., None]).sum(-2).flatten(1)
@@ -217,51 +208,10 @@ class InterpenetrationPairs(nn.Module):
     def radial_square(
         self, near: NearNodes
     ) -> tuple[Float[Tensor, " p"], Float[Tensor, "p 3"], Float[Tensor, "p 3 3"]]:
-        """`R^2` of nodes with its first and second derivatives in their position in B's frame.
-
-        With the squares a, b, c of the straightened, scaled coordinates, `R^2 = M_e1(M_e2(a, b),
-        c)` where `M_e(a, b) = (a^(1/e) + b^(1/e))^e`. As M is homogeneous of degree one, its second
-        derivatives follow from the first ones, and nothing is singular where a coordinate vanishes.
-        """
+        """`R^2` of nodes with its first and second derivatives in their position in B's frame."""
         part = self.second[near.pair][near.owner]
-        a1, a2, a3, e1, e2, tx, ty = self.shape[part].unbind(-1)
-        x, y, z = near.points.unbind(-1)
-        # The taper of the section at height u3 goes on beyond the ends for a while and levels off,
-        # twice differentiable; lx, ly and cx, cy are its derivatives in z, relative to it.
-        h, u3 = self.overhang[part], z / a3
-        past = (u3.abs() - 1).clamp(min=0)
-        level = (past.square() + h.square()).rsqrt()
-        height = u3.clamp(-1, 1) + u3.sign() * h * past * level
-        rise = (h * level) ** 3 / a3
-        turn = -3 * u3.sign() * past * level.square() * rise / a3
-        fx, fy = 1 + tx * height, 1 + ty * height
-        lx, ly, cx, cy = tx * rise / fx, ty * rise / fy, tx * turn / fx, ty * turn / fy
-        i, j, k = 1 / (a1 * fx), 1 / (a2 * fy), 1 / a3
-        u1, u2 = x * i, y * j
-        a, b, c = u1.square(), u2.square(), u3.square()
-        n, n1, n2 = _combine(a, b, e2)
-        value, m, m3 = _combine(n, c, e1)
-        # Derivatives in u: of n, then of R^2.
-        safe = torch.where(n > 0, n, 1)
-        cross = 4 * (1 / e2 - 1) * n1 * n2 / safe
-        bend = 4 * (1 / e1 - 1) * m * m3 / torch.where(value > 0, value, 1)
-        d1, d2, along = n1 * u1, n2 * u2, bend * c / safe
-        g1, g2, g3 = 2 * m * d1, 2 * m * d2, 2 * m3 * u3
-        h11 = m * (2 * n1 + cross * b) + along * d1.square()
-        h22 = m * (2 * n2 + cross * a) + along * d2.square()
-        h12 = along * d1 * d2 - m * cross * u1 * u2
-        h13, h23, h33 = -bend * u3 * d1, -bend * u3 * d2, 2 * m3 + bend * n
-        # From u to the position; the taper makes u1 and u2 depend on z.
-        w1, w2 = -u1 * lx, -u2 * ly
-        s1, s2 = h11 * w1 + h12 * w2 + h13 * k, h12 * w1 + h22 * w2 + h23 * k
-        s3 = h13 * w1 + h23 * w2 + h33 * k
-        hxz, hyz = i * (s1 - g1 * lx), j * (s2 - g2 * ly)
-        hzz = s1 * w1 + s2 * w2 + s3 * k
-        hzz = hzz + g1 * u1 * (2 * lx * lx - cx) + g2 * u2 * (2 * ly * ly - cy)
-        hxx, hxy, hyy = h11 * i * i, h12 * i * j, h22 * j * j
-        gradient = torch.stack([g1 * i, g2 * j, g1 * w1 + g2 * w2 + g3 * k])
-        hessian = torch.stack([hxx, hxy, hxz, hxy, hyy, hyz, hxz, hyz, hzz])
-        return value, gradient.mT, hessian.mT.unflatten(-1, (3, 3))
+        shape = Superquadrics._make(self.table.index_select(1, part).unbind(0))
+        return radial_hessian(shape, *near.points.unbind(-1), bent=self.bent)
 
     def lift(
         self,
@@ -378,20 +328,15 @@ def _nodes(body: BodyModel, rings: int, meridians: int) -> Float[Tensor, "parts 
     return torch.cat([mesh, poles], dim=1)
 
 
-def _combine(a: Tensor, b: Tensor, exponent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """`(a^(1/e) + b^(1/e))^e` for a, b >= 0 and 0 < e <= 1, and its derivatives in a and in b."""
-    most, least = torch.maximum(a, b), torch.minimum(a, b)
-    ratio = least / torch.where(most > 0, most, 1)
-    # Powers as exponentials of logarithms, which a CPU takes in a fraction of the time of `pow`.
-    log_ratio = ratio.clamp(min=torch.finfo(ratio.dtype).tiny).log()
-    power = ((1 / exponent - 1) * log_ratio).exp()
-    power = torch.where(ratio > 0, power, (exponent == 1).to(power))
-    total = 1 + ratio * power
-    of_most = ((exponent - 1) * total.log()).exp()
-    of_least = power * of_most
-    larger = a >= b
-    first, second = torch.where(larger, of_most, of_least), torch.where(larger, of_least, of_most)
-    return most * total * of_most, first, second
+def _extent(body: BodyModel) -> Float[Tensor, "parts 3"]:
+    """Half sides of boxes around the parts, metres; R times as large ones hold what is below R."""
+    axes, rows = body.part_shape[:, :3], Superquadrics.of(body.part_shape)
+    taper = torch.stack([rows.taper_x, rows.taper_y], dim=-1).abs()
+    section = axes[:, :2] * (1 + taper * (1 + rows.overhang[:, None]))
+    # What is bent stays as far from the centre as it was along the axis.
+    anywhere = section.norm(dim=-1) + axes[:, 2]
+    straight = torch.cat([section, axes[:, 2:]], dim=-1)
+    return torch.where((rows.bend != 0)[:, None], anywhere[:, None], straight)
 
 
 @dataclass(frozen=True, kw_only=True)

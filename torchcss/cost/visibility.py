@@ -12,9 +12,8 @@ sight, so that the cost has no jump where a contour is born. (A curve of a stron
 cross more often; the first crossing of either kind is taken.)
 
 **Self-occlusion.** A node is hidden where the stretch of its line of sight from the camera to the
-node enters another part. With R the part's radial function (`R^2 = F^e1`, F the inside-outside
-function of Barr with taper and bend undone; 1 on the surface, and twice as large twice as far
-out), the depth of the entry is the signed distance, to first order,
+node enters another part. With R the part's radial function (`torchcss.body.superquadric`), the
+depth of the entry is the signed distance, to first order,
 
     gap = min over the stretch of (R - 1) / |grad R|
 
@@ -41,6 +40,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchcss.body.model import BodyModel, BodyPose
+from torchcss.body.superquadric import EXPONENTS, Superquadrics, radial_square
 from torchcss.body.surface import SurfaceSample, surface_points
 from torchcss.cost.term import Posed
 
@@ -62,9 +62,6 @@ _STEPS, _SAMPLED_STEPS, _SAMPLES = 3, 4, 12
 
 _MICRO = 1e-10
 """Square of a step too short to tell the curvature from, square metres."""
-
-_LEAST_POWER, _MOST_SQUARE = 1e-30, 64.0
-"""Bounds on powers and on squared coordinates, so that single precision holds all products."""
 
 _ROUNDING = 1e-6
 """Relative error of a squared distance in single precision, with a margin."""
@@ -331,44 +328,11 @@ def line_of_sight(
     return visible, torch.ones_like(visible) if beside is None else free
 
 
-class _Shape(NamedTuple):
-    """Numbers of a part, as `_radial_square` takes them; one per line of sight, or a table's row.
-
-    Attributes:
-        ia, ib, ic: Reciprocal semi-axes.
-        around: Exponent `1/e2 - 1`.
-        section: Exponent `e2/e1 - 1`.
-        along: Exponent `1/e1 - 1`.
-        whole: Exponent `e1 - 1`.
-        taper_x, taper_y: As in `torchcss.body.surface`.
-        bend: Curvature of the axis, per metre.
-        c, s: Cosine and sine of the direction of the bend.
-    """
-
-    ia: Tensor
-    ib: Tensor
-    ic: Tensor
-    around: Tensor
-    section: Tensor
-    along: Tensor
-    whole: Tensor
-    taper_x: Tensor
-    taper_y: Tensor
-    bend: Tensor
-    c: Tensor
-    s: Tensor
-
-    def narrowed(self, w: Tensor) -> tuple[Tensor, Tensor]:
-        """Reciprocal semi-axes of the cross-section at a height in units of the third."""
-        height = w.clamp(-1, 1)  # beyond the ends the taper is held
-        return self.ia / (1 + self.taper_x * height), self.ib / (1 + self.taper_y * height)
-
-
 class _Parts(NamedTuple):
     """Shapes of all parts.
 
     Attributes:
-        table: The rows of `_Shape`, one column per part.
+        table: The fields of `Superquadrics`, one column per part.
         radius: Of the sphere outside which a part hides nothing, metres.
         around: Reciprocal semi-axes of an ellipsoid outside which a part hides nothing.
         within: Squared radius, of a plain part's own ellipsoid, at which it hides for sure.
@@ -386,21 +350,19 @@ class _Parts(NamedTuple):
     plain: Bool[Tensor, " parts"]
     bent: bool
 
-    def shapes(self, part: Int[Tensor, " m"]) -> _Shape:
+    def shapes(self, part: Int[Tensor, " m"]) -> Superquadrics:
         """The shapes of some of them."""
-        return _Shape._make(self.table.index_select(1, part).unbind(0))
+        return Superquadrics._make(self.table.index_select(1, part).unbind(0))
 
 
 def _tabulate(shape: Float[Tensor, "parts 9"], margin: float) -> _Parts:
-    axes, taper, (bend, direction) = shape[:, :3], shape[:, 5:7], shape[:, 7:].unbind(-1)
-    # From all but a box to a diamond; powers beyond these leave single precision.
-    exponents = shape[:, 3:5].clamp(0.1, 2.0)
+    axes, exponents = shape[:, :3], shape[:, 3:5].clamp(*EXPONENTS)
     e1, e2 = exponents.unbind(-1)
-    table = [*(1 / axes).unbind(-1), 1 / e2 - 1, e2 / e1 - 1, 1 / e1 - 1, e1 - 1]
-    table += [*taper.unbind(-1), bend, direction.cos(), direction.sin()]
+    rows = Superquadrics.of(shape)
+    taper = torch.stack([rows.taper_x, rows.taper_y], dim=-1)
     widest = axes[:, :2] * (1 + taper.abs())
     section = _farthest(widest[:, 0], widest[:, 1], e2)
-    is_bent = bend.abs() >= _LEAST_BEND
+    is_bent = rows.bend.abs() >= _LEAST_BEND
     is_round = ((exponents > 0.65) & (exponents < 1.05)).all(-1)
     # A bent axis ends no farther out than a straight one, but the section may stand off its end.
     straight = _farthest(section, axes[:, 2], e1)
@@ -413,7 +375,7 @@ def _tabulate(shape: Float[Tensor, "parts 9"], margin: float) -> _Parts:
     narrowest = torch.cat([axes[:, :2] * (1 - taper.abs()), axes[:, 2:]], dim=-1).amin(-1)
     within = (1 / smaller - margin / narrowest).clamp(min=0).square()
     return _Parts(
-        torch.stack(table),
+        torch.stack(rows),
         radius,
         1 / around.mT,
         within,
@@ -629,7 +591,7 @@ def _gap(
     shape, along = parts.shapes(lines.part), lines.along
 
     def slope(s: Tensor) -> Tensor:
-        _, (gx, gy, gz) = _radial_square(shape, *lines.point(s), bent=bent)
+        _, (gx, gy, gz) = radial_square(shape, *lines.point(s), bent=bent)
         return gx * along[0] + gy * along[1] + gz * along[2]
 
     last, before = s, slope(s)
@@ -641,14 +603,14 @@ def _gap(
         secant = torch.minimum(torch.maximum(secant, 0.3 * curvature), 10 * curvature)
         last, before = s, now
         s = lines.clamp(s - now / secant)
-    square, (gx, gy, gz) = _radial_square(shape, *lines.point(s), bent=bent)
+    square, (gx, gy, gz) = radial_square(shape, *lines.point(s), bent=bent)
     radial = square.sqrt()
     # grad R = grad(R^2) / 2 R
     steepness = (gx.square() + gy.square() + gz.square()).sqrt().clamp(min=_TINY)
     return (radial - 1) * radial / steepness
 
 
-def _ellipsoid_minimum(shape: _Shape, lines: _Stretches) -> _Triple:
+def _ellipsoid_minimum(shape: Superquadrics, lines: _Stretches) -> _Triple:
     """Where a stretch is nearest to the tapered ellipsoid, the curvature of R^2/2, and R^2."""
     (x, y, z), (dx, dy, dz) = lines.foot, lines.along
     z, dz = z * shape.ic, dz * shape.ic
@@ -673,7 +635,7 @@ def _sampled_minima(parts: _Parts, lines: _Stretches) -> tuple[_Stretches, Tenso
     shape, along = parts.shapes(lines.part), lines.along
     places = torch.linspace(0, 1, _SAMPLES, device=lines.end.device)[:, None]
     s = torch.lerp(lines.begin, lines.end, places)
-    _, (gx, gy, gz) = _radial_square(shape, *lines.point(s), bent=parts.bent)
+    _, (gx, gy, gz) = radial_square(shape, *lines.point(s), bent=parts.bent)
     rise = gx * along[0] + gy * along[1] + gz * along[2]
     # A minimum is where a fall meets a climb, or at an end. It lies between samples k - 1 and k.
     falls, anything = rise < 0, torch.ones_like(rise[:1], dtype=torch.bool)
@@ -687,68 +649,6 @@ def _sampled_minima(parts: _Parts, lines: _Stretches) -> tuple[_Stretches, Tenso
     change, width = (fall + climb).clamp(min=_TINY), upper - lower
     lines = lines._replace(begin=lower, end=upper)
     return lines, lower + width * fall / change, change / width.clamp(min=_TINY)
-
-
-def _radial_square(
-    shape: _Shape, x: Tensor, y: Tensor, z: Tensor, *, bent: bool
-) -> tuple[Tensor, _Triple]:
-    """`R^2` at points of the part's frame, and half its gradient there.
-
-    With u, v, w the coordinates of the straightened point in units of the semi-axes,
-    `F = (|u|^(2/e2) + |v|^(2/e2))^(e2/e1) + |w|^(2/e1)` and `R^2 = F^e1`.
-    """
-    cosine = sine = stretch = x
-    if bent:
-        x, y, z, cosine, sine, stretch = _unbend(shape, x, y, z)
-    w = z * shape.ic
-    height = w.clamp(-1, 1)  # beyond the ends the taper is held
-    fx = (1 + shape.taper_x * height).clamp(min=1e-3)
-    fy = (1 + shape.taper_y * height).clamp(min=1e-3)
-    ix, iy = shape.ia / fx, shape.ib / fy
-    u, v = x * ix, y * iy
-    uu, vv, ww = (a.square().clamp(_TINY, _MOST_SQUARE) for a in (u, v, w))
-    # Weights of u, v and w in the gradient of F, but for the factor 2 / e1.
-    pu, pv, pw = _power(uu, shape.around), _power(vv, shape.around), _power(ww, shape.along)
-    of_u, of_v = pu * uu, pv * vv
-    section = (of_u + of_v).clamp(min=_LEAST_POWER)
-    outer = _power(section, shape.section)
-    total = (outer * section + pw * ww).clamp(min=_LEAST_POWER)
-    scale = _power(total, shape.whole)
-    outer = outer * scale
-    gx, gy = outer * pu * u * ix, outer * pv * v * iy
-    narrowing = (of_u * shape.taper_x / fx + of_v * shape.taper_y / fy) * (w == height)
-    gz = (scale * pw * w - outer * narrowing) * shape.ic
-    if bent:
-        along, across = shape.c * gx + shape.s * gy, shape.c * gy - shape.s * gx
-        gz = gz / stretch
-        along, gz = cosine * along + sine * gz, cosine * gz - sine * along
-        gx, gy = shape.c * along - shape.s * across, shape.s * along + shape.c * across
-    return total * scale, (gx, gy, gz)
-
-
-def _power(base: Tensor, exponent: Tensor) -> Tensor:
-    """`base ** exponent` for positive bases, to a relative 1e-5 in single precision.
-
-    On a CPU `pow` takes up to seven times as long, and least for exponents that are whole.
-    """
-    return (base.log() * exponent).exp()
-
-
-def _unbend(
-    shape: _Shape, x: Tensor, y: Tensor, z: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Straightened point, cosine and sine of the axis' turn there, and the stretch along it."""
-    towards, across = shape.c * x + shape.s * y, shape.c * y - shape.s * x
-    # In units of the radius of the bend, seen from its centre.
-    cosine, sine = 1 - shape.bend * towards, shape.bend * z
-    stretch = torch.hypot(cosine, sine).clamp(min=1e-3)
-    # (1 - stretch) / bend, without cancellation where the bend is slight.
-    towards = (2 * towards - shape.bend * (towards.square() + z.square())) / (1 + stretch)
-    curved = shape.bend.abs() >= _LEAST_BEND
-    angle = torch.atan2(sine, cosine)
-    z = torch.where(curved, angle / torch.where(curved, shape.bend, 1.0), z)
-    x, y = shape.c * towards - shape.s * across, shape.s * towards + shape.c * across
-    return x, y, z, cosine / stretch, sine / stretch, stretch
 
 
 def _curves(
