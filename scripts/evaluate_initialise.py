@@ -47,7 +47,7 @@ SYNTHETIC: dict[str, dict[str, float]] = {
     "the same, told which": {"outliers": 0.05},
 }
 TOLD = "the same, told which"
-"""Gross outliers have confidence zero: what no method that must find them can surpass."""
+"""Outliers have confidence zero: what no method that must find them can surpass."""
 CLIPS = {
     "beam, camera 1": ("balance_beam_4cam", "cam01.mp4", "keypoints2d_cam01.npz"),
     "beam, camera 3": ("balance_beam_4cam", "cam03.mp4", "keypoints2d_cam03.npz"),
@@ -125,7 +125,7 @@ def cases(config: Config, condition: str) -> Iterator[tuple[int, Case]]:
             generator = torch.Generator().manual_seed(seed)
             person = random_person(generator=generator, **SYNTHETIC[condition])  # type: ignore[arg-type]
             noise = SYNTHETIC[condition].get("noise_px", 2.0)
-            known = person.gross if condition == TOLD else torch.zeros_like(person.gross)
+            known = person.is_outlier if condition == TOLD else torch.zeros_like(person.is_outlier)
             yield seed, Case(
                 person.camera,
                 Keypoints(person.keypoints, person.confidence, person.joint_names).without(known),

@@ -50,8 +50,8 @@ def some_nodes(*batch: int, count: int = 30, generator: torch.Generator) -> Cont
 
 
 def some_images(count: int, generator: torch.Generator) -> RegionImages:
-    likeness = 2 * torch.rand(3, HEIGHT, WIDTH, generator=generator, dtype=torch.float64) - 1
-    field = region_field(likeness)
+    ratio = 2 * torch.rand(3, HEIGHT, WIDTH, generator=generator, dtype=torch.float64) - 1
+    field = region_field(ratio)
     field = field._replace(coefficients=field.coefficients.double())
     return RegionImages(field, torch.arange(count) % 3)
 
@@ -101,8 +101,8 @@ def test_derivatives_per_point_are_those_of_autograd(
 
 def test_a_perfect_outline_costs_nothing_and_an_inverted_one_everything() -> None:
     camera, term = make_camera(), RegionTerm()
-    likeness = torch.full((1, HEIGHT, WIDTH), -1.0, dtype=torch.float64)
-    likeness[:, :, :40] = 1.0
+    ratio = torch.full((1, HEIGHT, WIDTH), -1.0, dtype=torch.float64)
+    ratio[:, :, :40] = 1.0
     edge = torch.tensor([[39.5, 30.0]])
     points = torch.cat([(edge - torch.tensor([39.5, 29.5])) / torch.tensor([70.0, 72.0]) * 2.0,
                         torch.full((1, 1), 2.0)], dim=-1).double()  # fmt: skip
@@ -111,9 +111,9 @@ def test_a_perfect_outline_costs_nothing_and_an_inverted_one_everything() -> Non
     layer = torch.zeros(1, dtype=torch.long)
     for normals, cost in ((outward, 0.0), (-outward, 1.0)):
         nodes = ContourNodes(points, normals, one, one)
-        value = term.value(nodes, camera, RegionImages(region_field(likeness), layer))
+        value = term.value(nodes, camera, RegionImages(region_field(ratio), layer))
         assert float(value) == pytest.approx(cost, abs=0.1)
-        nothing = RegionImages(region_field(0 * likeness), layer)
+        nothing = RegionImages(region_field(0 * ratio), layer)
         assert float(term.value(nodes, camera, nothing)) == 0.5
 
 

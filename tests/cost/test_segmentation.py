@@ -40,7 +40,7 @@ def plain_twin(
     for row, line in enumerate(parts.tolist()):
         for column, part in enumerate(line):
             if part >= 0:
-                total += float(images.likeness[images.layer[part], row, column])
+                total += float(images.ratio[images.layer[part], row, column])
     return 1 - total / images.area
 
 
@@ -50,8 +50,8 @@ def test_it_is_the_sum_of_the_covered_pixels(batch: tuple[int, ...], dtype: torc
     body, camera = a_body_before_a_camera(dtype)
     generator = torch.Generator().manual_seed(0)
     term = SegmentationTerm(reduction=12)
-    likeness = torch.rand(layers(body)[0], 600, 480, generator=generator).to(dtype) * 2 - 1
-    images = term.images(likeness, layers(body)[1], camera, body, body.rest)
+    ratio = torch.rand(layers(body)[0], 600, 480, generator=generator).to(dtype) * 2 - 1
+    images = term.images(ratio, layers(body)[1], camera, body, body.rest)
     x = body.rest + 0.3 * torch.randn(
         *batch, len(body.rest), generator=generator, dtype=torch.float64
     ).to(dtype)
@@ -78,8 +78,8 @@ def test_a_limb_that_is_left_uncovered_counts() -> None:
     body, camera = a_body_before_a_camera()
     term = SegmentationTerm()
     truth, hidden = moved(body, 1.2), moved(body, 0.0)
-    likeness = painted(body, camera, truth).clamp(min=0)  # nothing looks like background
-    images = term.images(likeness, layers(body)[1], camera, body, truth)
+    ratio = painted(body, camera, truth).clamp(min=0)  # nothing looks like background
+    images = term.images(ratio, layers(body)[1], camera, body, truth)
     values = term.value(body, torch.stack([truth, hidden]), images)
     assert float(values[0]) < float(values[1]) - 0.05
 
@@ -92,8 +92,8 @@ def test_out_of_the_picture_and_behind_the_camera_nothing_is_said() -> None:
             torch.eye(3, dtype=torch.float64), torch.tensor(place, dtype=torch.float64)
         )
         count, layer = layers(away)
-        likeness = torch.ones(count, 600, 480, dtype=torch.float64)
-        images = term.images(likeness, layer, camera, away, away.rest)
+        ratio = torch.ones(count, 600, 480, dtype=torch.float64)
+        images = term.images(ratio, layer, camera, away, away.rest)
         assert images.area > 0
         assert float(term.value(away, away.rest, images)) == 1.0
 
@@ -103,9 +103,9 @@ def test_pictures_of_odd_and_of_very_small_sizes(size: tuple[int, int]) -> None:
     body, camera = a_body_before_a_camera()
     odd = camera.resized(*size)
     count, layer = layers(body)
-    likeness = torch.ones(count, size[1], size[0], dtype=torch.float64)
-    images = SegmentationTerm().images(likeness, layer, odd, body, body.rest)
-    assert images.likeness.shape[-2:] == images.camera.image_size_wh[::-1]
+    ratio = torch.ones(count, size[1], size[0], dtype=torch.float64)
+    images = SegmentationTerm().images(ratio, layer, odd, body, body.rest)
+    assert images.ratio.shape[-2:] == images.camera.image_size_wh[::-1]
     assert bool(SegmentationTerm().value(body, body.rest, images).isfinite())
 
 

@@ -134,8 +134,8 @@ def test_derivatives_are_those_of_autograd(place: str) -> None:
 def test_an_empty_picture_pushes_the_body_nowhere(dtype: torch.dtype) -> None:
     body, camera = a_body_before_a_camera(dtype)
     points = nodes(body, body.rest)
-    for likeness, level in ((math.nan, 0.0), (0.2, 0.5), (-1.0, 0.5)):
-        everywhere = torch.full((600, 480), likeness, dtype=dtype)
+    for ratio, level in ((math.nan, 0.0), (0.2, 0.5), (-1.0, 0.5)):
+        everywhere = torch.full((600, 480), ratio, dtype=dtype)
         images = SilhouetteTerm().images(everywhere, camera, points, 0.0)
         assert len(images.points) == 0
         cost = SilhouetteTerm().point_cost(points, images)

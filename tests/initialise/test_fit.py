@@ -132,12 +132,14 @@ def test_hypotheses_are_the_fits_and_then_samples(found: Initialisation):
 
 def test_gross_marks_are_named_and_the_pose_is_that_without_them():
     someone = person(8, outliers=0.05)
-    gross = {
-        name for name, is_gross in zip(someone.joint_names, someone.gross, strict=True) if is_gross
+    outliers = {
+        name
+        for name, is_outlier in zip(someone.joint_names, someone.is_outlier, strict=True)
+        if is_outlier
     }
-    assert gross == {"r_wrist", "r_knee", "l_ankle"}
+    assert outliers == {"r_wrist", "r_knee", "l_ankle"}
     found = find(someone, num_modes=2)
-    assert set(found.left_out) == gross
+    assert set(found.left_out) == outliers
     assert any("left out" in line and "r_knee" in line for line in found.report)
     # What is left costs no more than marks with nothing but noise.
     assert float(found.cost[0]) < 8

@@ -61,10 +61,10 @@ def test_a_mark_that_is_elsewhere_is_left_out_and_no_other(name: str):
     fits = best_distinct(refine(cost, someone.state[None], search))
     assert not bool(find_outliers(cost, fits, search).any())
     spoilt = moved(cost, mark, (180.0, -120.0))
-    gross = find_outliers(
+    outliers = find_outliers(
         spoilt, best_distinct(refine(spoilt, someone.state[None], search)), search
     )
-    assert torch.nonzero(gross)[:, 0].tolist() == [mark]
+    assert torch.nonzero(outliers)[:, 0].tolist() == [mark]
 
 
 def test_where_very_many_marks_do_not_fit_none_is_left_out(generator: torch.Generator):
@@ -85,25 +85,25 @@ def test_no_mark_costs_more_than_leaving_it_out():
     assert torch.equal(capped_cost(cost, x[0, 0]), cost.value(x[0, 0]))
     mark = someone.joint_names.index("r_elbow")
     far = moved(cost, mark, (0.0, 900.0))
-    gross = torch.arange(14) == mark
+    outliers = torch.arange(14) == mark
     price = price_of_leaving_out(cost)[mark]
     torch.testing.assert_close(
-        capped_cost(far, x), without(far, gross).value(x) + price, rtol=1e-12, atol=0.0
+        capped_cost(far, x), without(far, outliers).value(x) + price, rtol=1e-12, atol=0.0
     )
 
 
 def test_every_item_is_without_its_own_marks(generator: torch.Generator):
     someone, cost = person_and_cost()
-    gross = torch.rand(5, 14, generator=generator) < 0.3
+    outliers = torch.rand(5, 14, generator=generator) < 0.3
     noise = torch.randn(5, len(someone.state), generator=generator, dtype=torch.float64)
     x = someone.body.bounds.project(someone.state + 0.05 * noise)
-    together = without(cost, gross)
+    together = without(cost, outliers)
     items = torch.tensor([3, 0, 4])
     for model, rows in (
         (together.local_model(x), range(5)),
         (together.take(items).local_model(x[items]), items.tolist()),
     ):
         for place, row in enumerate(rows):
-            alone = without(cost, gross[row]).local_model(x[row])
+            alone = without(cost, outliers[row]).local_model(x[row])
             for one, all_of_them in zip(alone, model, strict=True):
                 torch.testing.assert_close(all_of_them[place], one, rtol=1e-9, atol=1e-9)

@@ -22,7 +22,13 @@ from torchcss.inference.mixture import GaussianMixture
 from torchcss.studies.render.renderer import Lighting, Mesh, random_texture, render_meshes
 from torchcss.tracking.session import Posterior
 from torchcss.tracking.settings import Settings
-from torchcss.tracking.surface_prediction import Carrier, Displaced, Sight, SurfaceCost, trunk_of
+from torchcss.tracking.surface_prediction import (
+    Displaced,
+    PicturePair,
+    SurfaceCost,
+    SurfaceMotion,
+    trunk_of,
+)
 from torchcss.types import Frame
 from torchcss.vision.camera import Camera
 from torchcss.vision.contrast import local_contrast
@@ -100,20 +106,20 @@ def seen(x: Tensor, **how: bool | float) -> SplineField:
     return spline_field(local_contrast(picture(x, **how)))  # type: ignore[arg-type]
 
 
-def sight(before: Tensor, now: Tensor) -> Sight:
-    return Sight(the_camera(), seen(before), seen(now))
+def sight(before: Tensor, now: Tensor) -> PicturePair:
+    return PicturePair(the_camera(), seen(before), seen(now))
 
 
 def carry(
     before: Tensor,
-    sights: Iterable[Sight],
+    pairs: Iterable[PicturePair],
     *,
     velocity: Tensor | None = None,
     expected: Tensor | None = None,
 ) -> Tensor:
-    return Carrier(the_body())(
+    return SurfaceMotion(the_body())(
         the_body(),
-        list(sights),
+        list(pairs),
         before=before,
         velocity=torch.zeros_like(before) if velocity is None else velocity,
         expected=before if expected is None else expected,
@@ -133,7 +139,7 @@ def turn_between(x: Tensor, other: Tensor) -> Tensor:
 
 
 @cache
-def scene() -> tuple[Tensor, Tensor, Sight]:
+def scene() -> tuple[Tensor, Tensor, PicturePair]:
     """A pose, the same turned by eight degrees, and what is seen of the two."""
     before = poses()
     after = turned(before, 8.0)
@@ -174,7 +180,7 @@ def test_another_light_is_no_other_surface() -> None:
 def test_a_plain_surface_says_little() -> None:
     """Without texture there is light and the rim; the last motion is not thrown over."""
     before, after, _ = scene()
-    view = Sight(the_camera(), seen(before[0], plain=True), seen(after[0], plain=True))
+    view = PicturePair(the_camera(), seen(before[0], plain=True), seen(after[0], plain=True))
     found = carry(before, [view])
     assert abs(float(turn_between(before, found))) < 8
 
@@ -206,7 +212,7 @@ def test_without_two_pictures_nothing_moves(lacks: str) -> None:
 
 def test_without_an_expected_motion_nothing_moves() -> None:
     before, _, view = scene()
-    found = Carrier(the_body())(
+    found = SurfaceMotion(the_body())(
         the_body(),
         [view],
         before=before,
@@ -231,7 +237,7 @@ def test_limits_hold() -> None:
 
 def a_cost(generator: torch.Generator) -> tuple[SurfaceCost, Tensor]:
     before, _, view = scene()
-    carrier, body = Carrier(the_body()), the_body()
+    carrier, body = SurfaceMotion(the_body()), the_body()
     two = torch.cat([before, turned(before, 4.0)])
     columns = carrier.columns
     cost = SurfaceCost(
@@ -268,9 +274,9 @@ def test_hessian_is_that_of_gauss_and_newton(generator: torch.Generator) -> None
     assert torch.linalg.eigvalsh(hessian).min() > 0
     # At the pose that the picture shows, where all nodes agree, it is the Hessian.
     still = seen(poses()[0])
-    view = Sight(the_camera(), still, still)
+    view = PicturePair(the_camera(), still, still)
     before = poses()
-    carrier = Carrier(the_body())
+    carrier = SurfaceMotion(the_body())
     alike = SurfaceCost(
         body=cost.body, nodes=cost.nodes, chosen=cost.chosen,
         views=carrier.views(cost.body, [view], before), columns=cost.columns, held=before,
@@ -300,7 +306,7 @@ def test_single_precision_and_another_base() -> None:
     there, goal = before.clone(), after.clone()
     there[:, 2] -= 0.1
     goal[:, 2] -= 0.1
-    carrier = Carrier(load_body("body34", dtype=torch.float32))
+    carrier = SurfaceMotion(load_body("body34", dtype=torch.float32))
     single = load_body("body34", dtype=torch.float32).with_base(
         body.base_rotation.float(), body.base_translation.float()
     )
@@ -311,7 +317,7 @@ def test_single_precision_and_another_base() -> None:
     x = there.float()
     found = carrier(
         single,
-        [Sight(camera, *fields)],
+        [PicturePair(camera, *fields)],
         before=x,
         velocity=torch.zeros_like(x),
         expected=x,
@@ -326,7 +332,7 @@ def test_only_a_body_with_a_root_has_a_trunk() -> None:
     columns, parts = trunk_of(arm)
     assert len(columns) == 0
     assert not parts.any()
-    carrier, x = Carrier(arm), arm.rest[None]
+    carrier, x = SurfaceMotion(arm), arm.rest[None]
     assert not carrier.knows
     _, _, view = scene()
     found = carrier(

@@ -113,7 +113,7 @@ class FrameCosts:
     ) -> Appearance | None:
         """Take in what body and surroundings look like in a frame.
 
-        None without a term that asks for it, and of a body without flesh.
+        None without a term that asks for it, and of a body without parts.
 
         Args:
             appearance: What was known before; None: nothing.

@@ -1,4 +1,4 @@
-"""Interpenetration: repulsive potentials between parts of flesh, section 3.2.4 [IJRR].
+"""Interpenetration: repulsive potentials between parts, section 3.2.4 [IJRR].
 
 Every part B repels the surface nodes of every other part A that it may collide with:
 
@@ -341,7 +341,7 @@ def _extent(body: BodyModel) -> Float[Tensor, "parts 3"]:
 
 @dataclass(frozen=True, kw_only=True)
 class Interpenetration(Term):
-    """The repulsive potential between parts of flesh.
+    """The repulsive potential between parts.
 
     Attributes:
         weight: Nats that a part costs whose nodes all lie on the surface of another one. The

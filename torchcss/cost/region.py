@@ -1,9 +1,9 @@
 """Region term: just inside its contour the image looks like the part, just outside it does not.
 
 Clutter has edges too, and hidden limbs attach to them (section 8 [IJRR], which therefore weighs
-contours by foreground and background). Here colours are a term of their own. The likeness L of a
-part (`torchcss.vision.appearance`), in -1..1, is looked up a few pixels to either side of every
-contour node r, along its outward normal m in the image:
+contours by foreground and background). Here colours are a term of their own. The foreground
+log-likelihood ratio L of a part (`torchcss.vision.appearance`), in -1..1, is looked up a few pixels
+to either side of every contour node r, along its outward normal m in the image:
 
     e(r) = nu / 2 (1 - (L(r - d m) - L(r + d m)) / 2)
 
@@ -17,7 +17,7 @@ Where the colours come from: `region_masks` tells which pixels a pose assigns to
 its surroundings. Parts that look alike share a layer (`part_layers`), and what has a part's own
 colours is not outside it: the next part of the limb, where there is no contour.
 
-By default: `region_field(likeness)` once per frame, `RegionImages(field, layer)`, then
+By default: `region_field(ratio)` once per frame, `RegionImages(field, layer)`, then
 `RegionTerm().point_cost(...)`; `torchcss.cost.frame` does it.
 """
 
@@ -84,18 +84,18 @@ def layer_of_part(body: BodyModel) -> Int[Tensor, " parts"]:
     return torch.tensor(part_layers(body)[1], dtype=torch.long, device=body.tie.device)
 
 
-def region_field(likeness: Float[Tensor, "layers h w"], *, smoothing: float = 3.0) -> SplineField:
+def region_field(ratio: Float[Tensor, "layers h w"], *, smoothing: float = 3.0) -> SplineField:
     """Make the likenesses of a frame smooth functions.
 
     Args:
-        likeness: How much each pixel looks like each layer, in -1..1.
+        ratio: How much each pixel looks like each layer, in -1..1.
         smoothing: Standard deviation of the blur, pixels. On the beam clip 3 tells good poses from
             lost ones by a quarter more than 1 does; with more, thin limbs fade.
     """
     size = 2 * math.ceil(3.0 * smoothing) + 1
     # Single precision is far finer than the colours, and twice as fast.
     blurred = kornia.filters.gaussian_blur2d(
-        likeness[None].float(), (size, size), (smoothing, smoothing), border_type="replicate"
+        ratio[None].float(), (size, size), (smoothing, smoothing), border_type="replicate"
     )
     return spline_field(blurred[0])
 

@@ -3,13 +3,13 @@
 The terms of the contour look at the outline of the pose at hand. A limb that has slipped onto a
 chair keeps an outline, and the true one, left uncovered, costs nothing. Here every pixel counts:
 each that the pose covers is worth what its colour says for the part seen there against that part's
-surroundings (`Appearance.likeness`), and a pixel that is left uncovered is worth nothing. The sum
-is the log-likelihood ratio of a segmentation into the parts of the body and the rest, up to the
-tanh that keeps single pixels from deciding.
+surroundings (`Appearance.foreground_ratio`), and a pixel that is left uncovered is worth nothing.
+The sum is the log-likelihood ratio of a segmentation into the parts of the body and the rest, up to
+the tanh that keeps single pixels from deciding.
 
 It has no derivatives in the pose, and is dear. It therefore stays out of the descents, and is asked
 of the minima that they find, where the weights are made (step 3 of Fig. 6 [IJRR]):
-`TrackingCost.unsearched`. The papers have no such term; section 8 [IJRR] expects help of
+`TrackingCost.weight_only`. The papers have no such term; section 8 [IJRR] expects help of
 silhouettes. Here it tells good modes from bad ones better than the weights of all other terms do
 (`docs/findings.md`).
 
@@ -44,21 +44,21 @@ class SegmentationImages(NamedTuple):
 
     Attributes:
         camera: Camera of the reduced images.
-        likeness: How much each pixel looks like each layer, in -1..1; a last image of zeros stands
+        ratio: How much each pixel looks like each layer, in -1..1; a last image of zeros stands
             for what is no part.
         layer: Layer of each part, and last that of no part.
         area: Pixels that the body was expected to cover.
     """
 
     camera: Camera
-    likeness: Float[Tensor, "layers h w"]
+    ratio: Float[Tensor, "layers h w"]
     layer: Int[Tensor, " parts"]
     area: float
 
 
 @dataclass(frozen=True, kw_only=True)
 class SegmentationTerm(Term):
-    """The likeness of all covered pixels, against the area of the body.
+    """The foreground log-likelihood ratio of all covered pixels, against the area of the body.
 
     Attributes:
         weight: Nats per share of the body's area.
@@ -94,7 +94,7 @@ class SegmentationTerm(Term):
 
     def images(
         self,
-        likeness: Float[Tensor, "layers h w"],
+        ratio: Float[Tensor, "layers h w"],
         layer_of_part: Int[Tensor, " parts"],
         camera: Camera,
         body: BodyModel,
@@ -103,7 +103,7 @@ class SegmentationTerm(Term):
         """Prepare a frame.
 
         Args:
-            likeness: How much each pixel looks like each layer, in -1..1.
+            ratio: How much each pixel looks like each layer, in -1..1.
             layer_of_part: Layer of each part of the body.
             camera: Camera of the image.
             body: The body on this frame's base.
@@ -111,16 +111,16 @@ class SegmentationTerm(Term):
         """
         small = camera.scaled(1 / self.reduction)
         width, height = small.image_size_wh
-        reduced = functional.adaptive_avg_pool2d(likeness[None].to(body.tie), (height, width))[0]
+        reduced = functional.adaptive_avg_pool2d(ratio[None].to(body.tie), (height, width))[0]
         padded = functional.pad(reduced, (0, 0, 0, 0, 0, 1))
-        layer = functional.pad(layer_of_part, (0, 1), value=len(likeness))
+        layer = functional.pad(layer_of_part, (0, 1), value=len(ratio))
         area = int((self._parts(body, expected, small) >= 0).sum())
         return SegmentationImages(small, padded, layer, float(max(area, _FEWEST_PIXELS)))
 
     def value(
         self, body: BodyModel, x: Float[Tensor, "*batch n"], images: SegmentationImages
     ) -> Float[Tensor, "*batch"]:
-        """One, less the likeness summed over the covered pixels as a share of the body's area.
+        """One, less the ratio summed over the covered pixels as a share of the body's area.
 
         Zero is a body whose every pixel looks like what it is, one is a body of which nothing is
         known or which covers nothing, two one that lies where nothing looks like it.
@@ -133,7 +133,7 @@ class SegmentationTerm(Term):
         # The part of no part is -1, the last entry.
         layer = images.layer[self._parts(body, x, images.camera)]
         batch, (height, width) = layer.shape[:-2], layer.shape[-2:]
-        seen = images.likeness.expand(*batch, -1, height, width).gather(-3, layer[..., None, :, :])
+        seen = images.ratio.expand(*batch, -1, height, width).gather(-3, layer[..., None, :, :])
         return 1 - seen.sum((-3, -2, -1)) / images.area
 
     def _parts(self, body: BodyModel, x: Tensor, camera: Camera) -> Tensor:

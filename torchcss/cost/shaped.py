@@ -3,13 +3,13 @@
     f(x, z) = joints(x) + priors(x) + outlines(x, z) + 1/2 z^T P z
 
 `x` is the state of a body (lengths included, if they are free), `z` its shape parameters
-(`torchcss.body.shape`), P the precision of their prior. Joints do not see the flesh; outlines, by
+(`torchcss.body.shape`), P the precision of their prior. Joints do not see the shape; outlines, by
 their edges and by the colours on either side, see both. Contour nodes and their edges are found
 fresh at every (x, z), and the derivatives hold them fixed, as everywhere: a node keeps its angles
 on the part's surface and moves with pose and shape.
 
-Every item has flesh of its own, so items are worked off one after another. Make a `ShapedCost` and
-give it to the optimiser; hold variables by bounds of no width.
+Every item has a shape of its own, so items are worked off one after another. Make a `ShapedCost`
+and give it to the optimiser; hold variables by bounds of no width.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class ShapedCost:
     """Cost of pose and shape; a `CostFunction` on states followed by shape parameters.
 
     Attributes:
-        base: The terms that do not see the flesh; its body has the shape from which z counts.
+        base: The terms that do not see the shape; its body has the shape from which z counts.
         parameters: Which shape numbers are free.
         outlines: The terms that do.
     """
@@ -82,16 +82,16 @@ class ShapedCost:
         state, z = x[:, :n], x[:, n:]
         plain = self.base.local_model(state)
         items = range(len(x) if self.outlines else 0)
-        flesh = [self._outlines(state[item], z[item]) for item in items]
+        outlines = [self._outlines(state[item], z[item]) for item in items]
         pull = z @ self.parameters.precision
         prior = 0.5 * (pull * z).sum(-1)
         gradient = torch.cat([plain.gradient, pull], dim=-1)
         hessian = x.new_zeros(*x.shape, x.shape[-1])
         hessian[:, :n, :n] = plain.hessian
         hessian[:, n:, n:] = self.parameters.precision
-        if not flesh:
+        if not outlines:
             return LocalModel(plain.value + prior, gradient, hessian)
-        seen = LocalModel(*(torch.stack(field) for field in zip(*flesh, strict=True)))
+        seen = LocalModel(*(torch.stack(field) for field in zip(*outlines, strict=True)))
         return LocalModel(
             plain.value + prior + seen.value, gradient + seen.gradient, hessian + seen.hessian
         )

@@ -83,7 +83,7 @@ class SilhouetteTerm(Term):
         reach: Distance from what may be the body beyond which a node is as far out as can be,
             metres likewise.
         near: Points farther than this from all poses before are no limbs, metres likewise.
-        least: Likeness from which a pixel is of the silhouette; it is bare below.
+        least: Ratio from which a pixel is of the silhouette; it is bare below.
         reduction: Pixels of the image, along each side, to one that is looked at.
         spacing: Distance of the points, as a share of sigma.
         nu: Level of the cost (its unit only).
@@ -140,7 +140,7 @@ class SilhouetteTerm(Term):
 
     def images(
         self,
-        likeness: Float[Tensor, "h w"],
+        ratio: Float[Tensor, "h w"],
         camera: Camera,
         expected: Float[Tensor, "p 3"],
         area: float,
@@ -148,7 +148,7 @@ class SilhouetteTerm(Term):
         """Prepare a frame.
 
         Args:
-            likeness: How much more each pixel looks like the body than like what is behind it,
+            ratio: How much more each pixel looks like the body than like what is behind it,
                 -1..1; NaN where that is not known.
             camera: Camera of the image.
             expected: Nodes of the poses that the body may have had before, metres.
@@ -159,7 +159,7 @@ class SilhouetteTerm(Term):
         # The border of odd sizes is shared out among the reduced pixels.
         degree, may_be = (
             functional.adaptive_avg_pool2d(part[None].to(expected), (height, width))[0]
-            for part in (likeness.nan_to_num(0.0).clamp(min=0), ~(likeness <= self.least))
+            for part in (ratio.nan_to_num(0.0).clamp(min=0), ~(ratio <= self.least))
         )
         uv, depth, valid = small.project(expected)
         # Of a body that is all behind the camera nothing is seen, in whatever unit.

@@ -1,4 +1,4 @@
-"""Several trackers side by side through one pass over a sequence.
+"""Several trackers compared in one pass over a sequence.
 
 All trackers of one seed start from the same first pose (`find_start`) and see the same images.
 `track_together` runs them frame by frame, so that the features of a frame, which do not depend on
@@ -99,7 +99,7 @@ def track_together(
     stop_when_lost: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Iterator[Run]:
-    """Run trackers side by side, frame by frame, through one pass over the video.
+    """Run several trackers, frame by frame, in one pass over the video.
 
     Args:
         sequence: What is tracked.

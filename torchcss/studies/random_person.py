@@ -2,8 +2,8 @@
 
 A person is a body with lengths drawn from the anthropometric prior (within 10 % of the standard
 humanoid), in a pose drawn from the sticky priors, turned any way about the vertical, seen by the
-camera of `torchcss.studies.reprojection`: 1920 x 1080 pixels, at 3.5 m. Marks have Gaussian noise;
-some may be missing, and some may be anywhere in the image.
+camera of `torchcss.studies.reprojection`: 1920 x 1080 pixels, at 3.5 m. Keypoints have Gaussian
+noise; some may be missing, and some may be anywhere in the image.
 
 Call `random_person(generator=...)`, or `random_lengths` for the lengths alone; `coverage` tells
 whether stated covariances hold the truth.
@@ -43,7 +43,7 @@ class Person(NamedTuple):
         joint_names: Names of the marked joints.
         keypoints: Where they are marked, pixels.
         confidence: 0 where a joint is missing, else 1.
-        gross: Whether a mark is a gross outlier, which no fit is told.
+        is_outlier: Whether a keypoint is an outlier, which no fit is told.
     """
 
     body: BodyModel
@@ -52,7 +52,7 @@ class Person(NamedTuple):
     joint_names: tuple[str, ...]
     keypoints: Float[Tensor, "j 2"]
     confidence: Float[Tensor, " j"]
-    gross: Bool[Tensor, " j"]
+    is_outlier: Bool[Tensor, " j"]
 
     def joints_world(self, names: tuple[str, ...]) -> Float[Tensor, "j 3"]:
         """True positions of joints, metres."""
@@ -69,7 +69,7 @@ def random_person(
     missing: float = 0.0,
     outliers: float = 0.0,
 ) -> Person:
-    """Draw a person, the same one for all kinds of marks from the same state of the generator.
+    """Draw a person, the same one for all kinds of keypoints from the same state of the generator.
 
     Args:
         generator: Source of everything.
@@ -92,11 +92,11 @@ def random_person(
     noise = torch.randn(uv.shape, generator=generator, dtype=uv.dtype)
     chance = torch.rand(2, len(index), generator=generator, dtype=uv.dtype)
     anywhere = torch.rand(uv.shape, generator=generator, dtype=uv.dtype)
-    gross = chance[0] < outliers
+    is_outlier = chance[0] < outliers
     anywhere = anywhere * uv.new_tensor([WIDTH, HEIGHT])
-    uv = torch.where(gross[:, None], anywhere, uv + noise_px * noise)
+    uv = torch.where(is_outlier[:, None], anywhere, uv + noise_px * noise)
     confidence = (chance[1] >= missing).to(uv)
-    return Person(body, state, camera, joint_names, uv, confidence, gross)
+    return Person(body, state, camera, joint_names, uv, confidence, is_outlier)
 
 
 def random_lengths(*, generator: torch.Generator, body_name: str = "body34") -> dict[str, float]:

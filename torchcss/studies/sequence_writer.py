@@ -124,7 +124,7 @@ def write_sequence(
 
 def _write_joints(folder: Path, shot: Shot, frames: list[_Joints], noise_px: float) -> None:
     exact = torch.stack([frame.uv for frame in frames])
-    # Its own generator: the noise of the marks does not depend on how the picture was made.
+    # Its own generator: the noise of the keypoints does not depend on how the picture was made.
     generator = torch.Generator().manual_seed(shot.seed + 1)
     noise = torch.randn(exact.shape, generator=generator, dtype=exact.dtype)
     visible = torch.stack([frame.visible for frame in frames]).numpy()

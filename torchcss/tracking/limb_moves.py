@@ -153,7 +153,7 @@ def other_poses(
 
 
 def _without(cost: TrackingCost, body: BodyModel, limb: Limb, x: Float[Tensor, " n"]) -> float:
-    """What the colours cost with so little flesh on a limb that it covers nothing, nats."""
+    """What the colours cost with a limb so thin that it covers nothing, nats."""
     ancestors = body.tree.ancestors
     hung = ancestors[:, body.marker_link[body.joint_index(limb.joint)]]
     beyond = (ancestors[:, body.part_link] >= hung[:, None]).all(0)

@@ -48,7 +48,7 @@ from torchcss.stopwatch import Stopwatch
 from torchcss.tracking.flip_moves import with_flips
 from torchcss.tracking.limb_moves import with_limbs
 from torchcss.tracking.settings import Plan, Settings, make_plan
-from torchcss.tracking.surface_prediction import Carrier, Displaced, Sight
+from torchcss.tracking.surface_prediction import Displaced, PicturePair, SurfaceMotion
 from torchcss.tracking.view import (
     NOTHING_KNOWN,
     NOTHING_SEEN,
@@ -225,7 +225,7 @@ class TrackingSession:
         self.plan: Plan = make_plan(settings, body, views[0], frame_interval)
         self._observers = [self.plan.observer(body, view) for view in views]
         self._bounds = self.plan.bounds
-        self._carrier = Carrier(body) if settings.prediction == "surface" else None
+        self._surface_motion = SurfaceMotion(body) if settings.prediction == "surface" else None
 
     def checkpoint(self) -> SessionState:
         """All that the next frame needs; see `torchcss.tracking.checkpoint` for its tensors."""
@@ -385,16 +385,16 @@ class TrackingSession:
         cost: TrackingCost,
     ) -> SequenceTracker:
         """The tracker whose dynamics know where the pictures have carried each mode's trunk."""
-        if self._carrier is None or not isinstance(tracker, Tracker):
+        if self._surface_motion is None or not isinstance(tracker, Tracker):
             return tracker
-        sights = [
-            Sight(view.camera, seen.contrast_before, seen.contrast)
+        pairs = [
+            PicturePair(view.camera, seen.contrast_before, seen.contrast)
             for view, seen in zip(cost.views, observation.views, strict=True)
         ]
         mean = prior.mixture.mean
-        expected = self._carrier(
+        expected = self._surface_motion(
             self.state.body,
-            sights,
+            pairs,
             before=mean,
             velocity=prior.velocity,
             expected=tracker.dynamics.predict(prior.mixture, prior.velocity).mean,

@@ -14,8 +14,8 @@ frame. Limbs, neck and head come along as they hang: what is small is soon off i
 wall beside it stands still. The papers' trackers follow motion in the cost alone (section 3.1.2
 [IJRR]); trackers of one mode that live on it are older (Bregler and Malik, 1998).
 
-What to call: `Carrier(body)`, once, and in every frame `carrier(...)`; `Displaced` for the dynamics
-of the tracker.
+What to call: `SurfaceMotion(body)`, once, and in every frame `motion(...)`; `Displaced` for the
+dynamics of the tracker.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class Displaced:
         return spread._replace(mean=mixture.mean + self.displacement)
 
 
-class Sight(NamedTuple):
+class PicturePair(NamedTuple):
     """What one camera has for the fit.
 
     Attributes:
@@ -91,7 +91,7 @@ class Sight(NamedTuple):
     now: SplineField | None
 
 
-class Carrier:
+class SurfaceMotion:
     """Fits the trunk of modes to where its surface has gone.
 
     Args:
@@ -102,7 +102,7 @@ class Carrier:
         spread: s of each of them.
         nodes: Nodes on the body's surface.
         on_trunk: Those on the trunk.
-        knows: Whether there is anything to fit: not of a body without root, sides or flesh.
+        knows: Whether there is anything to fit: not of a body without root, sides or parts.
     """
 
     def __init__(self, body: BodyModel) -> None:
@@ -117,7 +117,7 @@ class Carrier:
     def __call__(
         self,
         body: BodyModel,
-        sights: Sequence[Sight],
+        pairs: Sequence[PicturePair],
         *,
         before: Float[Tensor, "k n"],
         velocity: Float[Tensor, "k n"],
@@ -128,7 +128,7 @@ class Carrier:
 
         Args:
             body: The body on this frame's base.
-            sights: What each camera has seen.
+            pairs: What each camera has seen.
             before: The modes of the frame before.
             velocity: How far each moved into that frame.
             expected: Where they are expected in this frame.
@@ -136,10 +136,10 @@ class Carrier:
 
         Returns:
             The expected poses, the trunk moved; as they are without two pictures of one camera,
-            without a motion that is expected, and for bodies without root, sides or flesh.
+            without a motion that is expected, and for bodies without root, sides or parts.
         """
         columns = self.columns
-        views = self.views(body, sights, before) if self.knows else ()
+        views = self.views(body, pairs, before) if self.knows else ()
         if not views or deviation is None:
             return expected
         lower, upper = (bound[columns].to(before) for bound in (body.lower, body.upper))
@@ -159,19 +159,19 @@ class Carrier:
         return expected.index_copy(-1, columns, found.mean)
 
     def views(
-        self, body: BodyModel, sights: Sequence[Sight], before: Float[Tensor, "k n"]
+        self, body: BodyModel, pairs: Sequence[PicturePair], before: Float[Tensor, "k n"]
     ) -> tuple[SurfaceView, ...]:
         """What the cameras that have two pictures tell of the trunk.
 
         Args:
             body: The body on this frame's base.
-            sights: What each camera has seen.
+            pairs: What each camera has seen.
             before: The modes of the frame before.
         """
         pose, part = body.pose(before), self.nodes.node_part[self.on_trunk]
         points, normals = (each[..., self.on_trunk, :] for each in self.nodes(body, pose))
         views = []
-        for camera, last, now in sights:
+        for camera, last, now in pairs:
             if last is None or now is None:
                 continue
             visible = visible_nodes(body, pose, camera.centre_world, points, part)

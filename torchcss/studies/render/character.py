@@ -315,7 +315,7 @@ def _spread_state(body: BodyModel) -> Tensor:
 def _padding(
     body: BodyModel, rotation: Tensor, centre: Tensor, without: Sequence[str]
 ) -> tuple[Float[Tensor, "k 9"], Float[Tensor, "k 3 3"], Float[Tensor, "k 3"]]:
-    """What is there besides the parts in the spread pose: flesh about joints, features."""
+    """What is there besides the parts in the spread pose: fillings about joints, features."""
     joints = body.pose(_spread_state(body)).joints
     shapes, rotations, centres = [], [], []
 

@@ -28,7 +28,7 @@ _SKIN_DEEP = 0.005
 """Metres that a point may lie behind the surface that the picture has there and count as seen."""
 
 _JOINT_DEEP = 0.2
-"""Metres that the surface may lie before a joint centre that it covers as its own flesh."""
+"""Metres that the surface may lie before a joint centre that it covers as its own part."""
 
 
 class Labels(NamedTuple):
@@ -121,7 +121,7 @@ class MeshTruth:
     ) -> tuple[Float[Tensor, "j 2"], Bool[Tensor, " j"], Bool[Tensor, " j"]]:
         """Projections of joints, whether they are visible, and whether they are in the image.
 
-        Visible means that the first surface on the line of sight is the joint's own flesh.
+        Visible means that the first surface on the line of sight is the joint's own part.
 
         Args:
             labels: Labels of the frame.
