@@ -100,7 +100,7 @@ def test_how_trackers_are_set_up_can_be_chosen(script: ModuleType, arm: Path) ->
     config = script.Config(sequence=arm, tracking=tracking)
     settings = script.settings_of(config, "body34", "css", 1)
     assert settings.terms == (*TERMS, "silhouette")
-    assert (settings.evidence, settings.prediction, settings.seed) == (0.3, "surface", 1)
+    assert (settings.likelihood_power, settings.prediction, settings.seed) == (0.3, "surface", 1)
     assert settings.limb_jumps == 2
     assert script.settings_of(script.Config(sequence=arm), "arm8", "css", 0).terms == TERMS
 

@@ -259,7 +259,9 @@ def _factors(shape: Superquadrics, x: Tensor, y: Tensor, z: Tensor) -> _Factors:
     w = z * shape.ic
     ix, iy = shape.narrowed(w)
     u, v = x * ix, y * iy
-    uu, vv, ww = (a.square().clamp(*_SQUARES[x.dtype]) for a in (u, v, w))
+    # Added, not clamped to, so that autograd sees the curvature where a coordinate is zero.
+    least, most = _SQUARES[x.dtype]
+    uu, vv, ww = ((a.square() + least).clamp(max=most) for a in (u, v, w))
     pu, pv, pw = _power(uu, shape.around), _power(vv, shape.around), _power(ww, shape.along)
     of_u, of_v = pu * uu, pv * vv
     section = (of_u + of_v).clamp(min=_LEAST_POWER[x.dtype])
