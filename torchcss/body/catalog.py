@@ -1,17 +1,9 @@
-"""The bodies that ship: arm7, arm8, body30, body32 and body34, from one table.
+"""The bodies that ship: arm7, arm8, body30, body32 and body34, from one table, `humanoid.toml`.
 
-Names are H-Anim's (ISO/IEC 19774), the rest pose is H-Anim's: standing, arms hanging, Y up, facing
-+Z, left is +X; the origin is the middle of the hips. Lengths are those of the H-Anim 1.1 standard
-humanoid of 1.75 m stature (the source of the papers' proportions, section 3.2.1 [IJRR]), except
-that shoulder joints stand at the glenohumeral centre (0.185 m from the midline; H-Anim's 0.203 m is
-nearer to the acromion) and limbs are straight at rest.
-
-Joint limits are the ranges of motion of the American Academy of Orthopaedic Surgeons (*Joint
-Motion: Method of Measuring and Recording*, 1965). At the shoulder, whose three angles start from an
-oblique axis (below), the box encloses that range.
-
-Internal proportions `x_i` (section 2 [IJRR]) are prismatic joints of the same tree, free only while
-a body is fitted; `PROPORTIONS` names them. Left and right share one parameter.
+The table holds lengths, joints with their limits and habits, parts and landmarks, and says where
+its numbers come from. Internal proportions `x_i` (section 2 [IJRR]) are prismatic joints of the
+same tree, free only while a body is fitted; `PROPORTIONS` names them. Left and right share one
+parameter.
 
 | body | parameters |
 |---|---|
@@ -20,36 +12,30 @@ a body is fitted; `PROPORTIONS` names them. Left and right share one parameter.
 | body34 | body32 and clavicle protraction, 2 |
 | arm7 | right shoulder 3, elbow 1, forearm twist 1, wrist 2; hangs from a placed shoulder |
 | arm8 | arm7 and clavicle protraction; hangs from a placed sternoclavicular joint |
+
+Call `specification` for the rows of one body, and `scaled` for another size of any.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import re
+import tomllib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from torchcss.body.chain import JointSpecification
+from torchcss.body.rotations import Vector, as_rows, as_vector
 from torchcss.errors import BodyError
 
-Vector = tuple[float, float, float]
+_TABLE = tomllib.loads(Path(__file__).with_name("humanoid.toml").read_text(encoding="utf-8"))
 
-LENGTHS: dict[str, float] = {
-    "hip_width": 0.0961,
-    "trunk": 0.525,
-    "shoulder_width": 0.155,
-    "neck": 0.065,
-    "head": 0.248,
-    "upper_arm": 0.302,
-    "forearm": 0.269,
-    "hand": 0.180,
-    "thigh": 0.426,
-    "shank": 0.421,
-    "foot": 0.170,
-}
-"""Lengths of the standard humanoid, metres: hip joint from the midline, hips to shoulder line,
-sternoclavicular joint to shoulder (sideways), shoulder line to vc7, vc7 to skull tip, and limbs."""
+LENGTHS: dict[str, float] = _TABLE["lengths"]
+"""Lengths of the standard humanoid, metres."""
 
 PROPORTIONS = tuple(LENGTHS)
 """The lengths that may be fitted, each a parameter of a body with free proportions."""
@@ -61,61 +47,19 @@ BODY_NAMES = ("arm7", "arm8", "body30", "body32", "body34")
 ARM_NAMES = tuple(name for name in BODY_NAMES if name.startswith("arm"))
 """Those that are an arm on a place in the world; the others move about."""
 
-_SHOULDER_AXIS = (0.70, 0.35, -0.62)
-"""First axis of the left shoulder. The three angles are singular where the arm points along it:
-backwards-up-outwards, or forwards-down across the chest, both at the edge of what a shoulder can
-reach, unlike the sideways, forward or hanging arm of the usual orders."""
-
-_DEGREE = math.pi / 180
-
-HABITS: dict[str, tuple[float, float, float]] = {
-    "lumbar_flexion": (0, 15, 1.0),
-    "lumbar_bending": (0, 12, 1.0),
-    "lumbar_twist": (0, 15, 1.0),
-    "neck_flexion": (0, 20, 1.0),
-    "neck_bending": (0, 15, 1.0),
-    "neck_twist": (0, 25, 1.5),
-    "clavicle_elevation": (0, 10, 0.7),
-    "clavicle_protraction": (0, 10, 0.7),
-    "shoulder_swing": (-10, 70, 3.0),
-    "shoulder_raising": (10, 50, 2.5),
-    "shoulder_twist": (0, 45, 2.5),
-    "elbow_flexion": (30, 45, 3.5),
-    "forearm_twist": (0, 40, 3.0),
-    "wrist_flexion": (0, 20, 2.5),
-    "wrist_deviation": (0, 15, 1.5),
-    "hip_flexion": (15, 40, 2.5),
-    "hip_abduction": (5, 18, 1.5),
-    "hip_twist": (0, 20, 1.5),
-    "knee_flexion": (20, 40, 3.0),
-    "ankle_flexion": (0, 15, 2.0),
-}
-"""Of every angle: rest value and deviation, degrees; deviation of its speed, radians per second.
-
-The first two are the sticky priors of section 3.2.2 [IJRR]: narrow for the joints that are hard to
-see, wide for the rest. The papers give no numbers; these are a third to a half of each joint's
-range, about a relaxed upright stance. The speed is that of everyday motion: the scale of the
-diffusion dynamics (section 4.2 [IJRR]). Brisk, not athletic; the tails of the temporal prior leave
-room for more."""
-
-_ROOT_RATES = {
-    "root_x": 0.7,
-    "root_y": 0.5,
-    "root_z": 0.7,
-    "root_yaw": 1.5,
-    "root_pitch": 0.8,
-    "root_roll": 0.8,
-}
-"""The same of the root, metres or radians per second."""
+HABITS: dict[str, tuple[float, float, float]] = _TABLE["habits"]
+"""Of every angle: rest value and deviation, degrees; deviation of its speed, radians per second."""
 
 DEFAULT_RATE = 2.0
 """Speed assumed for any other parameter, such as a robot's joint."""
+
+_DEGREE = math.pi / 180
 
 
 def motion_rate(parameter: str) -> float:
     """Deviation of the speed of a parameter, metres or radians per second."""
     habit = HABITS.get(without_side(parameter))
-    return _ROOT_RATES.get(parameter, DEFAULT_RATE) if habit is None else habit[2]
+    return _TABLE["root_speeds"].get(parameter, DEFAULT_RATE) if habit is None else habit[2]
 
 
 def without_side(name: str) -> str:
@@ -185,14 +129,43 @@ class BodySpecification:
     notes: tuple[str, ...] = ()
 
 
-_DOWN = ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0))
-_UP = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
-_FORWARD = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-"""Rotations (rows) that lay a part's z axis along -Y, +Y and +Z of its link."""
+_ALONG = {
+    "down": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
+    "up": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
+    "forwards": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    "inwards": ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
+}
+"""Rotations (rows) that lay a part's z axis along a direction, on the left side."""
+
+_LEFT, _RIGHT = np.array([1.0, 1.0, 1.0]), np.array([-1.0, 1.0, 1.0])
+"""What the coordinates of the table are multiplied by."""
+
+
+class _Row(NamedTuple):
+    """A row of the table, which says what the columns mean."""
+
+    joint: str = ""
+    length: str = ""
+    part: str = ""
+    marker: str = ""
+    touch: Sequence[str] = ()
+    on: str = ""
+    only: Sequence[str] = ("",)
+    at: Sequence[float | str] = (0.0, 0.0, 0.0)
+    turn: Sequence[float] = ()
+    slide: Sequence[float] = ()
+    degrees: Sequence[float] = (-math.inf, math.inf)
+    along: str = ""
+    axes: Sequence[float | str] = ()
+    square: Sequence[float] = (0.7, 1.0)
+    taper: Sequence[float] = (0.0, 0.0)
+
+
+_ROWS = {limb: [_Row(**row) for row in rows] for limb, rows in _TABLE["rows"].items()}
 
 
 class _Builder:
-    """Collects the rows of the table for one body."""
+    """Collects what the rows of the table say, one after the other."""
 
     def __init__(self, lengths: Mapping[str, float], free_proportions: bool) -> None:
         self.lengths = lengths
@@ -203,181 +176,99 @@ class _Builder:
         self.ties: dict[str, tuple[str, float]] = {}
         self.sticky: dict[str, tuple[float, float]] = {}
         self.neighbours: list[tuple[str, str]] = []
+        self.link = ""
+        """Where the next row hangs."""
+        self.links: dict[str, str] = {}
+        """Where the rows after a joint or length hang."""
 
-    def joint(
-        self,
-        name: str,
-        parent: str | None,
-        offset: Vector = (0.0, 0.0, 0.0),
-        axis: Vector | None = None,
-        limits: tuple[float, float] = (-math.inf, math.inf),
-        kind: str = "revolute",
-    ) -> str:
-        """Add a joint (fixed when it has no axis) and return the link below it."""
-        scale = _DEGREE if kind == "revolute" else 1.0
-        self.joints.append(
-            JointSpecification(
-                name=name,
-                link=f"{name}_link",
-                parent=parent,
-                kind="fixed" if axis is None else kind,
-                translation=offset,
-                axis=axis or (0.0, 0.0, 1.0),
-                lower=limits[0] * scale,
-                upper=limits[1] * scale,
+    def limb(self, body: str, limb: str, mirror: np.ndarray = _LEFT) -> None:
+        """Add the rows of a limb that a body has, as they stand or mirrored."""
+        for row in _ROWS[limb]:
+            if body.startswith(tuple(row.only)):
+                self._add(row, mirror)
+
+    def _add(self, row: _Row, mirror: np.ndarray) -> None:
+
+        def named(name: str) -> str:
+            return name if mirror is _LEFT else re.sub("^l_", "r_", name)
+
+        if row.on:
+            self.link = self.links[row.on]
+        place = as_vector(mirror * [self._metres(number) for number in row.at])
+        if row.joint:
+            self._joint(named(row.joint), row, place, mirror)
+        elif row.length and self.free:
+            self._length(named(row.length), mirror * row.slide)
+        elif row.part:
+            square = (*row.square, *row.taper, 0.0, 0.0)
+            self.parts.append(
+                PartSpecification(
+                    name=named(row.part),
+                    link=self.link,
+                    translation=place,
+                    rotation=as_rows(np.outer(mirror, mirror) * _ALONG[row.along]),
+                    shape=(*map(self._metres, row.axes), *square),
+                )
             )
-        )
+        elif row.marker:
+            marker = MarkerSpecification(name=named(row.marker), link=self.link, translation=place)
+            self.markers.append(marker)
+        elif row.touch:
+            first, second = map(named, row.touch)
+            self.neighbours.append((first, second))
+        self.links[row.joint or row.length] = self.link
+
+    def _metres(self, number: float | str) -> float:
+        """A number, or a sum of products of numbers and lengths: "0.5 * trunk - 0.1"."""
+        total = 0.0
+        for term in str(number).replace("- ", "+ -").split(" + "):
+            factors = [self.lengths.get(word) or float(word) for word in term.split(" * ")]
+            total += math.prod(factors)
+        return total
+
+    def _joint(self, name: str, row: _Row, place: Vector, mirror: np.ndarray) -> None:
+        """Add a joint that turns, slides, or is fixed."""
+        kind, axis = "fixed", np.array([0.0, 0.0, 1.0])
+        if row.slide:
+            kind, axis = "prismatic", mirror * row.slide
+        elif row.turn:  # so that equal angles mean mirrored motion
+            kind, axis = "revolute", mirror[0] * mirror * row.turn / np.linalg.norm(row.turn)
+        self._hang(name, kind, axis, [end * _DEGREE for end in row.degrees], place)
         if (habit := HABITS.get(without_side(name))) is not None:
             self.sticky[name] = (habit[0] * _DEGREE, habit[1] * _DEGREE)
-        return f"{name}_link"
 
-    def stretch(self, length: str, parent: str, direction: Vector, prefix: str = "") -> str:
-        """Add the prismatic joint of a proportion, if proportions are free."""
-        if not self.free:
-            return parent
+    def _length(self, name: str, axis: np.ndarray) -> None:
+        """Add the prismatic joint of a proportion."""
+        length = without_side(name)
         margin = PROPORTION_RANGE * LENGTHS[length]
         # Limits are absolute: a body that is already fitted may not drift further.
         offset = LENGTHS[length] - self.lengths[length]
-        name = f"{prefix}{length}_length"
-        if prefix:
-            self.ties[name] = (f"{length}_length", 1.0)
+        if length != name:
+            self.ties[f"{name}_length"] = (f"{length}_length", 1.0)
         self.sticky[f"{length}_length"] = (offset, 0.5 * margin)
-        return self.joint(
-            name, parent, (0, 0, 0), direction, (offset - margin, offset + margin), "prismatic"
-        )
+        self._hang(f"{name}_length", "prismatic", axis, [offset - margin, offset + margin])
 
-    def part(
+    def _hang(
         self,
         name: str,
-        link: str,
-        centre: Vector,
-        rotation: tuple[Vector, Vector, Vector],
-        axes: Vector,
-        *,
-        square: tuple[float, float] = (0.7, 1.0),
-        taper: tuple[float, float] = (0.0, 0.0),
+        kind: str,
+        axis: np.ndarray,
+        limits: Sequence[float],
+        place: Vector = (0.0, 0.0, 0.0),
     ) -> None:
-        self.parts.append(
-            PartSpecification(
-                name=name,
-                link=link,
-                translation=centre,
-                rotation=rotation,
-                shape=(*axes, *square, *taper, 0.0, 0.0),
-            )
+        """Hang a joint on the present link, and go on below it."""
+        joint = JointSpecification(
+            name=name,
+            link=f"{name}_link",
+            parent=self.link or None,
+            kind=kind,
+            translation=place,
+            axis=as_vector(axis),
+            lower=limits[0],
+            upper=limits[1],
         )
-
-    def marker(self, name: str, link: str, offset: Vector = (0.0, 0.0, 0.0)) -> None:
-        self.markers.append(MarkerSpecification(name=name, link=link, translation=offset))
-
-
-def _side(axis: Vector, sign: float) -> Vector:
-    """Mirror a rotation axis so that equal angles mean mirrored motion."""
-    return axis if sign > 0 else (axis[0], -axis[1], -axis[2])
-
-
-def _arm(
-    build: _Builder,
-    side: str,
-    parent: str,
-    sign: float,
-    *,
-    clavicle: tuple[str, ...],
-    hand: bool,
-    chest: str | None,
-) -> None:
-    """Clavicle to fingertip; `clavicle` names its free angles, `hand` frees forearm and wrist."""
-    size, p = build.lengths, f"{side}_"
-    link = parent
-    if "elevation" in clavicle:
-        link = build.joint(
-            p + "clavicle_elevation", link, (0, 0, 0), _side((0, 0, 1), sign), (-10, 40)
-        )
-    if "protraction" in clavicle:
-        axis = _side((0, -1, 0), sign)
-        link = build.joint(p + "clavicle_protraction", link, (0, 0, 0), axis, (-25, 30))
-    half = size["shoulder_width"] / 2
-    drop = 0.015 if chest else 0.0
-    if chest or clavicle:
-        along = ((0.0, 0.0, -sign), (0.0, 1.0, 0.0), (sign, 0.0, 0.0))
-        build.part(
-            p + "clavicle", link, (sign * half, drop - 0.025, -0.015), along, (0.05, 0.05, 0.10)
-        )
-        if chest:
-            build.neighbours += [(p + "clavicle", chest), (p + "clavicle", "neck")]
-        build.neighbours.append((p + "clavicle", p + "upper_arm"))
-        link = build.stretch("shoulder_width", link, (sign, 0, 0), p)
-        offset: Vector = (sign * size["shoulder_width"], drop, -0.03)
-    else:
-        offset = (0.0, 0.0, 0.0)
-    first = np.array(_SHOULDER_AXIS) / np.linalg.norm(_SHOULDER_AXIS)
-    down = np.array([0.0, -1.0, 0.0])
-    rest = down - first * (first @ down)
-    second = np.cross(rest / np.linalg.norm(rest), first)
-    tilt = math.degrees(math.asin(first @ down))  # of the hanging arm, from the plane of rest
-    axes = [tuple(first.tolist()), tuple(second.tolist()), (0.0, 1.0, 0.0)]
-    swing, raising, twist = (_side(axis, sign) for axis in axes)
-    link = build.joint(p + "shoulder_swing", link, offset, swing, (-195, 60))
-    link = build.joint(p + "shoulder_raising", link, (0, 0, 0), raising, (-80 - tilt, 80 - tilt))
-    link = build.joint(p + "shoulder_twist", link, (0, 0, 0), twist, (-90, 90))
-    build.marker(p + "shoulder", link)
-    length = size["upper_arm"]
-    build.part(p + "upper_arm", link, (0, -0.48 * length, 0), _DOWN, (0.049, 0.051, 0.57 * length),
-               taper=(-0.12, -0.12))  # fmt: skip
-    link = build.stretch("upper_arm", link, (0, -1, 0), p)
-    link = build.joint(p + "elbow_flexion", link, (0, -length, 0), (-1, 0, 0), (0, 150))
-    build.marker(p + "elbow", link)
-    length = size["forearm"]
-    if hand:
-        link = build.joint(p + "forearm_twist", link, (0, 0, 0), _side((0, 1, 0), sign), (-80, 80))
-    build.part(p + "forearm", link, (0, -0.5 * length, 0), _DOWN, (0.040, 0.042, 0.57 * length),
-               taper=(-0.25, -0.25))  # fmt: skip
-    link = build.stretch("forearm", link, (0, -1, 0), p)
-    link = build.joint(p + "wrist", link, (0, -length, 0))
-    if hand:
-        link = build.joint(p + "wrist_flexion", link, (0, 0, 0), _side((0, 0, -1), sign), (-70, 80))
-        link = build.joint(p + "wrist_deviation", link, (0, 0, 0), (1, 0, 0), (-30, 20))
-    build.marker(p + "wrist", link)
-    length = size["hand"]
-    build.part(p + "hand", link, (0, -0.48 * length, 0), _DOWN, (0.020, 0.040, 0.54 * length))
-    build.marker(p + "hand_tip", link, (0, -length, 0))
-    build.neighbours += [(p + "upper_arm", p + "forearm"), (p + "forearm", p + "hand")]
-    if chest:
-        build.neighbours.append((p + "upper_arm", chest))
-
-
-def _leg(build: _Builder, side: str, parent: str, sign: float) -> None:
-    size, p = build.lengths, f"{side}_"
-    link = build.stretch("hip_width", parent, (sign, 0, 0), p)
-    offset = (sign * size["hip_width"], 0.0, 0.0)
-    link = build.joint(p + "hip_flexion", link, offset, (-1, 0, 0), (-30, 120))
-    link = build.joint(p + "hip_abduction", link, (0, 0, 0), _side((0, 0, 1), sign), (-30, 45))
-    link = build.joint(p + "hip_twist", link, (0, 0, 0), _side((0, 1, 0), sign), (-45, 45))
-    build.marker(p + "hip", link)
-    length = size["thigh"]
-    build.part(p + "thigh", link, (0, -0.47 * length, 0), _DOWN, (0.075, 0.082, 0.55 * length),
-               taper=(-0.25, -0.25))  # fmt: skip
-    link = build.stretch("thigh", link, (0, -1, 0), p)
-    link = build.joint(p + "knee_flexion", link, (0, -length, 0), (1, 0, 0), (0, 135))
-    build.marker(p + "knee", link)
-    length = size["shank"]
-    build.part(p + "shank", link, (0, -0.5 * length, -0.008), _DOWN, (0.052, 0.056, 0.54 * length),
-               taper=(-0.33, -0.33))  # fmt: skip
-    link = build.stretch("shank", link, (0, -1, 0), p)
-    link = build.joint(p + "ankle_flexion", link, (0, -length, 0), (1, 0, 0), (-20, 50))
-    build.marker(p + "ankle", link)
-    length = size["foot"]
-    build.part(
-        p + "foot", link, (0, -0.038, 0.32 * length), _FORWARD, (0.042, 0.034, 0.75 * length)
-    )
-    build.marker(p + "heel", link, (0, -0.050, -0.055))
-    build.marker(p + "midtarsal", link, (0, -0.030, 0.4 * length))
-    build.marker(p + "toe", link, (sign * -0.01, -0.050, length))
-    build.neighbours += [
-        ("pelvis", p + "thigh"),
-        (p + "thigh", p + "shank"),
-        (p + "shank", p + "foot"),
-    ]
+        self.joints.append(joint)
+        self.link = joint.link
 
 
 def specification(
@@ -409,18 +300,20 @@ def specification(
     size = {**LENGTHS, **(lengths or {})}
     if not all(0 < value < math.inf for value in (*size.values(), scale)):
         raise BodyError("lengths and scale must be positive and finite")
-    build = _Builder(size, free_proportions)
     is_arm = name in ARM_NAMES
-    if free_root if free_root is not None else not is_arm:
-        build.joints += root_joints()
-        link = build.joints[-1].link
-    else:
-        link = build.joint("world", None)
+    build = _Builder(size, free_proportions)
+    moves = not is_arm if free_root is None else free_root
+    build.limb(name, "root" if moves else "world")
+    build.links["root"] = build.link
     if is_arm:
-        clavicle = ("protraction",) if name == "arm8" else ()
-        _arm(build, "r", link, -1.0, clavicle=clavicle, hand=True, chest=None)
+        build.limb(name, "arm", _RIGHT)
     else:
-        _torso(build, name, link)
+        build.limb(name, "trunk")
+        build.limb(name, "arm")
+        build.limb(name, "arm", _RIGHT)
+        build.limb(name, "head")
+        build.limb(name, "leg")
+        build.limb(name, "leg", _RIGHT)
     return scaled(
         BodySpecification(
             name=name,
@@ -438,65 +331,9 @@ def specification(
 
 def root_joints() -> tuple[JointSpecification, ...]:
     """The world's link and the six joints by which a body moves in it (`torchcss.body.root`)."""
-    build = _Builder({}, free_proportions=False)
-    link = build.joint("world", None)
-    for axis, letter in (((1.0, 0, 0), "x"), ((0, 1.0, 0), "y"), ((0, 0, 1.0), "z")):
-        link = build.joint(f"root_{letter}", link, (0, 0, 0), axis, kind="prismatic")
-    # The middle angle is the one that locks at a right angle: leaning forward, the rarest.
-    link = build.joint("root_yaw", link, (0, 0, 0), (0, 1, 0), (-360, 360))
-    link = build.joint("root_pitch", link, (0, 0, 0), (1, 0, 0), (-85, 85))
-    build.joint("root_roll", link, (0, 0, 0), (0, 0, 1), (-360, 360))
+    build = _Builder(LENGTHS, free_proportions=False)
+    build.limb("body", "root")
     return tuple(build.joints)
-
-
-def _torso(build: _Builder, name: str, root: str) -> None:
-    size = build.lengths
-    clavicle = {
-        "body30": (),
-        "body32": ("elevation",),
-        "body34": ("elevation", "protraction"),
-    }[name]
-    build.marker("HumanoidRoot", root)
-    build.part("pelvis", root, (0, 0.035, -0.005), _UP, (0.160, 0.105, 0.125), square=(0.8, 0.8))
-    link = build.joint("lumbar_flexion", root, (0, 0.12, -0.03), (1, 0, 0), (-25, 80))
-    link = build.joint("lumbar_bending", link, (0, 0, 0), (0, 0, 1), (-35, 35))
-    link = build.joint("lumbar_twist", link, (0, 0, 0), (0, 1, 0), (-45, 45))
-    build.marker("vl5", link)
-    trunk = size["trunk"]
-    build.part("chest", link, (0, 0.40 * trunk, 0.025), _UP, (0.150, 0.105, 0.475 * trunk),
-               square=(0.7, 0.8), taper=(0.06, 0.0))  # fmt: skip
-    link = build.stretch("trunk", link, (0, 1, 0))
-    top = trunk - 0.12
-    build.marker("vt1", link, (0, top, 0.0))
-    build.neighbours += [
-        ("pelvis", "chest"),
-        ("chest", "neck"),
-        ("chest", "head"),
-        ("neck", "head"),
-    ]
-    for side, sign in (("l", 1.0), ("r", -1.0)):
-        start = build.joint(f"{side}_sternoclavicular", link, (sign * 0.03, top - 0.015, 0.03))
-        _arm(build, side, start, sign, clavicle=clavicle, hand=False, chest="chest")
-    chest = link
-    link = build.stretch("neck", chest, (0, 1, 0))
-    link = build.joint("neck_flexion", link, (0, top + size["neck"], 0.02), (1, 0, 0), (-45, 45))
-    link = build.joint("neck_bending", link, (0, 0, 0), (0, 0, 1), (-45, 45))
-    link = build.joint("neck_twist", link, (0, 0, 0), (0, 1, 0), (-60, 60))
-    head = size["head"]
-    build.marker("vc7", link)
-    build.part("neck", link, (0, 0.15 * head, 0.0), _UP, (0.055, 0.058, 0.085))
-    build.part(
-        "head", link, (0, 0.54 * head, 0.03), _UP, (0.073, 0.093, 0.48 * head), square=(1, 1)
-    )
-    build.marker("skullbase", link, (0, 0.44 * head, 0.02))
-    build.marker("nose", link, (0, 0.46 * head, 0.125))
-    for side, sign in (("l", 1.0), ("r", -1.0)):
-        build.marker(f"{side}_eye", link, (sign * 0.033, 0.58 * head, 0.105))
-        build.marker(f"{side}_ear", link, (sign * 0.072, 0.50 * head, 0.02))
-    link = build.stretch("head", link, (0, 1, 0))
-    build.marker("skull_tip", link, (0, head, 0.02))
-    for side, sign in (("l", 1.0), ("r", -1.0)):
-        _leg(build, side, root, sign)
 
 
 def scaled(body: BodySpecification, scale: float) -> BodySpecification:

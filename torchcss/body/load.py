@@ -37,13 +37,14 @@ from torchcss.body.catalog import (
 )
 from torchcss.body.chain import JointSpecification
 from torchcss.body.files.bvh import Skeleton, read_bvh_skeleton
-from torchcss.body.files.default_shape import as_vector, bone_parts, rest_poses, touching_parts
+from torchcss.body.files.default_shape import bone_parts, rest_poses, touching_parts
 from torchcss.body.files.mjcf import read_mjcf
 from torchcss.body.files.urdf import read_urdf
 from torchcss.body.files.xml import parse_xml
 from torchcss.body.kinematics import KinematicTree
 from torchcss.body.model import BodyModel
 from torchcss.body.root import has_root
+from torchcss.body.rotations import as_vector
 from torchcss.errors import BodyError, MotionCaptureError
 from torchcss.files import one_line, read_bytes
 from torchcss.joint_names import skeleton_joint_names

@@ -18,6 +18,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+Vector = tuple[float, float, float]
+
 ROTATION_ORDERS = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
 
 
@@ -162,3 +164,15 @@ def root_angles(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 
     pitch = torch.asin((-rotation[..., 1, 2]).clamp(-1, 1))
     roll = torch.atan2(rotation[..., 1, 0], rotation[..., 1, 1])
     return torch.stack([yaw, pitch, roll], dim=-1)
+
+
+def as_vector(values: Float[np.ndarray, "3"]) -> Vector:
+    """Three numbers, as specifications hold them."""
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+def as_rows(matrix: Float[np.ndarray, "3 3"]) -> tuple[Vector, Vector, Vector]:
+    """The rows of a rotation, as specifications hold them."""
+    a, b, c = matrix
+    return as_vector(a), as_vector(b), as_vector(c)

@@ -27,8 +27,7 @@ from jaxtyping import Float
 
 from torchcss.body.chain import JointSpecification
 from torchcss.body.files.bvh_parser import Segment, Turn, parse_bvh
-from torchcss.body.files.default_shape import as_rows, as_vector
-from torchcss.body.rotations import about
+from torchcss.body.rotations import about, as_rows, as_vector
 from torchcss.errors import MotionCaptureError
 
 BASE: Final = "world_frame"

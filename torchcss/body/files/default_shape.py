@@ -24,9 +24,9 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from torchcss.body.catalog import PartSpecification, Vector, without_side
+from torchcss.body.catalog import PartSpecification, without_side
 from torchcss.body.chain import JointSpecification
-from torchcss.body.rotations import frame_along
+from torchcss.body.rotations import as_rows, as_vector, frame_along
 from torchcss.body.surface import angular_grid, implicit, surface_points
 
 GIRTHS: dict[tuple[str, str], tuple[str, float]] = {
@@ -285,15 +285,3 @@ def _unused(name: str, used: Sequence[str]) -> str:
     if name not in used:
         return name
     return next(f"{name}_{n}" for n in range(2, 10_000) if f"{name}_{n}" not in used)
-
-
-def as_vector(values: Float[np.ndarray, "3"]) -> Vector:
-    """Three numbers, as specifications hold them."""
-    x, y, z = values.tolist()
-    return x, y, z
-
-
-def as_rows(matrix: Float[np.ndarray, "3 3"]) -> tuple[Vector, Vector, Vector]:
-    """The rows of a rotation, as specifications hold them."""
-    a, b, c = matrix
-    return as_vector(a), as_vector(b), as_vector(c)

@@ -31,9 +31,9 @@ from jaxtyping import Float
 from torchcss.body.catalog import PartSpecification
 from torchcss.body.chain import JointSpecification
 from torchcss.body.files.bvh import BASE, Skeleton
-from torchcss.body.files.default_shape import as_rows, as_vector, solid_shape
+from torchcss.body.files.default_shape import solid_shape
 from torchcss.body.files.xml import parse_xml
-from torchcss.body.rotations import from_axis_angle
+from torchcss.body.rotations import as_rows, as_vector, from_axis_angle
 from torchcss.errors import BodyError, MissingExtraError
 from torchcss.files import one_line, read_bytes, shortened
 

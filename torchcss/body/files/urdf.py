@@ -19,8 +19,8 @@ from pathlib import Path
 
 from torchcss.body.catalog import PartSpecification
 from torchcss.body.chain import JointSpecification, urdf_joints
-from torchcss.body.files.default_shape import as_rows, solid_shape
-from torchcss.body.rotations import about_fixed_axes
+from torchcss.body.files.default_shape import solid_shape
+from torchcss.body.rotations import about_fixed_axes, as_rows
 from torchcss.errors import BodyError
 from torchcss.files import shortened
 
