@@ -24,14 +24,14 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from common import Table, start, write_report
+from common.flow_files import flow_discontinuities, read_flow
 from torch import Tensor
 from torch.nn import functional
 
 from torchcss.errors import FlowFileError
 from torchcss.io.video import read_image
 from torchcss.robust import Quadratic
-from torchcss.studies.flow_files import read_flow
-from torchcss.vision.boundaries import flow_discontinuities, motion_boundaries
+from torchcss.vision.boundaries import motion_boundaries
 from torchcss.vision.flow import ACCURATE, TRACKING, OpticalFlow, robust_flow
 
 

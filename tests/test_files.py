@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from common.flow_files import write_flow
 from made_tracks import export_as, make_track
 from matplotlib.figure import Figure
 
@@ -28,7 +29,6 @@ from torchcss.io.tracks import FrameModes, Track, TrackWriter, load_track, save_
 from torchcss.io.video import VideoReader, VideoWriter
 from torchcss.show.click import write_clicked
 from torchcss.show.style import save_figure
-from torchcss.studies.flow_files import write_flow
 from torchcss.studies.sequence_writer import write_sequence
 from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
@@ -164,7 +164,8 @@ def test_a_full_disk_and_a_killed_process_cost_no_file(tmp_path: Path) -> None:
         write(tmp_path / name)
     before = {name: (tmp_path / name).read_bytes() for name in WRITERS}
     here = Path(__file__).resolve()
-    script = ELSEWHERE.format(paths=[str(here.parent), str(here.parents[1])], folder=str(tmp_path))
+    paths = [str(path) for path in (here.parent, here.parents[1], here.parents[1] / "scripts")]
+    script = ELSEWHERE.format(paths=paths, folder=str(tmp_path))
     with subprocess.Popen(
         [sys.executable, "-c", script], stdout=subprocess.PIPE, stdin=subprocess.PIPE, text=True
     ) as process:

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import torch
+from common.flow_files import read_flow, write_flow
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from made_tracks import make_track
@@ -33,7 +34,6 @@ from torchcss.io.keypoints.read import read_keypoints
 from torchcss.io.motion.positions import read_motion_capture
 from torchcss.io.tracks import load_track, read_summary, save_track, write_summary
 from torchcss.io.video import VideoReader, VideoWriter
-from torchcss.studies.flow_files import read_flow, write_flow
 from torchcss.studies.sequences import read_sequence
 from torchcss.vision.camera import Camera
 

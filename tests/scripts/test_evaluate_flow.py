@@ -9,9 +9,9 @@ from types import ModuleType
 import matplotlib.image
 import pytest
 import torch
+from common.flow_files import write_flow
 
 from torchcss.errors import FlowFileError
-from torchcss.studies.flow_files import write_flow
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "evaluate_flow.py"
 

@@ -1,4 +1,4 @@
-"""Motion boundaries from outlier maps, and true discontinuities from known flow."""
+"""Motion boundaries from outlier maps, and those of a known flow."""
 
 from __future__ import annotations
 
@@ -9,16 +9,12 @@ import matplotlib.image
 import numpy as np
 import pytest
 import torch
+from common.flow_files import flow_discontinuities, read_flow
 from torch import Tensor
 from torch.nn import functional
 
 from torchcss.errors import ConfigurationError, ShapeError
-from torchcss.studies.flow_files import read_flow
-from torchcss.vision.boundaries import (
-    BoundaryConfiguration,
-    flow_discontinuities,
-    motion_boundaries,
-)
+from torchcss.vision.boundaries import BoundaryConfiguration, motion_boundaries
 from torchcss.vision.flow import TRACKING, OpticalFlow, robust_flow
 
 
@@ -85,39 +81,6 @@ def test_no_map_is_refused(shape: tuple[int, ...]) -> None:
 def test_choices_without_sense_are_refused(name: str, value: float) -> None:
     with pytest.raises(ConfigurationError, match=name):
         BoundaryConfiguration(**{name: value})
-
-
-def test_discontinuities_mark_both_sides() -> None:
-    flow = torch.zeros(2, 6, 7)
-    flow[0, :, 3:] = 0.6
-    expected = torch.zeros(6, 7, dtype=torch.bool)
-    expected[:, 2:4] = True
-    assert torch.equal(flow_discontinuities(flow), expected)
-    assert torch.equal(flow_discontinuities(flow.mT), expected.mT)
-    assert not flow_discontinuities(flow, jump=0.7).any()
-    assert torch.equal(flow_discontinuities(flow.expand(2, 3, 2, 6, 7))[1, 2], expected)
-
-
-def test_discontinuities_across_unknown_pixels() -> None:
-    flow = torch.zeros(2, 9, 11)
-    flow[1, :, 5:] = 2.0
-    known = torch.ones(9, 11, dtype=torch.bool)
-    known[:, 4:7] = False
-    flow[:, ~known] = float("nan")
-    found = flow_discontinuities(flow, known)
-    assert found[:, 4:7].any(dim=1).all()
-    assert not found[:, :3].any()
-    assert not found[:, 8:].any()
-    nothing_known = torch.zeros(9, 11, dtype=torch.bool)
-    assert not flow_discontinuities(flow, nothing_known).any()
-
-
-@pytest.mark.parametrize("shape", [(9, 11), (3, 9, 11)])
-def test_discontinuities_refuse_other_shapes(shape: tuple[int, ...]) -> None:
-    with pytest.raises(ShapeError, match="flow"):
-        flow_discontinuities(torch.zeros(shape))
-    with pytest.raises(ShapeError, match="known"):
-        flow_discontinuities(torch.zeros(2, 9, 11), torch.ones(9, 10, dtype=torch.bool))
 
 
 def test_true_boundaries_are_found(shared_data: Path) -> None:

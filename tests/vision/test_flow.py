@@ -10,6 +10,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 import torch
+from common.flow_files import flow_discontinuities, read_flow
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -17,9 +18,7 @@ from torch.nn import functional
 
 from torchcss.errors import ConfigurationError, FrameError, ShapeError
 from torchcss.robust import Leclerc, Lorentzian, Quadratic
-from torchcss.studies.flow_files import read_flow
 from torchcss.vision import flow as module
-from torchcss.vision.boundaries import flow_discontinuities
 from torchcss.vision.flow import ACCURATE, TRACKING, FlowConfiguration, OpticalFlow, robust_flow
 
 KINDS = (Lorentzian, Leclerc, Quadratic)

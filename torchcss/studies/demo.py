@@ -32,14 +32,12 @@ from torchcss.errors import ConfigurationError
 from torchcss.initialise.fit import initialise
 from torchcss.initialise.options import InitialiseOptions
 from torchcss.initialise.result import Initialisation
-from torchcss.io.fitted_body import write_fitted_body
 from torchcss.io.run import Run
 from torchcss.io.tracks import load_track, prepare_output_folder, write_summary
 from torchcss.io.video import VideoWriter
 from torchcss.io.view_files import RecordedCamera, ViewFiles
 from torchcss.studies.evaluation import read_reference
 from torchcss.studies.render.sequences import SyntheticSequence
-from torchcss.studies.sequence_writer import write_arrays, write_camera
 from torchcss.tracking.session import TrackingSession
 from torchcss.tracking.settings import Settings
 from torchcss.tracking.view import CameraView
@@ -80,48 +78,6 @@ def run_demo(
     )  # fmt: skip
     positions, _ = read_reference(CLIP / "reference3d.npz")
     return _with_errors(out, dict(run.summary), positions)
-
-
-def write_clip(
-    folder: Path, sequence: SyntheticSequence, *, generator: torch.Generator, crf: int = 13
-) -> Path:
-    """Write a sequence as the demo's clip is, with noisy joints of the first frame.
-
-    Args:
-        folder: The folder; made if missing.
-        sequence: The sequence and its truth.
-        generator: Source of the noise, and of the search for the first pose.
-        crf: Quality of the film, see `VideoWriter`.
-
-    Returns:
-        The folder.
-    """
-    prepare_output_folder(folder)
-    with VideoWriter(folder / "video.mp4", sequence.frame_rate, crf=crf) as film:
-        for image in sequence.frames:
-            film.write(image)
-    write_camera(folder / "cameras.json", sequence.camera)
-    first, seen = first_pose(sequence, generator)
-    # A keypoint file tells all frames; nothing is known of the later ones.
-    later = (len(sequence.frames) - 1, *seen.positions.shape[1:])
-    write_arrays(
-        folder / "keypoints.npz",
-        {
-            "keypoints": torch.cat([seen.positions, torch.zeros(later)]).numpy(),
-            "confidence": torch.cat([seen.confidence, torch.zeros(later[:2])]).numpy(),
-            "joint_names": np.array(seen.names),
-        },
-    )
-    write_fitted_body(folder / "body.npz", first, sequence.camera)
-    write_arrays(
-        folder / "reference3d.npz",
-        {
-            "joints": sequence.joints_world.numpy(),
-            "joint_names": np.array(sequence.body.joint_names),
-            "units": np.array("m"),
-        },
-    )
-    return folder
 
 
 def first_pose(

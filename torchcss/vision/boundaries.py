@@ -18,7 +18,7 @@ but also glints and aliasing: on the two Middlebury pairs of the tests, adding t
 precision and left the recall as it was; alone they reach an F score of 0.62 and 0.76, where the
 smoothness term reaches 0.88 and 0.90.
 
-By default: `motion_boundaries(flow)`. `flow_discontinuities` marks the boundaries of a known flow.
+By default: `motion_boundaries(flow)`.
 """
 
 from __future__ import annotations
@@ -27,12 +27,10 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
-from torch.nn import functional
 
-from torchcss.errors import ConfigurationError, ShapeError, check_shape
+from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.vision.flow import OpticalFlow
 from torchcss.vision.sampling import gaussian_blur
 
@@ -94,55 +92,3 @@ def motion_boundaries(
     squared = (math.sqrt(0.5 * math.pi) * choice.smoothing * blurred).square()
     strength = squared / (squared + choice.half_strength_line**2)
     return MotionBoundaries(strength, 1.0 - strength)
-
-
-def flow_discontinuities(
-    flow: Float[Tensor, "*batch 2 h w"],
-    known: Bool[Tensor, "*batch h w"] | None = None,
-    *,
-    jump: float = 0.5,
-) -> Bool[Tensor, "*batch h w"]:
-    """Mark both pixels of each pair of neighbours whose flows differ by more than `jump`.
-
-    Unknown pixels, which in measured truth lie along occlusions, first take the mean flow of their
-    known neighbours, ring by ring, so that a jump across them is found.
-
-    Args:
-        flow: Displacement, pixels.
-        known: Where the flow is known; None takes it to be known everywhere.
-        jump: Least difference of two neighbouring flows, pixels.
-
-    Raises:
-        ShapeError: If the flow is not `[..., 2, h, w]`, or `known` has not its image size.
-    """
-    check_shape("flow", flow, 2, None, None)
-    height, width = flow.shape[-2:]
-    batch = flow.shape[:-3]
-    flow = flow.reshape(-1, 2, height, width)
-    if known is not None:
-        check_shape("known", known, height, width)
-        flow = _filled(flow, known.expand(*batch, height, width).reshape(-1, 1, height, width))
-    found = torch.zeros_like(flow[:, 0], dtype=torch.bool)
-    right = flow.diff(dim=-1).square().sum(dim=1) > jump**2
-    down = flow.diff(dim=-2).square().sum(dim=1) > jump**2
-    found[..., :-1] |= right
-    found[..., 1:] |= right
-    found[..., :-1, :] |= down
-    found[..., 1:, :] |= down
-    return found.reshape(*batch, height, width)
-
-
-def _filled(
-    flow: Float[Tensor, "b 2 h w"], known: Bool[Tensor, "b 1 h w"]
-) -> Float[Tensor, "b 2 h w"]:
-    flow = torch.where(known, flow, 0.0)
-    for _ in range(sum(flow.shape[-2:])):
-        if bool(known.all()):
-            break
-        share = functional.avg_pool2d(known.to(flow), 3, stride=1, padding=1)
-        mean = functional.avg_pool2d(flow, 3, stride=1, padding=1)
-        reached = share > 0.0
-        mean = mean / share.where(reached, 1.0)
-        flow = torch.where(known, flow, mean)
-        known = known | reached
-    return flow

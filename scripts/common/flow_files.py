@@ -1,10 +1,10 @@
-"""Middlebury `.flo` files: a dense optical flow, two numbers per pixel.
+"""Known optical flow: Middlebury `.flo` files, and where a flow jumps.
 
 Little endian throughout: float32 202021.25 (its four bytes spell PIEH), int32 width, int32 height,
 then row by row the float32 pairs (u to the right, v down) in pixels. A component beyond 1e9 in
 size marks a pixel whose flow is not known.
 
-By default: `read_flow(path)` and `write_flow(path, flow)`.
+By default: `read_flow(path)` and `write_flow(path, flow)`; `flow_discontinuities` of what was read.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn import functional
 
 from torchcss.errors import FlowFileError, ShapeError, check_shape
 from torchcss.files import read_bytes, replace_file
@@ -101,3 +102,55 @@ def write_flow(
     header = _MAGIC + np.array([width, height], "<i4").tobytes()
     with replace_file(Path(path)) as partial:
         partial.write_bytes(header + values.astype("<f4").tobytes())
+
+
+def flow_discontinuities(
+    flow: Float[Tensor, "*batch 2 h w"],
+    known: Bool[Tensor, "*batch h w"] | None = None,
+    *,
+    jump: float = 0.5,
+) -> Bool[Tensor, "*batch h w"]:
+    """Mark both pixels of each pair of neighbours whose flows differ by more than `jump`.
+
+    Unknown pixels, which in measured truth lie along occlusions, first take the mean flow of their
+    known neighbours, ring by ring, so that a jump across them is found.
+
+    Args:
+        flow: Displacement, pixels.
+        known: Where the flow is known; None takes it to be known everywhere.
+        jump: Least difference of two neighbouring flows, pixels.
+
+    Raises:
+        ShapeError: If the flow is not `[..., 2, h, w]`, or `known` has not its image size.
+    """
+    check_shape("flow", flow, 2, None, None)
+    height, width = flow.shape[-2:]
+    batch = flow.shape[:-3]
+    flow = flow.reshape(-1, 2, height, width)
+    if known is not None:
+        check_shape("known", known, height, width)
+        flow = _filled(flow, known.expand(*batch, height, width).reshape(-1, 1, height, width))
+    found = torch.zeros_like(flow[:, 0], dtype=torch.bool)
+    right = flow.diff(dim=-1).square().sum(dim=1) > jump**2
+    down = flow.diff(dim=-2).square().sum(dim=1) > jump**2
+    found[..., :-1] |= right
+    found[..., 1:] |= right
+    found[..., :-1, :] |= down
+    found[..., 1:, :] |= down
+    return found.reshape(*batch, height, width)
+
+
+def _filled(
+    flow: Float[Tensor, "b 2 h w"], known: Bool[Tensor, "b 1 h w"]
+) -> Float[Tensor, "b 2 h w"]:
+    flow = torch.where(known, flow, 0.0)
+    for _ in range(sum(flow.shape[-2:])):
+        if bool(known.all()):
+            break
+        share = functional.avg_pool2d(known.to(flow), 3, stride=1, padding=1)
+        mean = functional.avg_pool2d(flow, 3, stride=1, padding=1)
+        reached = share > 0.0
+        mean = mean / share.where(reached, 1.0)
+        flow = torch.where(known, flow, mean)
+        known = known | reached
+    return flow

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from common.flow_files import flow_discontinuities, read_flow, write_flow
 
 from torchcss.errors import FlowFileError, OutputError, ShapeError
-from torchcss.studies.flow_files import read_flow, write_flow
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 5), (1, 7), (40, 30)])
@@ -103,3 +103,36 @@ def test_other_shapes_are_refused(tmp_path: Path, shape: tuple[int, ...]) -> Non
         write_flow(tmp_path / "a.flo", torch.zeros(shape))
     with pytest.raises(ShapeError, match="known"):
         write_flow(tmp_path / "a.flo", torch.zeros(2, 3, 4), torch.ones(4, 3, dtype=torch.bool))
+
+
+def test_discontinuities_mark_both_sides() -> None:
+    flow = torch.zeros(2, 6, 7)
+    flow[0, :, 3:] = 0.6
+    expected = torch.zeros(6, 7, dtype=torch.bool)
+    expected[:, 2:4] = True
+    assert torch.equal(flow_discontinuities(flow), expected)
+    assert torch.equal(flow_discontinuities(flow.mT), expected.mT)
+    assert not flow_discontinuities(flow, jump=0.7).any()
+    assert torch.equal(flow_discontinuities(flow.expand(2, 3, 2, 6, 7))[1, 2], expected)
+
+
+def test_discontinuities_across_unknown_pixels() -> None:
+    flow = torch.zeros(2, 9, 11)
+    flow[1, :, 5:] = 2.0
+    known = torch.ones(9, 11, dtype=torch.bool)
+    known[:, 4:7] = False
+    flow[:, ~known] = float("nan")
+    found = flow_discontinuities(flow, known)
+    assert found[:, 4:7].any(dim=1).all()
+    assert not found[:, :3].any()
+    assert not found[:, 8:].any()
+    nothing_known = torch.zeros(9, 11, dtype=torch.bool)
+    assert not flow_discontinuities(flow, nothing_known).any()
+
+
+@pytest.mark.parametrize("shape", [(9, 11), (3, 9, 11)])
+def test_discontinuities_refuse_other_shapes(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ShapeError, match="flow"):
+        flow_discontinuities(torch.zeros(shape))
+    with pytest.raises(ShapeError, match="known"):
+        flow_discontinuities(torch.zeros(2, 9, 11), torch.ones(9, 10, dtype=torch.bool))

@@ -1,17 +1,17 @@
-"""The demo's clip: small, whole, and filmed by what the package has."""
+"""The demo's clip: small, whole, and filmed by the script."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from types import ModuleType
 
 import torch
 
 from torchcss.io.cameras import read_camera
 from torchcss.io.keypoints.read import read_keypoints
 from torchcss.io.video import VideoReader
-from torchcss.studies.demo import CLIP, KEYPOINT_NOISE_PX, write_clip
+from torchcss.studies.demo import CLIP, KEYPOINT_NOISE_PX
 from torchcss.studies.evaluation import read_reference
-from torchcss.studies.render.sequences import arm_sequence
 
 
 def check(folder: Path, num_frames: int) -> None:
@@ -34,9 +34,7 @@ def test_the_clip_in_the_package_is_small_and_whole() -> None:
     check(CLIP, 50)
 
 
-def test_a_clip_is_written(tmp_path: Path) -> None:
-    generator = torch.Generator().manual_seed(1)
-    sequence = arm_sequence(generator=generator, num_frames=2)
-    folder = write_clip(tmp_path / "clip", sequence, generator=generator)
+def test_a_clip_is_written(tmp_path: Path, script: ModuleType) -> None:
+    folder = script.main(script.Config(out=tmp_path / "clip", frames=2, seed=1))
     check(folder, 2)
     assert {path.name for path in folder.iterdir()} == {path.name for path in CLIP.iterdir()}
