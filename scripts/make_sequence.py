@@ -18,11 +18,10 @@ from typing import Annotated, Any, Literal
 import tyro
 from common import start
 
-from torchcss.errors import ConfigurationError, TrackFileError
-from torchcss.files import load_arrays
-from torchcss.studies.render.motions import read_motion
+from torchcss.errors import ConfigurationError
 from torchcss.studies.render.sequences import STYLES, Shot, shot, shot_of_motion
 from torchcss.studies.sequence_writer import write_sequence
+from torchcss.studies.sequences import read_motion
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +54,7 @@ def make_shot(config: Config) -> Shot:
         raise ConfigurationError("--sequence mocap and --motion FILE.npz go together")
     if config.motion is None:
         return shot(config.sequence, seed=config.seed, num_frames=config.frames, small=config.small)
-    motion = read_motion(load_arrays(config.motion, TrackFileError), str(config.motion))
+    motion = read_motion(config.motion)
     return shot_of_motion(
         motion,
         name=f"mocap-{config.motion.stem}",

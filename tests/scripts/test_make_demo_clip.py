@@ -11,7 +11,7 @@ from torchcss.io.cameras import read_camera
 from torchcss.io.keypoints.read import read_keypoints
 from torchcss.io.video import VideoReader
 from torchcss.studies.demo import CLIP, KEYPOINT_NOISE_PX
-from torchcss.studies.evaluation import read_reference
+from torchcss.studies.sequences import read_reference
 
 
 def check(folder: Path, num_frames: int) -> None:

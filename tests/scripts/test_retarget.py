@@ -18,7 +18,7 @@ from torchcss import load_body
 from torchcss.errors import ConfigurationError, MotionCaptureError, OutputError
 from torchcss.io.motion.positions import LIMBS
 from torchcss.io.tracks import FrameModes, Track, TrackWriter
-from torchcss.studies.evaluation import read_reference
+from torchcss.studies.sequences import read_reference
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 

@@ -34,8 +34,9 @@ from torchcss.studies.evaluation import (
     summarise,
 )
 from torchcss.studies.metrics import LIMB_JOINTS, root_aligned_mpjpe_mm
+from torchcss.studies.render.motions import Motion
 from torchcss.studies.render.sequences import arm_motion
-from torchcss.studies.sequences import RecordedSequence, Truth
+from torchcss.studies.sequences import RecordedSequence
 from torchcss.types import Frame
 from torchcss.vision.camera import Camera
 
@@ -57,7 +58,7 @@ def recorded(body: BodyModel, states: Tensor, **changes: Any) -> RecordedSequenc
         keypoints=SimpleNamespace(), keypoint_noise_px=None,  # type: ignore[arg-type]
         joint_names=body.joint_names, joints_world=body.pose(states).joints.numpy(),
         mask=np.stack([silhouette(body, x, CAMERA) for x in states[:2]]),
-        truth=Truth(body, states),
+        truth=Motion(body, states, 25.0),
     )  # fmt: skip
     return sequence._replace(**changes)
 

@@ -12,9 +12,10 @@ import pytest
 import torch
 from made_sequences import NOISE_PX, write_arm
 
+from torchcss.body.load import load_body
 from torchcss.errors import CameraError, KeypointError, TrackFileError, VideoError
 from torchcss.studies.render.sequences import SyntheticSequence
-from torchcss.studies.sequences import read_sequence
+from torchcss.studies.sequences import read_motion, read_sequence
 
 T = 3
 
@@ -111,8 +112,8 @@ def test_a_view_of_several(made: tuple[Path, SyntheticSequence], tmp_path: Path)
         ("truth.npz", {"states": np.full((T, 8), np.nan)}, TrackFileError, "finite"),
         ("truth.npz", {"state_names": [*"abcdefgh"]}, TrackFileError, "those of arm8"),
         ("truth.npz", {"body": "octopus"}, TrackFileError, "no body 'octopus'"),
-        ("truth.npz", {"lengths": "[1]"}, TrackFileError, "no body of ours"),
-        ("truth.npz", {"lengths": "{"}, TrackFileError, "no body of ours"),
+        ("truth.npz", {"lengths": "[1]"}, TrackFileError, "no motion of a body of ours"),
+        ("truth.npz", {"lengths": "{"}, TrackFileError, "no motion of a body of ours"),
     ],
 )
 def test_bad_files_are_typed_errors(
@@ -187,3 +188,35 @@ def test_recordings_of_others(
         away = sequence.camera.project(points[seen]).uv - sequence.keypoints.positions[seen, column]
         if bool(seen.any()):
             assert float(away.norm(dim=-1).median()) < 0.01 * max(sequence.camera.image_size_wh)
+
+
+def test_a_motion_file_is_read_as_it_was_meant(tmp_path: Path) -> None:
+    body = load_body("body34", lengths={"thigh": 0.4})
+    base = torch.eye(4, dtype=torch.float64)
+    base[:3, 3] = torch.tensor([1.0, 2.0, 3.0])
+    arrays = {
+        "body": np.array("body34"),
+        "state_names": np.array(body.state_names),
+        "states": np.zeros((5, body.num_parameters)),
+        "frame_rate": np.array(60.0),
+        "lengths": np.array(json.dumps({"thigh": 0.4})),
+        "base_transform": base.numpy(),
+        "description": np.array("standing"),
+    }
+    np.savez(tmp_path / "file.npz", **arrays)
+    motion = read_motion(tmp_path / "file.npz")
+    assert motion.body.lengths == body.lengths
+    assert motion.body.base_translation.tolist() == [1.0, 2.0, 3.0]
+    assert (len(motion.states), motion.frame_rate, motion.description) == (5, 60.0, "standing")
+    for change, message in (
+        ({"states": None}, "states missing"),
+        ({"body": np.array("body99")}, "no body 'body99'"),
+        ({"state_names": np.array(("a", "b"))}, "state_names: expected those of body34"),
+        ({"states": np.zeros((5, 3))}, "frames', 34\\]"),
+        ({"frame_rate": np.array(0.0)}, "positive frame_rate"),
+        ({"lengths": np.array("no json")}, "no motion of a body of ours"),
+    ):
+        broken = {k: v for k, v in {**arrays, **change}.items() if v is not None}
+        np.savez(tmp_path / "broken.npz", **broken)
+        with pytest.raises(TrackFileError, match=message):
+            read_motion(tmp_path / "broken.npz")

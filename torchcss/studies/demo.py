@@ -36,8 +36,8 @@ from torchcss.io.run import Run
 from torchcss.io.tracks import load_track, prepare_output_folder, write_summary
 from torchcss.io.video import VideoWriter
 from torchcss.io.view_files import RecordedCamera, ViewFiles
-from torchcss.studies.evaluation import read_reference
 from torchcss.studies.render.sequences import SyntheticSequence
+from torchcss.studies.sequences import read_reference
 from torchcss.tracking.session import TrackingSession
 from torchcss.tracking.settings import Settings
 from torchcss.tracking.view import CameraView

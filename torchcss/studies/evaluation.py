@@ -30,7 +30,6 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -44,13 +43,11 @@ from torchcss.body.uncertainty import joint_covariance
 from torchcss.cost.interpenetration import InterpenetrationPairs
 from torchcss.cost.part_map import part_map
 from torchcss.errors import ConfigurationError, TrackFileError
-from torchcss.files import load_arrays
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.tracker import TrackerInfo
 from torchcss.io.run import Run, as_run
 from torchcss.io.track_body import pose_track
 from torchcss.io.tracks import Track
-from torchcss.joint_names import canonical_joint_name
 from torchcss.linalg import squared_mahalanobis
 from torchcss.studies.metrics import (
     LEVELS,
@@ -69,7 +66,7 @@ from torchcss.studies.metrics import (
     root_aligned_errors_mm,
     track_errors,
 )
-from torchcss.studies.sequences import RecordedSequence
+from torchcss.studies.sequences import RecordedSequence, common_name, read_reference
 from torchcss.tracking.session import Posterior
 from torchcss.types import Frame
 from torchcss.vision.camera import Camera
@@ -705,32 +702,3 @@ def _stated(track: Track, joints: Sequence[int]) -> Float[np.ndarray, "t j 3 3"]
     )
     pose = pose_track(track.body, state, base)
     return joint_covariance(track.body, pose, spread)[:, list(joints)].numpy()
-
-
-def common_name(name: str) -> str:
-    """The catalogue's name of a joint, or its own where the catalogue has none (robots)."""
-    return canonical_joint_name(name) or name
-
-
-def read_reference(
-    path: str | os.PathLike[str], array: str = "joints"
-) -> tuple[Float[np.ndarray, "t j 3"], list[str]]:
-    """Positions in metres and the joints' names; see `evaluate`."""
-    arrays = load_arrays(Path(path), TrackFileError)
-    missing = [name for name in (array, "joint_names") if name not in arrays]
-    if missing:
-        raise TrackFileError(
-            f"{path}: not a reference: expected {array} and joint_names, found "
-            f"{', '.join(arrays) or 'no arrays'}; name the positions with array "
-            "(--reference-array)"
-        )
-    positions, names = arrays[array], [common_name(str(name)) for name in arrays["joint_names"]]
-    if positions.shape[1:] != (len(names), 3) or positions.dtype.kind != "f":
-        raise TrackFileError(
-            f"{path}: {array}: expected shape [frames, {len(names)}, 3] in floating point, "
-            f"got {positions.dtype} {list(positions.shape)}"
-        )
-    units = str(arrays.get("units", "m"))
-    if units.lower() not in ("m", "metre", "metres", "meter", "meters"):
-        raise TrackFileError(f"{path}: units: expected metres, got {units!r}; convert the file")
-    return positions, names

@@ -35,9 +35,9 @@ from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
 from torchcss.io.cameras import read_camera
 from torchcss.io.keypoints.read import read_keypoints
 from torchcss.io.video import VideoReader
-from torchcss.studies.evaluation import read_reference
 from torchcss.studies.metrics import LIMB_JOINTS, root_aligned_mpjpe_mm
 from torchcss.studies.render.sequences import arm_sequence
+from torchcss.studies.sequences import read_reference
 from torchcss.studies.slices import Line, eigen_lines, joint_lines
 from torchcss.tracking.settings import Settings, make_choice, make_plan
 from torchcss.tracking.view import NOTHING_KNOWN, NOTHING_SEEN, CameraView

@@ -9,13 +9,15 @@
 | `mask.npz` | `mask [T H W]`, the silhouette; may be missing |
 | `truth.npz` | the body that moved, if it was one of ours; may be missing |
 
-`truth.npz` holds `body` (its name), `lengths` (JSON, metres), `base_transform [4 4]` (world from
-the frame in which the root moves), `state_names [n]` and `states [T n]`.
+`truth.npz` is a motion file: it holds `body` (its name), `state_names [n]` and `states [T n]`, and
+maybe `lengths` (JSON, metres), `base_transform [4 4]` (world from the frame in which the root
+moves), `frame_rate` and `description`.
 
 A recording with several cameras has one video and one keypoint file per view: `cam01.mp4`,
 `keypoints2d_cam01.npz`, `mask_cam01.npz`.
 
-By default: `read_sequence(folder)`, or `read_sequence(folder, view="cam01")`.
+By default: `read_sequence(folder)`, or `read_sequence(folder, view="cam01")`; `read_reference` and
+`read_motion` read a reference or a motion alone.
 """
 
 from __future__ import annotations
@@ -29,30 +31,17 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
 
 from torchcss.body.load import load_body
-from torchcss.body.model import BodyModel
 from torchcss.errors import CameraError, KeypointError, TrackFileError, VideoError
 from torchcss.files import load_arrays, one_line
 from torchcss.io.cameras import check_image_size, load_camera
 from torchcss.io.keypoints.read import read_keypoints
 from torchcss.io.video import VideoReader
 from torchcss.joint_names import canonical_joint_name
+from torchcss.studies.render.motions import Motion
 from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
-
-
-class Truth(NamedTuple):
-    """What moved in a sequence that was made from one of our own bodies.
-
-    Attributes:
-        body: The body, with its lengths, on its base.
-        states: Its state in every frame.
-    """
-
-    body: BodyModel
-    states: Float[Tensor, "t n"]
 
 
 class RecordedSequence(NamedTuple):
@@ -83,7 +72,7 @@ class RecordedSequence(NamedTuple):
     joint_names: tuple[str, ...]
     joints_world: Float[np.ndarray, "t j 3"]
     mask: Bool[np.ndarray, "t h w"] | None
-    truth: Truth | None
+    truth: Motion | None
 
 
 def read_sequence(folder: str | os.PathLike[str], *, view: str | None = None) -> RecordedSequence:
@@ -115,20 +104,23 @@ def read_sequence(folder: str | os.PathLike[str], *, view: str | None = None) ->
         )
     check_image_size(loaded.camera, *size)
     keypoints, noise = _read_keypoints(folder / f"keypoints2d{suffix}.npz", size, num_frames)
-    names, joints = _read_reference(folder / "reference3d.npz", num_frames)
+    joints, names = read_reference(folder / "reference3d.npz", num_frames=num_frames)
+    frame_rate = float(reader.info.frame_rate)
     mask_file, truth_file = folder / f"mask{suffix}.npz", folder / "truth.npz"
     return RecordedSequence(
         name=folder.resolve().name + ("" if view is None else f":{view}"),
         video=video,
         num_frames=num_frames,
-        frame_rate=float(reader.info.frame_rate),
+        frame_rate=frame_rate,
         camera=loaded.camera,
         keypoints=keypoints,
         keypoint_noise_px=noise,
-        joint_names=names,
-        joints_world=joints,
+        joint_names=tuple(names),
+        joints_world=joints.astype(np.float64),
         mask=_read_mask(mask_file, (num_frames, size[1], size[0])) if mask_file.exists() else None,
-        truth=_read_truth(truth_file, num_frames) if truth_file.exists() else None,
+        truth=read_motion(truth_file, frame_rate=frame_rate, num_frames=num_frames)
+        if truth_file.exists()
+        else None,
     )
 
 
@@ -170,15 +162,42 @@ def _read_keypoints(
     return keypoints, float(noise)
 
 
-def _read_reference(path: Path, num_frames: int) -> tuple[tuple[str, ...], np.ndarray]:
+def read_reference(
+    path: str | os.PathLike[str], array: str = "joints", *, num_frames: int | None = None
+) -> tuple[Float[np.ndarray, "t j 3"], list[str]]:
+    """Read joints in space.
+
+    Args:
+        path: An NPZ file with `joints [T J 3]` in metres, NaN where unknown, and `joint_names`.
+        array: Array of the file that holds the positions.
+        num_frames: How many frames there must be; None: any number.
+
+    Returns:
+        The positions, metres, and the names that the catalogue has for the joints, the file's own
+        for a place that has none.
+
+    Raises:
+        TrackFileError: If the file is missing or malformed.
+    """
+    path = Path(path)
     arrays = load_arrays(path, TrackFileError)
-    _require(path, arrays, "joints", "joint_names")
-    names = tuple(str(name) for name in arrays["joint_names"].reshape(-1))
-    joints = _array(path, arrays, "joints", (num_frames, len(names), 3), "f")
+    if array not in arrays:
+        raise TrackFileError(
+            f"{path}: expected the array {array}, found {', '.join(arrays) or 'none'}; name the "
+            "positions with array (--reference-array)"
+        )
+    _require(path, arrays, "joint_names")
+    names = [common_name(str(name)) for name in arrays["joint_names"].reshape(-1)]
+    joints = _array(path, arrays, array, (num_frames, len(names), 3), "f")
     units = str(arrays.get("units", "m"))
-    if units != "m":
-        raise TrackFileError(f"{path}: units: expected metres (m), found {units!r}; convert them")
-    return tuple(canonical_joint_name(name) or name for name in names), joints.astype(np.float64)
+    if units.lower() not in ("m", "metre", "metres", "meter", "meters"):
+        raise TrackFileError(f"{path}: units: expected metres, got {units!r}; convert the file")
+    return joints, names
+
+
+def common_name(name: str) -> str:
+    """The catalogue's name of a joint, or its own where the catalogue has none (robots)."""
+    return canonical_joint_name(name) or name
 
 
 def _read_mask(path: Path, shape: tuple[int, int, int]) -> np.ndarray:
@@ -187,28 +206,48 @@ def _read_mask(path: Path, shape: tuple[int, int, int]) -> np.ndarray:
     return _array(path, arrays, "mask", shape, "b")
 
 
-def _read_truth(path: Path, num_frames: int) -> Truth:
+def read_motion(
+    path: Path, *, frame_rate: float | None = None, num_frames: int | None = None
+) -> Motion:
+    """Read how one of our bodies moves.
+
+    Args:
+        path: A motion file, see above.
+        frame_rate: States per second; None: as the file says.
+        num_frames: How many states there must be; None: any number.
+
+    Raises:
+        TrackFileError: If an array is missing or does not fit the body.
+    """
     arrays = load_arrays(path, TrackFileError)
-    _require(path, arrays, "body", "lengths", "base_transform", "state_names", "states")
+    needed = ("body", "state_names", "states", *(("frame_rate",) if frame_rate is None else ()))
+    _require(path, arrays, *needed)
     try:
-        lengths = json.loads(str(arrays["lengths"]))
+        lengths = json.loads(str(arrays.get("lengths", "{}")))
         body = load_body(
             str(arrays["body"]), lengths={str(k): float(v) for k, v in lengths.items()}
         )
+        rate = float(arrays["frame_rate"] if frame_rate is None else frame_rate)
     except (ValueError, AttributeError, TypeError) as error:  # ValueError: JSON's and BodyError
-        raise TrackFileError(f"{path}: no body of ours: {one_line(error)}") from error
+        raise TrackFileError(f"{path}: no motion of a body of ours: {one_line(error)}") from error
     names = tuple(str(name) for name in arrays["state_names"].reshape(-1))
     if names != body.state_names:
         raise TrackFileError(
             f"{path}: state_names: expected those of {body.name}, {', '.join(body.state_names)}; "
             f"found {', '.join(names)}"
         )
-    states = _array(path, arrays, "states", (num_frames, len(names)), "f")
-    base = torch.from_numpy(_array(path, arrays, "base_transform", (4, 4), "f").astype(np.float64))
-    if not np.isfinite(states).all():
-        raise TrackFileError(f"{path}: states: expected finite numbers, found some that are not")
-    return Truth(
-        body.with_base(base[:3, :3], base[:3, 3]), torch.from_numpy(states.astype(np.float64))
+    base = np.eye(4)
+    if "base_transform" in arrays:
+        base = _array(path, arrays, "base_transform", (4, 4), "f").astype(np.float64)
+    states = _array(path, arrays, "states", (num_frames, len(names)), "f").astype(np.float64)
+    if not (rate > 0 and len(states) and np.isfinite(states).all()):
+        raise TrackFileError(f"{path}: states: expected finite numbers and a positive frame_rate")
+    turn, place = torch.from_numpy(base[:3, :3]), torch.from_numpy(base[:3, 3])
+    return Motion(
+        body.with_base(turn, place),
+        torch.from_numpy(states),
+        rate,
+        str(arrays.get("description", "")),
     )
 
 
@@ -216,19 +255,27 @@ def _require(path: Path, arrays: Mapping[str, np.ndarray], *names: str) -> None:
     missing = [name for name in names if name not in arrays]
     if missing:
         raise TrackFileError(
-            f"{path}: expected the arrays {', '.join(names)}; {', '.join(missing)} missing"
+            f"{path}: expected the arrays {', '.join(names)}; {', '.join(missing)} missing, found "
+            f"{', '.join(arrays) or 'none'}"
         )
 
 
 def _array(
-    path: Path, arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int, ...], kind: str
+    path: Path,
+    arrays: Mapping[str, np.ndarray],
+    name: str,
+    shape: tuple[int | None, ...],
+    kind: str,
 ) -> np.ndarray:
-    """The array, if it is of this shape, and floating point (`f`) or boolean (`b`)."""
+    """The array, if it is of this shape (None: any), and floating point (`f`) or boolean (`b`)."""
     array = arrays[name]
-    if array.shape != shape or array.dtype.kind != kind:
+    fits = len(array.shape) == len(shape) and all(
+        size in (None, found) for size, found in zip(shape, array.shape, strict=True)
+    )
+    if not fits or array.dtype.kind != kind:
         raise TrackFileError(
-            f"{path}: {name}: expected {'truth values' if kind == 'b' else 'numbers'} of shape "
-            f"{list(shape)}, as many frames as the video has; found {array.dtype} "
-            f"{list(array.shape)}"
+            f"{path}: {name}: expected {'truth values' if kind == 'b' else 'numbers'}, expected "
+            f"shape {[size or 'frames' for size in shape]}, as many frames as the video has; found "
+            f"{array.dtype} {list(array.shape)}"
         )
     return array

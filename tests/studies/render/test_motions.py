@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -14,14 +12,13 @@ from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.shape import with_shape
 from torchcss.cost.interpenetration import InterpenetrationPairs
-from torchcss.errors import ConfigurationError, TrackFileError
+from torchcss.errors import ConfigurationError
 from torchcss.studies.random_person import random_lengths
 from torchcss.studies.render.motions import (
     MOTIONS,
     KeyPoses,
     clamped_spline,
     plant_feet,
-    read_motion,
     sample_times,
 )
 
@@ -138,33 +135,3 @@ def test_tables_are_checked() -> None:
         KeyPoses(body="arm7", times=(0.0, 2.0, 1.0))
     with pytest.raises(ConfigurationError, match="r_elbow_flexion has 1 values for 2 times"):
         KeyPoses(body="arm7", times=(0.0, 2.0), degrees={"r_elbow_flexion": (3,)})
-
-
-def test_a_motion_file_is_read_as_it_was_meant() -> None:
-    body = load_body("body34", lengths={"thigh": 0.4})
-    base = torch.eye(4, dtype=torch.float64)
-    base[:3, 3] = torch.tensor([1.0, 2.0, 3.0])
-    arrays = {
-        "body": np.array("body34"),
-        "state_names": np.array(body.state_names),
-        "states": np.zeros((5, body.num_parameters)),
-        "frame_rate": np.array(60.0),
-        "lengths": np.array(json.dumps({"thigh": 0.4})),
-        "base_transform": base.numpy(),
-        "description": np.array("standing"),
-    }
-    motion = read_motion(arrays, "file.npz")
-    assert motion.body.lengths == body.lengths
-    assert motion.body.base_translation.tolist() == [1.0, 2.0, 3.0]
-    assert (len(motion.states), motion.frame_rate, motion.description) == (5, 60.0, "standing")
-    for change, message in (
-        ({"states": None}, "states missing"),
-        ({"body": np.array("body99")}, "no body 'body99'"),
-        ({"state_names": np.array(("a", "b"))}, "state_names: expected those of body34"),
-        ({"states": np.zeros((5, 3))}, "expected \\[frames, 34\\]"),
-        ({"frame_rate": np.array(0.0)}, "positive frame_rate"),
-        ({"lengths": np.array("no json")}, "not a motion"),
-    ):
-        broken = {k: v for k, v in {**arrays, **change}.items() if v is not None}
-        with pytest.raises(TrackFileError, match=message):
-            read_motion(broken, "file.npz")

@@ -7,24 +7,22 @@ from the pelvis, as they do in a person (`plant_feet`).
 
 `MOTIONS` has those of the papers' section 6 [IJRR]: an arm that bends, rotates and moves towards
 the camera (Fig. 9), a pivoting turn before clutter (Fig. 10), and turning and reaching before a
-dark background (Fig. 11). `KeyPoses.states` evaluates one; `read_motion` takes one from arrays.
+dark background (Fig. 11). `KeyPoses.states` evaluates one.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
-from torchcss.errors import ConfigurationError, TrackFileError
+from torchcss.errors import ConfigurationError
 from torchcss.types import Curvature, PointCost
 
 _METRES = ("root_x", "root_y", "root_z")
@@ -78,7 +76,7 @@ class KeyPoses:
 
 
 class Motion(NamedTuple):
-    """What a sequence is rendered from.
+    """How a body moves: what a sequence is rendered from, or the truth of a recorded one.
 
     Attributes:
         body: The body, on its base.
@@ -90,7 +88,7 @@ class Motion(NamedTuple):
     body: BodyModel
     states: Float[Tensor, "t n"]
     frame_rate: float
-    description: str
+    description: str = ""
 
 
 def clamped_spline(
@@ -253,51 +251,3 @@ def sample_times(duration: float, frame_rate: float, num_frames: int | None) -> 
     """Times of the frames: `num_frames`, or as many as begin before the motion's end."""
     count = round(duration * frame_rate) if num_frames is None else num_frames
     return torch.arange(count, dtype=torch.float64) / frame_rate
-
-
-def read_motion(arrays: Mapping[str, Any], where: str) -> Motion:
-    """Take a motion from the arrays of a file.
-
-    Args:
-        arrays: `body` (a name), `state_names [n]`, `states [T n]`, `frame_rate`, and maybe
-            `base_transform [4 4]`, `lengths` (JSON, metres) and `description`.
-        where: The file's name, for messages.
-
-    Raises:
-        TrackFileError: If an array is missing or does not fit the body.
-    """
-    needed = ("body", "state_names", "states", "frame_rate")
-    missing = [name for name in needed if name not in arrays]
-    if missing:
-        raise TrackFileError(
-            f"{where}: expected the arrays {', '.join(needed)}; {', '.join(missing)} missing"
-        )
-    try:
-        lengths = json.loads(str(arrays["lengths"])) if "lengths" in arrays else None
-        body = load_body(str(arrays["body"]), lengths=lengths)
-        states = torch.from_numpy(np.asarray(arrays["states"], dtype=np.float64))
-        base = np.asarray(arrays.get("base_transform", np.eye(4)), dtype=np.float64)
-        frame_rate = float(arrays["frame_rate"])
-    except (ValueError, TypeError) as error:  # ValueError: JSON's and BodyError, too
-        raise TrackFileError(f"{where}: not a motion of one of our bodies: {error}") from error
-    names = tuple(str(name) for name in np.ravel(arrays["state_names"]))
-    if names != body.state_names:
-        raise TrackFileError(
-            f"{where}: state_names: expected those of {body.name}, {', '.join(body.state_names)}; "
-            f"found {', '.join(names)}"
-        )
-    if states.ndim != 2 or states.shape[1] != len(names) or not len(states):
-        raise TrackFileError(
-            f"{where}: states: expected [frames, {len(names)}], found {list(states.shape)}"
-        )
-    if base.shape != (4, 4) or not (frame_rate > 0 and bool(states.isfinite().all())):
-        raise TrackFileError(
-            f"{where}: expected a base_transform [4, 4], a positive frame_rate and finite states"
-        )
-    transform = torch.from_numpy(base)
-    return Motion(
-        body.with_base(transform[:3, :3], transform[:3, 3]),
-        states,
-        frame_rate,
-        str(arrays.get("description", "")),
-    )
