@@ -43,8 +43,5 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
     report = ["format: NPZ"]
     if "confidence" not in arrays:
         report.append("no confidence in the file: 1 for every joint that is a number")
-    return People(
-        list(found[:, None]),
-        None if names is None else tuple(str(name) for name in names),
-        report,
-    )
+    known = None if names is None else tuple(map(str, names))
+    return People([[person] for person in found], known, report)

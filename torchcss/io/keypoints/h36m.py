@@ -97,7 +97,7 @@ def read_h36m(path: Path, selection: str) -> People:
     places = np.where(np.isfinite(points[..., :2]), points[..., :2], np.nan)
     found = screened(places, points[..., 2] if points.shape[2] == 3 else 1.0)
     report = [f"format: VideoPose3D's archive, {'/'.join(steps)}"]
-    return People(list(found[:, None]), None, report, _layout(path, points.shape[1]))
+    return People([[person] for person in found], None, report, _layout(path, points.shape[1]))
 
 
 def _layout(path: Path, num_joints: int) -> str | None:

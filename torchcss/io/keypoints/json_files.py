@@ -10,16 +10,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from torchcss.errors import KeypointError
 from torchcss.files import load_json, real_numbers, shortened
-from torchcss.io.keypoints.people import People, check_counts, stack, triples
+from torchcss.io.keypoints.people import People, Person, triples
 from torchcss.io.video import natural_order
 from torchcss.joint_names import JOINT_NAMES, canonical_joint_name
 
@@ -44,96 +43,85 @@ def read_openpose_folder(path: Path) -> People:
                     f"{before}; write empty files for frames without people"
                 )
     frames = [openpose_people(file, load_json(file, KeypointError)) for file in files]
-    check_counts(path, frames)
     return People(frames, None, [f"format: OpenPose, {len(files)} files"])
 
 
-def openpose_people(path: Path, content: object) -> Float[np.ndarray, "p j 3"]:
+def openpose_people(path: Path, content: object) -> list[Person]:
     """All people of one file's content."""
     people = content.get("people") if isinstance(content, dict) else None
     if not isinstance(people, list):
         raise KeypointError(f"{path}: not an OpenPose file; expected a list 'people'")
-    return stack(
-        path,
-        [
-            triples(
-                person.get("pose_keypoints_2d") if isinstance(person, dict) else None,
-                f"{path}: people[{index}].pose_keypoints_2d",
-            )
-            for index, person in enumerate(people)
-        ],
-    )
+    return [
+        triples(
+            person.get("pose_keypoints_2d") if isinstance(person, dict) else None,
+            f"{path}: people[{index}].pose_keypoints_2d",
+        )
+        for index, person in enumerate(people)
+    ]
 
 
-def read_coco(
-    path: Path, entries: object, content: Mapping[str, Any], num_frames: int | None
-) -> People:
+def read_coco(path: Path, entries: object, content: Mapping[str, Any]) -> People:
     """Read annotations or a list of detections; `content` is the object around the former."""
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise KeypointError(f"{path}: expected a list of detections, found {shortened(entries)}")
-    detections: dict[object, list[np.ndarray]] = {}
+    found: dict[object, list[Person]] = {}
     for index, entry in enumerate(entries):
         where = f"{path}: detection {index}"
         image = entry.get("image_id")
         if not isinstance(image, (int, str)) or isinstance(image, bool):
             raise KeypointError(f"{where}: expected an image_id, found {shortened(image)}")
-        if "keypoints" not in entry and content:
-            continue  # COCO's annotations of things that have no joints
-        if "keypoints" not in entry:
+        if "keypoints" in entry:
+            found.setdefault(image, []).append(triples(entry["keypoints"], where))
+        elif not content:  # COCO also annotates things that have no joints
             raise KeypointError(f"{where}: expected keypoints, found {shortened(list(entry))}")
-        detections.setdefault(image, []).append(triples(entry["keypoints"], where))
-    order, note = _coco_order(path, content.get("images"), list(detections), num_frames)
-    frames = [stack(path, detections.get(image, [])) for image in order]
-    check_counts(path, frames)
-    report = ["format: COCO, " + note]
-    confidence = np.concatenate([np.zeros(0), *(frame[..., 2].ravel() for frame in frames)])
-    if np.isin(confidence, (0, 1, 2)).all() and (confidence == 2).any():
+    report = ["format: COCO"]
+    confidence = [person[:, 2] for people in found.values() for person in people]
+    values = np.unique(np.concatenate([*confidence, []]))
+    if 2 in values and np.isin(values, (0, 1, 2)).all():
         # Annotations: 0 not labelled, 1 labelled but hidden, 2 seen.
-        frames = [frame * (1.0, 1.0, 0.5) for frame in frames]
+        found = {
+            image: [person * (1.0, 1.0, 0.5) for person in people]
+            for image, people in found.items()
+        }
         report.append("visibility 0, 1, 2 of the annotations taken as confidence 0, 0.5, 1")
+    frames: list[list[Person]] | dict[int, list[Person]]
+    if "images" in content:
+        frames = _in_order_of_images(path, content["images"], found)
+        report.append("frames in the order of the images' names")
+    else:
+        frames = {_frame_of_image(path, image): people for image, people in found.items()}
+        if len(frames) < len(found):
+            raise KeypointError(
+                f"{path}: two image_id of one frame number; number the images or add COCO's list "
+                "'images'"
+            )
     return People(frames, _coco_names(content), report)
 
 
-def _coco_order(
-    path: Path, images: object, found: Sequence[object], num_frames: int | None
-) -> tuple[list[object], str]:
-    """Return the image of every frame, and how that was decided."""
-    if images is not None:
-        if not isinstance(images, list) or not all(
-            isinstance(image, dict) and isinstance(image.get("id"), (int, str)) for image in images
-        ):
-            raise KeypointError(f"{path}: expected 'images' to be a list with an id each")
-        ordered = sorted(
-            images, key=lambda image: natural_order(str(image.get("file_name", image["id"])))
-        )
-        identifiers = [image["id"] for image in ordered]
-        unknown = next((image for image in found if image not in identifiers), None)
-        if unknown is not None:
-            raise KeypointError(f"{path}: detection of image {unknown!r}, which is not in 'images'")
-        return identifiers, "frames in the order of the images' names"
-    # Without the list of images, frames in which nobody was seen are absent: the number counts.
-    places: dict[int, object] = {}
-    for image in found:
-        text = Path(image).stem if isinstance(image, str) else str(image)
-        digits = re.findall(r"[0-9]+", text)
-        place = int(digits[-1]) if digits and len(digits[-1]) < 10 and text[0] != "-" else -1
-        if place < 0 or place in places:
-            raise KeypointError(
-                f"{path}: image_id {shortened(image)} is not a frame number of its own; "
-                "number the images or add COCO's list 'images'"
-            )
-        places[place] = image
-    last = max(places, default=-1)
-    origin = 1 if num_frames is not None and last == num_frames else 0
-    total = last + 1 if num_frames is None else num_frames
-    if last - origin >= total or (origin and 0 in places):
+def _in_order_of_images(
+    path: Path, images: object, found: Mapping[object, list[Person]]
+) -> list[list[Person]]:
+    if not isinstance(images, list) or not all(
+        isinstance(image, dict) and isinstance(image.get("id"), (int, str)) for image in images
+    ):
+        raise KeypointError(f"{path}: expected 'images' to be a list with an id each")
+    ordered = sorted(images, key=lambda each: natural_order(str(each.get("file_name", each["id"]))))
+    identifiers = [image["id"] for image in ordered]
+    if unknown := [image for image in found if image not in identifiers]:
+        raise KeypointError(f"{path}: detection of image {unknown[0]!r}, which is not in 'images'")
+    return [found.get(image, []) for image in identifiers]
+
+
+def _frame_of_image(path: Path, image: object) -> int:
+    """The number of the frame that an image is, where no list of images tells."""
+    text = str(image)
+    digits = re.findall(r"[0-9]+", Path(text).stem)
+    if not digits or len(digits[-1]) > 9 or text.startswith("-"):
         raise KeypointError(
-            f"{path}: expected images 0 to {total - 1}, as the video has, found image {last}"
+            f"{path}: image_id {shortened(image)} is not a frame number of its own; "
+            "number the images or add COCO's list 'images'"
         )
-    if total > 1_000_000:
-        raise KeypointError(f"{path}: image {last} is not a frame number; number the frames from 0")
-    order: list[object] = [places.get(index + origin) for index in range(total)]
-    return order, f"image {origin} is the first frame"
+    return int(digits[-1])
 
 
 def _coco_names(content: Mapping[str, Any]) -> tuple[str, ...] | None:
@@ -146,9 +134,7 @@ def _coco_names(content: Mapping[str, Any]) -> tuple[str, ...] | None:
     return None
 
 
-def read_clicked(
-    path: Path, content: Mapping[str, Any], num_frames: int | None, image_size_wh: tuple[int, int]
-) -> People:
+def read_clicked(path: Path, content: Mapping[str, Any], image_size_wh: tuple[int, int]) -> People:
     """Read joints by name, for one frame or for some."""
     size = content.get("image_size_wh")
     if size is not None and size != list(image_size_wh):
@@ -159,36 +145,35 @@ def read_clicked(
     frames = content.get("frames", {"0": content.get("joints")})
     if not isinstance(frames, dict) or not frames:
         raise KeypointError(f"{path}: expected 'frames' to name frames, found {shortened(frames)}")
-    clicked: dict[int, Mapping[str, Any]] = {}
+    clicked: dict[int, dict[str, list[float]]] = {}
     for key, joints in frames.items():
         if not re.fullmatch(r"[0-9]{1,6}", key):
             raise KeypointError(f"{path}: expected a frame number, found {shortened(key)}")
-        if isinstance(joints, dict) and isinstance(joints.get("joints"), dict):
-            joints = joints["joints"]
-        if not isinstance(joints, dict):
-            raise KeypointError(
-                f"{path}: frame {key}: expected joints by name, found {shortened(joints)}"
-            )
-        clicked[int(key)] = joints
-    total = max(clicked) + 1 if num_frames is None else num_frames
-    if max(clicked) >= total:
-        raise KeypointError(
-            f"{path}: frame {max(clicked)} is beyond the video, which has {total} frames"
-        )
+        clicked[int(key)] = _clicked_joints(f"{path}: frame {key}", joints)
     names = tuple(dict.fromkeys(name for joints in clicked.values() for name in joints))
-    triples = np.zeros((total, len(names), 3))
-    for frame, joints in clicked.items():
-        for name, place in joints.items():
-            where = f"{path}: frame {frame}: {name}"
-            numbers = real_numbers(place, where, KeypointError)
-            if numbers.shape not in ((2,), (3,)):
-                raise KeypointError(
-                    f"{where}: expected [u, v] or [u, v, confidence], found {shortened(place)}"
-                )
-            triples[frame, names.index(name)] = [*numbers, 1.0][:3]
-    unknown = [name for name in names if canonical_joint_name(name) is None]
-    if unknown:
-        raise KeypointError(
-            f"{path}: unknown joint {unknown[0]!r}; the known ones are {', '.join(JOINT_NAMES)}"
-        )
-    return People([frame[None] for frame in triples], names, ["format: clicked joints"])
+    found = {
+        frame: [np.array([joints.get(name, [0.0] * 3) for name in names]).reshape(-1, 3)]
+        for frame, joints in clicked.items()
+    }
+    return People(found, names, ["format: clicked joints"], from_zero=True)
+
+
+def _clicked_joints(where: str, joints: object) -> dict[str, list[float]]:
+    """u, v and confidence of the joints of a frame, by name."""
+    if isinstance(joints, dict) and isinstance(joints.get("joints"), dict):
+        joints = joints["joints"]
+    if not isinstance(joints, dict):
+        raise KeypointError(f"{where}: expected joints by name, found {shortened(joints)}")
+    found = {}
+    for name, place in joints.items():
+        numbers = real_numbers(place, f"{where}: {name}", KeypointError)
+        if numbers.shape not in ((2,), (3,)):
+            raise KeypointError(
+                f"{where}: {name}: expected [u, v] or [u, v, confidence], found {shortened(place)}"
+            )
+        if canonical_joint_name(name) is None:
+            raise KeypointError(
+                f"{where}: unknown joint {name!r}; the known ones are {', '.join(JOINT_NAMES)}"
+            )
+        found[name] = [*numbers.tolist(), 1.0][:3]
+    return found

@@ -21,18 +21,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from torchcss.errors import KeypointError
 from torchcss.files import real_numbers, shortened
-from torchcss.io.keypoints.people import (
-    FRAME_NAMES,
-    People,
-    frame_number,
-    in_order,
-    screened,
-    stack,
-)
+from torchcss.io.keypoints.people import FRAME_NAMES, People, Person, frame_number, screened
 from torchcss.joint_names import ALIASES
 
 LAYOUT = "MediaPipe-33"
@@ -51,55 +43,36 @@ NAMES = (
 _HOLDERS = ("landmarks", "pose_landmarks", "pose", "keypoints", "landmark")
 _CONFIDENCES = ("visibility", "confidence", "score", "presence")
 
-_LARGEST_FRACTION = 3.0
-"""Landmarks that MediaPipe guesses outside the image stay within this many of its sides."""
-
 
 def is_mediapipe(content: object) -> bool:
     """Whether a piece of JSON holds landmarks in one of these ways."""
-    if isinstance(content, dict) and isinstance(content.get("frames"), (list, dict)):
-        content = content["frames"]
+    content = _frames_of(content)
     frames = list(content.values()) if isinstance(content, dict) else content
-    if not isinstance(frames, list):
-        return False
-    if isinstance(content, dict) and any(holder in content for holder in _HOLDERS):
-        return _is_landmarks(_landmarks_of(content))
-    return _is_landmarks(frames) or any(_is_landmarks(_landmarks_of(frame)) for frame in frames)
+    return isinstance(frames, list) and (
+        _is_landmarks(frames) or any(_is_landmarks(_landmarks_of(frame)) for frame in frames)
+    )
 
 
-def read_landmarks(
-    path: Path, content: Any, num_frames: int | None, image_size_wh: tuple[int, int]
-) -> People:
+def read_landmarks(path: Path, content: Any) -> People:
     """Read JSON of landmarks."""
-    if isinstance(content, dict) and isinstance(content.get("frames"), (list, dict)):
-        content = content["frames"]
-    # A list of lists is one of frames, not of the people of one.
-    whole = isinstance(content, list) and isinstance(content[0], dict) and _is_landmarks(content)
-    if whole or (isinstance(content, dict) and any(holder in content for holder in _HOLDERS)):
-        content = [content]
+    content = _frames_of(content)
     if isinstance(content, dict):
         places = [frame_number(path, key) for key in content]
         entries = list(content.values())
     else:
-        entries = list(content)
+        entries = content
         places = [_place_of(path, entry, index) for index, entry in enumerate(entries)]
     if len(set(places)) < len(places):
         raise KeypointError(f"{path}: the same frame number twice; expected each frame once")
-    found: dict[int, np.ndarray] = {}
+    found: dict[int, list[Person]] = {}
     for place, entry in zip(places, entries, strict=True):
         where = f"{path}: frame {place}"
-        people = _people_of(where, _landmarks_of(entry))
-        found[place] = stack(
-            path, [_triples(where, person, index) for index, person in enumerate(people)]
-        )
-    frames, origin = in_order(path, found, num_frames)
-    report = [f"format: MediaPipe landmarks, frame {origin} is the first frame"]
-    return in_pixels(path, frames, image_size_wh, report)
+        people = enumerate(_people_of(where, _landmarks_of(entry)))
+        found[place] = [_triples(where, person, index) for index, person in people]
+    return People(found, None, ["format: MediaPipe landmarks"], LAYOUT, corner_fractions=True)
 
 
-def read_landmark_array(
-    path: Path, name: str, array: np.ndarray, image_size_wh: tuple[int, int]
-) -> People:
+def read_landmark_array(name: str, array: np.ndarray) -> People:
     """Read an array of landmarks, if it is one (see `is_landmark_array`)."""
     size = array.shape[-1] if array.ndim == 3 else array.shape[-1] // NUM_LANDMARKS
     values = array.astype(np.float64).reshape(len(array), NUM_LANDMARKS, size)
@@ -111,44 +84,24 @@ def read_landmark_array(
         report.append(
             "three numbers per landmark taken as x, y, z: confidence 1 where there is one"
         )
-    return in_pixels(path, list(found[:, None]), image_size_wh, report)
+    return People([[person] for person in found], None, report, LAYOUT, corner_fractions=True)
 
 
 def is_landmark_array(array: np.ndarray) -> bool:
     """Whether an array may be landmarks of every frame, by its shape."""
-    if array.dtype.kind not in "iuf" or not len(array.shape) or not len(array):
-        return False
-    return array.shape[1:] in (
-        (NUM_LANDMARKS, 4), (NUM_LANDMARKS, 3), (4 * NUM_LANDMARKS,), (3 * NUM_LANDMARKS,),
-    )  # fmt: skip
+    n = NUM_LANDMARKS
+    is_numbers = array.dtype.kind in "iuf" and array.ndim > 0 and len(array) > 0
+    return is_numbers and array.shape[1:] in ((n, 4), (n, 3), (4 * n,), (3 * n,))
 
 
-def in_pixels(
-    path: Path,
-    frames: list[Float[np.ndarray, "p j 3"]],
-    image_size_wh: tuple[int, int],
-    report: list[str],
-) -> People:
-    """Turn fractions of the image into pixels, where the numbers are fractions.
-
-    Raises:
-        KeypointError: If some are and some are not.
-    """
-    points = np.concatenate([np.zeros((0, 2)), *(f[f[..., 2] > 0][:, :2] for f in frames)])
-    sizes = np.abs(points[np.isfinite(points).all(-1)]).max(-1, initial=0.0)
-    if len(sizes) and np.median(sizes) <= _LARGEST_FRACTION:
-        if sizes.max() > 100 * _LARGEST_FRACTION:
-            raise KeypointError(
-                f"{path}: expected fractions of the image, as most are, found {sizes.max():.4g}"
-            )
-        with np.errstate(all="ignore"):  # what is huge or missing has no confidence
-            for frame in frames:
-                # From the image's corner; pixel centres are at integers.
-                frame[..., :2] = frame[..., :2] * np.array(image_size_wh) - 0.5
-        report.append("fractions of the image converted to pixels")
-    elif len(sizes):
-        report.append("coordinates are pixels already")
-    return People(frames, None, report, LAYOUT, in_pixels=True)
+def _frames_of(content: Any) -> Any:
+    """The frames in whatever holds them: a list, or an object of frames by number."""
+    if isinstance(content, dict) and isinstance(content.get("frames"), (list, dict)):
+        content = content["frames"]
+    # A list of lists is one of frames, not of the people of one.
+    whole = isinstance(content, list) and content and isinstance(content[0], dict)
+    one_frame = isinstance(content, dict) and any(holder in content for holder in _HOLDERS)
+    return [content] if one_frame or (whole and _is_landmarks(content)) else content
 
 
 def _landmarks_of(entry: object) -> object:
@@ -185,7 +138,7 @@ def _people_of(where: str, landmarks: object) -> list[Any]:
     return [landmarks]
 
 
-def _triples(where: str, landmarks: object, person: int) -> Float[np.ndarray, "33 3"]:
+def _triples(where: str, landmarks: object, person: int) -> Person:
     where = f"{where}: person {person}" if person else where
     found = np.zeros((NUM_LANDMARKS, 3))
     if isinstance(landmarks, Mapping):

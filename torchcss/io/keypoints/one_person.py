@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchcss.io.keypoints.people import People
-
 _JUMP = 0.5
 """How far (in sizes of the person) a person may move from one frame to the next and be the same."""
 
 
-def follow(people: People, first_frame: int, report: list[str]) -> np.ndarray:
+def follow(frames: list[np.ndarray], first_frame: int, report: list[str]) -> np.ndarray:
     """Return `[t j 3]`: the person that continuity chooses among those of every frame."""
-    frames = people.frames
     num_joints = frames[first_frame].shape[1]
     chosen = np.zeros((len(frames), num_joints, 3))
     most = max(len(frame) for frame in frames)

@@ -1,9 +1,8 @@
-"""What every reader of 2D joints returns: all detections of a file; and what all readers need."""
+"""What every reader of 2D joints returns, all detections of a file; and what all readers need."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,21 +19,32 @@ FRAME_NAMES = (
 
 _MOST_FRAMES = 1_000_000
 
+Person = Float[np.ndarray, "j 3"]
+"""u, v and confidence of every joint."""
+
 
 class People(NamedTuple):
-    """All detections of a file: per frame `[people, joints, 3]` with u, v, confidence."""
+    """All detections of a file.
 
-    frames: list[np.ndarray]
+    Attributes:
+        frames: The people of every frame in order; or by number, where the file may leave out
+            frames in which nobody is seen.
+        names: The file's own joint names, or None where it has only an order.
+        report: Lines for the user.
+        layout: The layout, where the format says it.
+        corner_fractions: Coordinates are pixels, or fractions of the image from its corner.
+        from_zero: Frames that have numbers are known to be counted from 0.
+    """
+
+    frames: list[list[Person]] | dict[int, list[Person]]
     names: tuple[str, ...] | None
-    """The file's own joint names, or None where it has only an order."""
     report: list[str]
     layout: str | None = None
-    """The layout, where the format says it."""
-    in_pixels: bool = False
-    """The format says what its numbers count, and they are pixels already."""
+    corner_fractions: bool = False
+    from_zero: bool = False
 
 
-def triples(value: object, where: str) -> Float[np.ndarray, "j 3"]:
+def triples(value: object, where: str) -> Person:
     """Return x, y, confidence of every joint from a list of them in a row."""
     numbers = real_numbers(value, where, KeypointError)
     if numbers.ndim != 1 or not numbers.size or numbers.size % 3:
@@ -54,48 +64,41 @@ def screened(
     return np.where(seen, np.concatenate([places, given], axis=-1), 0.0)
 
 
-def stack(path: Path, people: list[np.ndarray]) -> Float[np.ndarray, "p j 3"]:
-    """The people of one frame, all of one layout."""
-    if len({person.shape for person in people}) > 1:
-        raise KeypointError(
-            f"{path}: people with {' and '.join(sorted({str(len(person)) for person in people}))} "
-            "joints; expected one layout in the whole file"
-        )
-    return np.stack(people) if people else np.zeros((0, 0, 3))
+def in_order(
+    path: Path, people: People, num_frames: int | None, report: list[str]
+) -> list[Float[np.ndarray, "p j 3"]]:
+    """All people of every frame; frames that the file leaves out are empty.
 
+    Some programs count from 1, which shows where the last number is that of all frames.
 
-def check_counts(path: Path, frames: list[np.ndarray]) -> None:
-    """Refuse a change of layout between frames; give empty frames the layout of the others."""
-    counts = sorted({frame.shape[1] for frame in frames if len(frame)})
+    Args:
+        path: The file.
+        people: What was found in it.
+        num_frames: Number of frames of the video; None: as many as the file has.
+        report: Gets a line that says from where frames are counted.
+
+    Raises:
+        KeypointError: If a number is none of a frame, or the layout changes.
+    """
+    frames = people.frames
+    if isinstance(frames, dict):
+        last = max(frames, default=-1)
+        from_one = not people.from_zero and 0 not in frames and last == num_frames
+        origin = int(bool(frames) and from_one)
+        # Frames at the end in which nobody is seen are often left out.
+        total = max(last + 1 - origin, num_frames or 0)
+        if total > _MOST_FRAMES:
+            raise KeypointError(f"{path}: {last} is not a frame number; number the frames from 0")
+        report.append(f"frame {origin} is the first frame")
+        frames = [frames.get(index + origin, []) for index in range(total)]
+    counts = sorted({len(person) for frame in frames for person in frame})
     if len(counts) > 1:
         raise KeypointError(
             f"{path}: people with {' and '.join(map(str, counts))} joints; "
             "expected one layout in the whole file"
         )
-    for index, frame in enumerate(frames):
-        if not len(frame):
-            frames[index] = np.zeros((0, counts[0] if counts else 0, 3))
-
-
-def in_order(
-    path: Path, found: Mapping[int, np.ndarray], num_frames: int | None
-) -> tuple[list[np.ndarray], int]:
-    """All frames from people by frame number; those that the file leaves out are empty.
-
-    Some programs count from 1, which shows where the last number is that of all frames.
-
-    Returns:
-        The frames, and the number of the first.
-    """
-    last = max(found, default=-1)
-    origin = 1 if found and 0 not in found and last == num_frames else 0
-    # Frames at the end in which nobody is seen are often left out.
-    total = max(last + 1 - origin, num_frames or 0)
-    if total > _MOST_FRAMES:
-        raise KeypointError(f"{path}: {last} is not a frame number; number the frames from 0")
-    frames = [found.get(index + origin, np.zeros((0, 0, 3))) for index in range(total)]
-    check_counts(path, frames)
-    return frames, origin
+    nobody = np.zeros((0, *counts, 3) if counts else (0, 0, 3))
+    return [np.stack(frame) if len(frame) else nobody for frame in frames]
 
 
 def frame_number(where: object, text: str) -> int:

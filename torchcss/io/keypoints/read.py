@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -46,7 +46,7 @@ from torchcss.io.keypoints.mediapipe import (
     read_landmarks,
 )
 from torchcss.io.keypoints.one_person import follow, size_of
-from torchcss.io.keypoints.people import People
+from torchcss.io.keypoints.people import People, in_order
 from torchcss.io.keypoints.tables import read_table
 from torchcss.joint_names import ALIASES, JOINT_NAMES, layout_of_names
 from torchcss.types import Keypoints
@@ -65,6 +65,9 @@ for _name in (
 
 _NORMALISED_EXTENT = 2.0
 """No person is so few pixels large: coordinates that all lie within are fractions of the image."""
+
+_LARGEST_FRACTION = 3.0
+"""Landmarks that MediaPipe guesses outside the image stay within this many of its sides."""
 
 _OUTSIDE = 3.0
 """How many times the longer image side a joint may lie outside before the file is refused."""
@@ -109,39 +112,32 @@ def read_keypoints(
         raise KeypointError(
             f"{path}: unknown layout {layout!r}; the known ones are {', '.join(ALIASES)}"
         )
-    people = _read(path, num_frames, image_size_wh)
-    if num_frames is not None and len(people.frames) != num_frames:
-        raise KeypointError(
-            f"{path}: expected {num_frames} frames, as the video has, found {len(people.frames)}; "
-            "make the keypoints from this very video"
-        )
-    if not 0 <= first_frame < max(1, len(people.frames)):
-        raise KeypointError(
-            f"{path}: the first frame {first_frame} is beyond the file, "
-            f"which has {len(people.frames)} frames"
-        )
+    people = _read(path, image_size_wh)
     report = list(people.report)
-    _check_names(path, people)
-    _check_numbers(path, people, report)
-    _check_somebody(path, people, first_frame)
-    if not people.in_pixels:
-        _to_pixels(path, people, image_size_wh, normalised, report)
-    _check_places(path, people, image_size_wh)
-    chosen = follow(people, first_frame, report)
+    frames = in_order(path, people, num_frames, report)
+    _check_counts(path, frames, people.names, num_frames, first_frame)
+    frames = _checked_numbers(path, frames, people.names, report)
+    _check_somebody(path, frames, first_frame)
+    points = np.concatenate([frame[frame[..., 2] > 0.0][:, :2] for frame in frames])
+    if people.corner_fractions:
+        scale, shift, note = _from_corner(path, points, image_size_wh)
+    else:
+        scale, shift, note = _from_border_pixels(path, points, image_size_wh, normalised)
+    report += note
+    _check_places(path, scale * points + shift, image_size_wh)
+    for frame in frames:
+        frame[..., :2] = scale * frame[..., :2] + shift
+    chosen = follow(frames, first_frame, report)
     names = _joint_names(path, people, chosen, layout or people.layout, report)
     positions = np.where(chosen[..., 2:] > 0.0, chosen[..., :2], 0.0)
-    return Keypoints(
-        torch.from_numpy(positions),
-        torch.from_numpy(chosen[..., 2].copy()),
-        names,
-        report=tuple(report),
-    )
+    confidence = torch.from_numpy(chosen[..., 2].copy())
+    return Keypoints(torch.from_numpy(positions), confidence, names, report=tuple(report))
 
 
 # The formats.
 
 
-def _read(path: Path, num_frames: int | None, image_size_wh: tuple[int, int]) -> People:
+def _read(path: Path, image_size_wh: tuple[int, int]) -> People:
     if path.is_dir():
         return read_openpose_folder(path)
     archive, mark, selection = str(path).rpartition("#")
@@ -158,26 +154,29 @@ def _read(path: Path, num_frames: int | None, image_size_wh: tuple[int, int]) ->
             "several recordings to choose from"
         )
     if suffix in (".npz", ".npy"):
-        return _read_numpy(path, image_size_wh)
+        return _read_numpy(path)
     if suffix in (".csv", ".tsv"):
-        return read_table(path, num_frames, image_size_wh)
+        return read_table(path)
     if suffix in (".h5", ".hdf5"):
         raise KeypointError(
             f"{path}: DeepLabCut's HDF5 holds pickled objects, which could run a programme; save "
             "it as CSV (save_as_csv=True, or deeplabcut.analyze_videos_converth5_to_csv)"
         )
-    content = load_json(path, KeypointError)
-    if isinstance(content, dict) and "annotations" in content:
-        return read_coco(path, content["annotations"], content, num_frames)
-    if isinstance(content, dict) and "people" in content:
-        people = openpose_people(path, content)
-        return People([people], None, ["format: OpenPose, one frame"])
+    return _read_json(path, load_json(path, KeypointError), image_size_wh)
+
+
+def _read_json(path: Path, content: Any, image_size_wh: tuple[int, int]) -> People:
+    keys = content.keys() if isinstance(content, dict) else set()
+    if "annotations" in keys:
+        return read_coco(path, content["annotations"], content)
+    if "people" in keys:
+        return People([openpose_people(path, content)], None, ["format: OpenPose, one frame"])
     if is_mediapipe(content):
-        return read_landmarks(path, content, num_frames, image_size_wh)
+        return read_landmarks(path, content)
     if isinstance(content, list):
-        return read_coco(path, content, {}, num_frames)
-    if isinstance(content, dict) and ("joints" in content or "frames" in content):
-        return read_clicked(path, content, num_frames, image_size_wh)
+        return read_coco(path, content, {})
+    if keys & {"joints", "frames"}:
+        return read_clicked(path, content, image_size_wh)
     raise KeypointError(
         f"{path}: not a keypoint file; expected OpenPose's 'people', COCO's 'annotations' or list "
         "of detections, MediaPipe's landmarks, or clicked 'joints' or 'frames', found "
@@ -185,73 +184,85 @@ def _read(path: Path, num_frames: int | None, image_size_wh: tuple[int, int]) ->
     )
 
 
-def _read_numpy(path: Path, image_size_wh: tuple[int, int]) -> People:
+def _read_numpy(path: Path) -> People:
     if path.suffix.lower() == ".npy":
         arrays = {path.name: load_array(path, KeypointError)}
     else:
         arrays = dict(load_arrays(path, KeypointError))
     found = [name for name, array in arrays.items() if is_landmark_array(array)]
     if len(found) == 1:
-        return read_landmark_array(path, found[0], arrays[found[0]], image_size_wh)
+        return read_landmark_array(found[0], arrays[found[0]])
     return read_arrays(path, arrays)
 
 
 # What is checked and decided.
 
 
-def _check_names(path: Path, people: People) -> None:
-    num_joints = max((frame.shape[1] for frame in people.frames), default=0)
-    if people.names is None or not num_joints:  # nobody in the whole file: another check says so
-        return
-    if len(people.names) != num_joints:
+def _check_counts(
+    path: Path,
+    frames: list[np.ndarray],
+    names: tuple[str, ...] | None,
+    num_frames: int | None,
+    first_frame: int,
+) -> None:
+    """Refuse another number of frames than the video's, and of names than joints."""
+    if num_frames is not None and len(frames) != num_frames:
         raise KeypointError(
-            f"{path}: {len(people.names)} joint names for {num_joints} joints; expected as many"
+            f"{path}: expected {num_frames} frames, as the video has, found {len(frames)}; "
+            "make the keypoints from this very video"
         )
-    if len(set(people.names)) < num_joints:
-        raise KeypointError(f"{path}: the same joint name twice in {shortened(people.names)}")
+    if not 0 <= first_frame < max(1, len(frames)):
+        raise KeypointError(
+            f"{path}: the first frame {first_frame} is beyond the file, "
+            f"which has {len(frames)} frames"
+        )
+    num_joints = max((frame.shape[1] for frame in frames), default=0)
+    if names is None or not num_joints:  # nobody in the whole file: another check says so
+        return
+    if len(names) != num_joints:
+        raise KeypointError(
+            f"{path}: {len(names)} joint names for {num_joints} joints; expected as many"
+        )
+    if len(set(names)) < num_joints:
+        raise KeypointError(f"{path}: the same joint name twice in {shortened(names)}")
 
 
-def _check_numbers(path: Path, people: People, report: list[str]) -> None:
+def _checked_numbers(
+    path: Path, frames: list[np.ndarray], names: tuple[str, ...] | None, report: list[str]
+) -> list[np.ndarray]:
     """Refuse numbers that are not finite where they count; bring confidences into their range."""
-    clipped = 0
-    for index, frame in enumerate(people.frames):
+    checked, clipped = [], 0
+    for index, frame in enumerate(frames):
         confidence = frame[..., 2]
-        finite = np.isfinite(frame[..., 0]) & np.isfinite(frame[..., 1])
+        finite = np.isfinite(frame[..., :2]).all(-1)
         bad = np.isnan(confidence) | (~finite & (confidence != 0.0))
         if bad.any():
             joint = int(np.argwhere(bad)[0, -1])
-            name = repr(people.names[joint]) if people.names else str(joint)
-            found = float(np.extract(bad, confidence)[0])
             raise KeypointError(
-                f"{path}: frame {index}: joint {name} is not a number though its confidence is "
-                f"{found:g}; expected confidence 0 where a joint is missing"
+                f"{path}: frame {index}: joint {repr(names[joint]) if names else joint} is not a "
+                f"number though its confidence is {float(confidence[bad][0]):g}; expected "
+                "confidence 0 where a joint is missing"
             )
         if (confidence > 10.0).any():
             raise KeypointError(
                 f"{path}: frame {index}: confidence {confidence.max():g}; expected 0 to 1"
             )
         clipped += int(((confidence < 0.0) | (confidence > 1.0)).sum())
-        people.frames[index] = np.concatenate(
-            [
-                np.where(finite[..., None], frame[..., :2], 0.0),
-                confidence.clip(0.0, 1.0)[..., None],
-            ],
-            axis=-1,
-        )
+        places = np.where((confidence > 0.0)[..., None], frame[..., :2], 0.0)
+        checked.append(np.concatenate([places, confidence.clip(0.0, 1.0)[..., None]], axis=-1))
     if clipped:
         report.append(f"{clipped} confidences outside 0 to 1 were moved to the nearer end")
+    return checked
 
 
-def _check_somebody(path: Path, people: People, first_frame: int) -> None:
-    seen = [index for index, frame in enumerate(people.frames) if (frame[..., 2] > 0.0).any()]
+def _check_somebody(path: Path, frames: list[np.ndarray], first_frame: int) -> None:
+    seen = [index for index, frame in enumerate(frames) if (frame[..., 2] > 0.0).any()]
     if first_frame in seen:
         return
     later = next((index for index in seen if index > first_frame), None)
-    advice = (
-        f"the first frame with somebody is {later}: start there"
-        if later is not None
-        else "there is none later either"
-    )
+    advice = f"the first frame with somebody is {later}: start there"
+    if later is None:
+        advice = "there is none later either"
     if first_frame == 0 and later == 1:
         advice += ", or number the frames from 0, if the file counts them from 1"
     raise KeypointError(
@@ -259,19 +270,27 @@ def _check_somebody(path: Path, people: People, first_frame: int) -> None:
     )
 
 
-def _confident(people: People) -> np.ndarray:
-    """All confident points `[n, 2]` of all people."""
-    return np.concatenate([frame[frame[..., 2] > 0.0][:, :2] for frame in people.frames])
+Change = tuple[np.ndarray | float, np.ndarray | float, list[str]]
+"""Factor and shift that make pixels of coordinates, and what to report."""
 
 
-def _to_pixels(
-    path: Path,
-    people: People,
-    image_size_wh: tuple[int, int],
-    normalised: bool | Scale,
-    report: list[str],
-) -> None:
-    points = _confident(people)
+def _from_corner(path: Path, points: np.ndarray, image_size_wh: tuple[int, int]) -> Change:
+    """Pixels, or fractions of the image from its corner; MediaPipe's numbers tell which."""
+    sizes = np.abs(points).max(-1)
+    if np.median(sizes) > _LARGEST_FRACTION:
+        return 1.0, 0.0, ["coordinates are pixels already"]
+    if sizes.max() > 100 * _LARGEST_FRACTION:
+        raise KeypointError(
+            f"{path}: expected fractions of the image, as most are, found {sizes.max():.4g}"
+        )
+    # Pixel centres are at integers.
+    return np.array(image_size_wh), -0.5, ["fractions of the image converted to pixels"]
+
+
+def _from_border_pixels(
+    path: Path, points: np.ndarray, image_size_wh: tuple[int, int], normalised: bool | Scale
+) -> Change:
+    """Pixels, or fractions from the centres of border pixels, as the caller says."""
     fractions = bool((np.abs(points) <= _NORMALISED_EXTENT).all())
     if normalised is False or normalised == "pixels":
         if fractions:
@@ -280,7 +299,7 @@ def _to_pixels(
                 f"{points.max():.3g}: they seem to be fractions of the image; if so, "
                 "set normalised to zero-one or plus-minus-one"
             )
-        return
+        return 1.0, 0.0, []
     if not fractions:
         raise KeypointError(
             f"{path}: expected fractions of the image, but coordinates reach "
@@ -292,14 +311,12 @@ def _to_pixels(
             "outside the image (normalised 'zero-one') or from -1 to 1 ('plus-minus-one')"
         )
     largest = np.asarray(image_size_wh, dtype=np.float64) - 1.0
-    signed = normalised == "plus-minus-one"
-    for frame in people.frames:
-        frame[..., :2] = (0.5 * (frame[..., :2] + 1.0) if signed else frame[..., :2]) * largest
-    report.append(f"coordinates from {-1 if signed else 0} to 1 converted to pixels")
+    if normalised == "plus-minus-one":
+        return 0.5 * largest, 0.5 * largest, ["coordinates from -1 to 1 converted to pixels"]
+    return largest, 0.0, ["coordinates from 0 to 1 converted to pixels"]
 
 
-def _check_places(path: Path, people: People, image_size_wh: tuple[int, int]) -> None:
-    points = _confident(people)
+def _check_places(path: Path, points: np.ndarray, image_size_wh: tuple[int, int]) -> None:
     size = np.asarray(image_size_wh, dtype=np.float64)
     outside = np.maximum(-points, points - size).max(axis=1)
     if (outside > _OUTSIDE * size.max()).any():
@@ -319,7 +336,7 @@ def _check_places(path: Path, people: People, image_size_wh: tuple[int, int]) ->
 def _joint_names(
     path: Path, people: People, chosen: np.ndarray, layout: str | None, report: list[str]
 ) -> tuple[str, ...]:
-    num_joints = chosen.shape[1]
+    num_joints, own = chosen.shape[1], people.names or ()
     if layout is not None and len(ALIASES[layout]) != num_joints:
         fitting = ", ".join(_LAYOUTS_BY_COUNT.get(num_joints, ())) or "none of the known"
         raise KeypointError(
@@ -327,23 +344,20 @@ def _joint_names(
             f"the file has {num_joints}; fitting layouts: {fitting}"
         )
     if layout is not None:
-        known, own = ALIASES[layout], people.names or ()
-        report.append(
-            f"layout: {layout}, as {'the file says' if people.layout == layout else 'asked for'}"
-        )
-    elif people.names is not None and any(layout_of_names(people.names)):
-        known, own = layout_of_names(people.names), people.names
-        report.append(f"layout: by {num_joints} names")
+        known = ALIASES[layout]
+        why = f"{layout}, as {'the file says' if people.layout == layout else 'asked for'}"
+    elif own and any(layout_of_names(own)):
+        known, why = layout_of_names(own), f"by {num_joints} names"
     elif people.names is None and num_joints in _LAYOUTS_BY_COUNT:
         layout, reason = _recognise(chosen)
-        known, own = ALIASES[layout], ()
-        report.append(f"layout: {layout}, {reason}")
+        known, why = ALIASES[layout], f"{layout}, {reason}"
     else:
-        found = f"names {shortened(list(people.names))}" if people.names else "joints without names"
+        found = f"names {shortened(list(own))}" if own else "joints without names"
         raise KeypointError(
             f"{path}: unknown layout: found {num_joints} {found}; the known layouts are "
             + ", ".join(f"{name} ({len(joints)})" for name, joints in ALIASES.items())
         )
+    report.append(f"layout: {why}")
     names = tuple(
         name or (own[index] if own else f"{layout}[{index}]") for index, name in enumerate(known)
     )

@@ -8,7 +8,8 @@ row for every frame, `x, y, likelihood` for every body part. What was not found 
 
 *Long.* One row for every joint of every frame: `frame, landmark, x, y, visibility`.
 
-Joints that are only numbered are MediaPipe's if there are 33.
+Joints that are only numbered are MediaPipe's if there are 33. Each of the three says by its heading
+what its columns are (`_Columns`); the rows are then read alike.
 """
 
 from __future__ import annotations
@@ -16,16 +17,16 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from torchcss.errors import KeypointError
 from torchcss.files import read_text, shortened
-from torchcss.io.keypoints.mediapipe import NAMES, in_pixels
-from torchcss.io.keypoints.people import FRAME_NAMES, People, frame_number, in_order, screened
+from torchcss.io.keypoints.mediapipe import LAYOUT, NAMES
+from torchcss.io.keypoints.people import FRAME_NAMES, People, Person, frame_number, screened
 
 _PARTS = {
     **dict.fromkeys(("x", "u"), 0),
@@ -40,53 +41,169 @@ _PARTS = {
 _JOINTS = ("landmark", "landmark_id", "landmark_name", "landmark_index", "joint", "joint_name",
            "joint_id", "bodypart", "keypoint", "name", "id", "index")  # fmt: skip
 
+Row = tuple[int, list[str]]
+"""A row's number in the file, from 1, and its cells."""
 
-def read_table(path: Path, num_frames: int | None, image_size_wh: tuple[int, int]) -> People:
+
+class _Columns(NamedTuple):
+    """What the columns of a table are.
+
+    Attributes:
+        parts: Column of each of u, v and confidence, by person and joint.
+        size: How many columns there are.
+        frame: The column that numbers the frames; None: a frame is a row.
+        joint: The column that names the joint, if the heading does not.
+    """
+
+    parts: Mapping[tuple[str, str], Mapping[int, int]]
+    size: int
+    frame: int | None
+    joint: int | None = None
+
+
+def read_table(path: Path) -> People:
     """Read a CSV.
 
     Raises:
         KeypointError: If it is none of those above; the message names the row.
     """
+    text = read_text(path, KeypointError)
+    comma = max(",;\t", key=text[:4096].count)
     try:
-        text = read_text(path, KeypointError)
-        sample = text[:4096]
-        comma = max(",;\t", key=sample.count)
-        rows = [
-            [cell.strip() for cell in row]
-            for row in csv.reader(io.StringIO(text, newline=""), delimiter=comma)
-        ]
+        lines = list(csv.reader(io.StringIO(text, newline=""), delimiter=comma))
     except csv.Error as error:
         raise KeypointError(f"{path}: cannot be read as CSV: {error}") from error
-    numbered = [(number, row) for number, row in enumerate(rows, start=1) if any(row)]
-    if not numbered:
+    rows = [
+        (number, [cell.strip() for cell in row])
+        for number, row in enumerate(lines, start=1)
+        if any(row)
+    ]
+    if not rows:
         raise KeypointError(f"{path}: the file is empty")
-    firsts = [row[0].lower() for _, row in numbered[:4]]
+    firsts = [row[0].lower() for _, row in rows[:4]]
     if "bodyparts" in firsts and "coords" in firsts:
-        return _read_deeplabcut(path, numbered, num_frames)
-    heading, body = numbered[0][1], numbered[1:]
-    names = [re.sub(r"[\s.\-]+", "_", cell.lower()) for cell in heading]
-    if not body:
+        columns, body = _deeplabcut(path, rows)
+        joints, frames = _read_rows(path, columns, body)
+        animals = len({person for person, _ in columns.parts})
+        report = [f"format: DeepLabCut, {animals} individual{'s' * (animals > 1)}"]
+        return People(frames, tuple(joints), report)
+    if len(rows) == 1:
         raise KeypointError(f"{path}: row 1: a heading and nothing below it; get a complete copy")
-    joint = _first_of(_JOINTS, names)
-    if joint is not None and {"x", "y"} <= set(names):
-        joints, found = _long(path, names, joint, body)
-    else:
-        joints, found = _wide(path, names, heading, body)
-    people, _ = in_order(path, found, num_frames)
+    joints, frames = _read_rows(path, _headed(path, rows[0][1]), rows[1:])
     lower = [re.sub(r"[^a-z0-9]+", "_", name.lower()) for name in joints]
-    if len(joints) == len(NAMES) and (set(lower) == set(NAMES) or all(map(str.isdigit, lower))):
-        order = [lower.index(name) for name in NAMES] if lower[0] in NAMES else _by_number(lower)
-        people = [frame[:, order] for frame in people]
-        return in_pixels(path, people, image_size_wh, ["format: CSV of MediaPipe's landmarks"])
-    named = not all(map(str.isdigit, lower))
-    return People(people, tuple(joints) if named else None, ["format: CSV, a heading per column"])
+    numbered = all(map(str.isdigit, lower))
+    if len(joints) == len(NAMES) and (set(lower) == set(NAMES) or numbered):
+        key = int if numbered else NAMES.index
+        order = sorted(range(len(lower)), key=lambda index: key(lower[index]))
+        frames = {place: [each[order] for each in people] for place, people in frames.items()}
+        report = ["format: CSV of MediaPipe's landmarks"]
+        return People(frames, None, report, LAYOUT, corner_fractions=True)
+    return People(
+        frames, None if numbered else tuple(joints), ["format: CSV, a heading per column"]
+    )
 
 
-def _by_number(names: Sequence[str]) -> list[int]:
-    return sorted(range(len(names)), key=lambda index: int(names[index]))
+def _headed(path: Path, heading: Sequence[str]) -> _Columns:
+    """The columns of a table with one heading, long or wide."""
+    names = [re.sub(r"[\s.\-]+", "_", cell.lower()) for cell in heading]
+    frame, joint = _first_of(FRAME_NAMES, names), _first_of(_JOINTS, names)
+    if joint is not None and {"x", "y"} <= set(names):
+        parts = {_PARTS[name]: index for index, name in enumerate(names) if name in _PARTS}
+        return _Columns({("", ""): parts}, len(names), frame, joint)
+    columns: dict[tuple[str, str], dict[int, int]] = {}
+    for index, name in enumerate(names):
+        if (split := _split(name)) is not None:
+            own = columns.setdefault(("", split[0]), {})
+            if split[1] in own and split[1] != 3:
+                raise KeypointError(f"{path}: row 1: column {heading[index]!r} is there twice")
+            own[split[1]] = index
+    columns = {joint: parts for joint, parts in columns.items() if {0, 1} <= set(parts)}
+    if not columns:
+        raise KeypointError(
+            f"{path}: row 1: expected DeepLabCut's headings, or columns such as nose_x and nose_y, "
+            f"found {shortened(', '.join(heading))}"
+        )
+    return _Columns(columns, len(names), frame)
 
 
-def _number(path: Path, row: int, cell: str) -> float:
+def _split(name: str) -> tuple[str, int] | None:
+    """Joint and kind of number of a column, whichever comes first in its name."""
+    if match := re.fullmatch(r"([a-z]+)_?([0-9]+)", name):  # x1, v33
+        return (match[2], _PARTS[match[1]]) if match[1] in _PARTS else None
+    for joint, part in (name.rpartition("_")[::2], name.partition("_")[::-2]):
+        if part in _PARTS and joint:
+            number = re.fullmatch(r"(?:landmark|lm|joint|keypoint|kp|point|pose)_?([0-9]+)", joint)
+            return (number[1] if number else joint), _PARTS[part]
+    return None
+
+
+def _deeplabcut(path: Path, rows: Sequence[Row]) -> tuple[_Columns, Sequence[Row]]:
+    """The columns of DeepLabCut's headings, and the rows below."""
+    headings = {row[0].lower(): row for _, row in rows[:4]}
+    coords, joints = headings["coords"], headings["bodyparts"]
+    kinds = ("x", "y", "likelihood")
+    start = next((index for index, cell in enumerate(coords) if cell in kinds), None)
+    size = len(coords)
+    animals = headings.get("individuals", ["one"] * size)
+    if start is None or not len(joints) == len(animals) == size:
+        raise KeypointError(
+            f"{path}: expected x, y, likelihood under every body part, found "
+            f"{shortened(', '.join(coords))}"
+        )
+    if foreign := [kind for kind in coords[start:] if kind not in kinds]:
+        raise KeypointError(
+            f"{path}: coords: expected x, y, likelihood, found {shortened(foreign[0])}"
+        )
+    parts: dict[tuple[str, str], dict[int, int]] = {}
+    for column in range(start, size):
+        own = parts.setdefault((animals[column], joints[column]), {})
+        own[kinds.index(coords[column])] = column
+    body = rows[1 + [row[0].lower() for _, row in rows[:4]].index("coords") :]
+    if not body:
+        raise KeypointError(f"{path}: no frames below the headings; get a complete copy")
+    # Of labelled frames the picture's name is the index; of a video's its number.
+    return _Columns(parts, size, start - 1 if start else None), body
+
+
+def _read_rows(
+    path: Path, columns: _Columns, body: Sequence[Row]
+) -> tuple[list[str], dict[int, list[Person]]]:
+    """Names of the joints, and the people in every frame."""
+    joints: dict[str, None] = {}
+    found: dict[int, dict[str, dict[str, list[float]]]] = {}
+    for index, (row, cells) in enumerate(body):
+        where = f"{path}: row {row}"
+        if len(cells) != columns.size:
+            raise KeypointError(
+                f"{where}: expected {columns.size} columns, as the heading has, found "
+                f"{len(cells)}; get a complete copy"
+            )
+        place = index if columns.joint is None else 0
+        if columns.frame is not None:
+            place = frame_number(where, cells[columns.frame])
+        for (person, joint), parts in columns.parts.items():
+            # Of a wide table every row is a person of its own.
+            person = person or ("" if columns.joint is not None else f"row {row}")
+            name = joint if columns.joint is None else cells[columns.joint]
+            joints[name] = None
+            marked = found.setdefault(place, {}).setdefault(person, {})
+            if name in marked:
+                raise KeypointError(f"{where}: {name!r} is there twice in frame {place}")
+            marked[name] = [
+                _number(where, cells[parts[part]]) if part in parts else np.nan for part in range(3)
+            ]
+    names, frames = list(joints), {}
+    for place, people in found.items():
+        values = np.array(
+            [[marked.get(name, [np.nan] * 3) for name in names] for marked in people.values()]
+        )
+        confidence = np.where(np.isnan(values[..., 2]), 1.0, values[..., 2])
+        persons = screened(values[..., :2], confidence)
+        frames[place] = list(persons[(persons[..., 2] > 0).any(-1)])
+    return names, frames
+
+
+def _number(where: str, cell: str) -> float:
     """A number; what is not there is NaN."""
     if not cell or cell.lower() in ("nan", "none", "null", "na"):
         return np.nan
@@ -95,142 +212,9 @@ def _number(path: Path, row: int, cell: str) -> float:
             return float(cell)
     except ValueError:
         pass
-    raise KeypointError(f"{path}: row {row}: expected a number, found {shortened(cell)}")
+    raise KeypointError(f"{where}: expected a number, found {shortened(cell)}")
 
 
 def _first_of(wanted: Sequence[str], names: Sequence[str]) -> int | None:
     """Where the first of some words stands among the columns."""
     return next((names.index(name) for name in wanted if name in names), None)
-
-
-def _checked(path: Path, row: int, cells: Sequence[str], size: int) -> None:
-    if len(cells) != size:
-        raise KeypointError(
-            f"{path}: row {row}: expected {size} columns, as the heading has, found {len(cells)}; "
-            "get a complete copy"
-        )
-
-
-def _with_confidence(values: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3"]:
-    """Joints without a place have confidence 0, joints without confidence 1."""
-    confidence = np.where(np.isnan(values[..., 2]), 1.0, values[..., 2])
-    return screened(values[..., :2], confidence)
-
-
-Frames = dict[int, Float[np.ndarray, "p j 3"]]
-
-
-def _wide(
-    path: Path, names: Sequence[str], heading: Sequence[str], body: Sequence[tuple[int, list[str]]]
-) -> tuple[list[str], Frames]:
-    columns: dict[str, dict[int, int]] = {}
-    for index, name in enumerate(names):
-        split = _split(name)
-        if split is not None:
-            joint, part = split
-            if part in columns.setdefault(joint, {}) and part != 3:
-                raise KeypointError(f"{path}: row 1: column {heading[index]!r} is there twice")
-            columns[joint][part] = index
-    joints = [joint for joint, parts in columns.items() if {0, 1} <= set(parts)]
-    if not joints:
-        raise KeypointError(
-            f"{path}: row 1: expected DeepLabCut's headings, or columns such as nose_x and nose_y, "
-            f"found {shortened(', '.join(heading))}"
-        )
-    frame_column = _first_of(FRAME_NAMES, names)
-    frames: Frames = {}
-    for place, (row, cells) in enumerate(body):
-        _checked(path, row, cells, len(names))
-        if frame_column is not None:
-            place = frame_number(f"{path}: row {row}", cells[frame_column])
-        values = np.full((1, len(joints), 3), np.nan)
-        for index, joint in enumerate(joints):
-            for part, column in columns[joint].items():
-                if part < 3:
-                    values[0, index, part] = _number(path, row, cells[column])
-        values = _with_confidence(values)
-        frames[place] = np.concatenate([frames[place], values]) if place in frames else values
-    return joints, frames
-
-
-def _split(name: str) -> tuple[str, int] | None:
-    """Joint and kind of number of a column, whichever comes first in its name."""
-    if match := re.fullmatch(r"([a-z]+)_?([0-9]+)", name):  # x1, v33
-        if match[1] in _PARTS:
-            return match[2], _PARTS[match[1]]
-        return None
-    for joint, part in (name.rpartition("_")[::2], name.partition("_")[::-2]):
-        if part in _PARTS and joint:
-            number = re.fullmatch(r"(?:landmark|lm|joint|keypoint|kp|point|pose)_?([0-9]+)", joint)
-            return (number[1] if number else joint), _PARTS[part]
-    return None
-
-
-def _long(
-    path: Path, names: Sequence[str], joint: int, body: Sequence[tuple[int, list[str]]]
-) -> tuple[list[str], Frames]:
-    parts = {_PARTS[name]: index for index, name in enumerate(names) if name in _PARTS}
-    frame_column = _first_of(FRAME_NAMES, names)
-    found: dict[int, dict[str, np.ndarray]] = {}
-    joints: dict[str, None] = {}
-    for row, cells in body:
-        _checked(path, row, cells, len(names))
-        where = f"{path}: row {row}"
-        place = 0 if frame_column is None else frame_number(where, cells[frame_column])
-        name = cells[joint]
-        joints[name] = None
-        if name in found.setdefault(place, {}):
-            raise KeypointError(f"{where}: {name!r} is there twice in frame {place}")
-        values = np.full(3, np.nan)
-        for part, column in parts.items():
-            if part < 3:
-                values[part] = _number(path, row, cells[column])
-        found[place][name] = _with_confidence(values)
-    order = list(joints)
-    frames: Frames = {}
-    for place, rows in found.items():
-        frames[place] = np.zeros((1, len(order), 3))
-        for name, values in rows.items():
-            frames[place][0, order.index(name)] = values
-    return order, frames
-
-
-def _read_deeplabcut(
-    path: Path, rows: Sequence[tuple[int, list[str]]], num_frames: int | None
-) -> People:
-    headings = {row[0].lower(): row for _, row in rows[:4]}
-    coords, parts = headings["coords"], headings["bodyparts"]
-    start = next((i for i, cell in enumerate(coords) if cell in ("x", "y", "likelihood")), None)
-    size = len(coords)
-    if start is None or len(parts) != size or size != len(headings.get("individuals", coords)):
-        raise KeypointError(
-            f"{path}: expected x, y, likelihood under every body part, found "
-            f"{shortened(', '.join(coords))}"
-        )
-    animals = headings.get("individuals", ["one"] * size)
-    joints = list(dict.fromkeys(parts[start:]))
-    people = list(dict.fromkeys(animals[start:]))
-    first = 1 + max(i for i, (_, row) in enumerate(rows[:4]) if row[0].lower() == "coords")
-    if len(rows) <= first:
-        raise KeypointError(f"{path}: no frames below the headings; get a complete copy")
-    frames: Frames = {}
-    kinds = {"x": 0, "y": 1, "likelihood": 2}
-    for place, (row, cells) in enumerate(rows[first:]):
-        _checked(path, row, cells, size)
-        values = np.full((len(people), len(joints), 3), np.nan)
-        for column in range(start, size):
-            if coords[column] not in kinds:
-                raise KeypointError(
-                    f"{path}: coords: expected x, y, likelihood, found {shortened(coords[column])}"
-                )
-            person, joint = people.index(animals[column]), joints.index(parts[column])
-            values[person, joint, kinds[coords[column]]] = _number(path, row, cells[column])
-        # Of labelled frames the picture's name is the index; of a video's its number.
-        label = cells[start - 1] if start else str(place)
-        place = frame_number(f"{path}: row {row}", label)
-        if place in frames:
-            raise KeypointError(f"{path}: row {row}: frame {place} is there twice")
-        values = _with_confidence(values)
-        frames[place] = values[(values[..., 2] > 0).any(-1)]
-    report = [f"format: DeepLabCut, {len(people)} individual{'s' * (len(people) > 1)}"]
-    return People(in_order(path, frames, num_frames)[0], tuple(joints), report)
