@@ -136,6 +136,6 @@ def make_full_cost(
         torch.tensor([0.0, -1.0, -2.0]).to(dtype).log_softmax(0),
     )
     density = MixturePrior().density(previous)
-    bound = OnStates(lambda posed: MixturePrior().local_model(posed.x, density))
+    bound = OnStates(lambda posed, _: MixturePrior().local_model(posed.x, density))
     choice = cost.choice.having(Ready(MixturePrior(), bound))
     return replace(changed(cost, features=features), choice=choice)

@@ -208,3 +208,28 @@ class Truncated:
             torch.where(below, inner.first, 0.0),
             torch.where(below, inner.second, 0.0),
         )
+
+
+def residual_cost(
+    potential: RobustPotential,
+    residual: Float[Tensor, "*batch c"],
+    weight: Float[Tensor, "*#batch"],
+    share: Float[Tensor, "*#batch"] | float = 1.0,
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch c"], Float[Tensor, "*batch c c"]]:
+    """Costs of residuals with their derivatives in the residuals.
+
+    Args:
+        potential: The potential.
+        residual: The residuals.
+        weight: W, the same for all components.
+        share: Factor on the derivatives, for residuals that count in part.
+
+    Returns:
+        1/2 rho, and `share` times gradient and Hessian.
+    """
+    rho, first, second = potential(weight * residual.square().sum(-1))
+    stiffness = share * weight * first
+    bend = (2 * share * weight.square() * second)[..., None, None]
+    hessian = residual[..., :, None] * residual[..., None, :] * bend
+    hessian.diagonal(dim1=-2, dim2=-1).add_(stiffness[..., None])
+    return 0.5 * rho, stiffness[..., None] * residual, hessian

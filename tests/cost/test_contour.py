@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchcss.cost import contour
 from torchcss.cost.contour import ContourTerm
-from torchcss.cost.visibility import ContourNodes
+from torchcss.cost.visibility import SeenNodes
 from torchcss.robust import Leclerc
 from torchcss.types import PointCost
 from torchcss.vision.camera import Camera
@@ -52,7 +52,7 @@ def rough_field(generator: torch.Generator) -> Tensor:
     return 0.9 * field / (0.5 + field.norm(dim=0)).clamp(min=1.0)
 
 
-def random_nodes(camera: Camera, *batch: int, generator: torch.Generator) -> ContourNodes:
+def random_nodes(camera: Camera, *batch: int, generator: torch.Generator) -> SeenNodes:
     """Nodes in view, their normals at right angles to the line of sight."""
 
     def rand(*size: int) -> Tensor:
@@ -64,7 +64,7 @@ def random_nodes(camera: Camera, *batch: int, generator: torch.Generator) -> Con
     normals = torch.linalg.cross(sight, rand(3) - 0.5)
     normals = normals / normals.norm(dim=-1, keepdim=True)
     exists, visible = (3 * rand() - 1).clamp(0, 1), (3 * rand() - 1).clamp(0, 1)
-    return ContourNodes(points, normals, exists, visible)
+    return SeenNodes(points, normals, exists, visible)
 
 
 def node_costs(field: Tensor, u: Tensor, term: ContourTerm = TERM) -> tuple[Tensor, Tensor]:
@@ -76,7 +76,7 @@ def node_costs(field: Tensor, u: Tensor, term: ContourTerm = TERM) -> tuple[Tens
     points = torch.stack([(u - 64) / 1e3, 0 * u, 0 * u + 1], dim=-1)
     normals = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64).expand_as(points)
     ones = torch.ones_like(u)
-    cost = term.point_cost(ContourNodes(points, normals, ones, ones), camera, field)
+    cost = term.point_cost(SeenNodes(points, normals, ones, ones), camera, field)
     return cost.value, cost.gradient[:, 0] / 1e3
 
 
@@ -271,7 +271,7 @@ def test_images_without_structure(
     """No edges, and all edge."""
     camera = make_camera()
     nodes = random_nodes(camera, 2, generator=generator)
-    nodes = ContourNodes(*(part.to(dtype) for part in nodes))
+    nodes = SeenNodes(*(part.to(dtype) for part in nodes))
     field = torch.full((2, HEIGHT, WIDTH), filled / math.sqrt(2), dtype=dtype)
     cost = TERM.point_cost(nodes, camera, field)
     seen = nodes.visible * TERM.unmatched + (1 - nodes.visible) * 1.1 * TERM.fitted_level
@@ -300,7 +300,7 @@ def test_nodes_that_the_camera_does_not_see_cost_as_unmatched(
     points = (places - camera.t_camera_world) @ camera.R_camera_world
     normals = torch.randn(6, 3, generator=generator, dtype=torch.float64)
     ones = torch.ones(6, dtype=dtype)
-    nodes = ContourNodes(points.to(dtype), normals.to(dtype), ones, ones)
+    nodes = SeenNodes(points.to(dtype), normals.to(dtype), ones, ones)
     cost = TERM.point_cost(nodes, camera, field)
     for part in cost:
         assert torch.isfinite(part).all()
@@ -328,7 +328,7 @@ def test_hidden_and_absent_nodes_have_no_pull(generator: torch.Generator) -> Non
 def test_no_nodes() -> None:
     empty = torch.zeros(2, 0, dtype=torch.float64)
     points = torch.zeros(2, 0, 3, dtype=torch.float64)
-    nodes = ContourNodes(points, points, empty, empty)
+    nodes = SeenNodes(points, points, empty, empty)
     cost = TERM.point_cost(nodes, make_camera(), ridges())
     assert cost.value.shape == (2, 0)
     assert cost.hessian.shape == (2, 0, 3, 3)

@@ -8,7 +8,7 @@ from reference.spline import spline
 from torch import Tensor
 
 from torchcss.cost.edge_energy import EdgeEnergyTerm, SplineField, edge_energy_field
-from torchcss.cost.visibility import ContourNodes
+from torchcss.cost.visibility import SeenNodes
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.robust import Leclerc, Lorentzian
 from torchcss.types import PointCost
@@ -39,12 +39,12 @@ def random_edges(generator: torch.Generator, height: int = HEIGHT, width: int = 
     return length * direction / direction.norm(dim=0)
 
 
-def random_nodes(*batch: int, generator: torch.Generator, count: int = 30) -> ContourNodes:
+def random_nodes(*batch: int, generator: torch.Generator, count: int = 30) -> SeenNodes:
     def uniform(*shape: int) -> Tensor:
         return torch.rand(*batch, count, *shape, generator=generator, dtype=torch.float64)
 
     normals = torch.randn(*batch, count, 3, generator=generator, dtype=torch.float64)
-    return ContourNodes(
+    return SeenNodes(
         2.4 * (uniform(3) - 0.5),
         normals / normals.norm(dim=-1, keepdim=True),
         uniform().clamp(max=0.7) / 0.7,
@@ -191,7 +191,7 @@ def test_a_node_is_drawn_to_the_edge_and_rests_there() -> None:
     camera = Camera.pinhole(80, 60, focal_px=80.0)
     u = torch.linspace(33.0, 46.0, 131, dtype=torch.float64)
     points = torch.stack([(u - 39.5) / 80, torch.zeros_like(u), torch.ones_like(u)], dim=-1)
-    nodes = ContourNodes(points, torch.tensor([1.0, 0, 0]).double().expand(131, 3), u**0, u**0)
+    nodes = SeenNodes(points, torch.tensor([1.0, 0, 0]).double().expand(131, 3), u**0, u**0)
     term = EdgeEnergyTerm()
     cost = term.point_cost(nodes, camera, field)
     best = int(cost.value.argmin())
@@ -209,7 +209,7 @@ def test_types_and_awkward_points(dtype: torch.dtype, generator: torch.Generator
     edges = random_edges(generator)
     nodes = random_nodes(4, generator=generator)
     expected = term.point_cost(nodes, camera, edge_energy_field(edges))
-    single = ContourNodes(*(part.to(dtype) for part in nodes))
+    single = SeenNodes(*(part.to(dtype) for part in nodes))
     field = edge_energy_field(edges.to(dtype))
     for ours, theirs in zip(term.point_cost(single, camera, field), expected, strict=True):
         assert ours.dtype == dtype
@@ -225,7 +225,7 @@ def test_types_and_awkward_points(dtype: torch.dtype, generator: torch.Generator
         edge_energy_field(edges[:, :1, :1].to(dtype)),
         SplineField(field[0] * 0),
     ):
-        for part in term.point_cost(ContourNodes(far, far, one, one), camera, small):
+        for part in term.point_cost(SeenNodes(far, far, one, one), camera, small):
             assert torch.isfinite(part).all()
 
 

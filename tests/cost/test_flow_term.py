@@ -14,6 +14,7 @@ from torchcss.body.model import BodyModel
 from torchcss.body.surface import implicit
 from torchcss.cost.flow import FlowTargets, FlowTerm, flow_targets
 from torchcss.cost.interior import InteriorNodes
+from torchcss.cost.visibility import SeenNodes, front_facing
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.robust import Leclerc, Lorentzian
 from torchcss.studies.render.sequences import arm_sequence
@@ -70,6 +71,14 @@ def random_targets(*batch: int, generator: torch.Generator, count: int = 24) -> 
     )
 
 
+def seen(points: Tensor, normals: Tensor, visible: Tensor | None, camera: Camera) -> SeenNodes:
+    """Nodes that face the camera or not, of which all are visible or some."""
+    facing = front_facing(points, normals, camera.centre_world)
+    return SeenNodes(
+        points, normals, facing, torch.ones_like(facing) if visible is None else visible
+    )
+
+
 @pytest.mark.parametrize("name", ["arm7", "body34"])
 @pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
 def test_nodes_lie_on_the_surface_of_their_part(
@@ -108,12 +117,14 @@ def test_targets_and_costs_are_those_of_the_twin(
     flow, outlier = random_flow(generator)
     previous = random_poses(body, 3, generator=generator)
     was_visible = random_visibility(3, nodes.num_nodes, generator=generator)
-    targets = flow_targets(nodes, body, previous, camera, flow, outlier, was_visible)
+    targets = flow_targets(
+        seen(*nodes(body, body.pose(previous)), was_visible, camera), camera, flow, outlier
+    )
     parent = torch.tensor([2, 0, 2, 1])
     x = random_poses(body, 4, generator=generator)
     visible = random_visibility(4, nodes.num_nodes, generator=generator)
     points, normals = nodes(body, body.pose(x))
-    value = term.value(points, normals, visible, camera, targets.take(parent))
+    value = term.value(seen(points, normals, visible, camera), camera, targets.take(parent))
     before = nodes(body, body.pose(previous))
     choices = {"nu": 1.2, "sigma": term.sigma, "level": term.fitted_level, "factor": 1.1}
     assert float(targets.weight.max()) > 0.3
@@ -148,9 +159,9 @@ def test_derivatives_per_point_are_those_of_autograd(
     )
     targets = random_targets(*batch, generator=generator)
     visible = random_visibility(*batch, 24, generator=generator)
-    got = term.point_cost(points, normals, visible, camera, targets)
+    got = term.point_cost(seen(points, normals, visible, camera), camera, targets)
     leaf = points.clone().requires_grad_()
-    value = term.value(leaf, normals, visible, camera, targets)
+    value = term.value(seen(leaf, normals, visible, camera), camera, targets)
     (gradient,) = torch.autograd.grad(value.sum(), leaf, create_graph=True)
     rows = [
         torch.autograd.grad(gradient[..., a].sum(), leaf, retain_graph=True)[0] for a in range(3)
@@ -175,7 +186,7 @@ def test_gauss_newton_leaves_out_the_curvature_of_the_projection(
     rows = [torch.autograd.grad(slope[:, a].sum(), error, retain_graph=True)[0] for a in range(2)]
     bowl = torch.stack(rows, dim=-2)
     normals = camera.centre_world - points
-    got = term.point_cost(points, normals, one, camera, targets, gauss_newton=True)
+    got = term.point_cost(seen(points, normals, one, camera), camera, targets, gauss_newton=True)
     jacobian = camera.jacobian(model)
     torch.testing.assert_close(got.hessian, jacobian.mT @ bowl @ jacobian)
 
@@ -186,7 +197,9 @@ def test_the_lifted_gradient_is_that_of_the_cost_in_x(generator: torch.Generator
     nodes = InteriorNodes(body)
     flow, outlier = random_flow(generator)
     previous, x = random_poses(body, 2, generator=generator)
-    targets = flow_targets(nodes, body, previous, camera, flow, outlier)
+    targets = flow_targets(
+        seen(*nodes(body, body.pose(previous)), None, camera), camera, flow, outlier
+    )
     pose = body.pose(x)
     points, normals = nodes(body, pose)
     visible = torch.ones(nodes.num_nodes, dtype=torch.float64)
@@ -196,10 +209,10 @@ def test_the_lifted_gradient_is_that_of_the_cost_in_x(generator: torch.Generator
     def cost_of(state: Tensor) -> Tensor:
         moved = nodes(body, body.pose(state)).points
         faced = (camera.centre_world - moved) * (2 * facing - 1)[:, None]
-        return term.value(moved, faced, visible, camera, targets).sum(-1)
+        return term.value(seen(moved, faced, visible, camera), camera, targets).sum(-1)
 
     faced = toward * (2 * facing - 1)[:, None]
-    cost = term.point_cost(points, faced, visible, camera, targets)
+    cost = term.point_cost(seen(points, faced, visible, camera), camera, targets)
     model = body.lift(pose, points, nodes.node_link, cost, curvature=Curvature.EXACT)
     step = 1e-5 * torch.eye(body.num_parameters, dtype=torch.float64)
     ahead = torch.stack([cost_of(x + row) for row in step])
@@ -218,17 +231,17 @@ def test_a_body_that_moves_as_the_flow_says_has_no_residual(generator: torch.Gen
     x = random_poses(body, generator=generator)
     flow = torch.tensor([3.0, -2.0]).double()[:, None, None].expand(2, 160, 200)
     nodes = InteriorNodes(body)
-    targets = flow_targets(nodes, far, x, camera, flow)
+    targets = flow_targets(seen(*nodes(far, far.pose(x)), None, camera), camera, flow)
     points, normals = nodes(moved, moved.pose(x))
     visible = torch.ones(nodes.num_nodes, dtype=torch.float64)
     error = (camera.project(points).uv - targets.uv).norm(dim=-1)
     assert float(error.max()) < 0.05
     term = FlowTerm()
-    value = term.value(points, normals, visible, camera, targets)
+    value = term.value(seen(points, normals, visible, camera), camera, targets)
     assert float(targets.weight.max()) == 1.0
     assert float(value.max()) <= term.fitted_level * term.nu + 1e-9
     assert float(value[targets.weight == 1.0].max()) < 1e-3
-    still = term.value(*nodes(far, far.pose(x)), visible, camera, targets)
+    still = term.value(seen(*nodes(far, far.pose(x)), visible, camera), camera, targets)
     assert (still[targets.weight == 1.0] > 0.5).all()
 
 
@@ -249,12 +262,16 @@ def test_costs_without_a_measurement(generator: torch.Generator) -> None:
          far + (1 - targets.weight) * level),
     )  # fmt: skip
     for name, where, normal, visible, aim, expected in cases:
-        cost = term.point_cost(where, normal, visible, camera, aim)
+        cost = term.point_cost(seen(where, normal, visible, camera), camera, aim)
         torch.testing.assert_close(cost.value, expected, msg=lambda text, name=name: name + text)
         assert not cost.gradient.any()
         assert not cost.hessian.any()
-        torch.testing.assert_close(term.value(where, normal, visible, camera, aim), cost.value)
-    assert not term.point_cost(points, 0 * normals, one, camera, targets).gradient.any()
+        torch.testing.assert_close(
+            term.value(seen(where, normal, visible, camera), camera, aim), cost.value
+        )
+    assert not term.point_cost(
+        seen(points, 0 * normals, one, camera), camera, targets
+    ).gradient.any()
 
 
 def test_nodes_out_of_sight_at_the_parent_have_no_target(generator: torch.Generator) -> None:
@@ -262,26 +279,29 @@ def test_nodes_out_of_sight_at_the_parent_have_no_target(generator: torch.Genera
     nodes = InteriorNodes(body)
     flow, outlier = random_flow(generator)
     x = random_poses(body, 2, generator=generator)
-    seen = flow_targets(nodes, body, x, camera, flow, outlier)
-    assert (seen.weight > 0).any(-1).all()
+    known = flow_targets(seen(*nodes(body, body.pose(x)), None, camera), camera, flow, outlier)
+    assert (known.weight > 0).any(-1).all()
     for shift in ((0.0, 0.0, 9.0), (7.0, 0.0, 0.0), (0.0, -1e6, 0.0)):
         away = body.with_base(torch.eye(3), torch.tensor(shift).double())
-        gone = flow_targets(nodes, away, x, camera, flow, outlier)
+        gone = flow_targets(seen(*nodes(away, away.pose(x)), None, camera), camera, flow, outlier)
         assert not gone.weight.any()
         assert gone.uv.isfinite().all()
     hidden = torch.zeros(2, nodes.num_nodes, dtype=torch.float64)
-    assert not flow_targets(nodes, body, x, camera, flow, outlier, hidden).weight.any()
-    doubted = flow_targets(nodes, body, x, camera, flow, torch.ones_like(outlier))
+    unseen = seen(*nodes(body, body.pose(x)), hidden, camera)
+    assert not flow_targets(unseen, camera, flow, outlier).weight.any()
+    doubted = flow_targets(
+        seen(*nodes(body, body.pose(x)), None, camera), camera, flow, torch.ones_like(outlier)
+    )
     assert not doubted.weight.any()
-    trusted = flow_targets(nodes, body, x, camera, flow)
-    assert (trusted.weight >= seen.weight).all()
+    trusted = flow_targets(seen(*nodes(body, body.pose(x)), None, camera), camera, flow)
+    assert (trusted.weight >= known.weight).all()
     holes = flow.clone()
     holes[:, :, ::2] = 1e10
     holes[0, 3] = math.inf
     holes[1, 7] = math.nan
-    patchy = flow_targets(nodes, body, x, camera, holes, outlier)
+    patchy = flow_targets(seen(*nodes(body, body.pose(x)), None, camera), camera, holes, outlier)
     assert patchy.uv.isfinite().all()
-    assert (patchy.weight <= seen.weight + 1e-12).all()
+    assert (patchy.weight <= known.weight + 1e-12).all()
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -297,14 +317,16 @@ def test_unknown_flow_does_not_shorten_that_beside_it(
     flow[:, :, ::3] = math.inf
     flow[:, ::4] = math.nan
     flow[:, 10:20, 20:40] = 1e10
-    targets = flow_targets(nodes, body, x, camera, flow)
+    targets = flow_targets(seen(*nodes(body, body.pose(x)), None, camera), camera, flow)
     uv, known = camera.project(nodes(body, body.pose(x)).points).uv, targets.weight > 0
     moved = targets.uv - uv
     torch.testing.assert_close(
         moved[known], shift.expand_as(moved[known]), rtol=0.0, atol=2e3 * torch.finfo(dtype).eps
     )
     assert 0 < float(targets.weight[known].min()) < 0.5 < float(targets.weight.max())
-    nothing = flow_targets(nodes, body, x, camera, torch.full_like(flow, math.inf))
+    nothing = flow_targets(
+        seen(*nodes(body, body.pose(x)), None, camera), camera, torch.full_like(flow, math.inf)
+    )
     assert torch.equal(nothing.uv, uv)
     assert not nothing.weight.any()
 
@@ -317,7 +339,7 @@ def test_the_cost_is_continuous_where_nodes_come_and_go(
     nodes = InteriorNodes(body)
     flow, outlier = random_flow(generator)
     x = random_poses(body, generator=generator)
-    targets = flow_targets(nodes, body, x, camera, flow, outlier)
+    targets = flow_targets(seen(*nodes(body, body.pose(x)), None, camera), camera, flow, outlier)
     visible = torch.ones(nodes.num_nodes, dtype=torch.float64)
 
     start = nodes(body, body.pose(x))
@@ -330,7 +352,7 @@ def test_the_cost_is_continuous_where_nodes_come_and_go(
         turn = torch.stack(rows, dim=-1).reshape(-1, 3, 3)
         shift = torch.stack([3 * t * (sweep == "leave"), nothing, 3 * t * (sweep == "approach")])
         points = start.points @ turn + shift.T[:, None]
-        return term.value(points, start.normals @ turn, visible, camera, targets)
+        return term.value(seen(points, start.normals @ turn, visible, camera), camera, targets)
 
     coarse, fine = (float(along(steps).diff(dim=0).abs().max()) for steps in (2001, 8001))
     spread = float(along(101).max())
@@ -346,11 +368,18 @@ def test_a_true_pose_costs_less_than_its_neighbours(generator: torch.Generator) 
     assert features.flow is not None
     nodes, term = InteriorNodes(body), FlowTerm()
     before, truth = sequence.states[2], sequence.states[3]
-    targets = flow_targets(nodes, body, before, camera, features.flow, features.flow_outlier)
+    targets = flow_targets(
+        seen(*nodes(body, body.pose(before)), None, camera),
+        camera,
+        features.flow,
+        features.flow_outlier,
+    )
     x = torch.stack([truth, before, 2 * truth - before])
     visible = torch.ones(3, nodes.num_nodes, dtype=torch.float64)
     points, normals = nodes(body, body.pose(x))
-    right, late, early = term.value(points, normals, visible, camera, targets).mean(-1).tolist()
+    right, late, early = (
+        term.value(seen(points, normals, visible, camera), camera, targets).mean(-1).tolist()
+    )
     assert right < 0.8 * late
     assert right < 0.8 * early
 
@@ -361,11 +390,11 @@ def test_types_and_awkward_points(dtype: torch.dtype, generator: torch.Generator
     nodes = InteriorNodes(body)
     flow, outlier = (part.to(dtype) for part in random_flow(generator))
     x = random_poses(body, 2, 3, generator=generator)
-    targets = flow_targets(nodes, body, x, camera, flow, outlier)
+    targets = flow_targets(seen(*nodes(body, body.pose(x)), None, camera), camera, flow, outlier)
     points, normals = nodes(body, body.pose(x))
     assert targets.uv.shape == (2, 3, nodes.num_nodes, 2)
     one = torch.ones(nodes.num_nodes, dtype=dtype)
-    for part in (*targets, *term.point_cost(points, normals, one, camera, targets)):
+    for part in (*targets, *term.point_cost(seen(points, normals, one, camera), camera, targets)):
         assert part.dtype == dtype
         assert part.isfinite().all()
     far = torch.tensor(
@@ -375,7 +404,9 @@ def test_types_and_awkward_points(dtype: torch.dtype, generator: torch.Generator
     far[3] = camera.centre_world
     for aim in (0.0, 1e4, -1e9):
         wild = FlowTargets(torch.full((6, 2), aim, dtype=dtype), torch.ones(6, dtype=dtype))
-        for part in term.point_cost(far, -far, torch.ones(6, dtype=dtype), camera, wild):
+        for part in term.point_cost(
+            seen(far, -far, torch.ones(6, dtype=dtype), camera), camera, wild
+        ):
             assert part.isfinite().all()
 
 
@@ -384,11 +415,11 @@ def test_bad_input_is_refused(generator: torch.Generator) -> None:
     nodes, x = InteriorNodes(body), body.rest
     flow, outlier = random_flow(generator)
     with pytest.raises(ShapeError, match="flow: expected"):
-        flow_targets(nodes, body, x, camera, flow[:, 1:])
+        flow_targets(seen(*nodes(body, body.pose(x)), None, camera), camera, flow[:, 1:])
     with pytest.raises(ShapeError, match="one flow"):
-        flow_targets(nodes, body, x, camera, flow[None])
+        flow_targets(seen(*nodes(body, body.pose(x)), None, camera), camera, flow[None])
     with pytest.raises(ShapeError, match="outlier: expected"):
-        flow_targets(nodes, body, x, camera, flow, outlier[:, 1:])
+        flow_targets(seen(*nodes(body, body.pose(x)), None, camera), camera, flow, outlier[:, 1:])
     with pytest.raises(ConfigurationError, match="rings"):
         InteriorNodes(body, rings=0)
     with pytest.raises(ConfigurationError, match="sigma"):

@@ -20,7 +20,7 @@ from torchcss.cost.region import (
     region_field,
     region_masks,
 )
-from torchcss.cost.visibility import ContourNodes
+from torchcss.cost.visibility import SeenNodes
 from torchcss.types import PointCost
 from torchcss.vision.camera import Camera
 
@@ -34,7 +34,7 @@ def make_camera(distortion: list[float] | None = None) -> Camera:
     return camera.to(torch.float64)
 
 
-def some_nodes(*batch: int, count: int = 30, generator: torch.Generator) -> ContourNodes:
+def some_nodes(*batch: int, count: int = 30, generator: torch.Generator) -> SeenNodes:
     """Nodes in the image, outside it, behind the camera, hidden, and absent."""
     points = torch.randn(*batch, count, 3, generator=generator, dtype=torch.float64)
     points = points * torch.tensor([0.6, 0.5, 0.3]) + torch.tensor([0.0, 0.0, 2.0])
@@ -46,7 +46,7 @@ def some_nodes(*batch: int, count: int = 30, generator: torch.Generator) -> Cont
     exists[..., 2], exists[..., 3] = 0.0, 0.4
     visible = torch.ones_like(exists)
     visible[..., 4], visible[..., 5] = 0.0, 0.7
-    return ContourNodes(points, normals, exists, visible)
+    return SeenNodes(points, normals, exists, visible)
 
 
 def some_images(count: int, generator: torch.Generator) -> RegionImages:
@@ -57,7 +57,7 @@ def some_images(count: int, generator: torch.Generator) -> RegionImages:
 
 
 def frozen_value(
-    term: RegionTerm, nodes: ContourNodes, camera: Camera, images: RegionImages, points: Tensor
+    term: RegionTerm, nodes: SeenNodes, camera: Camera, images: RegionImages, points: Tensor
 ) -> Tensor:
     """The plain twin: the module's formula, normals fixed, differentiable in the points."""
     with torch.no_grad():
@@ -110,7 +110,7 @@ def test_a_perfect_outline_costs_nothing_and_an_inverted_one_everything() -> Non
     outward = torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)
     layer = torch.zeros(1, dtype=torch.long)
     for normals, cost in ((outward, 0.0), (-outward, 1.0)):
-        nodes = ContourNodes(points, normals, one, one)
+        nodes = SeenNodes(points, normals, one, one)
         value = term.value(nodes, camera, RegionImages(region_field(ratio), layer))
         assert float(value) == pytest.approx(cost, abs=0.1)
         nothing = RegionImages(region_field(0 * ratio), layer)
@@ -120,12 +120,12 @@ def test_a_perfect_outline_costs_nothing_and_an_inverted_one_everything() -> Non
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_single_precision_and_no_nodes(dtype: torch.dtype, generator: torch.Generator) -> None:
     camera, term = make_camera().to(dtype), RegionTerm()
-    nodes = ContourNodes(*(part.to(dtype) for part in some_nodes(4, generator=generator)))
+    nodes = SeenNodes(*(part.to(dtype) for part in some_nodes(4, generator=generator)))
     images = some_images(30, generator)
     for part in term.point_cost(nodes, camera, images):
         assert part.dtype == dtype
         assert part.isfinite().all()
-    none = ContourNodes(*(part[..., :0, :] if part.ndim == 3 else part[..., :0] for part in nodes))
+    none = SeenNodes(*(part[..., :0, :] if part.ndim == 3 else part[..., :0] for part in nodes))
     empty = images._replace(layer=images.layer[:0])
     assert term.value(none, camera, empty).shape == (4, 0)
 

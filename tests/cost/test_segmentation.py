@@ -19,7 +19,7 @@ from torchcss.cost.flow import FlowTerm
 from torchcss.cost.frame import FrameCosts
 from torchcss.cost.part_map import bare_pixels, part_map
 from torchcss.cost.region import RegionTerm
-from torchcss.cost.segmentation import BoundSegmentation, SegmentationImages, SegmentationTerm
+from torchcss.cost.segmentation import SegmentationImages, SegmentationTerm
 from torchcss.cost.total import TrackingCost
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.problem import SearchProblem
@@ -115,7 +115,7 @@ def test_the_whole_cost_leaves_it_out_and_adds_it_where_it_is_asked() -> None:
     truth = moved(body, 0.9)
     images = term.images(painted(body, camera, truth), layers(body)[1], camera, body, truth)
     view, plain = FrameContext(body=body, camera=camera), CostChoice().without("contour", "joints")
-    choice = plain.having(Ready(term, BoundSegmentation(term, images)))
+    choice = plain.having(Ready(term, term.bind(images)))
     cost = TrackingCost(choice=choice, views=(view,))
     without = TrackingCost(choice=plain.having(term), views=(view,))
     x = torch.stack([truth, moved(body, 0.2)])

@@ -19,7 +19,7 @@ from torchcss.cost.context import FrameContext
 from torchcss.cost.frame import FrameCosts
 from torchcss.cost.interior import InteriorNodes
 from torchcss.cost.part_map import part_map
-from torchcss.cost.silhouette import BoundSilhouette, SilhouetteImages, SilhouetteTerm
+from torchcss.cost.silhouette import SilhouetteImages, SilhouetteTerm
 from torchcss.cost.total import TrackingCost, beside
 from torchcss.vision.appearance import Appearance
 from torchcss.vision.background import Background
@@ -78,10 +78,10 @@ def test_it_is_the_sum_over_points_and_nodes(batch: tuple[int, ...], dtype: torc
     generator = torch.Generator().manual_seed(0)
     noise = torch.randn(*batch, len(body.rest), generator=generator, dtype=torch.float64)
     points = nodes(body, body.rest + 0.3 * noise.to(dtype))
-    got = term.value(points, images)
+    got = term.value(points, images.camera, images)
     assert got.shape == points.shape[:-1]
     assert got.dtype == dtype
-    assert term.point_cost(points, images).hessian.dtype == dtype
+    assert term.point_cost(points, images.camera, images).hessian.dtype == dtype
     every = points.reshape(-1, *points.shape[-2:])
     for value, some in zip(got.sum(-1).reshape(-1), every, strict=True):
         assert float(value) == pytest.approx(plain_twin(term, some, images), abs=2e-5)
@@ -109,9 +109,9 @@ def test_derivatives_are_those_of_autograd(place: str) -> None:
     term = SilhouetteTerm(spacing=1.0)
     images = the_silhouette_of(body, camera, moved(body, 0.9), body.rest, term)
     points = places(body)[place]
-    cost = term.point_cost(points, images)
-    torch.testing.assert_close(cost.value, term.value(points, images))
-    gradient = jacrev(lambda p: term.value(p, images).sum())(points)
+    cost = term.point_cost(points, images.camera, images)
+    torch.testing.assert_close(cost.value, term.value(points, images.camera, images))
+    gradient = jacrev(lambda p: term.value(p, images.camera, images).sum())(points)
     torch.testing.assert_close(cost.gradient, gradient, rtol=1e-8, atol=1e-10)
 
     # With the shares held fixed every node is on springs of its own.
@@ -126,7 +126,9 @@ def test_derivatives_are_those_of_autograd(place: str) -> None:
 
     expected = vmap(hessian(held))(points, share)
     torch.testing.assert_close(cost.hessian, expected, rtol=1e-7, atol=1e-8)
-    flat = replace(term, beta=0.0).point_cost(points, images, gauss_newton=True).hessian
+    flat = (
+        replace(term, beta=0.0).point_cost(points, images.camera, images, gauss_newton=True).hessian
+    )
     assert float(torch.linalg.eigvalsh(flat).min()) > -1e-9
 
 
@@ -138,7 +140,7 @@ def test_an_empty_picture_pushes_the_body_nowhere(dtype: torch.dtype) -> None:
         everywhere = torch.full((600, 480), ratio, dtype=dtype)
         images = SilhouetteTerm().images(everywhere, camera, points, 0.0)
         assert len(images.points) == 0
-        cost = SilhouetteTerm().point_cost(points, images)
+        cost = SilhouetteTerm().point_cost(points, images.camera, images)
         assert float(cost.value.sum()) == pytest.approx(level, abs=1e-5)
         assert float(cost.gradient.abs().max()) < 1e-5
 
@@ -149,7 +151,7 @@ def test_pictures_of_odd_and_of_very_small_sizes(size: tuple[int, int]) -> None:
     odd, full = camera.resized(*size), torch.ones(size[1], size[0], dtype=torch.float64)
     points = nodes(body, body.rest)
     images = SilhouetteTerm().images(full, odd, points, 100.0)
-    cost = SilhouetteTerm().point_cost(points, images)
+    cost = SilhouetteTerm().point_cost(points, images.camera, images)
     assert all(bool(part.isfinite().all()) for part in cost)
 
 
@@ -160,7 +162,7 @@ def test_the_true_pose_is_the_cheapest_and_a_far_limb_is_pulled_there() -> None:
     images = the_silhouette_of(body, camera, truth, moved(body, 0.3), term)
     angles = torch.tensor([0.3, 0.5, 0.7, 0.9, 1.1, 1.3])
     states = torch.stack([moved(body, float(angle)) for angle in angles])
-    values = term.value(nodes(body, states), images).sum(-1)
+    values = term.value(nodes(body, states), images.camera, images).sum(-1)
     assert 0.0 < float(values[3]) < 0.05
     assert float(values.diff()[:3].max()) < 0 < float(values.diff()[3:].min())
     # From the first of them the hand is 50 pixels off, where no contour feels anything.
@@ -178,7 +180,7 @@ def raising_force(
     body: BodyModel, camera: Camera, term: SilhouetteTerm, images: SilhouetteImages, x: Tensor
 ) -> float:
     """Nats per radian by which the cost raises the right arm."""
-    bound = Ready(term, BoundSilhouette(term, InteriorNodes(body), images))
+    bound = Ready(term, term.bind(InteriorNodes(body), images))
     view = FrameContext(body=body, camera=camera)
     cost = TrackingCost(choice=CostChoice(terms=(bound,)), views=(view,))
     return -float(cost.gradients(x)["silhouette"][body.state_index("r_shoulder_raising")])
@@ -193,15 +195,16 @@ def test_it_costs_the_same_however_large_the_body_is_seen() -> None:
     term, truth = SilhouetteTerm(), moved(body, 0.9)
     x = torch.stack([truth, moved(body, 0.2), moved(body, 1.5)])
     near, far = (
-        term.value(nodes(body, x), the_silhouette_of(body, seen, truth, truth, term)).sum(-1)
-        for seen in (long, camera)
+        term.value(nodes(body, x), images.camera, images).sum(-1)
+        for images in (the_silhouette_of(body, seen, truth, truth, term) for seen in (long, camera))
     )
     torch.testing.assert_close(near, far, rtol=0.15, atol=0.01)
     drawn = torch.ones(600, 480, dtype=torch.float64)
     points = nodes(body, body.rest)
     for shift in (-3.0, -2.0, -30.0):
         moved_to = points + points.new_tensor([0.0, 0.0, shift])
-        cost = term.point_cost(moved_to, term.images(drawn, camera, moved_to, 1000.0))
+        images = term.images(drawn, camera, moved_to, 1000.0)
+        cost = term.point_cost(moved_to, images.camera, images)
         assert all(bool(part.isfinite().all()) for part in cost)
 
 
@@ -221,7 +224,7 @@ def test_the_whole_cost_has_its_derivatives_and_chunks() -> None:
     body, camera = a_body_before_a_camera()
     term = SilhouetteTerm()
     images = the_silhouette_of(body, camera, moved(body, 0.9), body.rest, term)
-    bound = BoundSilhouette(term, InteriorNodes(body), images)
+    bound = term.bind(InteriorNodes(body), images)
     view = FrameContext(body=body, camera=camera)
     cost = TrackingCost(choice=CostChoice(terms=(Ready(term, bound),)), views=(view,))
     x = torch.stack([moved(body, 0.1), moved(body, 1.4), body.rest])
@@ -236,7 +239,7 @@ def test_the_whole_cost_has_its_derivatives_and_chunks() -> None:
     torch.testing.assert_close(twice.value(x), 2 * model.value)
     # Of a large silhouette fewer samples are looked at together.
     large = images._replace(points=images.points.repeat(9, 1), weight=images.weight.repeat(9) / 9)
-    ready = Ready(term, replace(bound, images=large))
+    ready = Ready(term, term.bind(InteriorNodes(body), large))
     larger = replace(cost, choice=CostChoice(terms=(ready,)))
     assert larger._chunk < cost._chunk
     torch.testing.assert_close(larger.value(x), model.value)
@@ -266,13 +269,13 @@ def test_a_frame_needs_a_background_or_a_mask_and_a_pose_before() -> None:
         cost = costs(features, **args)
         return cost.bound[term, cost.views[0]]
 
-    images = found(costs, features, **args).images
+    images = found(costs, features, **args).image
     assert len(images.points) > 50
-    value = SilhouetteTerm().value(nodes(body, truth), images).sum()
+    value = SilhouetteTerm().value(nodes(body, truth), images.camera, images).sum()
     assert float(value) < 0.1
     for missing in ("before", "appearance", "background"):
         assert found(costs, features, **{**args, missing: None}) is None
     assert found(costs, None, **args) is None
     masked = extract(before.numpy(), mask=drawn.numpy())
-    images = found(costs, masked, body=body, before=truth[None]).images
-    assert float(SilhouetteTerm().value(nodes(body, truth), images).sum()) < 0.1
+    images = found(costs, masked, body=body, before=truth[None]).image
+    assert float(SilhouetteTerm().value(nodes(body, truth), images.camera, images).sum()) < 0.1

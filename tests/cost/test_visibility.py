@@ -18,8 +18,8 @@ from torchcss.cost.contour import ContourTerm
 from torchcss.cost.interior import InteriorNodes
 from torchcss.cost.visibility import (
     Beside,
-    ContourNodes,
     ContourPredictor,
+    SeenNodes,
     front_facing,
     line_of_sight,
     visible_nodes,
@@ -526,6 +526,6 @@ def test_a_body_without_flesh(generator: torch.Generator) -> None:
         bare._buffers[name] = getattr(body, name)[:0]
     bare.part_names, bare.neighbours = (), ()
     nodes = ContourPredictor(bare)(bare, bare.pose(any_poses(body, 3, generator=generator)), EYE)
-    assert isinstance(nodes, ContourNodes)
+    assert isinstance(nodes, SeenNodes)
     assert nodes.points.shape == (3, 0, 3)
     assert nodes.visible.shape == nodes.exists.shape == (3, 0)

@@ -8,14 +8,14 @@ import torch
 from torch import Tensor
 
 from torchcss.cost.contour import ContourTerm, EdgeAssignments
-from torchcss.cost.visibility import ContourNodes
+from torchcss.cost.visibility import SeenNodes
 from torchcss.vision.camera import Camera
 from torchcss.vision.sampling import sample_bilinear
 
 
 def cost_of_fixed_matches(
     term: ContourTerm,
-    nodes: ContourNodes,
+    nodes: SeenNodes,
     camera: Camera,
     assignments: EdgeAssignments,
     uv: Tensor,

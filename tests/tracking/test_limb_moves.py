@@ -15,7 +15,7 @@ from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.cost.choice import CostChoice
 from torchcss.cost.context import FrameContext
-from torchcss.cost.segmentation import BoundSegmentation, SegmentationTerm
+from torchcss.cost.segmentation import SegmentationTerm
 from torchcss.cost.total import TrackingCost
 from torchcss.inference.dynamics import ConstantVelocity
 from torchcss.inference.mixture import GaussianMixture
@@ -45,7 +45,7 @@ def cost_of(
     truth, term = moved(body, angle), SegmentationTerm()
     likeness = painted(body, camera, truth, missing)
     images = term.images(likeness, layers(body)[1], camera, body, truth)
-    colours = Ready(term, BoundSegmentation(term, images))
+    colours = Ready(term, term.bind(images))
     choice = CostChoice().without("contour", "joints").having(colours)
     view = FrameContext(body=body, camera=camera, deviation=body.motion_rate / 25)
     return body, TrackingCost(choice=choice, views=(view,) * views)

@@ -97,7 +97,7 @@ class Anthropometric(Term):
         body = context.body
         if not proportion_columns(body):
             return None
-        return OnStates(lambda posed: self.local_model(posed.x, body))
+        return OnStates(lambda posed, _: self.local_model(posed.x, body))
 
     def covariance(self, body: BodyModel) -> Float[Tensor, "m m"]:
         """Sigma of the free lengths in the order of `proportion_columns`, square metres."""

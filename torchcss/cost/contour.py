@@ -23,18 +23,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import ClassVar, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchcss.cost.context import FrameContext
-from torchcss.cost.term import Kind, Posed, Term
-from torchcss.cost.visibility import ContourNodes, ContourPredictor, contour_nodes, places
+from torchcss.cost.outline import ImageNodes, OutlineTerm
+from torchcss.cost.term import OnPoints
+from torchcss.cost.visibility import places
 from torchcss.robust import Lorentzian, RobustPotential
-from torchcss.types import PointCost
-from torchcss.vision.camera import Camera
 from torchcss.vision.sampling import inside_image, interpolate_bilinear
 
 
@@ -65,37 +64,26 @@ _FADE = 0.25
 
 
 @dataclass(frozen=True, kw_only=True)
-class ContourTerm(Term):
+class ContourTerm(OutlineTerm):
     """The robust edge-matching cost of occluding contours.
 
     Attributes:
-        weight: Nats per nu of the mean cost per node.
         sigma: Scale of the distance between model and image contour, pixels.
-        nu: Level of the outliers of one node (its unit only: the sum is normalised by N nu).
         window: Half length of the search line, pixels. Of 4.8 sigmas, as here, a node without a
             match costs 1.6 nu with the Lorentzian.
         step: Distance between samples of the search line, pixels.
-        fitted_level: Cost of a node where there is no contour, as a share of nu: the mean error per
-            node of a fitted model: 0.5 to 0.8 on the demo, whose surface is the model's own, 0.9 on
-            the beam clip. Too low a level invites a badly fitting limb to hide.
-        occlusion_factor: k of `nu_occ = k nu_bf`. [IJRR] says k > 1, [RR] k < 1; slightly above 1
-            keeps hidden nodes dearer than matched ones and cheaper than bad fits (decision
-            "occlusion levels").
+        fitted_level: The mean error per node of a fitted model: 0.5 to 0.8 on the demo, whose
+            surface is the model's own, 0.9 on the beam clip.
         potential_kind: The potential rho.
     """
 
     name: ClassVar[str] = "contour"
-    kind: ClassVar[Kind] = "image"
-    watched: ClassVar[bool] = True
-    screens: ClassVar[bool] = True
 
     weight: float = 150.0
     sigma: float = 2.5
-    nu: float = 1.0
     window: float = 12.0
     step: float = 1.0
     fitted_level: float = 0.9
-    occlusion_factor: float = 1.1
     potential_kind: type = Lorentzian
 
     @property
@@ -108,12 +96,10 @@ class ContourTerm(Term):
         """U, the cost of a visible node without assignment."""
         return 0.5 * float(self.potential(torch.tensor(self.window**2, dtype=torch.float64)).rho)
 
-    def prepare(self, context: FrameContext) -> OnContour | None:
+    def prepare(self, context: FrameContext) -> OnPoints | None:
         """Bind the term to the edges of a frame; None without a picture."""
         field = context.edge_field
-        if field is None:
-            return None
-        return OnContour(self, context.tables.of(ContourPredictor), field)
+        return None if field is None else self.bind(context, field)
 
     def search(
         self,
@@ -196,159 +182,31 @@ class ContourTerm(Term):
         depth, slope, curvature = (torch.cat(parts) for parts in zip(*blocks, strict=True))
         return depth, slope, curvature
 
-    def value(
+    def match(
         self,
-        nodes: ContourNodes,
-        camera: Camera,
-        edge_field: Float[Tensor, "2 h w"],
-        at: Float[Tensor, "*batch p 3"] | None = None,
-    ) -> Float[Tensor, "*batch p"]:
-        """Cost of every node, in units of nu.
-
-        Args:
-            nodes: Nodes on the predicted contours, with what is seen of them.
-            camera: The camera of the image.
-            edge_field: Edge energy times gradient direction of the image.
-            at: Where the nodes have moved since their edges were found.
-        """
-        seen, index = seen_nodes(nodes)
-        model = camera.project_with_derivatives(seen.points)
-        normal = camera.image_normals(model, seen.normals)
+        nodes: ImageNodes,
+        image: Float[Tensor, "2 h w"],
+        at: Float[Tensor, "k 2"] | None = None,
+    ) -> Float[Tensor, " k"]:
+        """Depth of the nodes' wells below U, see `OutlineTerm.match`."""
         if at is None:
-            depth, _, _ = self._wells(model.uv, normal, edge_field)
-        else:
-            uv = camera.project(at.flatten(0, -2).index_select(0, index)).uv
-            moved = ((uv - model.uv) * normal).sum(-1)
-            node, distance, weight = self.search(model.uv, normal, edge_field)
-            rho = self.potential((distance - moved.index_select(0, node)).square()).rho
-            wells = weight * (self.unmatched - 0.5 * rho)
-            depth = torch.zeros_like(moved).index_add(0, node, wells)
-        return self._compose(nodes, spread(model.valid * depth, index, nodes))
+            return self._wells(nodes.uv, nodes.normal, image)[0]
+        moved = ((at - nodes.uv) * nodes.normal).sum(-1)
+        node, distance, weight = self.search(nodes.uv, nodes.normal, image)
+        rho = self.potential((distance - moved.index_select(0, node)).square()).rho
+        wells = weight * (self.unmatched - 0.5 * rho)
+        return torch.zeros_like(moved).index_add(0, node, wells)
 
-    def point_cost(
-        self,
-        nodes: ContourNodes,
-        camera: Camera,
-        edge_field: Float[Tensor, "2 h w"],
-        *,
-        gauss_newton: bool = False,
-    ) -> PointCost:
-        """The same with first and second derivatives in the nodes' positions.
-
-        Args:
-            nodes: Contour nodes of the posed body.
-            camera: The camera that took the image.
-            edge_field: As in `search`.
-            gauss_newton: Leave the curvature of the projection out.
-        """
-        seen, index = seen_nodes(nodes)
-        model = camera.project_with_derivatives(seen.points)
-        normal = camera.image_normals(model, seen.normals)
-        depth, slope, curvature = self._wells(model.uv, normal, edge_field)
-        weight = seen.visible * seen.exists * model.valid
+    def derivatives(
+        self, nodes: ImageNodes, image: Float[Tensor, "2 h w"]
+    ) -> tuple[Float[Tensor, " k"], Float[Tensor, "k 2"], Float[Tensor, "k 2 2"]]:
+        """See `OutlineTerm.derivatives`."""
+        depth, slope, curvature = self._wells(nodes.uv, nodes.normal, image)
+        normal, weight = nodes.normal, nodes.weight
         gradient = (weight * slope)[:, None] * normal
         hessian = (weight * curvature)[:, None, None] * normal[:, :, None] * normal[:, None, :]
-        cost = camera.pull_back(
-            model, model.valid * depth, gradient, hessian, gauss_newton=gauss_newton
-        )
-        value, gradient, hessian = (spread(part, index, nodes) for part in cost)
-        return PointCost(self._compose(nodes, value), gradient, hessian)
+        return depth, gradient, hessian
 
-    def _compose(
-        self, nodes: ContourNodes, depth: Float[Tensor, "*batch p"]
-    ) -> Float[Tensor, "*batch p"]:
-        matched = self.unmatched - depth
-        return nodes.cost(matched, self.fitted_level * self.nu, self.occlusion_factor)
-
-
-class OutlineTerm(Protocol):
-    """What the terms of the contour nodes have in common; see `ContourTerm`."""
-
-    @property
-    def weight(self) -> float:
-        """Nats per nu of the mean cost per node."""
-        ...
-
-    @property
-    def nu(self) -> float:
-        """Level of the outliers of one node."""
-        ...
-
-    def value(
-        self, nodes: ContourNodes, camera: Camera, image: Any, at: Tensor | None = None, /
-    ) -> Float[Tensor, "*batch p"]:
-        """Cost of every node."""
-        ...
-
-    def point_cost(
-        self, nodes: ContourNodes, camera: Camera, image: Any, /, *, gauss_newton: bool = False
-    ) -> PointCost:
-        """The same with first and second derivatives in the nodes' positions."""
-        ...
-
-
-@dataclass(frozen=True, eq=False)
-class OnContour:
-    """A term of the contour nodes and the image that it looks at; a `BoundImage`."""
-
-    term: OutlineTerm
-    nodes: ContourPredictor
-    image: Any
-
-    @property
-    def scale(self) -> float:
-        """Nats per unit of a node's cost."""
-        return self.term.weight / (max(self.size, 1) * self.term.nu)
-
-    @property
-    def link(self) -> Int[Tensor, " p"]:
-        """The link of each node."""
-        return self.nodes.node_link
-
-    @property
-    def size(self) -> int:
-        """Number of nodes."""
-        return self.nodes.num_nodes
-
-    def points(self, posed: Posed) -> Float[Tensor, "*batch p 3"]:
-        """The nodes."""
-        return posed.of(contour_nodes).points
-
-    def value(
-        self, posed: Posed, at: Float[Tensor, "*batch p 3"] | None = None
-    ) -> Float[Tensor, "*batch p"]:
-        """Cost of every node."""
-        return self.term.value(posed.of(contour_nodes), posed.camera, self.image, at)
-
-    def point_cost(self, posed: Posed, *, gauss_newton: bool = False) -> PointCost:
-        """Cost and derivatives of every node."""
-        nodes = posed.of(contour_nodes)
-        return self.term.point_cost(nodes, posed.camera, self.image, gauss_newton=gauss_newton)
-
-
-def seen_nodes(nodes: ContourNodes) -> tuple[ContourNodes, Int[Tensor, " k"]]:
-    """The nodes that count at all, of the whole batch, and their places in it."""
-    index = places(nodes.visible * nodes.exists > 0)
-    last = nodes.exists.dim() - 1
-    return ContourNodes(*(part.flatten(0, last).index_select(0, index) for part in nodes)), index
-
-
-def spread(
-    part: Float[Tensor, "k *rest"], index: Int[Tensor, " k"], nodes: ContourNodes
-) -> Float[Tensor, "..."]:
-    """What was worked out for the nodes that count, and zero for the others.
-
-    Args:
-        part: One row per node that counts.
-        index: Their places, from `seen_nodes`.
-        nodes: All nodes.
-
-    Returns:
-        One row per node, `[*batch p *rest]`.
-    """
-    components = part.movedim(0, -1)
-    shape, rest = nodes.exists.shape, components.shape[:-1]
-    whole = components.new_zeros(*rest, shape.numel()).index_copy(-1, index, components)
-    return whole.reshape(*rest, *shape).movedim(
-        tuple(range(len(rest))), tuple(range(-len(rest), 0))
-    )
+    def matched(self, match: Float[Tensor, "*batch p"]) -> Float[Tensor, "*batch p"]:
+        """See `OutlineTerm.matched`."""
+        return self.unmatched - match

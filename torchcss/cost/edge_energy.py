@@ -35,13 +35,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.cost.context import FrameContext
-from torchcss.cost.contour import OnContour
-from torchcss.cost.term import Kind, Term
-from torchcss.cost.visibility import ContourNodes, ContourPredictor
+from torchcss.cost.outline import ImageNodes, OutlineTerm
+from torchcss.cost.term import OnPoints
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.robust import Lorentzian, RobustPotential
-from torchcss.types import PointCost
-from torchcss.vision.camera import Camera
 from torchcss.vision.spline import SplineField, spline_field
 
 _RIDGE = 1.2
@@ -88,30 +85,22 @@ def edge_energy_field(edge_field: Float[Tensor, "2 h w"], *, smoothing: float = 
 
 
 @dataclass(frozen=True, kw_only=True)
-class EdgeEnergyTerm(Term):
+class EdgeEnergyTerm(OutlineTerm):
     """The robust potential of the edge energy at occluding contours.
 
     Attributes:
-        weight: Nats per nu of the mean cost per node.
         sigma: Scale of the square root of the missing energy: an edge weighs the more the nearer it
             comes to 1, within about the square of sigma.
-        nu: Level of the outliers of one node (its unit only: the sum is normalised by N nu).
-        fitted_level: Cost of a node where there is no contour, as a share of nu: the mean error per
-            node of a well-fitted model, measured on the demo's sequence at its true states.
-        occlusion_factor: k of `nu_occ = k nu_bf`, see `ContourTerm`.
+        fitted_level: The mean error per node of a well-fitted model, measured on the demo's
+            sequence at its true states.
         potential_kind: The potential rho.
     """
 
     name: ClassVar[str] = "edge_energy"
-    kind: ClassVar[Kind] = "image"
-    watched: ClassVar[bool] = True
-    screens: ClassVar[bool] = True
 
     weight: float = 150.0
     sigma: float = 0.5
-    nu: float = 1.0
     fitted_level: float = 0.45
-    occlusion_factor: float = 1.1
     potential_kind: type = Lorentzian
 
     @property
@@ -124,57 +113,28 @@ class EdgeEnergyTerm(Term):
         """The cost of a visible node without an edge, or outside the image."""
         return 0.5 * float(self.potential(torch.ones((), dtype=torch.float64)).rho)
 
-    def prepare(self, context: FrameContext) -> OnContour | None:
+    def prepare(self, context: FrameContext) -> OnPoints | None:
         """Make the edge energy of a frame smooth; None without a picture."""
-        if context.edge_field is None:
-            return None
-        field = edge_energy_field(context.edge_field)
-        return OnContour(self, context.tables.of(ContourPredictor), field)
+        field = context.edge_field
+        return None if field is None else self.bind(context, edge_energy_field(field))
 
-    def value(
-        self,
-        nodes: ContourNodes,
-        camera: Camera,
-        field: SplineField,
-        at: Float[Tensor, "*batch p 3"] | None = None,
-    ) -> Float[Tensor, "*batch p"]:
-        """Cost of every node, in units of nu.
+    def match(
+        self, nodes: ImageNodes, image: SplineField, at: Float[Tensor, "k 2"] | None = None
+    ) -> Float[Tensor, " k"]:
+        """The edge energy, see `OutlineTerm.match`."""
+        return image.value(nodes.uv if at is None else at)
 
-        Args:
-            nodes: Nodes on the predicted contours, with what is seen of them.
-            camera: The camera of the image.
-            field: The edge energy as a smooth function of the image.
-            at: Where the nodes have moved since, as they were seen before.
-        """
-        projection = camera.project(nodes.points if at is None else at)
-        energy = field.value(projection.uv) * projection.valid
-        return self._compose(nodes, self.potential((1 - energy).clamp(min=0)).rho)
-
-    def point_cost(
-        self,
-        nodes: ContourNodes,
-        camera: Camera,
-        field: SplineField,
-        *,
-        gauss_newton: bool = False,
-    ) -> PointCost:
-        """The same with first and second derivatives in the nodes' positions.
-
-        Args:
-            nodes: Contour nodes; existence and visibility are held fixed.
-            camera: Camera of the image that the field was made of.
-            field: The smooth edge energy.
-            gauss_newton: Leave out the curvature of the projection.
-        """
-        model = camera.project_with_derivatives(nodes.points)
-        energy, slope, bend = field.sample(model.uv)
-        rho, first, second = self.potential((1 - energy * model.valid).clamp(min=0))
-        weight = 0.5 * nodes.visible * nodes.exists * model.valid
+    def derivatives(
+        self, nodes: ImageNodes, image: SplineField
+    ) -> tuple[Float[Tensor, " k"], Float[Tensor, "k 2"], Float[Tensor, "k 2 2"]]:
+        """See `OutlineTerm.derivatives`."""
+        energy, slope, bend = image.sample(nodes.uv)
+        _, first, second = self.potential((1 - energy).clamp(min=0))
+        weight = 0.5 * nodes.weight
         gradient = (-weight * first)[..., None] * slope
         hessian = (weight * second)[..., None, None] * slope[..., :, None] * slope[..., None, :]
-        hessian = hessian - (weight * first)[..., None, None] * bend
-        value = self._compose(nodes, rho)
-        return camera.pull_back(model, value, gradient, hessian, gauss_newton=gauss_newton)
+        return energy, gradient, hessian - (weight * first)[..., None, None] * bend
 
-    def _compose(self, nodes: ContourNodes, rho: Tensor) -> Float[Tensor, "*batch p"]:
-        return nodes.cost(0.5 * rho, self.fitted_level * self.nu, self.occlusion_factor)
+    def matched(self, match: Float[Tensor, "*batch p"]) -> Float[Tensor, "*batch p"]:
+        """See `OutlineTerm.matched`."""
+        return 0.5 * self.potential((1 - match).clamp(min=0)).rho

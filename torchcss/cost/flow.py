@@ -36,13 +36,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchcss.body.model import BodyModel
 from torchcss.cost.context import FrameContext
-from torchcss.cost.interior import InteriorNodes, interior_nodes, interior_visibility
-from torchcss.cost.term import Kind, Need, Posed, Term
-from torchcss.cost.visibility import front_facing, visible_nodes
+from torchcss.cost.interior import InteriorNodes, seen_interior
+from torchcss.cost.term import Kind, Need, OnPoints, Posed, Term
+from torchcss.cost.visibility import SeenNodes
 from torchcss.errors import ShapeError, check_shape
-from torchcss.robust import Lorentzian, RobustPotential
+from torchcss.robust import Lorentzian, RobustPotential, residual_cost
 from torchcss.types import PointCost
 from torchcss.vision.camera import Camera
 from torchcss.vision.sampling import sample_bilinear
@@ -71,26 +70,19 @@ class FlowTargets(NamedTuple):
 
 
 def flow_targets(
-    nodes: InteriorNodes,
-    body: BodyModel,
-    mean_prev: Float[Tensor, "*k n"],
+    nodes: SeenNodes,
     camera: Camera,
     flow: Float[Tensor, "2 h w"],
     outlier: Float[Tensor, "h w"] | None = None,
-    visible: Float[Tensor, "*k p"] | None = None,
 ) -> FlowTargets:
     """Follow the nodes of the previous frame's modes along the flow.
 
     Args:
-        nodes: The interior nodes.
-        body: The body on its present base.
-        mean_prev: States of the modes at the previous frame, expressed on that base.
+        nodes: The interior nodes of the modes, with what was seen of them, on the present base.
         camera: Camera of both frames, at the size of the flow.
         flow: Displacement from the previous frame to this one, pixels (u right, v down), at the
             pixels of the previous frame. Infinite ones are unknown, as those from 1e9 on.
         outlier: Outlier map of the flow in [0, 1]; None: no outliers.
-        visible: Whether another part hides each node at `mean_prev`: 1 if none does, 0 if one does;
-            None: none does.
 
     Raises:
         ShapeError: If flow and outlier map are no images of the camera's size.
@@ -104,19 +96,14 @@ def flow_targets(
     if outlier is not None:
         check_shape("outlier", outlier, height, width)
         trust = known * (1 - outlier.to(flow))
-    sample = nodes(body, body.pose(mean_prev))
-    projection = camera.project(sample.points)
+    projection = camera.project(nodes.points)
     channels = torch.cat([torch.where(is_known, flow, 0.0), known[None], trust[None]])
     values, inside = sample_bilinear(channels, projection.uv)
     # The mean of the known pixels alone: the zeros in place of the others say nothing.
     share = values[..., 2:3]
     moved = values[..., :2] / torch.where(share > 0, share, 1.0)
-    seen = front_facing(sample.points, sample.normals, camera.centre_world) * (
-        inside & projection.valid
-    )
-    weight = values[..., 3].clamp(0, 1) * seen
-    if visible is not None:
-        weight = weight * visible
+    seen = nodes.exists * (inside & projection.valid)
+    weight = values[..., 3].clamp(0, 1) * seen * nodes.visible
     return FlowTargets(projection.uv + moved, weight)
 
 
@@ -154,23 +141,23 @@ class FlowTerm(Term):
         """Optical flow."""
         return frozenset(("flow",))
 
-    def prepare(self, context: FrameContext) -> BoundFlow | None:
+    def prepare(self, context: FrameContext) -> OnPoints | None:
         """Follow the nodes of the modes before; None without flow or modes."""
         features, modes, body = context.features, context.modes, context.body
         if features is None or features.flow is None or modes is None:
             return None
-        nodes, pose = context.tables.of(InteriorNodes), body.pose(modes)
-        points, eye = nodes(body, pose).points, context.camera.centre_world
-        targets = flow_targets(
-            nodes,
-            body,
-            modes,
-            context.camera,
-            features.flow.to(body.tie),
-            None if features.flow_outlier is None else features.flow_outlier.to(body.tie),
-            visible_nodes(body, pose, eye, points, nodes.node_part),
+        outlier = None if features.flow_outlier is None else features.flow_outlier.to(body.tie)
+        before = seen_interior(Posed(context, body, body.pose(modes)))
+        nodes = context.tables.of(InteriorNodes)
+        return OnPoints(
+            term=self,
+            find=seen_interior,
+            image=flow_targets(before, context.camera, features.flow.to(body.tie), outlier),
+            link=nodes.node_link,
+            scale=self.weight / (max(nodes.num_nodes, 1) * self.nu),
+            size=nodes.num_nodes,
+            of_parents=lambda posed, aims: FlowTargets(*(posed.of_parent(part) for part in aims)),
         )
-        return BoundFlow(self, nodes, targets)
 
     @property
     def potential(self) -> RobustPotential:
@@ -179,9 +166,7 @@ class FlowTerm(Term):
 
     def value(
         self,
-        points_world: Float[Tensor, "*batch p 3"],
-        normals_world: Float[Tensor, "*batch p 3"],
-        visible: Float[Tensor, "*#batch p"],
+        nodes: SeenNodes,
         camera: Camera,
         targets: FlowTargets,
         at: Float[Tensor, "*batch p 3"] | None = None,
@@ -189,27 +174,21 @@ class FlowTerm(Term):
         """Cost of every node, in units of nu.
 
         Args:
-            points_world: Nodes at the sample's pose, metres.
-            normals_world: Their unit outward normals.
-            visible: 1 where no other part is in front of the node, 0 where one is, or between.
+            nodes: Interior nodes at the sample's pose, with what is seen of them.
             camera: Camera of this frame, at the size of the flow.
             targets: Targets of each sample's own parent, or of one for all.
             at: Where the nodes have moved since, as they faced the camera before.
         """
-        projection = camera.project(points_world)
+        projection = camera.project(nodes.points)
         near = _in_front(projection.depth, projection.valid, camera)
         if at is not None:
             projection = camera.project(at)
         squared = targets.weight * (projection.uv - targets.uv).square().sum(-1)
-        facing = front_facing(points_world, normals_world, camera.centre_world)
-        rho = self.potential(squared).rho
-        return self._compose(rho, facing, visible, near, camera, targets)
+        return self._composed(0.5 * self.potential(squared).rho, nodes, near, camera, targets)
 
     def point_cost(
         self,
-        points_world: Float[Tensor, "*batch p 3"],
-        normals_world: Float[Tensor, "*batch p 3"],
-        visible: Float[Tensor, "*#batch p"],
+        nodes: SeenNodes,
         camera: Camera,
         targets: FlowTargets,
         *,
@@ -218,89 +197,27 @@ class FlowTerm(Term):
         """The same with first and second derivatives in the nodes' positions.
 
         Args:
-            points_world: Nodes at the sample's pose, metres.
-            normals_world: Their unit outward normals.
-            visible: 1 where no other part is in front of the node, 0 where one is, or between.
+            nodes: Interior nodes at the sample's pose, with what is seen of them.
             camera: Camera of this frame, at the size of the flow.
             targets: Targets of each sample's own parent, or of one for all.
             gauss_newton: Leave out the curvature of the projection.
         """
-        model = camera.project_with_derivatives(points_world)
-        error = model.uv - targets.uv
-        weight = targets.weight
-        rho, first, second = self.potential(weight * error.square().sum(-1))
-        facing = front_facing(points_world, normals_world, camera.centre_world)
+        model = camera.project_with_derivatives(nodes.points)
         near = _in_front(model.depth, model.valid, camera)
-        value = self._compose(rho, facing, visible, near, camera, targets)
-        seen = facing * visible * near
-        stiffness = seen * weight * first
-        bend = (2 * seen * weight.square() * second)[..., None, None]
-        hessian = error[..., :, None] * error[..., None, :] * bend
-        hessian.diagonal(dim1=-2, dim2=-1).add_(stiffness[..., None])
-        gradient = stiffness[..., None] * error
+        seen = nodes.exists * nodes.visible * near
+        error = model.uv - targets.uv
+        cost, gradient, hessian = residual_cost(self.potential, error, targets.weight, seen)
+        value = self._composed(cost, nodes, near, camera, targets)
         return camera.pull_back(model, value, gradient, hessian, gauss_newton=gauss_newton)
 
-    def _compose(
-        self,
-        rho: Tensor,
-        facing: Tensor,
-        visible: Tensor,
-        near: Tensor,
-        camera: Camera,
-        targets: FlowTargets,
+    def _composed(
+        self, cost: Tensor, nodes: SeenNodes, near: Tensor, camera: Camera, targets: FlowTargets
     ) -> Float[Tensor, "*batch p"]:
         far = self.potential(targets.weight * math.hypot(*camera.image_size_wh) ** 2).rho
         back_facing = self.fitted_level * self.nu
-        hidden = self.occlusion_factor * back_facing
         untold = (1 - targets.weight) * back_facing
-        unhidden = visible * (0.5 * rho + untold) + (1 - visible) * hidden
-        in_front = facing * unhidden + (1 - facing) * back_facing
+        in_front = nodes.cost(cost + untold, back_facing, self.occlusion_factor)
         return near * in_front + (1 - near) * (0.5 * far + untold)
-
-
-@dataclass(frozen=True, eq=False)
-class BoundFlow:
-    """The flow term with the targets of the modes before; a `BoundImage`."""
-
-    term: FlowTerm
-    nodes: InteriorNodes
-    targets: FlowTargets
-
-    @property
-    def scale(self) -> float:
-        """Nats per unit of a node's cost."""
-        return self.term.weight / (max(self.size, 1) * self.term.nu)
-
-    @property
-    def link(self) -> Int[Tensor, " p"]:
-        """The link of each node."""
-        return self.nodes.node_link
-
-    @property
-    def size(self) -> int:
-        """Number of nodes."""
-        return self.nodes.num_nodes
-
-    def points(self, posed: Posed) -> Float[Tensor, "*batch p 3"]:
-        """The nodes."""
-        posed.of(interior_visibility)
-        return posed.of(interior_nodes).points
-
-    def value(
-        self, posed: Posed, at: Float[Tensor, "*batch p 3"] | None = None
-    ) -> Float[Tensor, "*batch p"]:
-        """Cost of every node, see `FlowTerm.value`."""
-        return self.term.value(*self._arguments(posed), at)
-
-    def point_cost(self, posed: Posed, *, gauss_newton: bool = False) -> PointCost:
-        """Cost and derivatives of every node."""
-        return self.term.point_cost(*self._arguments(posed), gauss_newton=gauss_newton)
-
-    def _arguments(self, posed: Posed) -> tuple[Tensor, Tensor, Tensor, Camera, FlowTargets]:
-        targets = FlowTargets(*(posed.of_parent(part) for part in self.targets))
-        seen = posed.of(interior_visibility)
-        points, normals = posed.of(interior_nodes)
-        return points, normals, seen, posed.camera, targets
 
 
 def _in_front(depth: Tensor, valid: Tensor, camera: Camera) -> Float[Tensor, "*batch p"]:

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.surface import SurfaceSample, surface_points
 from torchcss.cost.term import Posed
-from torchcss.cost.visibility import front_facing, visible_nodes
+from torchcss.cost.visibility import SeenNodes, seen_nodes
 from torchcss.errors import ConfigurationError
 
 
@@ -84,9 +84,8 @@ def interior_nodes(posed: Posed) -> SurfaceSample:
     return posed.context.tables.of(InteriorNodes)(posed.body, posed.pose)
 
 
-def interior_visibility(posed: Posed) -> Float[Tensor, "*batch p"]:
-    """Which interior nodes no other part hides, of those that face the camera."""
+def seen_interior(posed: Posed) -> SeenNodes:
+    """The same with which of them face the camera, and which of these no other part hides."""
     points, normals = posed.of(interior_nodes)
-    eye, part = posed.camera.centre_world, posed.context.tables.of(InteriorNodes).node_part
-    facing = front_facing(points, normals, eye)
-    return visible_nodes(posed.body, posed.pose, eye, points, part, wanted=facing)
+    part = posed.context.tables.of(InteriorNodes).node_part
+    return seen_nodes(posed.body, posed.pose, posed.camera.centre_world, points, normals, part)

@@ -52,7 +52,7 @@ from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.superquadric import EXPONENTS, Superquadrics, radial_hessian
 from torchcss.body.surface import surface_points
 from torchcss.cost.context import FrameContext
-from torchcss.cost.term import Kind, Posed, Term
+from torchcss.cost.term import Kind, OnStates, Term
 from torchcss.errors import ConfigurationError
 from torchcss.types import Curvature, LocalModel
 
@@ -371,9 +371,15 @@ class Interpenetration(Term):
                 "leave them out for the defaults"
             )
 
-    def prepare(self, context: FrameContext) -> BoundInterpenetration:
+    def prepare(self, context: FrameContext) -> OnStates:
         """Bind the repulsion to the pairs of a body."""
-        return BoundInterpenetration(self, context.tables.of(InterpenetrationPairs))
+        pairs = context.tables.of(InterpenetrationPairs)
+        return OnStates(
+            lambda posed, curvature: self.local_model(
+                posed.body, posed.pose, pairs, curvature=curvature
+            ),
+            cost=lambda posed: self.value(posed.body, posed.pose, pairs),
+        )
 
     @property
     def reach(self) -> float:
@@ -446,19 +452,3 @@ class Interpenetration(Term):
         value = paper - last * (1 + END - u)
         inside = f < end
         return tuple(torch.where(inside, scale * part, 0.0) for part in (value, first, second))  # type: ignore[return-value]
-
-
-@dataclass(frozen=True, eq=False)
-class BoundInterpenetration:
-    """The repulsion between the parts of a body; a `BoundPrior`."""
-
-    term: Interpenetration
-    pairs: InterpenetrationPairs
-
-    def value(self, posed: Posed) -> Float[Tensor, "*batch"]:
-        """Cost, nats."""
-        return self.term.value(posed.body, posed.pose, self.pairs)
-
-    def local_model(self, posed: Posed, curvature: Curvature) -> LocalModel:
-        """Cost and derivatives in the state."""
-        return self.term.local_model(posed.body, posed.pose, self.pairs, curvature=curvature)

@@ -19,10 +19,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchcss.cost.context import FrameContext
-from torchcss.cost.term import Kind, Posed, Term
-from torchcss.robust import Lorentzian, RobustPotential
+from torchcss.cost.term import Kind, OnPoints, Posed, Term
+from torchcss.robust import Lorentzian, RobustPotential, residual_cost
 from torchcss.types import Keypoints, PointCost
-from torchcss.vision.camera import Camera, Projection
+from torchcss.vision.camera import Camera
 
 SPREAD = {
     "hip": 2.0,
@@ -131,28 +131,44 @@ class JointTerm(Term):
         """The same term for which hardly a keypoint is an outlier, see `COARSE_SCALE`."""
         return replace(self, nu=COARSE_SCALE**2 * self.nu)
 
-    def prepare(self, context: FrameContext) -> BoundJoints | None:
+    def prepare(self, context: FrameContext) -> OnPoints | None:
         """Bind the term to the keypoints of a frame; None without any."""
         if context.keypoints is None:
             return None
         targets = match_joints(context.keypoints, context.body.joint_names)
-        return BoundJoints(self, targets, context.body.marker_link[targets.joint])
+        return OnPoints(
+            term=self,
+            find=lambda posed: posed.pose.joints[..., targets.joint, :],
+            image=targets,
+            link=context.body.marker_link[targets.joint],
+            scale=self.weight,
+            size=0,
+            of_parents=None if targets.weight.dim() == 1 else _of_parents,
+        )
 
-    def value(self, projection: Projection, targets: JointTargets) -> Float[Tensor, "*batch m"]:
+    def value(
+        self,
+        points: Float[Tensor, "*batch m 3"],
+        camera: Camera,
+        targets: JointTargets,
+        at: Float[Tensor, "*batch m 3"] | None = None,
+    ) -> Float[Tensor, "*batch m"]:
         """Cost of every correspondence, nats.
 
         Args:
-            projection: Where the joint centres of the targets project.
+            points: The joint centres of the targets, metres.
+            camera: The camera whose pixels the targets are in.
             targets: The keypoints, matched to the body.
+            at: Where the joint centres have moved since; None: nowhere.
         """
-        error = _error(projection.uv, targets)
-        squared = targets.weight * error.square().sum(-1)
+        projection = camera.project(points if at is None else at)
+        squared = targets.weight * _error(projection.uv, targets).square().sum(-1)
         rho = self.potential(squared).rho
-        return 0.5 * torch.where(projection.valid, rho, self._unseen(targets))
+        return torch.where(projection.valid, 0.5 * rho, self._unseen(targets))
 
     def point_cost(
         self,
-        points_world: Float[Tensor, "*batch m 3"],
+        points: Float[Tensor, "*batch m 3"],
         camera: Camera,
         targets: JointTargets,
         *,
@@ -161,61 +177,23 @@ class JointTerm(Term):
         """The same with first and second derivatives in the joint centres' positions.
 
         Args:
-            points_world: The joint centres of the targets, metres.
+            points: The joint centres of the targets, metres.
             camera: The camera whose pixels the targets are in.
             targets: The keypoints, matched to the body.
-            gauss_newton: Leave out the curvature of the projection, eq. 9 [RR].
+            gauss_newton: Leave the curvature of the projection out.
         """
-        model = camera.project_with_derivatives(points_world)
-        error = _error(model.uv, targets)
-        weight = targets.weight
-        rho, first, second = self.potential(weight * error.square().sum(-1))
-        value = 0.5 * torch.where(model.valid, rho, self._unseen(targets))
-        gradient = (first * weight)[..., None] * error
-        outer = error[..., :, None] * error[..., None, :]
-        hessian = (first * weight)[..., None, None] * torch.eye(
-            2, dtype=error.dtype, device=error.device
+        model = camera.project_with_derivatives(points)
+        cost, gradient, hessian = residual_cost(
+            self.potential, _error(model.uv, targets), targets.weight
         )
-        hessian = hessian + (2 * second * weight.square())[..., None, None] * outer
+        value = torch.where(model.valid, cost, self._unseen(targets))
         return camera.pull_back(model, value, gradient, hessian, gauss_newton=gauss_newton)
 
     def _unseen(self, targets: JointTargets) -> Tensor:
         far = targets.weight * (OUTLIER_LENGTHS * self.sigma) ** 2
-        return self.potential(far).rho
+        return 0.5 * self.potential(far).rho
 
 
-@dataclass(frozen=True, eq=False)
-class BoundJoints:
-    """The keypoints of a frame; a `BoundImage`."""
-
-    term: JointTerm
-    targets: JointTargets
-    link: Int[Tensor, " m"]
-    size: int = 0
-
-    @property
-    def scale(self) -> float:
-        """Factor on the nats of a joint."""
-        return self.term.weight
-
-    def points(self, posed: Posed) -> Float[Tensor, "*batch m 3"]:
-        """The joint centres that have keypoints."""
-        return posed.pose.joints[..., self.targets.joint, :]
-
-    def value(
-        self, posed: Posed, at: Float[Tensor, "*batch m 3"] | None = None
-    ) -> Float[Tensor, "*batch m"]:
-        """Cost of every joint."""
-        points = self.points(posed) if at is None else at
-        return self.term.value(posed.camera.project(points), self._of_samples(posed))
-
-    def point_cost(self, posed: Posed, *, gauss_newton: bool = False) -> PointCost:
-        """Cost and derivatives of every joint."""
-        targets, points = self._of_samples(posed), self.points(posed)
-        return self.term.point_cost(points, posed.camera, targets, gauss_newton=gauss_newton)
-
-    def _of_samples(self, posed: Posed) -> JointTargets:
-        joint, position, weight = self.targets
-        if weight.dim() == 1:
-            return self.targets
-        return JointTargets(joint, posed.of_parent(position), posed.of_parent(weight))
+def _of_parents(posed: Posed, targets: JointTargets) -> JointTargets:
+    joint, position, weight = targets
+    return JointTargets(joint, posed.of_parent(position), posed.of_parent(weight))

@@ -37,11 +37,10 @@ from torch.nn import functional
 from torchcss.body.model import BodyModel
 from torchcss.body.root import has_root
 from torchcss.cost.context import FrameContext
-from torchcss.cost.contour import OnContour, seen_nodes, spread
+from torchcss.cost.outline import ImageNodes, OutlineTerm
 from torchcss.cost.part_map import grow, part_map
-from torchcss.cost.term import Kind, Need, Term
-from torchcss.cost.visibility import ContourNodes, ContourPredictor
-from torchcss.types import PointCost
+from torchcss.cost.term import Need, OnPoints
+from torchcss.cost.visibility import ContourPredictor
 from torchcss.vision.camera import Camera
 from torchcss.vision.spline import SplineField, spline_field
 
@@ -181,102 +180,61 @@ class RegionImages(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RegionTerm(Term):
+class RegionTerm(OutlineTerm):
     """The cost of what the image looks like on either side of the contour.
 
     Attributes:
-        weight: Nats per nu of the mean cost per node.
         background: Whether it knows what is behind the body, see `torchcss.vision.background`.
         offset: Distance d of the two places from the contour, pixels.
-        nu: Level of the cost of one node (its unit only: the sum is normalised by N nu).
-        fitted_level: Cost of a node where there is no contour, as a share of nu: the mean error per
-            node of a fitted model, 0.23 to 0.32 on the beam clip.
-        occlusion_factor: k of `nu_occ = k nu_bf`, see `ContourTerm`.
+        fitted_level: The mean error per node of a fitted model, 0.23 to 0.32 on the beam clip.
     """
 
     name: ClassVar[str] = "region"
-    kind: ClassVar[Kind] = "image"
-    watched: ClassVar[bool] = True
-    screens: ClassVar[bool] = True
 
     weight: float = 400.0
     background: bool = False
     offset: float = 5.0
-    nu: float = 1.0
     fitted_level: float = 0.3
-    occlusion_factor: float = 1.1
 
     @property
     def needs(self) -> frozenset[Need]:
         """Colours, and what is behind them where that is asked for."""
         return frozenset(("appearance", "background") if self.background else ("appearance",))
 
-    def prepare(self, context: FrameContext) -> OnContour | None:
+    def prepare(self, context: FrameContext) -> OnPoints | None:
         """Make the foreground of a frame smooth; None where no colours are known."""
         foreground = context.foreground(background=self.background)
         if foreground is None:
             return None
-        nodes = context.tables.of(ContourPredictor)
-        layer = context.tables.of(layer_of_part)[nodes.node_part]
-        return OnContour(self, nodes, RegionImages(region_field(foreground), layer))
+        part = context.tables.of(ContourPredictor).node_part
+        layer = context.tables.of(layer_of_part)[part]
+        return self.bind(context, RegionImages(region_field(foreground), layer))
 
-    def value(
-        self,
-        nodes: ContourNodes,
-        camera: Camera,
-        images: RegionImages,
-        at: Float[Tensor, "*batch p 3"] | None = None,
-    ) -> Float[Tensor, "*batch p"]:
-        """Cost of every node.
+    def match(
+        self, nodes: ImageNodes, image: RegionImages, at: Float[Tensor, "k 2"] | None = None
+    ) -> Float[Tensor, " k"]:
+        """The contrast L(r - d m) - L(r + d m), see `OutlineTerm.match`."""
+        inside, outside, layer = self._sides(nodes, image, at)
+        return image.field.value(inside, layer) - image.field.value(outside, layer)
 
-        Args:
-            nodes: Nodes on the predicted contours, with what is seen of them.
-            camera: The camera of the image.
-            images: What the pixels look like.
-            at: Where the nodes have moved since, as they were seen before.
-        """
-        seen, index = seen_nodes(nodes)
-        layer = images.layer[index % len(images.layer)]
-        model = camera.project_with_derivatives(seen.points)
-        step, uv = self.offset * camera.image_normals(model, seen.normals), model.uv
-        if at is not None:
-            uv = camera.project(at.flatten(0, -2).index_select(0, index)).uv
-        inside = images.field.value(uv - step, layer)
-        outside = images.field.value(uv + step, layer)
-        return self._compose(nodes, spread((inside - outside) * model.valid, index, nodes))
-
-    def point_cost(
-        self,
-        nodes: ContourNodes,
-        camera: Camera,
-        images: RegionImages,
-        *,
-        gauss_newton: bool = False,
-    ) -> PointCost:
-        """The same with first and second derivatives in the nodes' positions.
-
-        Args:
-            nodes: Contour nodes of the posed body.
-            camera: The camera that took the image.
-            images: How much every pixel looks like each part.
-            gauss_newton: Leave the curvature of the projection out.
-        """
-        seen, index = seen_nodes(nodes)
-        layer = images.layer[index % len(images.layer)]
-        model = camera.project_with_derivatives(seen.points)
-        step = self.offset * camera.image_normals(model, seen.normals)
-        inside = images.field.sample(model.uv - step, layer)
-        outside = images.field.sample(model.uv + step, layer)
-        contrast = (inside.value - outside.value) * model.valid
-        weight = 0.25 * self.nu * seen.visible * seen.exists * model.valid
+    def derivatives(
+        self, nodes: ImageNodes, image: RegionImages
+    ) -> tuple[Float[Tensor, " k"], Float[Tensor, "k 2"], Float[Tensor, "k 2 2"]]:
+        """See `OutlineTerm.derivatives`."""
+        *sides, layer = self._sides(nodes, image, None)
+        inside, outside = (image.field.sample(side, layer) for side in sides)
+        weight = 0.25 * self.nu * nodes.weight
         gradient = weight[..., None] * (outside.gradient - inside.gradient)
         hessian = weight[..., None, None] * (outside.hessian - inside.hessian)
-        cost = camera.pull_back(model, contrast, gradient, hessian, gauss_newton=gauss_newton)
-        value, gradient, hessian = (spread(part, index, nodes) for part in cost)
-        return PointCost(self._compose(nodes, value), gradient, hessian)
+        return inside.value - outside.value, gradient, hessian
 
-    def _compose(
-        self, nodes: ContourNodes, contrast: Float[Tensor, "*batch p"]
-    ) -> Float[Tensor, "*batch p"]:
-        found = 0.5 * self.nu * (1 - 0.5 * contrast)
-        return nodes.cost(found, self.fitted_level * self.nu, self.occlusion_factor)
+    def matched(self, match: Float[Tensor, "*batch p"]) -> Float[Tensor, "*batch p"]:
+        """See `OutlineTerm.matched`."""
+        return 0.5 * self.nu * (1 - 0.5 * match)
+
+    def _sides(
+        self, nodes: ImageNodes, image: RegionImages, at: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """The places inside and outside of the nodes, and the layers that are looked at there."""
+        uv, step = nodes.uv if at is None else at, self.offset * nodes.normal
+        return uv - step, uv + step, image.layer[nodes.place % len(image.layer)]

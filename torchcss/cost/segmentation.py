@@ -32,7 +32,7 @@ from torchcss.body.model import BodyModel
 from torchcss.cost.context import FrameContext
 from torchcss.cost.part_map import part_map
 from torchcss.cost.region import layer_of_part
-from torchcss.cost.term import Kind, Need, Posed, Term
+from torchcss.cost.term import BoundWeight, Kind, Need, Term
 from torchcss.vision.camera import Camera
 
 _FEWEST_PIXELS = 20
@@ -82,7 +82,7 @@ class SegmentationTerm(Term):
         """Colours, and what is behind them where that is asked for."""
         return frozenset(("appearance", "background") if self.background else ("appearance",))
 
-    def prepare(self, context: FrameContext) -> BoundSegmentation | None:
+    def prepare(self, context: FrameContext) -> BoundWeight | None:
         """Reduce the foreground of a frame; None without colours, or without a pose before it."""
         foreground = context.foreground(background=self.background)
         if foreground is None or context.modes is None:
@@ -90,7 +90,11 @@ class SegmentationTerm(Term):
         layer = context.tables.of(layer_of_part)
         expected = context.modes[0]
         images = self.images(foreground, layer, context.camera, context.body, expected)
-        return BoundSegmentation(self, images)
+        return self.bind(images)
+
+    def bind(self, images: SegmentationImages) -> BoundWeight:
+        """The term on a frame that `images` has prepared."""
+        return BoundWeight(self.weight, lambda posed: self.value(posed.body, posed.x, images))
 
     def images(
         self,
@@ -138,20 +142,3 @@ class SegmentationTerm(Term):
 
     def _parts(self, body: BodyModel, x: Tensor, camera: Camera) -> Tensor:
         return part_map(body, x, camera, rings=self.rings, meridians=self.meridians)
-
-
-@dataclass(frozen=True, eq=False)
-class BoundSegmentation:
-    """The segmentation of a frame; a `BoundWeight`."""
-
-    term: SegmentationTerm
-    images: SegmentationImages
-
-    @property
-    def scale(self) -> float:
-        """Nats per share of the body's area."""
-        return self.term.weight
-
-    def value(self, posed: Posed) -> Float[Tensor, "*batch"]:
-        """See `SegmentationTerm.value`."""
-        return self.term.value(posed.body, posed.x, self.images)

@@ -28,7 +28,7 @@ from torchcss.body.shape import (
     surface_derivatives,
     with_shape,
 )
-from torchcss.cost.contour import OutlineTerm
+from torchcss.cost.outline import OutlineTerm
 from torchcss.cost.total import TrackingCost
 from torchcss.cost.visibility import ContourPredictor
 from torchcss.types import Bounds, LocalModel, PointCost

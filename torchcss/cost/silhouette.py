@@ -33,14 +33,14 @@ from typing import ClassVar, NamedTuple
 
 import kornia
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
 from torchcss.cost.context import FrameContext
 from torchcss.cost.interior import InteriorNodes, interior_nodes
 from torchcss.cost.part_map import grow, part_map
-from torchcss.cost.term import Kind, Need, Posed, Term
+from torchcss.cost.term import Kind, Need, OnPoints, Term
 from torchcss.types import PointCost
 from torchcss.vision.camera import Camera
 from torchcss.vision.spline import SplineField, spline_field
@@ -108,7 +108,7 @@ class SilhouetteTerm(Term):
         """Colours, and what is behind them."""
         return frozenset(("appearance", "background"))
 
-    def prepare(self, context: FrameContext) -> BoundSilhouette | None:
+    def prepare(self, context: FrameContext) -> OnPoints | None:
         """Find the silhouette of a frame.
 
         None without a mask or a known background, or without a pose before it.
@@ -136,7 +136,19 @@ class SilhouetteTerm(Term):
             nodes(body, body.pose(modes)).points.flatten(0, -2),
             float((parts >= 0).sum()) * self.reduction**2,
         )
-        return BoundSilhouette(self, nodes, images)
+        return self.bind(nodes, images)
+
+    def bind(self, nodes: InteriorNodes, images: SilhouetteImages) -> OnPoints:
+        """The term on a frame that `images` has prepared, and on nodes all over the body."""
+        return OnPoints(
+            term=self,
+            find=lambda posed: posed.of(interior_nodes).points,
+            image=images,
+            camera=images.camera,
+            link=nodes.node_link,
+            scale=self.weight / self.nu,
+            size=math.ceil(nodes.num_nodes * len(images.points) / _PAIRS),
+        )
 
     def images(
         self,
@@ -172,15 +184,21 @@ class SilhouetteTerm(Term):
         return SilhouetteImages(small, points, weight, bare, self.sigma * metre)
 
     def value(
-        self, points: Float[Tensor, "*batch p 3"], images: SilhouetteImages
+        self,
+        points: Float[Tensor, "*batch p 3"],
+        camera: Camera,
+        images: SilhouetteImages,
+        at: Float[Tensor, "*batch p 3"] | None = None,
     ) -> Float[Tensor, "*batch p"]:
         """Cost in units of nu, shared out among the nodes: only the sum has a meaning.
 
         Args:
             points: Nodes of the posed body, metres.
+            camera: Camera of the reduced image.
             images: What `images` made of the frame.
+            at: Where the nodes have moved since; None: nowhere.
         """
-        uv, _, valid = images.camera.project(points)
+        uv, _, valid = camera.project(points if at is None else at)
         _, covered, _ = self._cover(uv, valid, images)
         outside = self._outside(points) * valid * images.bare.value(uv)
         return outside + covered[..., None] / points.shape[-2]
@@ -188,6 +206,7 @@ class SilhouetteTerm(Term):
     def point_cost(
         self,
         points: Float[Tensor, "*batch p 3"],
+        camera: Camera,
         images: SilhouetteImages,
         *,
         gauss_newton: bool = False,
@@ -196,10 +215,11 @@ class SilhouetteTerm(Term):
 
         Args:
             points: Nodes of the posed body, metres.
+            camera: Camera of the reduced image.
             images: What `images` made of the frame.
             gauss_newton: Leave the curvature of the projection out.
         """
-        model = images.camera.project_with_derivatives(points)
+        model = camera.project_with_derivatives(points)
         uv = model.uv
         share, covered, slope = self._cover(uv, model.valid, images)
         # Shares of a point's cost are springs to it: their stiffness, and their pull.
@@ -213,7 +233,7 @@ class SilhouetteTerm(Term):
         hessian = torch.diag_embed(stiffness[..., None].expand(uv.shape))
         hessian = hessian + outside[..., None, None] * sample.hessian
         value = outside * sample.value + covered[..., None] / points.shape[-2]
-        return images.camera.pull_back(model, value, gradient, hessian, gauss_newton=gauss_newton)
+        return camera.pull_back(model, value, gradient, hessian, gauss_newton=gauss_newton)
 
     def _outside(self, points: Tensor) -> Tensor:
         return points.new_tensor(self.nu * self.beta / max(points.shape[-2], 1))
@@ -259,41 +279,3 @@ class SilhouetteTerm(Term):
         return kornia.filters.gaussian_blur2d(
             distance[None, None], (5, 5), (1.0, 1.0), border_type="replicate"
         )[0, 0]
-
-
-@dataclass(frozen=True, eq=False)
-class BoundSilhouette:
-    """The silhouette of a frame; a `BoundImage`."""
-
-    term: SilhouetteTerm
-    nodes: InteriorNodes
-    images: SilhouetteImages
-
-    @property
-    def scale(self) -> float:
-        """Nats per nu."""
-        return self.term.weight / self.term.nu
-
-    @property
-    def link(self) -> Int[Tensor, " p"]:
-        """The link of each node."""
-        return self.nodes.node_link
-
-    @property
-    def size(self) -> int:
-        """Rows of memory for pairs of nodes and points."""
-        return math.ceil(self.nodes.num_nodes * len(self.images.points) / _PAIRS)
-
-    def points(self, posed: Posed) -> Float[Tensor, "*batch p 3"]:
-        """The nodes."""
-        return posed.of(interior_nodes).points
-
-    def value(
-        self, posed: Posed, at: Float[Tensor, "*batch p 3"] | None = None
-    ) -> Float[Tensor, "*batch p"]:
-        """See `SilhouetteTerm.value`."""
-        return self.term.value(self.points(posed) if at is None else at, self.images)
-
-    def point_cost(self, posed: Posed, *, gauss_newton: bool = False) -> PointCost:
-        """See `SilhouetteTerm.point_cost`."""
-        return self.term.point_cost(self.points(posed), self.images, gauss_newton=gauss_newton)

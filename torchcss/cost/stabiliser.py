@@ -69,7 +69,7 @@ class Stabiliser(Term):
         if lengths and not self.lengths:
             deviation = deviation.clone()
             deviation[lengths] = math.inf
-        return OnStates(lambda posed: self.local_model(posed.x, mean, deviation))
+        return OnStates(lambda posed, _: self.local_model(posed.x, mean, deviation))
 
     def local_model(
         self,

@@ -44,7 +44,7 @@ class TemporalPrior(Term):
         if prior is None or deviation is None:
             return None
         return OnStates(
-            lambda posed: self.local_model(posed.x, posed.of_parent(prior.mean), deviation)
+            lambda posed, _: self.local_model(posed.x, posed.of_parent(prior.mean), deviation)
         )
 
     def local_model(
@@ -101,7 +101,7 @@ class MixturePrior(Term):
         if context.prior is None:
             return None
         density = self.density(context.prior)
-        return OnStates(lambda posed: self.local_model(posed.x, density))
+        return OnStates(lambda posed, _: self.local_model(posed.x, density))
 
     def density(self, predicted: GaussianMixture) -> MixtureDensity:
         """Prepare the prior of a frame.

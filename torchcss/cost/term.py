@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, Protocol, TypeVar
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, TypeVar
 
 import torch
 from jaxtyping import Float, Int
@@ -118,17 +118,16 @@ class BoundPrior(Protocol):
         ...
 
 
-class BoundWeight(Protocol):
-    """A weight-only term that knows its frame."""
+class BoundWeight(NamedTuple):
+    """A weight-only term that knows its frame.
 
-    @property
-    def scale(self) -> float:
-        """Nats per unit of the value."""
-        ...
+    Attributes:
+        scale: Nats per unit of the value.
+        value: Value of each pose.
+    """
 
-    def value(self, posed: Posed) -> Float[Tensor, "*batch"]:
-        """Value of each pose."""
-        ...
+    scale: float
+    value: Callable[[Posed], Float[Tensor, "*batch"]]
 
 
 class Posed:
@@ -172,23 +171,86 @@ class Posed:
         return values[0] if self.parent is None else values[self.parent]
 
 
-@dataclass(frozen=True, eq=False)
-class OnStates:
-    """A prior whose derivatives cost next to nothing; a `BoundPrior`.
+class PointTerm(Protocol):
+    """What an image term on points of the body has to give; see `OnPoints`."""
+
+    def value(self, found: Any, camera: Camera, image: Any, at: Tensor | None = None, /) -> Tensor:
+        """Cost of every point, of which the image is compared with those `at` another place."""
+        ...
+
+    def point_cost(
+        self, found: Any, camera: Camera, image: Any, /, *, gauss_newton: bool = False
+    ) -> PointCost:
+        """The same with first and second derivatives in the points' positions."""
+        ...
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class OnPoints:
+    """An image term on points of the body that knows its frame; a `BoundImage`.
 
     Attributes:
-        model: Cost and derivatives.
+        term: The term.
+        find: Finds the points of posed bodies, and what the term needs to know of them.
+        image: What the term compares them with.
+        link: The link of each point.
+        scale: Nats per unit of a point's value.
+        size: Rows of memory that a sample takes, in points.
+        camera: The camera of what they are compared with; None: that of the view.
+        of_parents: Picks what the points of each sample are compared with, by its parent; None: all
+            samples' are compared with the same.
     """
 
-    model: Callable[[Posed], LocalModel]
+    term: PointTerm
+    find: Callable[[Posed], Any]
+    image: Any
+    link: Int[Tensor, " p"]
+    scale: float
+    size: int
+    camera: Camera | None = None
+    of_parents: Callable[[Posed, Any], Any] | None = None
+
+    def points(self, posed: Posed) -> Float[Tensor, "*batch p 3"]:
+        """Positions of the points, metres."""
+        found = posed.of(self.find)
+        return found if isinstance(found, Tensor) else found.points
+
+    def value(
+        self, posed: Posed, at: Float[Tensor, "*batch p 3"] | None = None
+    ) -> Float[Tensor, "*batch p"]:
+        """Cost of every point."""
+        return self.term.value(*self._seen(posed), at)
+
+    def point_cost(self, posed: Posed, *, gauss_newton: bool = False) -> PointCost:
+        """Cost and derivatives of every point."""
+        return self.term.point_cost(*self._seen(posed), gauss_newton=gauss_newton)
+
+    def _seen(self, posed: Posed) -> tuple[Any, Camera, Any]:
+        image = self.image if self.of_parents is None else self.of_parents(posed, self.image)
+        return posed.of(self.find), self.camera or posed.camera, image
+
+
+@dataclass(frozen=True, eq=False)
+class OnStates:
+    """A prior on states; a `BoundPrior`.
+
+    Attributes:
+        model: Cost and derivatives, by the curvature that is asked for.
+        cost: The cost alone; None: it is as cheap with derivatives.
+    """
+
+    model: Callable[[Posed, Curvature], LocalModel]
+    cost: Callable[[Posed], Tensor] | None = None
 
     def value(self, posed: Posed) -> Float[Tensor, "*batch"]:
         """Cost, nats."""
-        return self.model(posed).value
+        if self.cost is not None:
+            return self.cost(posed)
+        return self.model(posed, Curvature.EXACT).value
 
     def local_model(self, posed: Posed, curvature: Curvature) -> LocalModel:
         """Cost and derivatives in the state."""
-        return self.model(posed)
+        return self.model(posed, curvature)
 
 
 def differentiated(term: BoundImage, posed: Posed) -> PointCost:

@@ -70,16 +70,17 @@ _LEAST_BEND = 1e-6
 """Curvature, per metre, below which the axis counts as straight."""
 
 
-class ContourNodes(NamedTuple):
-    """Nodes of the occluding contours of all parts, world frame.
+class SeenNodes(NamedTuple):
+    """Nodes on the surface with what the camera sees of them, world frame.
 
     Attributes:
         points: Positions, metres.
-        normals: Unit outward normals; they are also the contour's normals in the image.
-        exists: 0 where the ring or meridian has no contour (wholly back-facing or front-facing) or
-            runs in front of a neighbouring part; 1 on a clear contour, between where one fades.
+        normals: Unit outward normals; those of contour nodes are the contour's in the image too.
+        exists: Of a contour node 0 where its ring or meridian has no contour (wholly back-facing or
+            front-facing) or runs in front of a neighbouring part; of any other node 0 where it
+            faces away. 1 where it is clear, between where it fades.
         visible: 1 where nothing is in front, 0 where another part is, between on the ramp. Also 1
-            where the ring or meridian has no contour: nothing depends on it there.
+            where a node does not exist: nothing depends on it there.
     """
 
     points: Float[Tensor, "*batch p 3"]
@@ -181,7 +182,7 @@ class ContourPredictor(nn.Module):
 
     def forward(
         self, body: BodyModel, pose: BodyPose, centre_world: Float[Tensor, "3"]
-    ) -> ContourNodes:
+    ) -> SeenNodes:
         """Predict the occluding contours.
 
         Args:
@@ -216,10 +217,10 @@ class ContourPredictor(nn.Module):
             wanted=(exists := exists.flatten(-2)),
             ramp=self.ramp,
         )
-        return ContourNodes(points, normals, exists * free, visible)
+        return SeenNodes(points, normals, exists * free, visible)
 
 
-def contour_nodes(posed: Posed) -> ContourNodes:
+def contour_nodes(posed: Posed) -> SeenNodes:
     """The contour nodes of posed bodies."""
     predictor = posed.context.tables.of(ContourPredictor)
     return predictor(posed.body, posed.pose, posed.camera.centre_world)
@@ -271,6 +272,29 @@ def visible_nodes(
     eye = ((centre_world - centre)[..., None, :] @ rotation)[..., 0, :]
     other = 1 - torch.eye(body.num_parts, device=points.device)[node_part]
     return line_of_sight(body, rotation, eye, points - centre_world, other=other, wanted=wanted)[0]
+
+
+def seen_nodes(
+    body: BodyModel,
+    pose: BodyPose,
+    centre_world: Float[Tensor, "3"],
+    points: Float[Tensor, "*batch p 3"],
+    normals: Float[Tensor, "*batch p 3"],
+    node_part: Int[Tensor, " p"],
+) -> SeenNodes:
+    """Surface nodes with which of them face the camera, and which of these no other part hides.
+
+    Args:
+        body: The body.
+        pose: Its poses.
+        centre_world: The camera's centre, metres.
+        points: Nodes, world frame, metres.
+        normals: Their unit outward normals.
+        node_part: The part of each node.
+    """
+    facing = front_facing(points, normals, centre_world)
+    visible = visible_nodes(body, pose, centre_world, points, node_part, wanted=facing)
+    return SeenNodes(points, normals, facing, visible)
 
 
 class Beside(NamedTuple):

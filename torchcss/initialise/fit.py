@@ -26,9 +26,10 @@ from torchcss.body.model import BodyModel
 from torchcss.body.root import has_root
 from torchcss.body.shape import WHOLE_SHAPE, ShapeParameters, with_shape
 from torchcss.cost.context import FrameContext
-from torchcss.cost.contour import ContourTerm, OnContour
+from torchcss.cost.contour import ContourTerm
 from torchcss.cost.frame import FrameCosts
 from torchcss.cost.joints import JointTerm
+from torchcss.cost.outline import OutlineTerm
 from torchcss.cost.region import RegionTerm
 from torchcss.cost.shaped import Outline
 from torchcss.cost.total import TrackingCost
@@ -228,11 +229,11 @@ def _with_contours(
 
 
 def _outlines(cost: TrackingCost) -> tuple[Outline, ...]:
-    bound = (cost.bound[term, cost.views[0]] for term in cost.choice.terms if term.kind == "image")
+    bound = ((term, cost.bound[term, cost.views[0]]) for term in cost.choice.terms)
     return tuple(
-        Outline(each.term, each.image, each.term.weight)
-        for each in bound
-        if isinstance(each, OnContour)
+        Outline(term, each.image, term.weight)
+        for term, each in bound
+        if isinstance(term, OutlineTerm) and each is not None
     )
 
 

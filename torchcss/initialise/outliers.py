@@ -135,8 +135,8 @@ def price_of_leaving_out(cost: TrackingCost) -> Float[Tensor, " j"]:
 def capped_cost(cost: TrackingCost, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
     """Cost in nats if no keypoint costs more than leaving it out."""
     joints, targets = _matched(cost)
-    projection = cost.camera.project(cost.body.pose(x).joints[..., targets.joint, :])
-    each = joints.weight * joints.value(projection, targets)
+    points = cost.body.pose(x).joints[..., targets.joint, :]
+    each = joints.weight * joints.value(points, cost.camera, targets)
     return cost.value(x) - (each - price_of_leaving_out(cost)).clamp(min=0.0).sum(-1)
 
 
