@@ -16,6 +16,9 @@ With `S_j = (omega_j, v_j)` and i an ancestor of j or j itself,
 and zero between branches. The first term is the Gauss-Newton form of eq. 9 [RR]; the second is the
 curvature of the kinematics. The work over points does not depend on the number of joints. Call
 `lift_to_joints`; `BodyModel.lift` adds the state layout on top.
+
+`point_moments` and `reactions` are its two halves, for sums over other points than those below a
+joint: pairs of parts that move against each other (`torchcss.cost.interpenetration`).
 """
 
 from __future__ import annotations
@@ -59,24 +62,13 @@ def lift_to_joints(
     # Any fixed reference point will do; one near the body avoids cancellation.
     reference = pose.translation[..., :1, :]
     velocity = pose.velocity + torch.linalg.cross(pose.omega, reference.expand_as(pose.omega))
-    # Components as whole tensors with the batch innermost: on a CPU this is many times faster than
-    # 3 x 3 products, and nothing is copied where the memory is laid out like that already.
-    x, y, z = _components(points - reference)
-    fx, fy, fz = _components(cost.gradient)
-    axx, axy, axz, _, ayy, ayz, _, _, azz = _components(cost.hessian.flatten(-2))
-    # mixed = [p]x A and angular = [p]x A [p]x^T, of which the upper triangle is enough.
-    point, force = (x, y, z), (fx, fy, fz)
-    columns = [
-        _cross(point, column) for column in ((axx, axy, axz), (axy, ayy, ayz), (axz, ayz, azz))
-    ]
-    rows = tuple(zip(*columns, strict=True))
-    angular = [_cross(point, row) for row in rows]
-    mixed = [entry for row in rows for entry in row]
-    angular = [angular[i][j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))]
-    moment = [p * f for p in point for f in force]
-    features = torch.stack(
-        [axx, axy, axz, ayy, ayz, azz, *mixed, *angular, *moment, *force], dim=1
-    ).flatten(1)
+    # The batch is innermost in memory: nothing is copied where it is laid out like that already.
+    moments = point_moments(
+        _components(points - reference),
+        _components(cost.gradient),
+        _components(cost.hessian.flatten(-2)),
+    )
+    features = torch.stack(moments, dim=1).flatten(1)
     below = ancestors.to(features)
     if num_points > num_joints:  # fewer products by way of the links
         links, place = torch.unique(point_link, return_inverse=True)
@@ -86,15 +78,72 @@ def lift_to_joints(
         below = below[:, point_link]
     per_joint = (below @ features).unflatten(1, (33, batch.numel()))
 
+    twist = (*_components(pose.omega), *_components(velocity))
+    if isinstance(second_order_kinematics, Tensor):
+        second_order_kinematics = second_order_kinematics.reshape(batch.numel())
+    gradient, reaction = reactions(per_joint.unbind(1), twist, second_order_kinematics)
+    left = torch.stack(twist).permute(2, 1, 0).contiguous()
+    right = torch.stack(reaction).permute(2, 0, 1).contiguous()
+    # Every pair of joints on a branch once, the diagonal twice by half.
+    half_diagonal = joint_ancestors.to(left)
+    half_diagonal.diagonal().fill_(0.5)
+    upper = (left @ right).mul_(half_diagonal)
+    hessian = upper + upper.mT
+    return LocalModel(
+        cost.value.sum(-1),
+        gradient.T.reshape(*batch, num_joints),
+        hessian.reshape(*batch, num_joints, num_joints),
+    )
+
+
+def point_moments(
+    point: Sequence[Tensor], force: Sequence[Tensor], hessian: Sequence[Tensor]
+) -> list[Tensor]:
+    """What the lift sums over points: K, P and f, of which 33 numbers are enough.
+
+    Components are whole tensors: on a CPU this is many times faster than 3 x 3 products.
+
+    Args:
+        point: The three components of positions.
+        force: Those of the costs' gradients.
+        hessian: The nine of the costs' Hessians, row by row.
+    """
+    axx, axy, axz, _, ayy, ayz, _, _, azz = hessian
+    # mixed = [p]x A and angular = [p]x A [p]x^T, of which the upper triangle is enough.
+    columns = [
+        _cross(point, column) for column in ((axx, axy, axz), (axy, ayy, ayz), (axz, ayz, azz))
+    ]
+    rows = tuple(zip(*columns, strict=True))
+    angular = [_cross(point, row) for row in rows]
+    mixed = [entry for row in rows for entry in row]
+    angular = [angular[i][j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))]
+    moment = [p * f for p in point for f in force]
+    return [axx, axy, axz, ayy, ayz, azz, *mixed, *angular, *moment, *force]
+
+
+def reactions(
+    sums: Sequence[Tensor],
+    twist: Sequence[Tensor],
+    second_order_kinematics: bool | Tensor = True,
+) -> tuple[Tensor, list[Tensor]]:
+    """How the points below joints react to their twists.
+
+    Args:
+        sums: `point_moments`, summed over the points below each joint.
+        twist: The six components of the joints' twists, about the same point and in the same axes.
+        second_order_kinematics: As in `lift_to_joints`.
+
+    Returns:
+        The gradient in the joints, and the six components of what the twist of another joint is
+        multiplied by for the Hessian.
+    """
     (sxx, sxy, sxz, syy, syz, szz,
      mxx, mxy, mxz, myx, myy, myz, mzx, mzy, mzz,
      kxx, kxy, kxz, kyy, kyz, kzz,
      pxx, pxy, pxz, pyx, pyy, pyz, pzx, pzy, pzz,
-     fx, fy, fz) = per_joint.unbind(1)  # fmt: skip
-    wx, wy, wz = _components(pose.omega)
-    vx, vy, vz = _components(velocity)
+     fx, fy, fz) = sums  # fmt: skip
+    wx, wy, wz, vx, vy, vz = twist
     # Torque and force are the six components of the wrench; so are the reactions to a twist.
-    twist = (wx, wy, wz, vx, vy, vz)
     gradient = _dot(twist, (pyz - pzy, pzx - pxz, pxy - pyx, fx, fy, fz))
     turning = [
         _dot((kxx, kxy, kxz, mxx, mxy, mxz), twist),
@@ -106,29 +155,19 @@ def lift_to_joints(
         _dot((mxy, myy, mzy, sxy, syy, syz), twist),
         _dot((mxz, myz, mzz, sxz, syz, szz), twist),
     ]
-    if second_order_kinematics is not False:
-        curvature = [
-            _dot((pxy, pxz, -pyy - pzz, fz, -fy), (wy, wz, wx, vy, vz)),
-            _dot((pyx, pyz, -pxx - pzz, fx, -fz), (wx, wz, wy, vz, vx)),
-            _dot((pzx, pzy, -pxx - pyy, fy, -fx), (wx, wy, wz, vx, vy)),
-        ]
-        if isinstance(second_order_kinematics, Tensor):
-            share = second_order_kinematics.reshape(batch.numel())
-            turning = [torch.addcmul(a, share, b) for a, b in zip(turning, curvature, strict=True)]
-        else:
-            turning = [a + b for a, b in zip(turning, curvature, strict=True)]
-    left = torch.stack(twist).permute(2, 1, 0).contiguous()
-    right = torch.stack([*turning, *shifting]).permute(2, 0, 1).contiguous()
-    # Every pair of joints on a branch once, the diagonal twice by half.
-    half_diagonal = joint_ancestors.to(left)
-    half_diagonal.diagonal().fill_(0.5)
-    upper = (left @ right).mul_(half_diagonal)
-    hessian = upper + upper.mT
-    return LocalModel(
-        cost.value.sum(-1),
-        gradient.T.reshape(*batch, num_joints),
-        hessian.reshape(*batch, num_joints, num_joints),
-    )
+    if second_order_kinematics is False:
+        return gradient, turning + shifting
+    curvature = [
+        _dot((pxy, pxz, -pyy - pzz, fz, -fy), (wy, wz, wx, vy, vz)),
+        _dot((pyx, pyz, -pxx - pzz, fx, -fz), (wx, wz, wy, vz, vx)),
+        _dot((pzx, pzy, -pxx - pyy, fy, -fx), (wx, wy, wz, vx, vy)),
+    ]
+    if isinstance(second_order_kinematics, Tensor):
+        share = second_order_kinematics
+        turning = [torch.addcmul(a, share, b) for a, b in zip(turning, curvature, strict=True)]
+    else:
+        turning = [a + b for a, b in zip(turning, curvature, strict=True)]
+    return gradient, turning + shifting
 
 
 def _components(vectors: Float[Tensor, "*batch m c"]) -> tuple[Float[Tensor, "m b"], ...]:
