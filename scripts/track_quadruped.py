@@ -35,7 +35,7 @@ from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.problem import SearchProblem
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.studies.render.robots import stand, trot
-from torchcss.studies.render.sequences import look_at
+from torchcss.studies.render.scene import look_at
 from torchcss.tracking.presets import make_tracker
 from torchcss.types import Bounds, CostFunction, Keypoints
 

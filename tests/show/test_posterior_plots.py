@@ -23,7 +23,7 @@ from torchcss.io.video import VideoWriter
 from torchcss.show.posterior_plots import DEVIATIONS, angles_figure, joints_figure, spectra_figure
 from torchcss.show.style import save_figure
 from torchcss.show.track_plots import effective_number
-from torchcss.studies.render.sequences import look_at
+from torchcss.studies.render.scene import look_at
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from torchcss.io.video import VideoWriter
 from torchcss.io.view_files import RecordedCamera, ViewFiles
 from torchcss.show.posterior_plots import plot_track
 from torchcss.show.track_pictures import has_pictures, pictures_of
-from torchcss.studies.render.sequences import look_at
+from torchcss.studies.render.scene import look_at
 from torchcss.vision.camera import Camera
 
 

@@ -17,7 +17,7 @@ from torchcss.io.tracks import Track
 from torchcss.io.video import VideoWriter
 from torchcss.show import track_plots
 from torchcss.show.style import save_figure
-from torchcss.studies.render.sequences import look_at
+from torchcss.studies.render.scene import look_at
 
 
 @pytest.fixture(scope="module")

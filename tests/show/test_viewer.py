@@ -28,7 +28,7 @@ from torchcss.show.overlay import PALETTE
 from torchcss.show.track_plots import bones_of, count_apart, effective_number
 from torchcss.show.viewer import posed_frames, view_track
 from torchcss.show.viewer_layout import _eye, layout, world_axes
-from torchcss.studies.render.sequences import look_at
+from torchcss.studies.render.scene import look_at
 from torchcss.vision.camera import Camera
 
 EVENTS = [{"event": "lost", "frame": 11}, {"event": "found", "frame": 12}]

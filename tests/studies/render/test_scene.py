@@ -12,8 +12,7 @@ from torchcss.body.load import load_body
 from torchcss.errors import CameraError, ConfigurationError
 from torchcss.studies.render.character import Character, Clothing
 from torchcss.studies.render.renderer import Mesh
-from torchcss.studies.render.scene import Place, SceneRenderer, Style
-from torchcss.studies.render.sequences import look_at
+from torchcss.studies.render.scene import Place, SceneRenderer, Style, look_at
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import rasterise
 

@@ -16,12 +16,12 @@ from torchcss.studies.random_person import random_lengths
 from torchcss.studies.render.character import distance_to_part
 from torchcss.studies.render.mesh_truth import MeshTruth, joints_own_parts
 from torchcss.studies.render.motions import Motion
+from torchcss.studies.render.scene import look_at
 from torchcss.studies.render.sequences import (
     STYLES,
     SequenceFrame,
     Shot,
     camera_in_front,
-    look_at,
     shot,
     shot_of_motion,
 )

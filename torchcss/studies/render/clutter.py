@@ -1,4 +1,4 @@
-"""A painted room to draw before: hard edges of every direction, in uneven light."""
+"""Painted backdrops to film before: a room of hard edges in uneven light, and a dark curtain."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torchcss.studies.render.renderer import to_bytes, value_noise
 
 
 def clutter_background(
-    height: int, width: int, *, generator: torch.Generator
+    height: int, width: int, *, generator: torch.Generator, pillar: float | None = None
 ) -> UInt8[Tensor, "h w 3"]:
     """Paint a cluttered and unevenly lit room: what an edge tracker finds hardest.
 
@@ -24,6 +24,7 @@ def clutter_background(
         height: Rows.
         width: Columns.
         generator: Source of randomness; its device is the picture's.
+        pillar: Left side of the pillar as a share of the width; None: random, near the middle.
     """
     painter = _Painter(2 * height, 2 * width, generator)  # twice the size, averaged at the end
     aspect, floor = width / height, painter.uniform(0.78, 0.86)
@@ -32,10 +33,26 @@ def clutter_background(
     painter.poster(painter.uniform(0.36, 0.42) * aspect, painter.uniform(0.08, 0.16))
     painter.poster(painter.uniform(0.10, 0.22) * aspect, painter.uniform(0.54, 0.58))
     painter.shelves(painter.uniform(0.66, 0.70) * aspect, aspect * 0.97, floor)
-    painter.pillar(painter.uniform(0.56, 0.60) * aspect, 0.055 * aspect)
+    pillar = painter.uniform(0.56, 0.60) if pillar is None else pillar
+    painter.pillar(pillar * aspect, 0.055 * aspect)
     for left in (0.03, 0.30, 0.44):
         painter.carton(painter.uniform(left, left + 0.08) * aspect, painter.uniform(0.9, 0.97))
     return painter.develop()
+
+
+def dark_background(
+    height: int, width: int, *, generator: torch.Generator
+) -> UInt8[Tensor, "h w 3"]:
+    """Paint a dark curtain.
+
+    Args:
+        height: Rows.
+        width: Columns.
+        generator: Source of the folds.
+    """
+    folds = value_noise(height, width, cell=width / 16, generator=generator)
+    cloth = 0.035 * (1 + 0.25 * folds[..., None])
+    return to_bytes(255 * cloth * cloth.new_tensor([0.95, 0.95, 1.15]))
 
 
 class _Painter:

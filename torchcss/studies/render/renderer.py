@@ -308,7 +308,7 @@ def visible_surface(
     )
     pixel = torch.nonzero(fine.face.view(-1) >= 0)[:, 0]
     face, weights = fine.face.view(-1)[pixel], fine.barycentric.view(-1, 3)[pixel]
-    values = (joined.vertices, joined.normals, joined.colours**_GAMMA, joined.points_part)
+    values = (joined.vertices, joined.normals, to_light(joined.colours), joined.points_part)
     at_pixel = interpolate(torch.cat(values, -1), joined.faces, face, weights)
     points, normals, albedo, local = at_pixel.split(3, -1)
     factor = torch.ones_like(albedo[:, :1])
@@ -337,6 +337,11 @@ def pool(
 def to_display(light: Float[Tensor, "i 3"]) -> Float[Tensor, "i 3"]:
     """Display values of light, 0 to 1."""
     return light.clamp(0, 1) ** (1 / _GAMMA)
+
+
+def to_light(display: Float[Tensor, "i 3"]) -> Float[Tensor, "i 3"]:
+    """Light of display values."""
+    return display**_GAMMA
 
 
 class _Joined(NamedTuple):

@@ -23,11 +23,11 @@ from torchcss.body.model import BodyModel
 from torchcss.errors import BodyError
 from torchcss.studies.render.clutter import clutter_background
 from torchcss.studies.render.renderer import Lighting, capsule, random_texture
+from torchcss.studies.render.scene import look_at
 from torchcss.studies.render.sequences import (
     PaintedPart,
     SyntheticSequence,
     film_parts,
-    look_at,
 )
 from torchcss.vision.rasterise import grid_faces
 

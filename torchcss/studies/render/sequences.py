@@ -48,7 +48,7 @@ from torchcss.studies.render.renderer import (
     random_texture,
     render_meshes,
 )
-from torchcss.studies.render.scene import Place, SceneRenderer, Style, lamp
+from torchcss.studies.render.scene import Place, SceneRenderer, Style, lamp, look_at
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import grid_faces, join_faces
 
@@ -370,35 +370,6 @@ def render_sequence(
         labels = after
 
 
-def look_at(
-    eye: Sequence[float],
-    target: Sequence[float],
-    *,
-    focal_px: float,
-    image_size_wh: tuple[int, int] = (640, 480),
-    name: str = "cam01",
-) -> Camera:
-    """A camera with level rows that looks at a point; Y is up.
-
-    Args:
-        eye: Its centre, metres.
-        target: What it looks at.
-        focal_px: Focal length.
-        image_size_wh: Width and height of the picture.
-        name: Its name.
-    """
-    width, height = image_size_wh
-    centre = torch.as_tensor(eye, dtype=torch.float64)
-    forward = functional.normalize(torch.as_tensor(target, dtype=torch.float64) - centre, dim=-1)
-    up = forward.new_tensor([0.0, 1.0, 0.0])
-    right = functional.normalize(torch.linalg.cross(forward, up), dim=-1)
-    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
-    K = [[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]]
-    return Camera(
-        K, image_size_wh, R_camera_world=rotation, t_camera_world=-rotation @ centre, name=name
-    )
-
-
 def _place(joints: Float[Tensor, "t j 3"], camera: Camera, floor: float | None) -> Place:
     """Where the motion is, seen from the camera."""
     lowest, highest = joints.amin((0, 1)), joints.amax((0, 1))
@@ -497,8 +468,7 @@ def shot(
 
 
 ARM_STYLE = Style(
-    pillars=(0.385,),
-    pillar_width=0.10,
+    pillar=0.36,
     wall=0.5,
     specular=0.15,
     lamps=(
