@@ -72,14 +72,7 @@ def problem(thicker: float, by: str) -> tuple[ShapedCost, torch.Tensor, ShapePar
         for part in range(true.num_parts)
     ]
     dark = torch.full((240, 320, 3), 10, dtype=torch.uint8)
-    picture = render_meshes(
-        meshes,
-        lambda p: tuple(camera.project(p)),  # type: ignore[arg-type]
-        240,
-        320,
-        background=dark,
-        eye_world=camera.centre_world,
-    ).image  # fmt: skip
+    picture = render_meshes(meshes, camera, background=dark)
     features = FeatureExtractor(colour=True)(picture.numpy())
     joints = camera.project(body.pose(x).joints).uv
     seen = torch.ones(len(joints)).double()

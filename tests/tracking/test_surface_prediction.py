@@ -91,14 +91,8 @@ def picture(x: Tensor, *, lamp: float = 0.9, plain: bool = False) -> Tensor:
     wall = functional.interpolate(wall, size=(HEIGHT, WIDTH), mode="bicubic")[0, 0].clamp(0, 1)
     background = (255 * wall).byte()[..., None].expand(-1, -1, 3).contiguous()
 
-    def project(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        return tuple(camera.project(points))  # type: ignore[return-value]
-
-    image = render_meshes(
-        meshes, project, HEIGHT, WIDTH,
-        background=background, eye_world=camera.centre_world,
-        lighting=Lighting(lamp_world=(1.0, 2.0, 1.0), target_world=(0.0, 0.0, -3.0), lamp=lamp),
-    ).image  # fmt: skip
+    light = Lighting(lamp_world=(1.0, 2.0, 1.0), target_world=(0.0, 0.0, -3.0), lamp=lamp)
+    image = render_meshes(meshes, camera, background=background, lighting=light)
     return image.double().mean(-1) / 255
 
 

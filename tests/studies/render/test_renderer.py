@@ -17,6 +17,7 @@ from torchcss.studies.render.renderer import (
     render_meshes,
     value_noise,
 )
+from torchcss.studies.render.scene import look_at
 from torchcss.vision import rasterise as rasterise_module
 from torchcss.vision.rasterise import (
     interpolate,
@@ -49,14 +50,7 @@ def sphere(around=24, along=12, dtype=torch.float32):
 
 def camera(height, width, focal):
     """A camera at `EYE` that looks along -Z of the world."""
-
-    def project(points):
-        depth = EYE[2].to(points) - points[:, 2]
-        middle = points.new_tensor([(width - 1) / 2, (height - 1) / 2])
-        plane = torch.stack((points[:, 0], -points[:, 1]), -1) / depth[:, None]
-        return focal * plane + middle, depth, depth > 0.01
-
-    return project
+    return look_at(EYE.tolist(), (0, 0, 0), focal_px=focal, image_size_wh=(width, height))
 
 
 def soup(generator, count=60, size=40.0, dtype=torch.float32):
@@ -169,7 +163,7 @@ def test_neighbours_cover_every_pixel_exactly_once(generator):
 
 def test_depth_of_a_slanted_plane_is_exact():
     corners = torch.tensor([[-9.0, -9, 1], [9, -9, 1], [9, 9, -8], [-9, 9, -8]]).double()
-    uv, depth, _ = camera(40, 60, 50.0)(corners)
+    uv, depth, _ = camera(40, 60, 50.0).project(corners)
     fragments = rasterise(uv, depth, torch.tensor([[0, 1, 2], [0, 2, 3]]), 40, 60)
     v = torch.arange(40).double()[:, None].expand(40, 60)
     # The plane y + 2 z = -7, met by the ray (., (19.5 - v) / 50, -1) from z = 3.
@@ -187,7 +181,7 @@ def test_depth_of_a_slanted_plane_is_exact():
 
 def test_a_sphere_has_no_holes_and_the_right_depth():
     vertices, faces = sphere(96, 48, torch.float64)
-    uv, depth, valid = camera(120, 160, 150.0)(vertices)
+    uv, depth, valid = camera(120, 160, 150.0).project(vertices)
     fragments = rasterise(uv, depth, faces, 120, 160, valid=valid)
     y, x = torch.meshgrid(torch.arange(120.0), torch.arange(160.0), indexing="ij")
     ray = torch.stack(((x - 79.5) / 150, (59.5 - y) / 150, -torch.ones_like(x)), -1).double()
@@ -280,10 +274,10 @@ def test_bad_shapes_are_named():
     with pytest.raises(ShapeError, match="at least 1 x 1"):
         rasterise(uv, depth, faces, 0, 5)
     with pytest.raises(ShapeError, match="background"):
-        render_meshes([], camera(5, 5, 5), 5, 5, background=torch.zeros(4, 5, 3), eye_world=EYE)
+        render_meshes([], camera(5, 5, 5), background=torch.zeros(4, 5, 3))
     black = torch.zeros(5, 5, 3, dtype=torch.uint8)
     with pytest.raises(ConfigurationError, match="supersample"):
-        render_meshes([], camera(5, 5, 5), 5, 5, background=black, eye_world=EYE, supersample=0)
+        render_meshes([], camera(5, 5, 5), background=black, supersample=0)
 
 
 def test_joined_faces_name_their_mesh():
@@ -354,52 +348,57 @@ def ball(centre, radius, colour, **more):
     return Mesh(place, vertices, faces, torch.tensor(colour), **more)
 
 
+def labels(meshes, camera):
+    """The mesh that every pixel's centre sees, -1 where there is none."""
+    faces, owner = join_faces([m.faces for m in meshes], [len(m.vertices_world) for m in meshes])
+    uv, depth, valid = camera.project(torch.cat([m.vertices_world for m in meshes]))
+    width, height = camera.image_size_wh
+    face = rasterise(uv, depth, faces, height, width, valid=valid).face
+    return torch.where(face >= 0, owner[face.clamp(min=0)], -1)
+
+
 def test_a_rendered_frame_agrees_with_its_labels():
     height, width = 61, 83
     background = torch.full((height, width, 3), 40, dtype=torch.uint8)
     meshes = [ball([-0.4, 0, 0], 0.5, [0.9, 0.1, 0.1]), ball([0.2, 0, 0.6], 0.4, [0.1, 0.1, 0.9])]
-    project = camera(height, width, 90.0)
-    frame = render_meshes(meshes, project, height, width, background=background, eye_world=EYE)
-    assert frame.image.dtype == torch.uint8
-    assert frame.image.shape == (height, width, 3)
-    assert torch.equal(frame.mask, frame.part >= 0)
-    assert torch.equal(frame.mask, torch.isfinite(frame.depth))
-    assert set(frame.part.unique().tolist()) == {-1, 0, 1}
+    eye = camera(height, width, 90.0)
+    image, seen = render_meshes(meshes, eye, background=background), labels(meshes, eye)
+    mask = seen >= 0
+    assert image.dtype == torch.uint8
+    assert image.shape == (height, width, 3)
+    assert set(seen.unique().tolist()) == {-1, 0, 1}
     # Red where part 0, blue where part 1, away from the antialiased borders.
     core = torch.nn.functional.max_pool2d
     for part, channel in ((0, 0), (1, 2)):
-        inner = core((frame.part != part).float()[None], 3, 1, 1)[0] == 0
-        colour = frame.image[inner].float()
+        inner = core((seen != part).float()[None], 3, 1, 1)[0] == 0
+        colour = image[inner].float()
         assert inner.sum() > 300
         assert (colour[:, channel] > colour[:, 2 - channel]).all()
     # The background two pixels away is untouched, and the silhouette is mixed.
-    away = core(frame.mask.float()[None], 5, 1, 2)[0] == 0
-    assert (frame.image[away] == 40).all()
+    away = core(mask.float()[None], 5, 1, 2)[0] == 0
+    assert (image[away] == 40).all()
     alone = render_meshes(
-        [m._replace(colour=torch.ones(3)) for m in meshes], project, height, width,
-        background=0 * background, eye_world=EYE,
+        [m._replace(colour=torch.ones(3)) for m in meshes], eye, background=0 * background,
         lighting=Lighting(lamp=0.0, ambient=1.0, upward=0.0),
     )  # fmt: skip
-    levels = alone.image[..., 0]
-    assert (levels[core((~frame.mask).float()[None], 3, 1, 1)[0] == 0] == 255).all()
+    levels = alone[..., 0]
+    assert (levels[core((~mask).float()[None], 3, 1, 1)[0] == 0] == 255).all()
     mixed = ((levels > 0) & (levels < 255)).sum()
     assert mixed > 50
     # Coverage and the mask measure the same area, to a tenth of a pixel per border pixel.
-    assert abs(levels.float().sum() / 255 - frame.mask.sum()) < 0.1 * mixed
+    assert abs(levels.float().sum() / 255 - mask.sum()) < 0.1 * mixed
 
 
 def test_colour_per_vertex_and_texture(generator):
     height, width = 40, 40
     background = torch.zeros(height, width, 3, dtype=torch.uint8)
-    project = camera(height, width, 50.0)
+    eye = camera(height, width, 50.0)
     plain = ball([0, 0, 0], 1.0, [0.5, 0.5, 0.5])
     halves = torch.where(plain.vertices_world[:, :1] < 0, torch.eye(3)[0], torch.eye(3)[1])
     flat = Lighting(lamp=0.0, ambient=1.0, upward=0.0)
 
     def draw(mesh):
-        return render_meshes(
-            [mesh], project, height, width, background=background, eye_world=EYE, lighting=flat
-        ).image
+        return render_meshes([mesh], eye, background=background, lighting=flat)
 
     two = draw(plain._replace(colour=halves))
     assert two[20, 12, 0] > 200
@@ -416,13 +415,9 @@ def test_colour_per_vertex_and_texture(generator):
 
 def test_no_mesh_and_no_mesh_in_sight_show_the_background(generator):
     background = clutter_background(24, 31, generator=generator)
-    project = camera(24, 31, 30.0)
+    eye = camera(24, 31, 30.0)
     for meshes in ([], [ball([0, 0, 10.0], 1.0, [1, 1, 1])], [ball([50.0, 0, 0], 1.0, [1, 1, 1])]):
-        frame = render_meshes(meshes, project, 24, 31, background=background, eye_world=EYE)
-        assert torch.equal(frame.image, background)
-        assert not frame.mask.any()
-        assert (frame.part == -1).all()
-        assert torch.isinf(frame.depth).all()
+        assert torch.equal(render_meshes(meshes, eye, background=background), background)
 
 
 def test_texture_has_the_contrast_that_was_asked_for(generator):

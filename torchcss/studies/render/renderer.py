@@ -1,14 +1,13 @@
-"""The renderer: triangle meshes in, pictures and exact labels out, on plain torch.
+"""The renderer: triangle meshes in, a picture out, on plain torch.
 
-It knows neither bodies nor cameras: it takes meshes, and a function that projects points. What is
-seen is found by `torchcss.vision.rasterise`. Light is ambient, plus a lamp with a soft cone (hence
-uneven) that gives Lambert's diffuse term and Blinn's highlight `(n . h)^shininess`, h halfway
-between the directions to the lamp and to the eye; it is evaluated per sample, on interpolated
-normals.
+What is seen is found by `torchcss.vision.rasterise`. Light is ambient, plus a lamp with a soft cone
+(hence uneven) that gives Lambert's diffuse term and Blinn's highlight `(n . h)^shininess`, h
+halfway between the directions to the lamp and to the eye; it is evaluated per sample, on
+interpolated normals.
 
-By default call `render_meshes`: it draws meshes before a background with antialiased silhouettes
-and returns the picture with mask, part and depth at the pixel centres. `random_texture` makes a
-cloth, `add_sensor_noise` the grain of a sensor. Scenes: `torchcss.studies.render.scene`.
+By default call `render_meshes`: it draws meshes before a background with antialiased silhouettes.
+`random_texture` makes a cloth, `add_sensor_noise` the grain of a sensor. Scenes are in
+`torchcss.studies.render.scene`, exact labels in `torchcss.studies.render.mesh_truth`.
 
 Axis letters here, besides those of `torchcss.types`: `v` vertices, `f` triangles, `h w` image rows
 and columns, `i` listed samples or points. Images are uint8 RGB, `[h w 3]`; pixel centres are at
@@ -23,21 +22,16 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 from torch.nn import functional
 
 from torchcss.errors import ConfigurationError, check_shape
+from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import interpolate, join_faces, rasterise
 
 _GAMMA = 2.2
 """Exponent between display values and light."""
-
-Projection = Callable[
-    [Float[Tensor, "v 3"]],
-    tuple[Float[Tensor, "v 2"], Float[Tensor, " v"], Bool[Tensor, " v"]],
-]
-"""World points to pixel `uv`, depth along the optical axis (metres), and whether to use them."""
 
 Colour = tuple[float, float, float]
 """Red, green and blue, 0 to 1."""
@@ -64,22 +58,6 @@ class Mesh(NamedTuple):
     colour: Float[Tensor, "*v 3"]
     points_part: Float[Tensor, "v 3"] | None = None
     texture: Texture | None = None
-
-
-class RenderedFrame(NamedTuple):
-    """A picture with its ground truth.
-
-    Attributes:
-        image: RGB picture, silhouettes antialiased.
-        mask: True where the pixel centre sees a mesh.
-        part: Which mesh of the sequence it sees, -1 for the background.
-        depth: Depth of what it sees, `inf` for the background.
-    """
-
-    image: UInt8[Tensor, "h w 3"]
-    mask: Bool[Tensor, "h w"]
-    part: Int[Tensor, "h w"]
-    depth: Float[Tensor, "h w"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -220,27 +198,20 @@ def random_texture(
 
 def render_meshes(
     meshes: Sequence[Mesh],
-    project: Projection,
-    height: int,
-    width: int,
+    camera: Camera,
     *,
     background: UInt8[Tensor, "h w 3"],
-    eye_world: Float[Tensor, "3"],
     lighting: Light | None = None,
     supersample: int = 2,
-) -> RenderedFrame:
+) -> UInt8[Tensor, "h w 3"]:
     """Draw meshes before a background.
 
-    The picture is rendered at `supersample` times the resolution and averaged; mask, part and
-    depth are those at the pixel centres, found separately, so that they are exact.
+    The picture is rendered at `supersample` times the resolution and averaged.
 
     Args:
         meshes: What to draw.
-        project: The camera.
-        height: Rows of the picture.
-        width: Columns of the picture.
-        background: What is behind the meshes.
-        eye_world: Where the camera is, for the highlights, metres.
+        camera: Who looks.
+        background: What is behind the meshes, of the camera's image size.
         lighting: The light on the meshes; the default lamp when absent.
         supersample: Samples per pixel and axis.
 
@@ -248,90 +219,35 @@ def render_meshes(
         ShapeError: If a mesh or the background has the wrong shape.
         ConfigurationError: If `supersample` is less than 1.
     """
+    width, height = camera.image_size_wh
     check_shape("background", background, height, width, 3)
     if supersample < 1:
         raise ConfigurationError(f"supersample: expected at least 1, got {supersample}; 2 is usual")
     if not meshes:
-        nothing = torch.full((height, width), -1, device=background.device)
-        far = torch.full_like(nothing, torch.inf, dtype=torch.float32)
-        return RenderedFrame(background.clone(), nothing >= 0, nothing, far)
+        return background.clone()
     joined = _join(meshes)
-    uv, depth, valid = project(joined.vertices)
-    labels = rasterise(uv, depth, joined.faces, height, width, valid=valid)
-    mask = labels.face >= 0
-    part = torch.where(mask, joined.owner[labels.face.clamp_min(0)], labels.face)
-    seen = visible_surface(meshes, project, height, width, supersample=supersample)
-    light = (lighting or Lighting()).shade(seen.points, seen.normals, seen.albedo, eye_world)
-    shown = torch.cat((to_display(light), torch.ones_like(light[:, :1])), -1)
-    pooled = pool(shown, seen.pixel, height, width, supersample)
-    mixed = pooled[..., :3] * 255 + (1 - pooled[..., 3:]) * background.to(pooled)
-    return RenderedFrame(image=to_bytes(mixed), mask=mask, part=part, depth=labels.depth)
-
-
-class VisibleSurface(NamedTuple):
-    """What the samples of a picture see of meshes.
-
-    Attributes:
-        pixel: Samples that see one, counted along the rows.
-        points: What they see, world frame, metres.
-        normals: Its outward normals, of about unit length.
-        albedo: Share of the light that it sends back.
-    """
-
-    pixel: Int[Tensor, " i"]
-    points: Float[Tensor, "i 3"]
-    normals: Float[Tensor, "i 3"]
-    albedo: Float[Tensor, "i 3"]
-
-
-def visible_surface(
-    meshes: Sequence[Mesh], project: Projection, height: int, width: int, *, supersample: int = 2
-) -> VisibleSurface:
-    """What every sample of a picture sees.
-
-    Args:
-        meshes: What is there.
-        project: The camera.
-        height: Rows of the picture.
-        width: Columns of the picture.
-        supersample: Samples per pixel and axis.
-    """
-    joined = _join(meshes)
-    uv, depth, valid = project(joined.vertices)
-    fine = rasterise(
-        (uv + 0.5) * supersample - 0.5,
-        depth,
-        joined.faces,
-        height * supersample,
-        width * supersample,
-        valid=valid,
-    )
-    pixel = torch.nonzero(fine.face.view(-1) >= 0)[:, 0]
-    face, weights = fine.face.view(-1)[pixel], fine.barycentric.view(-1, 3)[pixel]
+    uv, depth, valid = camera.project(joined.vertices)
+    rows, columns = height * supersample, width * supersample
+    uv = (uv + 0.5) * supersample - 0.5
+    fine = rasterise(uv, depth, joined.faces, rows, columns, valid=valid)
+    sample = torch.nonzero(fine.face.view(-1) >= 0)[:, 0]
+    face, weights = fine.face.view(-1)[sample], fine.barycentric.view(-1, 3)[sample]
     values = (joined.vertices, joined.normals, to_light(joined.colours), joined.points_part)
-    at_pixel = interpolate(torch.cat(values, -1), joined.faces, face, weights)
-    points, normals, albedo, local = at_pixel.split(3, -1)
+    at_sample = interpolate(torch.cat(values, -1), joined.faces, face, weights)
+    points, normals, albedo, local = at_sample.split(3, -1)
     factor = torch.ones_like(albedo[:, :1])
     for index, mesh in enumerate(meshes):
         if mesh.texture is not None:
             here = torch.nonzero(joined.owner[face] == index)[:, 0]
             factor[here] = mesh.texture(local[here]).to(factor)
-    return VisibleSurface(pixel, points, normals, (albedo * factor).clamp(0, 1))
-
-
-def pool(
-    values: Float[Tensor, "i c"],
-    pixel: Int[Tensor, " i"],
-    height: int,
-    width: int,
-    supersample: int,
-) -> Float[Tensor, "h w c"]:
-    """Put the values of samples in a picture, 0 elsewhere, and average over its pixels."""
-    channels = values.shape[-1]
-    canvas = values.new_zeros(height * width * supersample**2, channels)
-    canvas[pixel] = values
-    canvas = canvas.view(1, height * supersample, width * supersample, channels)
-    return functional.avg_pool2d(canvas.permute(0, 3, 1, 2), supersample)[0].permute(1, 2, 0)
+    albedo = (albedo * factor).clamp(0, 1)
+    light = (lighting or Lighting()).shade(points, normals, albedo, camera.centre_world)
+    # Colours and coverage of all samples, 0 where nothing is seen, averaged over the pixels.
+    canvas = light.new_zeros(rows * columns, 4)
+    canvas[sample] = torch.cat((to_display(light), torch.ones_like(light[:, :1])), -1)
+    canvas = canvas.view(1, rows, columns, 4).permute(0, 3, 1, 2)
+    pooled = functional.avg_pool2d(canvas, supersample)[0].permute(1, 2, 0)
+    return to_bytes(pooled[..., :3] * 255 + (1 - pooled[..., 3:]) * background.to(pooled))
 
 
 def to_display(light: Float[Tensor, "i 3"]) -> Float[Tensor, "i 3"]:

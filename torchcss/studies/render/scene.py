@@ -162,15 +162,8 @@ class SceneRenderer:
         light = self._light.among(meshes)
         reached = 1 - light.covered(self._points)
         shown = to_display(self._others + reached[:, None] * self._first)
-        return render_meshes(
-            meshes, self._project, height, width,
-            background=to_bytes(255 * shown.reshape(height, width, 3)),
-            eye_world=self.camera.centre_world, lighting=light,
-        ).image  # fmt: skip
-
-    def _project(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        uv, depth, valid = self.camera.project(points)
-        return uv, depth, valid
+        behind = to_bytes(255 * shown.reshape(height, width, 3))
+        return render_meshes(meshes, self.camera, background=behind, lighting=light)
 
 
 def _level_axes(camera: Camera) -> Float[Tensor, "3 3"]:

@@ -139,11 +139,6 @@ def film_parts(
         lighting: The light on the parts.
         generator: Source of the sensor's noise.
     """
-
-    def project(points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        uv, depth, valid = camera.project(points)
-        return uv, depth, valid
-
     frames = []
     for state in states:
         rotation, centre = body.part_poses(body.pose(state))
@@ -158,10 +153,7 @@ def film_parts(
             )
             for part, turn, place in zip(painted, rotation, centre, strict=True)
         ]
-        picture = render_meshes(
-            meshes, project, *background.shape[:2],
-            background=background, eye_world=camera.centre_world, lighting=lighting,
-        ).image  # fmt: skip
+        picture = render_meshes(meshes, camera, background=background, lighting=lighting)
         frames.append(add_sensor_noise(picture, generator=generator).numpy())
     return frames
 
