@@ -48,7 +48,8 @@ class TrackOptions:
             `torchcss.io.keypoints.read.Scale`.
         masks: Foreground of every frame, white or in shades of belief: a video or a folder of
             images, of the size and number of the video's frames.
-        init: A body that `torchcss init` fitted to the first frame, to start from.
+        init: What to start from: the file of a body that `torchcss init` fitted to the first frame,
+            or what `initialise` found there.
         others: What further synchronised cameras of the same calibration recorded. Their videos may
             be of another size; one that ends, or shows a single colour for a while, is left out as
             long. Their overlays are `overlay_2.mp4` and so on.
@@ -64,7 +65,7 @@ class TrackOptions:
     layout: str | None = None
     normalised: Scale = "pixels"
     masks: Path | None = None
-    init: Path | None = None
+    init: Path | Initialisation | None = None
     others: Sequence[ViewFiles] = ()
     live: Sink | None = None
     resume: bool = False
@@ -132,7 +133,9 @@ def track_video(
             )
     generator = torch.Generator().manual_seed(settings.seed)
     eye = views[0].camera.camera.to(dtype=settings.torch_dtype, device=settings.device)
-    if options.init is not None:
+    if isinstance(options.init, Initialisation):
+        first = options.init
+    elif options.init is not None:
         first = _first_pose_from_file(options.init, eye, settings)
     else:
         first = _first_pose(views, files[0].video, eye, settings, start, generator)
@@ -304,11 +307,11 @@ def _first_pose_from_file(path: Path, camera: Camera, settings: Settings) -> Ini
 
 
 def _writes_body(
-    out: Path, init: Path | None, first: Initialisation, eye: Camera
+    out: Path, init: Path | Initialisation | None, first: Initialisation, eye: Camera
 ) -> partial[None] | None:
     """Writes `body.npz`; None where it is what was started from, which stays as it is."""
     path = out / FITTED_BODY_NAME
-    if init is not None and Path(init).resolve() in (out.resolve(), path.resolve()):
+    if isinstance(init, Path) and init.resolve() in (out.resolve(), path.resolve()):
         return None
     return partial(write_fitted_body, path, first, eye)
 

@@ -23,25 +23,21 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 
-from torchcss.app.overlay import write_overlays
-from torchcss.app.recorder import Recorder
 from torchcss.app.track import TrackOptions, track_video
 from torchcss.errors import ConfigurationError
 from torchcss.initialise.fit import initialise
 from torchcss.initialise.options import InitialiseOptions
 from torchcss.initialise.result import Initialisation
-from torchcss.io.run import Run
+from torchcss.io.fitted_body import write_fitted_body
+from torchcss.io.keypoints.read import OWN_NAMES
 from torchcss.io.tracks import load_track, prepare_output_folder, write_summary
 from torchcss.io.video import VideoWriter
-from torchcss.io.view_files import RecordedCamera, ViewFiles
 from torchcss.studies.render.sequences import SyntheticSequence
+from torchcss.studies.sequence_writer import write_arrays, write_camera
 from torchcss.studies.sequences import read_reference
-from torchcss.tracking.session import TrackingSession
 from torchcss.tracking.settings import Settings
-from torchcss.tracking.view import CameraView
-from torchcss.types import Frame, Keypoints
+from torchcss.types import Keypoints
 
 KEYPOINT_NOISE_PX = 1.5
 DEMO_SETTINGS = Settings(body="arm8", keypoints_use="first")
@@ -69,26 +65,85 @@ def run_demo(
         ConfigurationError: If there is to be no frame.
         OutputError: If the folder cannot be written.
     """
-    settings = settings or DEMO_SETTINGS
     if num_frames is not None and num_frames < 1:
         raise ConfigurationError(f"num_frames must be at least 1, got {num_frames}")
-    run = track_video(
-        CLIP / "video.mp4", camera=CLIP / "cameras.json", keypoints=CLIP / "keypoints.npz", out=out,
-        settings=settings, stop=num_frames, options=TrackOptions(init=CLIP / "body.npz"),
-    )  # fmt: skip
-    positions, _ = read_reference(CLIP / "reference3d.npz")
-    return _with_errors(out, dict(run.summary), positions)
+    return _track_clip(CLIP, out, settings or DEMO_SETTINGS, CLIP / "body.npz", num_frames)
 
 
-def first_pose(
-    sequence: SyntheticSequence, generator: torch.Generator
-) -> tuple[Initialisation, Keypoints]:
-    """The pose that fits noisy 2D joints of the first frame, and these; the base is known.
+def track_sequence(
+    sequence: SyntheticSequence, out: Path, settings: Settings, *, generator: torch.Generator
+) -> dict[str, Any]:
+    """Track the body of a rendered sequence as the demo does its arm.
 
     Args:
-        sequence: The sequence and its truth; its body says type and device.
-        generator: Source of the noise and of the search.
+        sequence: The sequence and its truth.
+        out: See `run_demo`; the clip is written there as well.
+        settings: How to track. There are keypoints of the first frame alone.
+        generator: Source of the noise and of the search for the first pose.
+
+    Returns:
+        The summary, with the errors that `run_demo` names.
+
+    Raises:
+        OutputError: If the folder cannot be written.
     """
+    dtype, device = settings.torch_dtype, torch.device(settings.device)
+    body = sequence.body.to(dtype=dtype, device=device)
+    camera = sequence.camera.to(dtype=dtype, device=device)
+    there = replace(sequence, body=body, camera=camera, states=sequence.states.to(body.tie))
+    first = write_clip(out, there, generator=generator)
+    return _track_clip(out, out, settings, first)
+
+
+def write_clip(
+    folder: Path, sequence: SyntheticSequence, *, generator: torch.Generator, crf: int = 13
+) -> Initialisation:
+    """Write a sequence as the demo's clip is, with noisy joints of the first frame.
+
+    Args:
+        folder: The folder; made if missing.
+        sequence: The sequence and its truth.
+        generator: Source of the noise, and of the search for the first pose.
+        crf: Quality of the film, see `VideoWriter`.
+
+    Returns:
+        The first pose that was found.
+
+    Raises:
+        OutputError: If the folder cannot be written.
+    """
+    prepare_output_folder(folder)
+    with VideoWriter(folder / "video.mp4", sequence.frame_rate, crf=crf) as film:
+        for image in sequence.frames:
+            film.write(image)
+    write_camera(folder / "cameras.json", sequence.camera)
+    first, seen = _first_pose(sequence, generator)
+    # A keypoint file tells all frames; nothing is known of the later ones.
+    later = (len(sequence.frames) - 1, *seen.positions.shape[1:])
+    write_arrays(
+        folder / "keypoints.npz",
+        {
+            "keypoints": torch.cat([seen.positions, torch.zeros(later)]).numpy(),
+            "confidence": torch.cat([seen.confidence, torch.zeros(later[:2])]).numpy(),
+            "joint_names": np.array(seen.names),
+        },
+    )
+    write_fitted_body(folder / "body.npz", first, sequence.camera)
+    write_arrays(
+        folder / "reference3d.npz",
+        {
+            "joints": sequence.joints_world.double().cpu().numpy(),
+            "joint_names": np.array(sequence.body.joint_names),
+            "units": np.array("m"),
+        },
+    )
+    return first
+
+
+def _first_pose(
+    sequence: SyntheticSequence, generator: torch.Generator
+) -> tuple[Initialisation, Keypoints]:
+    """The pose that fits noisy 2D joints of the first frame, and these; the base is known."""
     camera, body = sequence.camera, sequence.body
     exact = camera.project(sequence.joints_world[0]).uv.double().cpu()
     noise = torch.randn(exact.shape, generator=generator, dtype=exact.dtype)
@@ -98,60 +153,19 @@ def first_pose(
     return initialise(None, seen.at(0), camera, body, generator=generator, options=options), seen
 
 
-def track_sequence(
-    sequence: SyntheticSequence, out: Path, settings: Settings, *, generator: torch.Generator
+def _track_clip(
+    clip: Path,
+    out: Path,
+    settings: Settings,
+    first: Path | Initialisation,
+    num_frames: int | None = None,
 ) -> dict[str, Any]:
-    """Track the body of a rendered sequence from noisy joints in its first frame.
-
-    Args:
-        sequence: The sequence and its truth.
-        out: See `run_demo`.
-        settings: How to track; `keypoints_use` is "first" whatever they say.
-        generator: Source of the noise and of the samples.
-
-    Returns:
-        The summary, with the errors that `run_demo` names.
-
-    Raises:
-        OutputError: If the folder cannot be written.
-    """
-    prepare_output_folder(out)
-    with VideoWriter(out / "video.mp4", sequence.frame_rate) as film:
-        for image in sequence.frames:
-            film.write(image)
-
-    dtype, device = settings.torch_dtype, torch.device(settings.device)
-    body = sequence.body.to(dtype=dtype, device=device)
-    camera_there = sequence.camera.to(dtype=dtype, device=device)
-    there = replace(sequence, body=body, camera=camera_there, states=sequence.states.to(body.tie))
-    first, seen = first_pose(there, generator)
-    interval = 1 / sequence.frame_rate
-    session = TrackingSession(
-        replace(settings, keypoints_use="first"),
-        first,
-        [CameraView(camera_there, seen, KEYPOINT_NOISE_PX)],
-        frame_interval=interval,
-        generator=generator,
-    )
-    frames = (Frame(i, i * interval, image) for i, image in enumerate(sequence.frames))
-    film = ViewFiles(video=out / "video.mp4", keypoints=None)
-    recorder = Recorder(
-        folder=out,
-        session=session,
-        recorded=[RecordedCamera(sequence.camera, film)],
-        frame_interval=interval,
-        notes=first.report,
-    )
-    summary = recorder.run(session.track(frames), len(sequence.frames))
-    if settings.overlay:
-        write_overlays(Run.open(out), sequence.frame_rate)
-    return _with_errors(out, summary, sequence.joints_world.cpu().numpy())
-
-
-def _with_errors(
-    out: Path, summary: dict[str, Any], truth: Float[np.ndarray, "t j 3"]
-) -> dict[str, Any]:
-    """A track's summary with its errors, which is written again."""
+    """Track a clip from its first pose; its summary with the errors, which is written again."""
+    run = track_video(
+        clip / "video.mp4", camera=clip / "cameras.json", keypoints=clip / "keypoints.npz", out=out,
+        settings=settings, stop=num_frames, options=TrackOptions(init=first, layout=OWN_NAMES),
+    )  # fmt: skip
+    summary, truth = dict(run.summary), read_reference(clip / "reference3d.npz")[0]
     track = load_track(out)
     error = np.linalg.norm(track.joints_world - truth[track.frames][:, None], axis=-1).mean(-1)
     error = np.where(np.isfinite(track.log_weight), error, np.inf)

@@ -374,8 +374,12 @@ def test_unknown_layouts_list_the_known(tmp_path: Path) -> None:
     with pytest.raises(KeypointError, match="COCO-17 has 17 joints, the file has 9"):
         read(path, layout="COCO-17")
     names = np.array([f"tentacle{index}" for index in range(9)])
-    with pytest.raises(KeypointError, match="unknown layout: found 9 names"):
-        read(write_npz(tmp_path / "b.npz", [person], joint_names=names))
+    named = write_npz(tmp_path / "b.npz", [person], joint_names=names)
+    with pytest.raises(KeypointError, match="unknown layout: found 9 names.*take layout own"):
+        read(named)
+    assert read(named, layout="own").names == tuple(names.tolist())
+    with pytest.raises(KeypointError, match="layout own: the file does not name"):
+        read(path, layout="own")
     with pytest.raises(KeypointError, match="twice"):
         read(write_npz(tmp_path / "c.npz", [person], joint_names=np.array(["l_hip"] * 9)))
 

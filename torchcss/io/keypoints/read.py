@@ -54,6 +54,9 @@ from torchcss.types import Keypoints
 Scale = Literal["pixels", "zero-one", "plus-minus-one"]
 """What the coordinates of a file count: pixels, or fractions of the image from 0 or -1 to 1."""
 
+OWN_NAMES = "own"
+"""The layout of files whose names are those of the body."""
+
 # Which layout a number of unnamed joints means; the first is the default.
 _LAYOUTS_BY_COUNT: dict[int, tuple[str, ...]] = {}
 for _name in (
@@ -93,7 +96,8 @@ def read_keypoints(
         image_size_wh: Size of the video's images in pixels.
         num_frames: Number of frames of the video, which the file must match (a clicked file need
             not). None: as many as the file has.
-        layout: A key of `torchcss.joint_names.ALIASES`, for files that do not name their joints.
+        layout: A key of `torchcss.joint_names.ALIASES`, for files that do not name their joints;
+            "own": the names of the file as they are, which are those of the body, such as a robot.
             None: recognise it.
         normalised: True, `"zero-one"` or `"plus-minus-one"` for coordinates that are fractions of
             the image, which are then converted: the range ends at the centres of the border pixels.
@@ -108,9 +112,10 @@ def read_keypoints(
             confident joint that is not a number.
     """
     path = Path(path)
-    if layout is not None and layout not in ALIASES:
+    if layout is not None and layout not in (OWN_NAMES, *ALIASES):
         raise KeypointError(
-            f"{path}: unknown layout {layout!r}; the known ones are {', '.join(ALIASES)}"
+            f"{path}: unknown layout {layout!r}; the known ones are "
+            f"{', '.join((*ALIASES, OWN_NAMES))}"
         )
     people = _read(path, image_size_wh)
     report = list(people.report)
@@ -337,6 +342,11 @@ def _joint_names(
     path: Path, people: People, chosen: np.ndarray, layout: str | None, report: list[str]
 ) -> tuple[str, ...]:
     num_joints, own = chosen.shape[1], people.names or ()
+    if layout == OWN_NAMES:
+        if not own:
+            raise KeypointError(f"{path}: layout {OWN_NAMES}: the file does not name its joints")
+        report.append(f"layout: {num_joints} names as they are")
+        return tuple(own)
     if layout is not None and len(ALIASES[layout]) != num_joints:
         fitting = ", ".join(_LAYOUTS_BY_COUNT.get(num_joints, ())) or "none of the known"
         raise KeypointError(
@@ -356,6 +366,7 @@ def _joint_names(
         raise KeypointError(
             f"{path}: unknown layout: found {num_joints} {found}; the known layouts are "
             + ", ".join(f"{name} ({len(joints)})" for name, joints in ALIASES.items())
+            + (f"; names that are a robot's own take layout {OWN_NAMES}" if own else "")
         )
     report.append(f"layout: {why}")
     names = tuple(
