@@ -36,6 +36,7 @@ VARIED = {
     "failure_modes": {"body", "preset"},
     "learn_weights": {"body", "weights"},
     "several_views": set(),
+    "track_quadruped": {"body"},
     "track_robot": {"body", "seed"},
 }
 """What a script varies itself, or is told by what it tracks."""
@@ -53,6 +54,9 @@ def arguments(folder: Path, script: str) -> list[str]:
     if script == "track_robot":
         urdf = made_robots.write_arm(folder / "seven.urdf")
         return ["--urdf", str(urdf), "--link", "tip", "--frames", "2", "--out", str(folder / "out")]
+    if script == "track_quadruped":
+        urdf = made_robots.write_quadruped(folder / "quadruped.urdf")
+        return ["--urdf", str(urdf), "--cameras", "1", "--frames", "1"]
     return {
         "ablation": ["--rows", "+ region", "--frames", "2", "--seeds", "1"],
         "learn_weights": ["--frames", "2", "--epochs", "1", "--starts", "1",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -25,17 +26,19 @@ def urdf(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return path
 
 
-def test_marks_in_space(script: ModuleType, urdf: Path, tmp_path: Path) -> None:
+def test_three_cameras_tell_places_in_space(script: ModuleType, urdf: Path, tmp_path: Path) -> None:
     out = tmp_path / "out" / "quadruped.json"
-    report = script.main(script.Config(urdf=urdf, frames=4, samples=10, out=out))
-    # Twelve keypoints of 5 mm a coordinate for 18 parameters.
+    tracking = replace(script.TRACKING, samples=10, working_size=320)
+    report = script.main(script.Config(urdf=urdf, frames=2, tracking=tracking, out=out))
+    # A pixel and a half of noise at 3.5 m is 6 mm, of three cameras and twelve keypoints.
     assert report["links_mm"] < 9
     assert json.loads(out.read_text())["links_mm"] == pytest.approx(report["links_mm"])
 
 
-def test_marks_in_one_image(script: ModuleType, tmp_path: Path) -> None:
+def test_one_camera_tells_depth_less_well(script: ModuleType, tmp_path: Path) -> None:
     urdf = write_quadruped(tmp_path / "quadruped.urdf")
-    report = script.main(script.Config(urdf=urdf, keypoints="2d", frames=3, samples=6))
+    tracking = replace(script.TRACKING, samples=6, working_size=320)
+    report = script.main(script.Config(urdf=urdf, cameras=1, frames=3, tracking=tracking))
     # Depth is known to some 3 cm a frame.
     assert report["links_mm"] < 100
 

@@ -375,7 +375,7 @@ def test_unknown_layouts_list_the_known(tmp_path: Path) -> None:
         read(path, layout="COCO-17")
     names = np.array([f"tentacle{index}" for index in range(9)])
     named = write_npz(tmp_path / "b.npz", [person], joint_names=names)
-    with pytest.raises(KeypointError, match="unknown layout: found 9 names.*take layout own"):
+    with pytest.raises(KeypointError, match=r"unknown layout: found 9 names.*take layout own"):
         read(named)
     assert read(named, layout="own").names == tuple(names.tolist())
     with pytest.raises(KeypointError, match="layout own: the file does not name"):

@@ -12,6 +12,7 @@ Robots are Z up; the world is Y up. An arm stands on the base that its loader gi
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -29,6 +30,7 @@ from torchcss.studies.render.sequences import (
     SyntheticSequence,
     film_parts,
 )
+from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import grid_faces
 
 _COLOURS = ((0.85, 0.86, 0.88), (0.95, 0.55, 0.15), (0.80, 0.82, 0.86))
@@ -140,38 +142,62 @@ def robot_sequence(
     """
     times = torch.arange(num_frames, dtype=torch.float64) / frame_rate
     states = swing(body, times, generator=generator, middle=middle, amplitude=amplitude)
+    (sequence,) = film_robot(body, states, generator=generator, frame_rate=frame_rate)
+    return sequence
+
+
+def film_robot(
+    body: BodyModel,
+    states: Float[Tensor, "t n"],
+    *,
+    generator: torch.Generator,
+    cameras: Sequence[Camera] = (),
+    frame_rate: float = 25.0,
+) -> list[SyntheticSequence]:
+    """Film a robot before clutter: capsules on its links.
+
+    Args:
+        body: A body whose parts are about as long as its links.
+        states: Its motion.
+        generator: Source of the room, the paint and the sensor noise.
+        cameras: Who looks; by default one camera that sees all of the motion.
+        frame_rate: Frames per second.
+
+    Returns:
+        What each camera filmed.
+    """
     joints = body.pose(states).joints.flatten(0, 1)
     lowest, highest = joints.amin(0), joints.amax(0)
     centre = 0.5 * (lowest + highest)
     size = float((highest - lowest).norm()) + 4 * float(body.part_shape[:, 0].max())
-    width, height, focal = 640, 480, 700.0
-    away = torch.tensor([0.45, 0.25, 1.0], dtype=torch.float64)
-    eye = centre + 1.1 * size * focal / height * away / away.norm()
-    camera = look_at(eye.tolist(), centre.tolist(), focal_px=focal, name="robot")
-    background = clutter_background(height, width, generator=generator)
+    if not cameras:
+        away = torch.tensor([0.45, 0.25, 1.0], dtype=torch.float64)
+        eye = centre + 1.1 * size * 700 / 480 * away / away.norm()
+        cameras = [look_at(eye.tolist(), centre.tolist(), focal_px=700.0, name="robot")]
+    rooms = [
+        clutter_background(*reversed(camera.image_size_wh), generator=generator)
+        for camera in cameras
+    ]
     thickness = 1 + 0.2 * (torch.rand(body.num_parts, generator=generator) - 0.5)
     textures = [random_texture(generator=generator) for _ in body.part_names]
     lamp = centre + size * torch.tensor([0.6, 1.2, 1.0], dtype=torch.float64)
     lighting = Lighting(
         lamp_world=tuple(lamp.tolist()), target_world=tuple(centre.tolist()), cone=0.9
     )
-    capsules = [
-        capsule(float(shape[0]) * float(factor), float(shape[2] - shape[0]))
-        for shape, factor in zip(body.part_shape, thickness, strict=True)
-    ]
-    painted = [
-        PaintedPart(
-            points.flatten(0, 1), normals.flatten(0, 1), _COLOURS[part % len(_COLOURS)], texture
+    painted = []
+    for part, (shape, factor) in enumerate(zip(body.part_shape, thickness, strict=True)):
+        points, normals = capsule(float(shape[0]) * float(factor), float(shape[2] - shape[0]))
+        colour, faces = _COLOURS[part % len(_COLOURS)], grid_faces(*points.shape[:2])
+        painted.append(
+            PaintedPart(points.flatten(0, 1), normals.flatten(0, 1), faces, colour, textures[part])
         )
-        for part, ((points, normals), texture) in enumerate(zip(capsules, textures, strict=True))
-    ]
-    frames = film_parts(
-        body, states, painted, grid_faces(*capsules[0][0].shape[:2]), camera=camera,
-        background=background, lighting=lighting, generator=generator,
-    )  # fmt: skip
-    return SyntheticSequence(
-        frames=frames, frame_rate=frame_rate, camera=camera, body=body, states=states
-    )
+    return [
+        film_parts(
+            body, states, painted, camera=camera, background=room, lighting=lighting,
+            frame_rate=frame_rate, generator=generator,
+        )
+        for camera, room in zip(cameras, rooms, strict=True)
+    ]  # fmt: skip
 
 
 TROT_LEGS = (("LF", "RH"), ("RF", "LH"))

@@ -112,6 +112,7 @@ class PaintedPart(NamedTuple):
 
     points: Float[Tensor, "v 3"]
     normals: Float[Tensor, "v 3"]
+    faces: Int[Tensor, "f 3"]
     colour: Colour
     texture: Texture
 
@@ -120,23 +121,23 @@ def film_parts(
     body: BodyModel,
     states: Float[Tensor, "t n"],
     painted: Sequence[PaintedPart],
-    faces: Int[Tensor, "f 3"],
     *,
     camera: Camera,
     background: UInt8[Tensor, "h w 3"],
     lighting: Lighting,
+    frame_rate: float,
     generator: torch.Generator,
-) -> list[UInt8[np.ndarray, "h w 3"]]:
+) -> SyntheticSequence:
     """Film a body's rigid parts before a background.
 
     Args:
         body: The body, on its base.
         states: Its states.
         painted: What every part looks like.
-        faces: Triangles of every part.
         camera: Who looks.
         background: What is behind.
         lighting: The light on the parts.
+        frame_rate: Frames per second.
         generator: Source of the sensor's noise.
     """
     frames = []
@@ -146,7 +147,7 @@ def film_parts(
             Mesh(
                 part.points @ turn.T + place,
                 part.normals @ turn.T,
-                faces,
+                part.faces,
                 torch.tensor(part.colour, dtype=torch.float64),
                 points_part=part.points,
                 texture=part.texture,
@@ -155,7 +156,9 @@ def film_parts(
         ]
         picture = render_meshes(meshes, camera, background=background, lighting=lighting)
         frames.append(add_sensor_noise(picture, generator=generator).numpy())
-    return frames
+    return SyntheticSequence(
+        frames=frames, frame_rate=frame_rate, camera=camera, body=body, states=states
+    )
 
 
 def arm_sequence(
@@ -173,35 +176,29 @@ def arm_sequence(
     """
     if num_frames < 1:
         raise ConfigurationError(f"num_frames must be at least 1, got {num_frames}")
-    width, height = 640, 480
-    body = load_body("arm8")
     # World: Y up, the camera at its origin looking along -Z. The body faces the camera.
     shoulder = torch.tensor([0.30, 0.16, -1.75], dtype=torch.float64)
-    body = body.with_base(torch.eye(3, dtype=torch.float64), shoulder)
-    focal = [[640.0, 0.0, 319.5], [0.0, 640.0, 239.5], [0.0, 0.0, 1.0]]
-    camera = Camera(focal, (width, height), R_camera_world=np.diag([1.0, -1.0, -1.0]), name="demo")
+    body = load_body("arm8").with_base(torch.eye(3, dtype=torch.float64), shoulder)
+    camera = look_at((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), focal_px=640.0, name="demo")
     times = torch.arange(num_frames, dtype=torch.float64) / frame_rate
-    states = arm_motion(body, times)
-    background = clutter_background(height, width, generator=generator)
+    background = clutter_background(480, 640, generator=generator)
     textures = [random_texture(generator=generator) for _ in body.part_names]
-    fine = body.mesh(40, 48)
+    fine, faces = body.mesh(40, 48), grid_faces(40, 48)
     painted = [
         PaintedPart(
             fine.points[part].flatten(0, 1),
             fine.normals[part].flatten(0, 1),
+            faces,
             _SLEEVE if name.endswith(("upper_arm", "clavicle")) else _SKIN,
             textures[part],
         )
         for part, name in enumerate(body.part_names)
     ]
-    lighting = Lighting(lamp_world=(0.8, 1.6, 0.4), target_world=(0.1, 0.0, -1.7))
-    frames = film_parts(
-        body, states, painted, grid_faces(40, 48), camera=camera, background=background,
-        lighting=lighting, generator=generator,
+    return film_parts(
+        body, arm_motion(body, times), painted, camera=camera, background=background,
+        lighting=Lighting(lamp_world=(0.8, 1.6, 0.4), target_world=(0.1, 0.0, -1.7)),
+        frame_rate=frame_rate, generator=generator,
     )  # fmt: skip
-    return SyntheticSequence(
-        frames=frames, frame_rate=frame_rate, camera=camera, body=body, states=states
-    )
 
 
 # The papers' sequences, with a dressed character in a scene.
