@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import pytest
 import torch
 from made_costs import changed, make_full_cost, random_states
 
 from torchcss.body.shape import with_shape
 from torchcss.cost.context import BodyTables
 from torchcss.cost.total import TrackingCost, together
+from torchcss.inference.mixture import GaussianMixture
 from torchcss.types import Keypoints
 
 
@@ -51,6 +55,31 @@ def test_one_call_gives_what_two_calls_give(generator: torch.Generator) -> None:
     )
     items = torch.tensor([6, 1, 2])
     torch.testing.assert_close(both.take(items).value(x[items]), both.value(x)[items])
+
+
+def test_samples_of_several_clips_descend_from_the_modes_of_their_own(
+    generator: torch.Generator,
+) -> None:
+    sequence, parent = torch.tensor([1, 0, 1, 0, 0]), torch.tensor([2, 1, 0, 0, 1])
+    costs = [replace(cost, parent=None) for cost in two_clips()]
+    priors = [
+        GaussianMixture(mean, 0.01 * torch.eye(mean.shape[-1]).double().expand(3, -1, -1), -weight)
+        for mean, weight in (
+            (random_states(cost.body, 3, generator=generator), torch.rand(3).double())
+            for cost in costs
+        )
+    ]
+    both = together(costs, sequence).of_children(parent, *priors)
+    x = random_states(costs[0].body, len(sequence), generator=generator)
+    for number, (cost, prior) in enumerate(zip(costs, priors, strict=True)):
+        rows = sequence == number
+        alone = cost.of_children(parent[rows], prior)
+        assert not torch.allclose(alone.value(x[rows]), cost.value(x[rows]), atol=1e-3)
+        torch.testing.assert_close(both.value(x)[rows], alone.value(x[rows]))
+        for got, expected in zip(both.local_model(x), alone.local_model(x[rows]), strict=True):
+            torch.testing.assert_close(got[rows], expected, rtol=1e-9, atol=1e-9)
+    with pytest.raises(ValueError, match="zip"):
+        together(costs, sequence).of_children(parent, priors[0])
 
 
 def test_one_clip_is_the_case_of_one(generator: torch.Generator) -> None:

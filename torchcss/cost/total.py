@@ -13,7 +13,8 @@ temperature: the nats that a term contributes per nu of mean cost per node (deci
 weights").
 
 Samples of several sequences (other bodies, cameras, pictures) may be evaluated together: each
-sample has the index of its sequence. One sequence is the case of one.
+sample has the index of its sequence, and of its parent among the modes of that sequence. One
+sequence is the case of one.
 
 | name | term or prior | section of [IJRR] |
 |---|---|---|
@@ -45,7 +46,7 @@ from torch import Tensor
 from torchcss.body.model import BodyModel, BodyPose, differentiate_twice
 from torchcss.cost.choice import CostChoice
 from torchcss.cost.context import BodyTables, FrameContext
-from torchcss.cost.term import BoundImage, BoundPrior, BoundWeight, Kind, Posed, Term
+from torchcss.cost.term import BoundImage, BoundPrior, Kind, Posed, Term
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.problem import SearchProblem
 from torchcss.stopwatch import Stopwatch
@@ -126,19 +127,24 @@ class TrackingCost:
         first, *others = self.views
         return replace(self, views=(replace(first, keypoints=keypoints), *others))
 
-    def of_children(self, parent: Int[Tensor, " b"], prior: GaussianMixture) -> TrackingCost:
+    def of_children(self, parent: Int[Tensor, " b"], *prior: GaussianMixture) -> TrackingCost:
         """The cost for samples of a prior's modes: each is compared with the mode it came from.
 
         Args:
-            parent: The mode of each sample.
-            prior: The modes, one frame ahead.
+            parent: The mode of each sample, among those of its sequence.
+            prior: The modes, one frame ahead, for each sequence.
         """
-        return replace(self, parent=parent, past=(replace(self.views[0], prior=prior),))
+        seen = {view.sequence: view for view in reversed(self.views)}
+        past = (
+            replace(seen[number], prior=modes)
+            for number, modes in zip(sorted(seen), prior, strict=True)
+        )
+        return replace(self, parent=parent, past=tuple(past))
 
     def of_mode(self, x: Float[Tensor, " n"]) -> TrackingCost:
         """The cost for samples that all descend from one pose."""
         single = GaussianMixture(x[None], torch.eye(len(x)).to(x)[None], x.new_zeros(1))
-        return replace(self, parent=None, past=(replace(self.views[0], prior=single),))
+        return replace(self.of_children(x.new_zeros(0).long(), single), parent=None)
 
     def take(self, items: Int[Tensor, " b"]) -> TrackingCost:
         """The cost restricted to some samples: each keeps its own parent and sequence."""
@@ -166,7 +172,7 @@ class TrackingCost:
         """
         terms = tuple(kept for term in self.choice.terms if (kept := term.coarse()) is not None)
         cost = replace(self, choice=replace(self.choice, terms=terms))
-        return cost if any(True for view in self.views for _ in cost._images(view)) else None
+        return cost if cost._says("image") else None
 
     def screening(self) -> TrackingCost:
         """The edges alone, by which [RR] section 4.2 scores sampled hypotheses for speed."""
@@ -179,11 +185,9 @@ class TrackingCost:
 
     def value(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
         """Cost in nats, visibility and assignments found fresh at x."""
-
-        def total(part: _Part) -> dict[str, Tensor]:
-            return {"": torch.stack(list(part.values().values())).sum(0)}
-
-        return self._evaluated(total, x)[""]
+        return self._evaluated(
+            lambda part: {"": torch.stack(list(part.values().values())).sum(0)}, x
+        )[""]
 
     def terms(self, x: Float[Tensor, "*batch n"]) -> dict[str, Float[Tensor, "*batch"]]:
         """Cost of every term and prior by name, nats."""
@@ -200,7 +204,7 @@ class TrackingCost:
     @property
     def weighs(self) -> bool:
         """Whether `weight_only` tells poses apart."""
-        return any(True for view in self.views for _ in self._bound("weight-only", view))
+        return self._says("weight-only")
 
     def weight_only(
         self, x: Float[Tensor, "*batch n"], *, body: BodyModel | None = None
@@ -230,7 +234,7 @@ class TrackingCost:
         nodes = 1
         for view in self.views:
             links: list[Tensor] = []
-            for _, bound in self._images(view):
+            for _, bound in self._bound("image", view):
                 # Terms on the same nodes share them.
                 if all(bound.link is not link for link in links):
                     links.append(bound.link)
@@ -242,24 +246,28 @@ class TrackingCost:
     ) -> dict[str, Tensor]:
         """Evaluate sequence by sequence, a chunk at a time, and put the results together."""
         flat, found, order = x.reshape(-1, x.shape[-1]), [], []
-        for number, past in enumerate(self.past):
+        for past in self.past:
             items = torch.arange(len(flat), device=x.device)
             if self.sequence is not None:
                 items = items[self.sequence == past.sequence]
-            if not len(items) and (number or len(flat)):
+            if not len(items) and (found or len(flat)):
                 continue
-            order.append(items)
             views = [view for view in self.views if view.sequence == past.sequence]
             for some in items.split(self._chunk):
-                part = None if self.parent is None else self.parent[some]
-                found.append(evaluate(_Part(self, past, views, flat[some], part)))
+                parent = None if self.parent is None else self.parent[some]
+                found.append(evaluate(_Part(self, past, views, flat[some], parent)))
+                order.append(some)
         names = dict.fromkeys(name for part in found for name in part)
-        results = {name: _joined(name, found) for name in names}
-        if len(order) > 1:
+        results = {name: _joined(name, found, order) for name in names}
+        if len(self.past) > 1:
             places = torch.cat(order).argsort()
             results = {name: result[places] for name, result in results.items()}
         shape = x.shape[:-1]
         return {n: result.reshape((*shape, *result.shape[1:])) for n, result in results.items()}
+
+    def _says(self, kind: Kind) -> bool:
+        """Whether a view says something to a term of a kind."""
+        return any(True for view in self.views for _ in self._bound(kind, view))
 
     def _timed(self, name: str) -> AbstractContextManager[Any]:
         return nullcontext() if self.stopwatch is None else self.stopwatch(name)
@@ -269,9 +277,6 @@ class TrackingCost:
         for term in self.choice.terms:
             if term.kind == kind and (bound := self.bound[term, context]) is not None:
                 yield term.name, bound
-
-    def _images(self, view: FrameContext) -> Iterator[tuple[str, BoundImage]]:
-        return self._bound("image", view)
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,7 +294,7 @@ class _Part:
         pose, values = self._pose(), {}
         for name, weight, prior, posed in self._priors(pose):
             with self.cost._timed(name):
-                values[name] = _times(weight, prior.value(posed))
+                values[name] = weight * prior.value(posed)
         for name, scale, term, posed in self._terms(pose):
             with self.cost._timed(name):
                 value = scale * term.value(posed).sum(-1)
@@ -298,28 +303,23 @@ class _Part:
 
     def gradients(self) -> dict[str, Tensor]:
         """Gradient of every prior and term."""
-        pose = self.past.body.pose(self.x)
-        gradients: dict[str, Any] = {
-            name: _times(weight, prior.local_model(posed, Curvature.EXACT).gradient)
-            for name, weight, prior, posed in self._priors(pose)
+        cost, pose = self.cost, self._pose()
+        bound = (self._bound(kind, pose, self.past.body) for kind in ("prior", "image"))
+        names = dict.fromkeys(name for every in bound for name, *_ in every)
+        alone = {
+            name: replace(cost, choice=replace(cost.choice.only([name]), curvature=Curvature.EXACT))
+            for name in names
         }
-        for name, scale, term, posed in self._terms(pose):
-            cost = PointCost(*(scale * part for part in term.point_cost(posed)))
-            lifted = self.past.body.lift(pose, term.points(posed), term.link, cost)
-            gradients[name] = gradients.get(name, 0.0) + lifted.gradient
-        return gradients or {"none": torch.zeros_like(self.x)}
+        return {name: replace(self, cost=c).local_model().gradient for name, c in alone.items()}
 
     def weights(self, body: BodyModel | None) -> dict[str, Tensor]:
         """Cost of every weight-only term."""
         body, total = body or self.past.body, {}
         pose = body.pose(self.x)
-        for view in self.views:
-            posed = Posed(view, body, pose, self.parent)
-            for name, bound in self.cost._bound("weight-only", view):
-                term: BoundWeight = bound
-                with self.cost._timed(name):
-                    value = self.cost.choice.weight(name) * term.scale * term.value(posed)
-                total[name] = total.get(name, 0.0) + value
+        for name, weight, term, posed in self._bound("weight-only", pose, body):
+            with self.cost._timed(name):
+                value = weight * term.scale * term.value(posed)
+            total[name] = total.get(name, 0.0) + value
         return total
 
     def local_model(self) -> LocalModel:
@@ -327,8 +327,7 @@ class _Part:
         cost, x, curvature = self.cost, self.x, self.cost.choice.curvature
         if curvature is Curvature.AUTOGRAD:
             return self._by_autograd()
-        pose = self._pose()
-        points, links, costs = [], [], []
+        pose, points, links, costs = self._pose(), [], [], []
         for name, scale, term, posed in self._terms(pose):
             with cost._timed(name):
                 part = term.point_cost(posed, gauss_newton=curvature is Curvature.GAUSS_NEWTON)
@@ -347,9 +346,7 @@ class _Part:
         for name, weight, prior, posed in self._priors(pose):
             with cost._timed(name):
                 model = prior.local_model(posed, curvature)
-                total = LocalModel(
-                    *(a + _times(weight, b) for a, b in zip(total, model, strict=True))
-                )
+                total = LocalModel(*(a + weight * b for a, b in zip(total, model, strict=True)))
         return total
 
     def _by_autograd(self) -> LocalModel:
@@ -372,34 +369,32 @@ class _Part:
 
     def _terms(self, pose: BodyPose) -> Iterator[tuple[str, float, BoundImage, Posed]]:
         """The image terms of all views with their weights, what they need of the poses found."""
-        for view in self.views:
-            posed = Posed(view, self.past.body, pose, self.parent)
-            for name, term in self.cost._images(view):
-                with self.cost._timed("visibility"):
-                    term.points(posed)
-                yield name, self.cost.choice.weight(name) * term.scale, term, posed
+        for name, weight, term, posed in self._bound("image", pose, self.past.body):
+            with self.cost._timed("visibility"):
+                term.points(posed)
+            yield name, weight * term.scale, term, posed
 
     def _priors(self, pose: BodyPose) -> Iterator[tuple[str, float, BoundPrior, Posed]]:
         """The priors with their weights."""
-        posed = Posed(self.past, self.past.body, pose, self.parent)
-        for name, prior in self.cost._bound("prior", self.past):
-            yield name, self.cost.choice.weight(name), prior, posed
+        return self._bound("prior", pose, self.past.body)
+
+    def _bound(
+        self, kind: Kind, pose: BodyPose, body: BodyModel
+    ) -> Iterator[tuple[str, float, Any, Posed]]:
+        """The terms of a kind with their weights, and the poses before each camera."""
+        for view in (self.past,) if kind == "prior" else self.views:
+            posed = Posed(view, body, pose, self.parent)
+            for name, bound in self.cost._bound(kind, view):
+                yield name, self.cost.choice.weight(name), bound, posed
 
 
-def _times(weight: float, value: Tensor) -> Tensor:
-    return value if weight == 1.0 else weight * value
-
-
-def _joined(name: str, parts: Sequence[Mapping[str, Tensor]]) -> Tensor:
+def _joined(
+    name: str, parts: Sequence[Mapping[str, Tensor]], rows: Sequence[Int[Tensor, " b"]]
+) -> Tensor:
     """A result of all parts; zero where a part does not have it."""
     like = next(part[name] for part in parts if name in part)
-    sizes = [len(next(iter(part.values()))) for part in parts]
-    return torch.cat(
-        [
-            part[name] if name in part else like.new_zeros(size, *like.shape[1:])
-            for part, size in zip(parts, sizes, strict=True)
-        ]
-    )
+    none = (like.new_zeros(len(some), *like.shape[1:]) for some in rows)
+    return torch.cat([part.get(name, zero) for part, zero in zip(parts, none, strict=True)])
 
 
 def _carried(
