@@ -17,7 +17,6 @@ from torchcss.body.surface import surface_points
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.interior import InteriorNodes
 from torchcss.cost.visibility import (
-    Beside,
     ContourPredictor,
     SeenNodes,
     front_facing,
@@ -343,19 +342,14 @@ def test_line_of_sight_without_neighbours(generator: torch.Generator) -> None:
     nodes = predictor(body, pose, EYE)
     rotation, centre = body.part_poses(pose)
     eye = -(centre[..., None, :] @ rotation)[..., 0, :]
-    visible, free = line_of_sight(body, rotation, eye, nodes.points, other=predictor.other)
+    scene = body.part_shape, rotation, eye, nodes.points
+    visible = line_of_sight(*scene, predictor.other > 0)
     assert torch.equal(visible[nodes.exists > 0], nodes.visible[nodes.exists > 0])
-    assert torch.equal(free, torch.ones_like(free))
     # What is beside a neighbour is in front of it or behind it, and only there is it not free.
-    _, free = line_of_sight(
-        body,
-        rotation,
-        eye,
-        nodes.points,
-        other=predictor.other,
-        beside=Beside(predictor.touching, torch.zeros_like(nodes.points)),
-    )
-    by_neighbour, _ = line_of_sight(body, rotation, eye, nodes.points, other=predictor.touching)
+    touching = predictor.touching > 0
+    reach = 3.5 * body.part_shape[:, :2].mean(-1).expand_as(predictor.touching)
+    free = line_of_sight(*scene, touching, behind=reach)
+    by_neighbour = line_of_sight(*scene, touching)
     assert (free <= by_neighbour + 1e-3).all()
     assert float((by_neighbour - free).max()) == 1
 

@@ -29,7 +29,7 @@ from typing import NamedTuple
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchcss.cost.visibility import front_facing
+from torchcss.cost.visibility import SeenNodes
 from torchcss.robust import Leclerc, RobustPotential
 from torchcss.types import PointCost
 from torchcss.vision.camera import Camera
@@ -52,28 +52,19 @@ class SurfaceTargets(NamedTuple):
         return SurfaceTargets(self.level[parent], self.weight[parent])
 
 
-def surface_targets(
-    points_world: Float[Tensor, "*k p 3"],
-    normals_world: Float[Tensor, "*k p 3"],
-    visible: Float[Tensor, "*#k p"],
-    camera: Camera,
-    contrast: SplineField,
-) -> SurfaceTargets:
+def surface_targets(nodes: SeenNodes, camera: Camera, contrast: SplineField) -> SurfaceTargets:
     """What nodes look like in a picture.
 
     Args:
-        points_world: Nodes at the modes of the frame before, metres.
-        normals_world: Their unit outward normals.
-        visible: 1 where no other part was in front of the node, 0 where one was.
+        nodes: Nodes at the modes of the frame before, with what was seen of them.
         camera: Camera of that frame, at the size of the picture.
         contrast: Its local contrast.
     """
-    projection = camera.project(points_world)
+    projection = camera.project(nodes.points)
     width, height = camera.image_size_wh
     inside = (projection.uv >= 0) & (projection.uv <= projection.uv.new_tensor([width, height]) - 1)
-    facing = front_facing(points_world, normals_world, camera.centre_world)
     seen = inside.all(-1) & projection.valid
-    return SurfaceTargets(contrast.value(projection.uv), facing * visible * seen)
+    return SurfaceTargets(contrast.value(projection.uv), nodes.exists * nodes.visible * seen)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,68 +88,39 @@ class SurfaceTerm:
         return Leclerc(nu=self.nu, sigma=self.sigma)
 
     def value(
-        self,
-        points_world: Float[Tensor, "*batch p 3"],
-        normals_world: Float[Tensor, "*batch p 3"],
-        camera: Camera,
-        contrast: SplineField,
-        targets: SurfaceTargets,
+        self, nodes: SeenNodes, camera: Camera, contrast: SplineField, targets: SurfaceTargets
     ) -> Float[Tensor, "*batch p"]:
         """Cost of every node, in units of nu.
 
         Args:
-            points_world: Nodes at the sample's pose, metres.
-            normals_world: Their unit outward normals.
+            nodes: Nodes at the sample's pose, and which of them face the camera.
             camera: Camera of this frame, at the size of the picture.
             contrast: Local contrast of this frame.
             targets: Targets of each sample's own parent, or of one for all.
         """
-        error = contrast.value(camera.project(points_world).uv) - targets.level
-        facing = front_facing(points_world, normals_world, camera.centre_world)
-        return self._compose(self.potential(error.square()).rho, facing, targets)
+        error = contrast.value(camera.project(nodes.points).uv) - targets.level
+        return self._composed(self.potential(error.square()).rho, nodes, targets)
 
     def point_cost(
-        self,
-        points_world: Float[Tensor, "*batch p 3"],
-        normals_world: Float[Tensor, "*batch p 3"],
-        camera: Camera,
-        contrast: SplineField,
-        targets: SurfaceTargets,
-        *,
-        gauss_newton: bool = False,
+        self, nodes: SeenNodes, camera: Camera, contrast: SplineField, targets: SurfaceTargets
     ) -> PointCost:
-        """The same with first and second derivatives in the nodes' positions.
+        """The same with its gradient and its Gauss-Newton Hessian in the nodes' positions.
 
-        Args:
-            points_world: Nodes at the sample's pose, metres.
-            normals_world: Their unit outward normals.
-            camera: Camera of this frame, at the size of the picture.
-            contrast: Local contrast of this frame.
-            targets: Targets of each sample's own parent, or of one for all.
-            gauss_newton: Leave out the curvature of the picture, of rho and of the projection, so
-                that no Hessian has a negative eigenvalue.
+        That leaves out the curvature of the picture, of rho and of the projection, so that it has
+        no negative eigenvalue. See `value` for the arguments.
         """
-        model = camera.project_with_derivatives(points_world)
+        model = camera.project_with_derivatives(nodes.points)
         look = contrast.sample(model.uv)
-        error = look.value - targets.level
-        rho, first, second = self.potential(error.square())
-        facing = front_facing(points_world, normals_world, camera.centre_world)
-        weight = targets.weight * facing
-        bend = first if gauss_newton else first + 2 * second * error.square()
-        slope = look.gradient
-        hessian = (weight * bend)[..., None, None] * slope[..., :, None] * slope[..., None, :]
-        if not gauss_newton:
-            hessian = hessian + (weight * first * error)[..., None, None] * look.hessian
-        return camera.pull_back(
-            model,
-            self._compose(rho, facing, targets),
-            (weight * first * error)[..., None] * slope,
-            hessian,
-            gauss_newton=gauss_newton,
-        )
+        error, slope = look.value - targets.level, look.gradient
+        rho, first, _ = self.potential(error.square())
+        weight = targets.weight * nodes.exists
+        hessian = (weight * first)[..., None, None] * slope[..., :, None] * slope[..., None, :]
+        gradient = (weight * first * error)[..., None] * slope
+        value = self._composed(rho, nodes, targets)
+        return camera.pull_back(model, value, gradient, hessian, gauss_newton=True)
 
-    def _compose(
-        self, rho: Tensor, facing: Tensor, targets: SurfaceTargets
+    def _composed(
+        self, rho: Tensor, nodes: SeenNodes, targets: SurfaceTargets
     ) -> Float[Tensor, "*batch p"]:
         back_facing = self.fitted_level * self.nu
-        return targets.weight * (facing * 0.5 * rho + (1 - facing) * back_facing)
+        return targets.weight * (nodes.exists * 0.5 * rho + (1 - nodes.exists) * back_facing)

@@ -207,16 +207,19 @@ class ContourPredictor(nn.Module):
         turn = rotation.transpose(-1, -2)
         points = (points @ turn + centre[..., None, :]).flatten(-3, -2)
         normals = (normals @ turn).flatten(-3, -2)
+        exists, rays = exists.flatten(-2), points - centre_world
+        # Past the others to the nodes; and past the neighbours beside them and on behind them.
+        reach = _BEHIND * body.part_shape.float()[:, :2].mean(-1)
         visible, free = line_of_sight(
-            body,
+            body.part_shape,
             rotation,
             eye,
-            points - centre_world,
-            other=self.other,
-            beside=Beside(self.touching, self.clearance * normals),
-            wanted=(exists := exists.flatten(-2)),
+            torch.cat([rays, rays + self.clearance * normals], dim=-2),
+            torch.cat([self.other, self.touching]) > 0,
+            behind=torch.outer(torch.arange(2).to(reach).repeat_interleave(self.num_nodes), reach),
+            wanted=torch.cat([exists, exists], dim=-1),
             ramp=self.ramp,
-        )
+        ).chunk(2, dim=-1)
         return SeenNodes(points, normals, exists * free, visible)
 
 
@@ -270,8 +273,25 @@ def visible_nodes(
     rotation, centre = body.part_poses(pose)
     centre_world = centre_world.to(centre)
     eye = ((centre_world - centre)[..., None, :] @ rotation)[..., 0, :]
-    other = 1 - torch.eye(body.num_parts, device=points.device)[node_part]
-    return line_of_sight(body, rotation, eye, points - centre_world, other=other, wanted=wanted)[0]
+    other = ~torch.eye(body.num_parts, dtype=torch.bool, device=points.device)[node_part]
+    rays = points - centre_world
+    return line_of_sight(body.part_shape, rotation, eye, rays, other, wanted=wanted)
+
+
+def facing_nodes(
+    points: Float[Tensor, "*batch p 3"],
+    normals: Float[Tensor, "*batch p 3"],
+    centre_world: Float[Tensor, "3"],
+) -> SeenNodes:
+    """Surface nodes with which of them face the camera, as if nothing were in front of them.
+
+    Args:
+        points: Nodes, world frame, metres.
+        normals: Their unit outward normals.
+        centre_world: The camera's centre, metres.
+    """
+    facing = front_facing(points, normals, centre_world)
+    return SeenNodes(points, normals, facing, torch.ones_like(facing))
 
 
 def seen_nodes(
@@ -282,7 +302,7 @@ def seen_nodes(
     normals: Float[Tensor, "*batch p 3"],
     node_part: Int[Tensor, " p"],
 ) -> SeenNodes:
-    """Surface nodes with which of them face the camera, and which of these no other part hides.
+    """The same with which of them no other part hides.
 
     Args:
         body: The body.
@@ -292,64 +312,74 @@ def seen_nodes(
         normals: Their unit outward normals.
         node_part: The part of each node.
     """
-    facing = front_facing(points, normals, centre_world)
-    visible = visible_nodes(body, pose, centre_world, points, node_part, wanted=facing)
-    return SeenNodes(points, normals, facing, visible)
-
-
-class Beside(NamedTuple):
-    """Where neighbouring parts are looked for, beside the points.
-
-    Attributes:
-        touching: 1 where a part is a neighbour of the point's own.
-        outward: How far beside the points, metres.
-    """
-
-    touching: Float[Tensor, "p parts"]
-    outward: Float[Tensor, "*batch p 3"]
+    nodes = facing_nodes(points, normals, centre_world)
+    wanted = nodes.exists
+    visible = visible_nodes(body, pose, centre_world, points, node_part, wanted=wanted)
+    return nodes._replace(visible=visible)
 
 
 def line_of_sight(
-    body: BodyModel,
+    shape: Float[Tensor, "parts 9"],
     rotation: Float[Tensor, "*batch parts 3 3"],
     eye: Float[Tensor, "*batch parts 3"],
     rays: Float[Tensor, "*batch p 3"],
+    others: Bool[Tensor, "p parts"],
     *,
-    other: Float[Tensor, "p parts"],
-    beside: Beside | None = None,
+    behind: Float[Tensor, "p parts"] | None = None,
     wanted: Float[Tensor, "*batch p"] | None = None,
     ramp: float = 0.010,
-) -> tuple[Float[Tensor, "*batch p"], Float[Tensor, "*batch p"]]:
-    """Visibility of points past all parts, and whether neighbouring parts leave them free.
+) -> Float[Tensor, "*batch p"]:
+    """Visibility of points past parts: 1 where nothing is in front, 0 where a part is.
 
     Single precision inside, whatever the type of the inputs.
 
     Args:
-        body: The body.
+        shape: The parts' shape numbers.
         rotation: World orientations of the parts.
         eye: The camera's centre in the frames of the parts, metres.
         rays: From the camera's centre to the points, world axes, metres.
-        other: 0 where a part cannot hide a point (its own), else 1.
-        beside: Where neighbouring parts are looked for; None: nowhere.
+        others: Which parts can hide a point.
+        behind: How far behind the points a part still hides them, metres; None: not at all.
         wanted: 0 where a point is not looked at, as nothing depends on it, and gets 1.
         ramp: Width of the transition between visible and hidden, metres.
-
-    Returns:
-        1 where nothing is in front of the point, 0 where a part is; and 1 where no neighbouring
-        part is in front or close behind.
     """
-    others, behind = other > 0, torch.zeros_like(other, dtype=torch.float32)
-    num_nodes = rays.shape[-2]
-    parts = _tabulate(body.part_shape.float(), ramp)
-    if beside is not None:
-        rays = torch.cat([rays, rays + beside.outward], dim=-2)
-        others = torch.cat([others, beside.touching > 0])
-        behind = torch.cat([behind, (_BEHIND * parts.thickness).expand_as(behind)])
-        wanted = None if wanted is None else torch.cat([wanted, wanted], dim=-1)
-    gaps = _sight_gaps(parts, rotation, eye, rays, others, behind, wanted)
-    passed = (0.5 + gaps / ramp).clamp(0, 1)
-    visible, free = passed[..., :num_nodes].to(eye), passed[..., num_nodes:].to(eye)
-    return visible, torch.ones_like(visible) if beside is None else free
+    if others.numel() == 0:
+        return eye.new_ones(rays.shape[:-1])
+    parts = _tabulate(shape.float(), ramp)
+    views = _Views.of(rotation, eye, rays)
+    if wanted is not None:  # what is not wanted ends before it begins
+        wanted = wanted.reshape(views.length.shape)
+        views = views._replace(length=torch.where(wanted > 0, views.length, -torch.inf))
+    behind = torch.zeros_like(others, dtype=torch.float32) if behind is None else behind
+    gaps = _sight_gaps(parts, views, others.T, behind.float().T.contiguous())
+    return (0.5 + gaps.reshape(rays.shape[:-1]) / ramp).clamp(0, 1).to(eye)
+
+
+class _Views(NamedTuple):
+    """Lines of sight of poses, nodes along the last axis in memory: long rows to work on.
+
+    Attributes:
+        frames: World axes in the frame of each part, one after the other, then the camera's centre.
+        centre: Centre of each part from the camera's, world axes, metres.
+        direction: Unit directions of the lines, world axes.
+        length: Distance of the nodes, metres.
+    """
+
+    frames: Float[Tensor, "b parts 12"]
+    centre: Float[Tensor, "b parts 3"]
+    direction: Float[Tensor, "b 3 p"]
+    length: Float[Tensor, "b p"]
+
+    @classmethod
+    def of(cls, rotation: Tensor, eye: Tensor, rays: Tensor) -> _Views:
+        """From the parts' orientations, the camera in their frames, and rays to the nodes."""
+        rotation = rotation.float().reshape(-1, *rotation.shape[-3:])
+        eye = eye.float().clamp(-_FAR, _FAR).reshape(rotation.shape[:-1])
+        centre = -(rotation @ eye[..., None])[..., 0]
+        frames = torch.cat([rotation.flatten(-2), eye], dim=-1)
+        rays = rays.float().clamp(-_FAR, _FAR).reshape(-1, *rays.shape[-2:]).mT.contiguous()
+        length = rays.square().sum(1).sqrt()
+        return cls(frames, centre, rays / length.clamp(min=_TINY)[:, None], length)
 
 
 class _Parts(NamedTuple):
@@ -360,7 +390,6 @@ class _Parts(NamedTuple):
         radius: Of the sphere outside which a part hides nothing, metres.
         around: Reciprocal semi-axes of an ellipsoid outside which a part hides nothing.
         within: Squared radius, of a plain part's own ellipsoid, at which it hides for sure.
-        thickness: Mean radius of the middle cross-section, metres.
         plain: Whether a part is round, straight and little tapered: a line of sight then has one
             nearest point, which a few steps find.
         bent: Whether any part is bent.
@@ -370,7 +399,6 @@ class _Parts(NamedTuple):
     radius: Float[Tensor, " parts"]
     around: Float[Tensor, "3 parts"]
     within: Float[Tensor, " parts"]
-    thickness: Float[Tensor, " parts"]
     plain: Bool[Tensor, " parts"]
     bent: bool
 
@@ -398,15 +426,7 @@ def _tabulate(shape: Float[Tensor, "parts 9"], margin: float) -> _Parts:
     around = torch.where(is_bent[:, None], radius[:, None], around)
     narrowest = torch.cat([axes[:, :2] * (1 - taper.abs()), axes[:, 2:]], dim=-1).amin(-1)
     within = (1 / smaller - margin / narrowest).clamp(min=0).square()
-    return _Parts(
-        torch.stack(rows),
-        radius,
-        1 / around.mT,
-        within,
-        axes[:, :2].mean(-1),
-        plain,
-        bool(is_bent.any()),
-    )
+    return _Parts(torch.stack(rows), radius, 1 / around.mT, within, plain, bool(is_bent.any()))
 
 
 def _farthest(a: Tensor, b: Tensor, exponent: Tensor) -> Tensor:
@@ -417,66 +437,41 @@ def _farthest(a: Tensor, b: Tensor, exponent: Tensor) -> Tensor:
 
 
 def _sight_gaps(
-    parts: _Parts,
-    rotation: Float[Tensor, "*batch parts 3 3"],
-    eye: Float[Tensor, "*batch parts 3"],
-    rays: Float[Tensor, "*batch p 3"],
-    others: Bool[Tensor, "p parts"],
-    behind: Float[Tensor, "p parts"],
-    wanted: Float[Tensor, "*batch p"] | None,
-) -> Float[Tensor, "*batch p"]:
+    parts: _Parts, views: _Views, others: Bool[Tensor, "parts p"], behind: Float[Tensor, "parts p"]
+) -> Float[Tensor, "b p"]:
     """Signed distance of each line of sight to the nearest of the others, metres.
 
     It is as it is within half a ramp of zero, and infinite where it is larger for sure, of either
     sign. A line counts from the camera to `behind` the ray's end.
     """
-    (nodes, num_parts), batch = others.shape, rays.shape[:-1]
-    if others.numel() == 0:
-        return eye.new_full(batch, torch.inf)
-    rotation = rotation.float().reshape(-1, num_parts, 3, 3)
-    eye = eye.float().clamp(-_FAR, _FAR).reshape(-1, num_parts, 3)
-    centre = -(rotation @ eye[..., None])[..., 0]
-    # World axes in the part's frame, one after the other, then the camera's centre.
-    frames = torch.cat([rotation.flatten(-2), eye], dim=-1)
-    # Nodes along the last axis in memory: the rows that the work below is done on are long.
-    rays = rays.float().clamp(-_FAR, _FAR).reshape(-1, nodes, 3).mT.contiguous()
-    length = rays.square().sum(1).sqrt()
-    direction = rays / length.clamp(min=_TINY)[:, None]
-    if wanted is not None:  # what is not wanted ends before it begins
-        length = torch.where(wanted.reshape(-1, nodes) > 0, length, -torch.inf)
-    others, behind = others.T, behind.T.contiguous()
-    gap = torch.full_like(length, torch.inf)
-    at_once = _PAIRS_AT_ONCE if rays.device.type == "cpu" else 2**6 * _PAIRS_AT_ONCE
+    gap = torch.full_like(views.length, torch.inf)
+    at_once = _PAIRS_AT_ONCE if gap.device.type == "cpu" else 2**6 * _PAIRS_AT_ONCE
     poses = max(1, at_once // others.numel())
     for plain in (True, False):
         candidates = others & (parts.plain == plain)[:, None]
         if not bool(candidates.any()):
             continue
         reach = torch.where(candidates, parts.radius[:, None] + behind, -torch.inf)
-        for first in range(0, len(rays), poses):
+        for first in range(0, len(gap), poses):
             chunk = slice(first, first + poses)
-            lines = direction[chunk], length[chunk]
-            near = places(_is_near(parts, centre[chunk], *lines, reach))
-            if not len(near):
-                continue
-            found = _least_gap(parts, frames[chunk], *lines, near, behind, plain=plain)
-            gap[chunk] = torch.minimum(gap[chunk], found)
-    return gap.reshape(batch)
+            some = _Views(*(part[chunk] for part in views))
+            near = places(_is_near(parts, some, reach))
+            if len(near):
+                lines = _stretches(parts, some, near, behind)
+                least = _least_gap(parts, lines, gap[chunk].numel(), plain=plain)
+                gap[chunk] = torch.minimum(gap[chunk], least.view_as(gap[chunk]))
+    return gap
 
 
 def _is_near(
-    parts: _Parts,
-    centre: Float[Tensor, "b parts 3"],
-    direction: Float[Tensor, "b 3 p"],
-    length: Float[Tensor, "b p"],
-    reach: Float[Tensor, "parts p"],
+    parts: _Parts, views: _Views, reach: Float[Tensor, "parts p"]
 ) -> Bool[Tensor, "b parts p"]:
     """Which rays meet a part's sphere before their end."""
-    depth = centre @ direction
+    depth = views.centre @ views.direction
     # Beyond the length of a tangent to the sphere; any ray where the camera is inside it.
-    tangent = (1 - _ROUNDING) * centre.square().sum(-1) - parts.radius.square()
+    tangent = (1 - _ROUNDING) * views.centre.square().sum(-1) - parts.radius.square()
     tangent = torch.where(tangent > 0, tangent.clamp(min=0).sqrt(), -torch.inf)
-    return (depth > tangent[:, :, None]) & (depth < length[:, None] + reach)
+    return (depth > tangent[:, :, None]) & (depth < views.length[:, None] + reach)
 
 
 _Triple = tuple[Tensor, Tensor, Tensor]
@@ -517,21 +512,11 @@ class _Stretches(NamedTuple):
         return torch.minimum(torch.maximum(s, self.begin), self.end)
 
 
-def _least_gap(
-    parts: _Parts,
-    frames: Float[Tensor, "b parts 12"],
-    direction: Float[Tensor, "b 3 p"],
-    length: Float[Tensor, "b p"],
-    near: Int[Tensor, " m"],
-    behind: Float[Tensor, "parts p"],
-    *,
-    plain: bool,
-) -> Float[Tensor, "b p"]:
-    """Signed distance of each line of sight to the nearest of the parts paired with it, metres."""
-    lines = _stretches(parts, frames, direction, length, near, behind)
+def _least_gap(parts: _Parts, lines: _Stretches, count: int, *, plain: bool) -> Float[Tensor, " r"]:
+    """Signed distance of so many lines of sight to the nearest part of their stretches, metres."""
     # A stretch is empty where the part is behind the node or the camera.
     lines = lines.take(places((lines.begin <= lines.end) & _is_close(parts, lines)))
-    least = torch.full_like(length, torch.inf).flatten()
+    least = torch.full((count,), torch.inf, device=lines.end.device)
     if plain:
         s, curvature, square = _ellipsoid_minimum(parts.shapes(lines.part), lines)
         hidden = places(square < parts.within.index_select(0, lines.part))
@@ -542,16 +527,11 @@ def _least_gap(
     else:
         lines, s, curvature = _sampled_minima(parts, lines)
         gap = _gap(parts, lines, s, curvature, steps=_SAMPLED_STEPS, bent=parts.bent).amin(0)
-    return least.scatter_reduce(0, lines.ray, gap, "amin").view(length.shape)
+    return least.scatter_reduce(0, lines.ray, gap, "amin")
 
 
 def _stretches(
-    parts: _Parts,
-    frames: Float[Tensor, "b parts 12"],
-    direction: Float[Tensor, "b 3 p"],
-    length: Float[Tensor, "b p"],
-    near: Int[Tensor, " m"],
-    behind: Float[Tensor, "parts p"],
+    parts: _Parts, views: _Views, near: Int[Tensor, " m"], behind: Float[Tensor, "parts p"]
 ) -> _Stretches:
     """Lines of sight in the frames of parts, from the camera to `behind` the rays' ends."""
     num_parts, nodes = behind.shape
@@ -559,8 +539,8 @@ def _stretches(
     pose = owner // num_parts
     node, part = near - owner * nodes, owner - pose * num_parts
     ray = pose * nodes + node
-    u, v, w = (a.flatten().index_select(0, ray) for a in direction.unbind(1))
-    frame = frames.flatten(0, 1).T.index_select(1, owner)
+    u, v, w = (a.flatten().index_select(0, ray) for a in views.direction.unbind(1))
+    frame = views.frames.flatten(0, 1).T.index_select(1, owner)
     ux, uy, uz, vx, vy, vz, wx, wy, wz, ox, oy, oz = frame.unbind(0)
     x, y, z = (u * a + v * b + w * c for a, b, c in ((ux, vx, wx), (uy, vy, wy), (uz, vz, wz)))
     # Measured from the foot of the perpendicular from the part's centre, for precision.
@@ -568,7 +548,7 @@ def _stretches(
     foot = (ox - start * x, oy - start * y, oz - start * z)
     half = parts.radius.square().index_select(0, part) - sum(a.square() for a in foot)
     half = half.clamp(min=0).sqrt()
-    stop = start + length.flatten().index_select(0, ray)
+    stop = start + views.length.flatten().index_select(0, ray)
     stop = stop + behind.flatten().index_select(0, part * nodes + node)
     return _Stretches(
         ray, part, foot, (x, y, z), torch.maximum(start, -half), torch.minimum(stop, half)

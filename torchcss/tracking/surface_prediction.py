@@ -33,7 +33,7 @@ from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.root import ROOT_NAMES, has_root
 from torchcss.cost.interior import InteriorNodes
 from torchcss.cost.surface import SurfaceTargets, SurfaceTerm, surface_targets
-from torchcss.cost.visibility import visible_nodes
+from torchcss.cost.visibility import facing_nodes, seen_nodes
 from torchcss.inference.dynamics import Dynamics
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.trust_region import TrustRegionNewton
@@ -174,9 +174,8 @@ class SurfaceMotion:
         for camera, last, now in pairs:
             if last is None or now is None:
                 continue
-            visible = visible_nodes(body, pose, camera.centre_world, points, part)
-            targets = surface_targets(points, normals, visible, camera, last)
-            views.append(SurfaceView(camera, now, targets))
+            nodes = seen_nodes(body, pose, camera.centre_world, points, normals, part)
+            views.append(SurfaceView(camera, now, surface_targets(nodes, camera, last)))
         return tuple(views)
 
 
@@ -231,8 +230,9 @@ class SurfaceCost:
         points, normals = self._surface(self.body.pose(self._whole(x)))
         total = 0.5 * ((x - self.expected) / self.deviation).square().sum(-1)
         for camera, contrast, targets in self.views:
-            nodes = self.term.value(points, normals, camera, contrast, targets)
-            total = total + (_share(targets) * nodes).sum(-1)
+            nodes = facing_nodes(points, normals, camera.centre_world)
+            cost = self.term.value(nodes, camera, contrast, targets)
+            total = total + (_share(targets) * cost).sum(-1)
         return total
 
     def local_model(self, x: Float[Tensor, "b m"]) -> LocalModel:
@@ -241,7 +241,8 @@ class SurfaceCost:
         points, normals = self._surface(pose)
         value, gradient, hessian = points.new_zeros(()), points.new_zeros(()), points.new_zeros(())
         for view in self.views:
-            cost = self.term.point_cost(points, normals, *view, gauss_newton=True)
+            nodes = facing_nodes(points, normals, view.camera.centre_world)
+            cost = self.term.point_cost(nodes, *view)
             share = _share(view.targets)
             value = value + share * cost.value
             gradient = gradient + share[..., None] * cost.gradient
