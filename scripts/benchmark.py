@@ -39,7 +39,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from common import start, write_report
+from common import Table, start, write_report
 from peers.autograd_cost import autograd_model, made_up_costs, made_up_frames
 from torch import Tensor
 
@@ -178,8 +178,20 @@ def main(config: Config) -> dict[str, Any]:
     report = {"metrics": metrics, "unit": dict(zip(metrics, units, strict=True)), "config": config}
     report |= {"threads": torch.get_num_threads(), "torch": torch.__version__}
     print_table(report)
-    write_report(config.out, report)
+    write_report(config.out, report, table_of(report))
     return report
+
+
+def table_of(report: dict[str, Any]) -> Table:
+    """The report for the page of results."""
+    rows = []
+    for name, times in report["metrics"]["seconds"].items():
+        peak, added = report["metrics"]["memory"][name].values()
+        rows.append([name, *(1e3 * value for value in times.values()), peak, added])
+    columns = ("evaluation", *(f"ms, {name}" for name in QUARTILES), "peak MiB", "added MiB")
+    config = report["config"]
+    title = f"Evaluations of the cost, {config.samples} samples, {config.dtype}"
+    return Table(f"{title}, {report['threads']} threads", columns, rows)
 
 
 def print_table(report: dict[str, Any]) -> None:

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from common import start, write_report
+from common import Table, start, write_report
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
@@ -73,6 +73,8 @@ class Config:
     """One frame of the arm, few samples: for tests."""
     out: Path | None = None
     """Folder for cost_minima.json and the figures."""
+    report: Path | None = None
+    """Where else to write the JSON file, such as docs/results/cost_minima.json."""
 
 
 class Curve(NamedTuple):
@@ -98,9 +100,11 @@ def main(config: Config) -> dict[str, Any]:
     rows = [row_of(key, curves) for key in sorted(curves, key=lambda key: key[:2])]
     report = {"settings": config, "least_prominences": LEAST, "rows": rows}
     print_table(rows)
+    table = table_of(rows)
     if config.out is not None:
         draw_counts(rows, config.out)
-        write_report(config.out / "cost_minima.json", report)
+        write_report(config.out / "cost_minima.json", report, table)
+    write_report(config.report, report, table)
     return report
 
 
@@ -172,6 +176,22 @@ def row_of(key: tuple[str, str, str, float], curves: Curves) -> dict[str, Any]:
         "misleading": np.mean([abs(curve.lowest_at) > MISLEADING for curve in found]),
         "num_slices": len(found),
     }
+
+
+def table_of(rows: list[dict[str, Any]]) -> Table:
+    """The rows for the page of results."""
+    cells = [
+        [
+            f"{row['body']}, {row['terms']}, {row['potential']}, k = {row['k']:g}",
+            *(row["spurious"][LEAST.index(least)] for least in STATED),
+            row["fewer"],
+            100 * row["misleading"],
+        ]
+        for row in rows
+    ]
+    counts = (f"minima of {100 * least:g} %" for least in STATED)
+    columns = ("cost", *counts, "fewer than first", "misleading %")
+    return Table("Spurious minima of the contour term", columns, cells)
 
 
 def print_table(rows: list[dict[str, Any]]) -> None:

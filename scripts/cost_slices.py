@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from common import start, write_report
+from common import Table, start, write_report
 from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 
@@ -75,6 +75,8 @@ class Config:
     """The arm alone, few lines and samples: for tests."""
     out: Path | None = None
     """Folder for cost_slices.json and the figures."""
+    report: Path | None = None
+    """Where else to write the JSON file, such as docs/results/cost_slices.json."""
 
 
 def main(config: Config) -> dict[str, Any]:
@@ -90,8 +92,10 @@ def main(config: Config) -> dict[str, Any]:
         print_table(scene.name, table, rows)
         report["frames"][scene.name] = {"table": table, "slices": rows}
         report["frames"][scene.name]["displaced_minimum"] = displaced_minimum(scene, config)
+    table = table_of(report["frames"])
     if config.out is not None:
-        write_report(config.out / "cost_slices.json", report)
+        write_report(config.out / "cost_slices.json", report, table)
+    write_report(config.report, report, table)
     return report
 
 
@@ -144,6 +148,22 @@ def summarise(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
                 entry[key], entry[f"{key}_on"] = max((report[key], line) for report, line in found)
             table.append(entry)
     return table
+
+
+def table_of(frames: dict[str, Any]) -> Table:
+    """The counts of all frames for the page of results."""
+    cells = [
+        [
+            f"{name}, {entry['term']}, {entry['scale']}",
+            entry["num_minima_raw"],
+            entry["num_minima"],
+            *(100 * entry[key] for key in ("largest_jump", "discontinuity")),
+        ]
+        for name, frame in frames.items()
+        for entry in frame["table"]
+    ]
+    columns = ("frame, term, slices", "all minima", "counted", "largest jump %", "bisected %")
+    return Table("Minima and jumps of the cost along lines", columns, cells)
 
 
 def print_table(name: str, table: list[dict[str, Any]], rows: list[dict[str, Any]]) -> None:

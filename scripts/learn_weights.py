@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from common import start, write_report
+from common import Table, start, write_report
 from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
@@ -149,7 +149,13 @@ def main(config: Config) -> dict[str, Any]:
         for when, factors in (("before", before), ("after", weights.factors())):
             report[f"track_{when}_mm"] = tracked_error(test, settings, factors)
     print_report(report)
-    write_report(config.out, report)
+    rows = [
+        [when, *report[f"weights_{when}"].values(), report[f"test_{when}_mm"],
+         report.get(f"track_{when}_mm")]
+        for when in ("before", "after")
+    ]  # fmt: skip
+    columns = ("weights", *config.learnt, "minimum mm", "track mm")
+    write_report(config.out, report, Table("Weights learnt from true states", columns, rows))
     return report
 
 

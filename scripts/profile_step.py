@@ -41,7 +41,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from common import start, write_report
+from common import Table, start, write_report
 from matplotlib.figure import Figure
 from peers.tracker_step import Step, Work, compile_step, make_frames, profiled, tracker_step
 
@@ -182,7 +182,18 @@ def main(config: Config) -> dict[str, Any]:
     report = {"rows": rows, "config": config, "torch": torch.__version__}
     if config.folder is not None:
         picture(rows).savefig(config.folder / "profile.png", dpi=100)
-    write_report(config.out, report)
+    cells = [
+        [
+            f"{row['body']}, {row['samples']} samples",
+            *(1e6 * row[name]["seconds"]["median"] for name in ("eager", "compiled")),
+            row["speed_up"]["median"],
+            *(row[name]["memory_mib"] for name in ("eager", "compiled")),
+        ]
+        for row in rows
+    ]
+    columns = ("body", "eager", "compiled", "speed-up", "MiB eager", "MiB compiled")
+    title = "A step eager and compiled, microseconds per sample and iteration"
+    write_report(config.out, report, Table(title, columns, cells))
     return report
 
 

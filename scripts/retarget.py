@@ -30,7 +30,7 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 import tyro
-from common import start, write_report
+from common import Table, start, write_report
 from matplotlib.figure import Figure
 
 from torchcss.errors import ConfigurationError
@@ -93,7 +93,9 @@ def main(config: Config) -> dict[str, Any]:
     write_motion(config.out, config, result)
     if config.reference is not None:
         write_reference(config.reference, config, result)
-    write_report(config.report, report)
+    cells = [[name, *row.values()] for name, row in report["error_mm"].items()]
+    title = f"Retargeting {config.file.name} onto {config.body}, millimetres"
+    write_report(config.report, report, Table(title, ("joint", "mean", "95 %", "worst"), cells))
     if config.picture is not None:
         with replace_file(config.picture) as partial:
             picture(motion, result).savefig(partial, dpi=80)

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from common import start, write_report
+from common import Table, start, write_report
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
@@ -59,6 +59,8 @@ class Config:
     """Points of the picture along each side."""
     out: Path | None = None
     """Folder for the figure and the table."""
+    report: Path | None = None
+    """Where else to write the JSON file, such as docs/results/sampler_slices.json."""
 
 
 @dataclass(frozen=True)
@@ -162,10 +164,17 @@ def main(config: Config) -> dict[str, Any]:
         print(f"{name:14}{row['median_cost']:14.4g}{row['share_low']:18.2f}"
               f"{row['share_elsewhere']:16.2f}{len(kept):8d}")  # fmt: skip
     report = {"config": config, "noise": noise, "methods": {k: run[0] for k, run in runs.items()}}
+    cells = [
+        [name, row["median_cost"], 100 * row["share_low"], 100 * row["share_elsewhere"], len(kept)]
+        for name, (row, _, _, kept) in runs.items()
+    ]
+    columns = ("sampler", "median cost", "within 100 nats %", "end elsewhere %", "minima")
+    table = Table("Samplers on a slice through a cost", columns, cells)
     if config.out is not None:
         folder = prepare_output_folder(config.out)
         picture(config, plane, own, noise, runs).savefig(folder / "fig8d.png", dpi=90)
-        write_report(folder / "sampler_slices.json", report)
+        write_report(folder / "sampler_slices.json", report, table)
+    write_report(config.report, report, table)
     return report
 
 

@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from common import start, write_report
+from common import Table, start, write_report
 from torch import Tensor
 
 from torchcss.body.model import BodyModel
@@ -76,6 +76,8 @@ class Config:
     """How to track; body and seeds are those above."""
     out: Path = Path("out/robot")
     """Folder of the results."""
+    report: Path | None = None
+    """Where else to write the JSON file, such as docs/results/robots.json."""
 
 
 def run_seed(config: Config, path: Path, link: str, middle: Tensor | None, seed: int) -> dict:
@@ -152,7 +154,16 @@ def main(config: Config) -> dict[str, Any]:
     pose = None if middle is None else torch.tensor(middle, dtype=torch.float64)
     rows = [run_seed(config, path, link, pose, seed) for seed in config.seeds]
     report = {"runs": rows, "config": config}
-    write_report(config.out / "summary.json", report)
+    parts = ("links_mm", "end_effector_mm", "end_effector_degrees", "joint_degrees")
+    cells = [
+        [f"{path.stem}, seed {row['seed']}, {mode} mode", *(row[mode][part] for part in parts)]
+        for row in rows
+        for mode in ("best", "nearest")
+    ]
+    columns = ("robot", "links mm", "tip mm", "tip degrees", "joints degrees")
+    table = Table("Robot arms", columns, cells)
+    write_report(config.out / "summary.json", report, table)
+    write_report(config.report, report, table)
     print_table(rows)
     return report
 
