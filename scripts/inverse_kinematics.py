@@ -44,10 +44,10 @@ from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.solve.inverse_kinematics import (
     Search,
     Solutions,
-    covered,
     inverse_kinematics,
     link_pose,
 )
+from torchcss.solve.self_motion import Curve, distance_from
 from torchcss.types import Bounds
 
 CASES: dict[str, tuple[str, str, str | None]] = {
@@ -236,6 +236,18 @@ def states_per_round(config: Config, problem: Problem, seed: int) -> int:
     """Exact states that one round of uniform descents of ours gives."""
     one = Config(data=config.data, restarts=config.search.num_samples, seed=seed)
     return len(restart(one, problem))
+
+
+def covered(solutions: Solutions, x: Tensor, distance: float) -> Tensor:
+    """Which states lie, to a distance in radians, on isolated solutions or curves that were found.
+
+    Joints without limits are between minus and plus half a turn, as in `solutions`.
+    """
+    near = torch.full_like(x[:, 0], torch.inf)
+    for branch, closed in enumerate(solutions.closed.tolist()):
+        curve = Curve(solutions.x[solutions.branch == branch], closed)
+        near = torch.minimum(near, distance_from(curve, x))
+    return near <= distance
 
 
 def run_pose(config: Config, case: str, number: int) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from torchcss.body.catalog import LENGTHS
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel, differentiate_twice
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
-from torchcss.cost.stabiliser import Stabiliser
+from torchcss.cost.targets import PointDistances
 from torchcss.errors import ConfigurationError, MotionCaptureError
 from torchcss.io.motion.positions import (
     LIMBS,
@@ -24,8 +24,6 @@ from torchcss.io.motion.positions import (
     resample,
 )
 from torchcss.solve.retarget import (
-    PointDistances,
-    Points,
     Retargeting,
     collision_depth,
     fit_lengths,
@@ -238,13 +236,10 @@ def test_derivatives_against_autograd(subject: BodyModel, generator: torch.Gener
     target = torch.randn(3, count, 3, generator=generator, dtype=torch.float64)
     cost = PointDistances(
         body=subject,
-        points=Points(
-            subject.marker_link[[subject.joint_index(name) for name in LIMBS]],
-            0.1 * torch.randn(count, 3, generator=generator, dtype=torch.float64),
-            target,
-            torch.linspace(0.1, 0.2, count, dtype=torch.float64),
-        ),
-        stabiliser=Stabiliser(),
+        link=subject.marker_link[[subject.joint_index(name) for name in LIMBS]],
+        offset=0.1 * torch.randn(count, 3, generator=generator, dtype=torch.float64),
+        target=target,
+        sigma=torch.linspace(0.1, 0.2, count, dtype=torch.float64),
     )
     model = cost.local_model(states)
     x = states.clone().requires_grad_()

@@ -7,12 +7,13 @@ For points p that are fixed in links, with known places t,
 in nats. With markers or triangulated joints this is an observation; with four points around the
 origin of one link it is zero exactly where that link has a given position and orientation, which is
 what inverse kinematics asks for (`pose_targets`, `torchcss.inverse_kinematics`). Value, gradient
-and exact Hessian are in closed form (`torchcss.body.lift`).
+and exact Hessian are in closed form (`torchcss.body.lift`). `PointDistances` is the sum for targets
+that differ from item to item, with the priors of a body.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -21,6 +22,8 @@ from torch import Tensor
 from torchcss.body.kinematics import TreePose
 from torchcss.body.lift import lift_to_joints
 from torchcss.body.model import BodyModel
+from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
+from torchcss.cost.stabiliser import Stabiliser
 from torchcss.errors import ShapeError, check_shape
 from torchcss.types import LocalModel, PointCost
 
@@ -133,6 +136,56 @@ class PointTargets:
             (slope @ tie).reshape(*batch, m),
             (tie.T @ curvature @ tie).reshape(*batch, m, m),
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointDistances:
+    """Squared distances from places of their own in every item, and priors; a `CostFunction`.
+
+    Attributes:
+        body: The body.
+        link: The link that carries each point.
+        offset: Its place in that link's frame, metres.
+        target: Where it should be in the world, item by item, metres.
+        sigma: Its standard deviation, metres.
+        stabiliser: The prior on what the points do not tell.
+        repulsion: Keeps parts out of each other, if `pairs` are there too.
+        pairs: Which parts may collide.
+    """
+
+    body: BodyModel
+    link: Int[Tensor, " p"]
+    offset: Float[Tensor, "p 3"]
+    target: Float[Tensor, "b p 3"]
+    sigma: Float[Tensor, " p"]
+    stabiliser: Stabiliser = field(default_factory=Stabiliser)
+    repulsion: Interpenetration | None = None
+    pairs: InterpenetrationPairs | None = None
+
+    def take(self, items: Int[Tensor, " s"]) -> PointDistances:
+        """The cost of some items."""
+        return replace(self, target=self.target[items])
+
+    def value(self, x: Float[Tensor, "b n"]) -> Float[Tensor, " b"]:
+        """Cost in nats."""
+        return self.local_model(x).value
+
+    def local_model(self, x: Float[Tensor, "b n"]) -> LocalModel:
+        """Cost, gradient and exact Hessian."""
+        body, pose = self.body, self.body.pose(x)
+        points = body.points_on_links(pose.tree, self.link, self.offset)
+        weight = self.sigma.pow(-2)
+        error = points - self.target
+        slope = weight[:, None] * error
+        hessian = (weight[:, None, None] * torch.eye(3).to(x)).expand(*error.shape, 3)
+        cost = PointCost(0.5 * weight * error.square().sum(-1), slope, hessian)
+        total = body.lift(pose, points, self.link, cost)
+        priors = [self.stabiliser.local_model(x, body.sticky_mean, body.sticky_deviation)]
+        if self.repulsion is not None and self.pairs is not None:
+            priors.append(self.repulsion.local_model(body, pose, self.pairs))
+        for prior in priors:
+            total = LocalModel(*(a + b for a, b in zip(total, prior, strict=True)))
+        return total
 
 
 def pose_targets(

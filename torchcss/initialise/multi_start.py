@@ -25,7 +25,7 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.body.catalog import PROPORTIONS
@@ -34,13 +34,13 @@ from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, has_root
 from torchcss.cost.anthropometric import proportion_columns
 from torchcss.cost.joints import JointTerm
-from torchcss.cost.stabiliser import Stabiliser
+from torchcss.cost.targets import PointDistances
 from torchcss.cost.total import TrackingCost
 from torchcss.errors import ConfigurationError
 from torchcss.inference.mixture import GaussianMixture, distinct_modes
 from torchcss.inference.proposals import CovarianceScaled
 from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.types import Bounds, LocalModel, Modes, PointCost
+from torchcss.types import Bounds, Modes
 
 _WIDE, _MIDDLE = 16.0, 4.0
 """Factors on the keypoints' scale: a random start is off by some hundred pixels, of which the
@@ -48,6 +48,9 @@ robust potential pulls those within three scales."""
 
 _SAME_TRUNK = 0.06
 """Mean distance of the trunk's joints, metres, below which two trunks count as one."""
+
+_ON_PLACE = 0.01
+"""Standard deviation of a joint's place after a flip, metres."""
 
 _SAME_ANGLE = 0.05
 """Radians within which two flips of a limb are one: limits or the sight line closed the other."""
@@ -249,7 +252,13 @@ def flips(
     shape = (len(x), *flipped.shape[:2])
     joints = body.pose(x).joints[:, None, None].expand(*shape, -1, 3)
     target = segments.flip(joints, flipped.expand(*shape, -1), cost.camera.centre_world)
-    reach = Reach(body=body, index=segments.joint, target=target.flatten(0, 2))
+    reach = PointDistances(
+        body=body,
+        link=body.marker_link[segments.joint],
+        offset=body.marker_offset[segments.joint],
+        target=target.flatten(0, 2),
+        sigma=target.new_full(target.shape[-2:-1], _ON_PLACE),
+    )
     start = x[:, None, None].expand(*shape, -1).flatten(0, 2)
     solved = TrustRegionNewton(max_steps=15, tolerance=0.1).minimise(reach, start, bounds)
     return _best_combinations(
@@ -298,44 +307,3 @@ def _best_combinations(
     for number, limb in enumerate(segments.limbs):
         poses[:, limb.columns] = x[trunk, chosen[:, number]][:, limb.columns]
     return poses
-
-
-@dataclass(frozen=True, kw_only=True)
-class Reach:
-    """Bring joints to places in 3D, and the rest near rest; a `CostFunction`.
-
-    Attributes:
-        body: The body.
-        index: Which joint centres.
-        target: Where they should be, one set for every item, metres.
-        deviation: Standard deviation of their places, metres.
-    """
-
-    body: BodyModel
-    index: Int[Tensor, " m"]
-    target: Float[Tensor, "b m 3"]
-    deviation: float = 0.01
-
-    def take(self, items: Int[Tensor, " s"]) -> Reach:
-        """The cost of some of the items."""
-        return replace(self, target=self.target[items])
-
-    def value(self, x: Float[Tensor, "b n"]) -> Float[Tensor, " b"]:
-        """Cost in nats."""
-        return self.local_model(x).value
-
-    def local_model(self, x: Float[Tensor, "b n"]) -> LocalModel:
-        """Cost, gradient and Hessian."""
-        body, precision = self.body, self.deviation**-2
-        pose = body.pose(x)
-        points = pose.joints[..., self.index, :]
-        apart = points - self.target
-        eye = precision * torch.eye(3, dtype=x.dtype, device=x.device)
-        cost = PointCost(
-            0.5 * precision * apart.square().sum(-1),
-            precision * apart,
-            eye.expand(*points.shape, 3),
-        )
-        reached = body.lift(pose, points, body.marker_link[self.index], cost)
-        near = Stabiliser().local_model(x, body.sticky_mean, body.sticky_deviation)
-        return LocalModel(*(a + b for a, b in zip(reached, near, strict=True)))

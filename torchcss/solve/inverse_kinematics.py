@@ -57,7 +57,7 @@ _SAME = 1e-3
 """Radians or metres within which two isolated solutions are one."""
 
 _PARENTS = 64
-"""Points of known curves about which a round samples, at most."""
+"""Known solutions about which a round samples, at most."""
 
 _STRIDE = 10
 """Spacings between the solutions from which curves are followed together."""
@@ -155,36 +155,20 @@ def inverse_kinematics(
     """
     search = search or Search()
     problem = _Problem.of(body, link, pose, dict(fixed or {}), search)
-    found = _Curves(problem) if problem.redundancy(generator) else _Points(problem)
+    found = _Found(problem, isolated=problem.redundancy(generator) == 0)
     quiet = rounds = descents = 0
-    parents = new = problem.lower.new_zeros(0, len(problem.lower))
+    known = new = found.points()
     while quiet < search.patience and rounds < search.max_rounds:
+        # About points evenly along all that is known.
+        parents = known[:: max(1, math.ceil(len(known) / _PARENTS))]
         starts = torch.cat([problem.samples(parents, generator), problem.turned(new)])
-        before = found.count
         new = found.add(problem.solve(starts))
-        parents = found.parents()
-        quiet = 0 if found.count > before else quiet + 1
+        known = found.points()
+        quiet = 0 if len(new) else quiet + 1
         rounds, descents = rounds + 1, descents + len(starts)
-    x, branch, closed = found.all()
-    whole = problem.states.cost.whole(x)
-    position, angle = pose_errors(body, link, pose, whole)
-    return Solutions(whole, branch, closed, position, angle, descents, rounds)
-
-
-def covered(solutions: Solutions, x: Float[Tensor, "k n"], distance: float) -> Bool[Tensor, " k"]:
-    """Which states of a body lie on the solutions found, to check a search by another one.
-
-    Args:
-        solutions: What was found.
-        x: States. Joints without limits are between minus and plus half a turn, as in `solutions`.
-        distance: From an isolated solution, or from the line through the points of a curve, at
-            which a state still counts, radians.
-    """
-    near = torch.full_like(x[:, 0], torch.inf)
-    for branch, closed in enumerate(solutions.closed.tolist()):
-        curve = Curve(solutions.x[solutions.branch == branch], closed)
-        near = torch.minimum(near, distance_from(curve, x))
-    return near <= distance
+    x = problem.states.cost.whole(problem.states.wrapped(known))
+    position, angle = pose_errors(body, link, pose, x)
+    return Solutions(x, *found.branches(), position, angle, descents, rounds)
 
 
 def link_pose(
@@ -307,59 +291,30 @@ class _Problem(NamedTuple):
         return self.states.wrapped(x[exact])
 
 
-class _Points:
-    """Isolated solutions found so far."""
+class _Found:
+    """Connected sets of solutions found so far: curves, or isolated points as curves of one point.
 
-    def __init__(self, problem: _Problem) -> None:
-        self.problem = problem
-        self.x = problem.lower.new_zeros(0, len(problem.lower))
+    Args:
+        problem: What is solved.
+        isolated: Whether all solutions are isolated.
+    """
 
-    @property
-    def count(self) -> int:
-        return len(self.x)
-
-    def add(self, x: Float[Tensor, "k m"]) -> Float[Tensor, "a m"]:
-        """Take in solutions; returns those that are new."""
-        before = len(self.x)
-        for known in self.x:
-            x = x[self.problem.states.apart(x, known).abs().amax(-1) > _SAME]
-        while len(x):
-            self.x = torch.cat([self.x, x[:1]])
-            x = x[self.problem.states.apart(x, x[0]).abs().amax(-1) > _SAME]
-        return self.x[before:]
-
-    def parents(self) -> Float[Tensor, "k m"]:
-        """About what to sample."""
-        return self.x
-
-    def all(self) -> tuple[Tensor, Tensor, Tensor]:
-        """States, their branches, and which branches are closed."""
-        branch = torch.arange(len(self.x), device=self.x.device)
-        return self.x, branch, torch.zeros_like(branch, dtype=torch.bool)
-
-
-class _Curves:
-    """Curves of solutions found so far."""
-
-    def __init__(self, problem: _Problem) -> None:
-        self.problem, self.spacing = problem, problem.search.spacing
+    def __init__(self, problem: _Problem, *, isolated: bool) -> None:
+        self.states, self.spacing, self.isolated = problem.states, problem.search.spacing, isolated
         self.curves: list[Curve] = []
 
-    @property
-    def count(self) -> int:
-        return len(self.curves)
-
     def add(self, x: Float[Tensor, "k m"]) -> Float[Tensor, "a m"]:
-        """Take in solutions; returns one of each new curve."""
+        """Take in solutions; returns one of each new set."""
         for curve in self.curves:
             x = x[~self._on(curve, x)]
         fresh = []
         while len(x):
             # Widely spaced ones first: most of them are of a few curves.
-            some = _thinned(self.problem.states, x, _STRIDE * self.spacing)
-            for start, curve in zip(
-                some, self.problem.states.follow(some, self.spacing), strict=True
-            ):
+            some = x[:1] if self.isolated else _thinned(self.states, x, _STRIDE * self.spacing)
+            curves = [Curve(some, False)]
+            if not self.isolated:
+                curves = self.states.follow(some, self.spacing)
+            for start, curve in zip(some, curves, strict=True):
                 same = (x == start).all(-1)
                 if bool(same.any()):  # else another curve of this round passes there
                     self.curves.append(curve)
@@ -368,28 +323,21 @@ class _Curves:
         return torch.stack(fresh) if fresh else x
 
     def _on(self, curve: Curve, x: Float[Tensor, "k m"]) -> Bool[Tensor, " k"]:
-        """Which states lie on a curve, to a quarter of its spacing."""
-        return distance_from(curve, x, self.problem.states.period) <= 0.25 * self.spacing
+        """Which states are one with an isolated solution, or lie on a curve."""
+        near = _SAME if self.isolated else 0.25 * self.spacing
+        return distance_from(curve, x, self.states.period) <= near
 
-    def parents(self) -> Float[Tensor, "k m"]:
-        """Points evenly along all curves."""
-        every = torch.cat(
-            [self.problem.lower.new_zeros(0, len(self.problem.lower))]
-            + [curve.x for curve in self.curves]
-        )
-        return every[:: max(1, -(-len(every) // _PARENTS))]
+    def points(self) -> Float[Tensor, "s m"]:
+        """Points along all sets, one after the other."""
+        none = self.states.period.new_zeros(0, len(self.states.period))
+        return torch.cat([none, *(curve.x for curve in self.curves)])
 
-    def all(self) -> tuple[Tensor, Tensor, Tensor]:
-        """States, their branches, and which branches are closed."""
-        device = self.problem.lower.device
+    def branches(self) -> tuple[Int[Tensor, " s"], Bool[Tensor, " c"]]:
+        """The set that each point belongs to, and which sets are closed curves."""
+        device = self.states.period.device
         sizes = torch.tensor([len(curve.x) for curve in self.curves], device=device).long()
-        x = torch.cat(
-            [self.problem.lower.new_zeros(0, len(self.problem.lower))]
-            + [curve.x for curve in self.curves]
-        )
-        branch = torch.arange(len(sizes), device=device).repeat_interleave(sizes)
         closed = torch.tensor([curve.closed for curve in self.curves], device=device).bool()
-        return self.problem.states.wrapped(x), branch, closed
+        return torch.arange(len(sizes), device=device).repeat_interleave(sizes), closed
 
 
 def _thinned(states: SolutionSet, x: Float[Tensor, "k m"], distance: float) -> Float[Tensor, "a m"]:

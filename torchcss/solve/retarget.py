@@ -32,21 +32,20 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchcss.body.catalog import BODY_NAMES, LENGTHS, PROPORTION_RANGE
+from torchcss.body.catalog import ARM_NAMES, BODY_NAMES, LENGTHS, PROPORTION_RANGE
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
-from torchcss.body.root import ROOT_NAMES, free_turns, has_root
+from torchcss.body.root import ROOT_NAMES, free_turns
 from torchcss.body.rotations import root_angles, root_rotation
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
-from torchcss.cost.stabiliser import Stabiliser
+from torchcss.cost.targets import PointDistances
 from torchcss.errors import ConfigurationError
 from torchcss.inference.smoothing import Refinement, Transition, best_path, refine
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.io.motion.positions import MotionCapture, limb_positions
-from torchcss.types import LocalModel, PointCost
 
 _STERNOCLAVICULAR = 0.03
 """Metres from the midline to where the body's shoulder width begins."""
@@ -63,6 +62,8 @@ _LEAST_PATH = 1.0
 """Metres of a path that tell the slope of its floor."""
 _LEAST_TILT, _MOST_TILT = 0.2, 4.0
 """Degrees of a floor that is not level by mistake."""
+_SLACK = 1e-6
+"""Radians or metres from a limit at which it holds an angle."""
 _DEEP = 0.01
 """Metres that a surface must be inside another part to count as a collision."""
 
@@ -129,67 +130,6 @@ class Retargeted(NamedTuple):
     report: tuple[str, ...]
 
 
-class Points(NamedTuple):
-    """Points fixed in links of a body, and where they should be.
-
-    Attributes:
-        link: The link of each.
-        offset: Its place in that link's frame, metres.
-        target: Where it should be, metres.
-        sigma: Standard deviation, metres.
-    """
-
-    link: Int[Tensor, " p"]
-    offset: Float[Tensor, "p 3"]
-    target: Float[Tensor, "b p 3"]
-    sigma: Float[Tensor, " p"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class PointDistances:
-    """Squared distances in space, a sticky prior and, perhaps, a path: a `CostFunction`.
-
-    Attributes:
-        body: The body.
-        points: What should be where, item by item.
-        stabiliser: The prior on what the points do not tell.
-        repulsion: Keeps parts out of each other, if `pairs` are there too.
-        pairs: Which parts may collide.
-    """
-
-    body: BodyModel
-    points: Points
-    stabiliser: Stabiliser
-    repulsion: Interpenetration | None = None
-    pairs: InterpenetrationPairs | None = None
-
-    def take(self, items: Int[Tensor, " b"]) -> PointDistances:
-        """The cost of some items."""
-        points = self.points._replace(target=self.points.target[items])
-        return replace(self, points=points)
-
-    def value(self, x: Float[Tensor, "b n"]) -> Float[Tensor, " b"]:
-        """Cost in nats."""
-        return self.local_model(x).value
-
-    def local_model(self, x: Float[Tensor, "b n"]) -> LocalModel:
-        """Cost, gradient and exact Hessian."""
-        body, (link, offset, target, sigma) = self.body, self.points
-        pose = body.pose(x)
-        where = body.points_on_links(pose.tree, link, offset)
-        weight = sigma.pow(-2)[:, None]
-        away = where - target
-        bowl = (weight[..., None] * torch.eye(3).to(x)).expand(*away.shape, 3)
-        cost = PointCost(0.5 * (weight * away.square()).sum(-1), weight * away, bowl)
-        total = body.lift(pose, where, link, cost)
-        prior = self.stabiliser.local_model(x, body.sticky_mean, body.sticky_deviation)
-        total = LocalModel(*(a + b for a, b in zip(total, prior, strict=True)))
-        if self.repulsion is not None and self.pairs is not None:
-            apart = self.repulsion.local_model(body, pose, self.pairs)
-            total = LocalModel(*(a + b for a, b in zip(total, apart, strict=True)))
-        return total
-
-
 def retarget(
     motion: MotionCapture,
     *,
@@ -214,46 +154,35 @@ def retarget(
     """
     choice = choice or Retargeting()
     names, index, _ = limb_positions(motion)
-    if body not in BODY_NAMES or not has_root(load_body(body)):
-        whole = [name for name in BODY_NAMES if has_root(load_body(name))]
-        raise ConfigurationError(f"body: expected one of {', '.join(whole)}, got {body!r}")
+    limb = list(index)
+    if body not in BODY_NAMES or body in ARM_NAMES:
+        whole = ", ".join(name for name in BODY_NAMES if name not in ARM_NAMES)
+        raise ConfigurationError(f"body: expected one of {whole}, got {body!r}")
     source, level = torch.from_numpy(motion.joints).clone(), []
     if centred:
-        source -= _middle_of_path(source[:, list(index)], names)
-        source, level = levelled(source, source[:, list(index)].mean(1))
-    limbs = source[:, list(index)]
-    lengths, report = fit_lengths(names, limbs, foot=_foot_length(motion, names, index))
-    report += level
+        source -= _middle_of_path(source[:, limb], names)
+        source, level = levelled(source, source[:, limb].mean(1))
+    lengths, report = fit_lengths(names, source[:, limb], foot=_foot_length(motion, names, index))
     model = load_body(body, lengths=lengths)
     others, line = _anchored(motion, model, names, index)
-    report.append(line)
-    points = _points(model, names, limbs, source, others, choice)
-    root = _root_by_trunk(names, limbs)
-    states = _fit(model, points, root, motion.frame_rate, choice, generator)
+    report += [*level, line]
+    cost = _cost(model, names, index, source, others, choice)
+    root = _root_by_trunk(names, source[:, limb])
+    states = _fit(cost, root, motion.frame_rate, choice, generator)
     model, states = _face_middle(model, states)
     if centred:
         feet = [model.joint_index(f"{side}_{end}") for side in "lr" for end in ("heel", "toe")]
         floor = model.pose(states).joints[:, feet, 1].amin(-1).quantile(_ON_FLOOR)
         drop = torch.stack([0 * floor, -floor, 0 * floor])
-        model = model.with_base(model.base_rotation, drop)
-        limbs, source = limbs + drop, source + drop
-    joints = model.pose(states).joints
-    error = (joints[:, [model.joint_index(name) for name in names]] - limbs).norm(dim=-1)
-    slack = 1e-6
-    at_limit = (states <= model.lower + slack) | (states >= model.upper - slack)
+        model, source = model.with_base(model.base_rotation, drop), source + drop
+    joints, limbs = model.pose(states).joints, source[:, limb]
+    columns = [model.joint_index(name) for name in names]
+    at_limit = (states <= model.lower + _SLACK) | (states >= model.upper - _SLACK)
     depth, pairs = collision_depth(model, states)
     report += _findings(model, states, at_limit, depth, pairs)
+    error = (joints[:, columns] - limbs).norm(dim=-1)
     return Retargeted(
-        body=model,
-        states=states,
-        joints=joints,
-        target_names=names,
-        targets=limbs,
-        source=source,
-        error=error,
-        at_limit=at_limit,
-        depth=depth,
-        report=tuple(report),
+        model, states, joints, names, limbs, source, error, at_limit, depth, tuple(report)
     )
 
 
@@ -508,42 +437,41 @@ def _meeting(parents: tuple[int, ...], one: int, other: int) -> int:
     return next((joint for joint in _above(parents, other) if joint in shared), 0)
 
 
-def _points(
+def _cost(
     body: BodyModel,
     names: tuple[str, ...],
-    limbs: Float[Tensor, "t limbs 3"],
+    index: tuple[int, ...],
     source: Float[Tensor, "t j 3"],
     others: list[_Anchored],
     choice: Retargeting,
-) -> Points:
+) -> PointDistances:
+    """Limbs and other joints where the source has them, frame by frame."""
     columns = [body.joint_index(name) for name in names]
-    extra = [other.joint for other in others]
     sigma = [choice.sigma] * len(names) + [choice.sigma_others] * len(others)
-    return Points(
-        torch.cat([body.marker_link[columns], torch.tensor([o.link for o in others]).long()]),
-        torch.cat([body.marker_offset[columns], *(other.offset[None] for other in others)]),
-        torch.cat([limbs, source[:, extra]], dim=1),
-        torch.tensor(sigma).to(limbs),
+    return PointDistances(
+        body=body,
+        link=torch.cat([body.marker_link[columns], torch.tensor([o.link for o in others]).long()]),
+        offset=torch.cat([body.marker_offset[columns], *(o.offset[None] for o in others)]),
+        target=source[:, [*index, *(other.joint for other in others)]],
+        sigma=torch.tensor(sigma).to(source),
     )
 
 
 def _fit(
-    body: BodyModel,
-    points: Points,
+    cost: PointDistances,
     root: Float[Tensor, "t 6"],
     rate: float,
     choice: Retargeting,
     generator: torch.Generator,
 ) -> Float[Tensor, "t n"]:
     """States of all frames: several descents each, the best path through them, smoothing."""
-    frames, k, n = len(root), choice.num_starts, body.num_parameters
+    body, frames, k = cost.body, len(root), choice.num_starts
     bounds = free_turns(body)
-    noise = torch.randn(k, n, generator=generator, dtype=body.dtype)
+    noise = torch.randn(k, body.num_parameters, generator=generator, dtype=body.dtype)
     noise[0] = 0.0
     spread = torch.where(body.sticky_deviation.isfinite(), body.sticky_deviation, 0.0)
-    starts = (body.sticky_mean + 0.7 * spread * noise).expand(frames, k, n).clone()
+    starts = (body.sticky_mean + 0.7 * spread * noise).expand(frames, *noise.shape).clone()
     starts[..., [body.state_index(name) for name in ROOT_NAMES]] = root[:, None]
-    cost = PointDistances(body=body, points=points, stabiliser=Stabiliser())
     every = torch.arange(frames).repeat_interleave(k)
     optimiser = TrustRegionNewton(max_steps=choice.max_steps, tolerance=1e-3)
     found = optimiser.minimise(cost.take(every), starts.flatten(0, 1), bounds)
@@ -553,20 +481,12 @@ def _fit(
     path = best_path(states, None, costs, times, Transition(velocity=speed))
     states = states[torch.arange(frames), path.mode]
     smooth = Transition(acceleration=tuple(rate / choice.settling_s for rate in speed))
-    costs = [cost]
-    if choice.repulsion is not None:
-        pairs = InterpenetrationPairs(body)
-        costs.append(replace(cost, repulsion=choice.repulsion, pairs=pairs))
-    for stage in costs:
-        states = refine(
-            stage,
-            states,
-            times,
-            smooth,
-            bounds,
-            choice=Refinement(max_steps=choice.max_steps, tolerance=1e-2),
-        ).mean
-    return states
+    end = Refinement(max_steps=choice.max_steps, tolerance=1e-2)
+    states = refine(cost, states, times, smooth, bounds, choice=end).mean
+    if choice.repulsion is None:
+        return states
+    apart = replace(cost, repulsion=choice.repulsion, pairs=InterpenetrationPairs(body))
+    return refine(apart, states, times, smooth, bounds, choice=end).mean
 
 
 def _findings(
@@ -578,7 +498,7 @@ def _findings(
 ) -> list[str]:
     """Lines about turns, limits and collisions."""
     lines = []
-    yaw, pitch, roll = (states[:, body.state_index(name)] for name in ROOT_NAMES[3:])
+    yaw, pitch, _ = (states[:, body.state_index(name)] for name in ROOT_NAMES[3:])
     steepest = float(pitch.abs().max())
     lines.append(
         f"root: yaw turns through {math.degrees(yaw.max() - yaw.min()):.0f} degrees without a "
@@ -589,12 +509,8 @@ def _findings(
             "WARNING: the root's pitch nears a right angle, where yaw and roll are one turn and "
             "the pitch is limited: this clip needs several bases; cut it there"
         )
-    beyond = [
-        name
-        for name, turn in (("root_yaw", yaw), ("root_roll", roll))
-        if bool((turn < body.lower[body.state_index(name)]).any())
-        or bool((turn > body.upper[body.state_index(name)]).any())
-    ]
+    outside = ((states < body.lower) | (states > body.upper)).any(0)
+    beyond = [name for name in ("root_yaw", "root_roll") if outside[body.state_index(name)]]
     if beyond:
         lines.append(
             f"WARNING: beyond the body's limits: {', '.join(beyond)}; a tracker cannot go there, "

@@ -33,7 +33,7 @@ from torchcss.body.chain import JointSpecification
 from torchcss.body.files.bvh import BASE, Skeleton
 from torchcss.body.files.default_shape import solid_shape
 from torchcss.body.files.xml import parse_xml
-from torchcss.body.rotations import as_rows, as_vector, from_axis_angle
+from torchcss.body.rotations import as_rows, as_vector, from_quaternion
 from torchcss.errors import BodyError, MissingExtraError
 from torchcss.files import one_line, read_bytes, shortened
 
@@ -228,7 +228,7 @@ class _Reader:
         model = self.model
         name = model.body(body).name or f"body{len(self.joints)}"
         parent = self.links[int(model.body_parentid[body])]
-        place = _Place(_matrix(model.body_quat[body]), model.body_pos[body])
+        place = _Place(from_quaternion(model.body_quat[body]), model.body_pos[body])
         anchor = np.zeros(3)
         for joint in np.flatnonzero(model.jnt_bodyid == body).tolist():
             if model.jnt_type[joint] == 0:
@@ -298,15 +298,7 @@ class _Reader:
                 name=next(name for name in names if name not in used),
                 link=link,
                 translation=as_vector(place),
-                rotation=as_rows(_matrix(model.geom_quat[geom])),
+                rotation=as_rows(from_quaternion(model.geom_quat[geom])),
                 shape=solid_shape(kind, size.tolist()),
             )
         )
-
-
-def _matrix(quaternion: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
-    """Rotation of a unit quaternion, scalar first."""
-    w, vector = quaternion[0], quaternion[1:]
-    length = float(np.linalg.norm(vector))
-    angle = 2 * math.atan2(length, w)
-    return from_axis_angle(vector * (angle / length if length else 0.0))
