@@ -304,7 +304,7 @@ def test_units_of_a_bvh(tmp_path: Path) -> None:
     assert load_body(small, file=FileOptions(units="mm")).num_parameters
     with pytest.raises(BodyError, match="units: expected m, cm"):
         load_body(path, file=FileOptions(units="furlong"))
-    with pytest.raises(BodyError, match="positive metres"):
+    with pytest.raises(BodyError, match="positive number of metres"):
         load_body(path, file=FileOptions(units=-1.0))
 
 

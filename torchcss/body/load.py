@@ -45,7 +45,7 @@ from torchcss.body.kinematics import KinematicTree
 from torchcss.body.model import BodyModel
 from torchcss.body.root import has_root
 from torchcss.body.rotations import as_vector
-from torchcss.errors import BodyError, MotionCaptureError
+from torchcss.errors import BodyError, ConfigurationError, MotionCaptureError
 from torchcss.files import one_line, read_bytes
 from torchcss.joint_names import skeleton_joint_names
 
@@ -200,6 +200,8 @@ def _read(
             skeleton = read_bvh_skeleton(path, units=units)
         except MotionCaptureError as error:
             raise BodyError(str(error)) from error
+        except ConfigurationError as error:
+            raise BodyError(f"{path}: {error}") from error
         return skeleton, (), _AS_IT_IS
     if units is not None:
         raise BodyError(f"{path}: units are for BVH files; this format is in metres (see scale)")

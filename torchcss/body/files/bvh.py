@@ -26,9 +26,9 @@ import numpy as np
 from jaxtyping import Float
 
 from torchcss.body.chain import JointSpecification
-from torchcss.body.files.bvh_parser import Segment, Turn, parse_bvh
+from torchcss.body.files.bvh_parser import Segment, parse_bvh
 from torchcss.body.rotations import about, as_rows, as_vector
-from torchcss.errors import MotionCaptureError
+from torchcss.errors import ConfigurationError, MotionCaptureError
 
 BASE: Final = "world_frame"
 """Name of the root link of a tree from a file that has none itself."""
@@ -81,54 +81,69 @@ def read_bvh_skeleton(path: Path, *, units: str | float | None = None) -> Skelet
 
     Raises:
         MotionCaptureError: If the file is bad, or its unit cannot be guessed.
+        ConfigurationError: If the units are none.
     """
     segments, values, _ = parse_bvh(path)
     scale, unit_line = _metres(path, segments, units)
     moves = np.ptp(values, axis=0) > 1e-6
-    has_motion = bool((moves & _is_angle(segments, len(moves))).any())
+    angles = [turn.column for segment in segments[1:] for turn in segment.turns if turn.is_rotation]
+    has_motion = bool(moves[angles].any())
     joints = [JointSpecification(name=BASE, link=BASE, parent=None)]
     sticky: dict[str, tuple[float, float]] = {}
     held: list[str] = []
     for index, segment in enumerate(segments):
-        parent = BASE if index == 0 else segments[segment.parent].name
-        offset = scale * np.asarray(segment.offset)
-        for turn in segment.turns:
-            if not turn.is_rotation and index:
-                offset[turn.axis] = scale * values[0, turn.column]
-        turns = [turn for turn in segment.turns if turn.is_rotation] if index else []
+        parent = segments[segment.parent].name if index else BASE
+        turns = segment.turns if index else ()
+        place = scale * np.asarray(segment.offset) if index else np.zeros(3)
+        for turn in turns:
+            if not turn.is_rotation:
+                place[turn.axis] = scale * values[0, turn.column]
+        turns = [turn for turn in turns if turn.is_rotation]
         locks = len({turn.axis for turn in turns}) == 3
-        for place, turn in enumerate(turns):
-            name = f"{segment.name}_{'xyz'[turn.axis]}"
-            last = place == len(turns) - 1
-            link = segment.name if last else f"{name}_link"
-            angles = values[:, turn.column]
+        for number, turn in enumerate(turns):
+            name, angle = f"{segment.name}_{'xyz'[turn.axis]}", values[:, turn.column]
+            link = segment.name if turn is turns[-1] else f"{name}_link"
             joint = JointSpecification(
-                name=name, link=link, parent=parent, translation=as_vector(offset)
+                name=name, link=link, parent=parent, translation=as_vector(place)
             )
             if has_motion and not moves[turn.column]:
                 held.append(name)
-                turned = as_rows(about(turn.axis, angles[0]))
-                joints.append(replace(joint, rotation=turned))
+                joint = replace(joint, rotation=as_rows(about(turn.axis, angle[0])))
             else:
-                lower, upper = _limits(angles, has_motion, locks and place == 1)
+                lower, upper = _limits(angle, has_motion, locks and number == 1)
                 axis = as_vector(np.eye(3)[turn.axis])
-                joints.append(replace(joint, kind="revolute", axis=axis, lower=lower, upper=upper))
+                joint = replace(joint, kind="revolute", axis=axis, lower=lower, upper=upper)
                 if has_motion:
-                    mean = float(angles.mean().clip(lower, upper))
-                    sticky[name] = (mean, max(float(angles.std()), _LEAST_DEVIATION))
-            parent, offset = link, np.zeros(3)
+                    mean = float(angle.mean().clip(lower, upper))
+                    sticky[name] = (mean, max(float(angle.std()), _LEAST_DEVIATION))
+            joints.append(joint)
+            parent, place = link, np.zeros(3)
         if not turns:
+            name, at = f"{segment.name}_fixed", as_vector(place)
             joints.append(
-                JointSpecification(
-                    name=f"{segment.name}_fixed",
-                    link=segment.name,
-                    parent=parent,
-                    translation=as_vector(offset if index else np.zeros(3)),
-                )
+                JointSpecification(name=name, link=segment.name, parent=parent, translation=at)
             )
     notes = (unit_line, _limits_line(len(values), has_motion, held))
     names = tuple(segment.name for segment in segments)
     return Skeleton(tuple(joints), sticky, notes, names, True)
+
+
+def metres_per_unit(units: str | float | None) -> float | None:
+    """Metres per unit of a file, given as a number or by a name of `UNITS`; None: not given.
+
+    Raises:
+        ConfigurationError: If it is neither.
+    """
+    if isinstance(units, str):
+        try:
+            units = UNITS[units] if units in UNITS else float(units)
+        except ValueError:
+            raise ConfigurationError(
+                f"units: expected {', '.join(UNITS)} or metres per unit, got {units!r}"
+            ) from None
+    if units is not None and not 0 < units < math.inf:
+        raise ConfigurationError(f"units: expected a positive number of metres, got {units}")
+    return units
 
 
 def guess_units(path: Path, span: float, stated: float | None) -> tuple[float, str]:
@@ -184,27 +199,11 @@ def rest_positions(segments: Sequence[Segment]) -> Float[np.ndarray, "j 3"]:
 def _metres(
     path: Path, segments: Sequence[Segment], units: str | float | None
 ) -> tuple[float, str]:
-    if isinstance(units, str):
-        if units not in UNITS:
-            raise MotionCaptureError(
-                f"{path}: units: expected {', '.join(UNITS)} or metres per unit, got {units!r}"
-            )
-        units = UNITS[units]
-    if units is not None:
-        if not 0 < units < math.inf:
-            raise MotionCaptureError(f"{path}: units: expected positive metres, got {units}")
-        return units, f"unit: {1000 * units:.3f} mm, as given"
+    if (metres := metres_per_unit(units)) is not None:
+        return metres, f"unit: {1000 * metres:.3f} mm, as given"
     with np.errstate(all="ignore"):  # what overflows is no person's
         span = skeleton_span(rest_positions(segments), segments)
     return guess_units(path, span, None)
-
-
-def _is_angle(segments: Sequence[Segment], size: int) -> np.ndarray:
-    """Which columns turn a joint other than the root."""
-    turns: list[Turn] = [turn for segment in segments[1:] for turn in segment.turns]
-    is_angle = np.zeros(size, dtype=bool)
-    is_angle[[turn.column for turn in turns if turn.is_rotation]] = True
-    return is_angle
 
 
 def _limits(angles: np.ndarray, has_motion: bool, locks: bool) -> tuple[float, float]:

@@ -206,24 +206,27 @@ def _bvh_frames(
     """From MOTION on: the rows of numbers, angles in radians, and the frame rate."""
     if len(lines) < 3:
         raise bad(path, lines[0].number, "Frames: and Frame Time: after it", "the end of the file")
-    (first, head), (second, time), rows = lines[1], lines[2], lines[3:]
-    title = " ".join(head).split(":")
-    if len(title) != 2 or title[0].strip().lower() != "frames":
-        raise bad(path, first, "Frames: and a number", " ".join(head))
-    number = count(path, first, title[1].strip(), "a number of frames")
-    title = " ".join(time).split(":")
-    if len(title) != 2 or title[0].strip().lower() != "frame time":
-        raise bad(path, second, "Frame Time: and seconds", " ".join(time))
-    digits = title[1].strip()
-    (interval,) = numbers(path, second, [digits], "the seconds of a frame")
+    first, second, rows = lines[1], lines[2], lines[3:]
+    number = count(path, first.number, _said(path, first, "Frames"), "a number of frames")
+    digits = _said(path, second, "Frame Time")
+    (interval,) = numbers(path, second.number, [digits], "the seconds of a frame")
     if not 1e-6 < interval < 1e3:
-        raise bad(path, second, "the seconds of a frame", digits)
+        raise bad(path, second.number, "the seconds of a frame", digits)
     if number != len(rows):
-        last = rows[-1].number if rows else second
-        raise bad(path, last, f"{number} frames, as Frames: says", f"{len(rows)} lines of numbers")
+        found = f"{len(rows)} lines of numbers"
+        raise bad(path, lines[-1].number, f"{number} frames, as Frames: says", found)
     if not number:
-        raise bad(path, first, "at least one frame", "none")
+        raise bad(path, first.number, "at least one frame", "none")
     return _table(path, rows, is_angle), _rate(interval, digits)
+
+
+def _said(path: Path, line: Line, title: str) -> str:
+    """What stands after a title and a colon."""
+    text = " ".join(line.words)
+    found, colon, value = text.partition(":")
+    if not colon or found.strip().lower() != title.lower():
+        raise bad(path, line.number, f"{title}: and a number", text)
+    return value.strip()
 
 
 def _rate(interval: float, digits: str) -> float:
@@ -239,8 +242,8 @@ def _rate(interval: float, digits: str) -> float:
 def _table(path: Path, rows: Sequence[Line], is_angle: np.ndarray) -> np.ndarray:
     """Rows of numbers, angles from degrees to radians."""
     values = np.empty((len(rows), len(is_angle)))
-    for out, (line, row) in zip(values, rows, strict=True):
-        if len(row) != len(is_angle):
-            raise bad(path, line, f"{len(is_angle)} numbers, one for every channel", len(row))
-        out[:] = numbers(path, line, row, "numbers")
+    for out, (line, words) in zip(values, rows, strict=True):
+        if len(words) != len(is_angle):
+            raise bad(path, line, f"{len(is_angle)} numbers, one for every channel", len(words))
+        out[:] = numbers(path, line, words, "numbers")
     return np.where(is_angle, np.radians(values), values)

@@ -32,7 +32,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from torchcss.body.files.bvh import UNITS, guess_units, rest_positions, skeleton_span
+from torchcss.body.files.bvh import guess_units, metres_per_unit, rest_positions, skeleton_span
 from torchcss.body.files.bvh_parser import Segment, parse_bvh
 from torchcss.body.rotations import about
 from torchcss.errors import ConfigurationError, MotionCaptureError
@@ -93,7 +93,7 @@ def read_motion_capture(
         ConfigurationError: If `units` or `frame_rate` is not positive or unknown.
     """
     path = Path(path)
-    scale = _scale_of(units)
+    scale = metres_per_unit(units)
     if frame_rate is not None and not 0 < frame_rate < math.inf:
         raise ConfigurationError(f"frame rate: expected a positive number, got {frame_rate}")
     suffix = path.suffix.lower()
@@ -194,19 +194,6 @@ def limb_positions(
     names = tuple(name for name in LIMBS if name in found)
     index = tuple(found[name] for name in names)
     return names, index, motion.joints[:, list(index)]
-
-
-def _scale_of(units: str | float | None) -> float | None:
-    if isinstance(units, str):
-        try:
-            units = UNITS[units] if units in UNITS else float(units)
-        except ValueError:
-            raise ConfigurationError(
-                f"units: expected {', '.join(UNITS)} or metres per unit, got {units!r}"
-            ) from None
-    if units is not None and not 0 < units < math.inf:
-        raise ConfigurationError(f"units: expected a positive number of metres, got {units}")
-    return units
 
 
 def _positions(
