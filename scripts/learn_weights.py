@@ -35,7 +35,7 @@ from torchcss.cli.options import SettingsOptions
 from torchcss.cost.frame import FrameCosts
 from torchcss.errors import ConfigurationError
 from torchcss.inference.implicit import TermWeights, weighted_minimum
-from torchcss.inference.mixture import GaussianMixture
+from torchcss.inference.mixture import GaussianMixture, Prior
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.initialise.result import Initialisation
 from torchcss.io.video import VideoReader
@@ -231,7 +231,7 @@ class Lesson:
         for index in range(1, len(states)):
             start = body.bounds.project(x + PERSISTENCE * velocity)
             like = torch.eye(len(deviation)).to(x).expand(len(x), -1, -1)
-            prior = GaussianMixture(start, like, x.new_zeros(len(x)))
+            prior = Prior.of(GaussianMixture(start, like, x.new_zeros(len(x))))
             cost = self.costs(
                 self.features[index], body=body, before=x, appearance=self.appearance[index]
             ).of_children(torch.arange(len(x)), prior)

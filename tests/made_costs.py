@@ -20,7 +20,7 @@ from torchcss.cost.joints import JointTerm
 from torchcss.cost.temporal import MixturePrior
 from torchcss.cost.term import OnStates, Term
 from torchcss.cost.total import TrackingCost
-from torchcss.inference.mixture import GaussianMixture
+from torchcss.inference.mixture import GaussianMixture, Prior
 from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FrameFeatures
@@ -102,13 +102,14 @@ def make_cost(
     cost = TrackingCost(choice=choice, views=(view,))
     if own_parents is None:
         return cost.of_mode(parents)
-    return cost.of_children(torch.arange(own_parents), mixture_at(parents))
+    return cost.of_children(torch.arange(own_parents), prior_at(parents))
 
 
-def mixture_at(mean: Tensor) -> GaussianMixture:
+def prior_at(mean: Tensor) -> Prior:
     """Modes of equal weight and unit covariance."""
     k, n = mean.shape
-    return GaussianMixture(mean, torch.eye(n).to(mean).expand(k, n, n), mean.new_zeros(k))
+    unit = torch.eye(n).to(mean).expand(k, n, n)
+    return Prior.of(GaussianMixture(mean, unit, mean.new_zeros(k)))
 
 
 def changed(cost: TrackingCost, **fields: Any) -> TrackingCost:

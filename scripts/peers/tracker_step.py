@@ -22,7 +22,7 @@ from torchcss.cost.choice import CostChoice
 from torchcss.cost.context import FrameContext
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.total import TrackingCost
-from torchcss.inference.mixture import GaussianMixture
+from torchcss.inference.mixture import GaussianMixture, Prior
 from torchcss.studies.reprojection import reprojection_problem
 from torchcss.types import Keypoints
 
@@ -76,7 +76,7 @@ def make_frames(body_name: str, pool: int, like: Tensor, seed: int) -> Iterator[
         noise = torch.randn(mean.shape, generator=generator).to(like)
         view = FrameContext(body=body, camera=camera, keypoints=observation, deviation=motion)
         alike = torch.eye(len(motion)).to(mean).expand(len(mean), -1, -1)
-        parents = GaussianMixture(mean, alike, mean.new_zeros(len(mean)))
+        parents = Prior.of(GaussianMixture(mean, alike, mean.new_zeros(len(mean))))
         cost = TrackingCost(choice=choice, views=(view,))
         cost = cost.of_children(torch.arange(len(mean), device=mean.device), parents)
         yield Frame(cost, mean, factor, noise)

@@ -21,7 +21,7 @@ from torchcss.cost.part_map import bare_pixels, part_map
 from torchcss.cost.region import RegionTerm
 from torchcss.cost.segmentation import SegmentationImages, SegmentationTerm
 from torchcss.cost.total import TrackingCost
-from torchcss.inference.mixture import GaussianMixture
+from torchcss.inference.mixture import GaussianMixture, Prior
 from torchcss.inference.problem import SearchProblem
 from torchcss.inference.proposals import CovarianceScaled
 from torchcss.inference.tracker import Tracker
@@ -184,7 +184,9 @@ def test_a_camera_that_stands_still_knows_what_was_behind(dtype: torch.dtype) ->
         assert (memory.background is not None) == asked
         cost = observer.cost(seen, memory, body, before[None])
         where = torch.zeros(2, dtype=torch.long)
-        prior = GaussianMixture(before[None], torch.eye(len(before))[None].to(before), before[:1])
+        prior = Prior.of(
+            GaussianMixture(before[None], torch.eye(len(before))[None].to(before), before[:1])
+        )
         both = torch.stack([after, before])
         cost = cost.of_children(where, prior)
         shown = cost.weight_only(both) + cost.terms(both)["region"]

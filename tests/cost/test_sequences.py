@@ -11,7 +11,7 @@ from made_costs import changed, make_full_cost, random_states
 from torchcss.body.shape import with_shape
 from torchcss.cost.context import BodyTables
 from torchcss.cost.total import TrackingCost, together
-from torchcss.inference.mixture import GaussianMixture
+from torchcss.inference.mixture import GaussianMixture, Prior
 from torchcss.types import Keypoints
 
 
@@ -63,7 +63,11 @@ def test_samples_of_several_clips_descend_from_the_modes_of_their_own(
     sequence, parent = torch.tensor([1, 0, 1, 0, 0]), torch.tensor([2, 1, 0, 0, 1])
     costs = [replace(cost, parent=None) for cost in two_clips()]
     priors = [
-        GaussianMixture(mean, 0.01 * torch.eye(mean.shape[-1]).double().expand(3, -1, -1), -weight)
+        Prior.of(
+            GaussianMixture(
+                mean, 0.01 * torch.eye(mean.shape[-1]).double().expand(3, -1, -1), -weight
+            )
+        )
         for mean, weight in (
             (random_states(cost.body, 3, generator=generator), torch.rand(3).double())
             for cost in costs

@@ -12,7 +12,7 @@ from made_costs import (
     changed,
     make_cost,
     make_full_cost,
-    mixture_at,
+    prior_at,
     random_states,
 )
 from torch import Tensor
@@ -132,7 +132,7 @@ def test_samples_keep_their_own_targets_in_every_view(generator: torch.Generator
     modes = random_states(first.body, 3, generator=generator)
     first = changed(first, modes=modes)
     aside = from_the_side(first.camera, first.body.base_translation, (160, 120))
-    second, prior = changed(first, camera=aside), mixture_at(modes)
+    second, prior = changed(first, camera=aside), prior_at(modes)
     parent = torch.tensor([2, 0, 1, 1])
     x = random_states(first.body, 4, generator=generator)
     both = beside([first, second]).of_children(parent, prior)

@@ -34,7 +34,7 @@ from torchcss.cost.joints import JointTerm
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.total import TrackingCost
 from torchcss.cost.visibility import ContourPredictor
-from torchcss.inference.mixture import GaussianMixture
+from torchcss.inference.mixture import GaussianMixture, Prior
 from torchcss.stopwatch import Stopwatch
 from torchcss.types import CostFunction, Curvature, LocalModel
 from torchcss.vision.camera import Camera
@@ -225,9 +225,8 @@ def test_frames_of_unknown_interval_have_no_temporal_prior() -> None:
     """By default, of how far a state may move in no time: not NaN."""
     body = load_body("arm8")
     n = body.num_parameters
-    prior = GaussianMixture(
-        body.rest[None], torch.eye(n).double()[None], torch.zeros(1, dtype=torch.float64)
-    )
+    unit = torch.eye(n).double()[None]
+    prior = Prior.of(GaussianMixture(body.rest[None], unit, torch.zeros(1, dtype=torch.float64)))
     for options, is_known in (({}, False), ({"frame_interval": 1 / 25}, True)):
         costs = FrameCosts(body, Camera.pinhole(64, 48, focal_px=60.0), CostChoice(), **options)
         cost = costs(None, body=body).of_children(torch.tensor([0, 0]), prior)

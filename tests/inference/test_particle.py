@@ -214,7 +214,7 @@ def test_parents_are_the_modes_of_the_last_frame(generator):
 
     def children(parent, prior):
         seen.append((parent, prior))
-        minima = prior.mean[parent]
+        minima = prior.mixture.mean[parent]
         return SearchProblem(problems.ItemBowls(torch.ones(len(parent), 1).double(), minima))
 
     problem = SearchProblem(bowl(0.0, 0.0), of_children=children)
@@ -223,7 +223,7 @@ def test_parents_are_the_modes_of_the_last_frame(generator):
     state, _ = tracker.step(state, problem, FREE)
     state, info = tracker.step(state, problem, FREE)
     for parent, prior in seen:
-        assert int(parent.max()) < len(prior.mean)
+        assert int(parent.max()) < len(prior.parent)
     assert len(seen) == 4
     assert torch.equal(seen[-1][0], info.origin)
 

@@ -1,5 +1,6 @@
 import itertools
 import math
+from dataclasses import dataclass
 
 import problems
 import pytest
@@ -21,8 +22,10 @@ from torchcss.inference.proposals import (
     HeavyTailed,
     InflatedPosterior,
     MixtureOfProposals,
+    Move,
     Spherical,
     project_in_metric,
+    with_moves,
 )
 from torchcss.types import Bounds
 
@@ -112,7 +115,7 @@ def test_moments(proposal, expected, generator):
 def test_bounds_modes_and_repeatability(proposal, dtype):
     mixture = GaussianMixture(*(x.to(dtype) for x in TWO))
     bounds = problems.box(2, -2.5, 8.5, dtype)
-    x, parent, _ = proposal.sample(mixture, 50, bounds, generator=torch.Generator().manual_seed(3))
+    x, parent, *_ = proposal.sample(mixture, 50, bounds, generator=torch.Generator().manual_seed(3))
     again, *_ = proposal.sample(mixture, 50, bounds, generator=torch.Generator().manual_seed(3))
     assert torch.equal(x, again)
     assert x.dtype == dtype
@@ -127,7 +130,7 @@ def test_bounds_modes_and_repeatability(proposal, dtype):
 
 def test_samples_are_shared_by_weight(generator):
     proposal = CovarianceScaled(covariance_scale=4, include_modes=False, stratified=True)
-    _, parent, _ = proposal.sample(TWO, 100, FREE, generator=generator)
+    _, parent, *_ = proposal.sample(TWO, 100, FREE, generator=generator)
     assert abs(int((parent == 1).sum()) - 75) <= 1
 
 
@@ -340,7 +343,8 @@ def test_members_project_their_samples_as_they_do_alone():
         near = CovarianceScaled(covariance_scale=4, correlated_projection=correlated)
         members = MixtureOfProposals(proposals=(near, far))
         again = torch.Generator().manual_seed(3)
-        alone = [member.sample(TWO, 20, bounds, generator=again) for member in (near, far)]
+        # The first member comes last: it draws what the others leave.
+        alone = [member.sample(TWO, 20, bounds, generator=again) for member in (far, near)][::-1]
         for proposal in (MixtureOfProposals(proposals=(members,)), members):
             source = torch.Generator().manual_seed(3)
             got[correlated] = proposal.sample(TWO, 40, bounds, generator=source)
@@ -348,6 +352,48 @@ def test_members_project_their_samples_as_they_do_alone():
     assert not torch.equal(got[True].x, got[False].x)
     # Weights are those of where samples were drawn, wherever they are moved.
     torch.testing.assert_close(got[True].log_weight, got[False].log_weight, rtol=0, atol=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Aside(Move):
+    """To states at some distances from the best one."""
+
+    distances: tuple[float, ...]
+
+    def states(self, best, bounds):
+        return bounds.project(best.mean + torch.tensor(self.distances).double()[:, None])
+
+
+NEAR = CovarianceScaled(covariance_scale=1)
+
+
+def test_a_mixture_counts_the_jumps_of_all_its_moves(generator):
+    """Jumps of the heaviest component follow the modes, those of one move after the other's."""
+    one = Aside(search=NEAR, distances=(20.0,), log_odds=-2.0)
+    two = Aside(search=NEAR, distances=(-20.0, 40.0))
+    samples = with_moves(NEAR, ((one, 4), (two, 6)), 20).sample(TWO, 20, FREE, generator=generator)
+    heaviest = int(TWO.log_weight.argmax())
+    assert samples.jumps.parent.tolist() == [heaviest] * 3
+    centres = torch.cat([TWO.mean, samples.jumps.mixture.mean])
+    moved = TWO.mean[heaviest, 0] + torch.tensor([20.0, -20.0, 40.0]).double()
+    assert torch.equal(centres[2:, 0], moved)
+    odds = samples.jumps.mixture.log_weight - TWO.log_weight[heaviest]
+    torch.testing.assert_close(odds, torch.tensor([-2.0, -5.0, -5.0]).double())
+    assert torch.bincount(samples.parent, minlength=5)[2] == 4
+    assert int(torch.bincount(samples.parent, minlength=5)[3:].sum()) == 6
+    assert float((samples.x - centres[samples.parent]).abs().max()) < 10
+    assert bool((samples.log_weight[-10:] == -torch.inf).all())
+
+
+def test_what_moves_leave_is_drawn_as_without_them(generator):
+    nowhere = Aside(search=NEAR, distances=())
+    samples = with_moves(NEAR, ((nowhere, 15),), 20).sample(TWO, 20, FREE, generator=generator)
+    assert samples.jumps is None
+    assert len(samples.x) == 20
+    assert with_moves(NEAR, (), 20) is NEAR
+    crowd = Aside(search=NEAR, distances=tuple(map(float, range(20, 120))))
+    samples = with_moves(NEAR, ((crowd, 100),), 8).sample(TWO, 8, FREE, generator=generator)
+    assert int((samples.parent < 2).sum()) == 2, "moves get three quarters at the most"
 
 
 @settings(max_examples=30, deadline=None)

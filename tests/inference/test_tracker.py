@@ -10,8 +10,15 @@ from hypothesis import strategies as st
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.inference.dynamics import ConstantVelocity, Diffusion
 from torchcss.inference.mixture import GaussianMixture
+from torchcss.inference.particle import ParticleFilter
 from torchcss.inference.problem import SearchProblem
-from torchcss.inference.proposals import CovarianceScaled, EigenDirectionGrid, Samples
+from torchcss.inference.proposals import (
+    CovarianceScaled,
+    EigenDirectionGrid,
+    Move,
+    Samples,
+    with_moves,
+)
 from torchcss.inference.tracker import Tracker
 from torchcss.types import LocalModel, Status
 
@@ -149,7 +156,7 @@ class Shuffled:
     def sample(self, mixture, num, bounds, *, generator):
         samples = CSS.proposal.sample(mixture, num, bounds, generator=generator)
         order = torch.randperm(num, generator=torch.Generator().manual_seed(5))
-        return Samples(*(field[order] for field in samples))
+        return samples.take(order)
 
     def log_density(self, mixture, x):
         return CSS.proposal.log_density(mixture, x)
@@ -236,7 +243,7 @@ def test_a_cost_made_from_the_samples_parents(generator):
 
     def make(parent, prior):
         seen.append((parent, prior))
-        return Sticky(torch.ones(len(parent), 1).double(), prior.mean[parent])
+        return Sticky(torch.ones(len(parent), 1).double(), prior.mixture.mean[parent])
 
     state = CSS.init(single(), generator=generator)
     problem = SearchProblem(
@@ -246,8 +253,35 @@ def test_a_cost_made_from_the_samples_parents(generator):
     state, _ = CSS.step(state, problem, BOUNDS)
     parent, prior = seen[0]
     assert parent.shape == (40,)
-    assert torch.equal(prior.mean, single().mean)
-    torch.testing.assert_close(state.mixture.mean[:1], prior.mean, rtol=0, atol=0.2)
+    assert torch.equal(prior.mixture.mean, single().mean)
+    torch.testing.assert_close(state.mixture.mean[:1], prior.mixture.mean, rtol=0, atol=0.2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ToTheOtherWell(Move):
+    """From one minimum of a double well into the other."""
+
+    def states(self, best, bounds):
+        return -best.mean
+
+
+def test_a_move_finds_the_other_well_and_parents_are_modes_of_the_frame_before(generator):
+    well = problems.DoubleWell()
+    start = GaussianMixture(well.minima[:1], 1e-4 * torch.eye(2).double()[None], torch.zeros(1))
+    narrow = CovarianceScaled(covariance_scale=1)
+    move = ToTheOtherWell(search=narrow, log_odds=0.0)
+    tracker = replace(CSS, proposal=with_moves(narrow, ((move, 3),), 40), num_modes=3)
+    state = tracker.init(start, generator=generator)
+    for known in (1, 2):
+        before, (state, info) = state, tracker.step(state, SearchProblem(well), BOUNDS)
+        assert len(state.mixture.mean) == 2, "both wells"
+        assert 0 <= int(info.parent.min()) <= int(info.parent.max()) < known
+        assert len(info.prior.parent) == known + 1
+        # Whoever was put elsewhere is at rest there.
+        assert float(state.velocity.abs().max()) < 0.1
+    assert before.frame == 1
+    with pytest.raises(TypeError, match="proposal"):
+        ParticleFilter(num_samples=4, num_modes=1, proposal=move)
 
 
 def test_bad_input(generator):

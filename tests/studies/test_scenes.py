@@ -13,7 +13,7 @@ from made_sessions import seen_by, session_at
 from torchcss.cost.region import RegionTerm
 from torchcss.cost.total import TrackingCost
 from torchcss.errors import ConfigurationError
-from torchcss.inference.mixture import GaussianMixture
+from torchcss.inference.mixture import GaussianMixture, Prior
 from torchcss.studies.render.sequences import arm_sequence
 from torchcss.studies.scenes import Scene, arm_scenes, clip_scenes
 from torchcss.tracking.settings import (
@@ -46,12 +46,13 @@ class Spy:
         return 1.0
 
     def step(self, state: SimpleNamespace, problem, bounds):
-        child = problem.children(torch.zeros(1, dtype=torch.long), state.mixture)
+        prior = Prior.of(state.mixture)
+        child = problem.children(torch.zeros(1, dtype=torch.long), prior)
         self.costs.append(child.cost)
         mean = self.truth[len(self.costs) - 1][None]
         mixture = state.mixture._replace(mean=mean)
         return SimpleNamespace(mixture=mixture), SimpleNamespace(
-            origin=torch.tensor([0]), parent=torch.tensor([0]), prior=state.mixture
+            origin=torch.tensor([0]), parent=torch.tensor([0]), prior=prior
         )
 
 

@@ -11,9 +11,9 @@ from torch import Tensor
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.inference.mixture import GaussianMixture
-from torchcss.inference.tracker import TrackerState, initial_state
+from torchcss.inference.proposals import CovarianceScaled
 from torchcss.studies.render.sequences import arm_motion
-from torchcss.tracking.flip_moves import flipped_poses, with_flips
+from torchcss.tracking.flip_moves import Flips, flipped_poses
 from torchcss.vision.camera import Camera
 
 # World: Y up, the camera at its origin looking along -Z.
@@ -91,45 +91,45 @@ def test_nothing_flips_without_limbs_or_out_of_sight(tmp_path: Path):
     assert flipped_poses(body, CAMERA, x, num=0).shape == (0, 8)
 
 
-def state_of(x: Tensor, generator: torch.Generator) -> TrackerState:
+def modes_about(x: Tensor) -> GaussianMixture:
     spread = 0.01 * torch.eye(len(x), dtype=x.dtype)
-    mixture = GaussianMixture(
+    return GaussianMixture(
         torch.stack([x, x + 0.01]),
         torch.stack([spread, 2 * spread]),
         torch.tensor([0.0, -1.0], dtype=x.dtype),
-    )
-    state = initial_state(mixture, generator=generator)
-    return state._replace(velocity=torch.full_like(mixture.mean, 0.02))
+    ).normalise()
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("log_odds", [0.0, -5.0])
-def test_with_flips_adds_modes_of_the_odds_stated(
+def test_flips_are_components_of_the_odds_stated(
     dtype: torch.dtype, log_odds: float, generator: torch.Generator
 ):
     body, x = posed("arm8", dtype)
-    before = state_of(x, generator)
-    after = with_flips(before, body, CAMERA, num=3, log_odds=log_odds)
-    mixture, flips = after.mixture, len(after.mixture.mean) - 2
+    modes, search = modes_about(x), CovarianceScaled(covariance_scale=1.0)
+    move = Flips(search=search, log_odds=log_odds, body=body, camera=CAMERA, num=3)
+    samples = move.sample(modes, 10, body.bounds, generator=generator)
+    jumps = samples.jumps
+    assert jumps is not None
+    flips = len(jumps.parent)
     assert 1 <= flips <= 3
-    assert {part.dtype for part in mixture} == {dtype}
-    assert float(mixture.log_weight.exp().sum()) == pytest.approx(1, abs=1e-5)
-    # What was there stays: its order, its places, its odds among itself, its motion.
-    torch.testing.assert_close(mixture.mean[:2], before.mixture.mean)
-    assert float(mixture.log_weight[0] - mixture.log_weight[1]) == pytest.approx(1, abs=1e-5)
-    assert torch.equal(after.velocity[:2], before.velocity)
-    # What is new: as stated.
-    odds = mixture.log_weight[2:] - mixture.log_weight[0]
+    assert {part.dtype for part in jumps.mixture} == {dtype}
+    assert torch.equal(jumps.mixture.mean, flipped_poses(body, CAMERA, x, num=3))
+    odds = jumps.mixture.log_weight - modes.log_weight[0]
     assert odds.tolist() == pytest.approx([log_odds] * flips, abs=1e-5)
-    assert torch.equal(mixture.covariance[2:], before.mixture.covariance[:1].expand(flips, 8, 8))
-    assert not bool(after.velocity[2:].any())
-    assert after.particles is None
-    assert bool(mixture.mean.isfinite().all())
+    assert torch.equal(jumps.mixture.covariance, modes.covariance[:1].expand(flips, 8, 8))
+    assert jumps.parent.tolist() == [0] * flips, "flips of the best mode"
+    # Each flip itself comes first, and the rest is drawn about them.
+    assert samples.x.shape == (10, 8)
+    assert torch.equal(samples.x[:flips], jumps.mixture.mean)
+    assert set(samples.parent.tolist()) == {2 + flip for flip in range(flips)}
+    assert bool((samples.log_weight == -torch.inf).all()), "not drawn from the modes"
 
 
-def test_with_flips_of_a_body_out_of_sight_changes_no_mode(generator: torch.Generator):
+def test_a_body_out_of_sight_has_no_flips(generator: torch.Generator):
     body = load_body("arm8").with_base(torch.eye(3).double(), torch.tensor([0, 0, 5.0]).double())
-    before = state_of(body.rest, generator)
-    after = with_flips(before, body, CAMERA, num=8)
-    assert torch.equal(after.mixture.mean, before.mixture.mean)
-    torch.testing.assert_close(after.mixture.weight, before.mixture.weight)
+    search = CovarianceScaled(covariance_scale=1.0)
+    move = Flips(search=search, body=body, camera=CAMERA, num=8)
+    samples = move.sample(modes_about(body.rest), 8, body.bounds, generator=generator)
+    assert samples.jumps is None
+    assert samples.x.shape == (0, 8)

@@ -19,9 +19,9 @@ from torchcss.cost.segmentation import SegmentationTerm
 from torchcss.cost.total import TrackingCost
 from torchcss.inference.dynamics import ConstantVelocity
 from torchcss.inference.mixture import GaussianMixture
-from torchcss.inference.proposals import CovarianceScaled
+from torchcss.inference.proposals import CovarianceScaled, with_moves
 from torchcss.inference.tracker import Tracker, TrackerState, initial_state
-from torchcss.tracking.limb_moves import astray_limbs, other_poses, with_limbs
+from torchcss.tracking.limb_moves import LostLimbs, astray_limbs, other_poses
 
 DYNAMICS = ConstantVelocity(deviation=0.05, persistence=0.8)
 
@@ -59,6 +59,20 @@ def state_at(body: BodyModel, x: Tensor, *others: Tensor) -> TrackerState:
     )
     state = initial_state(mixture.normalise(), generator=torch.Generator().manual_seed(0))
     return state._replace(velocity=torch.full_like(mean, 0.01))
+
+
+def move_of(body: BodyModel, cost: TrackingCost, num: int) -> LostLimbs:
+    return LostLimbs(search=CovarianceScaled(covariance_scale=1.0), body=body, cost=cost, num=num)
+
+
+def proposed(
+    body: BodyModel, cost: TrackingCost, state: TrackerState, num: int = 4
+) -> GaussianMixture | None:
+    """The components that are proposed, one frame ahead of a state."""
+    ahead = DYNAMICS.predict(state.mixture, state.velocity)
+    generator = torch.Generator().manual_seed(0)
+    jumps = move_of(body, cost, num).sample(ahead, 8, body.bounds, generator=generator).jumps
+    return None if jumps is None else jumps.mixture
 
 
 def arm(body: BodyModel, name: str = "r_arm") -> Limb:
@@ -117,7 +131,7 @@ def test_out_of_the_way_is_not_found():
     assert "r_arm" in names(astray_limbs(cost, body, x))
     assert len(find(cost, body, x, arm(body))) == 0
     state = state_at(body, x)
-    assert with_limbs(state, body, cost, DYNAMICS, body.bounds, num=4) is state
+    assert proposed(body, cost, state) is None
 
 
 def test_what_cannot_be_seen_is_left_alone():
@@ -127,7 +141,7 @@ def test_what_cannot_be_seen_is_left_alone():
         away = state._replace(mixture=state.mixture._replace(mean=state.mixture.mean.clone()))
         away.mixture.mean[:, body.state_index(column)] += shift
         assert names(astray_limbs(cost, body, away.mixture.mean[0])) == ["l_arm", "r_arm"]
-        assert with_limbs(away, body, cost, DYNAMICS, body.bounds, num=4) is away
+        assert proposed(body, cost, away) is None
     blind = replace(cost, choice=cost.choice.without("segmentation"))
     assert astray_limbs(blind, body, moved(body, 0.5)) == []
     unknown = replace(cost, choice=cost.choice.having(SegmentationTerm()))
@@ -149,28 +163,23 @@ def test_an_arm_before_the_chest_is_found_where_it_is():
     assert float((found - uv[1])[wrist].norm()) < 0.5 * float((uv[0] - uv[1])[wrist].norm())
 
 
-def test_it_joins_the_search_at_rest():
+def test_all_but_the_arm_is_where_it_is_expected():
     body, cost = cost_of(1.4)
     x = moved(body, 0.4)
     state = state_at(body, x, moved(body, 0.4, "l"))
-    joined = with_limbs(state, body, cost, DYNAMICS, body.bounds, num=3)
-    new = len(joined.mixture.mean) - 2
-    assert 1 <= new <= 3
-    assert torch.equal(joined.mixture.mean[:2], state.mixture.mean)
-    assert torch.equal(joined.velocity[:2], state.velocity)
-    odds = joined.mixture.log_weight[2:] - joined.mixture.log_weight[0]
+    found = proposed(body, cost, state, num=3)
+    assert found is not None
+    assert 1 <= len(found.mean) <= 3
+    ahead = DYNAMICS.predict(state.mixture, state.velocity)
+    odds = found.log_weight - ahead.log_weight[0]
     torch.testing.assert_close(odds, torch.full_like(odds, -5.0))
-    assert float(joined.mixture.log_weight.exp().sum()) == pytest.approx(1)
-    assert torch.equal(joined.generator_state, state.generator_state), "nothing is drawn at random"
-    # One frame ahead all but the limb is where the best mode is expected.
-    ahead = DYNAMICS.predict(joined.mixture, joined.velocity).mean
     columns = arm(body).columns
     held = torch.ones(len(x), dtype=torch.bool)
     held[columns] = False
-    torch.testing.assert_close(ahead[2:, held], ahead[:1, held].expand(new, -1))
-    assert torch.equal(ahead[2:, columns], joined.mixture.mean[2:, columns])
-    at_rest = state_at(body, moved(body, 1.4))
-    assert with_limbs(at_rest, body, cost, DYNAMICS, body.bounds, num=3) is at_rest
+    assert torch.equal(found.mean[:, held], ahead.mean[:1, held].expand(len(found.mean), -1))
+    assert bool((found.mean[:, columns] != ahead.mean[:1, columns]).any(-1).all())
+    assert torch.equal(found.covariance, ahead.covariance[:1].expand_as(found.covariance))
+    assert proposed(body, cost, state_at(body, moved(body, 1.4))) is None
 
 
 def test_a_tracker_goes_on_with_the_arm_that_it_had_lost():
@@ -184,10 +193,11 @@ def test_a_tracker_goes_on_with_the_arm_that_it_had_lost():
     missed = []
     for num in (0, 4):
         state = state_at(body, moved(body, 0.4))
+        moves = ((move_of(body, cost, num), num),)
+        jumping = replace(tracker, proposal=with_moves(tracker.proposal, moves, 12))
         for _ in range(2):
-            if num:
-                state = with_limbs(state, body, cost, DYNAMICS, body.bounds, num=num)
-            state, _ = tracker.step(state, cost.problem(), body.bounds)
+            state, info = jumping.step(state, cost.problem(), body.bounds)
+            assert int(info.parent.max()) < 4
         places = body.pose(torch.stack([state.mixture.mean[0], truth])).joints[:, elbow]
         uv = cost.camera.project(places).uv
         missed.append(float((uv[0] - uv[1]).norm()))
@@ -200,4 +210,4 @@ def test_an_arm_alone_has_no_colours_to_go_by():
     view = FrameContext(body=body, camera=camera)
     cost = TrackingCost(choice=CostChoice().without("contour", "joints"), views=(view,))
     state = state_at(body, body.rest)
-    assert with_limbs(state, body, cost, DYNAMICS, body.bounds, num=4) is state
+    assert proposed(body, cost, state) is None

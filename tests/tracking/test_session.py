@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 import torch
 from made_sessions import seen_by, session_at, start_at
+from torch import Tensor
 
 import torchcss
 from torchcss.app.track import TrackOptions, _first_pose_from_file, track_video
 from torchcss.body.load import load_body
-from torchcss.body.model import BodyModel
 from torchcss.cost.interpenetration import Interpenetration
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.segmentation import SegmentationTerm
@@ -35,7 +35,7 @@ from torchcss.io.video import VideoWriter
 from torchcss.robust import Quadratic
 from torchcss.studies.demo import run_demo
 from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
-from torchcss.tracking.flip_moves import with_modes
+from torchcss.tracking.limb_moves import LostLimbs
 from torchcss.tracking.presets import PRESETS
 from torchcss.tracking.session import Posterior, TrackingSession, follow_with_base
 from torchcss.tracking.settings import (
@@ -47,7 +47,7 @@ from torchcss.tracking.settings import (
     named_terms,
 )
 from torchcss.tracking.view import CameraView
-from torchcss.types import Frame
+from torchcss.types import Bounds, Frame
 from torchcss.vision.camera import Camera
 
 FRAMES = 4
@@ -441,18 +441,18 @@ def track(
 
 
 def test_poses_of_limbs_join_the_search(monkeypatch: pytest.MonkeyPatch):
-    """They are compared with the flow of their own, and what descends from them is the best's."""
+    """What descends from them is the best mode's."""
     sequence = arm_sequence(generator=torch.Generator().manual_seed(0), num_frames=3)
     settings = Settings(body="arm8", keypoints_use="first", working_size=160)
-    asked = []
+    asked, column = [], sequence.body.state_index("r_elbow_flexion")
 
-    def aside(state: TrackerState, body: BodyModel, *_, num: int) -> TrackerState:
-        asked.append(num)
-        elsewhere = state.mixture.mean[:1].clone()
-        elsewhere[:, body.state_index("r_elbow_flexion")] += 0.1
-        return with_modes(state, elsewhere, torch.zeros_like(elsewhere), log_odds=20.0)
+    def aside(move: LostLimbs, best: GaussianMixture, bounds: Bounds) -> Tensor:
+        asked.append(move.num)
+        elsewhere = best.mean.clone()
+        elsewhere[:, column] += 0.1
+        return elsewhere
 
-    monkeypatch.setattr("torchcss.tracking.session.with_limbs", aside)
+    monkeypatch.setattr(LostLimbs, "states", aside)
     plain = track(sequence.frames, sequence, settings)
     assert asked == []
     jumping = track(sequence.frames, sequence, replace(settings, limb_jumps=4))
@@ -463,6 +463,30 @@ def test_poses_of_limbs_join_the_search(monkeypatch: pytest.MonkeyPatch):
         assert int(with_jump.info.parent.max()) < known
         assert not torch.equal(with_jump.state.mixture.mean, without.state.mixture.mean)
         known = len(with_jump.state.mixture.mean)
+
+
+def test_between_steps_only_the_base_touches_the_state(monkeypatch: pytest.MonkeyPatch):
+    """A tracker starts from what it returned, but for a base that moves along."""
+    sequence = arm_sequence(generator=torch.Generator().manual_seed(0), num_frames=4)
+    given, returned = [], []
+    step = Tracker.step
+
+    def spy(tracker: Tracker, state: TrackerState, *args: Any) -> Any:
+        given.append(state)
+        done = step(tracker, state, *args)
+        returned.append(done[0])
+        return done
+
+    monkeypatch.setattr(Tracker, "step", spy)
+    settings = Settings(
+        body="arm8", keypoints_use="first", working_size=160, limb_jumps=2, samples=6, modes=2
+    )
+    session = session_at(settings, sequence.body, sequence.states[0], seen_by(sequence.camera))
+    session.plan = session.plan._replace(jumps_every=1)
+    for posterior in session.track(sequence.frames):
+        assert int(posterior.info.parent.max()) < len(given[-1].mixture.mean)
+    for before, after in zip(returned, given[1:], strict=False):
+        assert before is after
 
 
 def test_terms_of_the_best_mode_add_up_to_its_cost():

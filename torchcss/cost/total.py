@@ -47,7 +47,7 @@ from torchcss.body.model import BodyModel, BodyPose, differentiate_twice
 from torchcss.cost.choice import CostChoice
 from torchcss.cost.context import BodyTables, FrameContext
 from torchcss.cost.term import BoundImage, BoundPrior, Kind, Posed, Term
-from torchcss.inference.mixture import GaussianMixture
+from torchcss.inference.mixture import GaussianMixture, Prior
 from torchcss.inference.problem import SearchProblem
 from torchcss.stopwatch import Stopwatch
 from torchcss.types import Curvature, Keypoints, LocalModel, PointCost
@@ -70,6 +70,7 @@ class TrackingCost:
         views: What each camera sees; observations add up, priors count once.
         past: Where priors are taken from, one for each sequence; by default its first view.
         parent: The mode before that each sample descends from; None: the first one.
+        component: The component of the prior that each sample descends from; None: its parent.
         sequence: The sequence of each sample (`FrameContext.sequence`); None: there is one.
         stopwatch: Where the time of the evaluations is added up by term; None: not at all.
         bound: The terms bound to the views; what is not among them is bound now.
@@ -79,6 +80,7 @@ class TrackingCost:
     views: tuple[FrameContext, ...]
     past: tuple[FrameContext, ...] = ()
     parent: Int[Tensor, " b"] | None = None
+    component: Int[Tensor, " b"] | None = None
     sequence: Int[Tensor, " b"] | None = None
     stopwatch: Stopwatch | None = None
     bound: Mapping[tuple[Term, FrameContext], Any] = field(default_factory=dict, repr=False)
@@ -127,31 +129,34 @@ class TrackingCost:
         first, *others = self.views
         return replace(self, views=(replace(first, keypoints=keypoints), *others))
 
-    def of_children(self, parent: Int[Tensor, " b"], *prior: GaussianMixture) -> TrackingCost:
-        """The cost for samples of a prior's modes: each is compared with the mode it came from.
+    def of_children(self, component: Int[Tensor, " b"], *prior: Prior) -> TrackingCost:
+        """The cost for samples of a prior: each is compared with what it came from.
 
         Args:
-            parent: The mode of each sample, among those of its sequence.
-            prior: The modes, one frame ahead, for each sequence.
+            component: The component of each sample, in the prior of its sequence.
+            prior: The modes before, one frame ahead, and where moves lead, for each sequence.
         """
         seen = {view.sequence: view for view in reversed(self.views)}
-        past = (
-            replace(seen[number], prior=modes)
-            for number, modes in zip(sorted(seen), prior, strict=True)
-        )
-        return replace(self, parent=parent, past=tuple(past))
+        past, parent = [], torch.zeros_like(component)
+        for number, own in zip(sorted(seen), prior, strict=True):
+            past.append(replace(seen[number], prior=own.mixture))
+            some = slice(None) if self.sequence is None else self.sequence == number
+            parent[some] = own.parent[component[some]]
+        return replace(self, parent=parent, component=component, past=tuple(past))
 
     def of_mode(self, x: Float[Tensor, " n"]) -> TrackingCost:
         """The cost for samples that all descend from one pose."""
         single = GaussianMixture(x[None], torch.eye(len(x)).to(x)[None], x.new_zeros(1))
-        return replace(self.of_children(x.new_zeros(0).long(), single), parent=None)
+        every = self.of_children(x.new_zeros(0).long(), Prior.of(single))
+        return replace(every, parent=None, component=None)
 
     def take(self, items: Int[Tensor, " b"]) -> TrackingCost:
         """The cost restricted to some samples: each keeps its own parent and sequence."""
-        parent, sequence = (
-            None if index is None else index[items] for index in (self.parent, self.sequence)
+        parent, component, sequence = (
+            None if index is None else index[items]
+            for index in (self.parent, self.component, self.sequence)
         )
-        return replace(self, parent=parent, sequence=sequence)
+        return replace(self, parent=parent, component=component, sequence=sequence)
 
     def problem(self) -> SearchProblem:
         """What a tracker searches: the cost, its coarse and its cheap relative, and the rest."""
@@ -162,7 +167,7 @@ class TrackingCost:
             weight_only=self.weight_only,
             landmarks=self.landmarks,
             restrict=lambda items: self.take(items).problem(),
-            of_children=lambda parent, prior: self.of_children(parent, prior).problem(),
+            of_children=lambda *given: self.of_children(*given).problem(),
         )
 
     def coarse(self) -> TrackingCost | None:
@@ -246,6 +251,7 @@ class TrackingCost:
     ) -> dict[str, Tensor]:
         """Evaluate sequence by sequence, a chunk at a time, and put the results together."""
         flat, found, order = x.reshape(-1, x.shape[-1]), [], []
+        component = self.parent if self.component is None else self.component
         for past in self.past:
             items = torch.arange(len(flat), device=x.device)
             if self.sequence is not None:
@@ -254,8 +260,8 @@ class TrackingCost:
                 continue
             views = [view for view in self.views if view.sequence == past.sequence]
             for some in items.split(self._chunk):
-                parent = None if self.parent is None else self.parent[some]
-                found.append(evaluate(_Part(self, past, views, flat[some], parent)))
+                of = (None if each is None else each[some] for each in (self.parent, component))
+                found.append(evaluate(_Part(self, past, views, flat[some], *of)))
                 order.append(some)
         names = dict.fromkeys(name for part in found for name in part)
         results = {name: _joined(name, found, order) for name in names}
@@ -288,6 +294,7 @@ class _Part:
     views: Sequence[FrameContext]
     x: Float[Tensor, "b n"]
     parent: Int[Tensor, " b"] | None
+    component: Int[Tensor, " b"] | None
 
     def values(self) -> dict[str, Tensor]:
         """Cost of every prior and term."""
@@ -382,8 +389,9 @@ class _Part:
         self, kind: Kind, pose: BodyPose, body: BodyModel
     ) -> Iterator[tuple[str, float, Any, Posed]]:
         """The terms of a kind with their weights, and the poses before each camera."""
-        for view in (self.past,) if kind == "prior" else self.views:
-            posed = Posed(view, body, pose, self.parent)
+        prior = kind == "prior"
+        for view in (self.past,) if prior else self.views:
+            posed = Posed(view, body, pose, self.component if prior else self.parent)
             for name, bound in self.cost._bound(kind, view):
                 yield name, self.cost.choice.weight(name), bound, posed
 

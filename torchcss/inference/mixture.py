@@ -139,6 +139,31 @@ class MixtureSamples(NamedTuple):
     component: Int[Tensor, " s"]
 
 
+class Prior(NamedTuple):
+    """What is expected of a frame: the modes before, one frame ahead, and where moves lead.
+
+    Attributes:
+        mixture: The components; those of the modes come first, in their order.
+        parent: The mode before that each component was made from.
+    """
+
+    mixture: GaussianMixture
+    parent: Int[Tensor, " k"]
+
+    @staticmethod
+    def of(modes: GaussianMixture) -> Prior:
+        """A component for every mode."""
+        return Prior(modes, torch.arange(len(modes.mean), device=modes.mean.device))
+
+    def joined(self, others: Prior | None) -> Prior:
+        """These components and others of the same modes."""
+        if others is None or not len(others.parent):
+            return self
+        fields = zip(self.mixture, others.mixture, strict=True)
+        joined = GaussianMixture(*(torch.cat(pair) for pair in fields))
+        return Prior(joined, torch.cat([self.parent, others.parent]))
+
+
 class Matches(NamedTuple):
     """Posterior modes matched with prior ones, Fig. 6 step 5.
 

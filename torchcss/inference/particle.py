@@ -43,7 +43,7 @@ from torchcss.inference.importance import (
     survival,
     tempered_log_weight,
 )
-from torchcss.inference.mixture import GaussianMixture, standard_normal
+from torchcss.inference.mixture import GaussianMixture, Prior, standard_normal
 from torchcss.inference.problem import SearchProblem
 from torchcss.inference.proposals import CovarianceScaled
 from torchcss.inference.tracker import (
@@ -108,7 +108,7 @@ class _Filter(ABC):
         self,
         particles: Particles,
         moved: GaussianMixture,
-        prior: GaussianMixture,
+        prior: Prior,
         problem: SearchProblem,
         bounds: Bounds,
         generator: torch.Generator,
@@ -148,15 +148,15 @@ class _Filter(ABC):
         particles = state.particles
         if particles is None:
             fair = CovarianceScaled(covariance_scale=1.0, include_modes=False, stratified=True)
-            x, parent, log_weight = fair.sample(
-                mixture, self.num_samples, bounds, generator=generator
+            drawn = fair.sample(mixture, self.num_samples, bounds, generator=generator)
+            particles = Particles(
+                drawn.x, state.velocity[drawn.parent], drawn.log_weight, drawn.parent
             )
-            particles = Particles(x, state.velocity[parent], log_weight, parent)
         points = torch.zeros_like(mixture.covariance[:1]).expand(len(particles.x), -1, -1)
         moved = self.dynamics.predict(
             GaussianMixture(particles.x, points, particles.log_weight), particles.velocity
         )
-        prior = self.dynamics.predict(mixture, state.velocity)
+        prior = Prior.of(self.dynamics.predict(mixture, state.velocity))
 
         weighed = self._weigh(particles, moved, prior, problem, bounds, generator)
         some = bool((weighed.log_weight > -torch.inf).any())
@@ -271,7 +271,7 @@ class ParticleFilter(_Filter):
         self,
         particles: Particles,
         moved: GaussianMixture,
-        prior: GaussianMixture,
+        prior: Prior,
         problem: SearchProblem,
         bounds: Bounds,
         generator: torch.Generator,
@@ -330,7 +330,7 @@ class AnnealedParticleFilter(_Filter):
         self,
         particles: Particles,
         moved: GaussianMixture,
-        prior: GaussianMixture,
+        prior: Prior,
         problem: SearchProblem,
         bounds: Bounds,
         generator: torch.Generator,
@@ -353,7 +353,7 @@ class AnnealedParticleFilter(_Filter):
 def _energy(
     problem: SearchProblem,
     parent: Int[Tensor, " s"],
-    prior: GaussianMixture,
+    prior: Prior,
     x: Float[Tensor, "s n"],
 ) -> Float[Tensor, " s"]:
     """The frame's cost of states with these parents; infinite where it is not finite."""

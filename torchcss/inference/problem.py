@@ -11,7 +11,7 @@ inside them:
 | `weight_only` | what has no derivatives and counts among modes, nats |
 | `landmarks` | points by whose distance two states are told apart |
 | `restrict` | the problem of some of the samples |
-| `of_children` | the problem of samples of the modes before, where they are compared with them |
+| `of_children` | the problem of samples of a prior, where they are compared with it |
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import NamedTuple
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchcss.inference.mixture import GaussianMixture
+from torchcss.inference.mixture import Prior
 from torchcss.types import CostFunction
 
 
@@ -36,8 +36,8 @@ class SearchProblem(NamedTuple):
         weight_only: Cost in nats of what counts in the weights of modes alone.
         landmarks: Points of each state.
         restrict: Makes the problem of some samples, by index; None: by the costs' `take`.
-        of_children: Makes the problem of samples from their parents and the prior, one frame ahead,
-            that these index; None: the samples' parents do not matter.
+        of_children: Makes the problem of samples from the component of the prior that each came
+            from, and the prior; None: where samples come from does not matter.
     """
 
     cost: CostFunction
@@ -46,11 +46,11 @@ class SearchProblem(NamedTuple):
     weight_only: Callable[[Float[Tensor, "b n"]], Float[Tensor, " b"]] | None = None
     landmarks: Callable[[Float[Tensor, "b n"]], Float[Tensor, "b m d"]] | None = None
     restrict: Callable[[Int[Tensor, " m"]], SearchProblem] | None = None
-    of_children: Callable[[Int[Tensor, " s"], GaussianMixture], SearchProblem] | None = None
+    of_children: Callable[[Int[Tensor, " s"], Prior], SearchProblem] | None = None
 
-    def children(self, parent: Int[Tensor, " s"], prior: GaussianMixture) -> SearchProblem:
-        """The problem of samples of a prior's modes."""
-        return self if self.of_children is None else self.of_children(parent, prior)
+    def children(self, component: Int[Tensor, " s"], prior: Prior) -> SearchProblem:
+        """The problem of samples of a prior's components."""
+        return self if self.of_children is None else self.of_children(component, prior)
 
     def take(self, items: Int[Tensor, " m"]) -> SearchProblem:
         """The problem of some of the samples."""

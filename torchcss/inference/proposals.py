@@ -14,6 +14,7 @@ All proposals share one interface, `Proposal`, and differ in what a mode (mu, Si
 | `ChamRehg` | N(mu, Sigma + Q) where no other mode's is higher | Fig. 8d (2) [IJRR] |
 | `InflatedPosterior` | N(mu, s Sigma + Q), weights diluted to pi^(1/s) | section 9 [IJRR] |
 | `MixtureOfProposals` | those of its members, in given shares | |
+| `Move` | components elsewhere, where what is known of the body leads | |
 
 A scale is always named: `covariance_scale = s` multiplies the covariance (Fig. 6, s = 4 to 14),
 `deviation_scale = d` the standard deviations (Table 1; `d = sqrt(s)`). Exactly one is given
@@ -33,6 +34,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple, Protocol
@@ -45,6 +47,7 @@ from torchcss.errors import ConfigurationError
 from torchcss.inference.mixture import (
     GaussianMixture,
     MixtureSamples,
+    Prior,
     draw_components,
     standard_normal,
 )
@@ -60,15 +63,21 @@ class Samples(NamedTuple):
 
     Attributes:
         x: Admissible states.
-        parent: The mixture component that each came from.
+        parent: The component that each came from: of the mixture, or of the jumps that follow it.
         log_weight: Importance weight, log of the mixture's density over the proposal's, where the
             sample was drawn, before it was projected onto the bounds. `-inf` for what was not
-            drawn at random: the modes themselves, and regular patterns.
+            drawn at random from the mixture: the modes themselves, regular patterns, jumps.
+        jumps: Components that moves add to the mixture, weighed as its own are; None: none.
     """
 
     x: Float[Tensor, "s n"]
     parent: Int[Tensor, " s"]
     log_weight: Float[Tensor, " s"]
+    jumps: Prior | None = None
+
+    def take(self, items: Int[Tensor, " m"]) -> Samples:
+        """Some of the samples."""
+        return Samples(self.x[items], self.parent[items], self.log_weight[items], self.jumps)
 
 
 class Proposal(Protocol):
@@ -606,10 +615,11 @@ class MixtureOfProposals(_Projecting):
     (`correlated_projection`); those of a `Proposal` from elsewhere are projected each parameter for
     itself. Give `include_modes` to the first member only.
 
+    What a member leaves, such as a regular pattern of fewer states, the first one draws.
+
     Attributes:
         proposals: The members.
-        shares: Their shares of the samples, not negative; equal by default. A regular pattern that
-            gives fewer leaves the rest to nobody.
+        shares: Their shares of the samples, not negative; equal by default.
     """
 
     proposals: tuple[Proposal, ...]
@@ -661,19 +671,118 @@ class MixtureOfProposals(_Projecting):
     def draw(
         self, mixture: GaussianMixture, num: int, bounds: Bounds, *, generator: torch.Generator
     ) -> tuple[Samples, Float[Tensor, "s n"]]:
-        """Draw from the members one after another; each projects its own."""
-        free, drawn, admissible = unbounded(mixture.mean), [], []
-        for proposal, count in zip(self.proposals, self._counts(num), strict=True):
-            if isinstance(proposal, _Projecting):
-                samples, inside = proposal.draw(mixture, count, bounds, generator=generator)
-            else:
-                samples = proposal.sample(mixture, count, free, generator=generator)
-                inside = bounds.project(samples.x)
-            drawn.append(samples)
-            admissible.append(inside)
-        x, parent, log_weight = (torch.cat(field) for field in zip(*drawn, strict=True))
+        """Draw from the members; each projects its own, and the first draws what others leave."""
+        (first, *others), (count, *counts) = self.proposals, self._counts(num)
+        parts = [
+            _drawn(member, mixture, wanted, bounds, generator)
+            for member, wanted in zip(others, counts, strict=True)
+        ]
+        left = sum(counts) - sum(len(samples.x) for samples, _ in parts)
+        parts.insert(0, _drawn(first, mixture, count + left, bounds, generator))
+        drawn, admissible = zip(*parts, strict=True)
+        x, log_weight = (torch.cat([part[field] for part in drawn]) for field in (0, 2))
+        jumps, parents, num_modes = None, [], len(mixture.mean)
+        for part in drawn:
+            before = 0 if jumps is None else len(jumps.parent)
+            parents.append(part.parent + before * (part.parent >= num_modes))
+            jumps = part.jumps if jumps is None else jumps.joined(part.jumps)
+        parent = torch.cat(parents)
         random = log_weight > -math.inf
         counts = [int((part.log_weight > -math.inf).sum()) for part in drawn]
         joint = mixture.log_density(x) - self._joint_log_density(mixture, x, counts)
-        samples = Samples(x, parent, torch.where(random, joint, -math.inf))
-        return samples, torch.cat(admissible)
+        log_weight = torch.where(random, joint, -math.inf)
+        return Samples(x, parent, log_weight, jumps), torch.cat(admissible)
+
+
+def _drawn(
+    proposal: Proposal,
+    mixture: GaussianMixture,
+    num: int,
+    bounds: Bounds,
+    generator: torch.Generator,
+) -> tuple[Samples, Float[Tensor, "s n"]]:
+    """Samples of any proposal: as they were drawn, and their admissible states."""
+    if isinstance(proposal, _Projecting):
+        return proposal.draw(mixture, num, bounds, generator=generator)
+    if isinstance(proposal, Move):
+        samples = proposal.sample(mixture, num, bounds, generator=generator)
+        return samples, samples.x
+    samples = proposal.sample(mixture, num, unbounded(mixture.mean), generator=generator)
+    return samples, bounds.project(samples.x)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Move(ABC):
+    """A proposal that knows where else to look: it adds components to the prior.
+
+    What is known of the body or of the picture leads from the heaviest component to other states,
+    far from it and as plausible. Each becomes a component, as uncertain as the one that it was made
+    from, and is sampled as that would be. To use with others, in a `MixtureOfProposals`.
+
+    Attributes:
+        search: How samples of the new components are drawn.
+        log_odds: Weight of each against that of the component it was made from, nats. Low odds make
+            the image's evidence outweigh a jump before it leads.
+    """
+
+    search: Proposal
+    log_odds: float = -5.0
+
+    @abstractmethod
+    def states(self, best: GaussianMixture, bounds: Bounds) -> Float[Tensor, "j n"]:
+        """Other states, the most plausible first.
+
+        Args:
+            best: The heaviest component.
+            bounds: Limits of the state.
+        """
+
+    def sample(
+        self, mixture: GaussianMixture, num: int, bounds: Bounds, *, generator: torch.Generator
+    ) -> Samples:
+        """Draw from the new components; nothing if there are none, or none are wanted."""
+        best = mixture.log_weight.argmax()[None]
+        mean = self.states(mixture.take(best), bounds) if num > 0 else mixture.mean[:0]
+        parent = best.expand(len(mean))
+        like = mixture.take(parent)
+        jumps = GaussianMixture(mean, like.covariance, like.log_weight + self.log_odds)
+        if not len(mean):
+            return Samples(mean, parent, jumps.log_weight)
+        found = self.search.sample(jumps, num, bounds, generator=generator)
+        return Samples(
+            found.x,
+            len(mixture.mean) + found.parent,
+            torch.full_like(found.log_weight, -math.inf),
+            Prior(jumps, parent),
+        )
+
+    def log_density(
+        self, mixture: GaussianMixture, x: Float[Tensor, "*batch n"]
+    ) -> Float[Tensor, "*batch"]:
+        """`-inf`: of the mixture itself, nothing is drawn."""
+        return torch.full_like(x[..., 0], -math.inf)
+
+
+_MOST_OF_MOVES = 0.75
+"""Share of the samples that moves get at the most."""
+
+
+def with_moves(
+    proposal: Proposal, moves: Sequence[tuple[Move, float]], num_samples: int
+) -> Proposal:
+    """A proposal and moves as one; the samples that moves do not need are the proposal's.
+
+    Args:
+        proposal: Where the other samples go.
+        moves: Each with the number of samples wanted of it; together they get at most three
+            quarters of all.
+        num_samples: Samples in all.
+    """
+    wanted = sum(number for _, number in moves)
+    if not wanted:
+        return proposal
+    share = min(1.0, _MOST_OF_MOVES * num_samples / wanted)
+    return MixtureOfProposals(
+        proposals=(proposal, *(move for move, _ in moves)),
+        shares=(num_samples - share * wanted, *(share * number for _, number in moves)),
+    )

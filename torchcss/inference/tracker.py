@@ -36,6 +36,7 @@ from torchcss.inference.importance import Survival, survival
 from torchcss.inference.mixture import (
     GaussianMixture,
     Past,
+    Prior,
     distinct_modes,
     match_to_prior,
     prior_at,
@@ -100,9 +101,9 @@ class TrackerInfo(NamedTuple):
     Attributes:
         cost: Cost of each mode kept, weight-only cost included, nats; `inf` where a mode was
             carried over (no sample had a finite cost).
-        parent: Prior mode matched with each mode (Fig. 6 step 5), or next to it where matching is
-            soft; -1 for none.
-        origin: Prior mode whose sample descended to each mode.
+        parent: Mode before that is matched with each mode (Fig. 6 step 5), or next to it where
+            matching is soft; that from which a move was made, where the jump is; -1 for none.
+        origin: Component of the prior whose sample descended to each mode.
         status_counts: How many samples ended with each `Status`, by its number.
         num_steps: Optimiser iterations of every descent, those that were given up
             (`Tracker.survivors`) last.
@@ -112,7 +113,7 @@ class TrackerInfo(NamedTuple):
             many modes share the posterior.
         survival: How evenly the samples' importance weights are spread: those back to the prior
             for samples that descend (section 8 [IJRR]), those of the posterior for particles.
-        prior: The prior of the frame: the modes before, one frame ahead.
+        prior: The prior of the frame: the modes before, one frame ahead, and where moves led.
     """
 
     cost: Float[Tensor, " k"]
@@ -124,7 +125,7 @@ class TrackerInfo(NamedTuple):
     num_distinct: Int[Tensor, ""]
     effective_sample_size: Float[Tensor, ""]
     survival: Survival
-    prior: GaussianMixture
+    prior: Prior
 
 
 class SequenceTracker(Protocol):
@@ -205,10 +206,10 @@ def initial_state(mixture: GaussianMixture, *, generator: torch.Generator) -> Tr
     )
 
 
-def _unperturbed(samples: Samples, num_modes: int) -> Bool[Tensor, " s"]:
-    """The modes of the prior among its samples: they come first, and were not drawn at random."""
-    first = torch.arange(len(samples.x), device=samples.parent.device) < num_modes
-    return first & (samples.log_weight == -torch.inf)
+def _unperturbed(samples: Samples, prior: Prior, bounds: Bounds) -> Bool[Tensor, " s"]:
+    """The samples that are a component's centre, and were not drawn at random."""
+    centre = bounds.project(prior.mixture.mean)[samples.parent]
+    return (samples.x == centre).all(-1) & (samples.log_weight == -torch.inf)
 
 
 class _Space(NamedTuple):
@@ -226,7 +227,7 @@ class _Search(NamedTuple):
         problem: The problem of these samples.
         samples: Where they came from.
         descents: Where they have got to.
-        is_mode: Which of them are modes of the prior, unperturbed.
+        is_mode: Which of them are centres of the prior's components, unperturbed.
         given_up: Steps of those that were given up.
     """
 
@@ -241,7 +242,7 @@ class _Search(NamedTuple):
         others = torch.ones_like(self.is_mode).index_fill(0, items, False)
         return _Search(
             self.problem.take(items),
-            Samples(*(part[items] for part in self.samples)),
+            self.samples.take(items),
             self.descents.take(items),
             self.is_mode[items],
             torch.cat([self.given_up, self.descents.num_steps[others]]),
@@ -371,22 +372,26 @@ class Tracker:
         generator.set_state(state.generator_state)
 
         # 1: the prior, one frame ahead; the proposal inflates it.
-        prior = self.dynamics.predict(state.mixture, state.velocity)
+        ahead = self.dynamics.predict(state.mixture, state.velocity)
 
         # 2.1, 2.2: choose components and sample them, inside the bounds.
-        samples, spread = self._sample(problem, prior, bounds, generator)
+        drawn = self.num_samples * self.oversampling
+        samples = self.proposal.sample(ahead, drawn, bounds, generator=generator)
+        prior = Prior.of(ahead).joined(samples.jumps)
+        spread = survival(samples.log_weight)
+        samples = self._screen(problem, samples, prior, bounds)
         samples = self._descend_coarsely(problem, samples, prior, space)
         started = len(samples.x)
 
         # 2.3: descend from every sample, and discard minima found before.
-        search = self._halve(self._begin(problem, samples, prior), space)
+        search = self._halve(self._begin(problem, samples, prior, bounds), space)
         modes, distinct = self._minima(search, space)
         if len(distinct):
             # 3: weights by the likelihood at the modes. 4 to 6: the best K, with their pasts.
             found = search.problem.take(distinct), Modes(*(part[distinct] for part in modes))
             kept = self._posterior(state, prior, *found, search.samples.parent[distinct])
         else:
-            kept = self._carry_over(state, prior, bounds)
+            kept = self._carry_over(state, ahead, bounds)
 
         info = TrackerInfo(
             cost=kept.cost,
@@ -403,63 +408,58 @@ class Tracker:
         frame = state.frame + 1
         return TrackerState(kept.mixture, kept.velocity, generator.get_state(), frame), info
 
-    def _sample(
-        self,
-        problem: SearchProblem,
-        prior: GaussianMixture,
-        bounds: Bounds,
-        generator: torch.Generator,
-    ) -> tuple[Samples, Survival]:
-        """Draw samples; of more than are wanted, keep the best by the screening cost."""
-        drawn = self.num_samples * self.oversampling
-        samples = self.proposal.sample(prior, drawn, bounds, generator=generator)
-        spread = survival(samples.log_weight)
-        if self.oversampling > 1:
-            problem = problem.children(samples.parent, prior)
-            score = (problem.screening or problem.cost).value(samples.x).nan_to_num(torch.inf)
-            score[_unperturbed(samples, len(prior.mean))] = -torch.inf
-            best = score.argsort(stable=True)[: self.num_samples].sort().values
-            samples = Samples(*(part[best] for part in samples))
-        return samples, spread
+    def _screen(
+        self, problem: SearchProblem, samples: Samples, prior: Prior, bounds: Bounds
+    ) -> Samples:
+        """Of more samples than are wanted, keep the best by the screening cost."""
+        if self.oversampling == 1:
+            return samples
+        problem = problem.children(samples.parent, prior)
+        score = (problem.screening or problem.cost).value(samples.x).nan_to_num(torch.inf)
+        score[_unperturbed(samples, prior, bounds)] = -torch.inf
+        return samples.take(score.argsort(stable=True)[: self.num_samples].sort().values)
 
     def _descend_coarsely(
-        self, problem: SearchProblem, samples: Samples, prior: GaussianMixture, space: _Space
+        self, problem: SearchProblem, samples: Samples, prior: Prior, space: _Space
     ) -> Samples:
         """Let every so many samples descend on the coarse cost, if the frame has one."""
         if not self.coarse_every or problem.children(samples.parent, prior).coarse is None:
             return samples
-        samples, some = self._modes_among(samples, prior)
+        samples, some = self._modes_among(samples, prior, space.bounds)
         coarse = problem.children(samples.parent, prior).take(some).coarse
         assert coarse is not None
         rough = self.optimiser.minimise(coarse, samples.x[some], space.bounds, scale=space.scale)
         return samples._replace(x=samples.x.index_copy(0, some, rough.mean))
 
     def _modes_among(
-        self, samples: Samples, prior: GaussianMixture
+        self, samples: Samples, prior: Prior, bounds: Bounds
     ) -> tuple[Samples, Int[Tensor, " c"]]:
         """Choose the samples that descend on the coarse cost, every mode's own copy among them.
 
         They are taken from those that were drawn, so that the modes descend as they are, too; where
         none was drawn, from the modes.
         """
-        drawn = ~_unperturbed(samples, len(prior.mean))
+        drawn = ~_unperturbed(samples, prior, bounds)
         if not bool(drawn.any()):
             return samples, torch.nonzero(~drawn)[:: self.coarse_every, 0]
         some = torch.nonzero(drawn)[:: self.coarse_every, 0]
-        own = torch.arange(min(len(some), len(prior.mean)), device=some.device)
+        centres = prior.mixture.mean
+        own = torch.arange(min(len(some), len(centres)), device=some.device)
         first = some[: len(own)]
-        return Samples(
-            samples.x.index_copy(0, first, prior.mean[own]),
-            samples.parent.index_copy(0, first, own),
-            samples.log_weight.index_fill(0, first, -torch.inf),
+        return samples._replace(
+            x=samples.x.index_copy(0, first, centres[own]),
+            parent=samples.parent.index_copy(0, first, own),
+            log_weight=samples.log_weight.index_fill(0, first, -torch.inf),
         ), some
 
-    def _begin(self, problem: SearchProblem, samples: Samples, prior: GaussianMixture) -> _Search:
+    def _begin(
+        self, problem: SearchProblem, samples: Samples, prior: Prior, bounds: Bounds
+    ) -> _Search:
         return _Search(
             problem.children(samples.parent, prior),
             samples,
             self.optimiser.start(samples.x),
-            _unperturbed(samples, len(prior.mean)),
+            _unperturbed(samples, prior, bounds),
             samples.parent[:0],
         )
 
@@ -521,7 +521,7 @@ class Tracker:
     def _posterior(
         self,
         state: TrackerState,
-        prior: GaussianMixture,
+        prior: Prior,
         problem: SearchProblem,
         modes: Modes,
         origin: Int[Tensor, " m"],
@@ -535,20 +535,21 @@ class Tracker:
             volume = 0.5 * log_determinant(modes.covariance)
         log_weight = volume - self.likelihood_power * cost
         unpruned = GaussianMixture(modes.mean, modes.covariance, log_weight).normalise()
-        remembered = self.forgetting * prior.normalise().log_weight
-        tempered = prior._replace(log_weight=remembered)
+        remembered = self.forgetting * prior.mixture.normalise().log_weight
+        tempered = prior.mixture._replace(log_weight=remembered)
         past = prior_at(unpruned, tempered) if self.soft_matching else None
         kept = self._explanations(problem, unpruned, volume - cost, past)
         pruned = unpruned.take(kept).normalise()
         if past is None:
-            mixture, parent = match_to_prior(pruned, tempered, standard=self.standard_bhattacharyya)
+            mixture, match = match_to_prior(pruned, tempered, standard=self.standard_bhattacharyya)
         else:
             weighted = pruned.log_weight + past.log_weight[kept]
-            mixture, parent = pruned._replace(log_weight=weighted).normalise(), past.parent[kept]
+            mixture, match = pruned._replace(log_weight=weighted).normalise(), past.parent[kept]
         best_first = mixture.log_weight.argsort(descending=True, stable=True)
-        mixture, parent, kept = mixture.take(best_first), parent[best_first], kept[best_first]
-        moved = mixture.mean - state.mixture.mean[parent.clamp(min=0)]
-        velocity = torch.where((parent >= 0)[:, None], moved, 0.0)
+        mixture, match, kept = mixture.take(best_first), match[best_first], kept[best_first]
+        moved = mixture.mean - _start(state.mixture, prior)[match.clamp(min=0)]
+        velocity = torch.where((match >= 0)[:, None], moved, 0.0)
+        parent = torch.where(match >= 0, prior.parent[match.clamp(min=0)], -1)
         effective = (-(2 * unpruned.log_weight).logsumexp(0)).exp()
         return _Kept(mixture, velocity, cost[kept], parent, origin[kept], effective)
 
@@ -613,6 +614,12 @@ class Tracker:
                 state, problem, bounds, scale=scale, prior_variance=prior_variance
             )
             yield state, info
+
+
+def _start(modes: GaussianMixture, prior: Prior) -> Float[Tensor, "k n"]:
+    """Where each component of a prior was a frame ago: what a move put elsewhere was there."""
+    expected = prior.mixture.mean[prior.parent]
+    return torch.where(prior.mixture.mean == expected, modes.mean[prior.parent], prior.mixture.mean)
 
 
 def _finite_cost(modes: Modes) -> Float[Tensor, " s"]:

@@ -2,13 +2,15 @@
 
 A limb that comes towards the camera looks like one that goes away from it. Between the two lies a
 wall of cost that samples about a mode seldom cross, but where the other pose is can be computed:
-it is a forward-backward flip (`torchcss.body.flips`), as in initialisation. `with_flips` puts the
-flips of the best mode among the modes from which a tracker samples, so that every one of them is
-descended from in the next frame; the image decides what remains (Sminchisescu and Triggs,
-Kinematic Jump Processes, CVPR 2003, do so for every sample).
+it is a forward-backward flip (`torchcss.body.flips`), as in initialisation. `Flips` is the proposal
+that samples the flips of the best mode, so that every one of them is descended from; the image
+decides what remains (Sminchisescu and Triggs, Kinematic Jump Processes, CVPR 2003, do so for every
+sample).
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -21,9 +23,9 @@ from torchcss.cost.context import FrameContext
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.total import TrackingCost
 from torchcss.inference.mixture import GaussianMixture
-from torchcss.inference.tracker import TrackerState
+from torchcss.inference.proposals import Move
 from torchcss.initialise.multi_start import flips
-from torchcss.types import Keypoints
+from torchcss.types import Bounds, Keypoints
 from torchcss.vision.camera import Camera
 
 _NOISE = 0.02
@@ -42,50 +44,25 @@ _APART = 0.15
 that differ by the tilt of a foot or of the trunk, and they are the most plausible."""
 
 
-def with_flips(
-    state: TrackerState, body: BodyModel, camera: Camera, *, num: int, log_odds: float = -5.0
-) -> TrackerState:
-    """A tracker's state with the flips of its best mode among its modes.
+@dataclass(frozen=True, kw_only=True)
+class Flips(Move):
+    """The flips of the best mode; see `Move` for how they are sampled.
 
-    Args:
-        state: Where the last frame left off, the best mode first.
-        body: The body on the state's base.
+    Attributes:
+        search: How samples of each flip are drawn.
+        log_odds: Weight of a flip against that of the best mode, nats.
+        body: The body on this frame's base.
         camera: Any camera of the view.
         num: Most flips wanted.
-        log_odds: Their weight against that of the best mode, nats. Low odds spend one sample on
-            each, and make the image's evidence outweigh a jump before it leads.
     """
-    x = flipped_poses(body, camera, state.mixture.mean[0], num=num)
-    return with_modes(state, x, torch.zeros_like(x), log_odds=log_odds)
 
+    body: BodyModel
+    camera: Camera
+    num: int
 
-def with_modes(
-    state: TrackerState,
-    mean: Float[Tensor, "s n"],
-    velocity: Float[Tensor, "s n"],
-    *,
-    log_odds: float,
-) -> TrackerState:
-    """A tracker's state with other poses among its modes, as uncertain as the best one.
-
-    Args:
-        state: Where the last frame left off, the best mode first.
-        mean: The poses; none leaves the state as it is.
-        velocity: How far each moved in the last frame.
-        log_odds: Their weight against that of the best mode, nats.
-    """
-    if not len(mean):
-        return state
-    mixture = state.mixture
-    like = mixture.take(torch.zeros(len(mean), dtype=torch.long, device=mean.device))
-    joined = GaussianMixture(
-        torch.cat([mixture.mean, mean]),
-        torch.cat([mixture.covariance, like.covariance]),
-        torch.cat([mixture.log_weight, like.log_weight + log_odds]),
-    )
-    velocity = torch.cat([state.velocity, velocity])
-    # Particles are of the old modes; a filter draws new ones from the mixture.
-    return state._replace(mixture=joined.normalise(), velocity=velocity, particles=None)
+    def states(self, best: GaussianMixture, bounds: Bounds) -> Float[Tensor, "j n"]:
+        """The flips, the most plausible first; they obey the body's own limits."""
+        return flipped_poses(self.body, self.camera, bounds.project(best.mean[0]), num=self.num)
 
 
 def flipped_poses(

@@ -6,8 +6,8 @@ arm. But `segmentation`, which knows, has no derivatives, and samples about the 
 directions at once, do not reach what one limb has done meanwhile. So before a frame is searched,
 each arm of the best mode is asked whether its colours speak for it where it is expected
 (`astray_limbs`). One for which they do not is put into other poses, all else as expected, and those
-that cost least, and in which it explains something, join the search as modes (`with_limbs`). The
-image decides what remains: it is a jump as in `torchcss.tracking.flip_moves`, for another reason.
+that cost least, and in which it explains something, are proposed (`LostLimbs`). The image decides
+what remains: it is a move as in `torchcss.tracking.flip_moves`, for another reason.
 
 An arm that is hidden, or out of the picture, explains nothing either; it is found when it comes out
 elsewhere than expected. Legs are left alone. Arms swing, but legs stand: where one is astray, the
@@ -17,7 +17,7 @@ body has turned or gone, and a leg put elsewhere explains what the trunk has lef
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -27,10 +27,8 @@ from torchcss.body.flips import Limb, Segments
 from torchcss.body.model import BodyModel
 from torchcss.body.shape import with_shape
 from torchcss.cost.total import TrackingCost
-from torchcss.inference.dynamics import Dynamics
-from torchcss.inference.mixture import GaussianMixture
-from torchcss.inference.tracker import TrackerState
-from torchcss.tracking.flip_moves import with_modes
+from torchcss.inference.mixture import GaussianMixture, Prior
+from torchcss.inference.proposals import Move
 from torchcss.types import Bounds
 
 REACH = 0.2
@@ -50,40 +48,33 @@ _APART = 0.15
 """Least distance of some joint, metres, at which two poses are two."""
 
 
-def with_limbs(
-    state: TrackerState,
-    body: BodyModel,
-    cost: TrackingCost,
-    dynamics: Dynamics,
-    bounds: Bounds,
-    *,
-    num: int,
-    log_odds: float = -5.0,
-) -> TrackerState:
-    """A tracker's state with other poses of the arms that are astray among its modes.
+@dataclass(frozen=True, kw_only=True)
+class LostLimbs(Move):
+    """Other poses of the arms of the best mode that are astray; see `Move` for their samples.
 
-    Args:
-        state: Where the last frame left off, the best mode first.
-        body: The body on the state's base.
-        cost: The cost of the frame to come, of any modes. Without `segmentation` nothing is done.
-        dynamics: What happens between frames; the limb that is put elsewhere is at rest there.
-        bounds: Limits of the state.
+    Attributes:
+        search: How samples of each pose are drawn.
+        log_odds: Weight of a pose against that of the best mode, nats.
+        body: The body on this frame's base.
+        cost: The cost of the frame, of any modes. Without `segmentation` nothing is found.
         num: Most poses wanted of each arm.
-        log_odds: Their weight against that of the best mode, nats.
     """
-    first = torch.zeros(1, dtype=torch.long, device=state.velocity.device)
-    best, velocity = state.mixture.take(first), state.velocity[first]
-    prior = dynamics.predict(best, velocity)
-    expected = bounds.project(prior.mean[0])
-    means, velocities = [best.mean[:0]], [velocity[:0]]
-    for limb in astray_limbs(cost, body, expected):
-        poses = other_poses(cost, body, expected, limb, bounds, prior=prior, num=num)
-        columns, moved, still = limb.columns, best.mean.repeat(len(poses), 1), velocity.clone()
-        moved[:, columns] = poses[:, columns]
-        still[:, columns] = 0.0
-        means.append(moved)
-        velocities.append(still.repeat(len(poses), 1))
-    return with_modes(state, torch.cat(means), torch.cat(velocities), log_odds=log_odds)
+
+    body: BodyModel
+    cost: TrackingCost
+    num: int
+
+    def states(self, best: GaussianMixture, bounds: Bounds) -> Float[Tensor, "j n"]:
+        """The best mode as it is expected, but for one arm."""
+        expected, found = bounds.project(best.mean[0]), [best.mean[:0]]
+        for limb in astray_limbs(self.cost, self.body, expected):
+            poses = other_poses(
+                self.cost, self.body, expected, limb, bounds, prior=best, num=self.num
+            )
+            moved = best.mean.repeat(len(poses), 1)
+            moved[:, limb.columns] = poses[:, limb.columns]
+            found.append(moved)
+        return torch.cat(found)
 
 
 def astray_limbs(cost: TrackingCost, body: BodyModel, x: Float[Tensor, " n"]) -> list[Limb]:
@@ -137,7 +128,9 @@ def other_poses(
     drawn = bounds.project(drawn)
     every = torch.cat([x[None], drawn])
     choice = cost.choice.without("flow", "temporal", "temporal_mixture")
-    of_mode = replace(cost, choice=choice).of_children(every.new_zeros(len(every)).long(), prior)
+    of_mode = replace(cost, choice=choice).of_children(
+        every.new_zeros(len(every)).long(), Prior.of(prior)
+    )
     colours = cost.weight_only(every)
     apart = (every - x)[:, columns] / deviation
     value = of_mode.value(every) + colours + 0.5 * apart.square().sum(-1)

@@ -1,8 +1,8 @@
 """What a tracker does when it has lost its target: search more widely, and jump.
 
 `torchcss.inference.loss_monitor` tells from the costs that the track is lost. Until it is found
-again, each frame is searched with more samples, at a larger scale, for more modes, and from the
-other poses that project to the same places as the best mode: the forward-backward flips of
+again, each frame is searched with more samples, at a larger scale, for more modes, and most samples
+are of the poses that project to the same places as the best mode: the forward-backward flips of
 initialisation (`torchcss.body.flips`), which lie far apart in space and next to each other in the
 image. A track that was lost for that reason is found in one frame.
 """
@@ -12,12 +12,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from torchcss.body.model import BodyModel
 from torchcss.cost.choice import TERM_TABLE
 from torchcss.inference.loss_monitor import LossMonitor, MonitorState, widened
-from torchcss.inference.tracker import SequenceTracker, TrackerState
-from torchcss.tracking.flip_moves import with_flips
-from torchcss.vision.camera import Camera
+from torchcss.inference.tracker import SequenceTracker
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +26,7 @@ class Recovery:
         samples: How many times as many samples.
         modes: How many times as many modes.
         scale: Factor on the covariance scale.
-        num_flips: Most flips of the best mode that join the search, see
+        num_flips: Most flips of the best mode that are searched, see
             `torchcss.tracking.flip_moves`.
         patience: Frames in a row that are searched widely. What is not found by then has left, or
             the picture has changed for good; the track stays marked as lost.
@@ -48,9 +45,5 @@ class Recovery:
         return self.monitor.update(state, observed)
 
     def widened(self, tracker: SequenceTracker) -> SequenceTracker:
-        """The tracker that searches for what was lost."""
+        """The tracker that searches for what was lost; the flips are for whoever knows the body."""
         return widened(tracker, samples=self.samples, modes=self.modes, scale=self.scale)
-
-    def with_jumps(self, state: TrackerState, body: BodyModel, camera: Camera) -> TrackerState:
-        """The state with the best mode's flips among its modes, as likely as the best itself."""
-        return with_flips(state, body, camera, num=self.num_flips, log_odds=0.0)

@@ -36,6 +36,7 @@ from torchcss.cost.total import TrackingCost, beside
 from torchcss.errors import ConfigurationError
 from torchcss.inference.loss_monitor import MonitorState
 from torchcss.inference.mixture import GaussianMixture, tempered
+from torchcss.inference.proposals import with_moves
 from torchcss.inference.tracker import (
     SequenceTracker,
     Tracker,
@@ -45,10 +46,10 @@ from torchcss.inference.tracker import (
 from torchcss.inference.trust_region import default_prior_variance
 from torchcss.initialise.result import Initialisation
 from torchcss.stopwatch import Stopwatch
-from torchcss.tracking.flip_moves import with_flips
-from torchcss.tracking.limb_moves import with_limbs
+from torchcss.tracking.flip_moves import Flips
+from torchcss.tracking.limb_moves import LostLimbs
 from torchcss.tracking.settings import Plan, Settings, make_plan
-from torchcss.tracking.surface_prediction import Displaced, PicturePair, SurfaceMotion
+from torchcss.tracking.surface_prediction import PicturePair, SurfaceDynamics, SurfaceMotion
 from torchcss.tracking.view import (
     NOTHING_KNOWN,
     NOTHING_SEEN,
@@ -284,21 +285,10 @@ class TrackingSession:
             observer.recall(known, seen)
             for observer, known, seen in self._of_views(before.memory, observation)
         )
-        tracker, prior = self._with_flips(before)
+        cost = self._cost(observation, memory, stopwatch)
         clock.append(time.perf_counter())
-        cost = self._cost(observation, memory, prior, stopwatch)
-        clock.append(time.perf_counter())
-        if plan.limb_jumps and isinstance(tracker, Tracker):
-            num = plan.limb_jumps
-            found = with_limbs(prior, body, cost, tracker.dynamics, self._bounds, num=num)
-            if len(found.mixture.mean) > len(prior.mixture.mean):
-                prior, cost = found, self._cost(observation, memory, found, stopwatch)
-        tracker = self._told_by_pictures(tracker, prior, observation, cost)
-        after, info = tracker.step(prior, cost.problem(), self._bounds)
-        num_known = len(before.tracker.mixture.mean)
-        if len(prior.mixture.mean) > num_known:
-            # A mode that was jumped to goes back to the best one, from which the jump was made.
-            info = info._replace(parent=torch.where(info.parent < num_known, info.parent, 0))
+        tracker = self._tracker(observation, cost)
+        after, info = tracker.step(before.tracker, cost.problem(), self._bounds)
         clock.append(time.perf_counter())
         term_seconds = dict(stopwatch.seconds)
 
@@ -328,8 +318,8 @@ class TrackingSession:
             joints_world=body.pose(modes.mean).joints,
             terms=terms,
             seconds={
-                "features": observation.seconds + clock[2] - clock[1],
-                "search": clock[1] - clock[0] + clock[3] - clock[2],
+                "features": observation.seconds + clock[1] - clock[0],
+                "search": clock[2] - clock[1],
             },
             term_seconds=term_seconds,
             lost=lost,
@@ -346,18 +336,18 @@ class TrackingSession:
         self,
         observation: Observation,
         memory: Sequence[ViewMemory],
-        prior: TrackerState,
         stopwatch: Stopwatch,
     ) -> TrackingCost:
-        """The cost of a frame, for samples of the prior's modes."""
-        keypoints = not self.plan.keypoints_first_only or int(prior.frame) == 0
+        """The cost of a frame, for samples of the modes before."""
+        before = self.state.tracker
+        keypoints = not self.plan.keypoints_first_only or int(before.frame) == 0
         return beside(
             [
                 observer.cost(
                     seen,
                     known,
                     self.state.body,
-                    prior.mixture.mean,
+                    before.mixture.mean,
                     keypoints=keypoints,
                     stopwatch=stopwatch,
                 )
@@ -365,42 +355,49 @@ class TrackingSession:
             ]
         )
 
-    def _with_flips(self, state: SessionState) -> tuple[SequenceTracker, TrackerState]:
-        """The tracker of a frame, wider after a loss, and the prior with the best mode's flips."""
-        plan, tracker, camera = self.plan, state.tracker, self._observers[0].view.camera
-        if plan.recovery is not None and 0 < state.num_lost <= plan.recovery.patience:
-            jumped = plan.recovery.with_jumps(tracker, state.body, camera)
-            return plan.recovery.widened(plan.tracker), jumped
-        # To several cameras a flip looks different.
-        alone = len(self._observers) == 1
-        if plan.jumps_every and alone and int(tracker.frame) % plan.jumps_every == 0:
-            tracker = with_flips(tracker, state.body, camera, num=_NUM_FLIPS)
-        return plan.tracker, tracker
+    def _tracker(self, observation: Observation, cost: TrackingCost) -> SequenceTracker:
+        """The tracker of a frame: wider after a loss, with the moves and dynamics that it asks for.
 
-    def _told_by_pictures(
-        self,
-        tracker: SequenceTracker,
-        prior: TrackerState,
-        observation: Observation,
-        cost: TrackingCost,
-    ) -> SequenceTracker:
-        """The tracker whose dynamics know where the pictures have carried each mode's trunk."""
-        if self._surface_motion is None or not isinstance(tracker, Tracker):
+        Particle filters have neither: they search by the noise of their own dynamics.
+        """
+        plan, state = self.plan, self.state
+        tracker, recovery = plan.tracker, plan.recovery
+        lost = recovery is not None and 0 < state.num_lost <= recovery.patience
+        if recovery is not None and lost:
+            tracker = recovery.widened(tracker)
+        if not isinstance(tracker, Tracker):
             return tracker
-        pairs = [
-            PicturePair(view.camera, seen.contrast_before, seen.contrast)
-            for view, seen in zip(cost.views, observation.views, strict=True)
-        ]
-        mean = prior.mixture.mean
-        expected = self._surface_motion(
-            self.state.body,
-            pairs,
-            before=mean,
-            velocity=prior.velocity,
-            expected=tracker.dynamics.predict(prior.mixture, prior.velocity).mean,
-            deviation=cost.views[0].deviation,
-        )
-        return replace(tracker, dynamics=Displaced(tracker.dynamics, expected - mean))
+        search, dynamics, num = tracker.proposal, tracker.dynamics, tracker.num_samples
+        camera, moves = self._observers[0].view.camera, []
+        if recovery is not None and lost:
+            flips = Flips(
+                search=search, body=state.body, camera=camera, num=recovery.num_flips, log_odds=0.0
+            )
+            moves.append((flips, num))
+        elif self._flips_now():
+            flips = Flips(search=search, body=state.body, camera=camera, num=_NUM_FLIPS)
+            moves.append((flips, _NUM_FLIPS))
+        if plan.limb_jumps:
+            limbs = LostLimbs(search=search, body=state.body, cost=cost, num=plan.limb_jumps)
+            moves.append((limbs, 2 * plan.limb_jumps))
+        if self._surface_motion is not None:
+            pairs = [
+                PicturePair(view.camera, seen.contrast_before, seen.contrast)
+                for view, seen in zip(cost.views, observation.views, strict=True)
+            ]
+            dynamics = SurfaceDynamics(
+                dynamics=dynamics,
+                motion=self._surface_motion,
+                body=state.body,
+                pairs=pairs,
+                deviation=cost.views[0].deviation,
+            )
+        return replace(tracker, proposal=with_moves(search, moves, num), dynamics=dynamics)
+
+    def _flips_now(self) -> bool:
+        """Whether the flips of the best mode are searched; to several cameras they look unlike."""
+        every, frame = self.plan.jumps_every, int(self.state.tracker.frame)
+        return bool(every) and frame % every == 0 and len(self._observers) == 1
 
     def _terms_of_best(self, cost: TrackingCost, modes: GaussianMixture) -> dict[str, float]:
         """What the best mode costs by term, about the prior that the search had."""

@@ -14,8 +14,8 @@ frame. Limbs, neck and head come along as they hang: what is small is soon off i
 wall beside it stands still. The papers' trackers follow motion in the cost alone (section 3.1.2
 [IJRR]); trackers of one mode that live on it are older (Bregler and Malik, 1998).
 
-What to call: `SurfaceMotion(body)`, once, and in every frame `motion(...)`; `Displaced` for the
-dynamics of the tracker.
+What to call: `SurfaceMotion(body)`, once; in every frame `SurfaceDynamics` are the dynamics of the
+tracker.
 """
 
 from __future__ import annotations
@@ -52,29 +52,6 @@ taken for a step to the side."""
 
 _FEW_NODES = 10.0
 """Nodes seen below which the surface weighs less."""
-
-
-@dataclass(frozen=True)
-class Displaced:
-    """Dynamics that have been told how far each mode moves, and spread as others do.
-
-    Attributes:
-        dynamics: The others.
-        displacement: How far each mode moves.
-    """
-
-    dynamics: Dynamics
-    displacement: Float[Tensor, "k n"]
-
-    def predict(self, mixture: GaussianMixture, velocity: Float[Tensor, "k n"]) -> GaussianMixture:
-        """Return the prior of the next frame.
-
-        Args:
-            mixture: Posterior of this frame.
-            velocity: How far each mode moved since the last frame.
-        """
-        spread = self.dynamics.predict(mixture, velocity)
-        return spread._replace(mean=mixture.mean + self.displacement)
 
 
 class PicturePair(NamedTuple):
@@ -177,6 +154,45 @@ class SurfaceMotion:
             nodes = seen_nodes(body, pose, camera.centre_world, points, normals, part)
             views.append(SurfaceView(camera, now, surface_targets(nodes, camera, last)))
         return tuple(views)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceDynamics:
+    """Dynamics of one frame: the trunk goes where the pictures have carried it.
+
+    Modes spread, and all but their trunks move, as other dynamics say.
+
+    Attributes:
+        dynamics: The others.
+        motion: Fits the trunk.
+        body: The body on this frame's base.
+        pairs: What each camera has seen.
+        deviation: Motion expected in a frame; None: not known.
+    """
+
+    dynamics: Dynamics
+    motion: SurfaceMotion
+    body: BodyModel
+    pairs: Sequence[PicturePair]
+    deviation: Float[Tensor, " n"] | None
+
+    def predict(self, mixture: GaussianMixture, velocity: Float[Tensor, "k n"]) -> GaussianMixture:
+        """Return the prior of the next frame.
+
+        Args:
+            mixture: Posterior of this frame.
+            velocity: How far each mode moved since the last frame.
+        """
+        spread = self.dynamics.predict(mixture, velocity)
+        mean = self.motion(
+            self.body,
+            self.pairs,
+            before=mixture.mean,
+            velocity=velocity,
+            expected=spread.mean,
+            deviation=self.deviation,
+        )
+        return spread._replace(mean=mean)
 
 
 class SurfaceView(NamedTuple):
