@@ -489,6 +489,25 @@ def test_between_steps_only_the_base_touches_the_state(monkeypatch: pytest.Monke
         assert before is after
 
 
+def test_the_next_frame_may_be_seen_while_this_one_is_searched():
+    """Where it is looked at is known a frame ago, so that the bits are the same."""
+    sequence = arm_sequence(generator=torch.Generator().manual_seed(0), num_frames=4)
+    settings = Settings(body="arm8", working_size=160, samples=4, modes=2)
+    view = seen_by(sequence.camera)
+    one, ahead = (session_at(settings, sequence.body, sequence.states[0], view) for _ in range(2))
+    expected = list(one.track(sequence.frames))
+    observation = ahead.observe(sequence.frames[0])
+    for index, posterior in enumerate(expected):
+        coming = ahead.observe(sequence.frames[index + 1]) if index < 3 else observation
+        got = ahead.step(observation)
+        for part, same in zip(got.state.mixture, posterior.state.mixture, strict=True):
+            assert torch.equal(part, same)
+        observation = coming
+    features = observation.views[0].features
+    assert features is not None
+    assert features.window is not None, "an arm does not fill the picture"
+
+
 def test_terms_of_the_best_mode_add_up_to_its_cost():
     """In every frame: the priors are about the mixture that the search had, one frame ahead."""
     sequence = arm_sequence(generator=torch.Generator().manual_seed(0), num_frames=4)

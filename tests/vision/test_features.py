@@ -10,8 +10,9 @@ from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.vision.boundaries import motion_boundaries
 from torchcss.vision.camera import Camera
 from torchcss.vision.edges import EdgeConfiguration, edge_features, foreground_weight
-from torchcss.vision.features import FeatureExtractor, FrameFeatures
+from torchcss.vision.features import FeatureExtractor, FrameFeatures, Window
 from torchcss.vision.flow import TRACKING, robust_flow
+from torchcss.vision.sampling import gaussian_blur
 
 
 @pytest.fixture
@@ -252,9 +253,10 @@ def test_motion_of_thin_small_and_saturated_frames(
     for before, after in (frames, saturated, (frames[0], saturated[1])):
         features = extractor(after, before, mask=after[..., 0] > 100)
         assert features.flow is not None
+        assert features.colour is not None
         assert features.flow.shape == (2, *features.grey.shape)
-        for part in (*features, features.edge_field()):
-            assert part is not None
+        images = features._replace(window=None)
+        for part in (*(image for image in images if image is not None), features.edge_field()):
             assert part.dtype == dtype
             assert part.isfinite().all()
         for part in (features.flow_outlier, features.motion_boundary, features.mask):
@@ -286,3 +288,28 @@ def test_colours_are_those_of_the_frame_at_the_working_size(picture: torch.Tenso
     torch.testing.assert_close(grey.colour, features.grey.expand(3, -1, -1))
     small = FeatureExtractor(colour=True, working_size=20)(picture)
     assert small.colour.shape == (3, *small.grey.shape)
+
+
+def test_in_a_window_features_are_those_of_the_whole_but_for_its_border() -> None:
+    """And outside it nothing is known."""
+    generator = torch.Generator().manual_seed(2)
+    texture = gaussian_blur(torch.rand(120, 160, generator=generator), 2.0)
+    texture = (texture - texture.min()) / (texture.max() - texture.min())
+    before, after = texture[:, :-2], texture[:, 2:]
+    extractor, window = FeatureExtractor(flow=TRACKING, colour=True), Window(40, 24, 128, 96)
+    whole = extractor(after, before)
+    part = extractor(after, extractor(before), window=window)
+    inner = (..., slice(24 + 20, 96 - 20), slice(40 + 20, 128 - 20))
+    assert torch.equal(part.grey, whole.grey)
+    torch.testing.assert_close(part.edge_energy[inner], whole.edge_energy[inner], rtol=0, atol=0.1)
+    assert whole.flow is not None
+    assert part.flow is not None
+    torch.testing.assert_close(part.flow[inner], whole.flow[inner], rtol=0, atol=0.1)
+    outside = torch.ones_like(part.grey, dtype=torch.bool)
+    outside[window.pixels] = False
+    assert not bool(part.edge_energy[outside].any())
+    assert not bool(part.edge_field()[:, outside].any())
+    assert not bool(part.flow[:, outside].any())
+    for unknown in (part.flow_outlier, part.motion_boundary):
+        assert unknown is not None
+        assert bool((unknown[outside] == 1).all())

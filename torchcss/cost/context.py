@@ -93,7 +93,13 @@ class FrameContext:
     def _before_surroundings(self) -> Float[Tensor, "layers h w"] | None:
         if self.appearance is None or self.features is None or self.features.colour is None:
             return None
-        return self.appearance.foreground_ratio(self.features.colour)
+        colour, window = self.features.colour, self.features.window
+        if window is None:
+            return self.appearance.foreground_ratio(colour)
+        seen = self.appearance.foreground_ratio(colour[window.pixels])
+        whole = seen.new_zeros(len(seen), *colour.shape[1:])
+        whole[window.pixels] = seen
+        return whole
 
     @cached_property
     def _before_background(self) -> Float[Tensor, "layers h w"] | None:

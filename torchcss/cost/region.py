@@ -42,6 +42,7 @@ from torchcss.cost.part_map import grow, part_map
 from torchcss.cost.term import Need, OnPoints
 from torchcss.cost.visibility import ContourPredictor
 from torchcss.vision.camera import Camera
+from torchcss.vision.features import Window
 from torchcss.vision.spline import SplineField, spline_field
 
 _COARSE = 4
@@ -83,20 +84,28 @@ def layer_of_part(body: BodyModel) -> Int[Tensor, " parts"]:
     return torch.tensor(part_layers(body)[1], dtype=torch.long, device=body.tie.device)
 
 
-def region_field(ratio: Float[Tensor, "layers h w"], *, smoothing: float = 3.0) -> SplineField:
+def region_field(
+    ratio: Float[Tensor, "layers h w"], *, window: Window | None = None, smoothing: float = 3.0
+) -> SplineField:
     """Make the likenesses of a frame smooth functions.
 
     Args:
         ratio: How much each pixel looks like each layer, in -1..1.
+        window: Outside it the ratio is zero; None: everywhere is looked at.
         smoothing: Standard deviation of the blur, pixels. On the beam clip 3 tells good poses from
             lost ones by a quarter more than 1 does; with more, thin limbs fade.
     """
     size = 2 * math.ceil(3.0 * smoothing) + 1
     # Single precision is far finer than the colours, and twice as fast.
+    seen = (ratio if window is None else ratio[window.pixels]).float()
     blurred = kornia.filters.gaussian_blur2d(
-        ratio[None].float(), (size, size), (smoothing, smoothing), border_type="replicate"
-    )
-    return spline_field(blurred[0])
+        seen[None], (size, size), (smoothing, smoothing), border_type="replicate"
+    )[0]
+    if window is None:
+        return spline_field(blurred)
+    whole = blurred.new_zeros(ratio.shape)
+    whole[window.pixels] = blurred
+    return spline_field(whole)
 
 
 def region_masks(
@@ -208,7 +217,8 @@ class RegionTerm(OutlineTerm):
             return None
         part = context.tables.of(ContourPredictor).node_part
         layer = context.tables.of(layer_of_part)[part]
-        return self.bind(context, RegionImages(region_field(foreground), layer))
+        window = None if context.features is None else context.features.window
+        return self.bind(context, RegionImages(region_field(foreground, window=window), layer))
 
     def match(
         self, nodes: ImageNodes, image: RegionImages, at: Float[Tensor, "k 2"] | None = None

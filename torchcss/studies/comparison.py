@@ -125,7 +125,8 @@ def track_together(
     eye = going[0][1]
     first: Frame | None = None
     for frame in reader:
-        observation, first = eye.observe(frame), first or frame
+        observation = eye.observe(frame, everywhere=len(runs) > 1)
+        first = first or frame
         left = []
         for run, session, evaluator in going:
             ended = None

@@ -25,6 +25,7 @@ from torchcss.tracking.session import SessionState
 from torchcss.tracking.view import ViewMemory, ViewObservation
 from torchcss.vision.appearance import Appearance
 from torchcss.vision.background import Background
+from torchcss.vision.features import Window
 from torchcss.vision.spline import SplineField
 
 Record = TypeVar("Record")
@@ -46,6 +47,10 @@ def state_tensors(state: SessionState) -> dict[str, Tensor]:
         _put(tensors, f"views.{index}.appearance", memory.appearance)
         _put(tensors, f"views.{index}.background", memory.background)
     tensors["num_views"] = torch.tensor(len(state.seen))
+    for index, windows in enumerate(state.windows):
+        for number, window in enumerate(windows):
+            if window is not None:
+                tensors[f"windows.{index}.{number}"] = torch.tensor(window)
     if state.monitor is not None:
         history, excess, total, score = state.monitor
         for name, costs in history.items():
@@ -102,6 +107,10 @@ def state_from_tensors(tensors: Mapping[str, Tensor], body: BodyModel) -> Sessio
             memory=tuple(memory),
             monitor=_monitor(tensors),
             num_lost=int(tensors["num_lost"]),
+            windows=tuple(
+                tuple(_window(tensors, index, number) for number in range(len(seen)))
+                for index in range(2)
+            ),
         )
     except (KeyError, RuntimeError, TypeError, AssertionError) as error:
         raise TrackFileError(
@@ -123,6 +132,11 @@ def _get(kind: type[Record], tensors: Mapping[str, Tensor], at: str, like: Tenso
     names = inspect.signature(kind).parameters
     found = {name: tensors[f"{at}.{name}"] for name in names if f"{at}.{name}" in tensors}
     return kind(**{name: value.to(like.device) for name, value in found.items()}) if found else None
+
+
+def _window(tensors: Mapping[str, Tensor], index: int, number: int) -> Window | None:
+    corners = tensors.get(f"windows.{index}.{number}")
+    return None if corners is None else Window(*corners.tolist())
 
 
 def _monitor(tensors: Mapping[str, Tensor]) -> MonitorState | None:

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import zip_longest
@@ -60,6 +61,7 @@ from torchcss.tracking.view import (
 )
 from torchcss.types import Frame
 from torchcss.vision.camera import Camera
+from torchcss.vision.features import Window
 
 _PITCH_LIMIT = math.radians(55)
 """The base follows once the root's pitch exceeds this, well before it locks at 90 degrees."""
@@ -69,6 +71,9 @@ _NUM_FLIPS = 8
 
 Image = Frame | np.ndarray
 """An image with its place in the video, or its pixels `[h w 3]` alone: it then is the next one."""
+
+Windows = tuple[Window | None, ...]
+"""Where each view is looked at; None: everywhere."""
 
 Images = Image | Sequence[Image | None]
 """The images of one moment, one of each view; None from a camera that has ended."""
@@ -138,6 +143,7 @@ class SessionState(NamedTuple):
         memory: What each camera has taught.
         monitor: What tells a loss; None where nothing does.
         num_lost: Frames in a row that counted as lost, up to the last.
+        windows: Where each view is looked at, in the next frame and in the one after it.
     """
 
     tracker: TrackerState
@@ -146,6 +152,7 @@ class SessionState(NamedTuple):
     memory: tuple[ViewMemory, ...]
     monitor: MonitorState | None
     num_lost: int = 0
+    windows: tuple[Windows, ...] = ()
 
 
 class TrackingSession:
@@ -181,8 +188,9 @@ class TrackingSession:
             seen=(NOTHING_SEEN,) * nothing,
             memory=(NOTHING_KNOWN,) * nothing,
             monitor=None if self.plan.recovery is None else self.plan.recovery.monitor.init(),
+            windows=(self._windows(first.body, first.mixture),) * 2,
         )
-        self._seen, self._num_seen = self.state.seen, 0
+        self._expect(self.state)
 
     @classmethod
     def resume(
@@ -208,9 +216,18 @@ class TrackingSession:
                 f"the checkpoint is of {len(state.seen)} views, given are {len(views)}; give the "
                 "same views"
             )
-        session.state, session._seen = state, state.seen
-        session._num_seen = int(state.tracker.frame)
+        session.state = state
+        session._expect(state)
         return session
+
+    def _expect(self, state: SessionState) -> None:
+        """Be ready to see the frame that follows a state."""
+        self._seen, self._num_seen = state.seen, int(state.tracker.frame)
+        self._ahead = deque(state.windows, maxlen=2)
+
+    def _windows(self, body: BodyModel, mixture: GaussianMixture) -> Windows:
+        """Where each view is looked at two frames later."""
+        return tuple(observer.window(body, mixture.mean) for observer in self._observers)
 
     def _begin(
         self,
@@ -244,11 +261,15 @@ class TrackingSession:
         for each in images:
             yield self.step(self.observe(each))
 
-    def observe(self, images: Images) -> Observation:
+    def observe(self, images: Images, *, everywhere: bool = False) -> Observation:
         """See the images of one moment, in their order.
+
+        The next moment may be seen before this one is searched; it is looked at where the body can
+        be two frames after the search before. What is seen still earlier is looked at everywhere.
 
         Args:
             images: One of each view, or that of the only one.
+            everywhere: Look at all of each image, for others who search it too.
         """
         began = time.perf_counter()
         given = (images,) if isinstance(images, Image) else tuple(images)
@@ -256,10 +277,10 @@ class TrackingSession:
             self._placed(image, observer) for image, observer in zip_longest(given, self._observers)
         ]
         self._num_seen += 1
-        self._seen = tuple(
-            observer.observe(frame, before)
-            for observer, frame, before in zip(self._observers, frames, self._seen, strict=True)
-        )
+        windows: Windows = (None,) * len(frames)
+        if self._ahead and not everywhere:
+            windows = self._ahead.popleft()
+        self._seen = tuple(map(Observer.observe, self._observers, frames, self._seen, windows))
         return Observation(self._seen, time.perf_counter() - began)
 
     def _placed(self, image: Image | None, observer: Observer | None) -> Frame | None:
@@ -304,7 +325,14 @@ class TrackingSession:
             )
         next_body, moved = follow_with_base(body, after)
         num_lost = before.num_lost + 1 if lost else 0
-        self.state = SessionState(moved, next_body, observation.views, memory, monitor, num_lost)
+        windows: Windows = (None,) * len(self._observers)
+        if not lost:
+            windows = self._windows(body, modes)
+        self._ahead.append(windows)
+        self.state = SessionState(
+            *(moved, next_body, observation.views, memory, monitor, num_lost),
+            windows=(*before.windows[1:], windows),
+        )
         return Posterior(
             frame=observation.frame,
             body=body,

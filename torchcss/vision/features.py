@@ -20,6 +20,7 @@ the features of motion too: `FeatureExtractor(flow=TRACKING, ...)` and `extracto
 
 from __future__ import annotations
 
+from types import EllipsisType
 from typing import NamedTuple
 
 import numpy as np
@@ -56,8 +57,32 @@ _FLAT_RANGE = 1.0 / 255.0
 """Range of grey levels up to which a frame is of one colour."""
 
 
+class Window(NamedTuple):
+    """A rectangle of whole pixels of the working size.
+
+    Attributes:
+        left: First column.
+        top: First row.
+        right: Column after the last.
+        bottom: Row after the last.
+    """
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    @property
+    def pixels(self) -> tuple[EllipsisType, slice, slice]:
+        """The index of its pixels in an image `[... h w]`."""
+        return (..., slice(self.top, self.bottom), slice(self.left, self.right))
+
+
 class FrameFeatures(NamedTuple):
     """What the terms of the cost see of one frame, at the working size.
+
+    Edges and motion may have been looked for in a window only. Outside it there are no edges, the
+    flow is an outlier, and no motion boundary is known.
 
     Attributes:
         grey: Grey levels in 0..1.
@@ -72,6 +97,7 @@ class FrameFeatures(NamedTuple):
         mask: Foreground in 0..1; None if none was given.
         colour: Red, green, blue in 0..1, three times the same for a grey frame; None if not asked
             for.
+        window: Where the frame was looked at; None: everywhere.
     """
 
     grey: Float[Tensor, "h w"]
@@ -82,6 +108,7 @@ class FrameFeatures(NamedTuple):
     motion_boundary: Float[Tensor, "h w"] | None = None
     mask: Float[Tensor, "h w"] | None = None
     colour: Float[Tensor, "3 h w"] | None = None
+    window: Window | None = None
 
     def edge_field(self, *, boundary_emphasis: float = 0.3) -> Float[Tensor, "2 h w"]:
         """Edge energy times direction, weighted by motion boundaries and foreground.
@@ -164,61 +191,71 @@ class FeatureExtractor(nn.Module):
     def forward(
         self,
         frame: Frame | np.ndarray,
-        previous: Frame | np.ndarray | None = None,
+        previous: Frame | np.ndarray | FrameFeatures | None = None,
         mask: Bool[Tensor, "h w"] | Float[Tensor, "h w"] | np.ndarray | None = None,
+        *,
+        window: Window | None = None,
     ) -> FrameFeatures:
         """Extract the features of one frame.
 
         Args:
             frame: Grey `[h, w]`, RGB `[h, w, 3]` or RGBA `[h, w, 4]` (alpha is ignored), uint8,
                 uint16, or floating point in 0..1.
-            previous: The frame before, of the same size; None, or an extractor without flow
-                configuration: no features of motion.
+            previous: The frame before, of the same size, or its features; None, or an extractor
+                without flow configuration: no features of motion.
             mask: Foreground of the frame, of the same size: boolean, or in the types of `frame`.
+            window: Where to look for edges and motion; None: everywhere.
 
         Raises:
             ShapeError: If a picture is of another shape or type, empty, or outside 0..1 or not
                 finite, or if the pictures differ in size.
         """
-        levels = self._levels("frame", frame)
-        grey = self._luma(levels)
-        height, width = grey.shape
+        size = tuple(frame.shape[:2])
         for name, other in (("previous", previous), ("mask", mask)):
-            if other is not None and tuple(other.shape[:2]) != (height, width):
+            if other is None or isinstance(other, FrameFeatures):
+                continue
+            if tuple(other.shape[:2]) != size:
                 raise ShapeError(
-                    f"{name}: expected the frame's size [{height}, {width}], got "
-                    f"{list(other.shape[:2])}"
+                    f"{name}: expected the frame's size {list(size)}, got {list(other.shape[:2])}"
                 )
-        grey = self._resized(grey)
-        edges = edge_features(grey, self.edges)
+        planes = self._planes("frame", frame)
+        grey = self._luma(planes)
+        edges = edge_features(grey if window is None else grey[window.pixels], self.edges)
         features = FrameFeatures(
             grey=grey,
-            edge_energy=edges.energy,
-            edge_direction=edges.direction,
-            mask=None if mask is None else self._resized(self._grey("mask", mask)),
-            colour=self._colour(levels) if self.colour else None,
+            edge_energy=_within(window, grey, edges.energy, 0.0),
+            edge_direction=_within(window, grey, edges.direction, 0.0),
+            mask=None if mask is None else self._luma(self._planes("mask", mask)),
+            colour=planes.expand(3, -1, -1) if self.colour else None,
+            window=window,
         )
         if previous is None or self.flow is None:
             return features
+        if isinstance(previous, FrameFeatures):
+            return self._with_motion(features, previous.grey, self.flow)
         return self._with_motion(
-            features, self._resized(self._grey("previous", previous)), self.flow
+            features, self._luma(self._planes("previous", previous)), self.flow
         )
 
     def _with_motion(
         self, features: FrameFeatures, previous: Float[Tensor, "h w"], choice: FlowConfiguration
     ) -> FrameFeatures:
         """Add flow, outlier map and motion boundaries."""
-        grey = features.grey
-        if not _is_flat(previous) and not _is_flat(grey):
+        grey, window = features.grey, features.window
+        before, now = (
+            picture if window is None else picture[window.pixels] for picture in (previous, grey)
+        )
+        if not _is_flat(before) and not _is_flat(now):
             # Single precision is far finer than the flow's error, and twice as fast.
-            flow = robust_flow(previous.float(), grey.float(), choice)
+            flow = robust_flow(before.float(), now.float(), choice)
             if float(flow.data_outlier.mean()) < _CUT_SHARE:
                 doubt = _DISCONTINUITY_DOUBT * flow.smoothness_outlier
                 held = (1.0 - flow.data_outlier) * (1.0 - doubt)
+                boundary = motion_boundaries(flow).potential
                 return features._replace(
-                    flow=flow.flow.to(grey),
-                    flow_outlier=(1.0 - held).to(grey),
-                    motion_boundary=motion_boundaries(flow).potential.to(grey),
+                    flow=_within(window, grey, flow.flow, 0.0),
+                    flow_outlier=_within(window, grey, 1.0 - held, 1.0),
+                    motion_boundary=_within(window, grey, boundary, 1.0),
                 )
         return features._replace(
             flow=grey.new_zeros(2, *grey.shape),
@@ -226,19 +263,15 @@ class FeatureExtractor(nn.Module):
             motion_boundary=torch.ones_like(grey),
         )
 
-    def _grey(self, name: str, picture: Tensor | np.ndarray) -> Float[Tensor, "h w"]:
-        """Convert a picture to grey levels in 0..1, with the dtype and device of the module."""
-        return self._luma(self._levels(name, picture))
+    def _luma(self, planes: Float[Tensor, "c h w"]) -> Float[Tensor, "h w"]:
+        """Grey levels of a picture of one colour or three."""
+        return planes[0] if len(planes) == 1 else (self.luma[:, None, None] * planes).sum(0)
 
-    def _luma(self, levels: Float[Tensor, "h w *c"]) -> Float[Tensor, "h w"]:
-        return levels if levels.ndim == 2 else levels @ self.luma
+    def _planes(self, name: str, picture: Tensor | np.ndarray) -> Float[Tensor, "c h w"]:
+        """A picture as levels in 0..1 at the working size, its one or three colours first.
 
-    def _colour(self, levels: Float[Tensor, "h w *c"]) -> Float[Tensor, "3 h w"]:
-        channels = [levels] * 3 if levels.ndim == 2 else levels.unbind(-1)
-        return torch.stack([self._resized(channel) for channel in channels])
-
-    def _levels(self, name: str, picture: Tensor | np.ndarray) -> Float[Tensor, "h w *c"]:
-        """Convert a picture to levels in 0..1, grey or of three colours."""
+        Pictures of whole numbers are reduced in single precision, which holds them exactly.
+        """
         if not isinstance(picture, Tensor):
             # A copy only where torch cannot share the memory: read-only or mirrored arrays.
             picture = np.require(picture, requirements=["C", "W"])
@@ -257,30 +290,44 @@ class FeatureExtractor(nn.Module):
                 f"{name}: expected a picture [h, w], [h, w, 3] or [h, w, 4] of uint8, uint16 or "
                 f"floating point in 0..1, got {picture.dtype} {list(picture.shape)}"
             )
-        levels = picture.to(self.luma)
-        levels = levels if grey else levels[..., :3]
+        planes = picture[None] if grey else picture[..., :3].permute(2, 0, 1)
+        planes = planes.to(self.luma.device)
         if picture.dtype in _WHITE:
-            return levels / _WHITE[picture.dtype]
-        least, greatest = (float(bound) for bound in levels.aminmax())
+            small = self._resized(planes.to(torch.float32, memory_format=torch.contiguous_format))
+            return (small.to(self.luma) / _WHITE[picture.dtype]).clamp(0.0, 1.0)
+        planes = planes.to(self.luma).contiguous()
+        least, greatest = (float(bound) for bound in planes.aminmax())
         if not (least >= -1.0e-3 and greatest <= 1.0 + 1.0e-3):
             raise ShapeError(
                 f"{name}: expected floating-point levels in 0..1, got {least:g} to {greatest:g}; "
                 "divide by the value of white"
             )
-        return levels.clamp(0.0, 1.0)
+        return self._resized(planes.clamp(0.0, 1.0)).clamp(0.0, 1.0)
 
-    def _resized(self, picture: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-        height, width = picture.shape
+    def _resized(self, planes: Float[Tensor, "c h w"]) -> Float[Tensor, "c y x"]:
+        height, width = planes.shape[-2:]
         new_width, new_height = self.working_shape(width, height)
         if (new_width, new_height) == (width, height):
-            return picture
+            return planes
         return functional.interpolate(
-            picture[None, None],
+            planes[None],
             size=(new_height, new_width),
             mode="bilinear",
             align_corners=False,
             antialias=True,
-        )[0, 0].clamp(0.0, 1.0)
+        )[0]
+
+
+def _within(
+    window: Window | None, like: Float[Tensor, "h w"], part: Float[Tensor, "*c y x"], other: float
+) -> Float[Tensor, "*c h w"]:
+    """What was found in a window as an image of the whole frame, one number elsewhere."""
+    part = part.to(like)
+    if window is None:
+        return part
+    whole = like.new_full((*part.shape[:-2], *like.shape), other)
+    whole[window.pixels] = part
+    return whole
 
 
 def _is_flat(grey: Float[Tensor, "h w"]) -> bool:
