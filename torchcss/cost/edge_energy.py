@@ -29,7 +29,6 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
-import kornia
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -39,6 +38,7 @@ from torchcss.cost.outline import ImageNodes, OutlineTerm
 from torchcss.cost.term import OnPoints
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.robust import Lorentzian, RobustPotential
+from torchcss.vision.sampling import gaussian_blur
 from torchcss.vision.spline import SplineField, spline_field
 
 _RIDGE = 1.2
@@ -71,16 +71,10 @@ def edge_energy_field(edge_field: Float[Tensor, "2 h w"], *, smoothing: float = 
         raise ConfigurationError(
             f"edge energy: smoothing must be positive and finite, got {smoothing}"
         )
-    size = 2 * math.ceil(3.0 * smoothing) + 1
-    energy = kornia.filters.gaussian_blur2d(
-        edge_field.norm(dim=0)[None, None],
-        (size, size),
-        (smoothing, smoothing),
-        border_type="replicate",
-    )
+    energy = gaussian_blur(edge_field.norm(dim=0), smoothing)
     # The spline's own kernel has a variance of 1/3.
     height = math.sqrt(1.0 + (smoothing**2 + 1.0 / 3.0) / _RIDGE**2)
-    coefficients = (height * energy[0, 0]).clamp(0.0, 1.0)
+    coefficients = (height * energy).clamp(0.0, 1.0)
     return spline_field(coefficients[None])
 
 

@@ -23,12 +23,10 @@ By default: `region_field(ratio)` once per frame, `RegionImages(field, layer)`, 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from types import EllipsisType
 from typing import ClassVar, NamedTuple
 
-import kornia
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -43,6 +41,7 @@ from torchcss.cost.term import Need, OnPoints
 from torchcss.cost.visibility import ContourPredictor
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import Window
+from torchcss.vision.sampling import gaussian_blur
 from torchcss.vision.spline import SplineField, spline_field
 
 _COARSE = 4
@@ -95,12 +94,9 @@ def region_field(
         smoothing: Standard deviation of the blur, pixels. On the beam clip 3 tells good poses from
             lost ones by a quarter more than 1 does; with more, thin limbs fade.
     """
-    size = 2 * math.ceil(3.0 * smoothing) + 1
     # Single precision is far finer than the colours, and twice as fast.
     seen = (ratio if window is None else ratio[window.pixels]).float()
-    blurred = kornia.filters.gaussian_blur2d(
-        seen[None], (size, size), (smoothing, smoothing), border_type="replicate"
-    )[0]
+    blurred = gaussian_blur(seen, smoothing)
     if window is None:
         return spline_field(blurred)
     whole = blurred.new_zeros(ratio.shape)

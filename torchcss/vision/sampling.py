@@ -13,8 +13,9 @@ channels, or a spline (`torchcss.vision.spline`).
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
-import kornia
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
@@ -29,12 +30,23 @@ def gaussian_blur(image: Float[Tensor, "*batch h w"], sigma: float) -> Float[Ten
         image: Any number of images.
         sigma: Standard deviation, pixels.
     """
-    size = 2 * math.ceil(3.0 * sigma) + 1
-    flat = image.reshape(-1, 1, *image.shape[-2:])
-    blurred = kornia.filters.gaussian_blur2d(
-        flat, (size, size), (sigma, sigma), border_type="replicate"
-    )
-    return blurred.reshape(image.shape)
+    height, width = image.shape[-2:]
+    down, along = _blur_matrix(height, sigma).to(image), _blur_matrix(width, sigma).to(image)
+    return down @ image @ along.T
+
+
+@lru_cache(maxsize=32)
+def _blur_matrix(length: int, sigma: float) -> Float[Tensor, "n n"]:
+    """What `gaussian_blur` does to a row of pixels.
+
+    A product of matrices takes a fraction of the time of a convolution with a wide kernel.
+    """
+    radius = math.ceil(3.0 * sigma)
+    offset = torch.arange(-radius, radius + 1)
+    weight = (-0.5 * (offset.double() / sigma).square()).exp()
+    source = (torch.arange(length)[:, None] + offset).clamp(0, length - 1)
+    matrix = torch.zeros(length, length, dtype=torch.float64)
+    return matrix.scatter_add_(1, source, (weight / weight.sum()).expand(length, -1))
 
 
 def sample_bilinear(
