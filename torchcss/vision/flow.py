@@ -47,6 +47,7 @@ from torch.nn import functional
 
 from torchcss.errors import ConfigurationError, FrameError, ShapeError
 from torchcss.robust import Leclerc, Lorentzian, Quadratic
+from torchcss.vision import flow_kernels
 
 Potential = Quadratic | Lorentzian | Leclerc
 
@@ -275,9 +276,21 @@ def _resize(images: Float[Tensor, "b c h w"], size: tuple[int, int]) -> Float[Te
     )
 
 
+def _compiled(images: Tensor) -> bool:
+    """Whether the loops over these images have compiled twins."""
+    single = images.dtype == torch.float32 and images.device.type == "cpu"
+    return flow_kernels.AVAILABLE and single and not torch.compiler.is_compiling()
+
+
 def _structure(images: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
     """Smooth part of each image: least total variation near the image (Chambolle 2004)."""
     step = 0.249 / _STRUCTURE_SCALE
+    if _compiled(images):
+        structure = torch.empty_like(images)
+        for out, image in zip(structure.flatten(0, 1), images.flatten(0, 1), strict=True):
+            smooth = flow_kernels.structure(image.numpy(), _STRUCTURE_SCALE, step, _STRUCTURE_STEPS)
+            out.copy_(torch.from_numpy(smooth))
+        return structure
     dual_right = images.new_zeros(*images.shape[:-1], images.shape[-1] - 1)
     dual_down = images.new_zeros(*images.shape[:-2], images.shape[-2] - 1, images.shape[-1])
     structure = images
@@ -435,6 +448,14 @@ def _solve(
     """
     root = weight.sqrt()
     q = root * constancy.gradient
+    if _compiled(flow):
+        flow, target = flow.clone(), -q * (root * constancy.offset)
+        links = functional.pad(right, (1, 1)), functional.pad(down, (0, 0, 1, 1))
+        for x, *parts, (across,), (along,) in zip(flow, q, target, *links, strict=True):
+            flow_kernels.solve(
+                *(part.numpy() for part in (x, *parts, across, along)), num_iterations
+            )
+        return flow
     q_u, q_v = q[:, :1], q[:, 1:]
     degree = torch.zeros_like(weight)
     degree[..., :-1] += right
@@ -490,6 +511,12 @@ def _median(images: Float[Tensor, "b c h w"], radius: int) -> Float[Tensor, "b c
     Strip by strip: what is worked on at a time stays in the cache (twice as fast, measured).
     """
     height, width = images.shape[-2:]
+    if _compiled(images) and radius:
+        padded = functional.pad(images, (radius,) * 4, mode="replicate").flatten(0, 1)
+        out = torch.empty_like(images)
+        for plane, filtered in zip(padded, out.flatten(0, 1), strict=True):
+            flow_kernels.median(plane.numpy(), radius, filtered.numpy())
+        return out
     rows = max(1, _STRIP_VALUES // (images.shape[0] * images.shape[1] * width))
     padded = functional.pad(images, (radius,) * 4, mode="replicate")
     strips = [

@@ -1,0 +1,59 @@
+"""The compiled loops of the flow give what their twins in torch give."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchcss.vision import flow, flow_kernels
+
+pytestmark = pytest.mark.skipif(not flow_kernels.AVAILABLE, reason="numba is not installed")
+
+SIZES = [(1, 1), (1, 9), (7, 1), (2, 3), (33, 26)]
+
+
+def both(monkeypatch: pytest.MonkeyPatch, run):
+    compiled = run()
+    monkeypatch.setattr(flow_kernels, "AVAILABLE", False)
+    return compiled, run()
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_structure(size, monkeypatch, generator):
+    images = torch.rand(3, 2, *size, generator=generator)
+    got, expected = both(monkeypatch, lambda: flow._structure(images))
+    torch.testing.assert_close(got, expected, rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize("radius", [0, 1, 2])
+@pytest.mark.parametrize("size", SIZES)
+def test_median(size, radius, monkeypatch, generator):
+    images = torch.randn(2, 2, *size, generator=generator)
+    got, expected = both(monkeypatch, lambda: flow._median(images, radius))
+    assert torch.equal(got, expected)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_conjugate_gradients(size, monkeypatch, generator):
+    height, width = size
+
+    def random(*shape: int) -> torch.Tensor:
+        return torch.rand(2, *shape, generator=generator)
+
+    start, weight = random(2, *size) - 0.5, 1000 * random(1, *size)
+    constancy = flow._Constancy(
+        0.1 * random(2, *size) - 0.05, 0.04 * random(1, *size) - 0.02, torch.ones(2, 1, *size)
+    )
+    right, down = 30 * random(1, height, width - 1), 30 * random(1, height - 1, width)
+    got, expected = both(
+        monkeypatch, lambda: flow._solve(start, constancy, weight, right, down, 20)
+    )
+    torch.testing.assert_close(got, expected, rtol=0, atol=1e-5)
+
+
+def test_nothing_to_go_by_is_no_motion(generator):
+    """No links, no gradient: the flow stays where it is."""
+    start, zero = torch.rand(1, 2, 4, 5, generator=generator), torch.zeros(1, 1, 4, 5)
+    constancy = flow._Constancy(torch.zeros(1, 2, 4, 5), zero, zero)
+    got = flow._solve(start, constancy, zero, zero[..., 1:], zero[..., 1:, :], 20)
+    assert torch.equal(got, start)
