@@ -436,16 +436,19 @@ def together(costs: Sequence[TrackingCost], sequence: Int[Tensor, " b"]) -> Trac
         sequence: Which of the sequences each sample belongs to.
     """
     renumbered = [_numbered(cost, number) for number, cost in enumerate(costs)]
-    parent = torch.zeros_like(sequence)
+    parent, component = torch.zeros_like(sequence), torch.zeros_like(sequence)
     for number, cost in enumerate(costs):
         if cost.parent is not None:
-            parent[sequence == number] = cost.parent
+            own = sequence == number
+            parent[own] = cost.parent
+            component[own] = cost.parent if cost.component is None else cost.component
     return replace(
         renumbered[0],
         views=tuple(view for cost in renumbered for view in cost.views),
         past=tuple(past for cost in renumbered for past in cost.past),
         bound={key: term for cost in renumbered for key, term in cost.bound.items()},
         parent=parent,
+        component=component,
         sequence=sequence,
     )
 
