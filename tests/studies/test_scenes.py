@@ -68,8 +68,8 @@ def costs_of_a_tracker_at_the_truth(settings: Settings, num_frames: int) -> list
         variance=1.0,
     )
     session.plan = session.plan._replace(tracker=spy, jumps_every=0, recovery=None)  # type: ignore[arg-type]
-    for _ in session.track(Frame(i, i / 25, image) for i, image in enumerate(sequence.frames)):
-        pass
+    for index, image in enumerate(sequence.frames):
+        session.step(session.observe(Frame(index, index / 25, image), everywhere=True))
     return spy.costs
 
 
