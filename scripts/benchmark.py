@@ -7,8 +7,11 @@ interpenetration and stabiliser at 1008 nodes with their visibility. Each in sev
 
 * `value`: without derivatives, the price of a trial step;
 * `closed`: with gradient and exact Hessian in closed form, what the optimiser calls;
-* `plain`: the same by double backward (`peers/autograd_cost.py`), timed on one chunk, of the size
-  that suits it best, and extrapolated; `one_by_one`: with chunks of a single sample.
+* `plain`: the joint term written anew and differentiated by double backward, nothing of the
+  package's derivatives in it (`peers/autograd_cost.py`);
+* `autograd`: the full cost by the package's own curvature of that name; `one_by_one`: the same with
+  chunks of a single sample. These three are timed on one chunk, of the size that suits them best,
+  and extrapolated.
 
 Each repeat times every way in turn; ratios are taken within a repeat, so that a busy machine slows
 both sides. Memory is the peak of a process of its own. Then come the times of the full cost by
@@ -40,20 +43,20 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from common import Table, start, write_report
-from peers.autograd_cost import autograd_model, made_up_costs, made_up_frames
+from peers.autograd_cost import joints_by_autograd, made_up_costs, made_up_frames
 from torch import Tensor
 
 from torchcss.cost.total import TrackingCost
 from torchcss.io.video import read_image
 from torchcss.stopwatch import Stopwatch
-from torchcss.types import LocalModel
+from torchcss.types import Curvature, LocalModel
 from torchcss.vision.features import FeatureExtractor
 from torchcss.vision.flow import TRACKING
 
 COMPARED = {  # with which other way each is compared
     "joints_plain": "joints_closed",
     "full_closed": "full_value",
-    "full_plain": "full_closed",
+    "full_autograd": "full_closed",
     "full_one_by_one": "full_closed",
 }
 Way = tuple[Callable[[Tensor], Any], Tensor]
@@ -90,14 +93,15 @@ class Config:
 def make_ways(config: Config) -> tuple[dict[str, Way], TrackingCost]:
     """The ways to evaluate the costs, by name, with the states to time them on; the full cost."""
     alone, full, x = made_up_costs(config.samples, config.size_wh, getattr(torch, config.dtype))
+    by_autograd = replace(full, choice=replace(full.choice, curvature=Curvature.AUTOGRAD))
     return {
         "joints_value": (alone.value, x),
         "joints_closed": (alone.local_model, x),
-        "joints_plain": (partial(autograd_model, alone), x[: config.plain_joints]),
+        "joints_plain": (partial(joints_by_autograd, alone), x[: config.plain_joints]),
         "full_value": (full.value, x),
         "full_closed": (full.local_model, x),
-        "full_plain": (partial(autograd_model, full), x[: config.plain_full]),
-        "full_one_by_one": (partial(autograd_model, full), x[:1]),
+        "full_autograd": (by_autograd.local_model, x[: config.plain_full]),
+        "full_one_by_one": (by_autograd.local_model, x[:1]),
     }, full
 
 
@@ -154,7 +158,7 @@ def main(config: Config) -> dict[str, Any]:
     # First of all the memory: on Linux a process starts with the peak of the one that starts it.
     memory = {name: memory_in_own_process(config, name) for name in ways}
     agreement = {}
-    for name in ("joints_plain", "full_plain"):
+    for name in ("joints_plain", "full_autograd"):
         evaluate, x = ways[name]
         agreement[name] = difference(ways[COMPARED[name]][0](x), evaluate(x))
     rounds = [

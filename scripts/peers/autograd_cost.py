@@ -1,13 +1,10 @@
-"""A made-up frame, its cost, and that differentiated by autograd: state, pose, projection and all.
+"""A made-up frame, its costs, and the joint term written anew and differentiated by autograd.
 
-`autograd_model(cost, x)` is what `cost.local_model(x)` is, by double backward, row by row. As
-there, what is visible and which edges match is found at x and then held fixed: nodes stay where
-they are on their links, edges where they are in the image.
+`joints_by_autograd(cost, x)` is what `cost.local_model(x)` is, of the joint term alone: projection
+and potential from their formulas, and derivatives by double backward through state and pose.
 """
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -19,12 +16,12 @@ from torchcss.cost.context import BodyTables, FrameContext
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.flow import FlowTerm
 from torchcss.cost.interpenetration import Interpenetration
-from torchcss.cost.joints import JointTerm
+from torchcss.cost.joints import JointTerm, match_joints
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.total import TrackingCost
 from torchcss.cost.visibility import ContourPredictor
 from torchcss.joint_names import ALIASES
-from torchcss.types import Curvature, Keypoints, LocalModel
+from torchcss.types import Keypoints, LocalModel
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor
 
@@ -73,7 +70,29 @@ def made_up_frames(size_wh: tuple[int, int]) -> tuple[Tensor, Tensor]:
     return picture[:-3, :-3], picture[3:, 3:]
 
 
-def autograd_model(cost: TrackingCost, x: Tensor) -> LocalModel:
-    """Value, gradient and Hessian by differentiating the cost as a function of x, matches held."""
-    autograd = replace(cost.choice, curvature=Curvature.AUTOGRAD)
-    return replace(cost, choice=autograd).local_model(x)
+def joints_by_autograd(cost: TrackingCost, x: Tensor) -> LocalModel:
+    """The joint term alone: its value from its formula, differentiated twice row by row.
+
+    With pinhole pixels u of the joint centres and keypoints m of weight w, a joint costs
+    `nu / 2 log(1 + w |u - m|^2 / (nu sigma^2))`.
+
+    Args:
+        cost: A cost of the joint term alone, by a camera without distortion.
+        x: States, in front of the camera.
+    """
+    (term,), (view,) = cost.choice.terms, cost.views
+    assert isinstance(term, JointTerm)
+    assert view.keypoints is not None
+    camera, targets = view.camera, match_joints(view.keypoints, view.body.joint_names)
+    leaf = x.detach().requires_grad_()
+    points = view.body.pose(leaf).joints[:, targets.joint]
+    pixels = (points @ camera.R_camera_world.mT + camera.t_camera_world) @ camera.K.mT
+    apart = pixels[..., :2] / pixels[..., 2:] - targets.position
+    squared = targets.weight * apart.square().sum(-1)
+    value = 0.5 * term.nu * torch.log1p(squared / (term.nu * term.sigma**2)).sum(-1)
+    (gradient,) = torch.autograd.grad(value.sum(), leaf, create_graph=True)
+    rows = [
+        torch.autograd.grad(column.sum(), leaf, retain_graph=True)[0]
+        for column in gradient.unbind(-1)
+    ]
+    return LocalModel(value.detach(), gradient.detach(), torch.stack(rows, -2))

@@ -16,7 +16,7 @@ from torchcss.cost.visibility import ContourPredictor
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "benchmark.py"
 WAYS = {
     *("joints_value", "joints_closed", "joints_plain"),
-    *("full_value", "full_closed", "full_plain", "full_one_by_one"),
+    *("full_value", "full_closed", "full_autograd", "full_one_by_one"),
 }
 TERMS = {"pose", "visibility", "contour", "flow", "joints", "interpenetration", "stabiliser"}
 
@@ -70,7 +70,7 @@ def test_small_mode_agrees_with_autograd(
     assert set(metrics["seconds_by_term"]["full_closed"]) == TERMS | {"lift"}
     assert metrics["seconds_of_features"]["median"] > 0
     text = capsys.readouterr().out
-    assert "full_plain takes" in text
+    assert "full_autograd takes" in text
     assert "features of a frame" in text
 
 
