@@ -419,49 +419,26 @@ def summarise(
         interval_s: Seconds between the frames.
     """
     times = [m.time_s for m in measures]
+    nearest = [m.root_aligned_mm[_nearest(m)] for m in measures]
     lost = loss(measures, thresholds)
     held = measures if lost is None else measures[: max(lost, 1)]
-    near = [_nearest(m) for m in held]
-    told = [
-        (m, n) for m, n in zip(held, near, strict=True) if not np.isnan(m.root_aligned_mm).all()
-    ]
-    several = [(m, n) for m, n in told if len(m.weight) > 1]
-    depth = np.concatenate([m.penetration_m for m in held])
-    first = np.concatenate([np.arange(len(m.weight)) == 0 for m in held])
-    row: dict[str, Any] = {
+    return {
         "num_frames": len(measures),
         "lost": lost is not None,
         "lost_s": math.nan if lost is None else times[lost],
         "failed_share": _mean([m.failed for m in measures if m.failed is not None]),
         "limb_lost_s": limb_loss([m.root_aligned_mm[0] for m in measures], times, thresholds),
-        "limb_lost_of_modes_s": limb_loss(
-            [m.root_aligned_mm[_nearest(m)] for m in measures], times, thresholds
-        ),
+        "limb_lost_of_modes_s": limb_loss(nearest, times, thresholds),
         "num_frames_held": len(held) if lost is None else lost,
         **_errors(held),
-        "true_mode_kept": _mean(
-            [_mean(m.root_aligned_mm[n]) < thresholds.true_mode_mm for m, n in told]
-        ),
-        "true_angles_kept": math.nan
-        if np.isnan(held[0].angle_deviations).all()
-        else _mean([np.nanmin(m.angle_deviations) < thresholds.true_mode_deviations for m in held]),
-        "modes": _mean([len(m.weight) for m in held]),
-        # Of a calibrated mixture these two are equal: how sure it is of its best mode, and how
-        # often that is the nearest to the truth, where it has more than one.
-        "best_weight": _mean([m.weight[0] for m, _ in several]),
-        "best_is_nearest": _mean([n == 0 for _, n in several]),
+        **_modes(held, thresholds),
         "overlap": _mean([m.overlap for m in held]),
         "acceleration_error": acceleration_error(
             np.stack([m.joints_m for m in held]),
             np.stack([m.reference_m for m in held]),
             interval_s,
         ),
-        "outside_share": _mean([m.outside_degrees > thresholds.outside_degrees for m in held]),
-        "deep_share": _mean(depth[first] > thresholds.deep_m),
-        "deep_modes_share": _mean(depth > thresholds.deep_m),
-        "outside_degrees": max(m.outside_degrees for m in held),
-        "penetration_mm": 1000 * float(depth[first].max()),
-        "penetration_modes_mm": 1000 * float(depth.max()),
+        **_impossible(held, thresholds),
         "samples_per_frame": _mean([m.samples for m in measures]),
         "evaluations_per_frame": _mean([m.evaluations for m in measures]),
         **{
@@ -472,11 +449,34 @@ def summarise(
             "time_s": times,
             "failed": [m.failed for m in measures],
             "root_aligned_mm": [_mean(m.root_aligned_mm[0]) for m in measures],
-            "root_aligned_best_of_modes_mm": [
-                _mean(m.root_aligned_mm[_nearest(m)]) for m in measures
-            ],
+            "root_aligned_best_of_modes_mm": [_mean(errors) for errors in nearest],
             "overlap": [m.overlap for m in measures],
         },
+    }
+
+
+def _modes(held: Sequence[FrameMeasures], thresholds: Thresholds) -> dict[str, float]:
+    """How many modes there are, whether the true one is among them, and calibration."""
+    near = [_nearest(m) for m in held]
+    told = [
+        (m, n) for m, n in zip(held, near, strict=True) if not np.isnan(m.root_aligned_mm).all()
+    ]
+    several = [(m, n) for m, n in told if len(m.weight) > 1]
+    angles_known = not np.isnan(held[0].angle_deviations).all()
+    row = {
+        "true_mode_kept": _mean(
+            [_mean(m.root_aligned_mm[n]) < thresholds.true_mode_mm for m, n in told]
+        ),
+        "true_angles_kept": _mean(
+            [np.nanmin(m.angle_deviations) < thresholds.true_mode_deviations for m in held]
+        )
+        if angles_known
+        else math.nan,
+        "modes": _mean([len(m.weight) for m in held]),
+        # Of a calibrated mixture these two are equal: how sure it is of its best mode, and how
+        # often that is the nearest to the truth, where it has more than one.
+        "best_weight": _mean([m.weight[0] for m, _ in several]),
+        "best_is_nearest": _mean([n == 0 for _, n in several]),
     }
     for name, which in (("best", [0] * len(held)), ("nearest", near)):
         inside = np.stack([m.within[n] for m, n in zip(held, which, strict=True)])
@@ -484,21 +484,30 @@ def summarise(
     return row
 
 
+def _impossible(held: Sequence[FrameMeasures], thresholds: Thresholds) -> dict[str, float]:
+    """Shares of frames with poses that no body can take, and the worst of them."""
+    best = np.array([m.penetration_m[0] for m in held])
+    modes = np.concatenate([m.penetration_m for m in held])
+    outside = np.array([m.outside_degrees for m in held])
+    return {
+        "outside_share": _mean(outside > thresholds.outside_degrees),
+        "deep_share": _mean(best > thresholds.deep_m),
+        "deep_modes_share": _mean(modes > thresholds.deep_m),
+        "outside_degrees": float(outside.max()),
+        "penetration_mm": 1000 * float(best.max()),
+        "penetration_modes_mm": 1000 * float(modes.max()),
+    }
+
+
 def loss(measures: Sequence[FrameMeasures], thresholds: Thresholds) -> int | None:
     """The frame in which a run was lost for good, see `first_loss`; None if it never was.
-
-    A frame of which nothing is known ends no stretch of failures and begins none.
 
     Args:
         measures: The frames of a run.
         thresholds: How long failing has to last.
     """
-    return _first_known_loss(
-        np.array([bool(m.failed) for m in measures]),
-        np.array([m.failed is not None for m in measures]),
-        np.array([m.time_s for m in measures]),
-        thresholds,
-    )
+    failed = np.array([m.failed for m in measures], np.float64)  # None is NaN
+    return first_loss(failed, [m.time_s for m in measures], regain_s=thresholds.regain_s)
 
 
 def limb_loss(
@@ -507,29 +516,14 @@ def limb_loss(
     """When some joint was lost for good, see `first_loss`; NaN if none ever was.
 
     Args:
-        errors_mm: Errors of the joints, frame by frame; NaN, where a joint is not known, ends no
-            stretch of failures and begins none.
+        errors_mm: Errors of the joints, frame by frame; NaN where a joint is not known.
         times_s: Times of the frames, seconds.
         thresholds: How far off a joint has failed, and how long that has to last.
     """
-    times = np.asarray(times_s, np.float64)
-    lost = [
-        _first_known_loss(joint > thresholds.lost_mm, np.isfinite(joint), times, thresholds)
-        for joint in np.stack(errors_mm).T
-    ]
+    errors = np.stack(errors_mm)
+    failed = np.where(np.isnan(errors), np.nan, errors > thresholds.lost_mm)
+    lost = [first_loss(joint, times_s, regain_s=thresholds.regain_s) for joint in failed.T]
     return min((times_s[first] for first in lost if first is not None), default=math.nan)
-
-
-def _first_known_loss(
-    failed: Bool[np.ndarray, " t"],
-    known: Bool[np.ndarray, " t"],
-    times_s: Float[np.ndarray, " t"],
-    thresholds: Thresholds,
-) -> int | None:
-    """`first_loss` among the frames of which something is known."""
-    frames = np.flatnonzero(known)
-    first = first_loss(failed[frames], times_s[frames], regain_s=thresholds.regain_s)
-    return None if first is None else int(frames[first])
 
 
 def _nearest(measures: FrameMeasures) -> int:
@@ -659,18 +653,8 @@ def evaluate(
     common = [name for name in dict.fromkeys(tracked_names) if name in names]
     wanted = list(dict.fromkeys(common_name(name) for name in joints))
     compared = [name for name in wanted if name in common]
-    if not compared:
-        raise ConfigurationError(
-            f"no common joints: asked for {', '.join(wanted)}; the track has "
-            f"{', '.join(track.joint_names)}; the reference has {', '.join(names)}; "
-            "choose with joints (--joints)"
-        )
     roots = ["l_hip", "r_hip"] if root is None else [common_name(root)]
-    if not set(roots) <= set(common):
-        raise ConfigurationError(
-            f"cannot align the roots: track and reference do not both have {' and '.join(roots)}; "
-            f"choose one of {', '.join(common)} with root (--root)"
-        )
+    _check_names(wanted, common, roots, track.joint_names, names)
     column = [tracked_names.index(name) for name in common]
     true = positions[track.frames][:, [names.index(name) for name in common]]
     tracked = track.joints_world[:, :, column]
@@ -690,6 +674,27 @@ def evaluate(
         away_m=away,
         covariance=_stated(track, [column[i] for i in index]),
     )
+
+
+def _check_names(
+    wanted: Sequence[str],
+    common: Sequence[str],
+    roots: Sequence[str],
+    tracked: Sequence[str],
+    known: Sequence[str],
+) -> None:
+    """Refuse joints that run and reference do not both have."""
+    if not set(wanted) & set(common):
+        raise ConfigurationError(
+            f"no common joints: asked for {', '.join(wanted)}; the track has "
+            f"{', '.join(tracked)}; the reference has {', '.join(known)}; "
+            "choose with joints (--joints)"
+        )
+    if not set(roots) <= set(common):
+        raise ConfigurationError(
+            f"cannot align the roots: track and reference do not both have {' and '.join(roots)}; "
+            f"choose one of {', '.join(common)} with root (--root)"
+        )
 
 
 def _stated(track: Track, joints: Sequence[int]) -> Float[np.ndarray, "t j 3 3"] | None:

@@ -347,14 +347,15 @@ def track_errors(
 
 
 def first_loss(
-    failed: Bool[ArrayLike, " t"], times_s: Float[ArrayLike, " t"], *, regain_s: float = REGAIN_S
+    failed: Float[ArrayLike, " t"], times_s: Float[ArrayLike, " t"], *, regain_s: float = REGAIN_S
 ) -> int | None:
     """Find where a track was lost for good: it failed there and in all frames of the time after.
 
     What fails at the very end for a shorter time than that is no loss: nobody knows.
 
     Args:
-        failed: Frames in which the body was not followed.
+        failed: Frames in which the body was not followed; NaN, where nothing is known, neither
+            begins nor ends a stretch of failures.
         times_s: Their times, seconds, rising.
         regain_s: How long a failure has to last.
 
@@ -362,16 +363,16 @@ def first_loss(
         The first frame of the first such stretch, as an index; None if there is none.
     """
     start = None
-    for index, (fails, time) in enumerate(
-        zip(np.asarray(failed, bool), np.asarray(times_s, np.float64), strict=True)
-    ):
-        if not fails:
+    known = np.asarray(failed, np.float64)
+    times = np.asarray(times_s, np.float64)
+    for index in np.flatnonzero(~np.isnan(known)).tolist():
+        if not known[index]:
             start = None
             continue
-        start = (index, time) if start is None else start
+        start = index if start is None else start
         # Frame times are rounded; half a millisecond is less than a frame of any camera.
-        if time - start[1] > regain_s - 0.0005:
-            return start[0]
+        if times[index] - times[start] > regain_s - 0.0005:
+            return start
     return None
 
 
