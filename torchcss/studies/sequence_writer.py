@@ -75,34 +75,7 @@ def write_sequence(
     frames: Iterable[SequenceFrame] = shot.frames()
     if progress:
         frames = tqdm(frames, total=len(shot.states), desc=shot.name, unit="frame")
-    width, height = shot.camera.image_size_wh
-    count = len(shot.states)
-    mask = np.zeros((count, height, width), bool)
-    occluded = np.zeros((count - 1, height, width), bool)
-    kept: list[_Joints] = []
-    with (
-        VideoWriter(folder / "video.mp4", shot.frame_rate, crf=crf) as film,
-        replace_file(folder / "flow.npz") as partial,
-        zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
-    ):
-        with archive.open("flow.npy", "w", force_zip64=True) as stream:
-            # Frame by frame: all of them are half a gigabyte for eight seconds.
-            header = {
-                "descr": "<f2",
-                "fortran_order": False,
-                "shape": (count - 1, height, width, 2),
-            }
-            np.lib.format.write_array_header_1_0(stream, header)
-            for index, frame in enumerate(frames):
-                film.write(frame.image.numpy())
-                mask[index] = frame.mask.numpy()
-                if frame.flow is not None and frame.occluded is not None:
-                    stream.write(frame.flow.numpy().astype("<f2").tobytes())
-                    occluded[index] = frame.occluded.numpy()
-                kept.append(_Joints(frame.joints, frame.uv, frame.visible, frame.in_image))
-        with archive.open("occluded.npy", "w", force_zip64=True) as stream:
-            np.lib.format.write_array(stream, occluded, allow_pickle=False)
-    write_arrays(folder / "mask.npz", {"mask": mask})
+    kept = _write_frames(folder, shot, frames, crf)
     _write_joints(folder, shot, kept, noise_px)
     write_camera(folder / "cameras.json", shot.camera)
     body = shot.body
@@ -120,6 +93,38 @@ def write_sequence(
         },
     )
     return folder
+
+
+def _write_frames(
+    folder: Path, shot: Shot, frames: Iterable[SequenceFrame], crf: int
+) -> list[_Joints]:
+    """Write film, flow and masks as the frames are rendered; the joints are kept."""
+    width, height = shot.camera.image_size_wh
+    count = len(shot.states)
+    mask = np.zeros((count, height, width), bool)
+    occluded = np.zeros((count - 1, height, width), bool)
+    kept: list[_Joints] = []
+    with (
+        VideoWriter(folder / "video.mp4", shot.frame_rate, crf=crf) as film,
+        replace_file(folder / "flow.npz") as partial,
+        zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
+    ):
+        with archive.open("flow.npy", "w", force_zip64=True) as stream:
+            # Frame by frame: all of them are half a gigabyte for eight seconds.
+            shape = (count - 1, height, width, 2)
+            header = {"descr": "<f2", "fortran_order": False, "shape": shape}
+            np.lib.format.write_array_header_1_0(stream, header)
+            for index, frame in enumerate(frames):
+                film.write(frame.image.numpy())
+                mask[index] = frame.mask.numpy()
+                if frame.flow is not None and frame.occluded is not None:
+                    stream.write(frame.flow.numpy().astype("<f2").tobytes())
+                    occluded[index] = frame.occluded.numpy()
+                kept.append(_Joints(frame.joints, frame.uv, frame.visible, frame.in_image))
+        with archive.open("occluded.npy", "w", force_zip64=True) as stream:
+            np.lib.format.write_array(stream, occluded, allow_pickle=False)
+    write_arrays(folder / "mask.npz", {"mask": mask})
+    return kept
 
 
 def _write_joints(folder: Path, shot: Shot, frames: list[_Joints], noise_px: float) -> None:

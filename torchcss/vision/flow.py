@@ -107,33 +107,29 @@ class FlowConfiguration:
     weighted_median_radius: int = 5
 
     def __post_init__(self) -> None:
-        for name in ("smallest_side", "num_warps", "num_reweightings", "num_iterations"):
-            if getattr(self, name) < 1:
-                raise ConfigurationError(
-                    f"flow: {name} must be at least 1, got {getattr(self, name)}"
-                )
-        for name in ("median_radius", "weighted_median_radius"):
-            if getattr(self, name) < 0:
-                raise ConfigurationError(
-                    f"flow: {name} must be at least 0, got {getattr(self, name)}"
-                )
-        for name in ("data_outlier_scale", "smoothness_outlier_scale"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
-                raise ConfigurationError(
-                    f"flow: {name} must be positive and finite, got {getattr(self, name)}"
-                )
-        if not 0.0 <= self.texture <= 1.0:
-            raise ConfigurationError(f"flow: texture must lie in 0..1, got {self.texture}")
-        if not 0.0 < self.pyramid_factor < 1.0:
-            raise ConfigurationError(
-                f"flow: pyramid_factor must lie between 0 and 1, got {self.pyramid_factor}"
-            )
-        if not self.sigma_factors or not all(
-            math.isfinite(factor) and factor > 0.0 for factor in self.sigma_factors
+        for names, bound, fits in (
+            (
+                ("smallest_side", "num_warps", "num_reweightings", "num_iterations"),
+                "at least 1",
+                lambda value: value >= 1,
+            ),
+            (("median_radius", "weighted_median_radius"), "at least 0", lambda value: value >= 0),
+            (
+                ("data_outlier_scale", "smoothness_outlier_scale"),
+                "positive and finite",
+                lambda value: 0.0 < value < math.inf,
+            ),
+            (
+                ("sigma_factors",),
+                "positive and finite",
+                lambda value: value and all(0.0 < factor < math.inf for factor in value),
+            ),
+            (("texture",), "in 0..1", lambda value: 0.0 <= value <= 1.0),
+            (("pyramid_factor",), "between 0 and 1", lambda value: 0.0 < value < 1.0),
         ):
-            raise ConfigurationError(
-                f"flow: sigma_factors must be positive and finite, got {self.sigma_factors}"
-            )
+            for name in names:
+                if not fits(value := getattr(self, name)):
+                    raise ConfigurationError(f"flow: {name} must be {bound}, got {value}")
         if len(self.sigma_factors) > self.num_warps:
             raise ConfigurationError(
                 f"flow: {len(self.sigma_factors)} sigma_factors need as many warps, "
@@ -457,11 +453,7 @@ def _solve(
             )
         return flow
     q_u, q_v = q[:, :1], q[:, 1:]
-    degree = torch.zeros_like(weight)
-    degree[..., :-1] += right
-    degree[..., 1:] += right
-    degree[..., :-1, :] += down
-    degree[..., 1:, :] += down
+    degree = _degree(weight, right, down)
     determinant = degree * (degree + q_u.square() + q_v.square())
     inverse = torch.where(determinant > 0.0, 1.0 / determinant.where(determinant > 0.0, 1.0), 0.0)
     inverse_uu = (degree + q_v.square()) * inverse
@@ -503,6 +495,18 @@ def _solve(
         previous, reduction = reduction, dot(residual, preconditioned)
         direction = torch.addcmul(preconditioned, ratio(reduction, previous), direction)
     return flow
+
+
+def _degree(
+    like: Float[Tensor, "b 1 h w"], right: Float[Tensor, "b 1 h x"], down: Float[Tensor, "b 1 y w"]
+) -> Float[Tensor, "b 1 h w"]:
+    """Sum of the weights on the four links of each pixel."""
+    degree = torch.zeros_like(like)
+    degree[..., :-1] += right
+    degree[..., 1:] += right
+    degree[..., :-1, :] += down
+    degree[..., 1:, :] += down
+    return degree
 
 
 def _median(images: Float[Tensor, "b c h w"], radius: int) -> Float[Tensor, "b c h w"]:

@@ -235,7 +235,25 @@ def _nearest_faces(
     # Rows to pixels. A positive float orders like its bits, so one integer maximum over
     # (inverse depth, reversed face index) finds the nearest face and settles ties.
     name = torch.stack((first_pixel, faces.shape[0] - 1 - drawn[triangle]))
-    best = torch.full((pictures * height * width,), -1, dtype=torch.long, device=place.device)
+    best = _nearest_of_spans(length, plane, name, pictures * height * width)
+    return torch.where(best >= 0, faces.shape[0] - 1 - (best & 0xFFFFFFFF), best)
+
+
+def _nearest_of_spans(
+    length: Int[Tensor, " r"],
+    plane: Float[Tensor, "2 r"],
+    name: Int[Tensor, "2 r"],
+    num_pixels: int,
+) -> Int[Tensor, " p"]:
+    """The greatest key of the spans on every pixel, -1 where there is none.
+
+    Args:
+        length: Pixels of each span.
+        plane: Inverse depth at its first pixel, and its rise from pixel to pixel.
+        name: Its first pixel, and the lower half of its key.
+        num_pixels: Pixels of all pictures.
+    """
+    best = torch.full((num_pixels,), -1, dtype=torch.long, device=length.device)
     for chunk in _chunks(length):
         span, offset = _expand(length[chunk])
         near, rise = plane[:, chunk].index_select(1, span)
@@ -243,7 +261,7 @@ def _nearest_faces(
         near = (near + rise * offset).clamp_min(0)
         key = (near.view(torch.int32).long() << 32) | reverse
         best.scatter_reduce_(0, pixel + offset, key, "amax")
-    return torch.where(best >= 0, faces.shape[0] - 1 - (best & 0xFFFFFFFF), best)
+    return best
 
 
 def _chunks(length: Int[Tensor, " r"]) -> list[slice]:
