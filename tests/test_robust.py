@@ -9,12 +9,11 @@ import pytest
 import torch
 
 from torchcss.errors import ConfigurationError
-from torchcss.robust import Leclerc, Lorentzian, Quadratic, RobustPotential, Truncated
+from torchcss.robust import Leclerc, Lorentzian, Quadratic, RobustPotential
 
 KINDS = [Quadratic, Lorentzian, Leclerc]
-POTENTIALS = [kind(nu=1.7, sigma=0.6) for kind in KINDS] + [
-    Truncated(inner=Lorentzian(nu=1.7, sigma=0.6), threshold=3.0)
-]
+POTENTIALS = [kind(nu=1.7, sigma=0.6) for kind in KINDS]
+MOST = {Quadratic: math.inf, Lorentzian: math.inf, Leclerc: 1.7}
 PROBES = [0.0, 1e-12, 1e-4, 0.1, 0.36, 1.0, 2.999, 3.001, 50.0, 1e4, 1e8]
 
 
@@ -42,9 +41,10 @@ def test_behaviour_at_zero_and_far_out(potential: RobustPotential) -> None:
     assert float(zero.first) == pytest.approx(1.7 / 0.6**2, rel=1e-14)
     rho = potential(torch.tensor(PROBES, dtype=torch.float64)).rho
     assert (rho.diff() >= 0.0).all()
-    assert (rho <= potential.saturation).all()
-    if math.isfinite(potential.saturation):
-        assert float(rho[-1]) == pytest.approx(potential.saturation, rel=1e-12)
+    most = MOST[type(potential)]
+    assert (rho <= most).all()
+    if math.isfinite(most):
+        assert float(rho[-1]) == pytest.approx(most, rel=1e-12)
     far = potential(torch.tensor([1e20, 1e37]))
     assert all(torch.isfinite(tensor).all() for tensor in far)
 
@@ -85,23 +85,9 @@ def test_kornia_agrees(generator: torch.Generator) -> None:
     )
 
 
-def test_truncated_is_continuous_and_flat_beyond_the_threshold() -> None:
-    potential = Truncated(inner=Leclerc(nu=2.0, sigma=1.5), threshold=4.0)
-    s = torch.tensor([4.0 - 1e-9, 4.0, 5.0, 1e6], dtype=torch.float64)
-    value = potential(s)
-    torch.testing.assert_close(
-        value.rho, torch.full_like(s, potential.saturation), rtol=0.0, atol=1e-8
-    )
-    assert (value.first[1:] == 0.0).all()
-    assert (value.second[1:] == 0.0).all()
-    assert (potential.nu, potential.sigma) == (2.0, 1.5)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, math.inf])
 def test_bad_parameters_are_refused(kind: type, bad: float) -> None:
     for name in ("nu", "sigma"):
         with pytest.raises(ConfigurationError, match=name):
             kind(**{name: bad})
-    with pytest.raises(ConfigurationError, match="threshold"):
-        Truncated(inner=kind(), threshold=bad)

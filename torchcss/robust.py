@@ -13,10 +13,9 @@ outliers nu. They differ in what a large residual costs.
 | `Quadratic` | nu z (Gaussian errors) | never |
 | `Lorentzian` | nu log(1 + z) | never, but only logarithmically |
 | `Leclerc` | nu (1 - exp(-z)) | nu |
-| `Truncated` | min(rho_inner(s), rho_inner(threshold)) | rho_inner(threshold) |
 
-By default: `Lorentzian` for correspondences, which pull from afar; `Leclerc`, or either one
-`Truncated` at the edge of a search window, where a missing match must cost as much as the worst.
+By default: `Lorentzian` for correspondences, which pull from afar; `Leclerc` where what is far off
+must not pull.
 
 The derivatives are with respect to s. Those of the cost e with respect to the residual are, with
 v = W r, the gradient rho' v and the Hessian rho' W + 2 rho'' v v^T (eq. 9 [RR]).
@@ -27,7 +26,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
@@ -63,11 +61,6 @@ class RobustPotential(Protocol):
     @property
     def sigma(self) -> float:
         """Scale of the central peak, in the unit of the weighted residual."""
-        ...
-
-    @property
-    def saturation(self) -> float:
-        """Least upper bound of the potential; inf where there is none."""
         ...
 
     def __call__(self, s: Float[Tensor, "*batch"]) -> RobustValue:
@@ -108,11 +101,6 @@ class Quadratic(_Scaled):
         sigma: Scale of the central peak in the unit of the weighted residual.
     """
 
-    @property
-    def saturation(self) -> float:
-        """Inf: any residual can be outdone."""
-        return math.inf
-
     def __call__(self, s: Float[Tensor, "*batch"]) -> RobustValue:
         """Evaluate at squared weighted errors."""
         slope = self.nu / self.sigma**2
@@ -127,11 +115,6 @@ class Lorentzian(_Scaled):
         nu: Spread of the outliers.
         sigma: Scale of the central peak in the unit of the weighted residual.
     """
-
-    @property
-    def saturation(self) -> float:
-        """Inf: the logarithm grows for ever."""
-        return math.inf
 
     def __call__(self, s: Float[Tensor, "*batch"]) -> RobustValue:
         """Evaluate at squared weighted errors."""
@@ -150,64 +133,12 @@ class Leclerc(_Scaled):
         sigma: Scale of the central peak in the unit of the weighted residual.
     """
 
-    @property
-    def saturation(self) -> float:
-        """The spread of the outliers nu."""
-        return self.nu
-
     def __call__(self, s: Float[Tensor, "*batch"]) -> RobustValue:
         """Evaluate at squared weighted errors."""
         variance = self.sigma**2
         z = s / variance
         first = (self.nu / variance) * torch.exp(-z)
         return RobustValue(-self.nu * torch.expm1(-z), first, -first / variance)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Truncated:
-    """Another potential up to a threshold, and constant from there on.
-
-    The value is continuous; the derivatives jump to zero at the threshold.
-
-    Attributes:
-        inner: The potential below the threshold.
-        threshold: The squared weighted error at which the cost stops rising, e.g. that of a
-            residual as long as a search window.
-    """
-
-    inner: Quadratic | Lorentzian | Leclerc
-    threshold: float
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.threshold) and self.threshold > 0.0):
-            raise ConfigurationError(
-                f"Truncated: threshold must be positive and finite, got {self.threshold}"
-            )
-
-    @property
-    def nu(self) -> float:
-        """Spread of the outliers of the inner potential."""
-        return self.inner.nu
-
-    @property
-    def sigma(self) -> float:
-        """Scale of the central peak of the inner potential."""
-        return self.inner.sigma
-
-    @cached_property
-    def saturation(self) -> float:
-        """The inner potential at the threshold."""
-        return float(self.inner(torch.tensor(self.threshold, dtype=torch.float64)).rho)
-
-    def __call__(self, s: Float[Tensor, "*batch"]) -> RobustValue:
-        """Evaluate at squared weighted errors."""
-        below = s < self.threshold
-        inner = self.inner(s.clamp(max=self.threshold))
-        return RobustValue(
-            inner.rho,
-            torch.where(below, inner.first, 0.0),
-            torch.where(below, inner.second, 0.0),
-        )
 
 
 def residual_cost(

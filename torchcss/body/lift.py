@@ -18,7 +18,8 @@ curvature of the kinematics. The work over points does not depend on the number 
 `lift_to_joints`; `BodyModel.lift` adds the state layout on top.
 
 `point_moments` and `reactions` are its two halves, for sums over other points than those below a
-joint: pairs of parts that move against each other (`torchcss.cost.interpenetration`).
+joint: pairs of parts that move against each other (`torchcss.cost.interpenetration`). `wrench`
+serves parameters that deform the points (`torchcss.body.shape`).
 """
 
 from __future__ import annotations
@@ -168,6 +169,14 @@ def reactions(
     else:
         turning = [a + b for a, b in zip(turning, curvature, strict=True)]
     return gradient, turning + shifting
+
+
+def wrench(
+    points: Float[Tensor, "p 3 c"], force: Float[Tensor, "p 3 c"], *, couple: bool = False
+) -> Float[Tensor, "p 6 c"]:
+    """Torque and force (tau, f) of columns of forces at points; of couples the torque alone."""
+    torque = torch.linalg.cross(points, force, dim=-2)
+    return torch.cat([torque, torch.zeros_like(force) if couple else force], dim=-2)
 
 
 def _components(vectors: Float[Tensor, "*batch m c"]) -> tuple[Float[Tensor, "m b"], ...]:

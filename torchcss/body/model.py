@@ -344,6 +344,10 @@ class BodyModel(nn.Module):
             cost,
             second_order_kinematics=curvature is Curvature.EXACT,
         )
+        return self.tied(joints)
+
+    def tied(self, joints: LocalModel) -> LocalModel:
+        """A cost with its derivatives in the joints, and the same in x."""
         if self.is_untied:
             return joints
         return LocalModel(

@@ -30,9 +30,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchcss.body.catalog import without_side
+from torchcss.body.lift import wrench
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.surface import SHAPE_NAMES, straighten, surface_points
-from torchcss.types import Bounds, Curvature, LocalModel, PointCost
+from torchcss.types import Bounds, LocalModel, PointCost
 
 CROSS_SECTIONS = ("a1", "a2", "taper_x", "taper_y")
 """The volumetric numbers of the second stage: cross-sections and their tapers."""
@@ -183,8 +184,6 @@ def lift_with_shape(
     local: ShapeDerivatives,
     cost: PointCost,
     parameters: ShapeParameters,
-    *,
-    curvature: Curvature = Curvature.EXACT,
 ) -> LocalModel:
     """Sum a cost over surface points of one pose and differentiate it in pose and shape.
 
@@ -196,42 +195,31 @@ def lift_with_shape(
         local: The points' derivatives in the part's frame.
         cost: Value, gradient and Hessian of each point's cost in its world position.
         parameters: Which shape numbers are free.
-        curvature: EXACT, or GAUSS_NEWTON, without second derivatives of the points.
 
     Returns:
         Value, gradient `[n + z]` and Hessian: state first, then shape parameters.
     """
-    link = body.part_link[point_part]
-    by_state = body.lift(pose, points, link, cost, curvature=curvature)
+    by_state = body.lift(pose, points, body.part_link[point_part], cost)
     turn = body.part_poses(pose)[0][point_part]
     w = turn @ local.first  # p 3 9
-    bent = cost.hessian @ w
-    exact = curvature is Curvature.EXACT
-    gradient = _per_part((cost.gradient[..., None] * w).sum(-2), point_part, body.num_parts)
-    square = w.mT @ bent
-    turning = torch.linalg.cross(points[..., None].expand_as(bent), bent, dim=-2)
-    if exact:
-        force = (turn.mT @ cost.gradient[..., None])[..., 0]
-        square = square + (force[..., None, None] * local.second).sum(-3)
-        turning = turning + torch.linalg.cross(w, cost.gradient[..., None].expand_as(w), dim=-2)
-    square = _per_part(square, point_part, body.num_parts)
-    wrench = _per_part(torch.cat([turning, bent], dim=-2), point_part, body.num_parts)
+    force = cost.hessian @ w
+    pull = (turn.mT @ cost.gradient[..., None])[..., 0]
+    # How gradient, wrench and cost of the points change with the shape numbers of their part.
+    slope = (cost.gradient[..., None] * w).sum(-2)
+    square = w.mT @ force + (pull[..., None, None] * local.second).sum(-3)
+    six = wrench(points[..., None].expand_as(force), force)
+    six = six + wrench(w, cost.gradient[..., None].expand_as(w), couple=True)
+    slope, square, six = (
+        _per_part(part, point_part, body.num_parts) for part in (slope, square, six)
+    )
     twist = torch.cat([pose.tree.omega, pose.tree.velocity], dim=-1)  # q 6
     above = body.tree.ancestors[:, body.part_link].to(twist)  # q parts
-    mixed = torch.einsum("qi,pik,qp->qpk", twist, wrench, above).flatten(-2)
-    tie = parameters.tie
-    mixed = body.tie.T @ mixed @ tie
-    by_shape = tie.T @ torch.block_diag(*square) @ tie
-    return LocalModel(
-        by_state.value,
-        torch.cat([by_state.gradient, gradient.flatten() @ tie]),
-        torch.cat(
-            [
-                torch.cat([by_state.hessian, mixed], dim=1),
-                torch.cat([mixed.T, by_shape], dim=1),
-            ]
-        ),
-    )
+    mixed = torch.einsum("qi,pik,qp->qpk", twist, six, above).flatten(-2)
+    mixed = body.tie.T @ mixed @ parameters.tie
+    by_shape = parameters.tie.T @ torch.block_diag(*square) @ parameters.tie
+    rows = (torch.cat([by_state.hessian, mixed], dim=1), torch.cat([mixed.T, by_shape], dim=1))
+    gradient = torch.cat([by_state.gradient, slope.flatten() @ parameters.tie])
+    return LocalModel(by_state.value, gradient, torch.cat(rows))
 
 
 def _per_part(values: Float[Tensor, "p ..."], part: Tensor, num: int) -> Float[Tensor, "parts ..."]:

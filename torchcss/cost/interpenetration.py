@@ -41,6 +41,7 @@ on a few hundred poses at a time.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
@@ -55,7 +56,7 @@ from torchcss.body.surface import surface_points
 from torchcss.cost.context import FrameContext
 from torchcss.cost.term import Kind, OnStates, Term
 from torchcss.errors import ConfigurationError
-from torchcss.types import Curvature, LocalModel
+from torchcss.types import Curvature, LocalModel, PointCost
 
 END = 6.0
 """The `c` above: the potential ends where that of the paper has fallen to `exp(-c)`."""
@@ -86,14 +87,8 @@ class NearNodes(NamedTuple):
         """Some of the nodes, the pairs that they belong to, and the same rows of `along`."""
         index = keep.nonzero()[:, 0]
         pairs, owner = torch.unique_consecutive(self.owner[index], return_inverse=True)
-        chosen = NearNodes(
-            self.item[pairs],
-            self.pair[pairs],
-            self.rotation[pairs],
-            self.centre[pairs],
-            owner,
-            self.points[index],
-        )
+        item, pair, rotation, centre = (part[pairs] for part in self[:4])
+        chosen = NearNodes(item, pair, rotation, centre, owner, self.points[index])
         return chosen, [part[index] for part in along]
 
 
@@ -219,9 +214,7 @@ class InterpenetrationPairs(nn.Module):
         body: BodyModel,
         pose: BodyPose,
         near: NearNodes,
-        value: Float[Tensor, " p"],
-        gradient: Float[Tensor, "p 3"],
-        hessian: Float[Tensor, "p 3 3"],
+        cost: PointCost,
         *,
         curvature: Curvature = Curvature.EXACT,
     ) -> LocalModel:
@@ -231,18 +224,12 @@ class InterpenetrationPairs(nn.Module):
             body: The body.
             pose: The posed bodies.
             near: Their nodes.
-            value: Cost of every node.
-            gradient: Its derivative in the node's position in B's frame.
-            hessian: Its second derivative.
+            cost: Cost of every node, with its derivatives in the node's position in B's frame.
             curvature: Gauss-Newton leaves the second-order kinematics out; anything else is exact.
         """
         batch, joints = pose.x.shape[:-1], len(body.tree.joint_names)
-        rows = torch.stack(
-            point_moments(
-                near.points.unbind(-1), gradient.unbind(-1), hessian.flatten(-2).unbind(-1)
-            ),
-            dim=-1,
-        )
+        fields = (near.points, cost.gradient, cost.hessian.flatten(-2))
+        rows = torch.stack(point_moments(*(field.unbind(-1) for field in fields)), dim=-1)
         sums = rows.new_zeros(len(near.item), rows.shape[-1]).index_add(0, near.owner, rows)
         # Twists of the chain about the centre of B, in B's frame.
         chain, sign = self.chain[near.pair], self.sign[near.pair][..., None]
@@ -260,14 +247,12 @@ class InterpenetrationPairs(nn.Module):
             total = values.new_zeros(math.prod((*batch, *size)))
             return total.index_add(0, index.flatten(), values.flatten()).reshape((*batch, *size))
 
-        total = collect(near.item[near.owner], value)
+        total = collect(near.item[near.owner], cost.value)
         first = collect(row, slope, joints)
         second = collect(row[:, :, None] * joints + chain[:, None, :], upper, joints, joints)
         second = second + second.transpose(-1, -2)
         second = second - 0.5 * torch.diag_embed(second.diagonal(dim1=-2, dim2=-1))
-        if body.is_untied:
-            return LocalModel(total, first, second)
-        return LocalModel(total, first @ body.tie, body.tie.T @ second @ body.tie)
+        return body.tied(LocalModel(total, first, second))
 
 
 def _pairs(body: BodyModel) -> list[tuple[int, int, list[int], list[int]]]:
@@ -395,19 +380,13 @@ class Interpenetration(Term):
         near, (square, slope, bowl) = near.select(square < self.reach**2, square, slope, bowl)
         value, first, second = self._potential(square, pairs)
         outer = slope[:, :, None] * slope[:, None, :]
-        return pairs.lift(
-            body,
-            pose,
-            near,
-            value,
-            first[:, None] * slope,
-            first[:, None, None] * bowl + second[:, None, None] * outer,
-            curvature=curvature,
-        )
+        hessian = first[:, None, None] * bowl + second[:, None, None] * outer
+        cost = PointCost(value, first[:, None] * slope, hessian)
+        return pairs.lift(body, pose, near, cost, curvature=curvature)
 
     def _potential(
         self, square: Float[Tensor, " p"], pairs: InterpenetrationPairs
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    ) -> Iterator[Tensor]:
         """Cost of nodes and its first and second derivatives in `R^2`."""
         scale, end = self.weight / pairs.nodes.shape[1], END ** (1 / self.p)
         f = (self.sharpness * (square - 1)).clamp(max=end)
@@ -420,4 +399,4 @@ class Interpenetration(Term):
             second = second + (last - paper) * ddu * self.sharpness**2
         value = paper - last * (1 + END - u)
         inside = f < end
-        return tuple(torch.where(inside, scale * part, 0.0) for part in (value, first, second))  # type: ignore[return-value]
+        return (torch.where(inside, scale * part, 0.0) for part in (value, first, second))

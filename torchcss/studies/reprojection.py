@@ -210,10 +210,7 @@ class ReprojectionCost:
             PointCost(0.5 * rho.T, gradient.permute(2, 1, 0), hessian.permute(3, 2, 0, 1)),
             second_order_kinematics=True if share is None else share,
         )
-        if not body.is_untied:
-            model = LocalModel(
-                model.value, model.gradient @ body.tie, body.tie.T @ model.hessian @ body.tie
-            )
+        model = body.tied(model)
         if self.stabiliser is not None:
             value, slope, curvature = self._prior(x, share)
             model.hessian.diagonal(dim1=-2, dim2=-1).add_(curvature)
