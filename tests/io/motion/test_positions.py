@@ -14,10 +14,10 @@ from made_tracks import export_as, make_track
 from reference.bvh import read_bvh, rotation
 
 from torchcss import load_body
+from torchcss.body.files.bvh import UNITS
 from torchcss.errors import ConfigurationError, MotionCaptureError
 from torchcss.io.motion.positions import (
     LIMBS,
-    UNITS,
     MotionCapture,
     limb_positions,
     read_motion_capture,
