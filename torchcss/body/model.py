@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import copy
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -85,32 +86,28 @@ class BodyModel(nn.Module):
         self.neighbours = body.neighbours
         self.notes = body.notes
         self._lay_out_state(body)
-        real = torch.float64
         self.joint_names = tuple(marker.name for marker in body.markers)
         self.part_names = tuple(part.name for part in body.parts)
         repeated = sorted({name for name in self.part_names if self.part_names.count(name) > 1})
         if repeated:
             raise BodyError(f"part names must be unique; repeated: {', '.join(repeated)}")
-        link_of = self.tree.link_index
+        for name, rows in (("marker_link", body.markers), ("part_link", body.parts)):
+            links = [self.tree.link_index(row.link) for row in rows]
+            self.register_buffer(name, torch.tensor(links).long())
+        self._register("marker_offset", [marker.translation for marker in body.markers], 3)
+        self._register("part_rotation", [part.rotation for part in body.parts], 3, 3)
+        self._register("part_translation", [part.translation for part in body.parts], 3)
+        self._register("part_shape", [part.shape for part in body.parts], 9)
+        eta, omega = angular_grid(rings, meridians, dtype=torch.float64)
+        self.register_buffer("eta", eta)
+        self.register_buffer("omega", omega)
+        self.register_buffer("base_rotation", torch.eye(3, dtype=torch.float64))
+        self.register_buffer("base_translation", torch.zeros(3, dtype=torch.float64))
 
-        def register(name: str, value: Tensor) -> None:
-            self.register_buffer(name, value)
-
-        register("marker_link", torch.tensor([link_of(m.link) for m in body.markers]).long())
-        offsets = torch.tensor([m.translation for m in body.markers], dtype=real)
-        register("marker_offset", offsets.reshape(-1, 3))
-        register("part_link", torch.tensor([link_of(p.link) for p in body.parts]).long())
-        rotations = torch.tensor([p.rotation for p in body.parts], dtype=real)
-        register("part_rotation", rotations.reshape(-1, 3, 3))
-        centres = torch.tensor([p.translation for p in body.parts], dtype=real)
-        register("part_translation", centres.reshape(-1, 3))
-        shapes = torch.tensor([p.shape for p in body.parts], dtype=real)
-        register("part_shape", shapes.reshape(-1, 9))
-        eta, omega = angular_grid(rings, meridians, dtype=real)
-        register("eta", eta)
-        register("omega", omega)
-        register("base_rotation", torch.eye(3, dtype=real))
-        register("base_translation", torch.zeros(3, dtype=real))
+    def _register(self, name: str, rows: Sequence[Any], *shape: int) -> None:
+        """Keep rows of numbers, of which there may be none, as a tensor."""
+        values = torch.tensor(rows, dtype=torch.float64).reshape(-1, *shape)
+        self.register_buffer(name, values)
 
     def _lay_out_state(self, body: BodySpecification) -> None:
         mimics = {j.name: j.mimic for j in body.joints if j.mimic is not None}
@@ -147,15 +144,13 @@ class BodyModel(nn.Module):
         self.register_buffer("tie", tie)
         # Without ties the state is the joints, and the lift can skip two products with E.
         self.is_untied = tie.shape[0] == size and bool((tie == torch.eye(size)).all())
-        self.register_buffer("offset", torch.tensor([r[2] for r in rows], dtype=torch.float64))
+        self._register("offset", [offset for _, _, offset in rows])
         self.register_buffer("lower", lower)
         self.register_buffer("upper", upper)
         rest = [body.sticky.get(name, (0.0, math.inf)) for name in names]
-        self.register_buffer("sticky_mean", torch.tensor([r[0] for r in rest], dtype=torch.float64))
-        deviation = torch.tensor([r[1] for r in rest], dtype=torch.float64)
-        self.register_buffer("sticky_deviation", deviation)
-        rates = [motion_rate(name) for name in names]
-        self.register_buffer("motion_rate", torch.tensor(rates, dtype=torch.float64))
+        self._register("sticky_mean", [mean for mean, _ in rest])
+        self._register("sticky_deviation", [deviation for _, deviation in rest])
+        self._register("motion_rate", [motion_rate(name) for name in names])
 
     @property
     def num_parameters(self) -> int:
@@ -257,7 +252,7 @@ class BodyModel(nn.Module):
         return BodyPose(x, tree, self.points_on_links(tree, self.marker_link, self.marker_offset))
 
     def points_on_links(
-        self, tree: TreePose, link: Int[Tensor, " p"], offset: Float[Tensor, "p 3"]
+        self, tree: TreePose, link: Int[Tensor, " p"], offset: Float[Tensor, "*#batch p 3"]
     ) -> Float[Tensor, "*batch p 3"]:
         """World positions of points that are fixed in links.
 
@@ -266,7 +261,7 @@ class BodyModel(nn.Module):
             link: Link of each point.
             offset: Position in that link's frame, metres.
         """
-        turned = (tree.rotation[..., link, :, :] * offset[:, None, :]).sum(-1)
+        turned = (tree.rotation[..., link, :, :] * offset[..., None, :]).sum(-1)
         return turned + tree.translation[..., link, :]
 
     def part_poses(
@@ -363,11 +358,7 @@ class BodyModel(nn.Module):
         local = (rotation[..., point_link, :, :] * local[..., :, None]).sum(-2)
         with torch.enable_grad():
             x = pose.x.detach().requires_grad_()
-            tree = self.tree(
-                x @ self.tie.T + self.offset, self.base_rotation, self.base_translation
-            )
-            moved = (tree.rotation[..., point_link, :, :] * local[..., None, :]).sum(-1)
-            moved = moved + tree.translation[..., point_link, :]
+            moved = self.points_on_links(self.pose(x).tree, point_link, local)
             step = moved - points.detach()
             bowl = (step[..., None, :] @ cost.hessian.detach() @ step[..., :, None]).flatten(-3)
             value = cost.value.detach().sum(-1) + (cost.gradient.detach() * step).sum((-1, -2))

@@ -28,7 +28,6 @@ from torchcss.cost.joints import JointTargets, match_joints
 from torchcss.cost.total import TrackingCost
 from torchcss.cost.view import View
 from torchcss.errors import CameraError
-from torchcss.inference.mixture import GaussianMixture
 from torchcss.initialise.keypoint_checks import check_joints
 from torchcss.initialise.multi_start import multi_start_fits
 from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
@@ -40,6 +39,7 @@ from torchcss.initialise.result import (
     columns_of,
     fitted_lengths,
     hang_on_best,
+    mixture_of,
     scale_of,
     scale_report,
     undetermined_line,
@@ -100,7 +100,19 @@ def fit_joints(
         fits = multi_start_fits(cost, search=options.search, generator=generator)
         return as_initialisation(body, best_distinct(fits, options.num_modes), notes)
     free = _hang_before_camera(free, view.camera, match_joints(keypoints, free.joint_names))
-    cost = cost.with_body(free)
+    return _with_lengths_fitted(cost.with_body(free), generator, options, scale, notes)
+
+
+def _with_lengths_fitted(
+    cost: TrackingCost,
+    generator: torch.Generator,
+    options: InitialiseOptions,
+    scale: float,
+    notes: tuple[str, ...],
+) -> Initialisation:
+    """Fit pose and lengths, leave outliers out, and refine the poses with the lengths held."""
+    free, keypoints = cost.body, cost.keypoints
+    assert keypoints is not None
     fits, outliers = fits_and_outliers(cost, search=options.search, generator=generator)
     left_out = tuple(
         name for name, out in zip(keypoints.names, outliers.tolist(), strict=True) if out
@@ -111,7 +123,7 @@ def fit_joints(
     lengths = fitted_lengths(free, fits.mean[0], options.stature)
     held, kept = _with_lengths_held(cost, fits, lengths, scale, options)
     result = as_initialisation(held, kept, notes)
-    report = [*result.report, scale_report(options.stature, lengths, num_views=1 + len(others))]
+    report = [*result.report, scale_report(options.stature, lengths, num_views=len(cost.views))]
     if (line := undetermined_line(held, kept, joints=cost.with_body(held))) is not None:
         report.append(line)
     fits = Modes(*(field[: options.num_modes] for field in fits))
@@ -121,9 +133,7 @@ def fit_joints(
         scale=scale,
         left_out=left_out,
         free_body=free,
-        free_mixture=GaussianMixture(
-            fits.mean, fits.covariance, torch.log_softmax(-fits.cost, dim=0)
-        ),
+        free_mixture=mixture_of(fits),
     )
 
 

@@ -93,16 +93,20 @@ class Initialisation(NamedTuple):
         return torch.cat([fits, self.body.bounds.project(samples)])
 
 
+def mixture_of(fits: Modes) -> GaussianMixture:
+    """Fits as modes that weigh by their costs."""
+    return GaussianMixture(fits.mean, fits.covariance, torch.log_softmax(-fits.cost, dim=0))
+
+
 def as_initialisation(body: BodyModel, fits: Modes, notes: tuple[str, ...]) -> Initialisation:
     """Fits, the best first, as hypotheses, with what is to be reported about them."""
-    mixture = GaussianMixture(fits.mean, fits.covariance, torch.log_softmax(-fits.cost, dim=0))
     best = float(fits.cost[0])
     report = (
         *notes,
         f"first pose: {len(fits.cost)} distinct fits to the keypoints, best cost {best:.1f}",
     )
     stage = Stage("pose and proportions from joints", body, fits.mean[0], best)
-    return Initialisation(body, mixture, fits.cost, report, stages=(stage,))
+    return Initialisation(body, mixture_of(fits), fits.cost, report, stages=(stage,))
 
 
 def hang_on_best(body: BodyModel, fits: Modes) -> tuple[BodyModel, Modes]:

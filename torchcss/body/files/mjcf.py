@@ -41,14 +41,11 @@ _SOLIDS = {2: ("sphere", 1), 3: ("capsule", 2), 4: ("ellipsoid", 3), 5: ("cylind
            6: ("box", 3)}  # fmt: skip
 """Geoms that become parts, by MuJoCo's numbers: their names, and how many sizes they have."""
 
-_TOP = ("compiler", "default", "asset", "worldbody")
-_BODIES = ("body", "frame", "joint", "freejoint", "geom", "replicate", "attach", "flexcomp")
-_BELOW = {
-    **dict.fromkeys(("worldbody", "body", "frame", "replicate"), _BODIES),
-    "default": ("default", "joint", "geom"),
-    "asset": ("model",),
-}
-"""What is kept at the top of a file, and below an element."""
+_KEPT = (
+    *("compiler", "default", "asset", "model", "worldbody", "body", "frame", "joint", "freejoint"),
+    *("geom", "replicate", "attach", "flexcomp"),
+)
+"""Elements that say what a body is; others go, with what they hold."""
 
 _NAMES = ("name", "class", "childclass", "prefix", "mesh", "hfield", "model", "body", "file")
 _MOST_FILES, _MOST_BODIES, _FAR = 50, 10_000, 1e6
@@ -92,8 +89,8 @@ class _Screen:
         self.attached: dict[str, ElementTree.Element] = {}
         self.sizes: dict[ElementTree.Element, float] = {}
 
-    def read(self, name: str, wanted: tuple[str, ...] = _TOP) -> ElementTree.Element:
-        """A file of the folder without what is not a body's; `wanted` may stand at its top."""
+    def read(self, name: str) -> ElementTree.Element:
+        """A file of the folder without what is not a body's."""
         path = self.path.parent / name
         self.num_files += 1
         if self.num_files > _MOST_FILES:
@@ -104,19 +101,20 @@ class _Screen:
         if root.tag not in ("mujoco", "mujocoinclude"):
             raise BodyError(f"{path}: not an MJCF, expected <mujoco>, found <{root.tag}>")
         root.tag, root.attrib = "mujoco", {}
-        self._strip(root, wanted)
+        self._strip(root)
         return root
 
-    def _strip(self, element: ElementTree.Element, wanted: tuple[str, ...]) -> None:
+    def _strip(self, element: ElementTree.Element) -> None:
         children: list[ElementTree.Element] = []
         for child in element:
             if child.tag == "include":
-                children += self.read(child.get("file", ""), wanted)
-            elif child.tag in wanted:
-                for reference in ("material", *(["file"] if child.tag == "flexcomp" else [])):
-                    child.attrib.pop(reference, None)
+                children += self.read(child.get("file", ""))
+            elif child.tag in _KEPT:
+                child.attrib.pop("material", None)
+                if child.tag == "flexcomp":
+                    child.attrib.pop("file", None)
                 self._check_numbers(child)
-                self._strip(child, _BELOW.get(child.tag, ()))
+                self._strip(child)
                 children.append(child)
         element[:] = children
         for child in children:
@@ -260,24 +258,19 @@ class _Reader:
         model, kind = self.model, int(self.model.jnt_type[joint])
         name = model.joint(joint).name or f"{body}_joint{len(self.joints)}"
         limits, is_limited = model.jnt_range[joint], bool(model.jnt_limited[joint])
+        turn = JointSpecification(name=name, link="", parent="", kind="revolute")
         if kind == 1:  # a ball
             most = float(limits[1]) if is_limited else math.pi
             ends = zip("xyz", np.eye(3), (most, min(most, 0.5 * math.pi), most), strict=True)
             return [
-                JointSpecification(
-                    name=f"{name}_{letter}", link="", parent="", kind="revolute",
-                    axis=as_vector(axis), lower=-end, upper=end,
-                )
+                replace(turn, name=f"{name}_{letter}", axis=as_vector(axis), lower=-end, upper=end)
                 for letter, axis, end in ends
-            ]  # fmt: skip
-        reference = model.qpos0[model.jnt_qposadr[joint]]
-        lower, upper = (limits - reference).tolist() if is_limited else (-math.inf, math.inf)
-        return [
-            JointSpecification(
-                name=name, link="", parent="", axis=as_vector(model.jnt_axis[joint]),
-                kind="revolute" if kind == 3 else "prismatic", lower=lower, upper=upper,
-            )
-        ]  # fmt: skip
+            ]
+        if is_limited:
+            lower, upper = (limits - model.qpos0[model.jnt_qposadr[joint]]).tolist()
+            turn = replace(turn, lower=lower, upper=upper)
+        kind = "revolute" if kind == 3 else "prismatic"
+        return [replace(turn, kind=kind, axis=as_vector(model.jnt_axis[joint]))]
 
     def _part(self, geom: int, link: str) -> None:
         model = self.model
