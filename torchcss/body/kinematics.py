@@ -86,12 +86,13 @@ class KinematicTree(nn.Module):
         place_of = self.chain.frame_to_idx
         self.link_names = tuple(sorted(place_of, key=lambda link: place_of[link]))
         parents = {joint.link: joint.parent for joint in joints}
+        row_of = {joint.link: row for row, joint in enumerate(moving)}
         ancestors = torch.zeros(len(moving), len(self.link_names), dtype=torch.bool)
         for column, link in enumerate(self.link_names):
             above: str | None = link
             while above is not None:
-                for row, joint in enumerate(moving):
-                    ancestors[row, column] |= joint.link == above
+                if above in row_of:
+                    ancestors[row_of[above], column] = True
                 above = parents[above]
         links = torch.tensor([self.link_names.index(joint.link) for joint in moving]).long()
         axes = torch.tensor([joint.axis for joint in moving], dtype=torch.float64).reshape(-1, 3)
@@ -139,13 +140,8 @@ class KinematicTree(nn.Module):
         self._levels: list[_Level] = []
         for level in range(1, 1 + max(depth.values(), default=0)):
             names = [name for name in order if depth[name] == level]
-            self._levels.append(
-                _Level(
-                    size=len(names),
-                    turns=any(kinds[name] == "revolute" for name in names),
-                    slides=any(kinds[name] == "prismatic" for name in names),
-                )
-            )
+            found = [kinds[name] for name in names]
+            self._levels.append(_Level(len(names), "revolute" in found, "prismatic" in found))
             within |= {name: position for position, name in enumerate(names)}
 
         def matrices(items: list[np.ndarray]) -> Tensor:

@@ -26,7 +26,7 @@ from jaxtyping import Float
 
 from torchcss.body.catalog import PartSpecification, without_side
 from torchcss.body.chain import JointSpecification
-from torchcss.body.rotations import as_rows, as_vector, frame_along
+from torchcss.body.rotations import Vector, as_rows, as_vector, frame_along
 from torchcss.body.surface import angular_grid, implicit, surface_points
 
 GIRTHS: dict[tuple[str, str], tuple[str, float]] = {
@@ -84,10 +84,15 @@ def rest_poses(joints: Sequence[JointSpecification]) -> dict[str, Float[np.ndarr
     """Pose of every link with all joints at zero, in the root link's frame."""
     poses: dict[str, np.ndarray] = {}
     for joint in joints:
-        local = np.eye(4)
-        local[:3, :3], local[:3, 3] = joint.rotation, joint.translation
+        local = _frame(joint.rotation, joint.translation)
         poses[joint.link] = local if joint.parent is None else poses[joint.parent] @ local
     return poses
+
+
+def _frame(rotation: Sequence[Sequence[float]], place: Vector) -> Float[np.ndarray, "4 4"]:
+    frame = np.eye(4)
+    frame[:3, :3], frame[:3, 3] = rotation, place
+    return frame
 
 
 def bone_parts(
@@ -106,7 +111,11 @@ def bone_parts(
     """
     places, reach = _places(joints, landmarks)
     bones = [place for place in places if place.above is not None]
-    radius = {bone: _radius(bone, reach) for bone in bones}
+    kinds = {bone: _bone_kind(bone) for bone in bones}
+    radius = {
+        bone: min(max(girth * bone.length, _SLIM * reach), _STOUT * reach)
+        for bone, (_, girth) in kinds.items()
+    }
     for bone in reversed(bones):
         if len(bone.below) == 1 and bone.below[0].length > bone.length:
             radius[bone] = max(radius[bone], 0.9 * radius[bone.below[0]])
@@ -126,7 +135,7 @@ def bone_parts(
         middle = 0.5 * (bone.above.position + bone.position) - poses[bone.carrier][:3, 3]
         parts.append(
             PartSpecification(
-                name=_unused(_bone_name(bone), [part.name for part in parts]),
+                name=_unused(kinds[bone][0], [part.name for part in parts]),
                 link=bone.carrier,
                 translation=as_vector(turn.T @ middle),
                 rotation=as_rows(turn.T @ frame_along(bone.bone, side)),
@@ -146,10 +155,9 @@ def solid_shape(kind: str, size: Sequence[float]) -> tuple[float, ...]:
     """
     if kind == "sphere":
         axes, e1, e2 = (size[0],) * 3, 1.0, 1.0
-    elif kind == "ellipsoid":
-        axes, e1, e2 = tuple(size[:3]), 1.0, 1.0
-    elif kind == "box":
-        axes, e1, e2 = tuple(size[:3]), _SHARP, _SHARP
+    elif kind in ("ellipsoid", "box"):
+        e1 = e2 = _SHARP if kind == "box" else 1.0
+        axes = tuple(size[:3])
     elif kind == "cylinder":
         axes, e1, e2 = (size[0], size[0], size[1]), _SHARP, 1.0
     else:
@@ -165,11 +173,9 @@ def touching_parts(
     place_of = {link: place for place in places for link in place.links}
     poses = rest_poses(joints)
     shapes = torch.tensor([part.shape for part in parts], dtype=torch.float64).reshape(-1, 9)
-    frames = torch.eye(4, dtype=torch.float64).repeat(len(parts), 1, 1)
-    for frame, part in zip(frames, parts, strict=True):
-        local = np.eye(4)
-        local[:3, :3], local[:3, 3] = part.rotation, part.translation
-        frame.copy_(torch.from_numpy(poses[part.link] @ local))
+    frames = torch.from_numpy(
+        np.array([poses[part.link] @ _frame(part.rotation, part.translation) for part in parts])
+    ).reshape(-1, 4, 4)
     turn, centre = frames[:, :3, :3], frames[:, :3, 3]
     eta, omega = (
         grid.flatten().expand(len(parts), -1) for grid in angular_grid(6, 8, dtype=torch.float64)
@@ -213,27 +219,15 @@ def _places(
     return places, reach
 
 
-def _bone_kind(bone: _Place) -> tuple[str, str, float] | None:
-    """Side, name and girth of a bone of a person."""
+def _bone_kind(bone: _Place) -> tuple[str, float]:
+    """Name of a bone, and its radius by its length."""
     assert bone.above is not None
     for start in bone.above.names:
         for end in bone.names:
-            bare = [without_side(name) for name in (start, end)]
-            if (known := GIRTHS.get((bare[0], bare[1]))) is not None:
+            if (known := GIRTHS.get((without_side(start), without_side(end)))) is not None:
                 side = end[:2] if end.startswith(("l_", "r_")) else ""
-                return side, *known
-    return None
-
-
-def _bone_name(bone: _Place) -> str:
-    kind = _bone_kind(bone)
-    return bone.carrier if kind is None else kind[0] + kind[1]
-
-
-def _radius(bone: _Place, reach: float) -> float:
-    kind = _bone_kind(bone)
-    wanted = (_GIRTH if kind is None else kind[2]) * bone.length
-    return min(max(wanted, _SLIM * reach), _STOUT * reach)
+                return side + known[0], known[1]
+    return bone.carrier, _GIRTH
 
 
 def _trunk(places: Sequence[_Place]) -> dict[_Place, tuple[np.ndarray, float]]:
