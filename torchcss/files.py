@@ -73,6 +73,31 @@ def replace_file(path: Path) -> Iterator[Path]:
             partial.unlink(missing_ok=True)
 
 
+def save_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Write an NPZ file whole or not at all.
+
+    Args:
+        path: The file.
+        arrays: Arrays by name, or what NumPy makes arrays of.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    plain: dict[str, Any] = {name: np.asarray(value) for name, value in arrays.items()}
+    with replace_file(path) as partial:
+        np.savez(partial, **plain)
+
+
+def write_text(path: Path, text: str) -> None:
+    r"""Write a text file in UTF-8 whole or not at all, its lines ended by `\n` everywhere.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    with replace_file(path) as partial:
+        partial.write_text(text, encoding="utf-8", newline="\n")
+
+
 def temporary_name(path: Path) -> Path:
     """Return the name beside `path` under which this process writes before it moves the file."""
     return path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")

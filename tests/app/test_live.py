@@ -6,6 +6,7 @@ import io
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -57,16 +58,16 @@ def track(files: Path, *more: str) -> int:
 
 def test_a_live_recording_is_the_track(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     chunk = pytest.importorskip("rerun.chunk")
-    drawn, draw = [], recorder.draw_modes
+    drawn, draw = [], recorder.draw_poses
 
-    def count(*arguments: object) -> np.ndarray:
-        drawn.append(arguments[-1])
-        return draw(*arguments)  # pyright: ignore[reportArgumentType]
+    def count(*arguments: Any, text: str, **named: Any) -> np.ndarray:
+        drawn.append(text)
+        return draw(*arguments, text=text, **named)
 
-    monkeypatch.setattr(recorder, "draw_modes", count)
+    monkeypatch.setattr(recorder, "draw_poses", count)
     saved = files / "live.rrd"
     assert track(files, "--live-save", str(saved)) == 0
-    assert [str(text).split()[1] for text in drawn] == ["0", "1", "2"]
+    assert [text.split()[1] for text in drawn] == ["0", "1", "2"]
     result = load_track(files / "out")
     strips, pictures = {}, {}
     for piece in chunk.RrdReader(saved).stream():

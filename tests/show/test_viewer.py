@@ -26,7 +26,7 @@ from torchcss.io.view_files import RecordedCamera
 from torchcss.show import viewer
 from torchcss.show.overlay import PALETTE
 from torchcss.show.track_plots import bones_of, count_apart, effective_number
-from torchcss.show.viewer import posed_frames, view_track
+from torchcss.show.viewer import shown_frames, view_track
 from torchcss.show.viewer_layout import _eye, layout, world_axes
 from torchcss.studies.render.scene import look_at
 from torchcss.vision.camera import Camera
@@ -217,7 +217,7 @@ def test_large_pictures_are_reduced_with_their_camera(
 ) -> None:
     package = pytest.importorskip("rerun")
     large = look_at((0.3, -1.0, 5.0), (0.3, -1.0, 0.0), focal_px=3000, image_size_wh=(2560, 1440))
-    frame = next(posed_frames(run_of(track, large)))
+    frame = next(shown_frames(run_of(track, large)))
     frame = frame._replace(picture=np.zeros((1440, 2560, 3), np.uint8))
     recording = viewer.open_recording("large", save=tmp_path / "large.rrd")
     viewer.Viewer(recording, body, camera=large).add(frame)

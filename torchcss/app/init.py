@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from torchcss.cost.view import View
-from torchcss.errors import CameraError
+from torchcss.errors import CameraError, KeypointError
 from torchcss.files import prepare_output_folder, replace_file
 from torchcss.initialise.fit import default_camera, initialise
 from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
@@ -48,38 +48,37 @@ NUM_DRAWN = 7
 
 @dataclass(frozen=True, kw_only=True)
 class PictureFiles:
-    """A picture with its camera and the joints of a person in it.
+    """What belongs to a picture: its joints and its camera.
 
     Attributes:
-        image: The picture, or a video.
-        frame: Which frame of the video.
-        keypoints: File of the joints, or the joints.
-        layout: Layout of a file that does not name its joints.
-        normalised: Whether joints are fractions of the image, and which, see
-            `torchcss.io.keypoints.read.Scale`.
-        camera: Calibration file; None: a pinhole camera.
-        camera_name: Camera in the file.
-        focal_px: Focal length of the pinhole camera, pixels.
-        field_of_view_degrees: Its angle between left and right border, instead.
+        frame: Which frame of the video, from 0; `torchcss track --start` takes the same number.
+        joints: Marked joints: clicked JSON, CSV, OpenPose, COCO, MediaPipe or NPZ.
+        layout: Layout of a joints file that does not name its joints, e.g. BODY_25.
+        normalised: Whether joints are pixels, or fractions of the picture from 0 to 1 or from -1
+            to 1.
+        camera: Calibration; without it a pinhole camera of --focal-px, --field-of-view or 54
+            degrees.
+        camera_name: Camera in the file; by default the one whose picture this is.
+        focal_px: Focal length in pixels.
+        field_of_view: Angle between the left and the right border of the picture, degrees.
     """
 
-    image: Path
     frame: int = 0
-    keypoints: Path | Keypoints
+    joints: Path | None = None
     layout: str | None = None
-    normalised: bool | Scale = False
+    normalised: Scale = "pixels"
     camera: Path | None = None
     camera_name: str | None = None
     focal_px: float | None = None
-    field_of_view_degrees: float | None = None
+    field_of_view: float | None = None
 
-    def read_camera(self, width: int, height: int) -> tuple[Camera, list[str]]:
+    def read_camera(self, image: Path, width: int, height: int) -> tuple[Camera, list[str]]:
         """The camera of a picture of this size, and what is to be said about it.
 
         Raises:
             CameraError: If it cannot be read, is of another size, or is given twice.
         """
-        focal, angle = self.focal_px, self.field_of_view_degrees
+        focal, angle = self.focal_px, self.field_of_view
         if self.camera is None:
             camera, note = default_camera(
                 width, height, focal_px=focal, field_of_view_degrees=angle
@@ -87,21 +86,21 @@ class PictureFiles:
             return camera, [note]
         if focal is not None or angle is not None:
             raise CameraError("give a camera file, a focal length or a field of view, not several")
-        loaded = load_camera(self.camera, self.camera_name, video=self.image)
+        loaded = load_camera(self.camera, self.camera_name, video=image)
         check_image_size(loaded.camera, width, height)
         notes = [f"camera: {loaded.camera.name}", loaded.units_note]
         return loaded.camera, [note for note in notes if note]
 
-    def read_keypoints(self, width: int, height: int) -> Keypoints:
+    def read_joints(self, width: int, height: int) -> Keypoints:
         """The joints in a picture of this size.
 
         Raises:
             KeypointError: If they cannot be read.
         """
-        if isinstance(self.keypoints, Keypoints):
-            return self.keypoints
+        if self.joints is None:
+            raise KeypointError("give a file with --joints, or --click to mark the joints")
         return read_joints(
-            self.keypoints,
+            self.joints,
             image_size_wh=(width, height),
             layout=self.layout,
             normalised=self.normalised,
@@ -110,9 +109,11 @@ class PictureFiles:
 
 
 def initialise_image(
-    files: PictureFiles,
+    image: Path,
     out: Path,
     *,
+    files: PictureFiles,
+    keypoints: Keypoints | None = None,
     body: str = "body34",
     seed: int = 0,
     options: InitialiseOptions | None = None,
@@ -120,8 +121,10 @@ def initialise_image(
     """Initialise from a picture and write the results.
 
     Args:
-        files: The picture, its camera and its joints.
+        image: The picture, or a video.
         out: Output folder.
+        files: Its camera and its joints.
+        keypoints: The joints, if they are not in a file.
         body: Name of a body that ships, or a URDF, MJCF or BVH file.
         seed: Seed of all random numbers.
         options: How to look, and what to fit.
@@ -134,13 +137,12 @@ def initialise_image(
     """
     check_seed(seed)
     options = options or InitialiseOptions()
-    picture = read_frame(files.image, files.frame)
+    picture = read_frame(image, files.frame)
     height, width = picture.shape[:2]
     prepare_output_folder(out)
-    camera, notes = files.read_camera(width, height)
-    keypoints = files.read_keypoints(width, height)
-    began = time.perf_counter()
-    generator = torch.Generator().manual_seed(seed)
+    camera, notes = files.read_camera(image, width, height)
+    keypoints = files.read_joints(width, height) if keypoints is None else keypoints
+    began, generator = time.perf_counter(), torch.Generator().manual_seed(seed)
     found = initialise(picture, keypoints, camera, body, generator=generator, options=options)
     seconds = time.perf_counter() - began
     found = found._replace(report=(*notes, *keypoints.report, *found.report))
@@ -154,7 +156,7 @@ def initialise_image(
         writer.writeheader()
         writer.writerows(rows)
     summary: dict[str, Any] = {
-        "image": files.image,
+        "image": image,
         "frame": files.frame,
         "camera": camera.name,
         "body": body,

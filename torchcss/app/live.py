@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from torchcss.app.recorder import Picture
+from torchcss.app.recorder import Picture, modes_of
 from torchcss.io.export.selection import camera_up, up_axis
-from torchcss.show.viewer import PosedFrame, Viewer, close_recording, open_recording
+from torchcss.show.viewer import ShownFrame, Viewer, close_recording, open_recording
 from torchcss.tracking.session import Posterior
 from torchcss.vision.camera import Camera
 
@@ -52,21 +52,10 @@ class LiveViewer:
             frame: What the tracker found.
             picture: How it looks.
         """
-        body, mixture = frame.body, frame.state.mixture
         if self._viewer is None:
             up = _up(frame, picture.camera)
-            self._viewer = Viewer(self._recording, body, camera=picture.camera, up=up)
-        shown = PosedFrame(
-            number=frame.frame.index,
-            time_s=frame.frame.time_s,
-            pose=body.pose(mixture.mean),
-            covariance=frame.covariance,
-            weight=mixture.weight,
-            cost=frame.info.cost,
-            picture=picture.image,
-            lost=frame.lost,
-        )
-        self._viewer.add(shown)
+            self._viewer = Viewer(self._recording, frame.body, camera=picture.camera, up=up)
+        self._viewer.add(ShownFrame(modes_of(frame), picture.image, frame.lost))
 
     def close(self) -> None:
         """End the recording; a viewer stays open."""

@@ -4,7 +4,7 @@
 Ctrl-C or SIGTERM it writes `track.npz`, then `summary.json`, then `checkpoint.npz`, each whole or
 not at all; the checkpoint says how many frames of the track belong to it. Whatever else should see
 the frames as they come is a `Sink`, such as the live viewer (`torchcss.app.live`). What cannot be
-written piecemeal, the overlay film, is made at the end by `torchcss.app.overlay`.
+written piecemeal, the overlay film, is made at the end (`torchcss.show.track_pictures`).
 """
 
 from __future__ import annotations
@@ -27,13 +27,14 @@ from jaxtyping import UInt8
 from torch import Tensor
 from tqdm import tqdm
 
-from torchcss.app.overlay import caption, draw_modes
 from torchcss.app.smooth import SMOOTH_NAME
 from torchcss.files import output_error
 from torchcss.io.cameras import calibration
 from torchcss.io.checkpoint import Checkpoint, remove_checkpoint, write_checkpoint
 from torchcss.io.tracks import TRACK_NAME, FrameModes, Track, TrackWriter, write_summary
 from torchcss.io.view_files import RecordedCamera
+from torchcss.show.overlay import draw_poses
+from torchcss.show.track_pictures import caption
 from torchcss.tracking.checkpoint import state_tensors
 from torchcss.tracking.session import Posterior, TrackingSession
 from torchcss.types import Status
@@ -57,9 +58,11 @@ class Picture:
     @cached_property
     def image(self) -> UInt8[np.ndarray, "h w 3"]:
         """The frame with its modes drawn over it."""
-        frame = self._frame
-        text = caption(frame.frame.index, frame.info.cost)
-        return draw_modes(frame.frame.image, frame.body, frame.state.mixture, self.camera, text)
+        frame, modes = self._frame, self._frame.state.mixture
+        text = caption(frame.frame.index, len(modes.mean), float(frame.info.cost[0]))
+        return draw_poses(
+            frame.frame.image, frame.body, modes.mean, self.camera, weights=modes.weight, text=text
+        )
 
 
 class Sink(Protocol):
@@ -220,7 +223,7 @@ class Recorder:
         """Add a frame, and show it to the sinks."""
         if not len(self._writer):
             self._replace_last_run()
-        self._writer.append(_modes_of(frame, is_first=not len(self._writer)))
+        self._writer.append(modes_of(frame, is_first=not len(self._writer)))
         # The session may be one frame ahead when an interruption comes; its state then is not.
         self._state = self.session.checkpoint()
         self._totals.add(frame)
@@ -255,22 +258,25 @@ class Recorder:
                     raise output_error(old, error) from error
 
 
-def _modes_of(frame: Posterior, *, is_first: bool) -> FrameModes:
+def modes_of(frame: Posterior, *, is_first: bool = False) -> FrameModes:
     """A frame as the track takes it."""
-    base = np.eye(4)
-    base[:3, :3] = frame.body.base_rotation.cpu().numpy()
-    base[:3, 3] = frame.body.base_translation.cpu().numpy()
+    base = torch.eye(4, dtype=torch.float64)
+    base[:3, :3] = frame.body.base_rotation
+    base[:3, 3] = frame.body.base_translation
     mixture, parent = frame.state.mixture, frame.info.parent
+    numbers = {
+        "state": mixture.mean,
+        "covariance": frame.covariance,
+        "log_weight": mixture.log_weight,
+        "cost": frame.info.cost,
+        "parent": torch.full_like(parent, -1) if is_first else parent,
+        "joints_world": frame.joints_world,
+    }
     return FrameModes(
         frame=frame.frame.index,
         time_s=frame.frame.time_s,
-        state=mixture.mean,
-        covariance=frame.covariance,
-        log_weight=mixture.log_weight,
-        cost=frame.info.cost,
-        parent=torch.full_like(parent, -1) if is_first else parent,
-        joints_world=frame.joints_world,
         base_transform=base,
+        **{name: tensor.detach().double().cpu() for name, tensor in numbers.items()},
     )
 
 

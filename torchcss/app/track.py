@@ -19,7 +19,6 @@ import torch
 from tqdm import tqdm
 
 from torchcss.app.init import initialise_video
-from torchcss.app.overlay import write_overlays
 from torchcss.app.recorder import CHECKPOINT_EVERY, Begun, Recorder, Sink
 from torchcss.app.view_files import OpenView, Selection, moments, open_view
 from torchcss.cost.view import View
@@ -29,7 +28,8 @@ from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body, write_fi
 from torchcss.io.keypoints.read import Scale
 from torchcss.io.run import Run
 from torchcss.io.tracks import TRACK_NAME, prepare_output_folder
-from torchcss.io.view_files import RecordedCamera, ViewFiles
+from torchcss.io.view_files import ViewFiles
+from torchcss.show.track_pictures import write_overlays
 from torchcss.tracking.checkpoint import state_from_tensors
 from torchcss.tracking.session import TrackingSession
 from torchcss.tracking.settings import Settings, settings_from_plain
@@ -43,13 +43,13 @@ class TrackOptions:
     Attributes:
         stride: Every how many frames to track.
         camera_name: Which camera of the file; by default the one of this video.
-        layout: Layout of a keypoint file that does not name its joints.
-        normalised: Whether keypoints are fractions of the image, and which, see
-            `torchcss.io.keypoints.read.Scale`.
+        layout: Layout of a keypoint file that does not name its joints, e.g. BODY_25.
+        normalised: Whether keypoints are pixels, or fractions of the image from 0 to 1 or from -1
+            to 1.
         masks: Foreground of every frame, white or in shades of belief: a video or a folder of
-            images, of the size and number of the video's frames.
-        init: What to start from: the file of a body that `torchcss init` fitted to the first frame,
-            or what `initialise` found there.
+            images of the video's size.
+        init: A fitted body that `torchcss init` wrote for the first frame, to start from.
+        first: The same as `initialise` returns it.
         others: What further synchronised cameras of the same calibration recorded. Their videos may
             be of another size; one that ends, or shows a single colour for a while, is left out as
             long. Their overlays are `overlay_2.mp4` and so on.
@@ -65,7 +65,8 @@ class TrackOptions:
     layout: str | None = None
     normalised: Scale = "pixels"
     masks: Path | None = None
-    init: Path | Initialisation | None = None
+    init: Path | None = None
+    first: Initialisation | None = None
     others: Sequence[ViewFiles] = ()
     live: Sink | None = None
     resume: bool = False
@@ -113,59 +114,37 @@ def track_video(
     selection = Selection(start=start, stop=stop, stride=options.stride)
     if options.resume and (begun := _begun(out)) is not None:
         return _go_on(begun, settings, selection, options)
-    files = (
-        ViewFiles(
-            video=Path(video),
-            keypoints=Path(keypoints),
-            camera_name=options.camera_name,
-            masks=options.masks,
-            layout=options.layout,
-            normalised=options.normalised,
-        ),
-        *options.others,
+    own = ViewFiles(
+        video=Path(video),
+        keypoints=Path(keypoints),
+        camera_name=options.camera_name,
+        masks=options.masks,
+        layout=options.layout,
+        normalised=options.normalised,
     )
-    views = [open_view(each, Path(camera), selection) for each in files]
-    for each, opened in zip(files, views, strict=True):
-        if len(files) > 1 and not opened.camera.metric:
-            raise CameraError(
-                f"{camera}: several cameras need their places in one world, in metres; that of "
-                f"{each.video} is not known so: give R and t"
-            )
+    views = _open_views((own, *options.others), Path(camera), selection)
     generator = torch.Generator().manual_seed(settings.seed)
     eye = views[0].camera.camera.to(dtype=settings.torch_dtype, device=settings.device)
-    if isinstance(options.init, Initialisation):
-        first = options.init
-    elif options.init is not None:
-        first = _first_pose_from_file(options.init, eye, settings)
-    else:
-        first = _first_pose(views, files[0].video, eye, settings, start, generator)
+    first = _first_pose(views, eye, settings, start, options, generator)
     notes = [*(note for opened in views for note in opened.notes), *first.report]
-    for note in notes:
-        tqdm.write(note)
+    tqdm.write("\n".join(notes))
     interval = options.stride / float(views[0].reader.info.frame_rate)
+    looking = [opened.view(first.body.tie) for opened in views]
     session = TrackingSession(
-        settings,
-        first,
-        [opened.view(first.body.tie) for opened in views],
-        frame_interval=interval,
-        generator=generator,
+        settings, first, looking, frame_interval=interval, generator=generator
     )
     recorder = Recorder(
         folder=out,
         session=session,
-        recorded=[
-            RecordedCamera(opened.camera.camera, each)
-            for each, opened in zip(files, views, strict=True)
-        ],
+        recorded=[opened.recorded for opened in views],
         frame_interval=interval,
         notes=notes,
-        extra=_description(files, views, first, selection),
+        extra=_description(views, first, selection),
         sinks=() if options.live is None else (options.live,),
         on_first_frame=_writes_body(out, options.init, first, eye),
         checkpoint_every=options.checkpoint_every,
     )
-    recorder.run(session.track(moments(views)), views[0].reader.num_selected)
-    return _finish(out, settings, interval)
+    return _record(recorder, views)
 
 
 def resume(run: Run | str | os.PathLike[str], *, live: Sink | None = None) -> Run:
@@ -220,16 +199,17 @@ def _go_on(run: Run, settings: Settings, selection: Selection, options: TrackOpt
         checkpoint_every=options.checkpoint_every,
         begun=Begun(run.track.first(checkpoint.num_frames), checkpoint.notes),
     )
-    left = islice(moments(views), checkpoint.num_frames, None)
-    recorder.run(session.track(left), views[0].reader.num_selected)
-    return _finish(out, settings, interval)
+    return _record(recorder, views)
 
 
-def _finish(out: Path, settings: Settings, interval: float) -> Run:
-    """What is made when all frames are tracked."""
-    run = Run.open(out)
-    if settings.overlay:
-        write_overlays(run, 1 / interval)
+def _record(recorder: Recorder, views: Sequence[OpenView]) -> Run:
+    """Track the frames that are left, and make what is made when all are tracked."""
+    done = 0 if recorder.begun is None else len(recorder.begun.track.frames)
+    left = islice(moments(views), done, None)
+    recorder.run(recorder.session.track(left), views[0].reader.num_selected)
+    run = Run.open(recorder.folder)
+    if recorder.session.settings.overlay:
+        write_overlays(run, 1 / recorder.frame_interval)
     return run
 
 
@@ -253,22 +233,39 @@ def _check_same(run: Run, settings: Settings, selection: Selection, known: dict[
         )
 
 
+def _open_views(files: Sequence[ViewFiles], camera: Path, selection: Selection) -> list[OpenView]:
+    """The files of all cameras of one calibration, the places of several in one world."""
+    views = [open_view(each, camera, selection) for each in files]
+    for opened in views:
+        if len(views) > 1 and not opened.camera.metric:
+            raise CameraError(
+                f"{camera}: several cameras need their places in one world, in metres; that of "
+                f"{opened.files.video} is not known so: give R and t"
+            )
+    return views
+
+
 def _first_pose(
     views: Sequence[OpenView],
-    video: Path,
     eye: Camera,
     settings: Settings,
     start: int,
+    options: TrackOptions,
     generator: torch.Generator,
 ) -> Initialisation:
-    """Fit the body to the keypoints and the image of the first frame."""
+    """What is known of the first frame, or the body fitted to its keypoints and image."""
+    if options.first is not None:
+        return options.first
+    if options.init is not None:
+        return _first_pose_from_file(options.init, eye, settings)
     view, *beside = views
     if view.keypoints is None:
         raise ConfigurationError(
-            f"{video}: the first camera needs keypoints, from which the first pose is found"
+            f"{view.files.video}: the first camera needs keypoints, from which the first pose is "
+            "found"
         )
     return initialise_video(
-        video,
+        view.files.video,
         view.keypoints,
         eye,
         settings,
@@ -282,7 +279,7 @@ def _first_pose(
 def _first_view(opened: OpenView, start: int, sigma: float, settings: Settings) -> View:
     """What a further camera sees of the first frame, in the pixels of its video."""
     camera = opened.camera.camera.to(dtype=settings.torch_dtype, device=settings.device)
-    keypoints, frame = opened.keypoints, start + opened.offset
+    keypoints, frame = opened.keypoints, start + opened.files.offset
     if keypoints is None or not 0 <= frame < len(keypoints.confidence):
         return View(camera=camera)
     keypoints = keypoints.at(frame).to(camera.K)
@@ -300,40 +297,29 @@ def _first_pose_from_file(path: Path, camera: Camera, settings: Settings) -> Ini
             f"{path}: the fitted body is {fitted.body.name}, to be tracked is {settings.body}; "
             f"give the body {fitted.body.name}"
         )
-    note = f"first pose: {len(fitted.cost)} hypotheses from {path}"
-    return Initialisation(
-        fitted.body, fitted.mixture, fitted.cost, (note,), fitted.lengths, fitted.scale
-    )
+    return fitted
 
 
 def _writes_body(
-    out: Path, init: Path | Initialisation | None, first: Initialisation, eye: Camera
+    out: Path, init: Path | None, first: Initialisation, eye: Camera
 ) -> partial[None] | None:
     """Writes `body.npz`; None where it is what was started from, which stays as it is."""
     path = out / FITTED_BODY_NAME
-    if isinstance(init, Path) and init.resolve() in (out.resolve(), path.resolve()):
+    if init is not None and Path(init).resolve() in (out.resolve(), path.resolve()):
         return None
     return partial(write_fitted_body, path, first, eye)
 
 
 def _description(
-    files: Sequence[ViewFiles],
-    views: Sequence[OpenView],
-    first: Initialisation,
-    selection: Selection,
+    views: Sequence[OpenView], first: Initialisation, selection: Selection
 ) -> dict[str, Any]:
     """Entries of the summary about the files."""
-    (video, *videos), (camera, *cameras) = (
-        [str(each.video) for each in files],
-        [opened.camera.camera.name for opened in views],
+    seen, *others = (
+        {"video": str(opened.files.video), "camera": opened.camera.camera.name} for opened in views
     )
     return {
-        "video": video,
-        "camera": camera,
-        "other_views": [
-            {"video": video, "camera": camera}
-            for video, camera in zip(videos, cameras, strict=True)
-        ],
+        **seen,
+        "other_views": others,
         "world_is_metric": views[0].camera.metric,
         "body_lengths_m": dict(first.body.lengths),
         "frames_selected": asdict(selection),

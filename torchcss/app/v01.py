@@ -21,36 +21,36 @@ from torchcss.tracking.settings import Settings
 from torchcss.tracking.smooth import SmoothedTrack, Smoothing
 from torchcss.tracking.view import CameraView
 
+StrPath = str | os.PathLike[str]
+
 
 def smooth_track(
     track: Track, body: BodyModel | None = None, *, choice: Smoothing | None = None
 ) -> SmoothedTrack:
     """As `torchcss.tracking.smooth.smooth_track`; a track of version 0.1 needs the body."""
     _say("smooth_track", "torchcss.smooth(run)")
-    track = track._replace(body=body_of_track(track, body))
-    return smoothing.smooth_track(track, choice=choice)
+    return smoothing.smooth_track(_with(track, body), choice=choice)
 
 
 def smooth_file(
-    track: str | os.PathLike[str],
+    track: StrPath,
     *,
-    out: str | os.PathLike[str] | None = None,
+    out: StrPath | None = None,
     choice: Smoothing | None = None,
     body: BodyModel | None = None,
 ) -> dict[str, Any]:
     """As `torchcss.smooth`; returns the entry of the summary."""
     _say("smooth_file", "torchcss.smooth(run)")
-    done = smooth(_opened(track, body), choice, out=out)
-    return dict(done.summary["smoothed"])
+    return dict(smooth(_opened(track, body), choice, out=out).summary["smoothed"])
 
 
 def smooth_video(
-    track: str | os.PathLike[str],
+    track: StrPath,
     *,
     video: Path,
     camera: Path,
     keypoints: Path,
-    out: str | os.PathLike[str] | None = None,
+    out: StrPath | None = None,
     choice: Smoothing | None = None,
     masks: Path | None = None,
     body: Path | None = None,
@@ -58,26 +58,22 @@ def smooth_video(
     """As `torchcss.smooth` with images; returns the entry of the summary."""
     _say("smooth_video", "torchcss.smooth(run, images=True)")
     given = Given(video=video, camera=camera, body=body)
-    marked = GivenKeypoints(keypoints=keypoints, masks=masks)
-    done = smooth(Run.open(track, given, marked), choice, images=True, out=out)
-    return dict(done.summary["smoothed"])
+    run = Run.open(track, given, GivenKeypoints(keypoints=keypoints, masks=masks))
+    return dict(smooth(run, choice, images=True, out=out).summary["smoothed"])
 
 
 def export_track(
-    track: Track | str | os.PathLike[str],
+    track: Track | StrPath,
     *,
     to: str,
-    out: str | os.PathLike[str] | None = None,
+    out: StrPath | None = None,
     body: BodyModel | None = None,
     options: ExportOptions | None = None,
 ) -> Export:
     """As `torchcss.export`; a track of version 0.1 needs the body."""
     _say("export_track", "torchcss.export(run, path)")
-    if not isinstance(track, Track):
-        return export(_opened(track, body), out, to=to, options=options)
-    if body is not None:
-        track = track._replace(body=body_of_track(track, body))
-    return export(track, out, to=to, options=options)
+    known = _with(track, body) if isinstance(track, Track) else _opened(track, body)
+    return export(known, out, to=to, options=options)
 
 
 def track_frames(
@@ -88,27 +84,20 @@ def track_frames(
     views: Sequence[CameraView],
     frame_interval: float,
 ) -> Iterator[Posterior]:
-    """Track through a sequence: `TrackingSession(settings, first, views).track(frames)`.
-
-    Args:
-        frames: The images of one moment after another.
-        settings: How to track.
-        first: Where the body may be in the first frame.
-        views: The cameras that look on.
-        frame_interval: Seconds between frames.
-    """
+    """Track through a sequence: `TrackingSession(settings, first, views).track(frames)`."""
     _say("track_frames", "torchcss.TrackingSession(...).track(frames)")
     return TrackingSession(settings, first, views, frame_interval=frame_interval).track(frames)
 
 
 def _say(old: str, new: str) -> None:
-    warnings.warn(
-        f"torchcss.{old} goes with the next version: call {new}", DeprecationWarning, stacklevel=3
-    )
+    text = f"torchcss.{old} goes with the next version: call {new}"
+    warnings.warn(text, DeprecationWarning, stacklevel=3)
 
 
-def _opened(track: str | os.PathLike[str], body: BodyModel | None) -> Run:
+def _with(track: Track, body: BodyModel | None) -> Track:
+    return track if body is None else track._replace(body=body_of_track(track, body))
+
+
+def _opened(track: StrPath, body: BodyModel | None) -> Run:
     run = Run.open(track)
-    if body is None:
-        return run
-    return replace(run, track=run.track._replace(body=body_of_track(run.track, body)))
+    return replace(run, track=_with(run.track, body))

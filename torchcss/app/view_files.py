@@ -1,6 +1,6 @@
 """The files of one camera: its video, its calibration, its keypoints, checked against each other.
 
-`open_view` reads and checks them; `track_files` follows one view or several.
+`open_view` reads and checks them; `moments` are the images of several, moment by moment.
 """
 
 from __future__ import annotations
@@ -17,35 +17,35 @@ from torchcss.initialise.keypoint_checks import typical_sigma
 from torchcss.io.cameras import LoadedCamera, check_image_size, load_camera
 from torchcss.io.keypoints.read import read_keypoints
 from torchcss.io.video import VideoReader
-from torchcss.io.view_files import ViewFiles
+from torchcss.io.view_files import RecordedCamera, ViewFiles
 from torchcss.tracking.view import CameraView
 from torchcss.types import Frame, Keypoints
 from torchcss.vision.camera import Camera
 
 
 class OpenView(NamedTuple):
-    """The same, opened.
+    """The files of a camera, opened.
 
     Attributes:
+        files: Where they are.
         reader: The frames to be tracked.
         masks: Their foreground.
         camera: The camera, and what its file said about it.
         keypoints: Of the whole video.
         sigma: Noise of a keypoint, pixels of the full image.
-        offset: See `ViewFiles`.
     """
 
+    files: ViewFiles
     reader: VideoReader
     masks: VideoReader | None
     camera: LoadedCamera
     keypoints: Keypoints | None
     sigma: float
-    offset: int
 
     @property
-    def size_wh(self) -> tuple[int, int]:
-        """Width and height of the video, pixels."""
-        return self.reader.info.width, self.reader.info.height
+    def recorded(self) -> RecordedCamera:
+        """The camera with its files, as a run holds it."""
+        return RecordedCamera(self.camera.camera, self.files)
 
     @property
     def notes(self) -> list[str]:
@@ -60,7 +60,7 @@ class OpenView(NamedTuple):
             like: A tensor of the body's type and device.
         """
         camera = self.camera.camera.to(dtype=like.dtype, device=like.device)
-        return CameraView(camera, self.keypoints, self.sigma, self.offset)
+        return CameraView(camera, self.keypoints, self.sigma, self.files.offset)
 
     def images(self) -> Iterator[Frame]:
         """The frames to be tracked, each with its mask where there are masks.
@@ -91,7 +91,7 @@ def moments(
     """
 
     def wanted(view: OpenView) -> Iterator[Frame]:
-        return (f for f in view.images() if frames is None or f.index - view.offset in frames)
+        return (f for f in view.images() if frames is None or f.index - view.files.offset in frames)
 
     first, *others = (wanted(view) for view in views)
     for frame in first:
@@ -151,7 +151,7 @@ def open_view(
         loaded = load_camera(camera, files.camera_name, video=files.video)
     check_image_size(loaded.camera, width, height)
     if files.keypoints is None:
-        return OpenView(reader, masks, loaded, None, 1.0, files.offset)
+        return OpenView(files, reader, masks, loaded, None, 1.0)
     keypoints = read_keypoints(
         files.keypoints,
         image_size_wh=(width, height),
@@ -160,5 +160,4 @@ def open_view(
         normalised=files.normalised,
         first_frame=start,
     )
-    sigma = typical_sigma(keypoints)
-    return OpenView(reader, masks, loaded, keypoints, sigma, files.offset)
+    return OpenView(files, reader, masks, loaded, keypoints, typical_sigma(keypoints))

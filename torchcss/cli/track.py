@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from contextlib import closing, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from torchcss.app.live import LiveViewer
-from torchcss.app.recorder import CHECKPOINT_EVERY
 from torchcss.app.smooth import report, smooth
 from torchcss.app.track import TrackOptions, track_video
 from torchcss.cli.options import SettingsOptions
 from torchcss.errors import ConfigurationError
-from torchcss.io.keypoints.read import Scale
 from torchcss.io.view_files import ViewFiles
 from torchcss.tracking.settings import Settings
 
@@ -33,22 +31,10 @@ class Track:
     DeepLabCut's), NPZ (also VideoPose3D's: FILE.npz#SUBJECT/ACTION/CAMERA)."""
     out: Path = Path("out/track")
     """Output folder."""
-    init: Path | None = None
-    """A fitted body that `torchcss init` wrote for the first frame, to start from."""
-    camera_name: str | None = None
-    """Camera in the file; by default the one whose video this is."""
-    layout: str | None = None
-    """Layout of a keypoint file that does not name its joints, e.g. BODY_25."""
-    normalised: Scale = "pixels"
-    """Whether keypoints are pixels, or fractions of the image from 0 to 1 or from -1 to 1."""
     start: int = 0
     """First frame."""
     stop: int | None = None
     """Frame before which to end."""
-    stride: int = 1
-    """Track every so many frames."""
-    masks: Path | None = None
-    """Foreground of every frame: a video or a folder of images of the video's size."""
     other_videos: tuple[Path, ...] = ()
     """Videos of further synchronised cameras of the same calibration file."""
     other_keypoints: tuple[Path, ...] = ()
@@ -57,10 +43,6 @@ class Track:
     """Frame of each of them at the time of the first video's frame 0, by default 0."""
     other_cameras: tuple[str, ...] = ()
     """Camera of each of them in the file; by default the one whose video it is."""
-    resume: bool = False
-    """Go on with what the same command, interrupted, left in the output folder."""
-    checkpoint_every: float = CHECKPOINT_EVERY
-    """Seconds of wall time between checkpoints."""
     live: bool = False
     """Watch in the rerun viewer while tracking."""
     live_connect: str | None = None
@@ -72,32 +54,19 @@ class Track:
     as torchcss smooth does."""
     smooth_images: bool = False
     """The same, and fit that trajectory to the images again: a second pass over the video."""
+    options: Annotated[
+        TrackOptions, tyro.conf.OmitArgPrefixes, tyro.conf.AvoidSubcommands, tyro.conf.SuppressFixed
+    ] = field(default_factory=TrackOptions)
     settings: SettingsOptions = field(default_factory=Settings)
 
     def run(self) -> None:
         """Run the verb."""
         others = self.others()
-        live = None
-        if self.live or self.live_connect is not None or self.live_save is not None:
-            live = LiveViewer(
-                self.out.name,
-                save=self.live_save,
-                connect=self.live_connect,
-                spawn=self.live and self.live_connect is None,
-            )
+        live, save, connect = None, self.live_save, self.live_connect
+        if self.live or connect is not None or save is not None:
+            spawn = self.live and connect is None
+            live = LiveViewer(self.out.name, save=save, connect=connect, spawn=spawn)
         with nullcontext() if live is None else closing(live):
-            options = TrackOptions(
-                stride=self.stride,
-                camera_name=self.camera_name,
-                layout=self.layout,
-                normalised=self.normalised,
-                masks=self.masks,
-                init=self.init,
-                others=others,
-                live=live,
-                resume=self.resume,
-                checkpoint_every=self.checkpoint_every,
-            )
             run = track_video(
                 self.video,
                 camera=self.camera,
@@ -106,7 +75,7 @@ class Track:
                 settings=self.settings,
                 start=self.start,
                 stop=self.stop,
-                options=options,
+                options=replace(self.options, others=others, live=live),
             )
         print(
             f"{run.summary['num_frames']} frames, {run.summary['seconds_per_frame']:.2f} s each; "
@@ -130,8 +99,8 @@ class Track:
                 video=video,
                 keypoints=keypoints,
                 camera_name=name,
-                layout=self.layout,
-                normalised=self.normalised,
+                layout=self.options.layout,
+                normalised=self.options.normalised,
                 offset=offset,
             )
             for video, keypoints, offset, name in zip(

@@ -60,9 +60,9 @@ class _Entry(NamedTuple):
     distortion: Any
     rotation: Any
     translation: Any
-    units: str | None = "metre"
-    video: str | None = None
-    fisheye: bool = False
+    units: Any = "metre"
+    video: Any = None
+    fisheye: Any = False
     from_easymocap: bool = False
 
 
@@ -116,9 +116,17 @@ def load_camera(
             raise CameraError(f"{where}: EasyMocap does not say the image size; give the video")
         info = VideoReader(video).info
         entry = entry._replace(image_size_wh=[info.width, info.height])
-    for key, value in (("K (matrix)", entry.K), ("image_size_wh (size)", entry.image_size_wh)):
-        if value is None:
-            raise CameraError(f"{where}: {key} is missing")
+    camera = _make_camera(entry, name, path)
+    note = _own_frame_note(name, entry)
+    video_name = entry.video if isinstance(entry.video, str) else None
+    if note is not None:
+        camera = camera.in_own_frame()
+    return LoadedCamera(camera, note is None, note, video_name)
+
+
+def _make_camera(entry: _Entry, name: str, path: Path) -> Camera:
+    """The camera of an entry, in the file's world, after its numbers are checked."""
+    where = f"{path}: camera {name!r}"
     given = {
         "K": entry.K,
         "image size": entry.image_size_wh,
@@ -126,6 +134,9 @@ def load_camera(
         "rotation": entry.rotation,
         "translation": entry.translation,
     }
+    for key, value in (("K (matrix)", entry.K), ("image_size_wh (size)", entry.image_size_wh)):
+        if value is None:
+            raise CameraError(f"{where}: {key} is missing")
     intrinsics, size, distortion, rotation, translation = (
         None if value is None else real_numbers(value, f"{where}: {key}", CameraError)
         for key, value in given.items()
@@ -140,7 +151,7 @@ def load_camera(
     if rotation is not None and rotation.shape == (3,):
         rotation = rotation_matrix(rotation, where)
     try:
-        camera = Camera(
+        return Camera(
             intrinsics,
             (int(size[0]), int(size[1])),
             distortion=distortion,
@@ -150,10 +161,6 @@ def load_camera(
         )
     except CameraError as error:
         raise CameraError(f"{path}: camera {error}") from error
-    note = _own_frame_note(name, entry)
-    if note is not None:
-        camera = camera.in_own_frame()
-    return LoadedCamera(camera, note is None, note, entry.video)
 
 
 def camera_entry(camera: Camera) -> dict[str, Any]:
@@ -196,28 +203,24 @@ def check_image_size(camera: Camera, width: int, height: int) -> None:
     Raises:
         CameraError: If the sizes differ; where only the scale does, with the way to rescale.
     """
-    expected_width, expected_height = camera.image_size_wh
-    if (width, height) == (expected_width, expected_height):
+    expected = camera.image_size_wh
+    if (width, height) == expected:
         return
-    message = (
-        f"camera {camera.name!r} belongs to images of {expected_width} x {expected_height} pixels, "
-        f"these have {width} x {height}"
+    why = (
+        "another shape, so they were cropped or come from another camera; use the calibration of "
+        "this video"
     )
     # Half a pixel of rounding in either side is what resizing to whole pixels leaves.
-    if abs(width * expected_height - height * expected_width) <= max(
-        expected_width, expected_height
-    ):
-        raise CameraError(
-            f"{message}: the same shape at another scale; if the images were only resized, "
-            f"scale the calibration: camera.resized({width}, {height})"
+    if abs(width * expected[1] - height * expected[0]) <= max(expected):
+        why = (
+            "the same shape at another scale; if the images were only resized, scale the "
+            f"calibration: camera.resized({width}, {height})"
         )
-    if (height, width) == (expected_width, expected_height):
-        raise CameraError(
-            f"{message}: turned by a right angle; calibrate the video as it is shown upright"
-        )
+    elif (height, width) == expected:
+        why = "turned by a right angle; calibrate the video as it is shown upright"
     raise CameraError(
-        f"{message}: another shape, so they were cropped or come from another camera; "
-        "use the calibration of this video"
+        f"camera {camera.name!r} belongs to images of {expected[0]} x {expected[1]} pixels, "
+        f"these have {width} x {height}: {why}"
     )
 
 
@@ -225,7 +228,7 @@ def _own_frame_note(name: str, entry: _Entry) -> str | None:
     """Say why the file's world frame cannot be used, or None if it can."""
     if entry.rotation is None or entry.translation is None:
         why = "has no extrinsics"
-    elif entry.units is None:
+    elif not isinstance(entry.units, str):
         why = "has extrinsics of unknown unit"
     else:
         unit = entry.units.split(",")[0].strip()
@@ -277,32 +280,24 @@ def _read_json(path: Path) -> dict[str, _Entry]:
             f"{path}: expected an object 'cameras' with a camera under each name, "
             f"found {shortened(content)}"
         )
-    units = content.get("units")
     entries = {}
     for name, values in cameras.items():
         if not isinstance(values, dict):
             raise CameraError(
                 f"{path}: camera {name!r}: expected an object, found {shortened(values)}"
             )
-        video = values.get("video")
-        entries[name] = _Entry(
-            K=values.get("K"),
-            image_size_wh=values.get("image_size_wh"),
-            distortion=values.get("distortion"),
-            rotation=values.get("R"),
-            translation=values.get("t"),
-            units=units if isinstance(units, str) else None,
-            video=video if isinstance(video, str) else None,
+        found = map(values.get, ("K", "image_size_wh", "distortion", "R", "t"))
+        entries[name] = _Entry._make(
+            (*found, content.get("units"), values.get("video"), False, False)
         )
     return entries
 
 
 def _read_pose2sim(path: Path) -> dict[str, _Entry]:
+    text = read_text(path, CameraError)
     try:
-        content = tomllib.loads(read_text(path, CameraError))
+        content = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        if isinstance(error, CameraError):
-            raise
         raise CameraError(f"{path}: cannot be read as TOML: {one_line(error)}") from error
     entries = {}
     for table, values in content.items():
@@ -313,13 +308,9 @@ def _read_pose2sim(path: Path) -> dict[str, _Entry]:
             raise CameraError(
                 f"{path}: table {table!r}: expected a name of its own, found {shortened(name)}"
             )
-        entries[name] = _Entry(
-            K=values.get("matrix"),
-            image_size_wh=values.get("size"),
-            distortion=values.get("distortions"),
-            rotation=values.get("rotation"),
-            translation=values.get("translation"),
-            fisheye=bool(values.get("fisheye", False)),
+        keys = ("matrix", "size", "distortions", "rotation", "translation")
+        entries[name] = _Entry._make(
+            (*map(values.get, keys), "metre", None, values.get("fisheye"), False)
         )
     return entries
 
@@ -355,10 +346,8 @@ class _Loader(yaml.SafeLoader):
 
 def _matrix(loader: yaml.SafeLoader, node: yaml.Node) -> list[Any]:
     """A matrix as nested lists; one of a single row or column as a list."""
-    if not isinstance(node, yaml.MappingNode):
-        raise yaml.YAMLError("an opencv-matrix has rows, cols and data")
-    values: dict[Any, Any] = loader.construct_mapping(node, deep=True)
-    rows, columns, data = values.get("rows"), values.get("cols"), values.get("data")
+    values = loader.construct_mapping(node, deep=True) if isinstance(node, yaml.MappingNode) else {}
+    rows, columns, data = (values.get(key) for key in ("rows", "cols", "data"))
     if not (isinstance(rows, int) and isinstance(columns, int) and isinstance(data, list)):
         raise yaml.YAMLError("an opencv-matrix has rows, cols and data")
     if rows < 1 or columns < 1 or rows * columns != len(data):
@@ -389,13 +378,12 @@ def _read_easymocap(path: Path) -> dict[str, _Entry]:
     cameras = {}
     for name in map(str, names):
         size = [first.get(f"W_{name}"), first.get(f"H_{name}")]
-        rotation = second.get(f"Rot_{name}")
         cameras[name] = _Entry(
-            K=first.get(f"K_{name}"),
-            image_size_wh=None if None in size else size,
-            distortion=first.get(f"dist_{name}", first.get(f"D_{name}")),
-            rotation=second.get(f"R_{name}") if rotation is None else rotation,
-            translation=second.get(f"T_{name}"),
+            first.get(f"K_{name}"),
+            None if None in size else size,
+            first.get(f"dist_{name}", first.get(f"D_{name}")),
+            second.get(f"Rot_{name}", second.get(f"R_{name}")),
+            second.get(f"T_{name}"),
             from_easymocap=True,
         )
     return cameras

@@ -12,12 +12,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from torchcss.errors import TrackFileError
-from torchcss.files import load_arrays, one_line, output_error, replace_file
+from torchcss.files import load_arrays, one_line, output_error, save_arrays
 
 CHECKPOINT_NAME = "checkpoint.npz"
 SCHEMA_VERSION = 1
@@ -49,17 +48,14 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     Raises:
         OutputError: If it cannot be written.
     """
-    arrays: dict[str, Any] = {
-        _PREFIX + name: tensor.detach().cpu().numpy() for name, tensor in checkpoint.tensors.items()
+    tensors = checkpoint.tensors.items()
+    arrays = {_PREFIX + name: tensor.detach().cpu().numpy() for name, tensor in tensors}
+    about = {
+        "schema_version": SCHEMA_VERSION,
+        "num_frames": checkpoint.num_frames,
+        "notes": json.dumps(dict(checkpoint.notes)),
     }
-    with replace_file(Path(folder) / CHECKPOINT_NAME) as partial:
-        np.savez(
-            partial,
-            schema_version=np.array(SCHEMA_VERSION),
-            num_frames=np.array(checkpoint.num_frames),
-            notes=np.array(json.dumps(dict(checkpoint.notes))),
-            **arrays,
-        )
+    save_arrays(Path(folder) / CHECKPOINT_NAME, {**about, **arrays})
 
 
 def read_checkpoint(folder: Path) -> Checkpoint | None:

@@ -24,7 +24,6 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -34,31 +33,13 @@ from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES
 from torchcss.body.shape import with_shape
 from torchcss.errors import BodyError
-from torchcss.files import load_arrays, replace_file
+from torchcss.files import load_arrays, save_arrays
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.initialise.result import Initialisation
 from torchcss.vision.camera import Camera
 
 SCHEMA_VERSION = 1
 FITTED_BODY_NAME = "body.npz"
-
-
-class FittedBody(NamedTuple):
-    """A body with its hypotheses.
-
-    Attributes:
-        body: The body, on its base.
-        mixture: The hypotheses, best first.
-        cost: Their costs, nats.
-        lengths: Fitted lengths, metres, as the file has them; empty where they were given.
-        scale: Of the standard humanoid.
-    """
-
-    body: BodyModel
-    mixture: GaussianMixture
-    cost: torch.Tensor
-    lengths: Mapping[str, float]
-    scale: float
 
 
 def write_fitted_body(path: str | os.PathLike[str], found: Initialisation, camera: Camera) -> None:
@@ -73,16 +54,6 @@ def write_fitted_body(path: str | os.PathLike[str], found: Initialisation, camer
         OutputError: If it cannot be written.
     """
     body, mixture = found.body, found.mixture
-    arrays = {
-        "schema_version": np.array(SCHEMA_VERSION),
-        "body": np.array(body.name),
-        "body_file": np.array(os.path.abspath(body.name) if _is_file(body.name) else ""),
-        "scale": np.array(found.scale),
-        "length_names": np.array(list(found.lengths), dtype=np.str_),
-        "lengths": np.array(list(found.lengths.values()), dtype=np.float64),
-        "part_names": np.array(body.part_names, dtype=np.str_),
-        "state_names": np.array(body.state_names, dtype=np.str_),
-    }
     tensors = {
         "part_shape": body.part_shape,
         "state": mixture.mean,
@@ -95,9 +66,18 @@ def write_fitted_body(path: str | os.PathLike[str], found: Initialisation, camer
         "camera_translation": camera.t_camera_world,
         "camera_matrix": camera.K,
     }
-    arrays |= {name: tensor.detach().double().cpu().numpy() for name, tensor in tensors.items()}
-    with replace_file(Path(path)) as partial:
-        np.savez(partial, **arrays)
+    about = {
+        "schema_version": SCHEMA_VERSION,
+        "body": body.name,
+        "body_file": os.path.abspath(body.name) if _is_file(body.name) else "",
+        "scale": found.scale,
+        "length_names": np.array(list(found.lengths), dtype=np.str_),
+        "lengths": np.array(list(found.lengths.values()), dtype=np.float64),
+        "part_names": np.array(body.part_names, dtype=np.str_),
+        "state_names": np.array(body.state_names, dtype=np.str_),
+    }
+    arrays = {name: tensor.detach().double().cpu().numpy() for name, tensor in tensors.items()}
+    save_arrays(Path(path), {**about, **arrays})
 
 
 def read_fitted_body(
@@ -106,7 +86,7 @@ def read_fitted_body(
     camera: Camera | None = None,
     dtype: torch.dtype = torch.float64,
     device: torch.device | str = "cpu",
-) -> FittedBody:
+) -> Initialisation:
     """Read a fitted body back.
 
     Args:
@@ -129,43 +109,13 @@ def read_fitted_body(
                 f"{path}: schema version {int(arrays['schema_version'])}, expected "
                 f"{SCHEMA_VERSION}; write the file with this version of torchcss init"
             )
-        names, lengths = arrays["length_names"].tolist(), arrays["lengths"].tolist()
-        name, scale = str(arrays["body"]), float(arrays["scale"])
-        bare = {name: length / scale for name, length in zip(names, lengths, strict=True)}
-        # A robot that stands fixed may have been fitted with a root.
-        rooted = set(ROOT_NAMES) <= set(arrays["state_names"].tolist())
-        if _is_file(name):
-            name = _file_of_body(name, str(arrays.get("body_file", "")), path)
-        body = load_body(name, lengths=bare, scale=scale, free_root=rooted)
-        layout = {"state_names": body.state_names, "part_names": body.part_names}
-        for key, expected in layout.items():
-            if tuple(arrays[key].tolist()) != expected:
-                raise BodyError(f"{path}: {key} are not those of {name}; fit the body again")
-
-        def tensor(key: str, *shape: int) -> torch.Tensor:
-            values = torch.from_numpy(np.array(arrays[key], dtype=np.float64))
-            if values.shape != shape or not bool(values.isfinite().all()):
-                raise BodyError(
-                    f"{path}: {key}: expected finite numbers of shape {list(shape)}, "
-                    f"got {list(values.shape)}"
-                )
-            return values.to(dtype=dtype, device=device)
-
-        k, n = len(arrays["state"]), body.num_parameters
-        body = body.to(dtype=dtype, device=device)
-        body = with_shape(body, tensor("part_shape", body.num_parts, 9))
-        rotation, translation = tensor("base_rotation", 3, 3), tensor("base_translation", 3)
-        if camera is not None:
-            to, at = tensor("camera_rotation", 3, 3), tensor("camera_translation", 3)
-            back = camera.R_camera_world.to(to).T
-            rotation = back @ to @ rotation
-            translation = back @ (to @ translation + at - camera.t_camera_world.to(to))
-        mixture = GaussianMixture(
-            tensor("state", k, n), tensor("covariance", k, n, n), tensor("log_weight", k)
-        )
-        body = body.with_base(rotation, translation)
-        fitted = dict(zip(names, lengths, strict=True))
-        return FittedBody(body, mixture, tensor("cost", k), fitted, scale)
+        names, values = arrays["length_names"].tolist(), arrays["lengths"].tolist()
+        lengths, scale = dict(zip(names, values, strict=True)), float(arrays["scale"])
+        body = _load_body(path, arrays, {name: lengths[name] / scale for name in names}, scale)
+        tensors = {
+            name: tensor.to(dtype=dtype, device=device)
+            for name, tensor in _read_tensors(path, arrays, body).items()
+        }
     except KeyError as error:
         raise BodyError(
             f"{path}: not a fitted body: {error.args[0]} is missing; expected what torchcss init "
@@ -175,6 +125,54 @@ def read_fitted_body(
         if isinstance(error, BodyError):
             raise
         raise BodyError(f"{path}: not a fitted body: {error}") from error
+    rotation, translation = tensors["base_rotation"], tensors["base_translation"]
+    if camera is not None:
+        to, at = tensors["camera_rotation"], tensors["camera_translation"]
+        back = camera.R_camera_world.to(to).T
+        rotation = back @ to @ rotation
+        translation = back @ (to @ translation + at - camera.t_camera_world.to(to))
+    body = with_shape(body.to(dtype=dtype, device=device), tensors["part_shape"])
+    mixture = GaussianMixture(tensors["state"], tensors["covariance"], tensors["log_weight"])
+    note = f"first pose: {len(mixture.mean)} hypotheses from {path}"
+    body = body.with_base(rotation, translation)
+    return Initialisation(body, mixture, tensors["cost"], (note,), lengths, scale)
+
+
+def _load_body(
+    path: Path, arrays: Mapping[str, np.ndarray], lengths: Mapping[str, float], scale: float
+) -> BodyModel:
+    """The body of the file's name, without its fitted shape."""
+    name = str(arrays["body"])
+    # A robot that stands fixed may have been fitted with a root.
+    rooted = set(ROOT_NAMES) <= set(arrays["state_names"].tolist())
+    if _is_file(name):
+        name = _file_of_body(name, str(arrays.get("body_file", "")), path)
+    body = load_body(name, lengths=lengths, scale=scale, free_root=rooted)
+    for key, expected in (("state_names", body.state_names), ("part_names", body.part_names)):
+        if tuple(arrays[key].tolist()) != expected:
+            raise BodyError(f"{path}: {key} are not those of {name}; fit the body again")
+    return body
+
+
+def _read_tensors(
+    path: Path, arrays: Mapping[str, np.ndarray], body: BodyModel
+) -> dict[str, torch.Tensor]:
+    """The numbers of a file, finite and of the shapes that they must have."""
+    k, n = len(arrays["state"]), body.num_parameters
+    shapes = {
+        "part_shape": (body.num_parts, 9), "state": (k, n), "covariance": (k, n, n),
+        "log_weight": (k,), "cost": (k,), "base_rotation": (3, 3), "base_translation": (3,),
+        "camera_rotation": (3, 3), "camera_translation": (3,),
+    }  # fmt: skip
+    tensors = {}
+    for key, shape in shapes.items():
+        tensors[key] = torch.from_numpy(np.array(arrays[key], dtype=np.float64))
+        if tensors[key].shape != shape or not bool(tensors[key].isfinite().all()):
+            raise BodyError(
+                f"{path}: {key}: expected finite numbers of shape {list(shape)}, "
+                f"got {list(tensors[key].shape)}"
+            )
+    return tensors
 
 
 def _is_file(name: str) -> bool:

@@ -43,6 +43,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 from torch import Tensor
@@ -54,7 +55,8 @@ from torchcss.files import (
     load_json,
     one_line,
     prepare_output_folder,
-    replace_file,
+    save_arrays,
+    write_text,
 )
 from torchcss.io.track_body import body_from_plain, body_to_plain, on_origin
 from torchcss.io.view_files import RecordedCamera, camera_from_plain, camera_to_plain
@@ -91,7 +93,7 @@ _POWER_KEY = "evidence"
 
 
 class FrameModes(NamedTuple):
-    """One frame of a track, as it is appended.
+    """One frame of a track, as tensors; appended, arrays will do.
 
     Attributes:
         frame: Index in the video, greater than the last.
@@ -107,13 +109,13 @@ class FrameModes(NamedTuple):
 
     frame: int
     time_s: float
-    state: Tensor | ArrayLike
-    covariance: Tensor | ArrayLike
-    log_weight: Tensor | ArrayLike
-    cost: Tensor | ArrayLike
-    parent: Tensor | ArrayLike
-    joints_world: Tensor | ArrayLike
-    base_transform: Tensor | ArrayLike = np.eye(4)
+    state: Tensor
+    covariance: Tensor
+    log_weight: Tensor
+    cost: Tensor
+    parent: Tensor
+    joints_world: Tensor
+    base_transform: Tensor = torch.eye(4, dtype=torch.float64)
 
 
 class Track(NamedTuple):
@@ -195,17 +197,19 @@ class Track(NamedTuple):
         n, j = len(self.state_names), len(self.joint_names)
         return self._replace(**_stacked(self.rows()[:num_frames], n, j))
 
+    def modes(self, row: int) -> FrameModes:
+        """The modes of a frame, counted in the track."""
+        k = int(self.num_modes[row])
+        return FrameModes(
+            frame=int(self.frames[row]),
+            time_s=float(self.times[row]),
+            base_transform=torch.from_numpy(self.base_transform[row]),
+            **{name: torch.from_numpy(getattr(self, name)[row, :k]) for name in _PER_MODE},
+        )
+
     def rows(self) -> list[FrameModes]:
-        """The frames as they were appended."""
-        return [
-            FrameModes(
-                frame=int(self.frames[row]),
-                time_s=float(self.times[row]),
-                base_transform=self.base_transform[row],
-                **{name: getattr(self, name)[row, :k] for name in _PER_MODE},
-            )
-            for row, k in enumerate(self.num_modes)
-        ]
+        """All frames, as they were appended."""
+        return [self.modes(row) for row in range(len(self.frames))]
 
 
 def _stacked(rows: Sequence[FrameModes], n: int, j: int) -> dict[str, Any]:
@@ -215,7 +219,7 @@ def _stacked(rows: Sequence[FrameModes], n: int, j: int) -> dict[str, Any]:
     arrays: dict[str, Any] = {
         "frames": np.array([row.frame for row in rows], dtype=np.int64),
         "times": np.array([row.time_s for row in rows], dtype=np.float64),
-        "base_transform": np.array([row.base_transform for row in rows]).reshape(-1, 4, 4),
+        "base_transform": np.array([row.base_transform.numpy() for row in rows]).reshape(-1, 4, 4),
     }
     for name, shape in _PER_MODE.items():
         kind = np.int64 if name == "parent" else np.float64
@@ -293,7 +297,8 @@ class TrackWriter:
         order = order[weights[order] > -np.inf]
         self._rank_of_parent = np.full(k, -1)
         self._rank_of_parent[order] = np.arange(len(order))
-        ordered = {name: values[order] for name, values in per_mode.items()}
+        ordered = {name: torch.from_numpy(values[order]) for name, values in per_mode.items()}
+        base = torch.from_numpy(base)
         self._rows.append(FrameModes(frame, float(modes.time_s), base_transform=base, **ordered))
 
     def track(self) -> Track:
@@ -330,9 +335,8 @@ def save_track(path: str | os.PathLike[str], track: Track) -> None:
         "cameras": [camera_to_plain(camera) for camera in track.cameras],
         "settings": dict(track.settings),
     }
-    arrays |= {name: np.array(json.dumps(value, default=str)) for name, value in plain.items()}
-    with replace_file(Path(path)) as partial:
-        np.savez(partial, schema_version=np.array(SCHEMA_VERSION), **arrays)
+    arrays |= {name: json.dumps(value, default=str) for name, value in plain.items()}
+    save_arrays(Path(path), {"schema_version": SCHEMA_VERSION, **arrays})
 
 
 def load_track(path: str | os.PathLike[str]) -> Track:
@@ -445,8 +449,7 @@ def write_summary(path: str | os.PathLike[str], summary: Mapping[str, Any]) -> N
     if _is_folder(path):
         path = path / SUMMARY_NAME
     text = json.dumps(_plain(summary), indent=2, sort_keys=True, allow_nan=False)
-    with replace_file(path) as partial:
-        partial.write_text(text + "\n", encoding="utf-8")
+    write_text(path, text + "\n")
 
 
 def read_summary(path: str | os.PathLike[str]) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from matplotlib.widgets import Button
 
 from torchcss.body.load import load_body
 from torchcss.errors import ConfigurationError, KeypointError
-from torchcss.files import replace_file
+from torchcss.files import write_text
 from torchcss.show.track_plots import bones_of, draw_bones
 from torchcss.types import Keypoints
 
@@ -241,8 +241,7 @@ def write_clicked(
     }
     marked = {"joints": places} if frame == 0 else {"frames": {str(frame): places}}
     content = {"image_size_wh": list(image_size_wh), **marked}
-    with replace_file(Path(path)) as partial:
-        partial.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    write_text(Path(path), json.dumps(content, indent=2) + "\n")
 
 
 def _is_zooming(figure: Figure) -> bool:

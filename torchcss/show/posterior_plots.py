@@ -37,6 +37,7 @@ from torchcss.show.style import OKABE_ITO, save_figure
 from torchcss.show.track_pictures import has_pictures, pictures_of, rows_with_modes
 from torchcss.show.track_plots import (
     effective_number,
+    label,
     mode_colour,
     modes_figure,
     sheet_of,
@@ -161,8 +162,8 @@ def joints_figure(
         for axis, axes in enumerate(panels):
             _draw(axes, track, rows, places[:, :, joint, axis], deviation[:, joint, axis])
         panels[0].set_ylabel(name.replace("_", " "), fontsize=9)
-    for axes, label in zip(grid[0], labels, strict=True):
-        axes.set_title(f"{label} (metres)", fontsize=10)
+    for axes, direction in zip(grid[0], labels, strict=True):
+        axes.set_title(f"{direction} (metres)", fontsize=10)
     for axes in grid[-1]:
         axes.set_xlabel("seconds", fontsize=9)
     figure.suptitle(_caption("joint centres"), fontsize=10)
@@ -225,67 +226,70 @@ def spectra_figure(track: Track) -> Figure:
     """
     rows = _rows(track)
     names = [name.replace("_", " ") for name in track.state_names]
-    values, vectors = np.linalg.eigh(track.covariance[rows, 0])
+    covariance, times = track.covariance[rows, 0], track.times[rows]
+    values, vectors = np.linalg.eigh(covariance)
     deviation = np.sqrt(values.clip(min=0))
-    ratio = float(np.median(deviation[:, -1] / np.maximum(deviation[:, 0], np.finfo(float).tiny)))
-    times = track.times[rows]
-
     figure = Figure(figsize=(12.0, 8.2), layout="constrained")
     grid = figure.add_gridspec(2, 5, height_ratios=(1.0, 1.15))
-    spectrum = figure.add_subplot(grid[0, :3])
+    spectrum, heat = figure.add_subplot(grid[0, :3]), figure.add_subplot(grid[1, :3])
+    _draw_widest(heat, times, np.square(vectors[:, :, -1]), names)
     colours = colormaps["cividis"](np.linspace(0, 0.9, deviation.shape[1]))
     for index, colour in enumerate(colours):
         spectrum.plot(times, deviation[:, index], color=colour, lw=1.1)
     spectrum.set_yscale("log")
-    spectrum.set_title(
+    ratio = float(np.median(deviation[:, -1] / np.maximum(deviation[:, 0], np.finfo(float).tiny)))
+    label(
+        spectrum,
         f"standard deviations along all {len(names)} directions; widest over narrowest: "
         f"{ratio:.0f} (median)",
-        fontsize=10,
+        y="radians and metres",
     )
-    spectrum.set_ylabel("radians and metres", fontsize=9)
-    tidy(spectrum)
-
-    share = np.square(vectors[:, :, -1])
-    order = np.argsort(-share.mean(0))[:_SHOWN_PARAMETERS]
-    heat = figure.add_subplot(grid[1, :3])
-    # Frames need not be evenly spaced: the cells end halfway between them.
-    image = heat.pcolormesh(
-        _edges(times), np.arange(len(order) + 1) - 0.5, share[:, order].T, cmap="cividis",
-        vmin=0, vmax=1,
-    )  # fmt: skip
-    heat.set_yticks(range(len(order)), [names[index] for index in order], fontsize=8)
-    heat.set_ylim(len(order) - 0.5, -0.5)
-    heat.set_title("which parameters the widest direction mixes, share of its square", fontsize=10)
-    heat.set_xlabel("seconds", fontsize=9)
-    heat.tick_params(labelsize=8)
-    figure.colorbar(image, ax=heat, pad=0.01).ax.tick_params(labelsize=8)
     spectrum.set_xlim(*heat.get_xlim())
-
-    mean_values, mean_vectors = np.linalg.eigh(track.covariance[rows, 0].mean(0))
+    values, vectors = np.linalg.eigh(covariance.mean(0))
     side = grid[:, 3:].subgridspec(_DIRECTIONS, 1)
     for rank in range(min(_DIRECTIONS, len(names))):
         axes = figure.add_subplot(side[rank])
-        direction = mean_vectors[:, -1 - rank]
-        largest = np.argsort(-np.abs(direction))[:_BARS]
-        direction = direction * np.sign(direction[largest[0]])
-        axes.barh(
-            range(len(largest)), direction[largest],
-            color=[OKABE_ITO["blue" if part > 0 else "orange"] for part in direction[largest]],
-        )  # fmt: skip
-        axes.axvline(0, color="0.45", lw=0.8)
-        axes.set_yticks(range(len(largest)), [names[index] for index in largest])
-        axes.invert_yaxis()
-        axes.set_xlim(-1.05, 1.05)
-        axes.set_title(
-            f"direction {rank + 1}, standard deviation {math.sqrt(mean_values[-1 - rank]):.2g}",
-            fontsize=9,
-        )
-        tidy(axes)
+        _draw_direction(axes, vectors[:, -1 - rank], names)
+        width = math.sqrt(values[-1 - rank])
+        axes.set_title(f"direction {rank + 1}, standard deviation {width:.2g}", fontsize=9)
     figure.suptitle(
         "covariance of the best mode; right: most uncertain directions of its mean over all frames",
         fontsize=10,
     )
     return figure
+
+
+def _draw_widest(
+    axes: Axes, times: np.ndarray, share: Float[np.ndarray, "t n"], names: list[str]
+) -> None:
+    """Which parameters the widest direction mixes, over time."""
+    order = np.argsort(-share.mean(0))[:_SHOWN_PARAMETERS]
+    # Frames need not be evenly spaced: the cells end halfway between them.
+    image = axes.pcolormesh(
+        _edges(times), np.arange(len(order) + 1) - 0.5, share[:, order].T, cmap="cividis",
+        vmin=0, vmax=1,
+    )  # fmt: skip
+    axes.set_yticks(range(len(order)), [names[index] for index in order], fontsize=8)
+    axes.set_ylim(len(order) - 0.5, -0.5)
+    axes.set_title("which parameters the widest direction mixes, share of its square", fontsize=10)
+    axes.set_xlabel("seconds", fontsize=9)
+    axes.tick_params(labelsize=8)
+    axes.figure.colorbar(image, ax=axes, pad=0.01).ax.tick_params(labelsize=8)
+
+
+def _draw_direction(axes: Axes, direction: np.ndarray, names: list[str]) -> None:
+    """The largest parts of a direction, which points where the largest is positive."""
+    largest = np.argsort(-np.abs(direction))[:_BARS]
+    direction = direction * np.sign(direction[largest[0]])
+    axes.barh(
+        range(len(largest)), direction[largest],
+        color=[OKABE_ITO["blue" if part > 0 else "orange"] for part in direction[largest]],
+    )  # fmt: skip
+    axes.axvline(0, color="0.45", lw=0.8)
+    axes.set_yticks(range(len(largest)), [names[index] for index in largest])
+    axes.invert_yaxis()
+    axes.set_xlim(-1.05, 1.05)
+    tidy(axes)
 
 
 def _draw(

@@ -1,7 +1,8 @@
-"""The frames of a run with its modes drawn over them.
+"""The frames of a run with its modes drawn over them: the overlay films, and single pictures.
 
-`pictures_of` yields the picture of every frame: from the video, with the modes drawn anew, or else
-from the `overlay.mp4` that the tracker left.
+`write_overlays` makes `overlay.mp4`, and one for every further camera. `pictures_of` yields the
+picture of every frame: from the video, with the modes drawn anew, or else from the `overlay.mp4`
+that the tracker left.
 """
 
 from __future__ import annotations
@@ -17,10 +18,54 @@ from torchcss.errors import TrackFileError, VideoError
 from torchcss.io.cameras import check_image_size
 from torchcss.io.run import Run
 from torchcss.io.tracks import TRACK_NAME
-from torchcss.io.video import VideoReader
+from torchcss.io.video import VideoReader, VideoWriter
+from torchcss.io.view_files import RecordedCamera
 from torchcss.show.overlay import draw_poses
 
 OVERLAY_NAME = "overlay.mp4"
+
+Picture = UInt8[np.ndarray, "h w 3"]
+
+
+def caption(frame: int, num_modes: int, cost: float) -> str:
+    """The line in the corner of a frame.
+
+    Args:
+        frame: Its index in the video.
+        num_modes: How many modes it has.
+        cost: Cost of the best, nats; infinite where the frame said nothing.
+    """
+    told = f"   cost {cost:.1f}" if np.isfinite(cost) else ""
+    return f"frame {frame}   {num_modes} mode{'s' if num_modes > 1 else ''}{told}"
+
+
+def write_overlays(run: Run, frame_rate: float) -> list[Path]:
+    """Draw the films of a run: `overlay.mp4`, `overlay_2.mp4` and so on, one a camera.
+
+    A further camera's film is black where its video has ended.
+
+    Args:
+        run: The run.
+        frame_rate: Frames per second of the films.
+
+    Returns:
+        The files.
+
+    Raises:
+        TorchcssError: If a video cannot be read, or a film not be written.
+    """
+    films = []
+    for place, recorded in enumerate(run.cameras):
+        if recorded.files is None:
+            continue
+        name = OVERLAY_NAME if place == 0 else f"overlay_{place + 1}.mp4"
+        width, height = recorded.camera.image_size_wh
+        with VideoWriter(run.folder / name, frame_rate) as film:
+            for row, image in _frames_of(run, recorded, range(len(run.track.frames))):
+                image = np.zeros((height, width, 3), np.uint8) if image is None else image
+                film.write(_draw_row(run, recorded, row, image))
+        films.append(run.folder / name)
+    return films
 
 
 def known_video(run: Run) -> Path | None:
@@ -43,7 +88,7 @@ def has_pictures(run: Run) -> bool:
 
 def pictures_of(
     run: Run, rows: Iterable[int], *, anew: bool = False
-) -> Iterator[tuple[int, UInt8[np.ndarray, "h w 3"]]]:
+) -> Iterator[tuple[int, Picture]]:
     """Yield the pictures of some frames of a track, with its modes drawn over them.
 
     Args:
@@ -59,26 +104,25 @@ def pictures_of(
         CameraError: If the camera is of another image size.
         TrackFileError: If the body or the camera is not known.
     """
-    overlay, video = overlay_of(run), known_video(run)
-    if video is not None and (anew or overlay is None):
-        place = {int(run.track.frames[row]): int(row) for row in rows}
-        reader = VideoReader(video, stop=max(place, default=0) + 1)
-        check_image_size(run.camera, reader.info.width, reader.info.height)
-    elif overlay is not None:
-        place, video = {int(row): int(row) for row in rows}, None
-        reader = VideoReader(overlay, stop=max(place, default=0) + 1)
+    overlay, video, rows = overlay_of(run), known_video(run), list(rows)
+    if overlay is not None and (video is None or not anew):
+        missing, shown = len(rows), overlay
+        for frame in VideoReader(overlay, stop=max(rows, default=0) + 1):
+            if frame.index in rows:
+                missing -= 1
+                yield frame.index, frame.image
+    elif video is not None:
+        first, missing, shown = run.cameras[0], 0, video
+        for row, image in _frames_of(run, first, rows):
+            if image is None:
+                missing += 1
+            else:
+                yield row, _draw_row(run, first, row, image)
     else:
         return
-    found = 0
-    for frame in reader:
-        row = place.get(frame.index)
-        if row is not None:
-            found += 1
-            yield row, frame.image if video is None else _draw_row(run, row, frame.image)
-    if found < len(place):
+    if missing:
         raise VideoError(
-            f"{reader.path}: {len(place) - found} frames of the track are missing; give the video "
-            "that was tracked"
+            f"{shown}: {missing} frames of the track are missing; give the video that was tracked"
         )
 
 
@@ -94,19 +138,30 @@ def rows_with_modes(run: Run) -> np.ndarray:
     return rows
 
 
-def _draw_row(run: Run, row: int, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+def _frames_of(
+    run: Run, recorded: RecordedCamera, rows: Iterable[int]
+) -> Iterator[tuple[int, Picture | None]]:
+    """What a camera saw in some frames of the track; None where its video has none."""
+    assert recorded.files is not None
+    wanted = {int(run.track.frames[row]) + recorded.files.offset: int(row) for row in rows}
+    start, stop = min(wanted, default=0), max(wanted, default=0) + 1
+    reader = VideoReader(recorded.files.video, start=start, stop=stop)
+    check_image_size(recorded.camera, reader.info.width, reader.info.height)
+    frames = iter(reader)
+    for index, row in wanted.items():
+        frame = next((frame for frame in frames if frame.index >= index), None)
+        yield row, frame.image if frame is not None and frame.index == index else None
+
+
+def _draw_row(run: Run, recorded: RecordedCamera, row: int, image: Picture) -> Picture:
     """Draw the modes of a frame, counted in the track, over its image."""
-    track = run.track
-    count = int(track.num_modes[row])
-    base = torch.from_numpy(track.base_transform[row])
-    body = run.body.with_base(base[:3, :3], base[:3, 3])
-    state = torch.from_numpy(track.state[row, :count])
-    cost = f"   cost {track.cost[row, 0]:.1f}" if np.isfinite(track.cost[row, 0]) else ""
+    modes = run.track.modes(row)
+    body = run.body.with_base(modes.base_transform[:3, :3], modes.base_transform[:3, 3])
     return draw_poses(
         image,
         body,
-        state,
-        run.camera.double(),
-        weights=torch.from_numpy(np.exp(track.log_weight[row, :count])),
-        text=f"frame {track.frames[row]}   {count} mode{'s' if count > 1 else ''}{cost}",
+        modes.state,
+        recorded.camera.to(dtype=torch.float64, device="cpu"),
+        weights=modes.log_weight.exp(),
+        text=caption(modes.frame, len(modes.cost), float(modes.cost[0])),
     )

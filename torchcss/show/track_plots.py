@@ -115,36 +115,30 @@ def side_view_figure(
     """
     row = _row_of(track, frame)
     body = body_of_track(track)
-    count = int(track.num_modes[row])
-    pose = pose_track(
-        body,
-        torch.from_numpy(track.state[row, :count]),
-        torch.from_numpy(track.base_transform[row]).expand(count, 4, 4),
-    )
+    modes = track.modes(row)
+    pose = pose_track(body, modes.state, modes.base_transform)
     camera = _own_frame() if camera is None else camera.to(dtype=torch.float64, device="cpu")
     turn = camera.R_camera_world
-    spread = (turn @ joint_covariance(body, pose, torch.from_numpy(track.covariance[row, :count]))
-              @ turn.T).numpy()  # fmt: skip
+    spread = (turn @ joint_covariance(body, pose, modes.covariance) @ turn.T).numpy()
     joints = camera.to_camera_frame(pose.joints).numpy()
     distance = float(joints[0, :, 2].mean())
-    weight = np.exp(track.log_weight[row, :count])
+    weight = modes.log_weight.exp().numpy()
     bones = bones_of(body)
-    moving = _first_of_links(body)
 
     figure = Figure(figsize=(9.5, 5.0), layout="constrained")
     seen = in_perspective(joints, distance)
     front, side = figure.subplots(1, 2, sharey=True)
-    for mode in reversed(range(count)):  # the best on top
+    for mode in reversed(range(len(weight))):  # the best on top
         look = {
             "color": mode_colour(mode),
             "alpha": _FAINTEST + (1 - _FAINTEST) * float(weight[mode] / weight.max()),
             "lw": 2.6 if mode == 0 else 1.6,
             "zorder": 3 + (mode == 0),
         }
-        label = f"{100 * weight[mode]:.0f} %, cost {track.cost[row, mode]:.1f}"
-        draw_bones(front, seen[mode], bones, look, label=label)
+        text = f"{100 * weight[mode]:.0f} %, cost {track.cost[row, mode]:.1f}"
+        draw_bones(front, seen[mode], bones, look, label=text)
         draw_bones(side, joints[mode][:, [2, 1]], bones, look)
-        for joint in moving if weight[mode] >= _LEAST_WEIGHT else ():
+        for joint in _first_of_links(body) if weight[mode] >= _LEAST_WEIGHT else ():
             ellipse = _one_deviation(joints[mode, joint, [2, 1]], spread[mode, joint])
             ellipse.set(
                 fc=mode_colour(mode), ec=_darker(mode), alpha=look["alpha"], lw=0.9, zorder=5
@@ -152,25 +146,25 @@ def side_view_figure(
             side.add_patch(ellipse)
     if reference is not None:
         _draw_reference(front, side, body, bones, camera, reference, distance)
-    front.set_title("as the camera sees it", fontsize=10)
-    front.set_xlabel("metres to the right", fontsize=9)
-    front.set_ylabel("metres up", fontsize=9)
-    side.set_title("from the side; the camera is far to the left", fontsize=10)
-    side.set_xlabel("metres from the camera", fontsize=9)
-    for axes in (front, side):
-        tidy(axes)
-    _same_scale(figure, front, side)
-    handles, labels = front.get_legend_handles_labels()
-    figure.legend(
-        handles[::-1], labels[::-1], title="weight of the modes", loc="outside right upper",
-        fontsize=8, title_fontsize=9, frameon=False,
-    )  # fmt: skip
+    _label_side_view(figure, front, side)
     figure.suptitle(
         f"frame {frame}, {track.times[row]:.2f} s; ellipses: one standard deviation, of the modes "
         f"of {100 * _LEAST_WEIGHT:.0f} % or more",
         fontsize=10,
     )
     return figure
+
+
+def _label_side_view(figure: Figure, front: Axes, side: Axes) -> None:
+    """Titles, axes of one scale, and the legend."""
+    label(front, "as the camera sees it", "metres to the right", "metres up")
+    label(side, "from the side; the camera is far to the left", "metres from the camera")
+    _same_scale(figure, front, side)
+    handles, labels = front.get_legend_handles_labels()
+    figure.legend(
+        handles[::-1], labels[::-1], title="weight of the modes", loc="outside right upper",
+        fontsize=8, title_fontsize=9, frameon=False,
+    )  # fmt: skip
 
 
 def num_explanations(track: Track, *, apart: float = APART) -> np.ndarray:
@@ -236,43 +230,52 @@ def modes_figure(track: Track, summary: Mapping[str, Any] | None = None) -> Figu
         step="mid" if len(times) > 1 else None,
     )  # fmt: skip
     weights.set_ylim(0, 1)
-    weights.set_ylabel("weight, best\nmode first", fontsize=9)
-    number.step(times, track.num_modes, where="mid", color=OKABE_ITO["sky"], lw=4, label="modes")
-    number.step(
-        times, num_explanations(track), where="mid", color=OKABE_ITO["black"], lw=1.6,
-        label=f"of these {100 * APART:g} cm apart",
-    )  # fmt: skip
+    for values, look in (
+        (track.num_modes, {"color": OKABE_ITO["sky"], "lw": 4, "label": "modes"}),
+        (num_explanations(track),
+         {"color": OKABE_ITO["black"], "lw": 1.6, "label": f"of these {100 * APART:g} cm apart"}),
+    ):  # fmt: skip
+        number.step(times, values, where="mid", **look)
     number.plot(
         times, effective_number(track), color=OKABE_ITO["vermilion"], lw=1.3, ls="--",
         label="effective number",
     )  # fmt: skip
     number.set_ylim(0, 1.15 * max(int(track.num_modes.max()), 1))
     number.yaxis.get_major_locator().set_params(integer=True)
-    number.set_ylabel("explanations", fontsize=9)
-    number.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    number.legend(**_BESIDE)
     # A frame in which nothing was seen has no cost, and leaves a gap.
     shown = np.where(np.isfinite(track.cost[:, 0]), track.cost[:, 0], np.nan)
     cost.plot(times, shown, ".-", color=OKABE_ITO["blue"], lw=1.3, ms=4)
-    cost.set_ylabel("cost of the best\nmode (nats)", fontsize=9)
-    cost.set_xlabel("seconds", fontsize=9)
+    label(weights, y="weight, best\nmode first")
+    label(number, y="explanations")
+    label(cost, x="seconds", y="cost of the best\nmode (nats)")
+    _draw_events((weights, number, cost), events)
+    if len(times) > 1:
+        weights.set_xlim(times[0], times[-1])
+    return figure
+
+
+_BESIDE: dict[str, Any] = {
+    "fontsize": 8, "frameon": False, "loc": "center left", "bbox_to_anchor": (1.0, 0.5),
+}  # fmt: skip
+"""A legend to the right of its panel."""
+
+
+def _draw_events(panels: Sequence[Axes], events: Sequence[Mapping[str, Any]]) -> None:
+    """Lines where the track was lost and found, and marks on the border of the last panel."""
     for kind, marker, colour in (("lost", "X", "vermilion"), ("found", "o", "green")):
         at = [float(event["time_s"]) for event in events if event["event"] == kind]
-        for axes in (weights, number, cost):
+        for axes in panels:
             for time in at:
                 axes.axvline(time, color=OKABE_ITO[colour], lw=1.1, ls="--", zorder=3)
         if at:
             # On the upper border of the panel, whatever its range.
-            cost.plot(
-                at, np.ones(len(at)), marker, transform=cost.get_xaxis_transform(), clip_on=False,
-                color=OKABE_ITO[colour], ms=7, zorder=4, label=f"told {kind}",
+            panels[-1].plot(
+                at, np.ones(len(at)), marker, transform=panels[-1].get_xaxis_transform(),
+                clip_on=False, color=OKABE_ITO[colour], ms=7, zorder=4, label=f"told {kind}",
             )  # fmt: skip
     if events:
-        cost.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    for axes in (weights, number, cost):
-        tidy(axes)
-    if len(times) > 1:
-        weights.set_xlim(times[0], times[-1])
-    return figure
+        panels[-1].legend(**_BESIDE)
 
 
 def contact_sheet(
@@ -460,6 +463,14 @@ def _draw_reference(
     look = {"color": "black", "lw": 1.3, "ls": "--", "zorder": 5}
     draw_bones(front, in_perspective(places, distance), rows, look, label="reference")
     draw_bones(side, places[:, [2, 1]], rows, look)
+
+
+def label(axes: Axes, title: str = "", x: str = "", y: str = "") -> None:
+    """Give a panel the look of all figures, and say what it shows."""
+    axes.set_title(title, fontsize=10)
+    axes.set_xlabel(x, fontsize=9)
+    axes.set_ylabel(y, fontsize=9)
+    tidy(axes)
 
 
 def tidy(axes: Axes) -> None:

@@ -1,6 +1,6 @@
 """Tracks in the rerun viewer: the modes in space over the picture that they explain.
 
-`Viewer` takes one `PosedFrame` after the other, whether they come from a run on disk (`view_track`,
+`Viewer` takes one `ShownFrame` after the other, whether they come from a run on disk (`view_track`,
 which `torchcss view` calls) or from a tracker that runs (`torchcss.app.live`), and logs
 
 | entity | what |
@@ -38,13 +38,14 @@ from PIL import Image
 from torch import Tensor
 from tqdm import tqdm
 
-from torchcss.body.model import BodyModel, BodyPose
+from torchcss.body.model import BodyModel
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.errors import ConfigurationError, OutputError
 from torchcss.files import one_line, prepare_output_folder, replace_file
 from torchcss.io.export.selection import camera_up, up_axis
 from torchcss.io.run import Run
-from torchcss.io.track_body import pose_track
+from torchcss.io.track_body import on_origin, pose_track
+from torchcss.io.tracks import FrameModes
 from torchcss.show.overlay import PALETTE
 from torchcss.show.track_pictures import pictures_of, rows_with_modes
 from torchcss.show.track_plots import APART, bones_of, count_apart
@@ -80,26 +81,16 @@ _JPEG_QUALITY = 85
 _FILE_CHUNKS_S = 5.0
 
 
-class PosedFrame(NamedTuple):
-    """One frame as a viewer shows it, modes best first.
+class ShownFrame(NamedTuple):
+    """One frame as a viewer shows it.
 
     Attributes:
-        number: Index in the video.
-        time_s: Seconds since the video's first frame.
-        pose: Poses of the body in the world.
-        covariance: Covariances of the states.
-        weight: Weights of the modes, adding up to 1.
-        cost: Their costs, nats; infinite where nothing was seen.
-        picture: The frame with its modes, or None.
+        modes: Its modes, best first.
+        picture: The frame with its modes drawn over it, or None.
         lost: Whether the track counts as lost.
     """
 
-    number: int
-    time_s: float
-    pose: BodyPose
-    covariance: Float[Tensor, "k n n"]
-    weight: Float[Tensor, " k"]
-    cost: Float[Tensor, " k"]
+    modes: FrameModes
     picture: UInt8[np.ndarray, "h w 3"] | None = None
     lost: bool = False
 
@@ -128,36 +119,20 @@ def view_track(
         _replay(run, partial, connect, anew)
 
 
-def posed_frames(run: Run, *, anew: bool = False) -> Iterator[PosedFrame]:
+def shown_frames(run: Run, *, anew: bool = False) -> Iterator[ShownFrame]:
     """Yield the frames of a track, with pictures where there are any.
 
     Args:
         run: The run.
         anew: Whether to draw over the video even where the tracker left an overlay.
     """
-    track, body = run.track, run.body
-    rows = rows_with_modes(run)
+    rows, lost = rows_with_modes(run), False
     pictures = pictures_of(run, rows, anew=anew)
     changes = {int(event["frame"]): event["event"] for event in run.summary.get("events", [])}
-    lost = False
     for row in rows:
-        count, index = int(track.num_modes[row]), int(track.frames[row])
-        state, covariance, log_weight, cost = (
-            torch.from_numpy(values[row, :count])
-            for values in (track.state, track.covariance, track.log_weight, track.cost)
-        )
-        base = torch.from_numpy(track.base_transform[row]).expand(count, 4, 4)
-        lost = changes[index] == "lost" if index in changes else lost
-        yield PosedFrame(
-            number=index,
-            time_s=float(track.times[row]),
-            pose=pose_track(body, state, base),
-            covariance=covariance,
-            weight=log_weight.softmax(0),
-            cost=cost,
-            picture=next(pictures, (row, None))[1],
-            lost=lost,
-        )
+        modes = run.track.modes(row)
+        lost = changes.get(modes.frame, "lost" if lost else "found") == "lost"
+        yield ShownFrame(modes, next(pictures, (row, None))[1], lost)
 
 
 def _replay(run: Run, save: Path | None, connect: str | None, anew: bool) -> None:
@@ -168,7 +143,7 @@ def _replay(run: Run, save: Path | None, connect: str | None, anew: bool) -> Non
     recording = open_recording(run.folder.resolve().name, save=save, connect=connect)
     try:
         viewer = Viewer(recording, run.body, camera=camera, up=up, events=events)
-        frames = posed_frames(run, anew=anew)
+        frames = shown_frames(run, anew=anew)
         for frame in tqdm(frames, total=len(track.frames), unit="frame", dynamic_ncols=True):
             viewer.add(frame)
     finally:
@@ -268,7 +243,7 @@ class Viewer:
 
     Args:
         recording: Where to, see `open_recording`.
-        body: The body, for the mesh; its base does not matter.
+        body: The body, on any base.
         camera: The camera of the pictures; None: not known.
         up: Axis of the world that is up: x, y, z, -x, -y or -z.
         events: Whether to leave room for losses.
@@ -284,7 +259,7 @@ class Viewer:
         events: bool = True,
     ) -> None:
         self._recording = recording
-        self._body = body
+        self._body = body = on_origin(body)
         self._bones = np.array(bones_of(body), dtype=np.int64).reshape(-1, 2)
         self._camera = camera
         self._up = up
@@ -297,20 +272,23 @@ class Viewer:
         self._shown = 0
         self._lost = False
 
-    def add(self, frame: PosedFrame) -> None:
+    def add(self, frame: ShownFrame) -> None:
         """Log a frame.
 
         Args:
             frame: The frame, later than the last.
         """
         package, log = rerun(), self._recording.log
-        joints, weight, cost = map(_array, (frame.pose.joints, frame.weight, frame.cost))
-        spread = _array(joint_covariance(self._body, frame.pose, frame.covariance))
-        rotation, centre = map(_array, self._body.part_poses(frame.pose))
+        modes = frame.modes
+        pose = pose_track(self._body, modes.state, modes.base_transform)
+        weight = modes.log_weight.softmax(0)
+        joints, weight, cost = map(_array, (pose.joints, weight, modes.cost))
+        spread = _array(joint_covariance(self._body, pose, modes.covariance))
+        rotation, centre = map(_array, self._body.part_poses(pose))
         if not self._known:
             self._begin(joints[0])
-        self._recording.set_time("frame", sequence=frame.number)
-        self._recording.set_time("time", duration=frame.time_s)
+        self._recording.set_time("frame", sequence=modes.frame)
+        self._recording.set_time("time", duration=modes.time_s)
         if frame.picture is not None:
             log("world/camera/picture", _jpeg(frame.picture))
         for mode in range(len(weight)):
@@ -330,7 +308,7 @@ class Viewer:
         for name, number in zip(_COUNTS, numbers, strict=True):
             log(f"modes/{name}", package.Scalars(float(number)))
         if frame.lost != self._lost:
-            text = f"frame {frame.number}: told {'lost' if frame.lost else 'found'}"
+            text = f"frame {modes.frame}: told {'lost' if frame.lost else 'found'}"
             level = package.TextLogLevel.WARN if frame.lost else package.TextLogLevel.INFO
             log("events", package.TextLog(text, level=level))
         self._lost = frame.lost

@@ -67,7 +67,7 @@ def run_demo(
     """
     if num_frames is not None and num_frames < 1:
         raise ConfigurationError(f"num_frames must be at least 1, got {num_frames}")
-    return _track_clip(CLIP, out, settings or DEMO_SETTINGS, CLIP / "body.npz", num_frames)
+    return _track_clip(CLIP, out, settings or DEMO_SETTINGS, None, num_frames)
 
 
 def track_sequence(
@@ -157,13 +157,18 @@ def _track_clip(
     clip: Path,
     out: Path,
     settings: Settings,
-    first: Path | Initialisation,
+    first: Initialisation | None,
     num_frames: int | None = None,
 ) -> dict[str, Any]:
-    """Track a clip from its first pose; its summary with the errors, which is written again."""
+    """Track a clip from its first pose; its summary with the errors, which is written again.
+
+    The first pose is that of the clip's `body.npz`, if it is not given.
+    """
+    init = clip / "body.npz" if first is None else None
+    options = TrackOptions(first=first, init=init, layout=OWN_NAMES)
     run = track_video(
         clip / "video.mp4", camera=clip / "cameras.json", keypoints=clip / "keypoints.npz", out=out,
-        settings=settings, stop=num_frames, options=TrackOptions(init=first, layout=OWN_NAMES),
+        settings=settings, stop=num_frames, options=options,
     )  # fmt: skip
     summary, truth = dict(run.summary), read_reference(clip / "reference3d.npz")[0]
     track = load_track(out)

@@ -22,11 +22,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-import numpy as np
-
 from torchcss.body.model import BodyModel
 from torchcss.errors import ConfigurationError
-from torchcss.files import prepare_output_folder, replace_file
+from torchcss.files import prepare_output_folder, replace_file, save_arrays, write_text
 from torchcss.io.export.bvh import BvhStyle, bvh_text
 from torchcss.io.export.c3d import write_c3d
 from torchcss.io.export.mot import mot_text
@@ -124,57 +122,47 @@ def export(
     labels = [""] if one_file and options.selection.mode == "all" else selection.labels
     paths = _paths(source, to, labels, path)
     report = list(selection.report)
-    if to in ("trc", "c3d"):  # the formats of places, which need no body
-        _write_places(paths, to, selection)
-    elif one_file:
+    if one_file:
         _write_table(paths[0], to, selection, body_of_track(track))
     else:
-        report += _write_turns(paths, to, selection, body_of_track(track), options.bvh)
+        report += _write_modes(paths, to, selection, track, options.bvh)
     return Export(tuple(paths), tuple(report))
 
 
-def _write_places(paths: Sequence[Path], to: str, selection: Selection) -> None:
-    for index, path in enumerate(paths):
-        if to == "trc":
-            _write_text(path, trc_text(selection, index, path.name))
-            continue
-        with replace_file(path) as partial:
-            write_c3d(partial, selection, index)
-
-
-def _write_turns(
-    paths: Sequence[Path], to: str, selection: Selection, body: BodyModel, style: BvhStyle
+def _write_modes(
+    paths: Sequence[Path], to: str, selection: Selection, track: Track, style: BvhStyle
 ) -> list[str]:
-    """Write BVH or MOT; returns what to report."""
-    report: list[str] = []
+    """Write a file for every mode; returns what to report."""
+    if to == "c3d":
+        for index, path in enumerate(paths):
+            with replace_file(path) as partial:
+                write_c3d(partial, selection, index)
+        return []
+    if to == "trc":  # as C3D a format of places, which needs no body
+        for index, path in enumerate(paths):
+            write_text(path, trc_text(selection, index, path.name))
+        return []
+    body, report = body_of_track(track), []
     if not selection.present.all():
         report.append(f"{to} cannot leave frames out: there the mode's nearest pose stands")
     for index, path in enumerate(paths):
-        if to == "mot":
-            _write_text(path, mot_text(selection, index, body))
-        else:
-            text, notes = bvh_text(selection, index, body, style)
-            report += [note for note in notes if note not in report]
-            _write_text(path, text)
+        text, notes = (
+            (mot_text(selection, index, body), ())
+            if to == "mot"
+            else bvh_text(selection, index, body, style)
+        )
+        report += [note for note in notes if note not in report]
+        write_text(path, text)
     return report
 
 
 def _write_table(path: Path, to: str, selection: Selection, body: BodyModel) -> None:
     covariance = joint_covariances(selection, body)
     if to == "csv":
-        _write_text(path, csv_text(selection, covariance))
+        write_text(path, csv_text(selection, covariance))
         return
-    arrays = npz_arrays(selection, covariance)
-    if to == "npz-smpl":
-        arrays |= smpl_arrays(selection, body)
-    with replace_file(path) as partial, partial.open("wb") as stream:
-        np.savez(stream, allow_pickle=False, **arrays)
-
-
-def _write_text(path: Path, text: str) -> None:
-    # Line ends as they are, also on Windows: readers of these formats count bytes.
-    with replace_file(path) as partial:
-        partial.write_text(text, encoding="utf-8", newline="\n")
+    smpl = smpl_arrays(selection, body) if to == "npz-smpl" else {}
+    save_arrays(path, {**npz_arrays(selection, covariance), **smpl})
 
 
 def _paths(

@@ -122,19 +122,9 @@ def select(track: Track, choice: SelectionChoice | None = None, *, y_up: bool = 
     """
     choice = choice or SelectionChoice()
     _check(choice)
-    start, stop, stride = choice.start, choice.stop, choice.stride
-    first, last = track.frames.min(initial=0), track.frames.max(initial=0)
-    inside = np.flatnonzero(
-        (track.frames >= (first if start is None else start))
-        & (track.frames < (last + 1 if stop is None else stop))
-    )
-    if not inside.size:
-        raise ConfigurationError(
-            f"no frames to export: start {start} and stop {stop}, "
-            + (f"the track has the frames {first} to {last}" if track.frames.size else "no frames")
-        )
+    inside = _frames_inside(track, choice)
     report: list[str] = []
-    kept = inside[::stride]
+    kept = inside[:: choice.stride]
     wanted, ranks = _ranks(track, choice, inside)
     labels = ("",) if choice.mode == "best" else tuple(f"mode{rank}" for rank in wanted)
     for label, column in zip(labels, ranks.T, strict=True):
@@ -172,6 +162,22 @@ def select(track: Track, choice: SelectionChoice | None = None, *, y_up: bool = 
         upright=upright,
         report=tuple(report),
     )
+
+
+def _frames_inside(track: Track, choice: SelectionChoice) -> np.ndarray:
+    """Rows of the track from `start` to `stop`."""
+    start, stop, frames = choice.start, choice.stop, track.frames
+    inside = np.ones(len(frames), dtype=bool)
+    if start is not None:
+        inside &= frames >= start
+    if stop is not None:
+        inside &= frames < stop
+    if not inside.any():
+        known = f"the frames {frames[0]} to {frames[-1]}" if frames.size else "no frames"
+        raise ConfigurationError(
+            f"no frames to export: start {start} and stop {stop}, the track has {known}"
+        )
+    return np.flatnonzero(inside)
 
 
 def _check(choice: SelectionChoice) -> None:

@@ -96,29 +96,12 @@ def read_motion_capture(
     scale = metres_per_unit(units)
     if frame_rate is not None and not 0 < frame_rate < math.inf:
         raise ConfigurationError(f"frame rate: expected a positive number, got {frame_rate}")
-    suffix = path.suffix.lower()
-    if suffix == ".bvh":
-        segments, values, rate = parse_bvh(path)
-        stated, report = None, []
-    elif suffix == ".amc":
-        beside = Path(skeleton) if skeleton is not None else path.with_suffix(".asf")
-        if skeleton is None and not beside.is_file():
-            raise MotionCaptureError(
-                f"{path}: an AMC holds no skeleton, and there is no {beside.name} beside it; name "
-                "its ASF file"
-            )
-        segments, values, stated = parse_acclaim(beside, path)
-        rate, report = ACCLAIM_RATE, ["rate assumed: an AMC does not say it"]
-    else:
-        raise MotionCaptureError(
-            f"{path}: expected a .bvh file, or an .amc file with its .asf, found {suffix!r}"
-        )
+    segments, values, rate, stated, report = _parse(path, skeleton)
     if frame_rate is not None:
-        rate, report = frame_rate, []
+        rate, report = frame_rate, ()
     report = [f"{len(values)} frames, {rate:g} per second", *report]
     with np.errstate(all="ignore"):  # whatever overflows is found below
-        rest = rest_positions(segments)
-        joints = _positions(segments, values)
+        rest, joints = rest_positions(segments), _positions(segments, values)
         if scale is None:
             scale, line = guess_units(path, skeleton_span(rest, segments), stated)
             report.append(line)
@@ -128,14 +111,36 @@ def read_motion_capture(
         raise MotionCaptureError(
             f"{path}: frame {frame + 1}: the positions are beyond all bounds; the file is damaged"
         )
-    return MotionCapture(
-        tuple(segment.name for segment in segments),
-        tuple(segment.parent for segment in segments),
-        rest,
-        joints,
-        rate,
-        tuple(report),
-    )
+    names, parents = ([each.name for each in segments], [each.parent for each in segments])
+    return MotionCapture(tuple(names), tuple(parents), rest, joints, rate, tuple(report))
+
+
+class _Parsed(NamedTuple):
+    segments: list[Segment]
+    values: Float[np.ndarray, "t c"]
+    rate: float
+    metres_per_unit: float | None = None
+    report: tuple[str, ...] = ()
+
+
+def _parse(path: Path, skeleton: str | os.PathLike[str] | None) -> _Parsed:
+    """What either format says."""
+    suffix = path.suffix.lower()
+    if suffix == ".bvh":
+        return _Parsed(*parse_bvh(path))
+    if suffix != ".amc":
+        raise MotionCaptureError(
+            f"{path}: expected a .bvh file, or an .amc file with its .asf, found {suffix!r}"
+        )
+    beside = Path(skeleton) if skeleton is not None else path.with_suffix(".asf")
+    if skeleton is None and not beside.is_file():
+        raise MotionCaptureError(
+            f"{path}: an AMC holds no skeleton, and there is no {beside.name} beside it; name "
+            "its ASF file"
+        )
+    segments, values, stated = parse_acclaim(beside, path)
+    note = "rate assumed: an AMC does not say it"
+    return _Parsed(segments, values, ACCLAIM_RATE, stated, (note,))
 
 
 def resample(
