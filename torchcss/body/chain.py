@@ -1,6 +1,6 @@
 """The chain of a body: its joints in order, and forward kinematics, by pytorch-kinematics.
 
-`make_chain` builds its `Chain` from a list of
+This is the only module that knows the library. `make_chain` builds its `Chain` from a list of
 `JointSpecification`; `link_poses` is forward kinematics for any leading shape; `urdf_joints` reads
 the joints of a URDF. The evaluation of costs has kinematics of its own, the faster twin of these:
 `torchcss.body.kinematics`.

@@ -9,16 +9,14 @@
 | `root_rotation`, `root_angles` | yaw, pitch, roll of a body's root, as tensors |
 | `frame_along` | a frame whose z axis has a direction |
 | `as_vector`, `as_rows` | plain numbers, as specifications hold them |
-
-Conversions by way of quaternions are those of pytorch-kinematics.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
-import pytorch_kinematics as pk
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -49,13 +47,22 @@ def about_fixed_axes(angles: Sequence[float], order: str) -> Float[np.ndarray, "
 
 
 def from_axis_angle(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Rotation about a vector by its length in radians."""
-    return from_quaternion(pk.axis_angle_to_quaternion(torch.from_numpy(vector)).numpy())
+    """Rotation about a vector by its length in radians (Rodrigues' formula)."""
+    x, y, z = vector
+    angle = float(np.linalg.norm(vector))
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    # sin(a) / a and (1 - cos(a)) / a^2, both regular at zero.
+    first = np.sinc(angle / np.pi)
+    second = 0.5 * np.sinc(0.5 * angle / np.pi) ** 2
+    return np.eye(3) + first * cross + second * (cross @ cross)
 
 
 def from_quaternion(quaternion: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
-    """Rotation of a quaternion, scalar first."""
-    return pk.quaternion_to_matrix(torch.from_numpy(quaternion)).numpy()
+    """Rotation of a unit quaternion, scalar first."""
+    vector = quaternion[1:]
+    length = float(np.linalg.norm(vector))
+    angle = 2 * math.atan2(length, quaternion[0])
+    return from_axis_angle(vector * (angle / length if length else 0.0))
 
 
 def frame_along(
@@ -116,14 +123,46 @@ def euler_angles(
 
 
 def axis_angle(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 3"]:
-    """Rotation vectors: the axis times the angle in [0, pi], radians."""
-    quaternion = pk.matrix_to_quaternion(torch.from_numpy(rotation))
-    return pk.quaternion_to_axis_angle(pk.standardize_quaternion(quaternion)).numpy()
+    """Rotation vectors: the axis times the angle in [0, pi], radians.
+
+    By way of the unit quaternion, whose largest entry is never small (Shepperd 1978).
+    """
+    r = rotation
+    trace = np.trace(r, axis1=-2, axis2=-1)
+    diagonal = np.diagonal(r, axis1=-2, axis2=-1)
+    # Row m: the quaternion (w, x, y, z) times four times its entry m, from sums and differences.
+    skew = np.stack(
+        [r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]],
+        axis=-1,
+    )
+    rows = np.zeros((*trace.shape, 4, 4))
+    rows[..., 0, 0] = 1.0 + trace
+    rows[..., 0, 1:] = rows[..., 1:, 0] = skew
+    rows[..., 1:, 1:] = r + np.swapaxes(r, -1, -2)
+    for m in range(3):
+        rows[..., 1 + m, 1 + m] = 1.0 + 2.0 * diagonal[..., m] - trace
+    largest = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), axis=-1)
+    quaternion = np.take_along_axis(rows, largest[..., None, None], axis=-2)[..., 0, :]
+    quaternion = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    quaternion = np.where(quaternion[..., :1] < 0, -quaternion, quaternion)
+    sine = np.linalg.norm(quaternion[..., 1:], axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, quaternion[..., :1])
+    ratio = np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0)
+    return ratio * quaternion[..., 1:]
 
 
 def root_rotation(angles: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrix of yaw, pitch and roll (radians)."""
-    return pk.euler_angles_to_matrix(angles, "YXZ")
+    a, b, c = angles.unbind(-1)
+    zero, one = torch.zeros_like(a), torch.ones_like(a)
+
+    def matrix(*entries: Tensor) -> Tensor:
+        return torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
+
+    yaw = matrix(a.cos(), zero, a.sin(), zero, one, zero, -a.sin(), zero, a.cos())
+    pitch = matrix(one, zero, zero, zero, b.cos(), -b.sin(), zero, b.sin(), b.cos())
+    roll = matrix(c.cos(), -c.sin(), zero, c.sin(), c.cos(), zero, zero, zero, one)
+    return yaw @ pitch @ roll
 
 
 def root_angles(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
