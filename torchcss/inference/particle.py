@@ -145,13 +145,7 @@ class _Filter(ABC):
         check_bounds(bounds, mixture.mean.shape[-1])
         generator = torch.Generator()
         generator.set_state(state.generator_state)
-        particles = state.particles
-        if particles is None:
-            fair = CovarianceScaled(covariance_scale=1.0, include_modes=False, stratified=True)
-            drawn = fair.sample(mixture, self.num_samples, bounds, generator=generator)
-            particles = Particles(
-                drawn.x, state.velocity[drawn.parent], drawn.log_weight, drawn.parent
-            )
+        particles = state.particles or self._drawn(state, bounds, generator)
         points = torch.zeros_like(mixture.covariance[:1]).expand(len(particles.x), -1, -1)
         moved = self.dynamics.predict(
             GaussianMixture(particles.x, points, particles.log_weight), particles.velocity
@@ -188,6 +182,13 @@ class _Filter(ABC):
             survival=survival(weighed.log_weight),
             prior=prior,
         )
+
+    def _drawn(self, state: TrackerState, bounds: Bounds, generator: torch.Generator) -> Particles:
+        """Particles of a mixture."""
+        fair = CovarianceScaled(covariance_scale=1.0, include_modes=False, stratified=True)
+        drawn = fair.sample(state.mixture, self.num_samples, bounds, generator=generator)
+        velocity = state.velocity[drawn.parent]
+        return Particles(drawn.x, velocity, drawn.log_weight, drawn.parent)
 
     def track(
         self,

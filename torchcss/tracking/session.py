@@ -243,6 +243,7 @@ class TrackingSession:
         self.plan: Plan = make_plan(settings, body, views[0], frame_interval)
         self._observers = [self.plan.observer(body, view) for view in views]
         self._bounds = self.plan.bounds
+        self._prior_variance = default_prior_variance(self._bounds)
         self._surface_motion = SurfaceMotion(body) if settings.prediction == "surface" else None
 
     def checkpoint(self) -> SessionState:
@@ -318,19 +319,18 @@ class TrackingSession:
         monitor, lost = before.monitor, False
         if plan.recovery is not None and monitor is not None:
             monitor, lost = plan.recovery.judge(monitor, _per_view(terms, observation))
+        windows: Windows = (None,) * len(self._observers)
         if not lost:
             memory = tuple(
                 observer.learn(known, seen, body, modes.mean, modes.log_weight)
                 for observer, known, seen in self._of_views(memory, observation)
             )
-        next_body, moved = follow_with_base(body, after)
-        num_lost = before.num_lost + 1 if lost else 0
-        windows: Windows = (None,) * len(self._observers)
-        if not lost:
             windows = self._windows(body, modes)
         self._ahead.append(windows)
+        next_body, moved = follow_with_base(body, after)
         self.state = SessionState(
-            *(moved, next_body, observation.views, memory, monitor, num_lost),
+            *(moved, next_body, observation.views, memory, monitor),
+            num_lost=before.num_lost + 1 if lost else 0,
             windows=(*before.windows[1:], windows),
         )
         return Posterior(
@@ -338,11 +338,7 @@ class TrackingSession:
             body=body,
             state=after,
             info=info,
-            covariance=tempered(
-                modes.covariance,
-                plan.tracker.stated_power,
-                default_prior_variance(self._bounds),
-            ),
+            covariance=tempered(modes.covariance, plan.tracker.stated_power, self._prior_variance),
             joints_world=body.pose(modes.mean).joints,
             terms=terms,
             seconds={

@@ -83,6 +83,15 @@ def named_terms(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(term for name in names for term in _SETS.get(name, (name,))))
 
 
+_NOT_OF_PARTICLES = {
+    "oversampling": (1, "do not descend"),
+    "prediction": ("velocity", "move by noise, each for itself"),
+    "likelihood_power": (None, "have no modes to weigh"),
+    "limb_jumps": (0, "have no modes to jump from"),
+}
+"""Settings of trackers that descend: their defaults, and why particle filters have none."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Settings:
     """How to track; everything here is in `summary.json`.
@@ -145,6 +154,23 @@ class Settings:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "terms", named_terms(self.terms))
+        self._check_names()
+        self._check_numbers()
+        if PRESETS[self.preset].particles is not None:
+            for name, (default, why) in _NOT_OF_PARTICLES.items():
+                if getattr(self, name) != default:
+                    raise ConfigurationError(
+                        f"{name}: the particles of {self.preset} {why}; leave it out"
+                    )
+        try:
+            torch.empty(0, device=self.device)
+        except (RuntimeError, AssertionError) as error:  # the latter without CUDA
+            raise ConfigurationError(
+                f"device {self.device!r} is not available here; use cpu"
+            ) from error
+
+    def _check_names(self) -> None:
+        """Presets, terms and predictions are known."""
         if self.preset not in PRESETS:
             raise ConfigurationError(f"no tracker {self.preset!r}; there are {', '.join(PRESETS)}")
         unknown = sorted(set(self.terms) - set(all_terms()))
@@ -160,13 +186,17 @@ class Settings:
         if strange := sorted(set(self.weights) - set(TERM_TABLE)):
             known = ", ".join(TERM_TABLE)
             raise ConfigurationError(f"weights: no terms {strange}; there are {known}")
-        for name, weight in self.weights.items():
-            if not 0 <= weight < math.inf:
-                raise ConfigurationError(f"weights: {name}: expected at least 0, got {weight}")
-        if not 0 <= self.contour_weight < math.inf:
+        if self.prediction not in ("velocity", "surface"):
             raise ConfigurationError(
-                f"contour_weight must be at least 0 and finite, got {self.contour_weight}"
+                f"prediction must be velocity or surface, got {self.prediction!r}"
             )
+
+    def _check_numbers(self) -> None:
+        """Numbers lie where they may."""
+        for name, weight in (*self.weights.items(), ("contour_weight", self.contour_weight)):
+            if not 0 <= weight < math.inf:
+                where = f"weights: {name}" if name in self.weights else name
+                raise ConfigurationError(f"{where} must be at least 0 and finite, got {weight}")
         if not 0 <= self.boundary_emphasis <= 1:
             raise ConfigurationError(
                 f"boundary_emphasis must lie in 0..1, got {self.boundary_emphasis}"
@@ -176,42 +206,12 @@ class Settings:
             number = getattr(self, name)
             if number is not None and number < 1:
                 raise ConfigurationError(f"{name} must be at least 1, got {number}")
-        if self.oversampling > 1 and PRESETS[self.preset].particles is not None:
+        if self.likelihood_power is not None and not 0 < self.likelihood_power <= 1:
             raise ConfigurationError(
-                f"oversampling: {self.preset} does not descend from samples; leave it at 1"
+                f"likelihood_power must lie above 0 and at most at 1, got {self.likelihood_power}"
             )
-        if self.prediction not in ("velocity", "surface"):
-            raise ConfigurationError(
-                f"prediction must be velocity or surface, got {self.prediction!r}"
-            )
-        if self.prediction == "surface" and PRESETS[self.preset].particles is not None:
-            raise ConfigurationError(
-                f"prediction: {self.preset} moves particles, not modes; leave it at velocity"
-            )
-        if self.likelihood_power is not None:
-            if not 0 < self.likelihood_power <= 1:
-                raise ConfigurationError(
-                    "likelihood_power must lie above 0 and at most at 1, got "
-                    f"{self.likelihood_power}"
-                )
-            if PRESETS[self.preset].particles is not None:
-                raise ConfigurationError(
-                    f"likelihood_power: the particles of {self.preset} have no modes to weigh; "
-                    "leave it out"
-                )
         if self.limb_jumps < 0:
             raise ConfigurationError(f"limb_jumps must be at least 0, got {self.limb_jumps}")
-        if self.limb_jumps and PRESETS[self.preset].particles is not None:
-            raise ConfigurationError(
-                f"limb_jumps: the particles of {self.preset} have no modes to jump from; leave it "
-                "at 0"
-            )
-        try:
-            torch.empty(0, device=self.device)
-        except (RuntimeError, AssertionError) as error:  # the latter without CUDA
-            raise ConfigurationError(
-                f"device {self.device!r} is not available here; use cpu"
-            ) from error
 
     @property
     def torch_dtype(self) -> torch.dtype:
