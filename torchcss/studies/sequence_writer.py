@@ -22,7 +22,6 @@ import os
 import zipfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -37,15 +36,6 @@ from torchcss.vision.camera import Camera
 
 _HIDDEN_CONFIDENCE = 0.3
 """What a detector says of a joint that it cannot see."""
-
-
-class _Joints(NamedTuple):
-    """What is kept of a frame until the end."""
-
-    joints: Tensor
-    uv: Tensor
-    visible: Tensor
-    in_image: Tensor
 
 
 def write_sequence(
@@ -75,8 +65,8 @@ def write_sequence(
     frames: Iterable[SequenceFrame] = shot.frames()
     if progress:
         frames = tqdm(frames, total=len(shot.states), desc=shot.name, unit="frame")
-    kept = _write_frames(folder, shot, frames, crf)
-    _write_joints(folder, shot, kept, noise_px)
+    joints = _write_frames(folder, shot, frames, crf)
+    _write_joints(folder, shot, joints, noise_px)
     write_camera(folder / "cameras.json", shot.camera)
     body = shot.body
     write_arrays(
@@ -97,13 +87,16 @@ def write_sequence(
 
 def _write_frames(
     folder: Path, shot: Shot, frames: Iterable[SequenceFrame], crf: int
-) -> list[_Joints]:
-    """Write film, flow and masks as the frames are rendered; the joints are kept."""
+) -> list[Tensor]:
+    """Write film, flow and masks as the frames are rendered.
+
+    Returns the joints of all frames: in space, in the image, whether visible, whether inside it.
+    """
     width, height = shot.camera.image_size_wh
     count = len(shot.states)
     mask = np.zeros((count, height, width), bool)
     occluded = np.zeros((count - 1, height, width), bool)
-    kept: list[_Joints] = []
+    joints: list[tuple[Tensor, ...]] = []
     with (
         VideoWriter(folder / "video.mp4", shot.frame_rate, crf=crf) as film,
         replace_file(folder / "flow.npz") as partial,
@@ -120,19 +113,19 @@ def _write_frames(
                 if frame.flow is not None and frame.occluded is not None:
                     stream.write(frame.flow.numpy().astype("<f2").tobytes())
                     occluded[index] = frame.occluded.numpy()
-                kept.append(_Joints(frame.joints, frame.uv, frame.visible, frame.in_image))
+                joints.append((frame.joints, frame.uv, frame.visible, frame.in_image))
         with archive.open("occluded.npy", "w", force_zip64=True) as stream:
             np.lib.format.write_array(stream, occluded, allow_pickle=False)
     write_arrays(folder / "mask.npz", {"mask": mask})
-    return kept
+    return [torch.stack(part) for part in zip(*joints, strict=True)]
 
 
-def _write_joints(folder: Path, shot: Shot, frames: list[_Joints], noise_px: float) -> None:
-    exact = torch.stack([frame.uv for frame in frames])
+def _write_joints(folder: Path, shot: Shot, joints: list[Tensor], noise_px: float) -> None:
+    places, exact, seen, inside = joints
     # Its own generator: the noise of the keypoints does not depend on how the picture was made.
     generator = torch.Generator().manual_seed(shot.seed + 1)
     noise = torch.randn(exact.shape, generator=generator, dtype=exact.dtype)
-    visible = torch.stack([frame.visible for frame in frames]).numpy()
+    visible = seen.numpy()
     names = np.array(shot.body.joint_names)
     frame_rate = np.array(shot.frame_rate)
     write_arrays(
@@ -142,7 +135,7 @@ def _write_joints(folder: Path, shot: Shot, frames: list[_Joints], noise_px: flo
             "keypoints_exact": exact.numpy(),
             "confidence": np.where(visible, 1.0, _HIDDEN_CONFIDENCE),
             "visible": visible,
-            "in_image": torch.stack([frame.in_image for frame in frames]).numpy(),
+            "in_image": inside.numpy(),
             "joint_names": names,
             "frame_rate": frame_rate,
             "noise_px": np.array(noise_px),
@@ -151,11 +144,11 @@ def _write_joints(folder: Path, shot: Shot, frames: list[_Joints], noise_px: flo
     write_arrays(
         folder / "reference3d.npz",
         {
-            "joints": torch.stack([frame.joints for frame in frames]).numpy(),
+            "joints": places.numpy(),
             "joint_names": names,
             "camera_names": np.array([shot.camera.name]),
             "frame_rate": frame_rate,
-            "time_s": np.arange(len(frames)) / shot.frame_rate,
+            "time_s": np.arange(len(places)) / shot.frame_rate,
             "units": np.array("m"),
         },
     )
