@@ -101,21 +101,13 @@ def make_skeleton(body: BodyModel) -> Skeleton:
     Args:
         body: Any body; one from a URDF keeps all its joints, named by their links.
     """
-    links = body.tree.link_names
-    marks = [
-        (name, links[int(link)], tuple(offset.tolist()))
-        for name, link, offset in zip(
-            body.joint_names, body.marker_link, body.marker_offset, strict=True
-        )
-    ]
+    links, marks = body.tree.link_names, _landmarks(body)
     specifications = body.tree.specifications
     children = [joint.parent for joint in specifications]
-    name_at: dict[str, str] = {}  # the first landmark at a link's origin
-    busy: dict[str, bool] = {}  # more hangs on this link than the next joint at its origin
-    for name, link, point in marks:
-        if not np.any(point):
-            name_at.setdefault(link, name)
-        busy[link] = busy.get(link, False) or bool(np.any(point))
+    # The first landmark at a link's origin; and whether more hangs on the link than the next joint
+    # at its origin.
+    name_at = {link: name for name, link, point in reversed(marks) if not any(point)}
+    busy = {link: any(any(point) for _, on, point in marks if on == link) for link in links}
 
     nodes: list[Node] = []
     named: list[bool] = []
@@ -123,7 +115,7 @@ def make_skeleton(body: BodyModel) -> Skeleton:
     coincident: dict[str, bool] = {}  # the link's origin is its node's place
     for joint in specifications:
         link, above = joint.link, joint.parent
-        busy[link] = busy.get(link, False) or children.count(link) > 1
+        busy[link] |= children.count(link) > 1
         own_name = name_at.get(link)
         node = Node(
             own_name or _NAMES.get(joint.name, joint.name), -1, links.index(link), (0, 0, 0)
@@ -158,6 +150,13 @@ def make_skeleton(body: BodyModel) -> Skeleton:
             used.add(name)
             nodes.append(Node(name, owner[link], links.index(link), point))
     return _ordered(nodes)
+
+
+def _landmarks(body: BodyModel) -> list[tuple[str, str, tuple[float, float, float]]]:
+    """Name, link and place in its frame of every named joint centre."""
+    links = [body.tree.link_names[link] for link in body.marker_link.tolist()]
+    points = map(tuple, body.marker_offset.tolist())
+    return list(zip(body.joint_names, links, points, strict=True))
 
 
 def _ordered(nodes: Sequence[Node]) -> Skeleton:
