@@ -74,9 +74,16 @@ def grow(masks: Bool[Tensor, "layers h w"], radius: int) -> Bool[Tensor, "layers
         masks: The masks.
         radius: Half the side of the square, pixels.
     """
-    size = 2 * radius + 1
-    rows = functional.max_pool2d(masks.float(), (1, size), 1, (0, radius))
-    return functional.max_pool2d(rows, (size, 1), 1, (radius, 0)) > 0
+    for axis in (-1, -2):
+        done = 0
+        while done < radius:
+            # What has been grown by `done` may be shifted so far: no gap, even at the border.
+            step = min(done + 1, radius - done)
+            kept, wider = max(masks.shape[axis] - step, 0), masks.clone()
+            wider.narrow(axis, -kept, kept).logical_or_(masks.narrow(axis, 0, kept))
+            wider.narrow(axis, 0, kept).logical_or_(masks.narrow(axis, -kept, kept))
+            masks, done = wider, done + step
+    return masks
 
 
 def bare_pixels(
