@@ -25,12 +25,6 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
-from pytorch_kinematics.transforms import (
-    matrix_to_quaternion,
-    quaternion_apply,
-    quaternion_invert,
-    quaternion_raw_multiply,
-)
 from torch import Tensor
 from torch.nn import functional
 
@@ -241,10 +235,8 @@ class Character:
         # Motion of every part since the skin was made: turn about the origin, then shift.
         turn = rotation @ self._bind_rotation.mT
         shift = centre - (turn @ self._bind_centre[..., None])[..., 0]
-        real = matrix_to_quaternion(turn)
-        dual = 0.5 * quaternion_raw_multiply(
-            torch.cat([torch.zeros_like(shift[:, :1]), shift], -1), real
-        )
+        real = _quaternion(turn)
+        dual = 0.5 * _times(torch.cat([torch.zeros_like(shift[:, :1]), shift], -1), real)
         first, second = real[self._owner[:, 0]], real[self._owner[:, 1]]
         bend = 2 * (first * second).sum(-1).abs().clamp(max=1).acos()
         between = 4 * self._weight[:, 0] * self._weight[:, 1]
@@ -259,8 +251,12 @@ class Character:
         q, d = (sign[..., None] * q).sum(1), (sign[..., None] * d).sum(1)
         length = q.norm(dim=-1, keepdim=True)
         q, d = q / length, d / length
-        moved = 2 * quaternion_raw_multiply(d, quaternion_invert(q))[:, 1:]
-        vertices = quaternion_apply(q, vertices) + moved
+        conjugate = torch.cat([q[:, :1], -q[:, 1:]], -1)
+        moved = 2 * _times(d, conjugate)[:, 1:]
+        axis, scalar = q[:, 1:], q[:, :1]
+        spin = torch.linalg.cross(axis, vertices) + scalar * vertices
+        turned = vertices + 2 * torch.linalg.cross(axis, spin)
+        vertices = turned + moved
         return Skin(vertices, vertex_normals(vertices, self.faces))
 
     def _elbow_swell(self, state: Tensor) -> Tensor:
@@ -551,3 +547,31 @@ def _head(
         colour = torch.where((front & brow)[:, None], colour.new_tensor(clothing.hair), colour)
     mouth = (x / 0.3) ** 2 + ((z + 0.45) / 0.05) ** 2 < 1
     return torch.where((front & mouth)[:, None], colour.new_tensor((0.62, 0.30, 0.28)), colour)
+
+
+def _quaternion(rotation: Float[Tensor, "p 3 3"]) -> Float[Tensor, "p 4"]:
+    """Unit quaternions, scalar first: the largest of the four candidates, for accuracy."""
+    m = rotation
+    trace = m.diagonal(dim1=-2, dim2=-1)
+    t0, t1, t2 = trace.unbind(-1)
+    squares = torch.stack(
+        [1 + t0 + t1 + t2, 1 + t0 - t1 - t2, 1 - t0 + t1 - t2, 1 - t0 - t1 + t2], -1
+    )
+    a, b, c = m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]
+    d, e, f = m[:, 1, 0] + m[:, 0, 1], m[:, 0, 2] + m[:, 2, 0], m[:, 2, 1] + m[:, 1, 2]
+    s0, s1, s2, s3 = squares.unbind(-1)
+    rows = torch.stack([
+        torch.stack([s0, a, b, c], -1),
+        torch.stack([a, s1, d, e], -1),
+        torch.stack([b, d, s2, f], -1),
+        torch.stack([c, e, f, s3], -1),
+    ], 1)  # fmt: skip
+    best = rows[torch.arange(len(m)), squares.argmax(-1)]
+    return functional.normalize(best, dim=-1)
+
+
+def _times(p: Float[Tensor, "*b 4"], q: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 4"]:
+    """Product of quaternions, scalar first."""
+    scalar = p[..., :1] * q[..., :1] - (p[..., 1:] * q[..., 1:]).sum(-1, keepdim=True)
+    vector = p[..., :1] * q[..., 1:] + q[..., :1] * p[..., 1:]
+    return torch.cat([scalar, vector + torch.linalg.cross(p[..., 1:], q[..., 1:])], -1)
