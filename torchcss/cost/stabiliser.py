@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchcss.body.model import BodyModel
 from torchcss.cost.anthropometric import proportion_columns
 from torchcss.cost.context import FrameContext
 from torchcss.cost.term import Kind, OnStates, Term
@@ -63,13 +64,16 @@ class Stabiliser(Term):
 
     def prepare(self, context: FrameContext) -> OnStates:
         """Bind the prior to the rest values of a body."""
-        body = context.body
-        mean, deviation = body.sticky_mean, body.sticky_deviation
-        lengths = list(proportion_columns(body).values())
+        mean, deviation = context.body.sticky_mean, self.deviation(context.body)
+        return OnStates(lambda posed, _: self.local_model(posed.x, mean, deviation))
+
+    def deviation(self, body: BodyModel) -> Float[Tensor, " n"]:
+        """Standard deviations of a body's parameters; infinite where free."""
+        deviation, lengths = body.sticky_deviation, list(proportion_columns(body).values())
         if lengths and not self.lengths:
             deviation = deviation.clone()
             deviation[lengths] = math.inf
-        return OnStates(lambda posed, _: self.local_model(posed.x, mean, deviation))
+        return deviation
 
     def local_model(
         self,

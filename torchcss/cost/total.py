@@ -37,7 +37,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from jaxtyping import Float, Int
@@ -61,6 +61,18 @@ CHUNK_NODES = 65_536
 back to the system, and fetching it again costs as much as half of the arithmetic (measured)."""
 
 
+class Engine(Protocol):
+    """Another way to evaluate a cost, with the same results to a tolerance."""
+
+    def value(self, cost: TrackingCost, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+        """See `TrackingCost.value`."""
+        ...
+
+    def local_model(self, cost: TrackingCost, x: Float[Tensor, "*batch n"]) -> LocalModel:
+        """See `TrackingCost.local_model`."""
+        ...
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrackingCost:
     """The cost of one frame; a `CostFunction`.
@@ -73,6 +85,7 @@ class TrackingCost:
         component: The component of the prior that each sample descends from; None: its parent.
         sequence: The sequence of each sample (`FrameContext.sequence`); None: there is one.
         stopwatch: Where the time of the evaluations is added up by term; None: not at all.
+        engine: What evaluates it; None: the terms as they are written.
         bound: The terms bound to the views; what is not among them is bound now.
     """
 
@@ -83,6 +96,7 @@ class TrackingCost:
     component: Int[Tensor, " b"] | None = None
     sequence: Int[Tensor, " b"] | None = None
     stopwatch: Stopwatch | None = None
+    engine: Engine | None = None
     bound: Mapping[tuple[Term, FrameContext], Any] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
@@ -190,6 +204,8 @@ class TrackingCost:
 
     def value(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
         """Cost in nats, visibility and assignments found fresh at x."""
+        if self.engine is not None:
+            return self.engine.value(self, x)
         return self._evaluated(
             lambda part: {"": torch.stack(list(part.values().values())).sum(0)}, x
         )[""]
@@ -204,6 +220,8 @@ class TrackingCost:
 
     def local_model(self, x: Float[Tensor, "*batch n"]) -> LocalModel:
         """Cost, gradient and Hessian, visibility and assignments found at x and held fixed."""
+        if self.engine is not None and self.choice.curvature is not Curvature.AUTOGRAD:
+            return self.engine.local_model(self, x)
         return LocalModel(**self._evaluated(lambda part: part.local_model()._asdict(), x))
 
     @property

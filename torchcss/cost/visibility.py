@@ -51,7 +51,7 @@ _FAR = 1e6
 _GRAZING = 0.15
 """Sine of the angle by which a curve must turn through the line of sight to count fully."""
 
-_BEHIND = 3.5
+BEHIND = 3.5
 """How far behind a contour a neighbouring part suppresses it, in mean radii of that part."""
 
 _PAIRS_AT_ONCE = 2**20
@@ -209,7 +209,7 @@ class ContourPredictor(nn.Module):
         normals = (normals @ turn).flatten(-3, -2)
         exists, rays = exists.flatten(-2), points - centre_world
         # Past the others to the nodes; and past the neighbours beside them and on behind them.
-        reach = _BEHIND * body.part_shape.float()[:, :2].mean(-1)
+        reach = BEHIND * body.part_shape.float()[:, :2].mean(-1)
         visible, free = line_of_sight(
             body.part_shape,
             rotation,
@@ -345,7 +345,7 @@ def line_of_sight(
     """
     if others.numel() == 0:
         return eye.new_ones(rays.shape[:-1])
-    parts = _tabulate(shape.float(), ramp)
+    parts = tabulate_parts(shape.float(), ramp)
     views = _Views.of(rotation, eye, rays)
     if wanted is not None:  # what is not wanted ends before it begins
         wanted = wanted.reshape(views.length.shape)
@@ -407,7 +407,8 @@ class _Parts(NamedTuple):
         return Superquadrics._make(self.table.index_select(1, part).unbind(0))
 
 
-def _tabulate(shape: Float[Tensor, "parts 9"], margin: float) -> _Parts:
+def tabulate_parts(shape: Float[Tensor, "parts 9"], margin: float) -> _Parts:
+    """The shapes of all parts; outside `radius` and `around` a margin, metres, is left free."""
     axes, exponents = shape[:, :3], shape[:, 3:5].clamp(*EXPONENTS)
     e1, e2 = exponents.unbind(-1)
     rows = Superquadrics.of(shape)

@@ -55,7 +55,7 @@ from torchcss.errors import CameraError, check_shape
 from torchcss.types import PointCost
 from torchcss.vision.sampling import inside_image
 
-_GRAZING_RADIUS = 1.0e4
+GRAZING_RADIUS = 1.0e4
 """Normalised radius (0.006 degrees from the image plane) beyond which powers overflow float32."""
 
 _ORTHONORMALITY_TOLERANCE = 1.0e-4
@@ -412,7 +412,7 @@ class Camera(nn.Module):
         K, distortion = self.K.to(uv), self.distortion.to(uv)
         focal = torch.diagonal(K)[:2]
         target = (uv - K[:2, 2]) / focal
-        limit = self.maximum_radius.to(uv).clamp(max=_GRAZING_RADIUS)
+        limit = self.maximum_radius.to(uv).clamp(max=GRAZING_RADIUS)
 
         def residual_of(point: Tensor) -> tuple[Tensor, Tensor]:
             a, b = point.unbind(-1)
@@ -532,7 +532,7 @@ class Camera(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Return a, b, 1 / depth (zero, zero and one where invalid), depth and valid."""
         x, y, depth = self.to_camera_frame(points_world).unbind(-1)
-        limit = self.maximum_radius.to(depth).clamp(max=_GRAZING_RADIUS)
+        limit = self.maximum_radius.to(depth).clamp(max=GRAZING_RADIUS)
         valid = (depth > self.near) & (x * x + y * y < (limit * depth).square())
         # Both sides of the division are made harmless before it, so no derivative is NaN either.
         inverse_depth = torch.where(valid, depth, 1.0).reciprocal()

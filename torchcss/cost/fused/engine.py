@@ -1,0 +1,263 @@
+"""The fused engine: value, gradient and Hessian of a pool of states in three compiled calls.
+
+It gives what `TrackingCost` gives by its terms as they are written (the eager engine): to 1e-4 nats
+in double precision, and 1e-2 in single. Terms with a compiled twin are packed once a frame; what
+the other terms say is added. Each kernel stands in a file with the name of its twin.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchcss.cost.anthropometric import Anthropometric
+from torchcss.cost.context import FrameContext
+from torchcss.cost.contour import ContourTerm
+from torchcss.cost.flow import FlowTerm
+from torchcss.cost.fused import pack
+from torchcss.cost.fused.priors import add_priors
+from torchcss.cost.fused.records import (
+    Parts,
+    Repulsion,
+    Result,
+    Room,
+    Tree,
+    View,
+)
+from torchcss.cost.fused.repulsion import add_repulsion
+from torchcss.cost.fused.view import add_view
+from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
+from torchcss.cost.joints import JointTerm
+from torchcss.cost.region import RegionTerm
+from torchcss.cost.stabiliser import Stabiliser
+from torchcss.cost.temporal import MixturePrior, TemporalPrior
+from torchcss.cost.term import OnPoints
+from torchcss.cost.visibility import ContourPredictor
+from torchcss.types import Curvature, LocalModel
+
+if TYPE_CHECKING:
+    from torchcss.cost.total import TrackingCost
+
+_IMAGES: dict[type[Any], tuple[str, Callable[..., Any]]] = {
+    ContourTerm: ("edges", pack.pack_edges),
+    RegionTerm: ("colours", pack.pack_colours),
+    FlowTerm: ("flow", pack.pack_flow),
+    JointTerm: ("marks", pack.pack_marks),
+}
+"""Image terms that have a compiled twin: their field in `View`, and what packs them."""
+
+_PRIORS = (Stabiliser, Anthropometric, TemporalPrior, MixturePrior)
+_KEPT = 16
+"""Packed costs that are kept: those of a frame or two."""
+
+
+class _PackedView(NamedTuple):
+    tree: Tree
+    parts: Parts
+    view: View
+    room: Room
+
+
+class _PackedPrior(NamedTuple):
+    priors: tuple[Any, ...]
+    repulsion: tuple[Tree, Parts, Repulsion, Room] | None
+
+
+class FusedEngine:
+    """Evaluates costs by compiled kernels; an `Engine` of `torchcss.cost.total`.
+
+    Args:
+        dtype: Precision of the kernels; sums, priors and results are in double precision.
+    """
+
+    def __init__(self, dtype: Literal["float32", "float64"] = "float32") -> None:
+        self.real: Any = np.float32 if dtype == "float32" else np.float64
+        self._views: OrderedDict[Any, tuple[Any, _PackedView | None, frozenset[str]]] = OrderedDict()
+        self._priors: OrderedDict[Any, tuple[Any, _PackedPrior, frozenset[str]]] = OrderedDict()
+
+    def value(self, cost: TrackingCost, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+        """Cost in nats; see `TrackingCost.value`."""
+        result, others = self._evaluate(cost, x, slopes=False)
+        value = torch.from_numpy(result.value).to(x).reshape(x.shape[:-1])
+        return value if others is None else value + others.value(x)
+
+    def local_model(self, cost: TrackingCost, x: Float[Tensor, "*batch n"]) -> LocalModel:
+        """Cost, gradient and Hessian; see `TrackingCost.local_model`."""
+        result, others = self._evaluate(cost, x, slopes=True)
+        shapes = (x.shape[:-1], x.shape, (*x.shape, x.shape[-1]))
+        model = LocalModel(
+            *(torch.from_numpy(p).to(x).reshape(s) for p, s in zip(result, shapes, strict=True))
+        )
+        if others is None:
+            return model
+        rest = others.local_model(x)
+        return LocalModel(*(a + b for a, b in zip(model, rest, strict=True)))
+
+    def _evaluate(
+        self, cost: TrackingCost, x: Tensor, *, slopes: bool
+    ) -> tuple[Result, TrackingCost | None]:
+        """What the kernels give, and the cost of what they leave out; None: nothing."""
+        states = pack.array(x.reshape(-1, x.shape[-1]), np.float64)
+        size, n = states.shape
+        width = n if slopes else 0
+        result = Result(np.zeros(size), np.zeros((size, width)), np.zeros((size, width, width)))
+        parent = None if cost.parent is None else pack.array(cost.parent, np.int64)
+        sane = np.isfinite(states).all(1)
+        left_out: set[str] = set()
+        for past in cost.past:
+            items = None
+            if cost.sequence is not None:
+                items = (cost.sequence == past.sequence).numpy() & sane
+            elif not sane.all():
+                items = sane
+            views = [view for view in cost.views if view.sequence == past.sequence]
+            part = states if items is None else np.ascontiguousarray(states[items])
+            own = result if items is None else Result(*(np.zeros_like(p[items]) for p in result))
+            mode = parent if parent is None or items is None else parent[items]
+            left_out |= self._add_sequence(cost, past, views, (part, mode), own)
+            if items is not None:
+                for whole, some in zip(result, own, strict=True):
+                    whole[items] = some
+        for field in result:
+            field[~sane] = np.nan
+        if not left_out:
+            return result, None
+        return result, replace(cost, engine=None, choice=cost.choice.only(left_out))
+
+    def _add_sequence(
+        self,
+        cost: TrackingCost,
+        past: FrameContext,
+        views: Sequence[FrameContext],
+        samples: tuple[np.ndarray, np.ndarray | None],
+        result: Result,
+    ) -> set[str]:
+        """Add what the kernels know of some samples of one sequence; what they leave out."""
+        (x, parent), exact = samples, cost.choice.curvature is not Curvature.GAUSS_NEWTON
+        prior, left_out = self._prior(cost, past)
+        left_out = set(left_out)
+        tails, _, _ = prior.priors
+        add_priors(x, _rows(parent, tails.centre.shape[1], len(x)), *prior.priors, result)
+        if prior.repulsion is not None:
+            add_repulsion(x, *prior.repulsion[:3], exact, prior.repulsion[3], result)
+        for context in views:
+            packed, others = self._view(cost, past, context)
+            left_out |= others
+            if packed is not None:
+                modes = len(packed.view.flow.target)
+                add_view(x, _rows(parent, modes, len(x)), *packed, result)
+        return left_out
+
+    def _prior(self, cost: TrackingCost, past: FrameContext) -> tuple[_PackedPrior, frozenset[str]]:
+        key = (id(cost.choice), id(past))
+        if key not in self._priors:
+            self._priors[key] = ((cost.choice, past), *self._pack_prior(cost, past))
+            if len(self._priors) > _KEPT:
+                self._priors.popitem(last=False)
+        return self._priors[key][1:]
+
+    def _pack_prior(
+        self, cost: TrackingCost, past: FrameContext
+    ) -> tuple[_PackedPrior, frozenset[str]]:
+        priors, others, repulsion = [], set(), None
+        for term in cost.choice.terms:
+            if term.kind != "prior" or cost.bound[term, past] is None:
+                continue
+            weight = cost.choice.weight(term.name)
+            if type(term) in _PRIORS:
+                priors.append((term, weight))
+            elif type(term) is Interpenetration:
+                if weight * past.tables.of(InterpenetrationPairs).num_pairs:
+                    repulsion = self._pack_repulsion(term, weight, past)
+            else:
+                others.add(term.name)
+        return _PackedPrior(pack.pack_priors(priors, past), repulsion), frozenset(others)
+
+    def _pack_repulsion(
+        self, term: Interpenetration, weight: float, past: FrameContext
+    ) -> tuple[Tree, Parts, Repulsion, Room]:
+        tree, real = pack.pack_tree(past.body, past.camera), self.real
+        parts = pack.pack_parts(past.body, None, real)
+        repulsion = pack.pack_repulsion(
+            term, past.tables.of(InterpenetrationPairs), weight, real
+        )
+        curves = pack.pack_curves(None, len(parts.row), real)
+        interior, chain = repulsion.nodes.shape[2], repulsion.chain.shape[1]
+        return tree, parts, repulsion, pack.make_room(tree, curves, interior, chain, (5, real))
+
+    def _view(
+        self, cost: TrackingCost, past: FrameContext, context: FrameContext
+    ) -> tuple[_PackedView | None, frozenset[str]]:
+        key = (id(cost.choice), id(past.body), id(context))
+        if key not in self._views:
+            keep = (cost.choice, past.body, context)
+            self._views[key] = (keep, *self._pack_view(cost, past, context))
+            if len(self._views) > _KEPT:
+                self._views.popitem(last=False)
+        return self._views[key][1:]
+
+    def _pack_view(
+        self, cost: TrackingCost, past: FrameContext, context: FrameContext
+    ) -> tuple[_PackedView | None, frozenset[str]]:
+        body, real, camera = past.body, self.real, context.camera
+        made: dict[str, Any] = {}
+        others: set[str] = set()
+        for term in cost.choice.terms:
+            if term.kind != "image" or (bound := cost.bound[term, context]) is None:
+                continue
+            record, kind = None, type(term)
+            if kind in _IMAGES and isinstance(bound, OnPoints) and bound.camera is None:
+                weight = cost.choice.weight(term.name)
+                record = _IMAGES[kind][1](term, bound, weight, context, real)
+            if record is None:
+                others.add(term.name)
+            else:
+                made[_IMAGES[kind][0]] = record
+        predictor = None
+        if "edges" in made or "colours" in made:
+            predictor = context.tables.of(ContourPredictor)
+        if not made:
+            return None, frozenset(others)
+        tree, parts = pack.pack_tree(body, camera), pack.pack_parts(body, predictor, real)
+        num = len(parts.row)
+        edges = made.get("edges", pack.no_edges(real))
+        colours = made.get("colours", pack.no_colours(num, real))
+        # What is the same for all modes is there once for each that the flow knows, or the reverse.
+        flow, marks = made.get("flow", pack.no_flow(num, real)), made.get("marks", pack.no_marks(real))
+        modes = max(len(flow.target), len(marks.target))
+        flow, marks = (
+            record._replace(target=np.repeat(record.target, modes, 0))
+            if len(record.target) < modes
+            else record
+            for record in (flow, marks)
+        )
+        nothing = edges.scale * edges.back_facing + colours.scale * colours.back_facing
+        view = View(
+            lens=pack.pack_lens(camera, real),
+            curves=pack.pack_curves(predictor, num, real),
+            edges=edges,
+            colours=colours,
+            flow=flow,
+            marks=marks,
+            nothing=float(nothing) * (0 if predictor is None else predictor.num_nodes),
+            exact=cost.choice.curvature is not Curvature.GAUSS_NEWTON,
+        )
+        interior = num * view.flow.nodes.shape[2]
+        room = pack.make_room(tree, view.curves, interior, 1, (len(edges.steps), real))
+        return _PackedView(tree, parts, view, room), frozenset(others)
+
+
+def _rows(parent: np.ndarray | None, modes: int, size: int) -> np.ndarray:
+    """The mode that each sample is compared with, where there are several."""
+    if parent is None or modes == 1:
+        return np.zeros(size, np.int64)
+    if len(parent) and not 0 <= parent.min() <= parent.max() < modes:
+        raise IndexError(f"parent: expected modes 0 to {modes - 1}, got {parent.max()}")
+    return parent

@@ -1,0 +1,34 @@
+"""Joint centres against keypoints; the twin of `torchcss.cost.joints`."""
+
+from __future__ import annotations
+
+from torchcss.cost.fused.compiler import kernel
+from torchcss.cost.fused.potentials import potential_of, robust_slope
+from torchcss.cost.fused.projection import project, pull_back, times, write_point
+from torchcss.cost.fused.records import Array, Lens, Marks, Points
+
+_FAR_PX = 1e8
+
+
+@kernel
+def compare_joints(
+    frames: Array, lens: Lens, marks: Marks, mode: int, exact: bool, points: Points
+) -> float:
+    """Cost of all keypoints; there is a point for each, with its cost's derivatives."""
+    total, target = 0.0, marks.target[mode]
+    for i in range(len(marks.row)):
+        frame, place = frames[marks.row[i]], marks.place[i]
+        points.x[i] = frame[0, 0] * place[0] + frame[0, 1] * place[1] + frame[0, 2] * place[2] + frame[0, 3]
+        points.y[i] = frame[1, 0] * place[0] + frame[1, 1] * place[1] + frame[1, 2] * place[2] + frame[1, 3]
+        points.z[i] = frame[2, 0] * place[0] + frame[2, 1] * place[1] + frame[2, 2] * place[2] + frame[2, 3]
+        x, y, z = points.x[i], points.y[i], points.z[i]
+        pixel = project(lens, x, y, z)
+        weight = target[2, i]
+        du = min(max(pixel.u - target[0, i], -_FAR_PX), _FAR_PX)
+        dv = min(max(pixel.v - target[1, i], -_FAR_PX), _FAR_PX)
+        rho, slope = robust_slope(marks.potential, weight, du, dv)
+        if not pixel.valid:
+            rho, _, _ = potential_of(marks.potential, weight * marks.far)
+        total += 0.5 * marks.scale * rho
+        write_point(points, i, (x, y, z), pull_back(lens, pixel, times(marks.scale, slope), exact))
+    return total
