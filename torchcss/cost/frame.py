@@ -23,7 +23,7 @@ from torchcss.cost.choice import CostChoice
 from torchcss.cost.context import BodyTables, FrameContext
 from torchcss.cost.part_map import bare_pixels
 from torchcss.cost.region import part_layers, region_masks
-from torchcss.cost.total import TrackingCost
+from torchcss.cost.total import Engine, TrackingCost
 from torchcss.stopwatch import Stopwatch
 from torchcss.types import Keypoints
 from torchcss.vision.appearance import Appearance
@@ -41,6 +41,7 @@ class FrameCosts:
         choice: Terms and weights.
         frame_interval: Seconds between frames, which scales the expected motion; 0: not known.
         boundary_emphasis: Weight of motion boundaries, see `FrameFeatures.edge_field`.
+        engine: What evaluates the costs; None: the terms as they are written.
 
     Attributes:
         camera: Camera of the features, in the body's type and on its device.
@@ -56,11 +57,13 @@ class FrameCosts:
         *,
         frame_interval: float = 0.0,
         boundary_emphasis: float = 0.0,
+        engine: Engine | None = None,
     ) -> None:
         self.camera = camera.to(dtype=body.dtype, device=body.tie.device)
         self.choice = choice
         self.deviation = body.motion_rate * frame_interval if frame_interval else None
         self.boundary_emphasis = boundary_emphasis
+        self.engine = engine
         self.tables = BodyTables(body)
         self.num_layers = len(part_layers(body)[0])
 
@@ -100,7 +103,9 @@ class FrameCosts:
             modes=None if before is None else before.reshape(-1, before.shape[-1]),
             deviation=self.deviation,
         )
-        return TrackingCost(choice=self.choice, views=(context,), stopwatch=stopwatch)
+        return TrackingCost(
+            choice=self.choice, views=(context,), stopwatch=stopwatch, engine=self.engine
+        )
 
     def learn(
         self,

@@ -27,6 +27,7 @@ from torchcss.cost.joints import JointTerm
 from torchcss.cost.region import RegionTerm
 from torchcss.cost.segmentation import SegmentationTerm
 from torchcss.cost.stabiliser import Stabiliser
+from torchcss.cost.total import Engine
 from torchcss.errors import ConfigurationError
 from torchcss.inference.tracker import SequenceTracker, Tracker
 from torchcss.robust import Lorentzian, Quadratic
@@ -127,6 +128,9 @@ class Settings:
         seed: Seed of all random numbers; the same seed gives the same track.
         device: Where to compute.
         dtype: "float64" or "float32".
+        engine: "fused": compiled kernels evaluate the cost, on a CPU where numba is installed;
+            "eager": the terms as they are written, as everywhere else.
+        engine_dtype: Precision of the kernels; sums are in double precision.
         overlay: Write `overlay.mp4`.
         recovery: Tell from the costs when the track is lost, and search more widely then.
     """
@@ -149,6 +153,8 @@ class Settings:
     seed: int = 0
     device: str = "cpu"
     dtype: Literal["float64", "float32"] = "float64"
+    engine: Literal["fused", "eager"] = "eager"
+    engine_dtype: Literal["float32", "float64"] = "float32"
     overlay: bool = True
     recovery: bool = True
 
@@ -353,6 +359,16 @@ def make_settings_tracker(
     return replace(tracker, oversampling=settings.oversampling)
 
 
+def make_engine(settings: Settings) -> Engine | None:
+    """What evaluates the cost; None: the terms as they are written."""
+    if settings.engine == "eager" or torch.device(settings.device).type != "cpu":
+        return None
+    # Importing the kernels takes a third of a second.
+    from torchcss.cost.fused.engine import fused_engine
+
+    return fused_engine(settings.engine_dtype)
+
+
 class Plan(NamedTuple):
     """What settings mean for a body before a camera: the parts of a session.
 
@@ -369,6 +385,7 @@ class Plan(NamedTuple):
         surface_prediction: Whether the pictures tell where each mode's trunk is expected.
         frame_interval: Seconds between frames.
         noise: Noise of a wrist's keypoint that the cost is told, pixels of those features.
+        engine: What evaluates the cost; None: the terms as they are written.
     """
 
     extractor: FeatureExtractor
@@ -383,6 +400,7 @@ class Plan(NamedTuple):
     surface_prediction: bool
     frame_interval: float
     noise: float
+    engine: Engine | None
 
     def observer(self, body: BodyModel, view: CameraView) -> Observer:
         """One camera's part of the loop.
@@ -397,6 +415,7 @@ class Plan(NamedTuple):
             self.choice,
             frame_interval=self.frame_interval,
             boundary_emphasis=self.boundary_emphasis,
+            engine=self.engine,
         )
         return Observer(
             view=view,
@@ -431,6 +450,7 @@ def make_plan(settings: Settings, body: BodyModel, view: CameraView, frame_inter
         surface_prediction=settings.prediction == "surface",
         frame_interval=frame_interval,
         noise=noise,
+        engine=make_engine(settings),
     )
 
 

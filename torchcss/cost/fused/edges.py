@@ -41,9 +41,7 @@ def match_edges(
 
 
 @kernel
-def _respond(
-    edges: Edges, u: float, v: float, mu: float, mv: float, response: Array
-) -> None:
+def _respond(edges: Edges, u: float, v: float, mu: float, mv: float, response: Array) -> None:
     """The edge response `|G . m|` at the samples of a line; zero outside the image."""
     field, right, bottom = edges.field, edges.corner[0], edges.corner[1]
     for k in range(len(edges.steps)):

@@ -7,9 +7,12 @@ the other terms say is added. Each kernel stands in a file with the name of its 
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Callable, Sequence
+import warnings
+from collections import OrderedDict, deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
@@ -21,9 +24,12 @@ from torchcss.cost.anthropometric import Anthropometric
 from torchcss.cost.context import FrameContext
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.flow import FlowTerm
-from torchcss.cost.fused import pack
+from torchcss.cost.fused import compiler, pack
 from torchcss.cost.fused.priors import add_priors
 from torchcss.cost.fused.records import (
+    Gaussian,
+    LongTails,
+    Mixture,
     Parts,
     Repulsion,
     Result,
@@ -62,12 +68,46 @@ class _PackedView(NamedTuple):
     tree: Tree
     parts: Parts
     view: View
-    room: Room
+    rooms: Rooms
 
 
 class _PackedPrior(NamedTuple):
-    priors: tuple[Any, ...]
-    repulsion: tuple[Tree, Parts, Repulsion, Room] | None
+    priors: tuple[LongTails, Gaussian, Mixture]
+    repulsion: tuple[Tree, Parts, Repulsion, Rooms] | None
+
+
+class Rooms:
+    """Memory for the kernels, one for each thread that needs it at a time.
+
+    Args:
+        make: Makes one.
+    """
+
+    def __init__(self, make: Callable[[], Room]) -> None:
+        self._make, self._idle = make, deque[Room]()
+
+    @contextmanager
+    def lent(self) -> Iterator[Room]:
+        """A room that nobody else has."""
+        try:
+            room = self._idle.pop()
+        except IndexError:
+            room = self._make()
+        yield room
+        self._idle.append(room)
+
+
+@cache
+def fused_engine(dtype: Literal["float32", "float64"]) -> FusedEngine | None:
+    """The engine of a precision; None, with a warning, where numba cannot be imported."""
+    if compiler.AVAILABLE:
+        return FusedEngine(dtype)
+    warnings.warn(
+        "numba is not installed, so that costs are evaluated ten times more slowly; "
+        "install it with: pip install numba",
+        stacklevel=2,
+    )
+    return None
 
 
 class FusedEngine:
@@ -79,7 +119,9 @@ class FusedEngine:
 
     def __init__(self, dtype: Literal["float32", "float64"] = "float32") -> None:
         self.real: Any = np.float32 if dtype == "float32" else np.float64
-        self._views: OrderedDict[Any, tuple[Any, _PackedView | None, frozenset[str]]] = OrderedDict()
+        self._views: OrderedDict[Any, tuple[Any, _PackedView | None, frozenset[str]]] = (
+            OrderedDict()
+        )
         self._priors: OrderedDict[Any, tuple[Any, _PackedPrior, frozenset[str]]] = OrderedDict()
 
     def value(self, cost: TrackingCost, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
@@ -146,13 +188,16 @@ class FusedEngine:
         tails, _, _ = prior.priors
         add_priors(x, _rows(parent, tails.centre.shape[1], len(x)), *prior.priors, result)
         if prior.repulsion is not None:
-            add_repulsion(x, *prior.repulsion[:3], exact, prior.repulsion[3], result)
+            tree, parts, repulsion, rooms = prior.repulsion
+            with rooms.lent() as room:
+                add_repulsion(x, tree, parts, repulsion, exact, room, result)
         for context in views:
             packed, others = self._view(cost, past, context)
             left_out |= others
             if packed is not None:
                 modes = len(packed.view.flow.target)
-                add_view(x, _rows(parent, modes, len(x)), *packed, result)
+                with packed.rooms.lent() as room:
+                    add_view(x, _rows(parent, modes, len(x)), *packed[:3], room, result)
         return left_out
 
     def _prior(self, cost: TrackingCost, past: FrameContext) -> tuple[_PackedPrior, frozenset[str]]:
@@ -182,15 +227,14 @@ class FusedEngine:
 
     def _pack_repulsion(
         self, term: Interpenetration, weight: float, past: FrameContext
-    ) -> tuple[Tree, Parts, Repulsion, Room]:
+    ) -> tuple[Tree, Parts, Repulsion, Rooms]:
         tree, real = pack.pack_tree(past.body, past.camera), self.real
         parts = pack.pack_parts(past.body, None, real)
-        repulsion = pack.pack_repulsion(
-            term, past.tables.of(InterpenetrationPairs), weight, real
-        )
+        repulsion = pack.pack_repulsion(term, past.tables.of(InterpenetrationPairs), weight, real)
         curves = pack.pack_curves(None, len(parts.row), real)
         interior, chain = repulsion.nodes.shape[2], repulsion.chain.shape[1]
-        return tree, parts, repulsion, pack.make_room(tree, curves, interior, chain, (5, real))
+        rooms = Rooms(partial(pack.make_room, tree, curves, interior, chain, (5, real)))
+        return tree, parts, repulsion, rooms
 
     def _view(
         self, cost: TrackingCost, past: FrameContext, context: FrameContext
@@ -230,7 +274,10 @@ class FusedEngine:
         edges = made.get("edges", pack.no_edges(real))
         colours = made.get("colours", pack.no_colours(num, real))
         # What is the same for all modes is there once for each that the flow knows, or the reverse.
-        flow, marks = made.get("flow", pack.no_flow(num, real)), made.get("marks", pack.no_marks(real))
+        flow, marks = (
+            made.get("flow", pack.no_flow(num, real)),
+            made.get("marks", pack.no_marks(real)),
+        )
         modes = max(len(flow.target), len(marks.target))
         flow, marks = (
             record._replace(target=np.repeat(record.target, modes, 0))
@@ -250,8 +297,8 @@ class FusedEngine:
             exact=cost.choice.curvature is not Curvature.GAUSS_NEWTON,
         )
         interior = num * view.flow.nodes.shape[2]
-        room = pack.make_room(tree, view.curves, interior, 1, (len(edges.steps), real))
-        return _PackedView(tree, parts, view, room), frozenset(others)
+        make = partial(pack.make_room, tree, view.curves, interior, 1, (len(edges.steps), real))
+        return _PackedView(tree, parts, view, Rooms(make)), frozenset(others)
 
 
 def _rows(parent: np.ndarray | None, modes: int, size: int) -> np.ndarray:

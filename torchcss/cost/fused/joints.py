@@ -18,9 +18,15 @@ def compare_joints(
     total, target = 0.0, marks.target[mode]
     for i in range(len(marks.row)):
         frame, place = frames[marks.row[i]], marks.place[i]
-        points.x[i] = frame[0, 0] * place[0] + frame[0, 1] * place[1] + frame[0, 2] * place[2] + frame[0, 3]
-        points.y[i] = frame[1, 0] * place[0] + frame[1, 1] * place[1] + frame[1, 2] * place[2] + frame[1, 3]
-        points.z[i] = frame[2, 0] * place[0] + frame[2, 1] * place[1] + frame[2, 2] * place[2] + frame[2, 3]
+        points.x[i] = (
+            frame[0, 0] * place[0] + frame[0, 1] * place[1] + frame[0, 2] * place[2] + frame[0, 3]
+        )
+        points.y[i] = (
+            frame[1, 0] * place[0] + frame[1, 1] * place[1] + frame[1, 2] * place[2] + frame[1, 3]
+        )
+        points.z[i] = (
+            frame[2, 0] * place[0] + frame[2, 1] * place[1] + frame[2, 2] * place[2] + frame[2, 3]
+        )
         x, y, z = points.x[i], points.y[i], points.z[i]
         pixel = project(lens, x, y, z)
         weight = target[2, i]

@@ -1,4 +1,4 @@
-"""From derivatives at points to gradient and Hessian in the state; the twin of `torchcss.body.lift`.
+"""From derivatives at points to those in the state; the twin of `torchcss.body.lift`.
 
 Sums over the points that a joint carries, 33 numbers for each: stiffness K of the point's velocity
 (S), its moments (M = sum [p]x A, K = sum [p]x A [p]x^T), P = sum p g^T and f = sum g. They are

@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from torchcss.body.model import BodyModel
-from torchcss.body.superquadric import Superquadrics
 from torchcss.cost.anthropometric import Anthropometric, proportion_columns
 from torchcss.cost.context import FrameContext
 from torchcss.cost.contour import ContourTerm
@@ -42,8 +41,8 @@ from torchcss.cost.fused.records import (
     Room,
     Tree,
 )
-from torchcss.cost.interpenetration import END, Interpenetration, InterpenetrationPairs
 from torchcss.cost.interior import InteriorNodes
+from torchcss.cost.interpenetration import END, Interpenetration, InterpenetrationPairs
 from torchcss.cost.joints import OUTLIER_LENGTHS, JointTerm
 from torchcss.cost.region import RegionTerm
 from torchcss.cost.stabiliser import Stabiliser
@@ -53,7 +52,8 @@ from torchcss.cost.visibility import BEHIND, ContourPredictor, tabulate_parts
 from torchcss.robust import RobustPotential
 from torchcss.vision.camera import GRAZING_RADIUS, Camera
 
-Real = type[np.floating]
+Real = Any
+"""`np.float32` or `np.float64`."""
 
 
 def array(tensor: Tensor, real: Real) -> Array:
@@ -88,7 +88,7 @@ def pack_tree(body: BodyModel, camera: Camera) -> Tree:
 
 
 def _carried(body: BodyModel, link: Tensor, own: Tensor) -> tuple[Array, Array]:
-    """Rows of the frames that carry some links, and what is fixed in those links in these frames."""
+    """Rows of the frames that carry some links, and what is fixed in the links in these frames."""
     tree = body.tree
     place = tree.link_place[link]
     row = torch.where(place > 0, 1 + tree.joint_order[(place - 1).clamp(min=0)], 0)
@@ -155,7 +155,9 @@ def pack_potential(potential: RobustPotential, real: Real) -> Potential | None:
     return Potential(kind, real(potential.nu), real(potential.sigma**2))
 
 
-NO_POTENTIAL = {real: Potential(0, real(1), real(1)) for real in (np.float32, np.float64)}
+def no_potential(real: Real) -> Potential:
+    """What stands where nothing is compared."""
+    return Potential(0, real(1), real(1))
 
 
 def pack_edges(
@@ -186,7 +188,8 @@ def no_edges(real: Real) -> Edges:
     """Without the contour term."""
     zero = real(0)
     steps, field = np.zeros(5, real), np.zeros((2, 2, 2), real)
-    return Edges(zero, field, np.ones(2, real), steps, *(zero,) * 5, NO_POTENTIAL[real])
+    corner, potential = np.ones(2, real), no_potential(real)
+    return Edges(zero, field, corner, steps, zero, zero, zero, zero, zero, potential)
 
 
 def pack_colours(
@@ -201,7 +204,7 @@ def pack_colours(
         scale=real(weight * bound.scale),
         field=array(coefficients, real),
         corner=np.array([width - 6.5, height - 6.5], real),
-        layer=layer.cpu().numpy(),
+        layer=np.ascontiguousarray(layer.cpu().numpy()),
         offset=real(term.offset),
         nu=real(term.nu),
         back_facing=real(back_facing),
@@ -240,7 +243,8 @@ def pack_flow(
 def no_flow(num_parts: int, real: Real) -> Flow:
     """Without the flow term."""
     nodes, target = np.zeros((num_parts, 6, 0), real), np.zeros((1, 3, num_parts, 0), real)
-    return Flow(real(0), nodes, target, *(real(0),) * 3, NO_POTENTIAL[real])
+    zero, potential = real(0), no_potential(real)
+    return Flow(zero, nodes, target, zero, zero, zero, potential)
 
 
 def pack_marks(
@@ -268,7 +272,7 @@ def pack_marks(
 def no_marks(real: Real) -> Marks:
     """Without keypoints."""
     row, place = np.zeros(0, np.int64), np.zeros((0, 3))
-    return Marks(real(0), row, place, np.zeros((1, 3, 0), real), real(0), NO_POTENTIAL[real])
+    return Marks(real(0), row, place, np.zeros((1, 3, 0), real), real(0), no_potential(real))
 
 
 def pack_repulsion(
@@ -358,7 +362,8 @@ def pack_priors(
             mean = array(body.sticky_mean[None], np.float64)
             tails.append((weight, term.nu, mean, _sharpness(term.deviation(body))))
         elif isinstance(term, TemporalPrior):
-            assert context.prior is not None and context.deviation is not None
+            assert context.prior is not None
+            assert context.deviation is not None
             mean = array(context.prior.mean, np.float64)
             tails.append((weight, term.nu, mean, _sharpness(context.deviation)))
         elif isinstance(term, Anthropometric):
@@ -366,7 +371,9 @@ def pack_priors(
             mean = body.sticky_mean
             precision = term.local_model(mean, body).hessian[columns][:, columns]
             gaussian = Gaussian(
-                np.array(columns), array(mean[columns], np.float64), weight * array(precision, np.float64)
+                np.array(columns),
+                array(mean[columns], np.float64),
+                weight * array(precision, np.float64),
             )
         elif isinstance(term, MixturePrior):
             assert context.prior is not None

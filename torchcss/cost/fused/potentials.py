@@ -27,9 +27,7 @@ def potential_of(potential: Potential, s: float) -> tuple[float, float, float]:
 
 
 @inlined
-def robust_slope(
-    potential: Potential, weight: float, du: float, dv: float
-) -> tuple[float, Slope]:
+def robust_slope(potential: Potential, weight: float, du: float, dv: float) -> tuple[float, Slope]:
     """The potential of an error in the image, and the derivatives of half of it."""
     rho, first, second = potential_of(potential, weight * (du * du + dv * dv))
     stiffness, bend = weight * first, 2.0 * weight * weight * second

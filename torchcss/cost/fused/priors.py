@@ -1,4 +1,7 @@
-"""Priors on the state, in double precision: `stabiliser`, `anthropometric` and `temporal`'s twins."""
+"""Priors on the state, in double precision.
+
+Twins of `torchcss.cost.stabiliser`, `anthropometric` and `temporal`.
+"""
 
 from __future__ import annotations
 
@@ -60,9 +63,7 @@ def _long_tails(x: Array, mode: int, tails: LongTails, gradient: Array, hessian:
 
 
 @kernel
-def _gaussian(
-    x: Array, gaussian: Gaussian, pull: Array, gradient: Array, hessian: Array
-) -> float:
+def _gaussian(x: Array, gaussian: Gaussian, pull: Array, gradient: Array, hessian: Array) -> float:
     """A Gaussian prior of some parameters."""
     total, columns = 0.0, gaussian.columns
     for i in range(len(columns)):

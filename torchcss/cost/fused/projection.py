@@ -137,9 +137,7 @@ def pull_back(lens: Lens, pixel: Pixel, slope: Slope, exact: bool) -> Spatial:
     if exact:
         x, y, zz = x + fa, y + fb, zz + 2.0 * z
     ww = w * w
-    return Spatial(
-        w * fa, w * fb, -w * z, ww * faa, ww * fab, -ww * x, ww * fbb, -ww * y, ww * zz
-    )
+    return Spatial(w * fa, w * fb, -w * z, ww * faa, ww * fab, -ww * x, ww * fbb, -ww * y, ww * zz)
 
 
 @inlined
@@ -155,9 +153,7 @@ def times(factor: float, slope: Slope) -> Slope:
 
 
 @inlined
-def write_point(
-    points: Points, i: int, place: tuple[float, float, float], cost: Spatial
-) -> None:
+def write_point(points: Points, i: int, place: tuple[float, float, float], cost: Spatial) -> None:
     """Write a point and its cost's derivatives."""
     points.x[i], points.y[i], points.z[i] = place
     points.gx[i], points.gy[i], points.gz[i] = cost.x, cost.y, cost.z

@@ -6,12 +6,12 @@ precision. All positions are in the camera's frame, metres, so that no point is 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-Array = np.ndarray
-Real = np.floating
+Array = np.ndarray[Any, Any]
+Real = float
 
 
 class Tree(NamedTuple):

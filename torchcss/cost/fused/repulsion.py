@@ -48,7 +48,9 @@ def add_repulsion(
         for one in range(len(room.posed)):
             for other in range(len(room.posed)):
                 pair = repulsion.pair[one, other]
-                if pair < 0 or not _overlap(room.posed[one], room.posed[other], repulsion, (one, other)):
+                if pair < 0 or not _overlap(
+                    room.posed[one], room.posed[other], repulsion, (one, other)
+                ):
                     continue
                 cost, count = _push(repulsion, room.posed, (one, other), slopes, room.points)
                 result.value[b] += cost
@@ -88,7 +90,12 @@ def _push(
     repulsion: Repulsion, posed: Array, pair: tuple[int, int], slopes: bool, points: Points
 ) -> tuple[float, int]:
     """Cost of the nodes of a pair; those that feel it become points with its derivatives."""
-    a, b, nodes, outer = posed[pair[0]], posed[pair[1]], repulsion.nodes[pair[0]], repulsion.outer[pair[1]]
+    a, b, nodes, outer = (
+        posed[pair[0]],
+        posed[pair[1]],
+        repulsion.nodes[pair[0]],
+        repulsion.outer[pair[1]],
+    )
     total, count = 0.0, 0
     for n in range(nodes.shape[1]):
         x, y, z = nodes[0, n], nodes[1, n], nodes[2, n]

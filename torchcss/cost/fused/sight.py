@@ -139,9 +139,7 @@ def _meet(
 
 
 @kernel
-def _stretch(
-    near: Lines, met: int, frame: Array, parts: Parts, hider: int, behind: float
-) -> None:
+def _stretch(near: Lines, met: int, frame: Array, parts: Parts, hider: int, behind: float) -> None:
     """Put rays into the frame of a part, and find the stretches that may be inside."""
     cx, cy, cz = frame[0, 3], frame[1, 3], frame[2, 3]
     r00, r10, r20 = frame[0, 0], frame[1, 0], frame[2, 0]

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-
 from torchcss.cost.fused.compiler import floor, inlined
 from torchcss.cost.fused.records import Array
 
@@ -34,9 +32,7 @@ class Basis(NamedTuple):
 
 
 @inlined
-def sample_spline(
-    field: Array, corner: Array, layer: int, place: tuple[float, float]
-) -> Sample:
+def sample_spline(field: Array, corner: Array, layer: int, place: tuple[float, float]) -> Sample:
     """Evaluate a layer and its derivatives.
 
     Args:
@@ -48,7 +44,7 @@ def sample_spline(
     u, v = place
     x, y = min(max(u, _LEAST), corner[0]), min(max(v, _LEAST), corner[1])
     left, top = floor(x), floor(y)
-    column, row = np.int32(left) + (_MARGIN - 1), np.int32(top) + (_MARGIN - 1)
+    column, row = int(left) + (_MARGIN - 1), int(top) + (_MARGIN - 1)
     bu, su, cu = _basis(x - left)
     bv, sv, cv = _basis(y - top)
     fa, ga, ha = _row(field, layer, row, column, (bu, su, cu))

@@ -88,9 +88,7 @@ def _bounded_square(x: float) -> float:
 
 
 @inlined
-def radial_square(
-    shape: Shape, x: float, y: float, z: float
-) -> tuple[float, float, float, float]:
+def radial_square(shape: Shape, x: float, y: float, z: float) -> tuple[float, float, float, float]:
     """`R^2` at a point of a straight part, and half its gradient there."""
     w = z * shape.ic
     ix, iy = narrowed(shape, w)
