@@ -27,6 +27,7 @@ from torchcss.cost.flow import FlowTerm
 from torchcss.cost.fused import compiler, pack
 from torchcss.cost.fused.priors import add_priors
 from torchcss.cost.fused.records import (
+    Array,
     Gaussian,
     LongTails,
     Mixture,
@@ -74,6 +75,12 @@ class _PackedView(NamedTuple):
 class _PackedPrior(NamedTuple):
     priors: tuple[LongTails, Gaussian, Mixture]
     repulsion: tuple[Tree, Parts, Repulsion, Rooms] | None
+
+
+class _Samples(NamedTuple):
+    x: Array
+    parent: Array | None
+    component: Array | None
 
 
 class Rooms:
@@ -150,7 +157,11 @@ class FusedEngine:
         size, n = states.shape
         width = n if slopes else 0
         result = Result(np.zeros(size), np.zeros((size, width)), np.zeros((size, width, width)))
-        parent = None if cost.parent is None else pack.array(cost.parent, np.int64)
+        parent, component = (
+            None if index is None else pack.array(index, np.int64)
+            for index in (cost.parent, cost.component)
+        )
+        component = parent if component is None else component
         sane = np.isfinite(states).all(1)
         left_out: set[str] = set()
         for past in cost.past:
@@ -162,8 +173,8 @@ class FusedEngine:
             views = [view for view in cost.views if view.sequence == past.sequence]
             part = states if items is None else np.ascontiguousarray(states[items])
             own = result if items is None else Result(*(np.zeros_like(p[items]) for p in result))
-            mode = parent if parent is None or items is None else parent[items]
-            left_out |= self._add_sequence(cost, past, views, (part, mode), own)
+            of = [i if i is None or items is None else i[items] for i in (parent, component)]
+            left_out |= self._add_sequence(cost, past, views, _Samples(part, *of), own)
             if items is not None:
                 for whole, some in zip(result, own, strict=True):
                     whole[items] = some
@@ -178,15 +189,15 @@ class FusedEngine:
         cost: TrackingCost,
         past: FrameContext,
         views: Sequence[FrameContext],
-        samples: tuple[np.ndarray, np.ndarray | None],
+        samples: _Samples,
         result: Result,
     ) -> set[str]:
         """Add what the kernels know of some samples of one sequence; what they leave out."""
-        (x, parent), exact = samples, cost.choice.curvature is not Curvature.GAUSS_NEWTON
+        (x, parent, component), exact = samples, cost.choice.curvature is not Curvature.GAUSS_NEWTON
         prior, left_out = self._prior(cost, past)
         left_out = set(left_out)
         tails, _, _ = prior.priors
-        add_priors(x, _rows(parent, tails.centre.shape[1], len(x)), *prior.priors, result)
+        add_priors(x, _rows(component, tails.centre.shape[1], len(x)), *prior.priors, result)
         if prior.repulsion is not None:
             tree, parts, repulsion, rooms = prior.repulsion
             with rooms.lent() as room:
@@ -301,7 +312,7 @@ class FusedEngine:
         return _PackedView(tree, parts, view, Rooms(make)), frozenset(others)
 
 
-def _rows(parent: np.ndarray | None, modes: int, size: int) -> np.ndarray:
+def _rows(parent: Array | None, modes: int, size: int) -> Array:
     """The mode that each sample is compared with, where there are several."""
     if parent is None or modes == 1:
         return np.zeros(size, np.int64)

@@ -116,7 +116,7 @@ def pack_parts(body: BodyModel, predictor: ContourPredictor | None, real: Real) 
         radius=array(table.radius, real),
         around=array(table.around, real),
         within=array(table.within, real),
-        behind=array(BEHIND * table.thickness, real),
+        behind=array(BEHIND * body.part_shape[:, :2].mean(-1), real),
         plain=table.plain.cpu().numpy(),
         touching=touching,
         ramp=real(ramp),
