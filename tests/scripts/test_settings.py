@@ -27,8 +27,8 @@ CHANGED: dict[str, Any] = {
     "keypoints_use": "first", "terms": ("contour", "region", "segmentation"),
     "curvature": "gauss-newton", "working_size": 160, "contour_weight": 120.0,
     "weights": {"region": 0.5}, "boundary_emphasis": 0.2, "seed": 3, "device": "cpu:0",
-    "dtype": "float32", "engine": "fused", "engine_dtype": "float64", "overlay": False,
-    "recovery": False,
+    "dtype": "float32", "engine": "fused", "engine_dtype": "float64", "threads": 2,
+    "overlay": False, "recovery": False,
 }  # fmt: skip
 """Another value than the default for every setting."""
 

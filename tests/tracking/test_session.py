@@ -24,7 +24,7 @@ from torchcss.cost.joints import JointTerm
 from torchcss.cost.segmentation import SegmentationTerm
 from torchcss.cost.silhouette import SilhouetteTerm
 from torchcss.cost.temporal import MixturePrior, TemporalPrior
-from torchcss.errors import ConfigurationError, OutputError, VideoError
+from torchcss.errors import ConfigurationError, OutputError, TorchcssError, VideoError
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.tracker import Tracker, TrackerState
 from torchcss.initialise.result import Initialisation
@@ -506,6 +506,32 @@ def test_the_next_frame_may_be_seen_while_this_one_is_searched():
     features = observation.views[0].features
     assert features is not None
     assert features.window is not None, "an arm does not fill the picture"
+
+
+@pytest.mark.parametrize("num_frames", [0, 1, 4])
+def test_two_threads_give_the_same_bits(num_frames: int):
+    sequence = arm_sequence(generator=torch.Generator().manual_seed(0), num_frames=4)
+    settings = Settings(body="arm8", working_size=160, samples=4, modes=2)
+    view, frames = seen_by(sequence.camera), sequence.frames[:num_frames]
+    tracks = [
+        list(session_at(each, sequence.body, sequence.states[0], view).track(frames))
+        for each in (settings, replace(settings, threads=2))
+    ]
+    assert [len(track) for track in tracks] == [num_frames] * 2
+    for one, two in zip(*tracks, strict=True):
+        for part, same in zip(one.state.mixture, two.state.mixture, strict=True):
+            assert torch.equal(part, same)
+
+
+def test_what_is_wrong_with_an_image_is_told_by_two_threads_too():
+    sequence = arm_sequence(generator=torch.Generator().manual_seed(0), num_frames=2)
+    settings = Settings(body="arm8", working_size=160, samples=4, modes=2, threads=2)
+    session = session_at(settings, sequence.body, sequence.states[0], seen_by(sequence.camera))
+    images = [sequence.frames[0], np.zeros((4, 4, 2), np.uint8) + np.arange(2, dtype=np.uint8)]
+    tracked = session.track(images)
+    next(tracked)
+    with pytest.raises(TorchcssError):
+        next(tracked)
 
 
 def test_terms_of_the_best_mode_add_up_to_its_cost():

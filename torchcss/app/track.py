@@ -219,7 +219,7 @@ def _check_same(run: Run, settings: Settings, selection: Selection, known: dict[
     other = [
         f"{name} {plain[name]}, now {value}"
         for name, value in asdict(settings).items()
-        if name != "overlay" and plain[name] != value
+        if name not in ("overlay", "threads") and plain[name] != value
     ]
     other += [
         f"{name} {known[name]}, now {value}"

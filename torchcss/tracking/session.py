@@ -22,7 +22,9 @@ import math
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from itertools import zip_longest
 from typing import NamedTuple
 
@@ -251,7 +253,7 @@ class TrackingSession:
         return self.state
 
     def track(self, images: Iterable[Images]) -> Iterator[Posterior]:
-        """Track through a sequence.
+        """Track through a sequence; with two threads the next images are seen meanwhile.
 
         Args:
             images: The images of one moment after another.
@@ -259,8 +261,22 @@ class TrackingSession:
         Yields:
             What is known after each of them.
         """
-        for each in images:
-            yield self.step(self.observe(each))
+        if self.settings.threads < 2:
+            for each in images:
+                yield self.step(self.observe(each))
+            return
+        coming = iter(images)
+
+        def see() -> Observation | None:
+            each = next(coming, None)
+            return None if each is None else self.observe(each)
+
+        # torch's own threads are set thread by thread.
+        with ThreadPoolExecutor(1, initializer=partial(torch.set_num_threads, 1)) as pool:
+            pending = pool.submit(see)
+            while (observation := pending.result()) is not None:
+                pending = pool.submit(see)
+                yield self.step(observation)
 
     def observe(self, images: Images, *, everywhere: bool = False) -> Observation:
         """See the images of one moment, in their order.

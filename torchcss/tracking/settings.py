@@ -131,6 +131,8 @@ class Settings:
         engine: "fused": compiled kernels evaluate the cost, on a CPU where numba is installed;
             "eager": the terms as they are written, as everywhere else.
         engine_dtype: Precision of the kernels; sums are in double precision.
+        threads: With two or more, the next frame's features are found while this one is searched.
+            Nothing else changes.
         overlay: Write `overlay.mp4`.
         recovery: Tell from the costs when the track is lost, and search more widely then.
     """
@@ -155,6 +157,7 @@ class Settings:
     dtype: Literal["float64", "float32"] = "float64"
     engine: Literal["fused", "eager"] = "eager"
     engine_dtype: Literal["float32", "float64"] = "float32"
+    threads: int = 1
     overlay: bool = True
     recovery: bool = True
 
@@ -208,7 +211,7 @@ class Settings:
                 f"boundary_emphasis must lie in 0..1, got {self.boundary_emphasis}"
             )
         check_seed(self.seed)
-        for name in ("samples", "modes", "working_size", "oversampling"):
+        for name in ("samples", "modes", "working_size", "oversampling", "threads"):
             number = getattr(self, name)
             if number is not None and number < 1:
                 raise ConfigurationError(f"{name} must be at least 1, got {number}")
