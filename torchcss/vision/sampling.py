@@ -15,12 +15,17 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 
+import kornia
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
 from torchcss.errors import ShapeError, check_shape
+
+
+_WIDE = 4.0
+"""Standard deviation, pixels, from which a product of matrices is quicker than a convolution."""
 
 
 def gaussian_blur(image: Float[Tensor, "*batch h w"], sigma: float) -> Float[Tensor, "*batch h w"]:
@@ -31,6 +36,13 @@ def gaussian_blur(image: Float[Tensor, "*batch h w"], sigma: float) -> Float[Ten
         sigma: Standard deviation, pixels.
     """
     height, width = image.shape[-2:]
+    if sigma < _WIDE:
+        size = 2 * math.ceil(3.0 * sigma) + 1
+        flat = image.reshape(-1, 1, height, width)
+        blurred = kornia.filters.gaussian_blur2d(
+            flat, (size, size), (sigma, sigma), border_type="replicate"
+        )
+        return blurred.reshape(image.shape)
     down, along = _blur_matrix(height, sigma).to(image), _blur_matrix(width, sigma).to(image)
     return down @ image @ along.T
 
