@@ -23,7 +23,6 @@ from torch.nn import functional
 
 from torchcss.errors import ShapeError, check_shape
 
-
 _WIDE = 4.0
 """Standard deviation, pixels, from which a product of matrices is quicker than a convolution."""
 
