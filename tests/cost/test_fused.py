@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from made_costs import changed, make_full_cost, random_states
@@ -11,6 +16,7 @@ from torch import Tensor
 
 from torchcss.body.shape import with_shape
 from torchcss.cost.context import BodyTables
+from torchcss.cost.fused.checked import checked
 from torchcss.cost.fused.engine import FusedEngine, fused_engine
 from torchcss.cost.fused.priors import add_priors
 from torchcss.cost.fused.repulsion import add_repulsion
@@ -125,3 +131,62 @@ def test_a_state_that_is_none_spoils_no_other(generator: torch.Generator) -> Non
 
 def same(one: LocalModel, other: LocalModel) -> bool:
     return all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+def awkward_states(cost: TrackingCost, generator: torch.Generator) -> Tensor:
+    """Behind the camera, across its plane, out of the picture, far away, folded up, wild."""
+    body = cost.body
+    x = random_states(body, 14, generator=generator)
+    wild = torch.randn(x.shape, generator=generator, dtype=x.dtype)
+    bounds = body.bounds
+    lower, upper = bounds.lower.clamp(min=-3), bounds.upper.clamp(max=3)
+    x[6:8] = bounds.project(3 * wild[6:8])
+    x[8], x[9] = lower, upper
+    x[10:12] = torch.where(wild[10:12] > 0, lower, upper)
+    places = [(0, 0, 5), (0, 0, -40), (0, 0, 3.4), (3, 0, 0), (0.9, 0.7, 2.5), (0.0, 0.0, 3.0)]
+    if "root_x" in body.state_names:
+        columns = [body.state_index(f"root_{axis}") for axis in "xyz"]
+        x[: len(places), columns] += x.new_tensor(places)
+    x[12:] = body.rest + 1e-9 * wild[12:]
+    return x
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("name", BODIES)
+def test_awkward_poses(name: str, dtype: str, generator: torch.Generator) -> None:
+    cost = colours_of(make_full_cost(name))
+    assert_close(cost, awkward_states(cost, generator), dtype)
+
+
+CHECK = """
+import torch
+from dataclasses import replace
+from test_fused import assert_close, awkward_states, colours_of
+from made_costs import make_full_cost
+cost = colours_of(make_full_cost("arm8"))
+x = awkward_states(cost, torch.Generator().manual_seed(0))[[0, 7, 9]]
+assert_close(cost, x, "float64")
+assert_close(cost, x, "float32")
+print("checked")
+"""
+
+
+def test_no_index_is_out_of_range() -> None:
+    here = Path(__file__).parent
+    paths = [str(here), str(here.parent), str(here.parents[1])]
+    environment = {
+        **os.environ,
+        "TORCHCSS_CHECK_KERNELS": "1",
+        "PYTHONPATH": os.pathsep.join(paths),
+    }
+    run = [sys.executable, "-c", CHECK]
+    done = subprocess.run(run, env=environment, capture_output=True, text=True, check=False)
+    assert done.stdout == "checked\n", done.stderr
+
+
+def test_an_index_out_of_range_is_refused() -> None:
+    array = checked(np.zeros((2, 3)))
+    array[1, 2] = 1.0
+    for index in ((2, 0), (0, -1), 2, -1):
+        with pytest.raises(IndexError, match="of an axis of"):
+            array[index]

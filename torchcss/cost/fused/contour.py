@@ -1,11 +1,12 @@
-"""Edges and colours at the contour nodes; twins of `torchcss.cost.contour` and `region`.
+"""What the image has at the contour nodes; the twin of `torchcss.cost.outline`.
 
-Both look at the same nodes: their derivatives add up in the image, and are pulled back once.
+Edges and colours look at the same nodes: their derivatives add up in the image, and are pulled back
+once.
 """
 
 from __future__ import annotations
 
-from torchcss.cost.fused.compiler import inlined, kernel
+from torchcss.cost.fused.compiler import kernel
 from torchcss.cost.fused.edges import match_edges
 from torchcss.cost.fused.projection import (
     Pixel,
@@ -16,20 +17,13 @@ from torchcss.cost.fused.projection import (
     times,
     write_point,
 )
-from torchcss.cost.fused.records import Array, Colours, Edges, Lens, Nodes, Points
-from torchcss.cost.fused.spline import sample_spline
+from torchcss.cost.fused.records import Colours, Edges, Lens, Nodes, Points, Room, Seen
+from torchcss.cost.fused.region import match_colours
 
 
 @kernel
 def compare_outline(
-    nodes: Nodes,
-    lens: Lens,
-    edges: Edges,
-    colours: Colours,
-    exact: bool,
-    points: Points,
-    response: Array,
-    found: Array,
+    nodes: Nodes, lens: Lens, edges: Edges, colours: Colours, exact: bool, room: Room
 ) -> float:
     """Cost of all contour nodes; the points get its derivatives.
 
@@ -39,64 +33,75 @@ def compare_outline(
         edges: The contour term.
         colours: The region term.
         exact: Whether the curvature of the projection counts.
-        points: One for each node.
-        response: Room for the samples of a line.
-        found: Room for its edges.
+        room: Room for what is found on the way, and for the points.
     """
-    total, count = 0.0, 0
+    count = _look(nodes, lens, room.seen)
+    if edges.scale > 0.0:
+        match_edges(edges, room.seen, count, (room.response, room.maxima), room.peaks)
+    if colours.scale > 0.0:
+        match_colours(colours, room.seen, count)
+    _pull_back(nodes, lens, room.seen, count, exact, room.points)
     hidden = edges.scale * edges.hidden + colours.scale * colours.hidden
     nothing = edges.scale * edges.back_facing + colours.scale * colours.back_facing
     unmatched = edges.scale * edges.unmatched + 0.5 * colours.scale * colours.nu
-    for part in range(len(nodes.first) - 1):
-        points.first[part] = count
-        for i in range(nodes.first[part], nodes.first[part + 1]):
-            there, visible = nodes.exists[i], nodes.visible[i]
-            cost = hidden
-            if there * visible > 0.0:
-                x, y, z = nodes.x[i], nodes.y[i], nodes.z[i]
-                pixel, matched = project(lens, x, y, z), unmatched
-                if pixel.valid:
-                    normal = image_normal(lens, pixel, (nodes.nx[i], nodes.ny[i], nodes.nz[i]))
-                    gain, slope = _look(edges, colours, part, (pixel, normal), (response, found))
-                    matched = matched - gain
-                    spatial = pull_back(lens, pixel, times(there * visible, slope), exact)
-                    write_point(points, count, (x, y, z), spatial)
-                    count += 1
-                cost = visible * matched + (1.0 - visible) * hidden
-            total += there * (cost - nothing)
-    points.first[len(nodes.first) - 1] = count
+    total = 0.0
+    for i in range(nodes.first[len(nodes.first) - 1]):
+        cost = nodes.visible[i] * unmatched + (1.0 - nodes.visible[i]) * hidden
+        total += nodes.exists[i] * (cost - nothing)
+    for k in range(count):
+        i = room.seen.node[k]
+        total -= nodes.exists[i] * nodes.visible[i] * room.seen.gain[k]
     return total
 
 
-@inlined
-def _look(
-    edges: Edges,
-    colours: Colours,
-    part: int,
-    place: tuple[Pixel, tuple[float, float]],
-    room: tuple[Array, Array],
-) -> tuple[float, Slope]:
-    """What a node gains by what the image shows there, and the cost's derivatives in the image."""
-    pixel, (mu, mv) = place
-    gain = edges.scale * 0.0
-    slope = Slope(gain, gain, gain, gain, gain)
-    if edges.scale > 0.0:
-        depth, along, curvature = match_edges(edges, pixel, (mu, mv), room[0], room[1])
-        gain, along, curvature = edges.scale * depth, edges.scale * along, edges.scale * curvature
-        slope = Slope(
-            along * mu, along * mv, curvature * mu * mu, curvature * mu * mv, curvature * mv * mv
+@kernel
+def _look(nodes: Nodes, lens: Lens, seen: Seen) -> int:
+    """Project the nodes that are seen; their number."""
+    count = 0
+    for part in range(len(nodes.first) - 1):
+        for i in range(nodes.first[part], nodes.first[part + 1]):
+            if not nodes.exists[i] * nodes.visible[i] > 0.0:
+                continue
+            pixel = project(lens, nodes.x[i], nodes.y[i], nodes.z[i])
+            if not pixel.valid:
+                continue
+            mu, mv = image_normal(lens, pixel, (nodes.nx[i], nodes.ny[i], nodes.nz[i]))
+            seen.node[count], seen.part[count] = i, part
+            seen.u[count], seen.v[count] = pixel.u, pixel.v
+            seen.a[count], seen.b[count], seen.w[count] = pixel.a, pixel.b, pixel.w
+            seen.aa[count], seen.ab[count], seen.bb[count] = pixel.aa, pixel.ab, pixel.bb
+            seen.mu[count], seen.mv[count] = mu, mv
+            seen.gain[count] = seen.gu[count] = seen.gv[count] = 0.0
+            seen.uu[count] = seen.uv[count] = seen.vv[count] = 0.0
+            count += 1
+    return count
+
+
+@kernel
+def _pull_back(
+    nodes: Nodes, lens: Lens, seen: Seen, count: int, exact: bool, points: Points
+) -> None:
+    """Write the nodes with their costs' derivatives in space."""
+    part = -1
+    for k in range(count):
+        i = int(seen.node[k])
+        while part < seen.part[k]:
+            part += 1
+            points.first[part] = k
+        pixel = Pixel(
+            seen.u[k],
+            seen.v[k],
+            True,
+            seen.a[k],
+            seen.b[k],
+            seen.w[k],
+            seen.aa[k],
+            seen.ab[k],
+            seen.bb[k],
         )
-    if colours.scale > 0.0:
-        layer, du, dv = colours.layer[part], colours.offset * mu, colours.offset * mv
-        a = sample_spline(colours.field, colours.corner, layer, (pixel.u - du, pixel.v - dv))
-        b = sample_spline(colours.field, colours.corner, layer, (pixel.u + du, pixel.v + dv))
-        level = 0.25 * colours.scale * colours.nu
-        gain = gain + level * (a.value - b.value)
-        slope = Slope(
-            slope.u + level * (b.u - a.u),
-            slope.v + level * (b.v - a.v),
-            slope.uu + level * (b.uu - a.uu),
-            slope.uv + level * (b.uv - a.uv),
-            slope.vv + level * (b.vv - a.vv),
-        )
-    return gain, slope
+        slope = Slope(seen.gu[k], seen.gv[k], seen.uu[k], seen.uv[k], seen.vv[k])
+        slope = times(nodes.exists[i] * nodes.visible[i], slope)
+        place = nodes.x[i], nodes.y[i], nodes.z[i]
+        write_point(points, k, place, pull_back(lens, pixel, slope, exact))
+    for rest in range(part + 1, len(points.first)):
+        points.first[rest] = count

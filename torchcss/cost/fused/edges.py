@@ -1,11 +1,10 @@
-"""Edges along the normal of a contour node; the twin of `torchcss.cost.contour.ContourTerm`."""
+"""Edges along the normals of contour nodes; the twin of `torchcss.cost.contour.ContourTerm`."""
 
 from __future__ import annotations
 
 from torchcss.cost.fused.compiler import floor, kernel
 from torchcss.cost.fused.potentials import potential_of
-from torchcss.cost.fused.projection import Pixel
-from torchcss.cost.fused.records import Array, Edges
+from torchcss.cost.fused.records import Array, Edges, Peaks, Seen
 
 _TINY = 1e-12
 _SHARP_ENOUGH = 0.05
@@ -14,36 +13,49 @@ _FADE = 0.25
 
 @kernel
 def match_edges(
-    edges: Edges, pixel: Pixel, normal: tuple[float, float], response: Array, found: Array
-) -> tuple[float, float, float]:
-    """Depth of a node's well, eq. 8 [IJRR], and its cost's derivatives along the normal.
+    edges: Edges, seen: Seen, count: int, room: tuple[Array, Array], peaks: Peaks
+) -> None:
+    """Add what the nodes gain by their wells, eq. 8 [IJRR], and the derivatives.
 
     Args:
         edges: The term.
-        pixel: The node in the image.
-        normal: Its unit normal there.
-        response: Room for the response at each step.
-        found: Room for the distance and weight of each edge, `[2 steps]`.
+        seen: The nodes in the image.
+        count: Their number.
+        room: Room for the response at each step, and for the places of its maxima.
+        peaks: Room for the maxima of all nodes.
     """
-    mu, mv = normal
-    _respond(edges, pixel.u, pixel.v, mu, mv, response)
-    count, total = _find_peaks(edges, response, found)
-    share = 1.0 / max(total, 1.0)
-    depth = slope = curvature = total * 0.0
+    total = 0
     for k in range(count):
-        distance, weight = found[0, k], found[1, k] * share
-        squared = distance * distance
-        rho, first, second = potential_of(edges.potential, squared)
-        depth += weight * max(edges.unmatched - 0.5 * rho, 0.0)
-        slope -= weight * first * distance
-        curvature += weight * (first + 2.0 * second * squared)
-    return depth, slope, curvature
+        seen.first[k] = total
+        _respond(edges, (seen.u[k], seen.v[k]), (seen.mu[k], seen.mv[k]), room[0])
+        total = _collect(edges, room[0], room[1], peaks, total)
+    seen.first[count] = total
+    _weigh(edges, peaks, total)
+    for k in range(count):
+        share = well = slope = curvature = edges.scale * 0.0
+        for n in range(seen.first[k], seen.first[k + 1]):
+            weight = peaks.weight[n]
+            share += peaks.share[n]
+            well += weight * peaks.well[n]
+            slope -= weight * peaks.slope[n]
+            curvature += weight * peaks.curvature[n]
+        factor, mu, mv = edges.scale / max(share, 1.0), seen.mu[k], seen.mv[k]
+        slope, curvature = factor * slope, factor * curvature
+        seen.gain[k] += factor * well
+        seen.gu[k] += slope * mu
+        seen.gv[k] += slope * mv
+        seen.uu[k] += curvature * mu * mu
+        seen.uv[k] += curvature * mu * mv
+        seen.vv[k] += curvature * mv * mv
 
 
 @kernel
-def _respond(edges: Edges, u: float, v: float, mu: float, mv: float, response: Array) -> None:
+def _respond(
+    edges: Edges, place: tuple[float, float], normal: tuple[float, float], response: Array
+) -> None:
     """The edge response `|G . m|` at the samples of a line; zero outside the image."""
     field, right, bottom = edges.field, edges.corner[0], edges.corner[1]
+    (u, v), (mu, mv) = place, normal
     for k in range(len(edges.steps)):
         x, y = u + edges.steps[k] * mu, v + edges.steps[k] * mv
         inside = (x >= -0.5) & (x < right + 0.5) & (y >= -0.5) & (y < bottom + 0.5)
@@ -60,30 +72,45 @@ def _respond(edges: Edges, u: float, v: float, mu: float, mv: float, response: A
 
 
 @kernel
-def _find_peaks(edges: Edges, response: Array, found: Array) -> tuple[int, float]:
-    """Distances and weights of the maxima on a line; their number, and the sum of shares."""
-    count, total = 0, edges.step * 0.0
+def _collect(edges: Edges, response: Array, maxima: Array, peaks: Peaks, total: int) -> int:
+    """Add the maxima on a line to the list; its new length."""
+    count = 0
     for m in range(2, len(response) - 2):
-        left, middle, right = response[m - 1], response[m], response[m + 1]
-        if not (middle > left and not right > middle):
-            continue
-        before, after = response[m - 2], response[m + 2]
+        maxima[count] = m
+        rises, falls = response[m] > response[m - 1], response[m + 1] > response[m]
+        count += int(rises) & int(not falls)  # without a branch, which would be a guess
+    for k in range(count):
+        m, n = maxima[k], total + k
+        peaks.place[n], peaks.middle[n] = edges.steps[m], response[m]
+        peaks.before[n], peaks.left[n] = response[m - 2], response[m - 1]
+        peaks.right[n], peaks.after[n] = response[m + 1], response[m + 2]
+    return total + count
+
+
+@kernel
+def _weigh(edges: Edges, peaks: Peaks, total: int) -> None:
+    """Weights of all edges, and their wells with derivatives along the normal."""
+    reach = 1.5 * edges.step
+    sharp = 2.0 / (reach * reach * _SHARP_ENOUGH)
+    fade = 1.0 / (_FADE * edges.window)
+    for n in range(total):
+        left, middle, right = peaks.left[n], peaks.middle[n], peaks.right[n]
+        before, after = peaks.before[n], peaks.after[n]
         curve = max(2.0 * middle - left - right, _TINY)
         shift = 0.5 * (right - left) / curve
-        side = 2.0 * left - before - middle
-        if shift > 0.0:
-            side = 2.0 * right - middle - after
+        side = 2.0 * right - middle - after if shift > 0.0 else 2.0 * left - before - middle
         height = middle + 0.5 * shift * shift * (curve + abs(shift) * (side - curve))
         fall = middle - max(
             left + (0.5 - shift) * (before - left), right + (0.5 + shift) * (after - right)
         )
-        reach = 1.5 * edges.step
-        sharpness = fall / max(height, 1e-3) * (2.0 / (reach * reach * _SHARP_ENOUGH))
-        distance = edges.steps[m] + edges.step * shift
-        if not abs(distance) < edges.window:
-            continue
-        weight = height * min(max(sharpness, 0.0), 1.0)
-        total += weight * min((edges.window - abs(distance)) / (_FADE * edges.window), 1.0)
-        found[0, count], found[1, count] = distance, weight
-        count += 1
-    return count, total
+        sharpness = min(max(fall / max(height, 1e-3) * sharp, 0.0), 1.0)
+        distance = peaks.place[n] + edges.step * shift
+        within = abs(distance) < edges.window
+        weight = height * sharpness if within else 0.0
+        squared = distance * distance
+        rho, first, second = potential_of(edges.potential, squared)
+        peaks.weight[n] = weight
+        peaks.share[n] = weight * min((edges.window - abs(distance)) * fade, 1.0)
+        peaks.well[n] = max(edges.unmatched - 0.5 * rho, 0.0)
+        peaks.slope[n] = first * distance
+        peaks.curvature[n] = first + 2.0 * second * squared

@@ -10,7 +10,7 @@ from __future__ import annotations
 import warnings
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -25,6 +25,7 @@ from torchcss.cost.context import FrameContext
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.flow import FlowTerm
 from torchcss.cost.fused import compiler, pack
+from torchcss.cost.fused.checked import checked
 from torchcss.cost.fused.priors import add_priors
 from torchcss.cost.fused.records import (
     Array,
@@ -133,13 +134,15 @@ class FusedEngine:
 
     def value(self, cost: TrackingCost, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
         """Cost in nats; see `TrackingCost.value`."""
-        result, others = self._evaluate(cost, x, slopes=False)
+        with nullcontext() if cost.stopwatch is None else cost.stopwatch("fused"):
+            result, others = self._evaluate(cost, x, slopes=False)
         value = torch.from_numpy(result.value).to(x).reshape(x.shape[:-1])
         return value if others is None else value + others.value(x)
 
     def local_model(self, cost: TrackingCost, x: Float[Tensor, "*batch n"]) -> LocalModel:
         """Cost, gradient and Hessian; see `TrackingCost.local_model`."""
-        result, others = self._evaluate(cost, x, slopes=True)
+        with nullcontext() if cost.stopwatch is None else cost.stopwatch("fused"):
+            result, others = self._evaluate(cost, x, slopes=True)
         shapes = (x.shape[:-1], x.shape, (*x.shape, x.shape[-1]))
         model = LocalModel(
             *(torch.from_numpy(p).to(x).reshape(s) for p, s in zip(result, shapes, strict=True))
@@ -196,19 +199,20 @@ class FusedEngine:
         (x, parent, component), exact = samples, cost.choice.curvature is not Curvature.GAUSS_NEWTON
         prior, left_out = self._prior(cost, past)
         left_out = set(left_out)
-        tails, _, _ = prior.priors
-        add_priors(x, _rows(component, tails.centre.shape[1], len(x)), *prior.priors, result)
+        mode = _rows(component, prior.priors[0].centre.shape[1], len(x))
+        _run(add_priors, x, mode, *prior.priors, result)
         if prior.repulsion is not None:
             tree, parts, repulsion, rooms = prior.repulsion
             with rooms.lent() as room:
-                add_repulsion(x, tree, parts, repulsion, exact, room, result)
+                _run(add_repulsion, x, tree, parts, repulsion, exact, room, result)
         for context in views:
             packed, others = self._view(cost, past, context)
             left_out |= others
             if packed is not None:
                 modes = len(packed.view.flow.target)
                 with packed.rooms.lent() as room:
-                    add_view(x, _rows(parent, modes, len(x)), *packed[:3], room, result)
+                    mode = _rows(parent, modes, len(x))
+                    _run(add_view, x, mode, *packed[:3], room, result)
         return left_out
 
     def _prior(self, cost: TrackingCost, past: FrameContext) -> tuple[_PackedPrior, frozenset[str]]:
@@ -307,9 +311,14 @@ class FusedEngine:
             nothing=float(nothing) * (0 if predictor is None else predictor.num_nodes),
             exact=cost.choice.curvature is not Curvature.GAUSS_NEWTON,
         )
-        interior = num * view.flow.nodes.shape[2]
+        interior = view.flow.nodes.shape[2]
         make = partial(pack.make_room, tree, view.curves, interior, 1, (len(edges.steps), real))
         return _PackedView(tree, parts, view, Rooms(make)), frozenset(others)
+
+
+def _run(kernel: Callable[..., None], *arguments: Any) -> None:
+    """Call a kernel; in the checked mode with arrays that check their indices."""
+    kernel(*(checked(argument) for argument in arguments) if compiler.CHECKED else arguments)
 
 
 def _rows(parent: Array | None, modes: int, size: int) -> Array:

@@ -34,11 +34,13 @@ from torchcss.cost.fused.records import (
     Mixture,
     Nodes,
     Parts,
+    Peaks,
     Points,
     Potential,
     Rays,
     Repulsion,
     Room,
+    Seen,
     Tree,
 )
 from torchcss.cost.interior import InteriorNodes
@@ -311,14 +313,14 @@ def make_room(
     Args:
         tree: The body's tree.
         curves: The curves on its parts.
-        interior: Number of nodes all over the surface.
+        interior: Number of nodes all over the surface of a part.
         chain: Longest chain of joints between two parts.
         samples: Number of samples on a search line, and the precision.
     """
     steps, real = samples
     num_parts, num_joints = len(curves.table), len(tree.parent)
     outline = 2 * num_parts * (curves.rings + curves.meridians)
-    nodes = max(outline, interior, 1)
+    nodes = max(outline, num_parts * interior, 1)
     points = max(nodes, 64)
 
     def fields(kind: Any, size: int, whole: Sequence[str] = (), first: int = 0) -> Any:
@@ -327,8 +329,8 @@ def make_room(
             made["first"] = np.zeros(first, np.int64)
         return kind(**made)
 
-    # Every node may be before or behind every part; the second list is for those two.
-    pairs = nodes * max(num_parts, 1)
+    # Every node may be before or behind every part, or inside; one more, to be overwritten.
+    pairs = nodes * max(num_parts, 1) + 1
     return Room(
         frames=np.zeros((1 + num_joints, 3, 4)),
         frame=np.zeros((3, 4)),
@@ -344,8 +346,10 @@ def make_room(
         near=fields(Lines, nodes, whole=("ray", "part")),
         lines=fields(Lines, pairs, whole=("ray", "part")),
         points=fields(Points, points, first=num_parts + 1),
+        seen=fields(Seen, nodes, whole=("node", "part"), first=nodes + 1),
+        peaks=fields(Peaks, nodes * (steps // 2)),
         response=np.zeros(steps, real),
-        found=np.zeros((2, steps), real),
+        maxima=np.zeros(steps, np.int64),
     )
 
 

@@ -406,6 +406,65 @@ class Lines(NamedTuple):
     before: Array
 
 
+class Seen(NamedTuple):
+    """Contour nodes that the image is compared with.
+
+    Attributes:
+        node: Its place among the contour nodes.
+        part: Its part.
+        u, v: Its place in the image, pixels.
+        a, b, w, aa, ab, bb: See `torchcss.cost.fused.projection.Pixel`.
+        mu, mv: Its unit normal in the image.
+        gain: By how much it costs less than a node without a match.
+        gu, gv, uu, uv, vv: First and second derivatives of its cost in the image.
+        first: Where the edges of each begin.
+    """
+
+    node: Array
+    part: Array
+    u: Array
+    v: Array
+    a: Array
+    b: Array
+    w: Array
+    aa: Array
+    ab: Array
+    bb: Array
+    mu: Array
+    mv: Array
+    gain: Array
+    gu: Array
+    gv: Array
+    uu: Array
+    uv: Array
+    vv: Array
+    first: Array
+
+
+class Peaks(NamedTuple):
+    """Maxima of the edge response along the normals of nodes.
+
+    Attributes:
+        place: Distance of the highest sample from the node, pixels.
+        before, left, middle, right, after: That sample's response and those beside it.
+        weight: Weight of the edge.
+        share: What it takes of the sum of one.
+        well, slope, curvature: Its cost below that of no edge, and derivatives along the normal.
+    """
+
+    place: Array
+    before: Array
+    left: Array
+    middle: Array
+    right: Array
+    after: Array
+    weight: Array
+    share: Array
+    well: Array
+    slope: Array
+    curvature: Array
+
+
 class Points(NamedTuple):
     """Points with the derivatives of their cost.
 
@@ -463,8 +522,10 @@ class Room(NamedTuple):
         near: Stretches of them near one part.
         lines: Stretches of them that may be hidden.
         points: Points with derivatives.
+        seen: Contour nodes in the image.
+        peaks: Edges beside them.
         response: Responses along a search line.
-        found: Its edges, `[2 steps]`.
+        maxima: Places of its maxima.
     """
 
     frames: Array
@@ -481,5 +542,7 @@ class Room(NamedTuple):
     near: Lines
     lines: Lines
     points: Points
+    seen: Seen
+    peaks: Peaks
     response: Array
-    found: Array
+    maxima: Array

@@ -12,8 +12,14 @@ from torchcss.cost.fused.compiler import entry, exp, inlined, kernel, log
 from torchcss.cost.fused.kinematics import find_twists, pose_parts, pose_tree
 from torchcss.cost.fused.lift import react, sum_points
 from torchcss.cost.fused.projection import Spatial, write_point
-from torchcss.cost.fused.records import Array, Parts, Points, Repulsion, Result, Room, Tree
-from torchcss.cost.fused.superquadric import Bowl, bent_radial_square, radial_hessian
+from torchcss.cost.fused.records import Array, Lines, Parts, Repulsion, Result, Room, Tree
+from torchcss.cost.fused.superquadric import (
+    Bowl,
+    bent_radial_square,
+    radial_hessian,
+    radial_square,
+    shape_of,
+)
 
 
 @entry
@@ -44,22 +50,70 @@ def add_repulsion(
         room.reference[:] = 0.0
         if slopes:
             find_twists(room.frames, tree, room.reference, room.twists)
+        found = _find_nodes(repulsion, room.posed, room.lines)
+        _measure(repulsion.shape, room.lines, found)
+        if not slopes:
+            for m in range(found):
+                result.value[b] += potential(repulsion, room.lines.value[m])[0]
+            continue
         gradient, hessian = result.gradient[b], result.hessian[b]
-        for one in range(len(room.posed)):
-            for other in range(len(room.posed)):
-                pair = repulsion.pair[one, other]
-                if pair < 0 or not _overlap(
-                    room.posed[one], room.posed[other], repulsion, (one, other)
-                ):
-                    continue
-                cost, count = _push(repulsion, room.posed, (one, other), slopes, room.points)
-                result.value[b] += cost
-                if slopes and count:
-                    for i in range(3):
-                        room.reference[i] = room.posed[other, i, 3]
-                    room.sums[0] = 0.0
-                    sum_points(room.points, 0, count, room.reference, room.sums[0])
-                    _lift_pair(tree, repulsion, pair, exact, room, gradient, hessian)
+        m = 0
+        while m < found:
+            pair, cost, count, m = _push(repulsion, room, m, found)
+            result.value[b] += cost
+            if count:
+                room.sums[0] = 0.0
+                sum_points(room.points, 0, count, room.reference, room.sums[0])
+                _lift_pair(tree, repulsion, pair, exact, room, gradient, hessian)
+
+
+@kernel
+def _find_nodes(repulsion: Repulsion, posed: Array, lines: Lines) -> int:
+    """List the nodes that may feel another part, in its frame; their number."""
+    found = 0
+    for one in range(len(posed)):
+        for other in range(len(posed)):
+            pair = repulsion.pair[one, other]
+            if pair >= 0 and _overlap(posed[one], posed[other], repulsion, (one, other)):
+                found = _add_nodes(repulsion, posed, (one, other), lines, found)
+    return found
+
+
+@kernel
+def _add_nodes(
+    repulsion: Repulsion, posed: Array, pair: tuple[int, int], lines: Lines, found: int
+) -> int:
+    """Add the nodes of a part that are in the box of another one; the list's new length."""
+    a, b, number = posed[pair[0]], posed[pair[1]], repulsion.pair[pair[0], pair[1]]
+    nodes, outer = repulsion.nodes[pair[0]], repulsion.outer[pair[1]]
+    dx, dy, dz = a[0, 3] - b[0, 3], a[1, 3] - b[1, 3], a[2, 3] - b[2, 3]
+    for n in range(nodes.shape[1]):
+        x, y, z = nodes[0, n], nodes[1, n], nodes[2, n]
+        px = a[0, 0] * x + a[0, 1] * y + a[0, 2] * z + dx
+        py = a[1, 0] * x + a[1, 1] * y + a[1, 2] * z + dy
+        pz = a[2, 0] * x + a[2, 1] * y + a[2, 2] * z + dz
+        x = b[0, 0] * px + b[1, 0] * py + b[2, 0] * pz
+        y = b[0, 1] * px + b[1, 1] * py + b[2, 1] * pz
+        z = b[0, 2] * px + b[1, 2] * py + b[2, 2] * pz
+        lines.x[found], lines.y[found], lines.z[found] = x, y, z
+        lines.part[found], lines.ray[found] = pair[1], number
+        inside = (abs(x) < outer[0]) & (abs(y) < outer[1]) & (abs(z) < outer[2])
+        found += int(inside)
+    return found
+
+
+@kernel
+def _measure(table: Array, lines: Lines, found: int) -> None:
+    """R^2 of all nodes in the list."""
+    for m in range(found):
+        shape = shape_of(table, lines.part[m])
+        square, _, _, _ = radial_square(shape, lines.x[m], lines.y[m], lines.z[m])
+        lines.value[m] = square
+    for m in range(found):
+        part = lines.part[m]
+        if table[10, part] != 0.0:
+            place = lines.x[m], lines.y[m], lines.z[m]
+            lines.value[m], _, _, _ = bent_radial_square(table, part, place)
 
 
 @kernel
@@ -86,39 +140,28 @@ def _overlap(a: Array, b: Array, repulsion: Repulsion, pair: tuple[int, int]) ->
 
 
 @kernel
-def _push(
-    repulsion: Repulsion, posed: Array, pair: tuple[int, int], slopes: bool, points: Points
-) -> tuple[float, int]:
-    """Cost of the nodes of a pair; those that feel it become points with its derivatives."""
-    a, b, nodes, outer = (
-        posed[pair[0]],
-        posed[pair[1]],
-        repulsion.nodes[pair[0]],
-        repulsion.outer[pair[1]],
-    )
-    total, count = 0.0, 0
-    for n in range(nodes.shape[1]):
-        x, y, z = nodes[0, n], nodes[1, n], nodes[2, n]
-        px = a[0, 0] * x + a[0, 1] * y + a[0, 2] * z + a[0, 3]
-        py = a[1, 0] * x + a[1, 1] * y + a[1, 2] * z + a[1, 3]
-        pz = a[2, 0] * x + a[2, 1] * y + a[2, 2] * z + a[2, 3]
-        dx, dy, dz = px - b[0, 3], py - b[1, 3], pz - b[2, 3]
-        x = b[0, 0] * dx + b[1, 0] * dy + b[2, 0] * dz
-        y = b[0, 1] * dx + b[1, 1] * dy + b[2, 1] * dz
-        z = b[0, 2] * dx + b[1, 2] * dy + b[2, 2] * dz
-        if abs(x) >= outer[0] or abs(y) >= outer[1] or abs(z) >= outer[2]:
-            continue
-        if not slopes:
-            square, _, _, _ = bent_radial_square(repulsion.shape, pair[1], (x, y, z))
-            total += potential(repulsion, square)[0]
-            continue
-        bowl = radial_hessian(repulsion.shape, pair[1], (x, y, z))
-        if bowl.square < repulsion.reach:
+def _push(repulsion: Repulsion, room: Room, m: int, found: int) -> tuple[int, float, int, int]:
+    """The next pair in the list: its number, cost, points with derivatives, and where it ends."""
+    lines, total, count, pair = room.lines, 0.0, 0, room.lines.ray[m]
+    frame = room.posed[lines.part[m]]
+    for i in range(3):
+        room.reference[i] = frame[i, 3]
+    while m < found and lines.ray[m] == pair:
+        x, y, z = lines.x[m], lines.y[m], lines.z[m]
+        if lines.value[m] < repulsion.reach:
+            bowl = radial_hessian(repulsion.shape, lines.part[m], (x, y, z))
             value, first, second = potential(repulsion, bowl.square)
             total += value
-            write_point(points, count, (px, py, pz), _turned(_bent(bowl, first, second), b))
+            place = (
+                frame[0, 0] * x + frame[0, 1] * y + frame[0, 2] * z + frame[0, 3],
+                frame[1, 0] * x + frame[1, 1] * y + frame[1, 2] * z + frame[1, 3],
+                frame[2, 0] * x + frame[2, 1] * y + frame[2, 2] * z + frame[2, 3],
+            )
+            cost = _turned(_bent(bowl, first, second), frame)
+            write_point(room.points, count, place, cost)
             count += 1
-    return total, count
+        m += 1
+    return pair, total, count, m
 
 
 @inlined

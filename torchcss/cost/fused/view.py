@@ -71,16 +71,7 @@ def _outline(parts: Parts, view: View, slopes: bool, room: Room) -> float:
     find_outline(view.curves, room.posed, room.facing, nodes)
     see_nodes(nodes, room.posed, parts, True, room.rays, room.near, room.lines)
     see_nodes(nodes, room.posed, parts, False, room.rays, room.near, room.lines)
-    cost = compare_outline(
-        nodes,
-        view.lens,
-        view.edges,
-        view.colours,
-        view.exact,
-        room.points,
-        room.response,
-        room.found,
-    )
+    cost = compare_outline(nodes, view.lens, view.edges, view.colours, view.exact, room)
     if slopes:
         _sum_parts(parts, room)
     return cost + view.nothing
