@@ -321,7 +321,6 @@ def make_room(
     num_parts, num_joints = len(curves.table), len(tree.parent)
     outline = 2 * num_parts * (curves.rings + curves.meridians)
     nodes = max(outline, num_parts * interior, 1)
-    points = max(nodes, 64)
 
     def fields(kind: Any, size: int, whole: Sequence[str] = (), first: int = 0) -> Any:
         made = {name: np.zeros(size, np.int64 if name in whole else real) for name in kind._fields}
@@ -345,7 +344,7 @@ def make_room(
         rays=fields(Rays, nodes),
         near=fields(Lines, nodes, whole=("ray", "part")),
         lines=fields(Lines, pairs, whole=("ray", "part")),
-        points=fields(Points, points, first=num_parts + 1),
+        points=fields(Points, max(pairs, 64), first=num_parts + 1),
         seen=fields(Seen, nodes, whole=("node", "part"), first=nodes + 1),
         peaks=fields(Peaks, nodes * (steps // 2)),
         response=np.zeros(steps, real),

@@ -159,3 +159,19 @@ def write_point(points: Points, i: int, place: tuple[float, float, float], cost:
     points.gx[i], points.gy[i], points.gz[i] = cost.x, cost.y, cost.z
     points.xx[i], points.xy[i], points.xz[i] = cost.xx, cost.xy, cost.xz
     points.yy[i], points.yz[i], points.zz[i] = cost.yy, cost.yz, cost.zz
+
+
+@inlined
+def read_point(points: Points, i: int) -> Spatial:
+    """The derivatives of a point's cost."""
+    return Spatial(
+        points.gx[i],
+        points.gy[i],
+        points.gz[i],
+        points.xx[i],
+        points.xy[i],
+        points.xz[i],
+        points.yy[i],
+        points.yz[i],
+        points.zz[i],
+    )

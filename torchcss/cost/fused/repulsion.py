@@ -11,14 +11,15 @@ from __future__ import annotations
 from torchcss.cost.fused.compiler import entry, exp, inlined, kernel, log
 from torchcss.cost.fused.kinematics import find_twists, pose_parts, pose_tree
 from torchcss.cost.fused.lift import react, sum_points
-from torchcss.cost.fused.projection import Spatial, write_point
-from torchcss.cost.fused.records import Array, Lines, Parts, Repulsion, Result, Room, Tree
+from torchcss.cost.fused.projection import Spatial, read_point, write_point
+from torchcss.cost.fused.records import Array, Lines, Parts, Points, Repulsion, Result, Room, Tree
 from torchcss.cost.fused.superquadric import (
-    Bowl,
+    as_spatial,
     bent_radial_square,
     radial_hessian,
     radial_square,
     shape_of,
+    straight_hessian,
 )
 
 
@@ -57,14 +58,16 @@ def add_repulsion(
                 result.value[b] += potential(repulsion, room.lines.value[m])[0]
             continue
         gradient, hessian = result.gradient[b], result.hessian[b]
+        found = _felt(room.lines, found, repulsion.reach)
+        _curve(repulsion.shape, room.lines, found, room.points)
         m = 0
         while m < found:
-            pair, cost, count, m = _push(repulsion, room, m, found)
+            begin, pair = m, room.lines.ray[m]
+            cost, m = _push(repulsion, room, m, found)
             result.value[b] += cost
-            if count:
-                room.sums[0] = 0.0
-                sum_points(room.points, 0, count, room.reference, room.sums[0])
-                _lift_pair(tree, repulsion, pair, exact, room, gradient, hessian)
+            room.sums[0] = 0.0
+            sum_points(room.points, begin, m, room.reference, room.sums[0])
+            _lift_pair(tree, repulsion, pair, exact, room, gradient, hessian)
 
 
 @kernel
@@ -140,28 +143,53 @@ def _overlap(a: Array, b: Array, repulsion: Repulsion, pair: tuple[int, int]) ->
 
 
 @kernel
-def _push(repulsion: Repulsion, room: Room, m: int, found: int) -> tuple[int, float, int, int]:
-    """The next pair in the list: its number, cost, points with derivatives, and where it ends."""
-    lines, total, count, pair = room.lines, 0.0, 0, room.lines.ray[m]
+def _felt(lines: Lines, found: int, reach: float) -> int:
+    """Keep the nodes that feel the other part; their number."""
+    kept = 0
+    for m in range(found):
+        lines.x[kept], lines.y[kept], lines.z[kept] = lines.x[m], lines.y[m], lines.z[m]
+        lines.part[kept], lines.ray[kept] = lines.part[m], lines.ray[m]
+        kept += int(lines.value[m] < reach)
+    return kept
+
+
+@kernel
+def _curve(table: Array, lines: Lines, found: int, points: Points) -> None:
+    """R^2 of the nodes with its derivatives, in the frames of the other parts."""
+    for m in range(found):
+        shape = shape_of(table, lines.part[m])
+        place = lines.x[m], lines.y[m], lines.z[m]
+        bowl = straight_hessian(shape, place[0], place[1], place[2])
+        lines.value[m] = bowl.square
+        write_point(points, m, place, as_spatial(bowl))
+    for m in range(found):
+        if table[10, lines.part[m]] != 0.0:
+            place = lines.x[m], lines.y[m], lines.z[m]
+            bowl = radial_hessian(table, lines.part[m], place)
+            lines.value[m] = bowl.square
+            write_point(points, m, place, as_spatial(bowl))
+
+
+@kernel
+def _push(repulsion: Repulsion, room: Room, m: int, found: int) -> tuple[float, int]:
+    """The next pair: its cost and where it ends. Its points get the cost's derivatives."""
+    lines, points, total, pair = room.lines, room.points, 0.0, room.lines.ray[m]
     frame = room.posed[lines.part[m]]
     for i in range(3):
         room.reference[i] = frame[i, 3]
     while m < found and lines.ray[m] == pair:
-        x, y, z = lines.x[m], lines.y[m], lines.z[m]
-        if lines.value[m] < repulsion.reach:
-            bowl = radial_hessian(repulsion.shape, lines.part[m], (x, y, z))
-            value, first, second = potential(repulsion, bowl.square)
-            total += value
-            place = (
-                frame[0, 0] * x + frame[0, 1] * y + frame[0, 2] * z + frame[0, 3],
-                frame[1, 0] * x + frame[1, 1] * y + frame[1, 2] * z + frame[1, 3],
-                frame[2, 0] * x + frame[2, 1] * y + frame[2, 2] * z + frame[2, 3],
-            )
-            cost = _turned(_bent(bowl, first, second), frame)
-            write_point(room.points, count, place, cost)
-            count += 1
+        x, y, z = points.x[m], points.y[m], points.z[m]
+        value, first, second = potential(repulsion, lines.value[m])
+        total += value
+        place = (
+            frame[0, 0] * x + frame[0, 1] * y + frame[0, 2] * z + frame[0, 3],
+            frame[1, 0] * x + frame[1, 1] * y + frame[1, 2] * z + frame[1, 3],
+            frame[2, 0] * x + frame[2, 1] * y + frame[2, 2] * z + frame[2, 3],
+        )
+        cost = _bent(read_point(points, m), first, second)
+        write_point(points, m, place, _turned(cost, frame))
         m += 1
-    return pair, total, count, m
+    return total, m
 
 
 @inlined
@@ -184,7 +212,7 @@ def potential(repulsion: Repulsion, square: float) -> tuple[float, float, float]
 
 
 @inlined
-def _bent(bowl: Bowl, first: float, second: float) -> Spatial:
+def _bent(bowl: Spatial, first: float, second: float) -> Spatial:
     """Derivatives of a function of `R^2`."""
     return Spatial(
         first * bowl.x,

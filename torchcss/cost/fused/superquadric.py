@@ -9,6 +9,7 @@ import math
 from typing import NamedTuple
 
 from torchcss.cost.fused.compiler import exp, inlined, kernel, log, sqrt
+from torchcss.cost.fused.projection import Spatial
 from torchcss.cost.fused.records import Array
 
 _LEAST_SQUARE, _MOST_SQUARE, _LEAST_POWER = 1e-12, 64.0, 1e-30
@@ -162,20 +163,27 @@ class Bowl(NamedTuple):
     zz: float
 
 
+@inlined
+def as_spatial(bowl: Bowl) -> Spatial:
+    """The derivatives alone."""
+    return Spatial(bowl.x, bowl.y, bowl.z, bowl.xx, bowl.xy, bowl.xz, bowl.yy, bowl.yz, bowl.zz)
+
+
 @kernel
 def radial_hessian(table: Array, part: int, place: tuple[float, float, float]) -> Bowl:
     """`R^2` of any part with its derivatives."""
     x, y, z = place
     bend, c, s = table[10, part], table[11, part], table[12, part]
     if bend == 0.0:
-        return _straight_hessian(shape_of(table, part), x, y, z)
+        return straight_hessian(shape_of(table, part), x, y, z)
     turn = unbend(bend, c, s, x, y, z)
-    straight = _straight_hessian(shape_of(table, part), turn.x, turn.y, turn.z)
+    straight = straight_hessian(shape_of(table, part), turn.x, turn.y, turn.z)
     return _bent(straight, turn, bend, c, s)
 
 
 @inlined
-def _straight_hessian(shape: Shape, x: float, y: float, z: float) -> Bowl:
+def straight_hessian(shape: Shape, x: float, y: float, z: float) -> Bowl:
+    """The same of a straight part."""
     w = z * shape.ic
     i, j = narrowed(shape, w)
     u, v = x * i, y * j
