@@ -16,6 +16,7 @@ from torchcss.errors import ConfigurationError
 from torchcss.inference.mixture import GaussianMixture, Prior
 from torchcss.studies.render.sequences import arm_sequence
 from torchcss.studies.scenes import Scene, arm_scenes, clip_scenes
+from torchcss.tracking.session import TrackingSession
 from torchcss.tracking.settings import (
     Settings,
     all_terms,
@@ -68,8 +69,12 @@ def costs_of_a_tracker_at_the_truth(settings: Settings, num_frames: int) -> list
         variance=1.0,
     )
     session.plan = session.plan._replace(tracker=spy, jumps_every=0, recovery=None)  # type: ignore[arg-type]
-    for index, image in enumerate(sequence.frames):
-        session.step(session.observe(Frame(index, index / 25, image), everywhere=True))
+    # Scenes are looked at everywhere.
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TrackingSession, "_windows", lambda self, *_: (None,))
+        session._ahead.clear()
+        for _ in session.track(Frame(i, i / 25, image) for i, image in enumerate(sequence.frames)):
+            pass
     return spy.costs
 
 

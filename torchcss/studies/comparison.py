@@ -1,9 +1,8 @@
 """Several trackers compared in one pass over a sequence.
 
-All trackers of one seed start from the same first pose (`find_start`) and see the same images.
-`track_together` runs them frame by frame, so that the features of a frame, which do not depend on
-who tracks and take longer than many a tracker, are computed once; nothing of a frame stays in
-memory, and a run can end as soon as it has lost the body.
+All trackers of one seed start from the same first pose (`find_start`) and see the same images, each
+where its own body can be. `track_together` runs them frame by frame, so that the film is decoded
+once; nothing of a frame stays in memory, and a run can end as soon as it has lost the body.
 """
 
 from __future__ import annotations
@@ -122,15 +121,14 @@ def track_together(
         )
         for settings, begin in runs
     ]
-    eye = going[0][1]
     first: Frame | None = None
     for frame in reader:
-        observation = eye.observe(frame, everywhere=len(runs) > 1)
         first = first or frame
         left = []
         for run, session, evaluator in going:
             ended = None
             try:
+                observation = session.observe(frame)
                 posterior = session.step(observation)
                 run.measures.append(evaluator(posterior, first, observation.seconds))
             except (TorchcssError, RuntimeError, ArithmeticError) as error:

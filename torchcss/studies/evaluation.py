@@ -141,7 +141,7 @@ class FrameMeasures(NamedTuple):
         samples: Samples drawn.
         evaluations: Evaluations of the cost: with two derivatives for each iteration of a
             descending sample, or the value alone for each weighing of a particle.
-        seconds: Wall time by stage; that of the features is shared by all trackers.
+        seconds: Wall time by stage.
     """
 
     frame: int

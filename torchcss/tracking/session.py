@@ -278,7 +278,7 @@ class TrackingSession:
                 pending = pool.submit(see)
                 yield self.step(observation)
 
-    def observe(self, images: Images, *, everywhere: bool = False) -> Observation:
+    def observe(self, images: Images) -> Observation:
         """See the images of one moment, in their order.
 
         The next moment may be seen before this one is searched; it is looked at where the body can
@@ -286,7 +286,6 @@ class TrackingSession:
 
         Args:
             images: One of each view, or that of the only one.
-            everywhere: Look at all of each image, for others who search it too.
         """
         began = time.perf_counter()
         given = (images,) if isinstance(images, Image) else tuple(images)
@@ -295,7 +294,7 @@ class TrackingSession:
         ]
         self._num_seen += 1
         windows: Windows = (None,) * len(frames)
-        if self._ahead and not everywhere:
+        if self._ahead:
             windows = self._ahead.popleft()
         self._seen = tuple(map(Observer.observe, self._observers, frames, self._seen, windows))
         return Observation(self._seen, time.perf_counter() - began)
