@@ -34,6 +34,7 @@ CHANGED: dict[str, Any] = {
 
 VARIED = {
     "ablation": {"body", "terms"},
+    "benchmark_engines": set(),
     "failure_modes": {"body", "preset"},
     "learn_weights": {"body", "weights"},
     "several_views": set(),
@@ -49,6 +50,9 @@ class Caught(Exception):
 
 def arguments(folder: Path, script: str) -> list[str]:
     """The shortest way to a session."""
+    if script == "benchmark_engines":
+        write_arm(folder / "arm", 3)
+        return ["--sequence", str(folder / "arm")]
     if script == "failure_modes":
         write_arm(folder / "arm", 3)
         return ["--sequence", str(folder / "arm"), "--presets", "css"]

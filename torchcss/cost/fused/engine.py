@@ -291,7 +291,7 @@ class FusedEngine:
         # What is the same for all modes is there once for each that the flow knows, or the reverse.
         flow, marks = (
             made.get("flow", pack.no_flow(num, real)),
-            made.get("marks", pack.no_marks(real)),
+            made.get("marks", pack.no_marks()),
         )
         modes = max(len(flow.target), len(marks.target))
         flow, marks = (
@@ -303,6 +303,7 @@ class FusedEngine:
         nothing = edges.scale * edges.back_facing + colours.scale * colours.back_facing
         view = View(
             lens=pack.pack_lens(camera, real),
+            precise=pack.pack_lens(camera, np.float64),
             curves=pack.pack_curves(predictor, num, real),
             edges=edges,
             colours=colours,

@@ -1,4 +1,4 @@
-"""Joint centres against keypoints; the twin of `torchcss.cost.joints`."""
+"""Joint centres against keypoints, in double precision; the twin of `torchcss.cost.joints`."""
 
 from __future__ import annotations
 
@@ -18,16 +18,10 @@ def compare_joints(
     total, target = 0.0, marks.target[mode]
     for i in range(len(marks.row)):
         frame, place = frames[marks.row[i]], marks.place[i]
-        points.x[i] = (
-            frame[0, 0] * place[0] + frame[0, 1] * place[1] + frame[0, 2] * place[2] + frame[0, 3]
-        )
-        points.y[i] = (
-            frame[1, 0] * place[0] + frame[1, 1] * place[1] + frame[1, 2] * place[2] + frame[1, 3]
-        )
-        points.z[i] = (
-            frame[2, 0] * place[0] + frame[2, 1] * place[1] + frame[2, 2] * place[2] + frame[2, 3]
-        )
-        x, y, z = points.x[i], points.y[i], points.z[i]
+        a, b, c = place[0], place[1], place[2]
+        x = frame[0, 0] * a + frame[0, 1] * b + frame[0, 2] * c + frame[0, 3]
+        y = frame[1, 0] * a + frame[1, 1] * b + frame[1, 2] * c + frame[1, 3]
+        z = frame[2, 0] * a + frame[2, 1] * b + frame[2, 2] * c + frame[2, 3]
         pixel = project(lens, x, y, z)
         weight = target[2, i]
         du = min(max(pixel.u - target[0, i], -_FAR_PX), _FAR_PX)

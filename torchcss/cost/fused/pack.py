@@ -250,10 +250,10 @@ def no_flow(num_parts: int, real: Real) -> Flow:
 
 
 def pack_marks(
-    term: JointTerm, bound: OnPoints, weight: float, context: FrameContext, real: Real
+    term: JointTerm, bound: OnPoints, weight: float, context: FrameContext, _: Real
 ) -> Marks | None:
     """The keypoints of a frame."""
-    body, (joint, position, precision) = context.body, bound.image
+    real, body, (joint, position, precision) = np.float64, context.body, bound.image
     potential = pack_potential(term.potential, real)
     if potential is None:
         return None
@@ -271,8 +271,9 @@ def pack_marks(
     )
 
 
-def no_marks(real: Real) -> Marks:
+def no_marks() -> Marks:
     """Without keypoints."""
+    real = np.float64
     row, place = np.zeros(0, np.int64), np.zeros((0, 3))
     return Marks(real(0), row, place, np.zeros((1, 3, 0), real), real(0), no_potential(real))
 

@@ -201,12 +201,12 @@ class Flow(NamedTuple):
 
 
 class Marks(NamedTuple):
-    """The keypoints of a frame; see `torchcss.cost.joints`.
+    """The keypoints of a frame, in double precision; see `torchcss.cost.joints`.
 
     Attributes:
         scale: Factor on the nats of a joint; zero: there is no such term.
         row: Row of the frame that carries each joint.
-        place: The joint in that frame, metres, double precision.
+        place: The joint in that frame, metres.
         target: Position and weight of each keypoint, for each mode or for all, `[modes 3 joints]`.
         far: Squared distance that an unseen joint counts as, square pixels of weight one.
         potential: Kind, nu and sigma of the potential.
@@ -225,6 +225,7 @@ class View(NamedTuple):
 
     Attributes:
         lens: The camera.
+        precise: The same in double precision, for the keypoints.
         curves: The curves on the parts where contours are found.
         edges: The contour term.
         colours: The region term.
@@ -235,6 +236,7 @@ class View(NamedTuple):
     """
 
     lens: Lens
+    precise: Lens
     curves: Curves
     edges: Edges
     colours: Colours

@@ -42,7 +42,7 @@ def add_view(
         if view.marks.scale > 0.0:
             marks = view.marks
             result.value[b] += compare_joints(
-                room.frames, view.lens, marks, mode[b], view.exact, room.points
+                room.frames, view.precise, marks, mode[b], view.exact, room.points
             )
             if slopes:
                 for i in range(len(marks.row)):
