@@ -33,7 +33,6 @@ from torchcss.studies.sequences import read_sequence
 from torchcss.tracking.settings import Settings
 from torchcss.types import Curvature, LocalModel
 
-
 SETTINGS = Settings()
 
 
