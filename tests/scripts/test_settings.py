@@ -27,7 +27,7 @@ CHANGED: dict[str, Any] = {
     "keypoints_use": "first", "terms": ("contour", "region", "segmentation"),
     "curvature": "gauss-newton", "working_size": 160, "contour_weight": 120.0,
     "weights": {"region": 0.5}, "boundary_emphasis": 0.2, "seed": 3, "device": "cpu:0",
-    "dtype": "float32", "engine": "fused", "engine_dtype": "float64", "threads": 2,
+    "dtype": "float32", "engine": "eager", "engine_dtype": "float32", "threads": 2,
     "overlay": False, "recovery": False,
 }  # fmt: skip
 """Another value than the default for every setting."""

@@ -192,7 +192,7 @@ def test_same_seed_same_track(clip: Path, tmp_path: Path):
 
 
 def test_all_terms_track(clip: Path, tmp_path: Path):
-    summary = run(clip, tmp_path, terms=all_terms())
+    summary = run(clip, tmp_path, terms=all_terms(), engine="eager")
     # Weights of edges and the background are no terms; lengths are not free while tracking; an arm
     # is not segmented and has no silhouette.
     without = {"motion_boundaries", "background", "anthropometric", "segmentation", "silhouette"}
@@ -537,7 +537,7 @@ def test_what_is_wrong_with_an_image_is_told_by_two_threads_too():
 def test_terms_of_the_best_mode_add_up_to_its_cost():
     """In every frame: the priors are about the mixture that the search had, one frame ahead."""
     sequence = arm_sequence(generator=torch.Generator().manual_seed(0), num_frames=4)
-    settings = Settings(body="arm8", keypoints_use="first", working_size=160)
+    settings = Settings(body="arm8", keypoints_use="first", working_size=160, engine="eager")
     for tracked in track(sequence.frames, sequence, settings):
         assert sum(tracked.terms.values()) == pytest.approx(float(tracked.info.cost[0]), rel=1e-9)
 

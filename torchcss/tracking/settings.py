@@ -155,8 +155,8 @@ class Settings:
     seed: int = 0
     device: str = "cpu"
     dtype: Literal["float64", "float32"] = "float64"
-    engine: Literal["fused", "eager"] = "eager"
-    engine_dtype: Literal["float32", "float64"] = "float32"
+    engine: Literal["fused", "eager"] = "fused"
+    engine_dtype: Literal["float32", "float64"] = "float64"
     threads: int = 1
     overlay: bool = True
     recovery: bool = True
