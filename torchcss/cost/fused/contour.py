@@ -17,13 +17,13 @@ from torchcss.cost.fused.projection import (
     times,
     write_point,
 )
-from torchcss.cost.fused.records import Colours, Edges, Lens, Nodes, Points, Room, Seen
+from torchcss.cost.fused.records import Colours, Edges, Lens, Nodes, Points, Seen, Workspace
 from torchcss.cost.fused.region import match_colours
 
 
 @kernel
 def compare_outline(
-    nodes: Nodes, lens: Lens, edges: Edges, colours: Colours, exact: bool, room: Room
+    nodes: Nodes, lens: Lens, edges: Edges, colours: Colours, exact: bool, workspace: Workspace
 ) -> float:
     """Cost of all contour nodes; the points get its derivatives.
 
@@ -33,14 +33,16 @@ def compare_outline(
         edges: The contour term.
         colours: The region term.
         exact: Whether the curvature of the projection counts.
-        room: Room for what is found on the way, and for the points.
+        workspace: Memory for what is found on the way, and for the points.
     """
-    count = _look(nodes, lens, room.seen)
+    count = _look(nodes, lens, workspace.seen)
     if edges.scale > 0.0:
-        match_edges(edges, room.seen, count, (room.response, room.maxima), room.peaks)
+        match_edges(
+            edges, workspace.seen, count, (workspace.response, workspace.maxima), workspace.peaks
+        )
     if colours.scale > 0.0:
-        match_colours(colours, room.seen, count)
-    _pull_back(nodes, lens, room.seen, count, exact, room.points)
+        match_colours(colours, workspace.seen, count)
+    _pull_back(nodes, lens, workspace.seen, count, exact, workspace.points)
     hidden = edges.scale * edges.hidden + colours.scale * colours.hidden
     nothing = edges.scale * edges.back_facing + colours.scale * colours.back_facing
     unmatched = edges.scale * edges.unmatched + 0.5 * colours.scale * colours.nu
@@ -49,8 +51,8 @@ def compare_outline(
         cost = nodes.visible[i] * unmatched + (1.0 - nodes.visible[i]) * hidden
         total += nodes.exists[i] * (cost - nothing)
     for k in range(count):
-        i = room.seen.node[k]
-        total -= nodes.exists[i] * nodes.visible[i] * room.seen.gain[k]
+        i = workspace.seen.node[k]
+        total -= nodes.exists[i] * nodes.visible[i] * workspace.seen.gain[k]
     return total
 
 

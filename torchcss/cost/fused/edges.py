@@ -13,7 +13,7 @@ _FADE = 0.25
 
 @kernel
 def match_edges(
-    edges: Edges, seen: Seen, count: int, room: tuple[Array, Array], peaks: Peaks
+    edges: Edges, seen: Seen, count: int, workspace: tuple[Array, Array], peaks: Peaks
 ) -> None:
     """Add what the nodes gain by their wells, eq. 8 [IJRR], and the derivatives.
 
@@ -21,14 +21,14 @@ def match_edges(
         edges: The term.
         seen: The nodes in the image.
         count: Their number.
-        room: Room for the response at each step, and for the places of its maxima.
-        peaks: Room for the maxima of all nodes.
+        workspace: Memory for the response at each step, and for the places of its maxima.
+        peaks: Memory for the maxima of all nodes.
     """
     total = 0
     for k in range(count):
         seen.first[k] = total
-        _respond(edges, (seen.u[k], seen.v[k]), (seen.mu[k], seen.mv[k]), room[0])
-        total = _collect(edges, room[0], room[1], peaks, total)
+        _respond(edges, (seen.u[k], seen.v[k]), (seen.mu[k], seen.mv[k]), workspace[0])
+        total = _collect(edges, workspace[0], workspace[1], peaks, total)
     seen.first[count] = total
     _weigh(edges, peaks, total)
     for k in range(count):

@@ -35,9 +35,9 @@ from torchcss.cost.fused.records import (
     Parts,
     Repulsion,
     Result,
-    Room,
     Tree,
     View,
+    Workspace,
 )
 from torchcss.cost.fused.repulsion import add_repulsion
 from torchcss.cost.fused.view import add_view
@@ -57,7 +57,7 @@ _IMAGES: dict[type[Any], tuple[str, Callable[..., Any]]] = {
     ContourTerm: ("edges", pack.pack_edges),
     RegionTerm: ("colours", pack.pack_colours),
     FlowTerm: ("flow", pack.pack_flow),
-    JointTerm: ("marks", pack.pack_marks),
+    JointTerm: ("keypoints", pack.pack_keypoints),
 }
 """Image terms that have a compiled twin: their field in `View`, and what packs them."""
 
@@ -70,12 +70,12 @@ class _PackedView(NamedTuple):
     tree: Tree
     parts: Parts
     view: View
-    rooms: Rooms
+    workspaces: Workspaces
 
 
 class _PackedPrior(NamedTuple):
     priors: tuple[LongTails, Gaussian, Mixture]
-    repulsion: tuple[Tree, Parts, Repulsion, Rooms] | None
+    repulsion: tuple[Tree, Parts, Repulsion, Workspaces] | None
 
 
 class _Samples(NamedTuple):
@@ -84,25 +84,25 @@ class _Samples(NamedTuple):
     component: Array | None
 
 
-class Rooms:
+class Workspaces:
     """Memory for the kernels, one for each thread that needs it at a time.
 
     Args:
         make: Makes one.
     """
 
-    def __init__(self, make: Callable[[], Room]) -> None:
-        self._make, self._idle = make, deque[Room]()
+    def __init__(self, make: Callable[[], Workspace]) -> None:
+        self._make, self._idle = make, deque[Workspace]()
 
     @contextmanager
-    def lent(self) -> Iterator[Room]:
-        """A room that nobody else has."""
+    def lent(self) -> Iterator[Workspace]:
+        """A workspace that nobody else has."""
         try:
-            room = self._idle.pop()
+            workspace = self._idle.pop()
         except IndexError:
-            room = self._make()
-        yield room
-        self._idle.append(room)
+            workspace = self._make()
+        yield workspace
+        self._idle.append(workspace)
 
 
 @cache
@@ -202,17 +202,17 @@ class FusedEngine:
         mode = _rows(component, prior.priors[0].centre.shape[1], len(x))
         _run(add_priors, x, mode, *prior.priors, result)
         if prior.repulsion is not None:
-            tree, parts, repulsion, rooms = prior.repulsion
-            with rooms.lent() as room:
-                _run(add_repulsion, x, tree, parts, repulsion, exact, room, result)
+            tree, parts, repulsion, workspaces = prior.repulsion
+            with workspaces.lent() as workspace:
+                _run(add_repulsion, x, tree, parts, repulsion, exact, workspace, result)
         for context in views:
             packed, others = self._view(cost, past, context)
             left_out |= others
             if packed is not None:
                 modes = len(packed.view.flow.target)
-                with packed.rooms.lent() as room:
+                with packed.workspaces.lent() as workspace:
                     mode = _rows(parent, modes, len(x))
-                    _run(add_view, x, mode, *packed[:3], room, result)
+                    _run(add_view, x, mode, *packed[:3], workspace, result)
         return left_out
 
     def _prior(self, cost: TrackingCost, past: FrameContext) -> tuple[_PackedPrior, frozenset[str]]:
@@ -242,14 +242,16 @@ class FusedEngine:
 
     def _pack_repulsion(
         self, term: Interpenetration, weight: float, past: FrameContext
-    ) -> tuple[Tree, Parts, Repulsion, Rooms]:
+    ) -> tuple[Tree, Parts, Repulsion, Workspaces]:
         tree, real = pack.pack_tree(past.body, past.camera), self.real
         parts = pack.pack_parts(past.body, None, real)
         repulsion = pack.pack_repulsion(term, past.tables.of(InterpenetrationPairs), weight, real)
         curves = pack.pack_curves(None, len(parts.row), real)
         interior, chain = repulsion.nodes.shape[2], repulsion.chain.shape[1]
-        rooms = Rooms(partial(pack.make_room, tree, curves, interior, chain, (5, real)))
-        return tree, parts, repulsion, rooms
+        workspaces = Workspaces(
+            partial(pack.make_workspace, tree, curves, interior, chain, (5, real))
+        )
+        return tree, parts, repulsion, workspaces
 
     def _view(
         self, cost: TrackingCost, past: FrameContext, context: FrameContext
@@ -289,16 +291,16 @@ class FusedEngine:
         edges = made.get("edges", pack.no_edges(real))
         colours = made.get("colours", pack.no_colours(num, real))
         # What is the same for all modes is there once for each that the flow knows, or the reverse.
-        flow, marks = (
+        flow, keypoints = (
             made.get("flow", pack.no_flow(num, real)),
-            made.get("marks", pack.no_marks()),
+            made.get("keypoints", pack.no_keypoints()),
         )
-        modes = max(len(flow.target), len(marks.target))
-        flow, marks = (
+        modes = max(len(flow.target), len(keypoints.target))
+        flow, keypoints = (
             record._replace(target=np.repeat(record.target, modes, 0))
             if len(record.target) < modes
             else record
-            for record in (flow, marks)
+            for record in (flow, keypoints)
         )
         nothing = edges.scale * edges.back_facing + colours.scale * colours.back_facing
         view = View(
@@ -308,13 +310,15 @@ class FusedEngine:
             edges=edges,
             colours=colours,
             flow=flow,
-            marks=marks,
+            keypoints=keypoints,
             nothing=float(nothing) * (0 if predictor is None else predictor.num_nodes),
             exact=cost.choice.curvature is not Curvature.GAUSS_NEWTON,
         )
         interior = view.flow.nodes.shape[2]
-        make = partial(pack.make_room, tree, view.curves, interior, 1, (len(edges.steps), real))
-        return _PackedView(tree, parts, view, Rooms(make)), frozenset(others)
+        make = partial(
+            pack.make_workspace, tree, view.curves, interior, 1, (len(edges.steps), real)
+        )
+        return _PackedView(tree, parts, view, Workspaces(make)), frozenset(others)
 
 
 def _run(kernel: Callable[..., None], *arguments: Any) -> None:

@@ -30,18 +30,18 @@ from torchcss.cost.fused.records import (
     Lens,
     Lines,
     LongTails,
-    Marks,
     Mixture,
     Nodes,
+    PackedKeypoints,
     Parts,
     Peaks,
     Points,
     Potential,
     Rays,
     Repulsion,
-    Room,
     Seen,
     Tree,
+    Workspace,
 )
 from torchcss.cost.interior import InteriorNodes
 from torchcss.cost.interpenetration import END, Interpenetration, InterpenetrationPairs
@@ -249,9 +249,9 @@ def no_flow(num_parts: int, real: Real) -> Flow:
     return Flow(zero, nodes, target, zero, zero, zero, potential)
 
 
-def pack_marks(
+def pack_keypoints(
     term: JointTerm, bound: OnPoints, weight: float, context: FrameContext, _: Real
-) -> Marks | None:
+) -> PackedKeypoints | None:
     """The keypoints of a frame."""
     real, body, (joint, position, precision) = np.float64, context.body, bound.image
     potential = pack_potential(term.potential, real)
@@ -261,7 +261,7 @@ def pack_marks(
     homogeneous = torch.cat([offset, torch.ones_like(offset[:, :1])], dim=1)[:, :, None]
     row, place = _carried(body, bound.link, homogeneous)
     target = torch.cat([position, precision[..., None]], dim=-1).mT
-    return Marks(
+    return PackedKeypoints(
         scale=real(weight * bound.scale),
         row=row,
         place=place[:, :, 0].copy(),
@@ -271,11 +271,13 @@ def pack_marks(
     )
 
 
-def no_marks() -> Marks:
+def no_keypoints() -> PackedKeypoints:
     """Without keypoints."""
     real = np.float64
     row, place = np.zeros(0, np.int64), np.zeros((0, 3))
-    return Marks(real(0), row, place, np.zeros((1, 3, 0), real), real(0), no_potential(real))
+    return PackedKeypoints(
+        real(0), row, place, np.zeros((1, 3, 0), real), real(0), no_potential(real)
+    )
 
 
 def pack_repulsion(
@@ -306,9 +308,9 @@ def pack_repulsion(
     )
 
 
-def make_room(
+def make_workspace(
     tree: Tree, curves: Curves, interior: int, chain: int, samples: tuple[int, Any]
-) -> Room:
+) -> Workspace:
     """Memory for one state.
 
     Args:
@@ -331,7 +333,7 @@ def make_room(
 
     # Every node may be before or behind every part, or inside; one more, to be overwritten.
     pairs = nodes * max(num_parts, 1) + 1
-    return Room(
+    return Workspace(
         frames=np.zeros((1 + num_joints, 3, 4)),
         frame=np.zeros((3, 4)),
         posed=np.zeros((num_parts, 3, 4), real),

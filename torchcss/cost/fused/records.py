@@ -200,7 +200,7 @@ class Flow(NamedTuple):
     potential: Potential
 
 
-class Marks(NamedTuple):
+class PackedKeypoints(NamedTuple):
     """The keypoints of a frame, in double precision; see `torchcss.cost.joints`.
 
     Attributes:
@@ -230,7 +230,7 @@ class View(NamedTuple):
         edges: The contour term.
         colours: The region term.
         flow: The flow term.
-        marks: The keypoints.
+        keypoints: The keypoints.
         nothing: Cost of all contour nodes where no part has a contour.
         exact: Whether the curvature of projection and kinematics counts.
     """
@@ -241,7 +241,7 @@ class View(NamedTuple):
     edges: Edges
     colours: Colours
     flow: Flow
-    marks: Marks
+    keypoints: PackedKeypoints
     nothing: float
     exact: bool
 
@@ -506,7 +506,7 @@ class Result(NamedTuple):
     hessian: Array
 
 
-class Room(NamedTuple):
+class Workspace(NamedTuple):
     """Memory for what is found of one state on the way; nothing in it is kept.
 
     Attributes:

@@ -12,7 +12,16 @@ from torchcss.cost.fused.compiler import entry, exp, inlined, kernel, log
 from torchcss.cost.fused.kinematics import find_twists, pose_parts, pose_tree
 from torchcss.cost.fused.lift import react, sum_points
 from torchcss.cost.fused.projection import Spatial, read_point, write_point
-from torchcss.cost.fused.records import Array, Lines, Parts, Points, Repulsion, Result, Room, Tree
+from torchcss.cost.fused.records import (
+    Array,
+    Lines,
+    Parts,
+    Points,
+    Repulsion,
+    Result,
+    Tree,
+    Workspace,
+)
 from torchcss.cost.fused.superquadric import (
     as_spatial,
     bent_radial_square,
@@ -30,7 +39,7 @@ def add_repulsion(
     parts: Parts,
     repulsion: Repulsion,
     exact: bool,
-    room: Room,
+    workspace: Workspace,
     result: Result,
 ) -> None:
     """Add the repulsion of all states of a pool.
@@ -41,33 +50,33 @@ def add_repulsion(
         parts: Its parts.
         repulsion: The term.
         exact: Whether the curvature of the kinematics counts.
-        room: Room for what is found on the way.
+        workspace: Memory for what is found on the way.
         result: Where it is added.
     """
     slopes = len(result.gradient[0]) > 0
     for b in range(len(x)):
-        pose_tree(x[b], tree, room.frames)
-        pose_parts(room.frames, parts, room.frame, room.posed)
-        room.reference[:] = 0.0
+        pose_tree(x[b], tree, workspace.frames)
+        pose_parts(workspace.frames, parts, workspace.frame, workspace.posed)
+        workspace.reference[:] = 0.0
         if slopes:
-            find_twists(room.frames, tree, room.reference, room.twists)
-        found = _find_nodes(repulsion, room.posed, room.lines)
-        _measure(repulsion.shape, room.lines, found)
+            find_twists(workspace.frames, tree, workspace.reference, workspace.twists)
+        found = _find_nodes(repulsion, workspace.posed, workspace.lines)
+        _measure(repulsion.shape, workspace.lines, found)
         if not slopes:
             for m in range(found):
-                result.value[b] += potential(repulsion, room.lines.value[m])[0]
+                result.value[b] += potential(repulsion, workspace.lines.value[m])[0]
             continue
         gradient, hessian = result.gradient[b], result.hessian[b]
-        found = _felt(room.lines, found, repulsion.reach)
-        _curve(repulsion.shape, room.lines, found, room.points)
+        found = _felt(workspace.lines, found, repulsion.reach)
+        _curve(repulsion.shape, workspace.lines, found, workspace.points)
         m = 0
         while m < found:
-            begin, pair = m, room.lines.ray[m]
-            cost, m = _push(repulsion, room, m, found)
+            begin, pair = m, workspace.lines.ray[m]
+            cost, m = _push(repulsion, workspace, m, found)
             result.value[b] += cost
-            room.sums[0] = 0.0
-            sum_points(room.points, begin, m, room.reference, room.sums[0])
-            _lift_pair(tree, repulsion, pair, exact, room, gradient, hessian)
+            workspace.sums[0] = 0.0
+            sum_points(workspace.points, begin, m, workspace.reference, workspace.sums[0])
+            _lift_pair(tree, repulsion, pair, exact, workspace, gradient, hessian)
 
 
 @kernel
@@ -171,12 +180,12 @@ def _curve(table: Array, lines: Lines, found: int, points: Points) -> None:
 
 
 @kernel
-def _push(repulsion: Repulsion, room: Room, m: int, found: int) -> tuple[float, int]:
+def _push(repulsion: Repulsion, workspace: Workspace, m: int, found: int) -> tuple[float, int]:
     """The next pair: its cost and where it ends. Its points get the cost's derivatives."""
-    lines, points, total, pair = room.lines, room.points, 0.0, room.lines.ray[m]
-    frame = room.posed[lines.part[m]]
+    lines, points, total, pair = workspace.lines, workspace.points, 0.0, workspace.lines.ray[m]
+    frame = workspace.posed[lines.part[m]]
     for i in range(3):
-        room.reference[i] = frame[i, 3]
+        workspace.reference[i] = frame[i, 3]
     while m < found and lines.ray[m] == pair:
         x, y, z = points.x[m], points.y[m], points.z[m]
         value, first, second = potential(repulsion, lines.value[m])
@@ -262,15 +271,15 @@ def _lift_pair(
     repulsion: Repulsion,
     pair: int,
     exact: bool,
-    room: Room,
+    workspace: Workspace,
     gradient: Array,
     hessian: Array,
 ) -> None:
     """Add the derivatives of a pair's cost in the state."""
-    cx, cy, cz = room.reference[0], room.reference[1], room.reference[2]
+    cx, cy, cz = workspace.reference[0], workspace.reference[1], workspace.reference[2]
     chain, signs = repulsion.chain[pair], repulsion.sign[pair]
     for n in range(len(chain)):
-        joint, twist = room.twists[chain[n]], room.moved[n]
+        joint, twist = workspace.twists[chain[n]], workspace.moved[n]
         factor = signs[n] * tree.factor[chain[n]]
         if signs[n] == 0.0:
             return
@@ -279,11 +288,11 @@ def _lift_pair(
         twist[3] = factor * (joint[3] + wy * cz - wz * cy)
         twist[4] = factor * (joint[4] + wz * cx - wx * cz)
         twist[5] = factor * (joint[5] + wx * cy - wy * cx)
-        slope, turning, shifting = react(room.sums[0], twist, exact)
+        slope, turning, shifting = react(workspace.sums[0], twist, exact)
         column = tree.column[chain[n]]
         gradient[column] += slope
         for m in range(n + 1):
-            t, other = room.moved[m], tree.column[chain[m]]
+            t, other = workspace.moved[m], tree.column[chain[m]]
             bend = t[0] * turning[0] + t[1] * turning[1] + t[2] * turning[2]
             bend += t[3] * shifting[0] + t[4] * shifting[1] + t[5] * shifting[2]
             hessian[other, column] += bend

@@ -45,9 +45,9 @@ def see_nodes(
         parts: Shapes of the parts.
         beside: Look at the neighbours alone, a little outside the node, and behind it too, and
             multiply `exists` instead.
-        rays: Room for the rays.
-        near: Room for the stretches near one part.
-        lines: Room for all stretches that count.
+        rays: Memory for the rays.
+        near: Memory for the stretches near one part.
+        lines: Memory for all stretches that count.
     """
     count = nodes.first[len(posed)]
     _aim(nodes, parts.clearance if beside else parts.clearance * 0.0, count, rays)

@@ -9,13 +9,19 @@ from torchcss.cost.fused.joints import compare_joints
 from torchcss.cost.fused.kinematics import find_twists, pose_parts, pose_tree
 from torchcss.cost.fused.lift import lift, sum_points
 from torchcss.cost.fused.outline import find_outline
-from torchcss.cost.fused.records import Array, Parts, Result, Room, Tree, View
+from torchcss.cost.fused.records import Array, Parts, Result, Tree, View, Workspace
 from torchcss.cost.fused.sight import see_nodes
 
 
 @entry
 def add_view(
-    x: Array, mode: Array, tree: Tree, parts: Parts, view: View, room: Room, result: Result
+    x: Array,
+    mode: Array,
+    tree: Tree,
+    parts: Parts,
+    view: View,
+    workspace: Workspace,
+    result: Result,
 ) -> None:
     """Add what a view says of all states of a pool.
 
@@ -25,33 +31,33 @@ def add_view(
         tree: The body's tree before the camera.
         parts: Its parts.
         view: Camera and terms.
-        room: Room for what is found on the way.
+        workspace: Memory for what is found on the way.
         result: Where it is added.
     """
     slopes = len(result.gradient[0]) > 0
     for b in range(len(x)):
-        pose_tree(x[b], tree, room.frames)
-        pose_parts(room.frames, parts, room.frame, room.posed)
+        pose_tree(x[b], tree, workspace.frames)
+        pose_parts(workspace.frames, parts, workspace.frame, workspace.posed)
         if slopes:
-            _choose_reference(room.frames, room.reference)
-            room.sums[:] = 0.0
+            _choose_reference(workspace.frames, workspace.reference)
+            workspace.sums[:] = 0.0
         if view.edges.scale > 0.0 or view.colours.scale > 0.0:
-            result.value[b] += _outline(parts, view, slopes, room)
+            result.value[b] += _outline(parts, view, slopes, workspace)
         if view.flow.scale > 0.0:
-            result.value[b] += _flow(parts, view, mode[b], slopes, room)
-        if view.marks.scale > 0.0:
-            marks = view.marks
+            result.value[b] += _flow(parts, view, mode[b], slopes, workspace)
+        if view.keypoints.scale > 0.0:
+            keypoints = view.keypoints
             result.value[b] += compare_joints(
-                room.frames, view.precise, marks, mode[b], view.exact, room.points
+                workspace.frames, view.precise, keypoints, mode[b], view.exact, workspace.points
             )
             if slopes:
-                for i in range(len(marks.row)):
-                    sums = room.sums[marks.row[i]]
-                    sum_points(room.points, i, i + 1, room.reference, sums)
+                for i in range(len(keypoints.row)):
+                    sums = workspace.sums[keypoints.row[i]]
+                    sum_points(workspace.points, i, i + 1, workspace.reference, sums)
         if slopes:
-            find_twists(room.frames, tree, room.reference, room.twists)
+            find_twists(workspace.frames, tree, workspace.reference, workspace.twists)
             gradient, hessian = result.gradient[b], result.hessian[b]
-            lift(tree, room.sums, room.twists, view.exact, gradient, hessian)
+            lift(tree, workspace.sums, workspace.twists, view.exact, gradient, hessian)
 
 
 @kernel
@@ -65,34 +71,34 @@ def _choose_reference(frames: Array, reference: Array) -> None:
 
 
 @kernel
-def _outline(parts: Parts, view: View, slopes: bool, room: Room) -> float:
+def _outline(parts: Parts, view: View, slopes: bool, workspace: Workspace) -> float:
     """Cost of the contour nodes, their derivatives added to the sums."""
-    nodes = room.outline
-    find_outline(view.curves, room.posed, room.facing, nodes)
-    see_nodes(nodes, room.posed, parts, True, room.rays, room.near, room.lines)
-    see_nodes(nodes, room.posed, parts, False, room.rays, room.near, room.lines)
-    cost = compare_outline(nodes, view.lens, view.edges, view.colours, view.exact, room)
+    nodes = workspace.outline
+    find_outline(view.curves, workspace.posed, workspace.facing, nodes)
+    see_nodes(nodes, workspace.posed, parts, True, workspace.rays, workspace.near, workspace.lines)
+    see_nodes(nodes, workspace.posed, parts, False, workspace.rays, workspace.near, workspace.lines)
+    cost = compare_outline(nodes, view.lens, view.edges, view.colours, view.exact, workspace)
     if slopes:
-        _sum_parts(parts, room)
+        _sum_parts(parts, workspace)
     return cost + view.nothing
 
 
 @kernel
-def _flow(parts: Parts, view: View, mode: int, slopes: bool, room: Room) -> float:
+def _flow(parts: Parts, view: View, mode: int, slopes: bool, workspace: Workspace) -> float:
     """Cost of the nodes all over the surface, their derivatives added to the sums."""
-    nodes = room.interior
-    find_interior(view.flow.nodes, room.posed, nodes)
-    see_nodes(nodes, room.posed, parts, False, room.rays, room.near, room.lines)
-    cost = follow_flow(nodes, view.lens, view.flow, mode, view.exact, room.points)
+    nodes = workspace.interior
+    find_interior(view.flow.nodes, workspace.posed, nodes)
+    see_nodes(nodes, workspace.posed, parts, False, workspace.rays, workspace.near, workspace.lines)
+    cost = follow_flow(nodes, view.lens, view.flow, mode, view.exact, workspace.points)
     if slopes:
-        _sum_parts(parts, room)
+        _sum_parts(parts, workspace)
     return cost
 
 
 @kernel
-def _sum_parts(parts: Parts, room: Room) -> None:
-    points = room.points
+def _sum_parts(parts: Parts, workspace: Workspace) -> None:
+    points = workspace.points
     for part in range(len(parts.row)):
         begin, end = points.first[part], points.first[part + 1]
         if begin < end:
-            sum_points(points, begin, end, room.reference, room.sums[parts.row[part]])
+            sum_points(points, begin, end, workspace.reference, workspace.sums[parts.row[part]])
