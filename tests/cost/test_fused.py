@@ -16,7 +16,6 @@ from torch import Tensor
 
 from torchcss.body.shape import with_shape
 from torchcss.cost.context import BodyTables
-from torchcss.cost.fused.checked import checked
 from torchcss.cost.fused.engine import FusedEngine, fused_engine
 from torchcss.cost.fused.priors import add_priors
 from torchcss.cost.fused.repulsion import add_repulsion
@@ -24,6 +23,7 @@ from torchcss.cost.fused.view import add_view
 from torchcss.cost.region import RegionImages, RegionTerm, layer_of_part
 from torchcss.cost.total import TrackingCost, beside, together
 from torchcss.cost.visibility import ContourPredictor
+from torchcss.kernels.checked import checked
 from torchcss.types import Curvature, LocalModel
 from torchcss.vision.spline import spline_field
 

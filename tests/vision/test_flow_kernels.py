@@ -5,16 +5,17 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchcss.vision import flow, flow_kernels
+from torchcss.kernels import compiler
+from torchcss.vision import flow
 
-pytestmark = pytest.mark.skipif(not flow_kernels.AVAILABLE, reason="numba is not installed")
+pytestmark = pytest.mark.skipif(not compiler.COMPILED, reason="numba is not installed")
 
 SIZES = [(1, 1), (1, 9), (7, 1), (2, 3), (33, 26)]
 
 
 def both(monkeypatch: pytest.MonkeyPatch, run):
     compiled = run()
-    monkeypatch.setattr(flow_kernels, "AVAILABLE", False)
+    monkeypatch.setattr(compiler, "COMPILED", False)
     return compiled, run()
 
 

@@ -46,6 +46,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchcss.errors import ConfigurationError, FrameError, ShapeError
+from torchcss.kernels import compiler
 from torchcss.robust import Leclerc, Lorentzian, Quadratic
 from torchcss.vision import flow_kernels
 
@@ -275,7 +276,7 @@ def _resize(images: Float[Tensor, "b c h w"], size: tuple[int, int]) -> Float[Te
 def _compiled(images: Tensor) -> bool:
     """Whether the loops over these images have compiled twins."""
     single = images.dtype == torch.float32 and images.device.type == "cpu"
-    return flow_kernels.AVAILABLE and single and not torch.compiler.is_compiling()
+    return compiler.COMPILED and single and not torch.compiler.is_compiling()
 
 
 def _structure(images: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:

@@ -1,40 +1,24 @@
 """The inner loops of the optical flow, compiled; `torchcss.vision.flow` has their twins in torch.
 
 A conjugate-gradient step in torch is a dozen passes over the image, each of which fetches it from
-memory anew. Here a step is three passes, each row at a time. `AVAILABLE` is False where numba
-cannot be imported; the flow then takes torch's way, as it does on a GPU and in double precision.
+memory anew. Here a step is three passes, each row at a time. Where numba cannot be
+imported the flow takes torch's way, as it does on a GPU and in double precision.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 
-try:
-    import numba
-except ImportError:
-    numba = None
-
-AVAILABLE = numba is not None
+from torchcss.kernels.compiler import entry, kernel, sqrt
 
 
-def _kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    if numba is None:
-        return function
-    # What the compiler may reorder depends on the code alone, so that results repeat.
-    freedom = {"contract", "nsz", "arcp", "reassoc"}
-    return numba.njit(nogil=True, cache=True, fastmath=freedom, error_model="numpy")(function)
-
-
-@_kernel
+@kernel
 def _apply(x, q, degree, right, down, product):  # type: ignore[no-untyped-def]
     """Matrix times vector, inside a border of zeros; returns their inner product."""
     height, width = degree.shape
-    total = 0.0
+    total = np.float64(0.0)  # over all rows
     for row in range(height):
-        along = np.float32(0.0)
+        along = 0.0
         for c in range(width):
             u, v = x[0, row + 1, c + 1], x[1, row + 1, c + 1]
             common = q[0, row, c] * u + q[1, row, c] * v
@@ -53,13 +37,13 @@ def _apply(x, q, degree, right, down, product):  # type: ignore[no-untyped-def]
     return total
 
 
-@_kernel
+@kernel
 def _descend(length, x, image, inverse, flow, residual, conditioned):  # type: ignore[no-untyped-def]
     """Go along a direction; the new residual, preconditioned, and their inner product."""
     height, width = flow.shape[1:]
-    total = 0.0
+    total = np.float64(0.0)  # over all rows
     for row in range(height):
-        along = np.float32(0.0)
+        along = 0.0
         for c in range(width):
             flow[0, row, c] += length * x[0, row + 1, c + 1]
             flow[1, row, c] += length * x[1, row + 1, c + 1]
@@ -74,7 +58,7 @@ def _descend(length, x, image, inverse, flow, residual, conditioned):  # type: i
     return total
 
 
-@_kernel
+@kernel
 def _turn(share, conditioned, x):  # type: ignore[no-untyped-def]
     """The next direction."""
     height, width = conditioned.shape[1:]
@@ -84,7 +68,7 @@ def _turn(share, conditioned, x):  # type: ignore[no-untyped-def]
             x[1, row + 1, c + 1] = conditioned[1, row, c] + share * x[1, row + 1, c + 1]
 
 
-@_kernel
+@entry
 def solve(flow, q, target, right, down, num_iterations):  # type: ignore[no-untyped-def]
     """Improve a flow, in place, by conjugate gradients on `(q q^T + L) f = target`.
 
@@ -104,7 +88,7 @@ def solve(flow, q, target, right, down, num_iterations):  # type: ignore[no-unty
             links = right[row, c] + right[row, c + 1] + down[row, c] + down[row + 1, c]
             q_u, q_v = q[0, row, c], q[1, row, c]
             determinant = links * (links + q_u * q_u + q_v * q_v)
-            share = np.float32(1.0) / determinant if determinant > 0.0 else np.float32(0.0)
+            share = 1.0 / determinant if determinant > 0.0 else 0.0
             degree[row, c] = links
             inverse[0, row, c] = (links + q_v * q_v) * share
             inverse[1, row, c] = (links + q_u * q_u) * share
@@ -114,9 +98,9 @@ def solve(flow, q, target, right, down, num_iterations):  # type: ignore[no-unty
     image, conditioned = np.empty_like(flow), np.empty_like(flow)
     _apply(x, q, degree, right, down, image)
     residual = target - image
-    x[:] = np.float32(0.0)
-    reduction = _descend(np.float32(0.0), x, image, inverse, flow, residual, conditioned)
-    _turn(np.float32(0.0), conditioned, x)
+    x[:] = 0.0
+    reduction = _descend(0.0, x, image, inverse, flow, residual, conditioned)
+    _turn(0.0, conditioned, x)
     for _ in range(num_iterations):
         bend = _apply(x, q, degree, right, down, image)
         if not bend > 0.0:
@@ -129,7 +113,7 @@ def solve(flow, q, target, right, down, num_iterations):  # type: ignore[no-unty
         _turn(np.float32(reduction / before), conditioned, x)
 
 
-@_kernel
+@kernel
 def _order(planes, low, high, width):  # type: ignore[no-untyped-def]
     """The lesser of two rows into the first of them, the greater into the second."""
     for c in range(width):
@@ -137,7 +121,7 @@ def _order(planes, low, high, width):  # type: ignore[no-untyped-def]
         planes[low, c], planes[high, c] = min(a, b), max(a, b)
 
 
-@_kernel
+@entry
 def median(padded, radius, out):  # type: ignore[no-untyped-def]
     """Median over square windows, as `torchcss.vision.flow._inner_median` finds it, row by row.
 
@@ -174,7 +158,7 @@ def median(padded, radius, out):  # type: ignore[no-untyped-def]
         out[row] = planes[first + 1]
 
 
-@_kernel
+@entry
 def structure(image, scale, step, num_steps):  # type: ignore[no-untyped-def]
     """The smooth part of an image: least total variation near it (Chambolle 2004).
 
@@ -186,7 +170,6 @@ def structure(image, scale, step, num_steps):  # type: ignore[no-untyped-def]
     """
     height, width = image.shape
     scale, step = np.float32(scale), np.float32(step)
-    one = np.float32(1.0)
     # Links to the right and down, after a first row and column of zeros.
     along, across = (
         np.zeros((height, width + 1), np.float32),
@@ -200,12 +183,12 @@ def structure(image, scale, step, num_steps):  # type: ignore[no-untyped-def]
             for c in range(width - 1):
                 u = along[row, c + 1] + step * (smooth[row, c + 1] - smooth[row, c])
                 v = across[row + 1, c] + step * (smooth[below, c] - smooth[row, c])
-                length = max(one, np.sqrt(u * u + v * v))
+                length = max(1.0, sqrt(u * u + v * v))
                 along[row, c + 1] = u / length
                 across[row + 1, c] = v / length
             c = width - 1
             v = across[row + 1, c] + step * (smooth[below, c] - smooth[row, c])
-            across[row + 1, c] = v / max(one, abs(v))
+            across[row + 1, c] = v / max(1.0, abs(v))
         for row in range(height):
             for c in range(width):
                 inward = along[row, c + 1] - along[row, c] + across[row + 1, c] - across[row, c]

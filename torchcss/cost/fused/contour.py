@@ -6,7 +6,6 @@ once.
 
 from __future__ import annotations
 
-from torchcss.cost.fused.compiler import kernel
 from torchcss.cost.fused.edges import match_edges
 from torchcss.cost.fused.projection import (
     Pixel,
@@ -19,6 +18,7 @@ from torchcss.cost.fused.projection import (
 )
 from torchcss.cost.fused.records import Colours, Edges, Lens, Nodes, Points, Seen, Workspace
 from torchcss.cost.fused.region import match_colours
+from torchcss.kernels.compiler import kernel
 
 
 @kernel

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from torchcss.cost.fused.compiler import floor, kernel
 from torchcss.cost.fused.potentials import potential_of
 from torchcss.cost.fused.records import Array, Edges, Peaks, Seen
+from torchcss.kernels.compiler import floor, kernel
 
 _TINY = 1e-12
 _SHARP_ENOUGH = 0.05

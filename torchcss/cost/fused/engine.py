@@ -24,8 +24,7 @@ from torchcss.cost.anthropometric import Anthropometric
 from torchcss.cost.context import FrameContext
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.flow import FlowTerm
-from torchcss.cost.fused import compiler, pack
-from torchcss.cost.fused.checked import checked
+from torchcss.cost.fused import pack
 from torchcss.cost.fused.priors import add_priors
 from torchcss.cost.fused.records import (
     Array,
@@ -48,6 +47,8 @@ from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.temporal import MixturePrior, TemporalPrior
 from torchcss.cost.term import OnPoints
 from torchcss.cost.visibility import ContourPredictor
+from torchcss.kernels import compiler
+from torchcss.kernels.checked import checked
 from torchcss.types import Curvature, LocalModel
 
 if TYPE_CHECKING:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from torchcss.cost.fused.compiler import kernel
 from torchcss.cost.fused.potentials import potential_of, robust_slope
 from torchcss.cost.fused.projection import project, pull_back, times, write_point
 from torchcss.cost.fused.records import Array, Lens, PackedKeypoints, Points
+from torchcss.kernels.compiler import kernel
 
 _FAR_PX = 1e8
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 
-from torchcss.cost.fused.compiler import kernel
 from torchcss.cost.fused.records import Array, Parts, Tree
+from torchcss.kernels.compiler import kernel
 
 
 @kernel

@@ -7,8 +7,8 @@ added up along the tree, and the twists of the joints turn them into derivatives
 
 from __future__ import annotations
 
-from torchcss.cost.fused.compiler import inlined, kernel
 from torchcss.cost.fused.records import Array, Points, Tree
+from torchcss.kernels.compiler import inlined, kernel
 
 
 @kernel

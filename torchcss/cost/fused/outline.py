@@ -6,8 +6,8 @@ does, by linear interpolation; it counts by how far the curve turns through the 
 
 from __future__ import annotations
 
-from torchcss.cost.fused.compiler import inlined, kernel, sqrt
 from torchcss.cost.fused.records import Array, Curves, Nodes
+from torchcss.kernels.compiler import inlined, kernel, sqrt
 
 _GRAZING = 0.15
 """Sine of the angle by which a curve must turn through the line of sight to count fully."""

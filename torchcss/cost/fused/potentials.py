@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from torchcss.cost.fused.compiler import exp, inlined, log
 from torchcss.cost.fused.projection import Slope
 from torchcss.cost.fused.records import Potential
+from torchcss.kernels.compiler import exp, inlined, log
 from torchcss.robust import Leclerc, Lorentzian, Quadratic
 
 KINDS = (Lorentzian, Leclerc, Quadratic)

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import math
 
-from torchcss.cost.fused.compiler import entry, kernel
 from torchcss.cost.fused.records import Array, Gaussian, LongTails, Mixture, Result
+from torchcss.kernels.compiler import entry, kernel
 
 _FAR = 1e150
 """Deviations whose square does not overflow."""

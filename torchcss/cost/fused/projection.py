@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from torchcss.cost.fused.compiler import inlined, sqrt
 from torchcss.cost.fused.records import Lens, Points
+from torchcss.kernels.compiler import inlined, sqrt
 
 
 class Pixel(NamedTuple):

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from torchcss.cost.fused.compiler import kernel
 from torchcss.cost.fused.records import Colours, Seen
 from torchcss.cost.fused.spline import sample_spline
+from torchcss.kernels.compiler import kernel
 
 
 @kernel

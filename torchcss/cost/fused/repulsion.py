@@ -8,7 +8,6 @@ move that part count with the opposite sign.
 
 from __future__ import annotations
 
-from torchcss.cost.fused.compiler import entry, exp, inlined, kernel, log
 from torchcss.cost.fused.kinematics import find_twists, pose_parts, pose_tree
 from torchcss.cost.fused.lift import react, sum_points
 from torchcss.cost.fused.projection import Spatial, read_point, write_point
@@ -30,6 +29,7 @@ from torchcss.cost.fused.superquadric import (
     shape_of,
     straight_hessian,
 )
+from torchcss.kernels.compiler import entry, exp, inlined, kernel, log
 
 
 @entry

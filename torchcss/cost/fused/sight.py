@@ -7,7 +7,6 @@ steps to where they are nearest to their parts.
 
 from __future__ import annotations
 
-from torchcss.cost.fused.compiler import inlined, kernel, sqrt
 from torchcss.cost.fused.records import Array, Lines, Nodes, Parts, Rays
 from torchcss.cost.fused.superquadric import (
     bent_radial_square,
@@ -15,6 +14,7 @@ from torchcss.cost.fused.superquadric import (
     radial_square,
     shape_of,
 )
+from torchcss.kernels.compiler import inlined, kernel, sqrt
 
 _TINY = 1e-12
 _STEPS, _SAMPLED_STEPS, _SAMPLES = 3, 4, 12

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from torchcss.cost.fused.compiler import floor, inlined
 from torchcss.cost.fused.records import Array
+from torchcss.kernels.compiler import floor, inlined
 
 _MARGIN = 4
 _LEAST = 1.5 - _MARGIN

@@ -8,9 +8,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from torchcss.cost.fused.compiler import exp, inlined, kernel, log, sqrt
 from torchcss.cost.fused.projection import Spatial
 from torchcss.cost.fused.records import Array
+from torchcss.kernels.compiler import exp, inlined, kernel, log, sqrt
 
 _LEAST_SQUARE, _MOST_SQUARE, _LEAST_POWER = 1e-12, 64.0, 1e-30
 """Bounds on squared coordinates and on powers, so that single precision holds all products."""

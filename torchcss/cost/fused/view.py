@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from torchcss.cost.fused.compiler import entry, kernel
 from torchcss.cost.fused.contour import compare_outline
 from torchcss.cost.fused.flow import find_interior, follow_flow
 from torchcss.cost.fused.joints import compare_joints
@@ -11,6 +10,7 @@ from torchcss.cost.fused.lift import lift, sum_points
 from torchcss.cost.fused.outline import find_outline
 from torchcss.cost.fused.records import Array, Parts, Result, Tree, View, Workspace
 from torchcss.cost.fused.sight import see_nodes
+from torchcss.kernels.compiler import entry, kernel
 
 
 @entry

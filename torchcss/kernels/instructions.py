@@ -14,8 +14,8 @@ from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic, overload
 
-from torchcss.cost.fused import compiler
-from torchcss.cost.fused.compiler import inlined
+from torchcss.kernels import compiler
+from torchcss.kernels.compiler import inlined
 
 
 def _unary(name: str) -> Any:

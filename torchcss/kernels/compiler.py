@@ -1,7 +1,7 @@
 """How a kernel is compiled: `@kernel`, `@inlined`, `@entry`, and the functions of one number.
 
 A kernel is a plain Python function under `@kernel`. It is compiled on its first call for the types
-of its arguments, for the processor at hand (`torchcss.cost.fused.pipeline`):
+of its arguments, for the processor at hand (`torchcss.kernels.pipeline`):
 
 - **Literals take the precision of the arguments.** If any argument is in single precision, then so
   are the floating-point literals and constants of the function; else a literal would turn all that
@@ -11,7 +11,7 @@ of its arguments, for the processor at hand (`torchcss.cost.fused.pipeline`):
   making, whatever the pool: an item's result depends on that item alone.
 
 With `TORCHCSS_CHECK_KERNELS=1` kernels are not compiled. They run as plain Python on arrays that
-refuse any index out of range (`torchcss.cost.fused.checked`): slow, for tests.
+refuse any index out of range (`torchcss.kernels.checked`): slow, for tests.
 
 Where numba cannot be imported `AVAILABLE` is False, and nobody calls a kernel.
 """
@@ -34,6 +34,9 @@ AVAILABLE = numba is not None
 CHECKED = os.environ.get("TORCHCSS_CHECK_KERNELS", "") == "1"
 """Whether kernels run as plain Python with every index checked."""
 
+COMPILED = AVAILABLE and not CHECKED
+"""Whether kernels are compiled: where they are not, they are of use for tests alone."""
+
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
@@ -53,14 +56,14 @@ def entry(function: _Function) -> _Function:
 
 
 def _compiled(function: _Function, role: str) -> _Function:
-    if not AVAILABLE or CHECKED:
+    if not COMPILED:
         return function
-    from torchcss.cost.fused import pipeline
+    from torchcss.kernels import pipeline
 
     return pipeline.compiled(function, role)
 
 
-# Functions of one number. In kernels they are instructions, see `torchcss.cost.fused.instructions`:
+# Functions of one number. In kernels they are instructions, see `torchcss.kernels.instructions`:
 # numba's own are calls, which keep a loop from becoming vector code.
 
 

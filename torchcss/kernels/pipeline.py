@@ -1,8 +1,9 @@
 """What is done to kernels on their way through numba, and where compiled ones are kept.
 
-They are kept in the user's cache folder, in a folder whose name is a digest of all kernels and of
-the versions that compile them: a change of any of them compiles all anew, another process finds
-them, and the package's own folder may be read-only. `TORCHCSS_CACHE` names another place.
+They are kept in the user's cache folder. A folder of the package has its own folder there, whose
+name is a digest of its modules, of these here and of the versions that compile them: a change of
+any of them compiles its kernels anew, another process finds them, and the package's own folder may
+be read-only. `TORCHCSS_CACHE` names another place.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ def compiled(function: Any, role: str) -> Any:
             "inlined": it becomes a part of these.
     """
     # Registers how numba makes the functions of `compiler`; it needs `compiled` itself.
-    from torchcss.cost.fused import instructions as _  # noqa: F401
+    from torchcss.kernels import instructions as _  # noqa: F401
 
     njit: Any = numba.njit  # its stubs lack some options
     made = njit(
@@ -58,12 +59,15 @@ def compiled(function: Any, role: str) -> Any:
 
 
 @cache
-def cache_folder() -> Path:
-    """Where compiled kernels are kept: the user's cache, or else a temporary folder."""
-    own = sorted(Path(__file__).parent.glob("*.py"))
+def cache_folder(kernels: Path) -> Path:
+    """Where the compiled kernels of a folder of the package are kept.
+
+    In the user's cache, or else in a temporary folder. Kernels call those of their own folder only.
+    """
+    own = sorted({*kernels.glob("*.py"), *Path(__file__).parent.glob("*.py")})
     made_by = f"{numba.__version__} {llvmlite.__version__} {sys.version_info[:2]}"
     text = b"".join(path.read_bytes() for path in own) + made_by.encode()
-    name = f"kernels-{hashlib.sha256(text).hexdigest()[:16]}"
+    name = f"{kernels.name}-{hashlib.sha256(text).hexdigest()[:16]}"
     root = os.environ.get("TORCHCSS_CACHE") or os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     with contextlib.suppress(OSError, RuntimeError):
         folder = Path(root).expanduser() / "torchcss" / name
@@ -76,15 +80,16 @@ def cache_folder() -> Path:
 class _Locator(caching._CacheLocator):
     """Tells numba where the cache is, and that its name says what is in it."""
 
-    def __init__(self, name: str) -> None:
-        self._name = self._py_file = name
+    def __init__(self, path: Path) -> None:
+        self._name = self._py_file = path.stem
+        self._kernels = path.parent
 
     @classmethod
     def from_function(cls, py_func: Callable[..., Any], py_file: str) -> _Locator:
-        return cls(Path(py_file).stem)
+        return cls(Path(py_file))
 
     def get_cache_path(self) -> Any:
-        return str(cache_folder())
+        return str(cache_folder(self._kernels))
 
     def get_source_stamp(self) -> Any:
         return ""
@@ -107,7 +112,7 @@ class _Cache(caching.FunctionCache):
         found = super().load_overload(sig, target_context)
         if found is None and not _Cache._said:
             _Cache._said = True
-            print("torchcss: compiling for this processor, once (30 to 60 s)", file=sys.stderr)
+            print("torchcss: compiling for this processor, once (up to a minute)", file=sys.stderr)
         return found
 
 
