@@ -115,9 +115,8 @@ class ContourTerm(OutlineTerm):
             edge_field: Contrast-normalised gradient, of length at most one (edge energy times
                 direction).
         """
-        # Single precision is enough to find what the derivatives hold fixed, and twice as fast.
         # Samples run along the first axis in memory, so that neighbours on a line are whole rows.
-        start, along = (v.detach().reshape(-1, 2).float().mT.contiguous() for v in (uv, normal_uv))
+        start, along = (v.detach().reshape(-1, 2).mT.contiguous() for v in (uv, normal_uv))
         # Samples beyond the window, so that a maximum on its very edge is found too.
         reach = math.ceil(self.window / self.step) + 2
         steps = self.step * torch.arange(-reach, reach + 1, dtype=start.dtype, device=uv.device)
@@ -155,7 +154,7 @@ class ContourTerm(OutlineTerm):
         share = weight * ((self.window - distance.abs()) / (_FADE * self.window)).clamp(max=1)
         total = share.new_zeros(size).index_add(0, node, share).clamp(min=1)
         weight = weight / total.index_select(0, node)
-        return EdgeAssignments(node, distance.to(uv), weight.to(uv))
+        return EdgeAssignments(node, distance, weight)
 
     def _wells(
         self,
@@ -165,7 +164,7 @@ class ContourTerm(OutlineTerm):
     ) -> tuple[Float[Tensor, " p"], Float[Tensor, " p"], Float[Tensor, " p"]]:
         """Depth of the wells of nodes, and the cost's derivatives in the distance moved."""
         # Both components of a pixel side by side: fewer misses of the cache.
-        edge_field = edge_field.float().movedim(0, -1).contiguous().movedim(-1, 0)
+        edge_field = edge_field.to(uv).movedim(0, -1).contiguous().movedim(-1, 0)
         unmatched, blocks = self.unmatched, []
         for start, along in zip(uv.split(_LINES), normal_uv.split(_LINES), strict=True):
             node, distance, weight = self.search(start, along, edge_field)

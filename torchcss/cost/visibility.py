@@ -209,7 +209,7 @@ class ContourPredictor(nn.Module):
         normals = (normals @ turn).flatten(-3, -2)
         exists, rays = exists.flatten(-2), points - centre_world
         # Past the others to the nodes; and past the neighbours beside them and on behind them.
-        reach = BEHIND * body.part_shape.float()[:, :2].mean(-1)
+        reach = BEHIND * body.part_shape.to(rays)[:, :2].mean(-1)
         visible, free = line_of_sight(
             body.part_shape,
             rotation,
@@ -331,8 +331,6 @@ def line_of_sight(
 ) -> Float[Tensor, "*batch p"]:
     """Visibility of points past parts: 1 where nothing is in front, 0 where a part is.
 
-    Single precision inside, whatever the type of the inputs.
-
     Args:
         shape: The parts' shape numbers.
         rotation: World orientations of the parts.
@@ -345,14 +343,14 @@ def line_of_sight(
     """
     if others.numel() == 0:
         return eye.new_ones(rays.shape[:-1])
-    parts = tabulate_parts(shape.float(), ramp)
+    parts = tabulate_parts(shape.to(eye), ramp)
     views = _Views.of(rotation, eye, rays)
     if wanted is not None:  # what is not wanted ends before it begins
         wanted = wanted.reshape(views.length.shape)
         views = views._replace(length=torch.where(wanted > 0, views.length, -torch.inf))
-    behind = torch.zeros_like(others, dtype=torch.float32) if behind is None else behind
-    gaps = _sight_gaps(parts, views, others.T, behind.float().T.contiguous())
-    return (0.5 + gaps.reshape(rays.shape[:-1]) / ramp).clamp(0, 1).to(eye)
+    behind = torch.zeros_like(others, dtype=eye.dtype) if behind is None else behind
+    gaps = _sight_gaps(parts, views, others.T, behind.to(eye).T.contiguous())
+    return (0.5 + gaps.reshape(rays.shape[:-1]) / ramp).clamp(0, 1)
 
 
 class _Views(NamedTuple):
@@ -373,11 +371,11 @@ class _Views(NamedTuple):
     @classmethod
     def of(cls, rotation: Tensor, eye: Tensor, rays: Tensor) -> _Views:
         """From the parts' orientations, the camera in their frames, and rays to the nodes."""
-        rotation = rotation.float().reshape(-1, *rotation.shape[-3:])
-        eye = eye.float().clamp(-_FAR, _FAR).reshape(rotation.shape[:-1])
+        rotation = rotation.reshape(-1, *rotation.shape[-3:])
+        eye = eye.clamp(-_FAR, _FAR).reshape(rotation.shape[:-1])
         centre = -(rotation @ eye[..., None])[..., 0]
         frames = torch.cat([rotation.flatten(-2), eye], dim=-1)
-        rays = rays.float().clamp(-_FAR, _FAR).reshape(-1, *rays.shape[-2:]).mT.contiguous()
+        rays = rays.clamp(-_FAR, _FAR).reshape(-1, *rays.shape[-2:]).mT.contiguous()
         length = rays.square().sum(1).sqrt()
         return cls(frames, centre, rays / length.clamp(min=_TINY)[:, None], length)
 
@@ -517,7 +515,7 @@ def _least_gap(parts: _Parts, lines: _Stretches, count: int, *, plain: bool) -> 
     """Signed distance of so many lines of sight to the nearest part of their stretches, metres."""
     # A stretch is empty where the part is behind the node or the camera.
     lines = lines.take(places((lines.begin <= lines.end) & _is_close(parts, lines)))
-    least = torch.full((count,), torch.inf, device=lines.end.device)
+    least = lines.end.new_full((count,), torch.inf)
     if plain:
         s, curvature, square = _ellipsoid_minimum(parts.shapes(lines.part), lines)
         hidden = places(square < parts.within.index_select(0, lines.part))
@@ -638,7 +636,7 @@ def _sampled_minima(parts: _Parts, lines: _Stretches) -> tuple[_Stretches, Tenso
     There are no others: a line meets a bent part at most twice.
     """
     shape, along = parts.shapes(lines.part), lines.along
-    places = torch.linspace(0, 1, _SAMPLES, device=lines.end.device)[:, None]
+    places = torch.linspace(0, 1, _SAMPLES).to(lines.end)[:, None]
     s = torch.lerp(lines.begin, lines.end, places)
     _, (gx, gy, gz) = radial_square(shape, *lines.point(s), bent=parts.bent)
     rise = gx * along[0] + gy * along[1] + gz * along[2]

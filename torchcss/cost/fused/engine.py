@@ -1,8 +1,9 @@
 """The fused engine: value, gradient and Hessian of a pool of states in three compiled calls.
 
-It gives what `TrackingCost` gives by its terms as they are written (the eager engine), to some
-1e-4 nats (measured by `scripts/benchmark_engines.py`). Terms with a compiled twin are packed once a
-frame; what the other terms say is added. Each kernel stands in a file with the name of its twin.
+It gives what `TrackingCost` gives by its terms as they are written (the eager engine): in double
+precision to rounding, in single precision to 1e-2 nats (`scripts/benchmark_engines.py` measures
+both). Terms with a compiled twin are packed once a frame; what the other terms say is added. Each
+kernel stands in a file with the name of its twin.
 """
 
 from __future__ import annotations
