@@ -448,9 +448,9 @@ def _solve(
     if _compiled(flow):
         flow, target = flow.clone(), -q * (root * constancy.offset)
         links = functional.pad(right, (1, 1)), functional.pad(down, (0, 0, 1, 1))
-        for x, *parts, (across,), (along,) in zip(flow, q, target, *links, strict=True):
+        for x, a, b, (across,), (along,) in zip(flow, q, target, *links, strict=True):
             flow_kernels.solve(
-                *(part.numpy() for part in (x, *parts, across, along)), num_iterations
+                x.numpy(), a.numpy(), b.numpy(), across.numpy(), along.numpy(), num_iterations
             )
         return flow
     q_u, q_v = q[:, :1], q[:, 1:]
