@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchcss.errors import ConfigurationError, ShapeError
-from torchcss.vision.boundaries import BoundaryConfiguration, motion_boundaries
+from torchcss.vision.boundaries import BoundaryConfiguration, carried, motion_boundaries
 from torchcss.vision.flow import TRACKING, OpticalFlow, robust_flow
 
 
@@ -67,6 +67,60 @@ def test_any_batch_and_size(
         last = tuple(count - 1 for count in batch)
         alone = motion_boundaries(with_outliers(outlier[last]))
         torch.testing.assert_close(result.strength[last], alone.strength)
+
+
+@pytest.mark.parametrize("moved", [1, 2, 4, 6])
+def test_boundaries_lie_where_the_second_frame_has_them(
+    moved: int, generator: torch.Generator
+) -> None:
+    """Before ground that stands still, the trailing outline has left the place that it had."""
+
+    def texture(height: int, width: int) -> Tensor:
+        noise = functional.avg_pool2d(
+            torch.rand(1, height + 4, width + 4, generator=generator), 5, 1
+        )
+        return ((noise - noise.mean()) / noise.std() * 0.12)[0]
+
+    ground, thing = texture(120, 160) + 0.5, texture(60, 50) + 0.6
+
+    def picture(offset: int) -> Tensor:
+        whole = ground.clone()
+        whole[30:90, 50 + offset : 100 + offset] = thing
+        return whole
+
+    flow = robust_flow(picture(0), picture(moved), TRACKING)
+    strength = motion_boundaries(flow).strength[40:80].mean(0)
+    assert strength[50 + moved - 1 : 50 + moved + 1].max() > 0.75, "trailing"
+    assert strength[100 + moved - 1 : 100 + moved + 1].max() > 0.75, "leading"
+    assert strength[50 + moved + 7 : 100 - 7].max() < 0.1
+    assert max(strength[:35].max(), strength[115 + moved :].max()) < 0.1
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (3.0, -2.0), (0.5, 0.25), (40.0, 0.0)])
+def test_carried_outliers_move_with_the_picture(shift: tuple[float, float]) -> None:
+    outlier = torch.zeros(2, 20, 30)
+    outlier[0, 8:12, 10:12] = 1.0
+    flow = torch.tensor(shift)[:, None, None].expand(2, 2, 20, 30)
+    there = carried(outlier, flow, reach=3)
+    u, v = math.floor(shift[0]), math.floor(shift[1])
+    assert not there[1].any()
+    if u == 40:
+        assert not there.any()
+        return
+    torch.testing.assert_close(there.sum(), outlier.sum())
+    whole = torch.zeros(22, 32)
+    for x in (0, 1):
+        for y in (0, 1):
+            share = (shift[0] - u if x else 1 - shift[0] + u) * (
+                shift[1] - v if y else 1 - shift[1] + v
+            )
+            whole[8 + v + y : 12 + v + y, 10 + u + x : 12 + u + x] += share
+    torch.testing.assert_close(there[0], whole[:20, :30])
+
+
+def test_outliers_need_their_flow() -> None:
+    with pytest.raises(ShapeError, match="flow: expected two numbers"):
+        motion_boundaries(OpticalFlow(torch.zeros(2, 4, 4), torch.zeros(5, 4), torch.zeros(5, 4)))
 
 
 @pytest.mark.parametrize("shape", [(8,), (0, 4)])

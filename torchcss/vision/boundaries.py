@@ -9,6 +9,9 @@ term and a Gaussian blur G_s of s pixels:
     strength   B = x^2 / (x^2 + half_strength_line^2)
     potential  S_p = 1 - B
 
+The flow is known on the grid of the frame before, and the edges are those of this frame: outliers
+are `carried` along the flow first.
+
 The sign deserves a word: with W = 1 - k S_p the text wants k = 1 to exclude every edge that is
 *not* on a motion boundary, so S_p is low on boundaries and 1 elsewhere, a potential with the
 boundaries as its valleys. `MotionBoundaries` holds both, under names that cannot be mistaken.
@@ -27,12 +30,17 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.vision.flow import OpticalFlow
 from torchcss.vision.sampling import gaussian_blur
+
+
+_LEAST_OUTLIER = 1e-3
+"""What is less of an outlier is none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +79,7 @@ class MotionBoundaries(NamedTuple):
 def motion_boundaries(
     flow: OpticalFlow, configuration: BoundaryConfiguration | None = None
 ) -> MotionBoundaries:
-    """Turn the outlier map of the smoothness term into motion boundaries.
+    """Turn the outlier map of the smoothness term into motion boundaries of the second frame.
 
     Args:
         flow: What `robust_flow` returns. A flow under quadratic potentials has no outliers, so
@@ -88,7 +96,52 @@ def motion_boundaries(
             f"smoothness_outlier: expected [..., h, w] with at least one pixel, "
             f"got {list(outlier.shape)}"
         )
+    if flow.flow.shape != (*outlier.shape[:-2], 2, *outlier.shape[-2:]):
+        raise ShapeError(
+            f"flow: expected two numbers for each pixel of smoothness_outlier "
+            f"{list(outlier.shape)}, got {list(flow.flow.shape)}"
+        )
+    outlier = carried(outlier, flow.flow, reach=math.ceil(2 * choice.smoothing))
     blurred = gaussian_blur(outlier, choice.smoothing)
     squared = (math.sqrt(0.5 * math.pi) * choice.smoothing * blurred).square()
     strength = squared / (squared + choice.half_strength_line**2)
     return MotionBoundaries(strength, 1.0 - strength)
+
+
+def carried(
+    outlier: Float[Tensor, "*batch h w"], flow: Float[Tensor, "*batch 2 h w"], *, reach: int
+) -> Float[Tensor, "*batch h w"]:
+    """Outliers of the flow's smoothness on the grid of the frame that the flow leads to.
+
+    A boundary moves with what is in front, which the flow does not tell: each outlier goes where
+    the pixels about it go, on either side of the boundary, and the greatest stays. Where what is
+    behind stands still, the place that the boundary has left is among these.
+
+    Args:
+        outlier: In 0..1, at the pixels of the frame before.
+        flow: Displacement from there to here, pixels.
+        reach: How far from a boundary both sides move as they are, pixels.
+    """
+    height, width = outlier.shape[-2:]
+    marks, moves = outlier.reshape(-1, height, width), flow.reshape(-1, 2, height, width)
+    found = torch.zeros_like(marks).flatten()
+    image, row, column = torch.nonzero(marks > _LEAST_OUTLIER, as_tuple=True)
+    mark = marks[image, row, column]
+    for down, right in ((0, 0), (0, reach), (0, -reach), (reach, 0), (-reach, 0)):
+        side = (row + down).clamp(0, height - 1), (column + right).clamp(0, width - 1)
+        move = moves[image, :, *side]
+        to = torch.stack([column, row], -1) + move
+        first = to.floor()
+        share = to - first
+        arrived = torch.zeros_like(found)
+        for x in (0, 1):
+            for y in (0, 1):
+                u, v = (first + first.new_tensor([x, y])).unbind(-1)
+                inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+                part = (share[:, 0] if x else 1 - share[:, 0]) * (
+                    share[:, 1] if y else 1 - share[:, 1]
+                )
+                place = image[inside] * (height * width) + (v * width + u)[inside].long()
+                arrived.index_add_(0, place, (mark * part)[inside])
+        found = found.maximum(arrived.clamp(max=1.0))
+    return found.reshape(outlier.shape)
