@@ -101,6 +101,7 @@ def test_names_of_the_real_file(shared_data) -> None:
         (("lfemur", "ltibia", "lhumerus", "lradius"), ("l_hip", "l_knee", "l_shoulder", "l_elbow")),
         (("right_thigh", "right_shin", "left_upper_arm", "left_lower_arm"),
          ("r_hip", "r_knee", "l_shoulder", "l_elbow")),
+        (("lThigh", "lShin", "rShldr", "rForeArm"), ("l_hip", "l_knee", "r_shoulder", "r_elbow")),
         (("thigh.L", "shin.L", "upper_arm.R"), ("l_hip", "l_knee", "r_shoulder")),
         (("LeftHip", "LeftKnee", "LeftShoulder", "link3"),
          ("l_hip", "l_knee", "l_shoulder", None)),

@@ -199,6 +199,8 @@ _SKELETONS: Final[tuple[dict[str, str], ...]] = tuple(
         # Acclaim's bones by their starts, as in models for MuJoCo.
         ("femur", "tibia", "foot", "humerus", "radius", "hand"),
         ("thigh", "shin", "foot", "upperarm", "lowerarm", "hand"),
+        # Poser and DAZ Studio, and the BVH conversions of the CMU database that were made for them.
+        ("thigh", "shin", "foot", "shldr", "forearm", "hand"),
     )
 )
 """What skeletons call the joint in which a limb's segment starts, without side and prefix."""
