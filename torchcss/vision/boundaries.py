@@ -38,7 +38,6 @@ from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.vision.flow import OpticalFlow
 from torchcss.vision.sampling import gaussian_blur
 
-
 _LEAST_OUTLIER = 1e-3
 """What is less of an outlier is none."""
 

@@ -54,6 +54,7 @@ from torchcss.vision.rasterise import grid_faces, join_faces
 
 _SKIN = (0.86, 0.63, 0.52)
 _SLEEVE = (0.35, 0.42, 0.62)
+_UP = (0.0, 1.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -535,8 +536,10 @@ def camera_in_front(
     focal_px: float = 720.0,
     image_size_wh: tuple[int, int] = (640, 480),
     margin: float = 0.06,
+    azimuth: float = 0.0,
+    height: float = 0.12,
 ) -> Camera:
-    """A camera at eye height that sees the whole motion, from where the body looks at first.
+    """A camera that sees the whole motion, by default from where the body looks at first.
 
     Args:
         body: The body.
@@ -544,6 +547,8 @@ def camera_in_front(
         focal_px: Focal length.
         image_size_wh: Width and height of the picture.
         margin: Share of the picture's width and height to leave free on every side.
+        azimuth: Angle about the vertical from there, radians.
+        height: Height of its centre above the middle of the motion, in distances from it.
     """
     points = body.surface(body.pose(states)).points
     lowest, highest = points.amin((0, 1)), points.amax((0, 1))
@@ -552,16 +557,18 @@ def camera_in_front(
     front = body.pose(states[0]).tree.rotation[link, :, 2].clone()
     front[1] = 0
     front = functional.normalize(front, dim=-1)
-    width, height = image_size_wh
-    border = points.new_tensor([margin * width, margin * height])
+    aside = torch.stack([front[2], front[1], -front[0]])
+    away = math.cos(azimuth) * front + math.sin(azimuth) * aside + height * front.new_tensor(_UP)
+    width_px, height_px = image_size_wh
+    border = margin * points.new_tensor(image_size_wh)
     distance = 1.0
     while True:
-        eye = middle + distance * front + points.new_tensor([0.0, 0.12 * distance, 0.0])
+        eye = middle + distance * away
         camera = look_at(
             eye.tolist(), middle.tolist(), focal_px=focal_px, image_size_wh=image_size_wh
         )
         uv, _, valid = camera.project(points)
-        inside = (uv > border).all() & (uv < uv.new_tensor([width, height]) - border).all()
+        inside = (uv > border).all() & (uv < uv.new_tensor([width_px, height_px]) - border).all()
         if bool(valid.all() & inside) or distance > 50:
             return camera
         distance *= 1.05
