@@ -1,7 +1,7 @@
 """How good a posterior is: leading mode, best mode, weights and regions, over many clips.
 
     python scripts/evaluate_posterior.py --data clips --out posterior.json
-    python scripts/evaluate_posterior.py --data clips --seeds 3 --settings '{"modes": 3}'
+    python scripts/evaluate_posterior.py --data clips --seeds 3 --samples 200 --out J
 
 DIR holds clips as folders (`video.mp4`, `cameras.json`, `keypoints2d.npz`, `reference3d.npz`), as
 `scripts/make_clips.py` and `scripts/make_sequence.py` write them, or is one of them. Each is
@@ -29,7 +29,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,9 +39,9 @@ from common import Table, start, write_report
 from jaxtyping import Float
 from torch import Tensor
 
-import torchcss
-from torchcss import Run, Settings
+from torchcss import Run, Settings, smooth, track_video
 from torchcss.body.uncertainty import joint_covariance
+from torchcss.cli.options import SettingsOptions
 from torchcss.errors import ConfigurationError
 from torchcss.io.track_body import pose_track
 from torchcss.linalg import squared_mahalanobis
@@ -55,6 +55,9 @@ HEADS = ("clip", "PA", "best PA", "root", "best root", "smooth PA", "rank", "cal
          "NLL", "lost", "s")  # fmt: skip
 
 
+TRACKING = Settings(overlay=False)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Config:
     """Which clips, tracked how."""
@@ -66,24 +69,13 @@ class Config:
     runs: Path = Path("posterior-runs")
     """Folder of the runs."""
     seeds: int = 1
-    """Number of seeds, from 0 on."""
+    """Number of seeds, from --seed on."""
     frames: int | None = None
     """Only the first frames of each clip."""
-    settings: str = "{}"
-    """Settings of the tracker as JSON."""
+    tracking: SettingsOptions = TRACKING
+    """How to track."""
     smooth: bool = True
     """Whether to smooth each track too."""
-
-    @property
-    def chosen(self) -> dict[str, Any]:
-        """The settings by name."""
-        try:
-            chosen = json.loads(self.settings)
-        except json.JSONDecodeError as error:
-            raise ConfigurationError(f"--settings: expected JSON, {error}") from error
-        if not isinstance(chosen, dict):
-            raise ConfigurationError(f"--settings: expected names and values, got {chosen!r}")
-        return chosen
 
 
 def find_clips(data: Path) -> list[Path]:
@@ -105,12 +97,12 @@ def track(config: Config, clip: Path, seed: int) -> tuple[Run, float | None]:
         return Run.open(folder), None
     video, camera, keypoints, _ = (clip / name for name in FILES)
     began = time.process_time()
-    run = torchcss.track_video(
+    run = track_video(
         video,
         camera=camera,
         keypoints=keypoints,
         out=folder,
-        settings=Settings(**{"overlay": False, **config.chosen, "seed": seed}),
+        settings=replace(config.tracking, seed=seed),
         stop=config.frames,
     )
     return run, (time.process_time() - began) / max(1, len(run.track.frames))
@@ -190,7 +182,7 @@ def measure(config: Config, clip: Path, seed: int) -> dict[str, Any]:
         "s": seconds,
     }
     if config.smooth and len(found.frames) > 2:
-        row["smooth PA"] = evaluate(torchcss.smooth(run), reference).errors.procrustes.mean_mm
+        row["smooth PA"] = evaluate(smooth(run), reference).errors.procrustes.mean_mm
     return row
 
 
@@ -198,9 +190,9 @@ def main(config: Config) -> dict[str, Any]:
     """Track, measure, print, write; return what is written."""
     if config.seeds < 1:
         raise ConfigurationError(f"--seeds {config.seeds}: expected at least 1")
-    settings, rows = config.chosen, []
+    first, rows = config.tracking.seed, []
     for clip in find_clips(config.data):
-        for seed in range(config.seeds):
+        for seed in range(first, first + config.seeds):
             rows.append(measure(config, clip, seed))
             print(json.dumps(rows[-1]), flush=True)
     by_clip: dict[str, list[dict[str, Any]]] = {}
@@ -212,7 +204,7 @@ def main(config: Config) -> dict[str, Any]:
         cells.append([name, *(summed(column, middle) for column in columns)])
     table = Table(f"{len(by_clip)} clips, {config.seeds} seeds", HEADS, cells)
     table.print()
-    report = {"settings": settings, "frames": config.frames, "rows": rows}
+    report = {"settings": asdict(config.tracking), "frames": config.frames, "rows": rows}
     write_report(config.out, report, table)
     return report
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -23,7 +24,7 @@ def test_a_clip_is_tracked_and_measured(script: ModuleType, tmp_path: Path) -> N
         data=tmp_path / "clips",
         out=tmp_path / "J.json",
         runs=tmp_path / "runs",
-        settings='{"samples": 10, "modes": 2}',
+        tracking=replace(script.TRACKING, samples=10, modes=2),
     )
     (row,) = script.main(config)["rows"]
     assert row["best PA"] <= row["PA"] < 400
@@ -54,8 +55,7 @@ def test_density_and_rank(script: ModuleType) -> None:
 
 @pytest.mark.parametrize(
     ("given", "said"),
-    [({"settings": "{"}, "expected JSON"), ({"settings": "3"}, "names and values"),
-     ({"seeds": 0}, "at least 1"), ({}, "no clip in it")],
+    [({"seeds": 0}, "at least 1"), ({}, "no clip in it")],
 )  # fmt: skip
 def test_wrong_options_are_refused(
     script: ModuleType, tmp_path: Path, given: dict[str, object], said: str

@@ -35,6 +35,7 @@ CHANGED: dict[str, Any] = {
 VARIED = {
     "ablation": {"body", "terms"},
     "benchmark_engines": set(),
+    "evaluate_posterior": set(),
     "failure_modes": {"body", "preset"},
     "learn_weights": {"body", "weights"},
     "several_views": set(),
@@ -56,6 +57,10 @@ def arguments(folder: Path, script: str) -> list[str]:
     if script == "failure_modes":
         write_arm(folder / "arm", 3)
         return ["--sequence", str(folder / "arm"), "--presets", "css"]
+    if script == "evaluate_posterior":
+        for name in ("video.mp4", "cameras.json", "keypoints2d.npz", "reference3d.npz"):
+            (folder / name).touch()
+        return ["--data", str(folder), "--runs", str(folder / "runs")]
     if script == "track_robot":
         urdf = made_robots.write_arm(folder / "seven.urdf")
         return ["--urdf", str(urdf), "--link", "tip", "--frames", "2", "--out", str(folder / "out")]
@@ -102,7 +107,7 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Settings]:
         patch.setattr(TrackingSession, "__init__", catch)
         for name in VARIED:
             script = importlib.import_module(name)
-            if name == "several_views":  # the person's files are not in the repository
+            if name in ("several_views", "evaluate_posterior"):  # whose films are none here
                 patch.setattr(script, "track_video", catch_video)
             words = [*arguments(tmp_path_factory.mktemp(name), name), *options(CHANGED)]
             with pytest.raises(Caught) as caught:
