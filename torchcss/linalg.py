@@ -97,19 +97,24 @@ def inverse_on_free(
     hessian: Float[Tensor, "*batch n n"],
     free: Bool[Tensor, "*batch n"],
     prior_variance: Float[Tensor, " n"],
+    gradient: Float[Tensor, "*batch n"] | None = None,
 ) -> Float[Tensor, "*batch n n"]:
     """Covariance of a mode: the inverse Hessian on the free variables, never wider than the prior.
 
     In units of the prior's standard deviations, an eigen-direction of curvature `e > 1` gets the
     variance `1 / e`. A direction of smaller, zero or negative curvature, about which the cost says
-    less than the prior does, gets the prior's variance, 1; so does every variable that is not free
-    (decision "active bounds"). The result is positive definite whatever the Hessian. It is computed
-    in float64, by Cholesky where every curvature exceeds 1 and by eigenvectors for the other items.
+    less than the prior does, gets the prior's variance, 1. A variable that a bound holds may leave
+    it to one side alone, against the slope g of the cost: its density falls as `exp(-|g| t)`, with
+    the deviation `1 / |g|` (decision "active bounds"). It is uncorrelated with the others, and no
+    wider than the widest of them. The result is positive definite whatever the Hessian. It is
+    computed in float64, by Cholesky where every curvature exceeds 1 and by eigenvectors for the
+    other items.
 
     Args:
         hessian: Second derivative of the cost in nats; need not be definite.
         free: Variables that no bound holds.
         prior_variance: Positive variance of each parameter before the image is seen.
+        gradient: First derivative; None: what a bound holds keeps the prior's variance.
 
     Returns:
         Covariances in the Hessian's dtype.
@@ -123,7 +128,14 @@ def inverse_on_free(
         strict=True,
     )
     parts = [_inverse_at_least_one(part.double() * units, loose) * units for part, loose in pairs]
-    return torch.cat(parts).reshape(hessian.shape).to(hessian.dtype)
+    covariance = torch.cat(parts).reshape(hessian.shape)
+    if gradient is not None:
+        variance = covariance.diagonal(dim1=-2, dim2=-1)
+        widest = torch.where(free, variance, 0.0).amax(-1, keepdim=True)
+        one_sided = variance.minimum(gradient.detach().double() ** -2)
+        one_sided = torch.where(widest > 0, one_sided.minimum(widest), one_sided)
+        variance.copy_(torch.where(free, variance, one_sided))
+    return covariance.to(hessian.dtype)
 
 
 def _inverse_at_least_one(

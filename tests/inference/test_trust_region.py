@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.inference import trust_region
+from torchcss.inference.mixture import distinct_modes
 from torchcss.inference.trust_region import TrustRegionNewton, default_prior_variance
 from torchcss.types import Bounds, CostFunction, LocalModel, Status
 
@@ -88,7 +89,7 @@ def test_flat_directions_are_no_reason_to_go_on(generator):
     torch.testing.assert_close(variances, torch.tensor([0.2, 16.0, 16.0]).double().expand(8, 3))
 
 
-def test_active_bounds_hold_and_keep_the_prior_variance():
+def test_active_bounds_hold_and_leave_what_the_slope_leaves():
     hessian = torch.tensor([[2.0, 0.9, 0.0], [0.9, 2.0, 0.0], [0.0, 0.0, 50.0]]).double()
     cost = problems.Bowl(hessian, torch.tensor([3.0, 0.0, 0.5]).double())
     bounds = Bounds(torch.full((3,), -torch.inf), torch.tensor([1.0, torch.inf, 2.0]))
@@ -97,9 +98,32 @@ def test_active_bounds_hold_and_keep_the_prior_variance():
     assert float(modes.mean[0]) == 1.0
     # On the face x_0 = 1 the minimum of the second variable moves by -H01/H11 (1 - 3).
     torch.testing.assert_close(modes.mean[1], torch.tensor(0.9).double(), atol=1e-4, rtol=0)
-    torch.testing.assert_close(
-        modes.covariance, torch.diag(torch.tensor([1.0, 0.5, 0.02]).double())
-    )
+    slope = 2.0 * (1.0 - 3.0) + 0.9 * 0.9
+    expected = torch.diag(torch.tensor([slope**-2, 0.5, 0.02]).double())
+    torch.testing.assert_close(modes.covariance, expected, atol=1e-4, rtol=0)
+
+
+PRIOR = torch.tensor([0.25, 20.0]).double()
+
+
+def test_a_held_variable_does_not_swallow_its_neighbours():
+    """Two minima half a radian apart, of which one is at a bound, are two."""
+    bounds = Bounds(torch.tensor([-1.0, -9.0]).double(), torch.tensor([1.0, 9.0]).double())
+    hessian = torch.diag(torch.tensor([2500.0, 100.0]).double())
+    means = [torch.tensor([1.1, 0.0]).double(), torch.tensor([0.5, 0.0]).double()]
+    found = [
+        NEWTON.minimise(problems.Bowl(hessian, mean), mean[None], bounds, prior_variance=PRIOR)
+        for mean in means
+    ]
+    assert found[0].active[0].tolist() == [True, False]
+    both = [torch.cat([getattr(mode, name) for mode in found]) for name in ("mean", "covariance")]
+    assert len(distinct_modes(*both, torch.tensor([0.0, 15.0]))) == 2
+    # Nor is it ever the widest direction, however gentle the slope.
+    gentle = problems.Bowl(torch.diag(torch.tensor([1e-6, 100.0]).double()), means[0])
+    mode = NEWTON.minimise(gentle, bounds.project(means[0])[None], bounds, prior_variance=PRIOR)
+    if bool(mode.active[0, 0]):
+        variance = mode.covariance[0].diagonal()
+        assert float(variance[0]) <= float(variance[1]) * (1 + 1e-9)
 
 
 @settings(max_examples=25, deadline=None)

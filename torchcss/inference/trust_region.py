@@ -272,8 +272,7 @@ class TrustRegionNewton:
             bounds: Box limits; they hold exactly, in the dtype of `x0`.
             scale: See `init`.
             prior_variance: Variance of each parameter before the image is seen; no direction of a
-                covariance exceeds it, and a variable held by a bound gets it (decision "active
-                bounds"). By default `default_prior_variance(bounds)`.
+                covariance exceeds it. By default `default_prior_variance(bounds)`.
 
         Returns:
             One mode per start; no cost exceeds that of the (projected) start.
@@ -422,7 +421,7 @@ def _modes(
     active = _held(state.x, state.model.gradient, bounds)
     sound = state.status != Status.NON_FINITE
     hessian = torch.where(sound[:, None, None], state.model.hessian, 0.0)
-    covariance = inverse_on_free(hessian, ~active, prior_variance)
+    covariance = inverse_on_free(hessian, ~active, prior_variance, state.model.gradient)
     return Modes(
         mean=state.x.reshape(shape),
         covariance=covariance.reshape(*batch, n, n),

@@ -184,7 +184,7 @@ def with_unknown_lengths(cost: TrackingCost, body: BodyModel, fits: Modes, searc
     lengths = bounds.upper > bounds.lower
     lengths[columns] = False
     covariance = inverse_on_free(
-        model.hessian, ~held | lengths, default_prior_variance(loose.bounds)
+        model.hessian, ~held | lengths, default_prior_variance(loose.bounds), model.gradient
     )
     return fits._replace(covariance=covariance[:, columns][:, :, columns])
 
