@@ -148,3 +148,56 @@ def test_the_file_of_a_body_is_found_from_anywhere(
     (moved / "robot.urdf").unlink()
     with pytest.raises(BodyError, match=r"tried .*made/robots.*, .*moved/robots.*, .*moved/robot"):
         read_fitted_body(moved)
+
+
+def robot_with_changed_parameters(path: Path) -> Initialisation:
+    """A robot whose limits, prior and neighbours are not those of its file."""
+    found = fitted_robot(path)
+    body = found.body
+    body.lower[-1], body.upper[-1] = -0.5, 0.75
+    body.sticky_mean[-1], body.sticky_deviation[-1] = 0.1, 0.3
+    body.neighbours = (("b", "b"),)
+    return found
+
+
+def test_changed_limits_prior_and_neighbours_survive(tmp_path: Path, generator: torch.Generator):
+    found = robot_with_changed_parameters(tmp_path / "robot.urdf")
+    body = found.body
+    write_fitted_body(tmp_path / "body.npz", found, camera(generator))
+    back = read_fitted_body(tmp_path).body
+    assert back.neighbours == (("b", "b"),)
+    for name in ("lower", "upper", "sticky_mean", "sticky_deviation"):
+        assert torch.equal(back.get_buffer(name), body.get_buffer(name))
+
+
+def test_a_file_without_limits_has_those_of_its_body(tmp_path: Path, generator: torch.Generator):
+    path = tmp_path / "body.npz"
+    write_fitted_body(path, robot_with_changed_parameters(tmp_path / "r.urdf"), camera(generator))
+    older = dict(np.load(path))
+    for name in ("lower", "upper", "sticky_mean", "sticky_deviation", "neighbours"):
+        del older[name]
+    np.savez(path, **older)
+    body, plain = read_fitted_body(path).body, load_body(tmp_path / "r.urdf", free_root=True)
+    assert body.neighbours == plain.neighbours
+    assert torch.equal(body.lower, plain.lower)
+    assert torch.equal(body.sticky_deviation, plain.sticky_deviation)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"lower": np.zeros(3)},
+        {"upper": np.full(7, np.nan)},
+        {"lower": np.full(7, 9.0)},
+        {"sticky_deviation": np.zeros(7)},
+        {"neighbours": np.array([["b", "nobody"]])},
+    ],
+)
+def test_damaged_limits_prior_and_neighbours(
+    tmp_path: Path, generator: torch.Generator, changed: dict[str, np.ndarray]
+):
+    path = tmp_path / "body.npz"
+    write_fitted_body(path, robot_with_changed_parameters(tmp_path / "r.urdf"), camera(generator))
+    np.savez(path, **{**dict(np.load(path)), **changed})
+    with pytest.raises(BodyError, match=rf"body\.npz: .*{next(iter(changed))}"):
+        read_fitted_body(path)

@@ -11,9 +11,14 @@ One NPZ file, schema version 1. K hypotheses, n parameters, P parts, L lengths:
 | `length_names`, `lengths` | L | fitted lengths, metres |
 | `part_names`, `part_shape` | P, P 9 | shape numbers of the parts |
 | `state_names` | n | names of the parameters |
+| `lower`, `upper` | n, n | limits of the parameters, infinite where there are none |
+| `sticky_mean`, `sticky_deviation` | n, n | the prior that draws them to rest; infinite: none |
+| `neighbours` | N 2 | names of the parts that touch in every pose |
 | `state`, `covariance`, `log_weight`, `cost` | K n, K n n, K, K | the hypotheses, best first |
 | `base_rotation`, `base_translation` | 3 3, 3 | frame in which the root moves, in the world |
 | `camera_rotation`, `camera_translation`, `camera_matrix` | 3 3, 3, 3 3 | the picture's camera |
+
+Files without limits, prior and neighbours have those that the body is built with.
 
 `write_fitted_body` and `read_fitted_body`. The latter can hang the body before another camera of
 the same place, such as the calibrated one of a video whose first frame was fitted without.
@@ -56,6 +61,10 @@ def write_fitted_body(path: str | os.PathLike[str], found: Initialisation, camer
     body, mixture = found.body, found.mixture
     tensors = {
         "part_shape": body.part_shape,
+        "lower": body.lower,
+        "upper": body.upper,
+        "sticky_mean": body.sticky_mean,
+        "sticky_deviation": body.sticky_deviation,
         "state": mixture.mean,
         "covariance": mixture.covariance,
         "log_weight": mixture.log_weight,
@@ -75,6 +84,7 @@ def write_fitted_body(path: str | os.PathLike[str], found: Initialisation, camer
         "lengths": np.array(list(found.lengths.values()), dtype=np.float64),
         "part_names": np.array(body.part_names, dtype=np.str_),
         "state_names": np.array(body.state_names, dtype=np.str_),
+        "neighbours": np.array(body.neighbours, dtype=np.str_).reshape(-1, 2),
     }
     arrays = {name: tensor.detach().double().cpu().numpy() for name, tensor in tensors.items()}
     save_arrays(Path(path), {**about, **arrays})
@@ -151,7 +161,29 @@ def _load_body(
     for key, expected in (("state_names", body.state_names), ("part_names", body.part_names)):
         if tuple(arrays[key].tolist()) != expected:
             raise BodyError(f"{path}: {key} are not those of {name}; fit the body again")
+    if "neighbours" in arrays:
+        pairs = arrays["neighbours"].reshape(-1, 2).tolist()
+        if not {part for pair in pairs for part in pair} <= set(body.part_names):
+            raise BodyError(f"{path}: neighbours: expected names of parts of {name}")
+        body.neighbours = tuple((first, second) for first, second in pairs)
+    _set_parameters(path, arrays, body)
     return body
+
+
+def _set_parameters(path: Path, arrays: Mapping[str, np.ndarray], body: BodyModel) -> None:
+    """Give a body the limits and the prior of its file, where the file has them."""
+    for key in ("lower", "upper", "sticky_mean", "sticky_deviation"):
+        if key not in arrays:
+            continue
+        numbers = torch.from_numpy(np.array(arrays[key], dtype=np.float64))
+        if numbers.shape != (body.num_parameters,) or bool(numbers.isnan().any()):
+            raise BodyError(
+                f"{path}: {key}: expected {body.num_parameters} numbers, "
+                f"got {list(numbers.shape)} or one that is none"
+            )
+        body.register_buffer(key, numbers)
+    if bool((body.lower > body.upper).any()) or bool((body.sticky_deviation <= 0).any()):
+        raise BodyError(f"{path}: expected lower <= upper and positive sticky_deviation")
 
 
 def _read_tensors(
