@@ -40,10 +40,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchcss import Run, Settings, smooth, track_video
+from torchcss.body.bases import pose_track
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.cli.options import SettingsOptions
 from torchcss.errors import ConfigurationError
-from torchcss.io.track_body import pose_track
 from torchcss.linalg import squared_mahalanobis
 from torchcss.studies.evaluation import Thresholds, evaluate
 from torchcss.studies.metrics import LIMB_JOINTS

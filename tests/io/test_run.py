@@ -12,6 +12,7 @@ from made_tracks import make_track, save_v01_track
 
 import torchcss
 from torchcss import Run, load_body
+from torchcss.body.bases import pose_track
 from torchcss.body.model import BodyModel
 from torchcss.body.shape import with_shape
 from torchcss.cli import main as cli
@@ -21,7 +22,6 @@ from torchcss.initialise.result import Initialisation
 from torchcss.io.cameras import calibration
 from torchcss.io.fitted_body import write_fitted_body
 from torchcss.io.run import Given, GivenKeypoints
-from torchcss.io.track_body import pose_track
 from torchcss.io.tracks import Track, save_track, write_summary
 from torchcss.io.view_files import RecordedCamera, ViewFiles
 from torchcss.show.posterior_plots import plot_track

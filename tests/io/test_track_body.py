@@ -12,13 +12,14 @@ from made_robots import write_quadruped
 from made_tracks import make_track
 
 from torchcss import load_body
+from torchcss.body.bases import pose_track
 from torchcss.body.catalog import BODY_NAMES, specification
 from torchcss.body.model import BodyModel
 from torchcss.body.shape import with_shape
 from torchcss.body.uncertainty import joint_jacobian
 from torchcss.errors import TrackFileError
 from torchcss.io.run import body_of_track
-from torchcss.io.track_body import body_from_plain, body_to_plain, pose_track
+from torchcss.io.track_body import body_from_plain, body_to_plain
 
 LENGTHS = {"thigh": 0.41, "neck": 0.07, "hand": 0.17, "forearm": 0.26, "shoulder_width": 0.16}
 

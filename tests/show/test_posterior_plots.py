@@ -12,12 +12,12 @@ from matplotlib.axes import Axes
 from matplotlib.collections import FillBetweenPolyCollection, PathCollection
 from matplotlib.figure import Figure
 
+from torchcss.body.bases import pose_track
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.cli import main as cli
 from torchcss.errors import ConfigurationError
-from torchcss.io.track_body import pose_track
 from torchcss.io.tracks import TRACK_NAME, Track, save_track
 from torchcss.io.video import VideoWriter
 from torchcss.show.posterior_plots import DEVIATIONS, angles_figure, joints_figure, spectra_figure

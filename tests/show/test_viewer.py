@@ -13,13 +13,13 @@ import torch
 from made_tracks import make_track
 from PIL import Image
 
+from torchcss.body.bases import pose_track
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.cli import main as cli
 from torchcss.errors import ConfigurationError, MissingExtraError, OutputError
 from torchcss.io.run import Run
-from torchcss.io.track_body import pose_track
 from torchcss.io.tracks import TRACK_NAME, Track, save_track, write_summary
 from torchcss.io.video import VideoWriter
 from torchcss.io.view_files import RecordedCamera

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from torchcss.body.bases import on_origin, pose_track
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES
@@ -29,7 +30,6 @@ from torchcss.io.cameras import read_camera
 from torchcss.io.checkpoint import Checkpoint, read_checkpoint
 from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body
 from torchcss.io.keypoints.read import Scale
-from torchcss.io.track_body import on_origin, pose_track
 from torchcss.io.tracks import SUMMARY_NAME, TRACK_NAME, Track, load_track, read_summary
 from torchcss.io.view_files import RecordedCamera, ViewFiles
 from torchcss.vision.camera import Camera

@@ -1,4 +1,4 @@
-"""The body of a track: as plain data for its file, and posed on the bases of its frames.
+"""The body of a track: as plain data for its file, and back.
 
 A file holds everything that the body was built of (joints, parts with their fitted shapes,
 landmarks, ties), so that it needs neither the catalogue of that day nor the robot's file.
@@ -10,18 +10,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, replace
 from typing import Any
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
-
 from torchcss.body.catalog import BodySpecification, MarkerSpecification, PartSpecification
-from torchcss.body.kinematics import JointSpecification, TreePose
-from torchcss.body.model import BodyModel, BodyPose
-
-
-def on_origin(body: BodyModel) -> BodyModel:
-    """The same body on the world's origin, float64 on the processor; the given one stays."""
-    return body.with_base(torch.eye(3), torch.zeros(3)).to(dtype=torch.float64, device="cpu")
+from torchcss.body.kinematics import JointSpecification
+from torchcss.body.model import BodyModel
 
 
 def body_to_plain(body: BodyModel) -> dict[str, Any]:
@@ -62,30 +53,3 @@ def _with_tuples(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: _with_tuples(entry) for name, entry in value.items()}
     return tuple(_with_tuples(entry) for entry in value) if isinstance(value, list) else value
-
-
-def pose_track(
-    body: BodyModel, state: Float[Tensor, "*batch n"], base: Float[Tensor, "*batch 4 4"]
-) -> BodyPose:
-    """Pose a body on a base of its own in every item.
-
-    Args:
-        body: A body on the origin, as that of a `Track` is.
-        state: States.
-        base: Base transforms, in any frame.
-
-    Returns:
-        The poses in the frame of the base transforms.
-    """
-    pose = body.pose(state)
-    turn, shift = base[..., None, :3, :3], base[..., None, :3, 3]
-    omega = (turn @ pose.tree.omega[..., None])[..., 0]
-    velocity = (turn @ pose.tree.velocity[..., None])[..., 0]
-    tree = TreePose(
-        turn @ pose.tree.rotation,
-        (turn @ pose.tree.translation[..., None])[..., 0] + shift,
-        omega,
-        # The twist is taken at the origin, which moved away from the base by -shift.
-        velocity + torch.linalg.cross(shift.expand_as(omega), omega),
-    )
-    return BodyPose(state, tree, (turn @ pose.joints[..., None])[..., 0] + shift)

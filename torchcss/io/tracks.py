@@ -48,6 +48,7 @@ from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from torchcss.body.bases import on_origin
 from torchcss.body.model import BodyModel
 from torchcss.errors import ShapeError, TorchcssError, TrackFileError
 from torchcss.files import (
@@ -58,7 +59,7 @@ from torchcss.files import (
     save_arrays,
     write_text,
 )
-from torchcss.io.track_body import body_from_plain, body_to_plain, on_origin
+from torchcss.io.track_body import body_from_plain, body_to_plain
 from torchcss.io.view_files import RecordedCamera, camera_from_plain, camera_to_plain
 
 __all__ = [

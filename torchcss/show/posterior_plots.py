@@ -26,12 +26,12 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from torchcss.body.bases import pose_track
 from torchcss.body.root import ROOT_NAMES
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.errors import ConfigurationError
 from torchcss.files import prepare_output_folder
 from torchcss.io.run import Run, body_of_track
-from torchcss.io.track_body import pose_track
 from torchcss.io.tracks import Track
 from torchcss.show.style import OKABE_ITO, save_figure
 from torchcss.show.track_pictures import has_pictures, pictures_of, rows_with_modes

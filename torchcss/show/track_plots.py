@@ -25,11 +25,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from PIL import Image
 
+from torchcss.body.bases import pose_track
 from torchcss.body.model import BodyModel
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.io.run import body_of_track
-from torchcss.io.track_body import pose_track
 from torchcss.io.tracks import Track
 from torchcss.io.video import VideoReader
 from torchcss.joint_names import canonical_joint_name

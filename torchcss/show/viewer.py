@@ -38,13 +38,13 @@ from PIL import Image
 from torch import Tensor
 from tqdm import tqdm
 
+from torchcss.body.bases import on_origin, pose_track
 from torchcss.body.model import BodyModel
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.errors import ConfigurationError, OutputError
 from torchcss.files import one_line, prepare_output_folder, replace_file
 from torchcss.io.export.selection import camera_up, up_axis
 from torchcss.io.run import Run
-from torchcss.io.track_body import on_origin, pose_track
 from torchcss.io.tracks import FrameModes
 from torchcss.show.overlay import PALETTE
 from torchcss.show.track_pictures import pictures_of, rows_with_modes

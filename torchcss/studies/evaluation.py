@@ -37,6 +37,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchcss.body.bases import pose_track
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.root import ROOT_NAMES, has_root, move_base
 from torchcss.body.uncertainty import joint_covariance
@@ -46,7 +47,6 @@ from torchcss.errors import ConfigurationError, TrackFileError
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.tracker import TrackerInfo
 from torchcss.io.run import Run, as_run
-from torchcss.io.track_body import pose_track
 from torchcss.io.tracks import Track
 from torchcss.linalg import squared_mahalanobis
 from torchcss.studies.metrics import (

@@ -26,6 +26,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchcss.body.bases import pose_track
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, free_turns, has_root, move_base
 from torchcss.errors import ConfigurationError, TrackFileError
@@ -38,7 +39,6 @@ from torchcss.inference.smoothing import (
     refine,
 )
 from torchcss.io.run import body_of_track
-from torchcss.io.track_body import pose_track
 from torchcss.io.tracks import (
     Track,
 )

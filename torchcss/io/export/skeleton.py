@@ -19,9 +19,9 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from torchcss.body.bases import pose_track
 from torchcss.body.model import BodyModel
 from torchcss.body.rotations import about
-from torchcss.io.track_body import pose_track
 
 # Where H-Anim hangs what we fix in the link below. Both ends turn alike, so only the picture of
 # the bones differs.

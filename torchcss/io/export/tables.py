@@ -27,10 +27,10 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from torchcss.body.bases import pose_track
 from torchcss.body.model import BodyModel
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.io.export.selection import Selection
-from torchcss.io.track_body import pose_track
 
 _CHUNK = 1024  # poses at a time: 30 MB of Jacobians
 _UPPER = np.triu_indices(3)

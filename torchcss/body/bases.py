@@ -1,0 +1,45 @@
+"""A body on the world's origin, and posed on bases that differ from item to item.
+
+A track says for each frame where the base of its body is; the body itself lies on the origin.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchcss.body.kinematics import TreePose
+from torchcss.body.model import BodyModel, BodyPose
+
+
+def on_origin(body: BodyModel) -> BodyModel:
+    """The same body on the world's origin, float64 on the processor; the given one stays."""
+    return body.with_base(torch.eye(3), torch.zeros(3)).to(dtype=torch.float64, device="cpu")
+
+
+def pose_track(
+    body: BodyModel, state: Float[Tensor, "*batch n"], base: Float[Tensor, "*batch 4 4"]
+) -> BodyPose:
+    """Pose a body on a base of its own in every item.
+
+    Args:
+        body: A body on the origin, as that of a `Track` is.
+        state: States.
+        base: Base transforms, in any frame.
+
+    Returns:
+        The poses in the frame of the base transforms.
+    """
+    pose = body.pose(state)
+    turn, shift = base[..., None, :3, :3], base[..., None, :3, 3]
+    omega = (turn @ pose.tree.omega[..., None])[..., 0]
+    velocity = (turn @ pose.tree.velocity[..., None])[..., 0]
+    tree = TreePose(
+        turn @ pose.tree.rotation,
+        (turn @ pose.tree.translation[..., None])[..., 0] + shift,
+        omega,
+        # The twist is taken at the origin, which moved away from the base by -shift.
+        velocity + torch.linalg.cross(shift.expand_as(omega), omega),
+    )
+    return BodyPose(state, tree, (turn @ pose.joints[..., None])[..., 0] + shift)
