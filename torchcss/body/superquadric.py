@@ -34,9 +34,11 @@ from torch import Tensor
 
 Triple = tuple[Tensor, Tensor, Tensor]
 
-_SQUARES = {torch.float32: (1e-12, 64.0), torch.float64: (1e-24, 1e12)}
+_LEAST_SQUARE = {torch.float32: 1e-12, torch.float64: 1e-24}
 _LEAST_POWER = {torch.float32: 1e-30, torch.float64: 1e-280}
-"""Bounds on squared coordinates and on powers, so that the type holds all products."""
+MOST_SQUARE = 400.0
+"""Bounds on squared coordinates and on powers, so that the type holds all products. The upper one
+is the same for all types, so that what is far from a thin part is."""
 
 EXPONENTS = (0.1, 2.0)
 """From all but a box to a diamond; powers beyond these leave single precision."""
@@ -260,8 +262,8 @@ def _factors(shape: Superquadrics, x: Tensor, y: Tensor, z: Tensor) -> _Factors:
     ix, iy = shape.narrowed(w)
     u, v = x * ix, y * iy
     # Added, not clamped to, so that autograd sees the curvature where a coordinate is zero.
-    least, most = _SQUARES[x.dtype]
-    uu, vv, ww = ((a.square() + least).clamp(max=most) for a in (u, v, w))
+    least = _LEAST_SQUARE[x.dtype]
+    uu, vv, ww = ((a.square() + least).clamp(max=MOST_SQUARE) for a in (u, v, w))
     pu, pv, pw = _power(uu, shape.around), _power(vv, shape.around), _power(ww, shape.along)
     of_u, of_v = pu * uu, pv * vv
     section = (of_u + of_v).clamp(min=_LEAST_POWER[x.dtype])

@@ -23,6 +23,8 @@ import os
 from collections.abc import Callable
 from typing import Any, TypeVar
 
+import numpy as np
+
 try:
     import numba
 except ImportError:  # a plain install has it; some platforms do not
@@ -83,5 +85,11 @@ def log(x: float) -> float:
 
 
 def exp(x: float) -> float:
-    """Exponential; its argument is limited to what single precision holds."""
-    return 0 * x + math.exp(min(max(x, -87.0), 88.0))
+    """Exponential; its argument is limited to what the type of the number holds."""
+    most = by_precision(x, 87.0, 700.0)
+    return 0 * x + math.exp(min(max(x, -most), most))
+
+
+def by_precision(x: float, single: float, double: float) -> float:
+    """One of two constants, by the precision of a number."""
+    return single if isinstance(x, np.float32) else double

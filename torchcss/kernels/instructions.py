@@ -90,7 +90,13 @@ def _log_of(x: Any) -> Any:
 def _exp_of(x: Any) -> Any:
     if x == types.float32:
         return lambda x: _exp_single(x)
-    return lambda x: math.exp(min(max(x, -87.0), 88.0))
+    return lambda x: math.exp(min(max(x, -700.0), 700.0))
+
+
+def _one_of(x: Any, single: Any, double: Any) -> Any:
+    if x == types.float32:
+        return lambda x, single, double: single
+    return lambda x, single, double: double
 
 
 for _name, _implementation in (
@@ -98,6 +104,7 @@ for _name, _implementation in (
     ("floor", _floor_of),
     ("log", _log_of),
     ("exp", _exp_of),
+    ("by_precision", _one_of),
 ):
     _register: Any = overload
     _register(vars(compiler)[_name], inline="always", strict=False)(_implementation)

@@ -8,12 +8,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from torchcss.body.superquadric import MOST_SQUARE
 from torchcss.cost.fused.projection import Spatial
 from torchcss.cost.fused.records import Array
-from torchcss.kernels.compiler import exp, inlined, kernel, log, sqrt
-
-_LEAST_SQUARE, _MOST_SQUARE, _LEAST_POWER = 1e-12, 64.0, 1e-30
-"""Bounds on squared coordinates and on powers, so that single precision holds all products."""
+from torchcss.kernels.compiler import by_precision, exp, inlined, kernel, log, sqrt
 
 _SMALL = 0.1
 """Angle, radians, below which a quotient by it is its series."""
@@ -85,7 +83,7 @@ def narrowed(shape: Shape, w: float) -> tuple[float, float]:
 
 @inlined
 def _bounded_square(x: float) -> float:
-    return min(x * x + _LEAST_SQUARE, _MOST_SQUARE)
+    return min(x * x + by_precision(x, 1e-12, 1e-24), MOST_SQUARE)
 
 
 @inlined
@@ -96,9 +94,9 @@ def radial_square(shape: Shape, x: float, y: float, z: float) -> tuple[float, fl
     u, v = x * ix, y * iy
     uu, vv, ww = _bounded_square(u), _bounded_square(v), _bounded_square(w)
     pu, pv, pw = power(uu, shape.around), power(vv, shape.around), power(ww, shape.along)
-    section = max(pu * uu + pv * vv, _LEAST_POWER)
+    section = max(pu * uu + pv * vv, by_precision(x, 1e-30, 1e-280))
     outer = power(section, shape.section)
-    total = max(outer * section + pw * ww, _LEAST_POWER)
+    total = max(outer * section + pw * ww, by_precision(x, 1e-30, 1e-280))
     scale = power(total, shape.whole)
     p1, p2 = outer * scale * pu, outer * scale * pv
     past = max(abs(w) - 1.0, 0.0)
@@ -189,9 +187,9 @@ def straight_hessian(shape: Shape, x: float, y: float, z: float) -> Bowl:
     u, v = x * i, y * j
     uu, vv, ww = _bounded_square(u), _bounded_square(v), _bounded_square(w)
     pu, pv, pw = power(uu, shape.around), power(vv, shape.around), power(ww, shape.along)
-    section = max(pu * uu + pv * vv, _LEAST_POWER)
+    section = max(pu * uu + pv * vv, by_precision(x, 1e-30, 1e-280))
     outer = power(section, shape.section)
-    total = max(outer * section + pw * ww, _LEAST_POWER)
+    total = max(outer * section + pw * ww, by_precision(x, 1e-30, 1e-280))
     scale = power(total, shape.whole)
     k1, k2 = 4.0 * shape.along, 4.0 * shape.around
     p1, p2, p3 = outer * scale * pu, outer * scale * pv, scale * pw
