@@ -27,7 +27,7 @@ def test_a_difference_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_states_at_the_end_of_a_search_window_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    cost, x = script.make_case(1, "body30", 8)
+    cost, x = script.make_case(2, "body30", 8)
     assert "contour" in {term.name for term in cost.choice.terms}
     monkeypatch.setattr(script, "NEAR_END_PX", 100.0)
     assert not script.apart_from_ends(cost, x).all()
