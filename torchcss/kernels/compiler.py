@@ -92,4 +92,4 @@ def exp(x: float) -> float:
 
 def by_precision(x: float, single: float, double: float) -> float:
     """One of two constants, by the precision of a number."""
-    return single if isinstance(x, np.float32) else double
+    return single if isinstance(x, np.floating) and x.itemsize == 4 else double
