@@ -112,10 +112,7 @@ def smooth_track(track: Track, *, choice: Smoothing | None = None) -> SmoothedTr
     absent = torch.from_numpy(track.log_weight == -np.inf)
     node = torch.where(seen[:, None], cost, torch.where(absent, math.inf, 0.0))
     changes = base_changes(body, bases)
-    period = torch.full((body.num_parameters,), math.inf, dtype=torch.float64)
-    if has_root(body):
-        period[[body.state_index(name) for name in ROOT_NAMES[3:]]] = 2 * math.pi
-
+    period = _periods(body)
     path = best_path(
         state,
         # Between frames the modes count as they are; `choice.likelihood_power` tempers their costs.
@@ -245,6 +242,14 @@ def effect_of(track: Track, modes: Int[np.ndarray, " t"], smooth: Track) -> dict
         "jitter_of_the_path_m_per_s2": jitter(path, track.times),
         "jitter_after_m_per_s2": jitter(after, track.times),
     }
+
+
+def _periods(body: BodyModel) -> Float[Tensor, " n"]:
+    """After how much each parameter comes round; infinite but for the angles of the root."""
+    period = torch.full((body.num_parameters,), math.inf, dtype=torch.float64)
+    if has_root(body):
+        period[[body.state_index(name) for name in ROOT_NAMES[3:]]] = 2 * math.pi
+    return period
 
 
 def _unwrapped(
