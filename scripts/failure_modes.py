@@ -34,7 +34,7 @@ from torchcss.studies.comparison import Run, Start, find_start, track_together
 from torchcss.studies.evaluation import Thresholds, over_seeds, summarise
 from torchcss.studies.plots import error_curves, failure_figure
 from torchcss.studies.sequences import RecordedSequence, read_sequence
-from torchcss.tracking.presets import PRESETS
+from torchcss.tracking.presets import PRESETS, preset_name
 from torchcss.tracking.settings import Settings
 
 COLUMNS = {
@@ -95,8 +95,7 @@ class Config:
 
 def main(config: Config) -> dict[str, Any]:
     """Run, print, draw, write; return what is written."""
-    if unknown := sorted(set(config.presets) - set(PRESETS)):
-        raise ConfigurationError(f"no trackers {unknown}; there are {', '.join(PRESETS)}")
+    config = replace(config, presets=tuple(map(preset_name, config.presets)))
     if config.together is not None and config.together < 1:
         raise ConfigurationError(f"--together: expected at least 1, got {config.together}")
     sequence = read_sequence(config.sequence, view=config.view)
@@ -149,7 +148,10 @@ def study_of(config: Config, sequence: RecordedSequence, thresholds: Thresholds)
         "frame_rate": sequence.frame_rate,
         "body": config.tracking.body if sequence.truth is None else sequence.truth.body.name,
         "thresholds": asdict(thresholds),
-        "settings": {**tracked, "terms": list(config.tracking.terms)},
+        "settings": {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in tracked.items()
+        },
         **{name: getattr(config, name) for name in shared},
     }
 

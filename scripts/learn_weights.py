@@ -56,7 +56,7 @@ from torchcss.vision.camera import Camera
 from torchcss.vision.features import FrameFeatures
 
 OPTIMISER = TrustRegionNewton(max_steps=30, tolerance=1e-6)
-PERSISTENCE = PRESETS["single"].persistence
+PERSISTENCE = PRESETS["css"].persistence
 LOST_M = 0.15
 """Mean error of the joints from which a mode has lost the body, metres."""
 TRACKING = Settings(body="arm8", keypoints_use="first", working_size=320)

@@ -46,22 +46,22 @@ _FIST = "the turn is underestimated; without non-self-intersection the fist ends
 _DEPTH = "follows slightly longer, misestimates the depth, loses track during the turn"
 
 PUBLISHED: tuple[Published, ...] = (
-    Published("arm", "gaussian_single", (0.5, 2.2), "[IJRR] 6.1", _PILLAR),
-    Published("arm", "robust_single", (2.6,), "[IJRR] 6.1", _ELBOW),
-    Published("arm", "single", (2.6,), "[IJRR] 6.1", _ELBOW),
-    Published("arm", "css", (), "[IJRR] 6.1", "8 s without failure, three modes", False),
-    Published("body-clutter", "gaussian_single", (0.3,), "[IJRR] 6.1", _PILLAR),
-    Published("body-clutter", "robust_single", (), "[IJRR] 6.1", _FIST),
-    Published("body-clutter", "cham_rehg_ssd", (0.5,), "[IJRR] 6.1", "lost early in the turn"),
-    Published("body-clutter", "cham_rehg", (0.7,), "[IJRR] 6.1", "lost further into the turn"),
+    Published("arm", "ijrr_gaussian_single", (0.5, 2.2), "[IJRR] 6.1", _PILLAR),
+    Published("arm", "ijrr_robust_single", (2.6,), "[IJRR] 6.1", _ELBOW),
+    Published("arm", "ijrr_single_limits", (2.6,), "[IJRR] 6.1", _ELBOW),
+    Published("arm", "ijrr_css", (), "[IJRR] 6.1", "8 s without failure, three modes", False),
+    Published("body-clutter", "ijrr_gaussian_single", (0.3,), "[IJRR] 6.1", _PILLAR),
+    Published("body-clutter", "ijrr_single_limits", (), "[IJRR] 6.1", _FIST),
+    Published("body-clutter", "ijrr_cham_rehg_ssd", (0.5,), "[IJRR] 6.1", "lost early in the turn"),
+    Published("body-clutter", "ijrr_cham_rehg", (0.7,), "[IJRR] 6.1", "lost further into the turn"),
     Published(
-        "body-clutter", "css", (), "[IJRR] 6.1", "3.5 s without failure, seven modes", False
+        "body-clutter", "ijrr_css", (), "[IJRR] 6.1", "3.5 s without failure, seven modes", False
     ),
-    Published("body-dark", "gaussian_single", (0.5,), "[IJRR] 6.2", "loses track"),
-    Published("body-dark", "robust_single", (1.0,), "[IJRR] 6.2", _DEPTH),
+    Published("body-dark", "ijrr_gaussian_single", (0.5,), "[IJRR] 6.2", "loses track"),
+    Published("body-dark", "ijrr_robust_single", (1.0,), "[IJRR] 6.2", _DEPTH),
     Published(
-        "body-dark", "css_limits", (), "[IJRR] 6.2",
+        "body-dark", "ijrr_css_limits", (), "[IJRR] 6.2",
         "modes occasionally in impossible poses, with terminal consequences; no time is given",
     ),
-    Published("body-dark", "css_constrained", (), "[IJRR] 6.2", "4 s without failure", False),
+    Published("body-dark", "ijrr_css_constrained", (), "[IJRR] 6.2", "4 s without failure", False),
 )  # fmt: skip

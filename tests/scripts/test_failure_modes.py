@@ -34,7 +34,7 @@ def test_small_mode_and_resume(
 ) -> None:  # fmt: skip
     out, plot = tmp_path / "tables" / "j.json", tmp_path / "p.png"
     options = {"sequence": arm, "small": True, "out": out, "plot": plot}
-    presets = ("robust_single", "condensation")
+    presets = ("ijrr_robust_single", "ijrr_condensation")
     script.main(script.Config(presets=presets[:1], seeds=1, **options))
     assert plot.stat().st_size > 10_000
 
@@ -47,26 +47,34 @@ def test_small_mode_and_resume(
 
     monkeypatch.setattr(script, "follow", spy)
     script.main(script.Config(presets=presets, seeds=2, resume=True, together=1, **options))
-    assert asked == [[("condensation", 0)], [("robust_single", 1)], [("condensation", 1)]]
+    assert asked == [
+        [("ijrr_condensation", 0)],
+        [("ijrr_robust_single", 1)],
+        [("ijrr_condensation", 1)],
+    ]
     report = json.loads(out.read_text())
     assert [(run["preset"], run["seed"]) for run in report["runs"]] == [
-        ("robust_single", 0), ("condensation", 0), ("robust_single", 1), ("condensation", 1),
+        ("ijrr_robust_single", 0), ("ijrr_condensation", 0),
+        ("ijrr_robust_single", 1), ("ijrr_condensation", 1),
     ]  # fmt: skip
     for run in report["runs"]:
         assert run["ended"] == "complete"
         assert run["num_frames"] == len(run["per_frame"]["time_s"]) == 3
     rows = report["by_tracker"]
     assert set(rows) == set(presets)
-    row = rows["robust_single"]
+    row = rows["ijrr_robust_single"]
     assert (row["seeds"], row["lost"], row["errors"]) == (2, 0, 0)
     assert row["lost_s"] == [None] * 3
     middle, least, most = row["root_aligned_mm"]
     errors = sorted(run["root_aligned_mm"] for run in report["runs"][::2])
     assert (least, most) == pytest.approx(tuple(errors))
     assert middle == pytest.approx(sum(errors) / 2)
-    assert rows["condensation"]["evaluations_per_frame"][0] == 6
-    assert row["evaluations_per_frame"][0] <= 20
-    assert {entry["preset"] for entry in report["published"]} >= {"gaussian_single", "css"}
+    assert rows["ijrr_condensation"]["evaluations_per_frame"][0] == 6
+    assert row["evaluations_per_frame"][0] <= PRESETS["ijrr_robust_single"].optimiser.max_steps + 1
+    assert {entry["preset"] for entry in report["published"]} >= {
+        "ijrr_gaussian_single",
+        "ijrr_css",
+    }
     text = capsys.readouterr().out
     assert "2.6 s" in text  # the paper's robust tracker
     assert "0/2" in text
@@ -85,8 +93,8 @@ def test_small_mode_and_resume(
     beside = {**options, "out": tmp_path / "beside.json", "plot": None}
     again = script.main(script.Config(presets=presets, seeds=2, together=3, **beside))
     assert asked == [
-        [("robust_single", 0), ("condensation", 0), ("robust_single", 1)],
-        [("condensation", 1)],
+        [("ijrr_robust_single", 0), ("ijrr_condensation", 0), ("ijrr_robust_single", 1)],
+        [("ijrr_condensation", 1)],
     ]
     found = {(run["preset"], run["seed"]): run["root_aligned_mm"] for run in again["runs"]}
     for run in report["runs"]:
@@ -102,7 +110,7 @@ def test_how_trackers_are_set_up_can_be_chosen(script: ModuleType, arm: Path) ->
     assert settings.terms == (*TERMS, "silhouette")
     assert (settings.likelihood_power, settings.prediction, settings.seed) == (0.3, "surface", 1)
     assert settings.limb_jumps == 2
-    assert script.settings_of(script.Config(sequence=arm), "arm8", "css", 0).terms == TERMS
+    assert script.settings_of(script.Config(sequence=arm), "arm8", "css", 0).used_terms == TERMS
 
 
 def test_a_lost_track_in_the_table(
@@ -111,21 +119,21 @@ def test_a_lost_track_in_the_table(
     times = [0.0, 0.04, 0.08]
     measured = {"time_s": times, "root_aligned_mm": [10.0, 300.0, None]}
     measured["root_aligned_best_of_modes_mm"] = [10.0, 200.0, 200.0]
-    base = {"preset": "single", "ended": "lost", "num_frames": 3, "per_frame": measured}
+    base = {"preset": "ijrr_single_limits", "ended": "lost", "num_frames": 3, "per_frame": measured}
     entries = {key: 1.0 for key, _, _ in script.COLUMNS.values()}
     runs = [
         {**base, **entries, "seed": 0, "lost": True, "lost_s": 0.04},
         {**base, **entries, "seed": 1, "lost": False, "lost_s": None, "ended": "complete"},
-        {"preset": "single", "seed": 2, "ended": "error: LinAlgError: singular"},
+        {"preset": "ijrr_single_limits", "seed": 2, "ended": "error: LinAlgError: singular"},
     ]
-    config = script.Config(sequence=arm, presets=("single",))
+    config = script.Config(sequence=arm, presets=("ijrr_single_limits",))
     report = script.write(config, {"sequence": "arm"}, runs)
     script.print_table(report["by_tracker"], "arm")
     text = capsys.readouterr().out
     assert "1/2" in text
     assert "- (0.0..-)" in text
     assert "1 ended by an error" in text
-    shown, (curve,) = error_curves(runs, {"single": (2.6,)})
+    shown, (curve,) = error_curves(runs, {"ijrr_single_limits": (2.6,)})
     assert shown.tolist() == times
     np.testing.assert_equal(curve.best_mm, [[10, 300, np.nan]] * 2)
     np.testing.assert_equal(curve.lost_s, [0.04, np.nan])
@@ -137,7 +145,10 @@ def test_a_lost_track_in_the_table(
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [({"presets": ("nobody",)}, "no trackers"), ({"resume": True, "out": None}, "expected --out")],
+    [
+        ({"presets": ("nobody",)}, "no tracker 'nobody'"),
+        ({"resume": True, "out": None}, "expected --out"),
+    ],
 )
 def test_bad_options(
     script: ModuleType, arm: Path, change: dict[str, object], message: str
@@ -159,9 +170,9 @@ def test_published_figures_are_of_our_trackers() -> None:
     pairs = [(row.sequence, row.preset) for row in PUBLISHED]
     assert len(set(pairs)) == len(pairs)
     told = {pair: row.told for pair, row in zip(pairs, PUBLISHED, strict=True)}
-    assert told["arm", "gaussian_single"] == "0.5 s and 2.2 s"
-    assert told["arm", "css"] == "never"
-    assert told["body-dark", "css_limits"] == "fails"
+    assert told["arm", "ijrr_gaussian_single"] == "0.5 s and 2.2 s"
+    assert told["arm", "ijrr_css"] == "never"
+    assert told["body-dark", "ijrr_css_limits"] == "fails"
 
 
 def test_the_figure_shows_medians_ranges_and_losses() -> None:

@@ -11,7 +11,7 @@ import pytest
 from torchcss.errors import ConfigurationError, TorchcssError
 from torchcss.tracking.settings import Settings
 
-SMALL = script.Config(frames=2, epochs=2, starts=2, track=True,
+SMALL = script.Config(frames=3, epochs=2, starts=2, track=True,
     tracking=Settings(body="arm8", keypoints_use="first", working_size=160))  # fmt: skip
 
 

@@ -46,7 +46,7 @@ def together(
 
 def test_side_by_side_is_as_alone(sequence: RecordedSequence, begin: Start) -> None:
     counts: list[tuple[int, int]] = []
-    presets = ("css", "condensation")
+    presets = ("css", "ijrr_condensation")
     both = together(sequence, begin, *presets, progress=lambda *count: counts.append(count))
     assert counts == [(index, 2) for index in range(2)]
     for preset, run in zip(presets, both, strict=True):
@@ -72,7 +72,7 @@ def test_each_tracker_looks_where_its_own_body_can_be(
         return forward(self, *arguments, window=window)
 
     monkeypatch.setattr(FeatureExtractor, "forward", spy)
-    together(sequence, begin, "condensation", "css_figure_6", stop=T)
+    together(sequence, begin, "ijrr_condensation", "ijrr_css", stop=T)
     assert len(windows) == 2 * T
     assert windows[0] == windows[1] is not None, "both start from one pose"
     assert windows[-2] != windows[-1]
@@ -81,10 +81,10 @@ def test_each_tracker_looks_where_its_own_body_can_be(
 def test_a_lost_run_ends_early(sequence: RecordedSequence, begin: Start) -> None:
     never = Thresholds(lost_mm=-1.0, regain_s=0.04)
     options: dict = {"thresholds": never, "stop": T}
-    (run,) = together(sequence, begin, "condensation", stop_when_lost=True, **options)
+    (run,) = together(sequence, begin, "ijrr_condensation", stop_when_lost=True, **options)
     assert run.ended == "lost"
     assert len(run.measures) == 2
-    (run,) = together(sequence, begin, "condensation", **options)
+    (run,) = together(sequence, begin, "ijrr_condensation", **options)
     assert run.ended == "complete"
     assert len(run.measures) == T
     assert all(m.failed for m in run.measures)
@@ -96,13 +96,13 @@ def test_an_error_ends_one_run_only(
     step = TrackingSession.step
 
     def breaking(self: TrackingSession, observation: Observation) -> Posterior:
-        if self.settings.preset == "gaussian_single":
+        if self.settings.preset == "ijrr_gaussian_single":
             raise torch.linalg.LinAlgError("singular")
         return step(self, observation)
 
     monkeypatch.setattr(TrackingSession, "step", breaking)
-    broken, sound = together(sequence, begin, "gaussian_single", "condensation")
-    assert broken.settings.preset == "gaussian_single"
+    broken, sound = together(sequence, begin, "ijrr_gaussian_single", "ijrr_condensation")
+    assert broken.settings.preset == "ijrr_gaussian_single"
     assert broken.ended == f"error: {torch.linalg.LinAlgError.__name__}: singular"
     assert not broken.measures
     assert sound.ended == "complete"
@@ -120,7 +120,7 @@ def test_the_start_is_the_sequences(sequence: RecordedSequence) -> None:
     assert float(away.norm(dim=-1).mean(-1).min()) < 0.1
     # Every run of a seed starts with the same numbers.
     state = begin.generator.get_state()
-    begins = [(choose(preset), begin) for preset in ("condensation", "annealed")]
+    begins = [(choose(preset), begin) for preset in ("ijrr_condensation", "annealed")]
     list(track_together(sequence, begins, Thresholds(), stop=1))
     assert torch.equal(begin.generator.get_state(), state)
 
@@ -128,7 +128,10 @@ def test_the_start_is_the_sequences(sequence: RecordedSequence) -> None:
 def test_a_recorded_person_is_initialised(shared_data: Path) -> None:
     sequence = read_sequence(shared_data / "rendered_turn")
     settings = Settings(
-        preset="single", keypoints_use="first", working_size=160, terms=("joints", "stabiliser")
+        preset="ijrr_single_limits",
+        keypoints_use="first",
+        working_size=160,
+        terms=("joints", "stabiliser"),
     )
     begin = find_start(sequence, settings, start=20)
     (run,) = track_together(sequence, [(settings, begin)], Thresholds(), start=20, stop=21)

@@ -4,15 +4,30 @@ import problems
 import pytest
 import torch
 
+from torchcss.cost.contour import ContourTerm
+from torchcss.cost.flow import FlowTerm
 from torchcss.errors import ConfigurationError
 from torchcss.inference.dynamics import ConstantVelocity
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.particle import AnnealedParticleFilter, ParticleFilter
 from torchcss.inference.problem import SearchProblem
-from torchcss.inference.proposals import ChamRehg, Condensation, CovarianceScaled, Samples
+from torchcss.inference.proposals import (
+    ChamRehg,
+    Condensation,
+    CovarianceScaled,
+    HeavyTailed,
+    Samples,
+)
 from torchcss.inference.tracker import Tracker
-from torchcss.tracking.presets import PRESETS, Preset, make_tracker
-from torchcss.types import Bounds, Curvature
+from torchcss.tracking.presets import ALIASES, PRESETS, Preset, make_tracker
+from torchcss.tracking.settings import (
+    PAPER_TERMS,
+    TERMS,
+    Settings,
+    make_choice,
+    settings_from_plain,
+)
+from torchcss.types import Bounds, Curvature, Status
 
 MOTION = (0.3, 0.2)
 START = GaussianMixture(
@@ -36,20 +51,23 @@ def test_every_tracker_follows_a_minimum(name, body, generator):
     assert float(apart.norm(dim=-1).min()) < 0.5, "whatever other modes there are"
 
 
-@pytest.mark.parametrize("name", ["css", "single"])
+@pytest.mark.parametrize("name", ["css", "ijrr_single_limits"])
 def test_the_first_rows_are_what_they_were(name):
     tracker = make_tracker(name, "body34", motion=MOTION)
     assert isinstance(tracker, Tracker)
     assert isinstance(tracker.proposal, CovarianceScaled)
-    assert tracker.dynamics.deviation == MOTION
-    assert (tracker.num_samples, tracker.num_modes) == {"css": (60, 7), "single": (1, 1)}[name]
+    assert tracker.dynamics.deviation == (MOTION if name == "css" else (0.0, 0.0))
+    assert (tracker.num_samples, tracker.num_modes) == {
+        "css": (60, 7),
+        "ijrr_single_limits": (1, 1),
+    }[name]
     row = PRESETS[name]
-    assert (row.robust, row.limits, row.interpenetration) == (True, True, None)
+    assert (row.robust, row.limits) == (True, True)
 
 
 def test_numbers_and_noise_reach_the_tracker():
-    row = PRESETS["cham_rehg"]
-    tracker = make_tracker("cham_rehg", "arm8", num_samples=5, num_modes=4, motion=MOTION)
+    row = PRESETS["ijrr_cham_rehg"]
+    tracker = make_tracker("ijrr_cham_rehg", "arm8", num_samples=5, num_modes=4, motion=MOTION)
     assert isinstance(tracker, Tracker)
     assert isinstance(tracker.proposal, ChamRehg)
     assert isinstance(tracker.dynamics, ConstantVelocity)
@@ -77,7 +95,7 @@ def test_weights_of_css_and_of_figure_6():
     assert arm.soft_matching
     assert body.soft_matching
     for name in ("arm8", "body34"):
-        printed = make_tracker("css_figure_6", name)
+        printed = make_tracker("ijrr_css", name)
         assert isinstance(printed, Tracker)
         assert (printed.likelihood_power, printed.forgetting) == (1.0, 1.0)
         assert not printed.soft_matching
@@ -86,7 +104,7 @@ def test_weights_of_css_and_of_figure_6():
 def test_the_reports_numbers_of_hypotheses():
     """Section 6 [RR]: three for the arm, seven for the body, from one mode."""
     for body, expected in [("arm7", 3), ("body30", 7)]:
-        tracker = make_tracker("multiple_hypothesis", body)
+        tracker = make_tracker("rr_multiple_hypothesis", body)
         assert isinstance(tracker, Tracker)
         one = GaussianMixture(
             torch.zeros(1, 9), torch.eye(9)[None] * torch.arange(1.0, 10), torch.zeros(1)
@@ -100,15 +118,15 @@ def test_the_reports_numbers_of_hypotheses():
 
 def test_limits_can_be_lifted():
     bounds = problems.box(3, -1, 1)
-    assert PRESETS["single"].bounds(bounds) is bounds
-    free = PRESETS["gaussian_single"].bounds(bounds)
+    assert PRESETS["ijrr_single_limits"].bounds(bounds) is bounds
+    free = PRESETS["ijrr_gaussian_single"].bounds(bounds)
     assert isinstance(free, Bounds)
     assert bool(free.lower.isneginf().all())
     assert bool(free.upper.isposinf().all())
 
 
 def test_least_squares_rows_are_the_papers():
-    for name in ("cham_rehg_ssd", "heap_hogg_ssd"):
+    for name in ("ijrr_cham_rehg_ssd", "heap_hogg_ssd"):
         row = PRESETS[name]
         assert (row.robust, row.limits, row.curvature) == (False, False, Curvature.GAUSS_NEWTON)
         robust = PRESETS[name.removesuffix("_ssd")]
@@ -120,6 +138,116 @@ def test_bad_rows_and_names():
     with pytest.raises(ConfigurationError, match=r"no tracker 'x'; there are css"):
         make_tracker("x", "arm8")
     with pytest.raises(ConfigurationError, match="either a proposal or a particle filter"):
-        replace(PRESETS["css"], particles=PRESETS["condensation"].particles)
+        replace(PRESETS["css"], particles=PRESETS["ijrr_condensation"].particles)
     with pytest.raises(ConfigurationError, match="either"):
         Preset(what="nothing", samples_arm=1, samples_body=1)
+
+
+PAPERS = [name for name in PRESETS if name.startswith(("ijrr_", "rr_"))]
+CSS_ROWS = [name for name in PAPERS if name.startswith("ijrr_css")]
+
+
+@pytest.mark.parametrize("name", PAPERS)
+@pytest.mark.parametrize("body", ["arm8", "body34"])
+def test_nothing_of_ours_is_in_the_papers_rows(name, body):
+    settings, row = Settings(preset=name, body=body), PRESETS[name]
+    assert not settings.changed()
+    assert settings.keypoints_first_only
+    assert not settings.recovers
+    assert row.start == "one fit"
+    assert row.jumps_every == 0
+    assert row.persistence == (1.0 if "cham_rehg" in name else 0.0)
+    choice = make_choice(settings, 2.0)
+    expected = set(PAPER_TERMS) - {"motion_boundaries"}
+    if not row.interpenetration:
+        expected.discard("interpenetration")
+    assert {term.name for term in choice.terms} == expected
+    for term in (choice.find(ContourTerm), choice.find(FlowTerm)):
+        assert term is not None
+        assert term.fitted_level == 1.0
+        assert (term.occlusion_factor > 1) == name.startswith("ijrr_")
+    tracker = make_tracker(name, body, motion=0.1)
+    if isinstance(tracker, Tracker):
+        optimiser = tracker.optimiser
+        assert optimiser.max_steps >= 100
+        assert (optimiser.tolerance, optimiser.initial_radius) == (1e-6, 1.0)
+        assert tracker.converged_only
+        assert (tracker.coarse_every, tracker.survivors, tracker.soft_matching) == (0, 0, False)
+        if "single" not in name:
+            modes = {"ijrr_cham_rehg": 10, "ijrr_cham_rehg_ssd": 10}
+            assert tracker.num_modes == modes.get(name, 3 if body == "arm8" else 7)
+
+
+@pytest.mark.parametrize("name", CSS_ROWS)
+def test_figure_6_draws_from_scaled_covariances_and_nothing_else(name):
+    tracker = make_tracker(name, "arm8", motion=0.1)
+    assert isinstance(tracker, Tracker)
+    proposal = tracker.proposal
+    assert isinstance(proposal, (CovarianceScaled, HeavyTailed))
+    assert proposal.covariance_scale == (4 if isinstance(proposal, HeavyTailed) else 8)
+    assert proposal.max_deviation is None
+    assert not proposal.include_modes
+    assert tracker.dynamics.deviation == 0
+    assert (tracker.forgetting, tracker.likelihood_power) == (1, 1)
+    assert not tracker.keep_alike
+
+
+def test_which_rows_have_physical_constraints():
+    said = {name: (PRESETS[name].limits, PRESETS[name].interpenetration) for name in PAPERS}
+    assert said["ijrr_gaussian_single"] == said["ijrr_robust_single"] == (False, False)
+    assert said["ijrr_cham_rehg_ssd"] == (False, False)
+    assert said["ijrr_single_limits"] == said["ijrr_css_limits"] == (True, False)
+    assert said["ijrr_css"] == said["ijrr_css_constrained"] == (True, True)
+    assert PRESETS["rr_multiple_hypothesis"].curvature is Curvature.GAUSS_NEWTON
+    assert PRESETS["ijrr_css"].curvature is Curvature.EXACT
+
+
+def test_what_is_given_beside_a_preset_wins_and_is_recorded():
+    settings = Settings(
+        preset="ijrr_css", terms=("default",), keypoints_use="all", recovery=True, samples=9
+    )
+    assert set(settings.changed()) == {"terms", "keypoints_use", "recovery", "samples"}
+    assert "region" in settings.used_terms
+    assert settings.recovers
+    assert not settings.keypoints_first_only
+    assert not Settings(recovery=True, keypoints_use="all", terms=("default",)).changed()
+
+
+def test_old_names_and_old_runs_still_open():
+    for old, new in ALIASES.items():
+        assert Settings(preset=old).preset == new
+        assert old not in PRESETS
+        assert make_tracker(old, "arm8") == make_tracker(new, "arm8")
+    old = {"preset": "css_figure_6", "terms": ["contour", "region"], "recovery": True}
+    opened = settings_from_plain(old)
+    assert (opened.preset, opened.used_terms) == ("ijrr_css", ("contour", "region"))
+    assert opened.recovers
+
+
+def test_css_is_what_it_was():
+    plain = Settings()
+    assert (plain.recovers, plain.keypoints_first_only, plain.used_terms) == (True, False, TERMS)
+    tracker = make_tracker("css", "arm8", motion=0.1)
+    assert isinstance(tracker, Tracker)
+    optimiser = tracker.optimiser
+    assert (optimiser.max_steps, optimiser.tolerance) == (17, 1e-2)
+    assert optimiser.initial_radius == 1 / 16
+    assert (tracker.coarse_every, tracker.keep_alike, tracker.converged_only) == (3, True, False)
+    assert tracker.dynamics == ConstantVelocity(deviation=0.1, persistence=0.8)
+    assert (tracker.separation, tracker.forgetting) == (0.12, 0.98)
+    contour, flow = (make_choice(plain, 2.0).find(kind) for kind in (ContourTerm, FlowTerm))
+    assert contour is not None
+    assert flow is not None
+    assert contour.fitted_level == pytest.approx(0.983, abs=1e-3)
+    assert (flow.fitted_level, flow.occlusion_factor) == (0.3, 1.1)
+
+
+def test_what_stopped_at_the_step_limit_is_not_kept(generator):
+    tracker = make_tracker("ijrr_css", "arm8", num_samples=6, num_modes=3)
+    assert isinstance(tracker, Tracker)
+    hurried = replace(tracker, optimiser=replace(tracker.optimiser, max_steps=1))
+    problem, bounds = SearchProblem(problems.DoubleWell(width=0.3)), problems.box(2, -6, 6)
+    for each, ends in ((hurried, False), (tracker, True)):
+        _, info = each.step(each.init(START, generator=generator), problem, bounds)
+        assert (int(info.num_distinct) > 0) == ends
+        assert (int(info.status_counts[Status.STEP_LIMIT]) == 0) == ends

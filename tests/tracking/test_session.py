@@ -598,7 +598,7 @@ def test_awkward_frames_leave_no_nan_and_lose_nothing():
         ({"body": "arm8"}, 0.05, 0.05),
         ({"likelihood_power": 0.7}, 0.7, 0.1),
         ({"keypoints_use": "first", "likelihood_power": 0.7}, 0.7, 0.1),
-        ({"preset": "css_heavy_tailed"}, 0.2, 0.1),
+        ({"preset": "ijrr_css_heavy_tailed"}, 1.0, 1.0),
         ({"preset": "css_figure_6"}, 1.0, 1.0),
         ({"preset": "single"}, 1.0, 1.0),
         ({"preset": "annealed"}, None, 1.0),

@@ -206,8 +206,8 @@ def initialise_video(
     options = InitialiseOptions(
         sigma=sigma,
         least_joints=LEAST_JOINTS,
-        contours="contour" in settings.terms,
-        colours="region" in settings.terms,
+        contours="contour" in settings.used_terms,
+        colours="region" in settings.used_terms,
         working_size=settings.working_size,
         dtype=settings.torch_dtype,
         device=settings.device,

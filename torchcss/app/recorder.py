@@ -200,6 +200,7 @@ class Recorder:
             "samples": plan.tracker.num_samples,
             "modes": plan.tracker.num_modes,
             "settings": asdict(settings),
+            "changed_beside_preset": list(settings.changed()),
             "versions": {
                 "python": platform.python_version(),
                 **{name: version(name) for name in ("torchcss", "torch", "kornia", "numpy")},

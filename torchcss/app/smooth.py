@@ -103,7 +103,7 @@ def settings_of(run: Run) -> Settings:
     known = {field.name for field in fields(Settings)}
     try:
         entries: dict[str, Any] = {k: v for k, v in run.settings.items() if k in known}
-        if "terms" in entries:
+        if entries.get("terms") is not None:
             entries["terms"] = tuple(entries["terms"])
         return Settings(**{"body": run.body.name, **entries, "device": "cpu", "dtype": "float64"})
     except (TypeError, AttributeError) as error:

@@ -66,8 +66,12 @@ Verb = (
 )
 
 
-_OLD_NAMES = {"--evidence": "--likelihood-power", "--agility": "--acceleration-ratio"}
-"""Options of version 0.1 that are called otherwise now; not in the help."""
+_OLD_NAMES = {
+    "--evidence": "--likelihood-power",
+    "--agility": "--acceleration-ratio",
+    "--no-recovery": "--recovery=False",
+}
+"""Options of version 0.1 that are written otherwise now; not in the help."""
 
 
 def main(arguments: list[str] | None = None) -> int:

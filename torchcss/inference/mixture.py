@@ -291,17 +291,19 @@ def tempered(
     return symmetric_part(torch.linalg.solve(power * (one - own) + own, own)) * units
 
 
-def separated(landmarks: Float[Tensor, "k m d"], distance: float, num: int) -> Int[Tensor, " num"]:
+def separated(
+    landmarks: Float[Tensor, "k m d"], distance: float, num: int, *, fill: bool = True
+) -> Int[Tensor, " num"]:
     """Choose modes that are unlike each other, best first.
 
     Args:
         landmarks: Points of each mode, the best mode first.
         distance: Two modes are alike if no landmark is this far from where it is in the other.
         num: How many to choose.
+        fill: Whether places that are left go to modes that are like a better one, best first.
 
     Returns:
-        Indices of the modes: of those alike only the best, and the best of the others only if that
-        leaves places; in the order given.
+        Indices of the modes, in the order given.
     """
     left = torch.ones(len(landmarks), dtype=torch.bool, device=landmarks.device)
     chosen: list[int] = []
@@ -312,6 +314,8 @@ def separated(landmarks: Float[Tensor, "k m d"], distance: float, num: int) -> I
         left &= (landmarks - landmarks[best]).norm(dim=-1).amax(-1) >= distance
     taken = torch.zeros_like(left)
     taken[chosen] = True
+    if not fill:
+        return taken.nonzero()[:, 0]
     alike = (~taken).nonzero()[: num - len(chosen), 0]
     return torch.cat([taken.nonzero()[:, 0], alike]).sort().values
 

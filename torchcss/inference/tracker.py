@@ -306,6 +306,9 @@ class Tracker:
             alike they are, as in Fig. 6. Clutter makes many minima within a hand's breadth, which
             crowd out all that differ. In the unit of the problem's landmarks; problems without
             them are not concerned.
+        keep_alike: Whether places that `separation` leaves go to modes alike; False: fewer than K
+            are kept.
+        converged_only: Keep nothing that stopped at the optimiser's step limit.
     """
 
     proposal: Proposal
@@ -324,6 +327,8 @@ class Tracker:
     standard_bhattacharyya: bool = False
     soft_matching: bool = False
     separation: float = 0.0
+    keep_alike: bool = True
+    converged_only: bool = False
 
     def __post_init__(self) -> None:
         for name in ("num_samples", "num_modes", "duplicate_distance", "oversampling"):
@@ -514,8 +519,11 @@ class Tracker:
             search.problem.cost, search.descents, bounds, scale=space.scale
         )
         modes = self.optimiser.modes(descents, bounds, prior_variance=space.prior_variance)
+        energy = _finite_cost(modes)
+        if self.converged_only:
+            energy = torch.where(modes.status == Status.STEP_LIMIT, torch.inf, energy)
         return modes, distinct_modes(
-            modes.mean, modes.covariance, _finite_cost(modes), distance=self.duplicate_distance
+            modes.mean, modes.covariance, energy, distance=self.duplicate_distance
         )
 
     def _posterior(
@@ -574,7 +582,7 @@ class Tracker:
             heaviest = (modes.log_weight + past.log_weight).argmax()
             order = torch.cat([heaviest[None], order[order != heaviest]])
         points = problem.landmarks(modes.mean[order])
-        chosen = separated(points, self.separation, self.num_modes)
+        chosen = separated(points, self.separation, self.num_modes, fill=self.keep_alike)
         if past is None:
             return order[chosen]
         score = (log_likelihood + self.likelihood_power * past.log_weight)[order]

@@ -1,44 +1,45 @@
-"""The trackers of the papers by name, as one table of choices.
+"""The trackers by name, as one table of choices: the papers' and ours.
 
-`make_tracker(name, body_name)` builds one. The number of modes is the papers': 3 for an arm, 7 for
-a body, 10 for Cham and Rehg's.
+`make_tracker(name, body_name)` builds one. A row says everything: search, cost, dynamics,
+optimiser, recovery, what keypoints are used for and where the track starts. An option that the user
+gives beside it wins (`Settings.changed`).
 
 | name | tracker | from |
 |---|---|---|
-| css | covariance scaled sampling, modes kept apart, soft matching, jumps | [IJRR] Fig. 6 |
-| css_figure_6 | covariance scaled sampling alone | [IJRR] Fig. 6 |
-| css_heavy_tailed | the same with Student t tails | [IJRR] Fig. 6 |
-| css_limits, css_constrained | without and with non-interpenetration | [IJRR] section 6.2 |
-| multiple_hypothesis | a regular pattern along the most uncertain directions | [RR] Fig. 4 |
-| gaussian_single, robust_single, single | one mode: Gaussian errors, robust, + limits | [IJRR] 6 |
-| condensation_modes | modes and descents, sampled by dynamical noise | [IJRR] section 6 |
-| cham_rehg, cham_rehg_ssd | Cham and Rehg (1999) in 3D, robust and not | [IJRR] section 6.1 |
-| heap_hogg, heap_hogg_ssd | Heap and Hogg (1998) in 3D, robust and not | [IJRR] section 6.1 |
-| condensation | the particle filter | [IJRR] section 1.1 |
-| condensation_inflated | with an inflated posterior | [IJRR] section 9 |
-| annealed | the annealed particle filter | [IJRR] section 1.2 |
+| css | covariance scaled sampling, modes kept apart, soft matching, jumps | ours |
+| ijrr_css | covariance scaled sampling as printed | [IJRR] Fig. 6 |
+| ijrr_css_heavy_tailed | the same with Student t tails | [IJRR] Fig. 6, section 8 |
+| ijrr_css_limits, ijrr_css_constrained | without and with non-self-intersection | [IJRR] 6.2 |
+| ijrr_gaussian_single, ijrr_robust_single | one mode: Gaussian errors, robust errors | [IJRR] 6 |
+| ijrr_single_limits | one robust mode with limits, without non-self-intersection | [IJRR] 6.1 |
+| ijrr_cham_rehg, ijrr_cham_rehg_ssd | Cham and Rehg (1999) in 3D, robust and not | [IJRR] 6.1 |
+| ijrr_condensation | the particle filter | [IJRR] 1.1 |
+| rr_multiple_hypothesis | a regular pattern along the most uncertain directions | [RR] Fig. 4 |
+| condensation_modes | ijrr_css, sampled by dynamical noise | ours, after [IJRR] 6 |
+| heap_hogg, heap_hogg_ssd | Heap and Hogg (1998) in 3D, robust and not | ours, after [IJRR] 6.1 |
+| condensation_inflated | with an inflated posterior | ours, after [IJRR] 9 |
+| annealed | the annealed particle filter | ours, after [IJRR] 1.2 |
 
-A row also says what the cost has to be: whether its potentials are robust, whether joint limits
-hold, whether parts repel each other, and which Hessian it gives (decision "papers' presets"). That
-is for whoever builds the cost; `Preset.bounds` gives the limits.
+Modes are the papers': 3 for an arm, 7 for a body, 10 for Cham and Rehg's. What the papers leave
+open is ours: the numbers of samples and particles, the search noise of the rows that search by it
+(a multiple of the everyday motion of one frame), the step limit and the tolerance of descents, the
+degrees of freedom of the t, and that modes of which no joint centre is 3 cm apart are confounded
+minima. A filter gets as many evaluations of the cost as a descending tracker may take, 20 per
+sample that descends to the end.
 
-What [IJRR] says of the two multiple-hypothesis trackers, and what is made of it here. Both combine
-sampling as in CONDENSATION with least-squares descent from the samples, for 2D models; the paper
-runs them in 3D with a Gaussian mixture and a dynamical noise large enough to search by. Cham and
-Rehg sample within the Gauss-Newton covariances of their modes, piecewise, under constant velocity,
-and keep ten modes. Heap and Hogg's samples are particles at the modes themselves, randomised by the
-noise alone. The "ssd" rows have Gaussian errors, Gauss-Newton Hessians and no joint limits, as in
-the originals; the others share the robust cost and the limits of this package.
-
-The search noise of these rows is a multiple of the everyday motion of one frame (`noise`). It and
-the numbers of particles are ours, chosen before any comparison: the papers give none. A filter gets
-as many evaluations of the cost as a descending tracker may take, 20 per sample that descends to
-the end.
+The papers' rows have the papers' terms (`Preset.terms`), no recovery, no flips, no descents on a
+coarser cost, driftless diffusion where that is printed, keypoints in the first frame alone, and
+they start from the covariance of one fit (section 5 of both). Cham and Rehg's "ssd" row has
+Gaussian errors, Gauss-Newton Hessians, no joint limits and no repulsion; [IJRR] names only the
+metric and the optimiser, the rest is our reading.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Literal
 
 import torch
 
@@ -93,10 +94,11 @@ class Preset:
             limb whose flow is underestimated: on the beam clip it doubles the time that limbs are
             held, and takes a quarter off the errors of the demo.
         noise: Dynamical noise that the tracker searches by, in multiples of the motion of one
-            frame. Trackers that descend from scaled covariances have 1: realistic noise.
+            frame. Ours that descend from scaled covariances have 1, realistic noise; the papers' 0.
         robust: Whether the cost's potentials are robust (False: `Quadratic`).
         limits: Whether joint limits hold, see `bounds`.
-        interpenetration: Whether parts repel each other; None: as the cost is set up otherwise.
+        interpenetration: Whether parts repel each other, unless the user names the terms; None: as
+            `terms` has it.
         curvature: Which Hessian the cost gives.
         separation: Distance of some joint centre, metres, from which two modes count as two
             explanations, see `Tracker`. The papers have none; their modes are distinct minima. By
@@ -105,6 +107,18 @@ class Preset:
         soft_matching: See `Tracker`.
         jumps_every: Every how many frames the flips of the best mode join the search, see
             `torchcss.tracking.flip_moves`; 0, as in the papers: never.
+        keep_alike: See `Tracker`.
+        coarse_every: See `Tracker`.
+        optimiser: How samples descend.
+        converged_only: See `Tracker`.
+        terms: Name of a set of terms, see `torchcss.tracking.settings.named_terms`.
+        levels: What a hidden node and one that faces away cost: "ours", the error per node of a
+            fitted model and a little more; "ijrr" and "rr": `nu_bf = nu` and `nu_occ = k nu`, k
+            above and below 1 (eq. 5 of both; the numbers 1.1 and 0.9 are ours).
+        recovery: Whether a loss widens the search, see `torchcss.tracking.recovery`.
+        keypoints_use: See `Settings`.
+        start: Which fits of the first frame the track starts from: all, or the likeliest with its
+            covariance (section 5 of both papers).
     """
 
     what: str
@@ -130,6 +144,15 @@ class Preset:
     separation: float = 0.0
     soft_matching: bool = False
     jumps_every: int = 0
+    keep_alike: bool = True
+    coarse_every: int = 3
+    optimiser: TrustRegionNewton = field(default_factory=lambda: _FEW_STEPS)
+    converged_only: bool = False
+    terms: str = "default"
+    levels: Literal["ours", "ijrr", "rr"] = "ours"
+    recovery: bool = True
+    keypoints_use: Literal["first", "all"] = "all"
+    start: Literal["fits", "one fit"] = "fits"
 
     def __post_init__(self) -> None:
         if (self.proposal is None) == (self.particles is None):
@@ -151,13 +174,16 @@ class Preset:
         )
 
 
-_PERSISTENCE = 0.8
-"""Of all trackers without dynamics of their own, so that they differ in the search alone."""
+_FEW_STEPS = TrustRegionNewton(max_steps=17, tolerance=1e-2, initial_radius=1 / 16)
+"""Of our rows. The radius is in metres and radians: the edges are searched for some 20 pixels to
+either side, and of first steps of a radian, a half and a quarter most are rejected (measured; 17
+steps end where 20 from a radian on did)."""
 
-_FIRST_RADIUS = 1 / 16
-"""Metres and radians that a first step may go. The edges are searched for some 20 pixels to either
-side: of first steps of a radian, a half and a quarter most are rejected (measured; 17 steps
-end where 20 from a radian on did)."""
+_TO_CONVERGENCE = TrustRegionNewton(max_steps=200, tolerance=1e-6, initial_radius=1.0)
+"""Of the papers' rows (note 8 [IJRR]); the numbers are ours."""
+
+_CONFOUNDED = 0.03
+"""Metres that some joint centre of two minima is apart, for them to count as two. Ours."""
 
 _CSS = Preset(
     what="covariance scaled sampling, [IJRR] Fig. 6 with s = 8, modes kept apart, and jumps",
@@ -170,32 +196,67 @@ _CSS = Preset(
     power_keypoints=0.2,
     survivors_arm=40,
     survivors_body=60,
-    persistence=_PERSISTENCE,
+    persistence=0.8,
     separation=0.12,
     soft_matching=True,
     jumps_every=3,
 )
-_SINGLE = Preset(
-    what="one robust mode with joint limits, no search ([IJRR] section 6)",
-    proposal=CovarianceScaled(covariance_scale=1.0),
-    samples_arm=1,
-    samples_body=1,
-    modes_arm=1,
-    modes_body=1,
-    persistence=_PERSISTENCE,
+
+
+def _printed(row: Preset, *, paper: Literal["ijrr", "rr"] = "ijrr") -> Preset:
+    """The row with nothing of ours in what is around its search."""
+    return replace(
+        row,
+        optimiser=_TO_CONVERGENCE,
+        converged_only=True,
+        coarse_every=0,
+        terms="papers",
+        levels=paper,
+        recovery=False,
+        keypoints_use="first",
+        start="one fit",
+    )
+
+
+_IJRR_CSS = _printed(
+    Preset(
+        what="covariance scaled sampling as printed ([IJRR] Fig. 6, s = 8)",
+        proposal=CovarianceScaled(covariance_scale=8.0, include_modes=False),
+        samples_arm=40,
+        samples_body=60,
+        noise=0.0,
+        interpenetration=True,
+        separation=_CONFOUNDED,
+        keep_alike=False,
+    )
 )
-_CHAM_REHG = Preset(
-    what="Cham and Rehg's multiple-hypothesis tracker in 3D, robust ([IJRR] section 6.1)",
-    proposal=ChamRehg(deviation=0.0),
-    samples_arm=40,
-    samples_body=60,
-    modes_arm=10,
-    modes_body=10,
-    persistence=1.0,
-    noise=3.0,
+_SINGLE = _printed(
+    Preset(
+        what="one robust mode with joint limits, without non-self-intersection ([IJRR] 6.1)",
+        proposal=CovarianceScaled(covariance_scale=1.0),
+        samples_arm=1,
+        samples_body=1,
+        modes_arm=1,
+        modes_body=1,
+        noise=0.0,
+        interpenetration=False,
+    )
+)
+_CHAM_REHG = _printed(
+    Preset(
+        what="Cham and Rehg's multiple-hypothesis tracker in 3D, robust ([IJRR] section 6.1)",
+        proposal=ChamRehg(deviation=0.0, piecewise=False),
+        samples_arm=40,
+        samples_body=60,
+        modes_arm=10,
+        modes_body=10,
+        persistence=1.0,
+        noise=3.0,
+        interpenetration=True,
+    )
 )
 _HEAP_HOGG = Preset(
-    what="Heap and Hogg's multiple-hypothesis tracker in 3D, robust ([IJRR] section 6.1)",
+    what="Heap and Hogg's multiple-hypothesis tracker in 3D, robust",
     proposal=Condensation(deviation=0.0),
     samples_arm=40,
     samples_body=60,
@@ -213,80 +274,76 @@ _CONDENSATION = Preset(
 
 
 def _least_squares(row: Preset, what: str) -> Preset:
-    """The row with Gaussian errors, Gauss-Newton Hessians and no joint limits."""
-    return replace(row, what=what, robust=False, limits=False, curvature=Curvature.GAUSS_NEWTON)
+    """The row with Gaussian errors, Gauss-Newton Hessians and no physical constraints."""
+    return replace(
+        row,
+        what=what,
+        robust=False,
+        limits=False,
+        interpenetration=False,
+        curvature=Curvature.GAUSS_NEWTON,
+    )
 
 
 PRESETS: dict[str, Preset] = {
     "css": _CSS,
-    "css_figure_6": replace(
-        _CSS,
-        what="css as printed: weights multiplied, minima however alike, no jumps to flips",
-        forgetting=1.0,
-        likelihood_power=1.0,
-        power_arm=None,
-        power_keypoints=None,
-        samples_arm=40,
-        survivors_arm=0,
-        survivors_body=0,
-        separation=0.0,
-        soft_matching=False,
-        jumps_every=0,
+    "ijrr_css": _IJRR_CSS,
+    "ijrr_css_heavy_tailed": replace(
+        _IJRR_CSS,
+        what="covariance scaled sampling with Student t tails ([IJRR] Fig. 6)",
+        proposal=HeavyTailed(covariance_scale=4.0, degrees_of_freedom=3, include_modes=False),
     ),
-    "css_heavy_tailed": replace(
-        _CSS,
-        what="covariance scaled sampling with Student t tails, [IJRR] Fig. 6",
-        proposal=HeavyTailed(covariance_scale=4.0, degrees_of_freedom=3, max_deviation=1.0),
-    ),
-    "css_limits": replace(
-        _CSS,
-        what="css with joint limits, without non-interpenetration ([IJRR] section 6.2)",
+    "ijrr_css_limits": replace(
+        _IJRR_CSS,
+        what="as printed with joint limits, without non-self-intersection ([IJRR] section 6.2)",
         interpenetration=False,
     ),
-    "css_constrained": replace(
-        _CSS,
-        what="css with joint limits and non-interpenetration ([IJRR] section 6.2)",
-        interpenetration=True,
+    "ijrr_css_constrained": replace(
+        _IJRR_CSS,
+        what="as printed with joint limits and non-self-intersection ([IJRR] section 6.2)",
     ),
-    "multiple_hypothesis": Preset(
-        what="a pattern along the most uncertain directions, one pool ([RR] Fig. 4); all descend",
-        proposal=EigenDirectionGrid(num_directions=3, num_steps=1),
-        proposal_arm=EigenDirectionGrid(num_directions=1, num_steps=1),
-        samples_arm=9,  # 3 modes and 2 steps from each
-        samples_body=49,  # 7 modes and 6 steps from each
-        forgetting=0.0,
-        persistence=_PERSISTENCE,
+    "rr_multiple_hypothesis": _printed(
+        Preset(
+            what="a pattern along the most uncertain directions, one pool ([RR] Fig. 4); all "
+            "descend, before the pool is pruned",
+            proposal=EigenDirectionGrid(num_directions=3, num_steps=1),
+            proposal_arm=EigenDirectionGrid(num_directions=1, num_steps=1),
+            samples_arm=9,  # 3 modes and 2 steps from each
+            samples_body=49,  # 7 modes and 6 steps from each
+            forgetting=0.0,
+            noise=0.0,
+            interpenetration=True,
+            curvature=Curvature.GAUSS_NEWTON,
+        ),
+        paper="rr",
     ),
-    "single": _SINGLE,
-    "robust_single": replace(
+    "ijrr_single_limits": _SINGLE,
+    "ijrr_robust_single": replace(
         _SINGLE,
-        what="one robust mode without joint limits ([IJRR] section 6)",
+        what="one robust mode without physical constraints ([IJRR] section 6)",
         limits=False,
     ),
-    "gaussian_single": replace(
+    "ijrr_gaussian_single": replace(
         _SINGLE,
-        what="one mode, Gaussian errors, no joint limits ([IJRR] section 6)",
+        what="one mode, Gaussian errors, without physical constraints ([IJRR] section 6)",
         robust=False,
         limits=False,
     ),
     "condensation_modes": replace(
-        _CSS,
-        what="css, but sampled by dynamical noise instead of scaled covariances ([IJRR] section 6)",
+        _IJRR_CSS,
+        what="ijrr_css, but sampled by dynamical noise instead of scaled covariances",
         proposal=Condensation(deviation=0.0),
         noise=3.0,
-        separation=0.0,
-        soft_matching=False,
-        jumps_every=0,
     ),
-    "cham_rehg": _CHAM_REHG,
-    "cham_rehg_ssd": _least_squares(
+    "ijrr_cham_rehg": _CHAM_REHG,
+    "ijrr_cham_rehg_ssd": _least_squares(
         _CHAM_REHG, "Cham and Rehg's multiple-hypothesis tracker in 3D, least squares"
     ),
     "heap_hogg": _HEAP_HOGG,
     "heap_hogg_ssd": _least_squares(
         _HEAP_HOGG, "Heap and Hogg's multiple-hypothesis tracker in 3D, least squares"
     ),
-    "condensation": _CONDENSATION,
+    "ijrr_condensation": replace(_printed(_CONDENSATION), interpenetration=True),
     "condensation_inflated": replace(
         _CONDENSATION,
         what="CONDENSATION from the posterior to the power 1/8 ([IJRR] section 9)",
@@ -301,6 +358,38 @@ PRESETS: dict[str, Preset] = {
     ),
 }
 
+ALIASES: Mapping[str, str] = MappingProxyType(
+    {
+        "css_figure_6": "ijrr_css",
+        "css_heavy_tailed": "ijrr_css_heavy_tailed",
+        "css_limits": "ijrr_css_limits",
+        "css_constrained": "ijrr_css_constrained",
+        "gaussian_single": "ijrr_gaussian_single",
+        "robust_single": "ijrr_robust_single",
+        "single": "ijrr_single_limits",
+        "cham_rehg": "ijrr_cham_rehg",
+        "cham_rehg_ssd": "ijrr_cham_rehg_ssd",
+        "condensation": "ijrr_condensation",
+        "multiple_hypothesis": "rr_multiple_hypothesis",
+    }
+)
+"""Names of version 0.1, which hold for one version more."""
+
+
+def preset_name(name: str) -> str:
+    """The present name of a row.
+
+    Args:
+        name: A name in `PRESETS`, or one of `ALIASES`.
+
+    Raises:
+        ConfigurationError: If there is no such tracker.
+    """
+    known = ALIASES.get(name, name)
+    if known not in PRESETS:
+        raise ConfigurationError(f"no tracker {name!r}; there are {', '.join(PRESETS)}")
+    return known
+
 
 def make_tracker(
     preset: str,
@@ -314,7 +403,7 @@ def make_tracker(
     """Build a tracker from the table.
 
     Args:
-        preset: A name in `PRESETS`.
+        preset: A name in `PRESETS` or `ALIASES`.
         body_name: The body; arms and bodies differ in numbers.
         num_samples: Samples per frame instead of the table's.
         num_modes: Modes kept instead of the table's.
@@ -324,9 +413,7 @@ def make_tracker(
     Raises:
         ConfigurationError: If there is no such tracker.
     """
-    if preset not in PRESETS:
-        raise ConfigurationError(f"no tracker {preset!r}; there are {', '.join(PRESETS)}")
-    row = PRESETS[preset]
+    row = PRESETS[preset_name(preset)]
     arm = not (has_free_root(body_name) if free_root is None else free_root)
     num_samples = num_samples or (row.samples_arm if arm else row.samples_body)
     num_modes = num_modes or (row.modes_arm if arm else row.modes_body)
@@ -351,7 +438,10 @@ def make_tracker(
         proposal=proposal,
         num_samples=num_samples,
         num_modes=num_modes,
-        optimiser=TrustRegionNewton(max_steps=17, tolerance=1e-2, initial_radius=_FIRST_RADIUS),
+        optimiser=row.optimiser,
+        coarse_every=row.coarse_every,
+        converged_only=row.converged_only,
+        keep_alike=row.keep_alike,
         forgetting=row.forgetting,
         likelihood_power=evidence,
         survivors=row.survivors_arm if arm else row.survivors_body,

@@ -184,13 +184,14 @@ class TrackingSession:
         generator = generator or torch.Generator().manual_seed(settings.seed)
         self._begin(settings, first.body, views, frame_interval)
         nothing = len(self._observers)
+        mixture = first.mixture.prune(1) if self.plan.one_fit else first.mixture
         self.state = SessionState(
-            tracker=self.plan.tracker.init(first.mixture, generator=generator),
+            tracker=self.plan.tracker.init(mixture, generator=generator),
             body=first.body,
             seen=(NOTHING_SEEN,) * nothing,
             memory=(NOTHING_KNOWN,) * nothing,
             monitor=None if self.plan.recovery is None else self.plan.recovery.monitor.init(),
-            windows=(self._windows(first.body, first.mixture),) * 2,
+            windows=(self._windows(first.body, mixture),) * 2,
         )
         self._expect(self.state)
 

@@ -31,7 +31,7 @@ from torchcss.cost.total import Engine
 from torchcss.errors import ConfigurationError
 from torchcss.inference.tracker import SequenceTracker, Tracker
 from torchcss.robust import Lorentzian, Quadratic
-from torchcss.tracking.presets import PRESETS, make_tracker
+from torchcss.tracking.presets import PRESETS, Preset, make_tracker, preset_name
 from torchcss.tracking.recovery import Recovery
 from torchcss.tracking.view import CameraView, Observer
 from torchcss.types import Bounds, Curvature
@@ -51,10 +51,10 @@ it. Where a body turns quickly the flow falls behind, and holds it back."""
 
 PAPER_TERMS = (
     *("contour", "motion_boundaries", "flow"),
-    *("stabiliser", "anthropometric", "interpenetration", "temporal"),
+    *("stabiliser", "anthropometric", "interpenetration"),
 )
 """What the papers' cost has ([IJRR] sections 3.1 and 3.2, [RR] section 3): edges weighed by motion
-boundaries, flow and priors; no colours, and joints in the first frame only."""
+boundaries, flow and priors on parameters; no colours, no prior over time (note 5 [IJRR])."""
 
 _NO_COST = ("motion_boundaries", "background")
 """Names in `Settings.terms` that have no cost of their own. `motion_boundaries` weighs the edges of
@@ -99,7 +99,7 @@ class Settings:
 
     Attributes:
         body: Body to track: arm7, arm8, body30, body32, body34, or a URDF, MJCF or BVH file.
-        preset: Tracker, a name in `presets.PRESETS`.
+        preset: Tracker, a name in `presets.PRESETS`; one of `presets.ALIASES` becomes that.
         samples: Samples per frame; the preset's number by default.
         modes: Modes kept; the preset's number by default.
         prediction: "velocity": a mode is expected where its own last motion leads; "surface": its
@@ -112,10 +112,10 @@ class Settings:
         limb_jumps: How many other poses of an arm for which the colours do not speak join the
             search, see `torchcss.tracking.limb_moves`; 0 for none. For trackers that descend from
             samples.
-        keypoints_use: "all": keypoints are observations in every frame; "first": they only
-            give the first pose, as in the papers.
-        terms: Terms and priors of the cost; `default` stands for the default ones, `still` for
-            those for a camera that stands still, `papers` for those of the papers. See
+        keypoints_use: The preset's by default. "all": keypoints are observations in every frame;
+            "first": they only give the first pose, as in the papers.
+        terms: Terms and priors of the cost, the preset's by default; `default` stands for ours,
+            `still` for those for a camera that stands still, `papers` for the papers'. See
             `make_choice` for what the preset changes.
         curvature: Which Hessian the optimiser gets; the preset's by default. "autograd" is the slow
             reference.
@@ -134,7 +134,8 @@ class Settings:
         threads: With two or more, the next frame's features are found while this one is searched.
             Nothing else changes.
         overlay: Write `overlay.mp4`.
-        recovery: Tell from the costs when the track is lost, and search more widely then.
+        recovery: Tell from the costs when the track is lost, and search more widely then; as the
+            preset does by default.
     """
 
     body: str = "body34"
@@ -145,8 +146,8 @@ class Settings:
     oversampling: int = 1
     likelihood_power: float | None = None
     limb_jumps: int = 0
-    keypoints_use: Literal["first", "all"] = "all"
-    terms: tuple[str, ...] = TERMS
+    keypoints_use: Literal["first", "all"] | None = None
+    terms: tuple[str, ...] | None = None
     curvature: Literal["exact", "gauss-newton", "autograd"] | None = None
     working_size: int = 640
     contour_weight: float = 150.0
@@ -159,10 +160,13 @@ class Settings:
     engine_dtype: Literal["float32", "float64"] = "float64"
     threads: int = 1
     overlay: bool = True
-    recovery: bool = True
+    recovery: bool | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "terms", named_terms(self.terms))
+        object.__setattr__(self, "preset", preset_name(self.preset))
+        if self.terms is not None:
+            object.__setattr__(self, "terms", named_terms(self.terms))
+            _check_terms(self.terms)
         self._check_names()
         self._check_numbers()
         if PRESETS[self.preset].particles is not None:
@@ -179,17 +183,7 @@ class Settings:
             ) from error
 
     def _check_names(self) -> None:
-        """Presets, terms and predictions are known."""
-        if self.preset not in PRESETS:
-            raise ConfigurationError(f"no tracker {self.preset!r}; there are {', '.join(PRESETS)}")
-        unknown = sorted(set(self.terms) - set(all_terms()))
-        if unknown:
-            raise ConfigurationError(f"unknown terms {unknown}; there are {', '.join(all_terms())}")
-        if not set(self.terms) & set(watched_terms()):
-            raise ConfigurationError(
-                f"terms: expected at least one of {', '.join(watched_terms())}, which compare a "
-                f"pose with the image; got {', '.join(self.terms) or 'none'}"
-            )
+        """Weights and predictions are known."""
         if not isinstance(self.weights, Mapping):
             raise ConfigurationError(f"weights: expected factors by name, got {self.weights!r}")
         if strange := sorted(set(self.weights) - set(TERM_TABLE)):
@@ -223,9 +217,55 @@ class Settings:
             raise ConfigurationError(f"limb_jumps must be at least 0, got {self.limb_jumps}")
 
     @property
+    def used_terms(self) -> tuple[str, ...]:
+        """The terms: those given, or the preset's."""
+        given = self.terms
+        return named_terms([PRESETS[self.preset].terms]) if given is None else given
+
+    @property
+    def keypoints_first_only(self) -> bool:
+        """Whether keypoints count in the first frame alone."""
+        return (self.keypoints_use or PRESETS[self.preset].keypoints_use) == "first"
+
+    @property
+    def recovers(self) -> bool:
+        """Whether a loss widens the search."""
+        return PRESETS[self.preset].recovery if self.recovery is None else self.recovery
+
+    def changed(self) -> tuple[str, ...]:
+        """Names of the options in which the run differs from its preset."""
+        row, power = PRESETS[self.preset], self.likelihood_power
+        differs = {
+            "samples": self.samples is not None,
+            "modes": self.modes is not None,
+            "prediction": self.prediction != "velocity",
+            "oversampling": self.oversampling != 1,
+            "likelihood_power": power is not None,
+            "limb_jumps": self.limb_jumps > 0,
+            "keypoints_use": self.keypoints_first_only != (row.keypoints_use == "first"),
+            "terms": set(self.used_terms) != set(named_terms([row.terms])),
+            "curvature": self.curvature not in (None, row.curvature.value),
+            "weights": any(weight != 1 for weight in self.weights.values()),
+            "recovery": self.recovers != row.recovery,
+        }
+        return tuple(name for name, does in differs.items() if does)
+
+    @property
     def torch_dtype(self) -> torch.dtype:
         """The floating type."""
         return torch.float32 if self.dtype == "float32" else torch.float64
+
+
+def _check_terms(terms: tuple[str, ...]) -> None:
+    """Refuse terms that do not exist, or that cannot track."""
+    unknown = sorted(set(terms) - set(all_terms()))
+    if unknown:
+        raise ConfigurationError(f"unknown terms {unknown}; there are {', '.join(all_terms())}")
+    if not set(terms) & set(watched_terms()):
+        raise ConfigurationError(
+            f"terms: expected at least one of {', '.join(watched_terms())}, which compare a "
+            f"pose with the image; got {', '.join(terms) or 'none'}"
+        )
 
 
 _NAMES_OF_V01 = {"evidence": "likelihood_power"}
@@ -262,9 +302,9 @@ def check_seed(seed: int) -> None:
 
 def make_extractor(settings: Settings) -> FeatureExtractor:
     """The features that the settings ask for, in their type and on their device."""
-    kinds = [kind for name, kind in TERM_TABLE.items() if name in settings.terms]
+    kinds = [kind for name, kind in TERM_TABLE.items() if name in settings.used_terms]
     needs = {need for kind in kinds for need in kind().needs}
-    flow = TRACKING if "flow" in needs or "motion_boundaries" in settings.terms else None
+    flow = TRACKING if "flow" in needs or "motion_boundaries" in settings.used_terms else None
     extractor = FeatureExtractor(
         working_size=settings.working_size,
         flow=flow,
@@ -275,7 +315,7 @@ def make_extractor(settings: Settings) -> FeatureExtractor:
 
 def boundary_emphasis(settings: Settings) -> float:
     """Emphasis k of the motion-boundary weights, zero if the settings do not ask for them."""
-    return settings.boundary_emphasis if "motion_boundaries" in settings.terms else 0.0
+    return settings.boundary_emphasis if "motion_boundaries" in settings.used_terms else 0.0
 
 
 def make_choice(settings: Settings, sigma: float, free_root: bool | None = None) -> CostChoice:
@@ -296,26 +336,22 @@ def make_choice(settings: Settings, sigma: float, free_root: bool | None = None)
     """
     row = PRESETS[settings.preset]
     potential = Lorentzian if row.robust else Quadratic
-    chosen = set(settings.terms)
-    if row.interpenetration is not None:
+    chosen = set(settings.used_terms)
+    if row.interpenetration is not None and settings.terms is None:
         chosen.discard("interpenetration")
         chosen |= {"interpenetration"} if row.interpenetration else set()
     if row.particles is not None:
         chosen -= {"segmentation", "temporal", "temporal_mixture"}
     if not (has_free_root(settings.body) if free_root is None else free_root):
         chosen -= {"segmentation", "background", "silhouette"}
-    contour = ContourTerm(weight=settings.contour_weight, potential_kind=potential)
-    # The weights of motion boundaries make the wells of a fitted model shallower; what is back-
-    # facing or hidden must not become cheaper than that. 0.3 takes 12 % on the demo's true states.
-    shallower = 0.4 * boundary_emphasis(settings)
-    level = contour.unmatched - (1 - shallower) * (contour.unmatched - contour.fitted_level)
+    contour, flow = _node_terms(settings, row, potential)
     background = "background" in chosen
     set_up = (
-        replace(contour, fitted_level=level),
+        contour,
         EdgeEnergyTerm(potential_kind=potential),
         RegionTerm(background=background),
         SegmentationTerm(background=background),
-        FlowTerm(potential_kind=potential),
+        flow,
         JointTerm(sigma=sigma, potential_kind=potential),
         Stabiliser(lengths="anthropometric" not in chosen),
     )
@@ -325,6 +361,27 @@ def make_choice(settings: Settings, sigma: float, free_root: bool | None = None)
         weights=dict(settings.weights),
         curvature=row.curvature if settings.curvature is None else Curvature(settings.curvature),
     )
+
+
+_OCCLUSION_FACTOR = {"ijrr": 1.1, "rr": 0.9}
+"""k of `nu_occ = k nu`: above 1 in [IJRR] and below it in [RR], eq. 5 of both. Numbers: ours."""
+
+
+def _node_terms(settings: Settings, row: Preset, potential: type) -> tuple[ContourTerm, FlowTerm]:
+    """The two terms of eq. 5, with the preset's levels."""
+    contour = ContourTerm(weight=settings.contour_weight, potential_kind=potential)
+    flow = FlowTerm(potential_kind=potential)
+    if row.levels != "ours":
+        factor = _OCCLUSION_FACTOR[row.levels]
+        return (
+            replace(contour, fitted_level=1.0, occlusion_factor=factor),
+            replace(flow, fitted_level=1.0, occlusion_factor=factor),
+        )
+    # The weights of motion boundaries make the wells of a fitted model shallower; what is back-
+    # facing or hidden must not become cheaper than that. 0.3 takes 12 % on the demo's true states.
+    shallower = 0.4 * boundary_emphasis(settings)
+    level = contour.unmatched - (1 - shallower) * (contour.unmatched - contour.fitted_level)
+    return replace(contour, fitted_level=level), flow
 
 
 def make_settings_tracker(
@@ -351,7 +408,7 @@ def make_settings_tracker(
     if not isinstance(tracker, Tracker):
         return tracker  # `Settings` has refused what follows
     power = settings.likelihood_power
-    marked = settings.keypoints_use == "all" and "joints" in settings.terms
+    marked = not settings.keypoints_first_only and "joints" in settings.used_terms
     moves = has_free_root(settings.body) if free_root is None else free_root
     if power is None and marked and moves:
         power = PRESETS[settings.preset].power_keypoints
@@ -380,6 +437,7 @@ class Plan(NamedTuple):
         choice: Terms and weights of the cost, in pixels of the features of the first view.
         tracker: Search, optimiser, numbers of samples and modes.
         bounds: Bounds that the search obeys.
+        one_fit: Whether the track starts from the likeliest fit of the first frame alone.
         keypoints_first_only: Whether keypoints count in the first frame alone.
         boundary_emphasis: Weight of motion boundaries, see `FrameFeatures.edge_field`.
         recovery: How losses are told and what is done then; None: nothing.
@@ -395,6 +453,7 @@ class Plan(NamedTuple):
     choice: CostChoice
     tracker: SequenceTracker
     bounds: Bounds
+    one_fit: bool
     keypoints_first_only: bool
     boundary_emphasis: float
     recovery: Recovery | None
@@ -445,9 +504,10 @@ def make_plan(settings: Settings, body: BodyModel, view: CameraView, frame_inter
         choice=make_choice(settings, noise, has_root(body)),
         tracker=make_settings_tracker(settings, body.motion_rate * frame_interval, has_root(body)),
         bounds=row.bounds(body.bounds),
-        keypoints_first_only=settings.keypoints_use == "first",
+        one_fit=row.start == "one fit",
+        keypoints_first_only=settings.keypoints_first_only,
         boundary_emphasis=boundary_emphasis(settings),
-        recovery=Recovery() if settings.recovery else None,
+        recovery=Recovery() if settings.recovers else None,
         jumps_every=row.jumps_every,
         limb_jumps=settings.limb_jumps,
         surface_prediction=settings.prediction == "surface",
