@@ -224,14 +224,18 @@ def test_old_names_and_old_runs_still_open():
     assert opened.recovers
 
 
-def test_css_is_what_it_was():
+def test_css_has_what_was_measured_to_help():
     plain = Settings()
     assert (plain.recovers, plain.keypoints_first_only, plain.used_terms) == (True, False, TERMS)
     tracker = make_tracker("css", "arm8", motion=0.1)
     assert isinstance(tracker, Tracker)
     optimiser = tracker.optimiser
-    assert (optimiser.max_steps, optimiser.tolerance) == (17, 1e-2)
+    assert (optimiser.max_steps, optimiser.tolerance) == (60, 1e-2)
     assert optimiser.initial_radius == 1 / 16
+    assert (tracker.num_samples, tracker.survivors) == (160, 20)
+    body = make_tracker("css", "body34", motion=0.1)
+    assert isinstance(body, Tracker)
+    assert (body.num_samples, body.survivors, body.num_modes) == (60, 15, 7)
     assert (tracker.coarse_every, tracker.keep_alike, tracker.converged_only) == (3, True, False)
     assert tracker.dynamics == ConstantVelocity(deviation=0.1, persistence=0.8)
     assert (tracker.separation, tracker.forgetting) == (0.12, 0.98)

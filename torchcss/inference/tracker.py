@@ -49,7 +49,7 @@ from torchcss.inference.trust_region import TrustRegionNewton, TrustRegionState,
 from torchcss.linalg import log_determinant
 from torchcss.types import Bounds, Modes, Status
 
-_ROUNDS = ((0, 2.0), (3, 1.0))
+_ROUNDS = ((0, 6.0), (1, 2.0), (5, 1.0))
 """Rounds of successive halving: steps of descent, and how many samples are left then, in multiples
 of `Tracker.survivors`."""
 
@@ -291,8 +291,8 @@ class Tracker:
             `num_samples` are kept, by the problem's screening cost. Section 4.2 [RR] scores sampled
             hypotheses by their edges alone.
         survivors: Of more samples than these, successive halving keeps so many: those whose first
-            step promises most descend a few steps, and the best of them to the end, since a sample
-            that starts far up seldom overtakes. Of those within half the `separation` of each other
+            step promises most take it, twice as many descend five steps, and so many to the end,
+            since a sample that starts far up seldom overtakes. Of those within half the `separation` of each other
             the best goes first. Zero: all descend to the end, as in Fig. 6.
         standard_bhattacharyya: Match modes by the distance of the literature instead of the one
             printed (decision "mode weights").

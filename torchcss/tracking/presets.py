@@ -69,9 +69,8 @@ class Preset:
         proposal: Where samples go, for trackers that descend from them; one that searches by
             dynamical noise gets its `deviation` from `noise`.
         particles: The particle filter instead; its numbers and dynamics are filled in.
-        samples_arm: Samples per frame for an arm. With 160 halved to 40 instead of 40
-            (`survivors_arm`) css takes a fifth more evaluations; on the rendered arm none of five
-            seeds is lost; with 40 two were.
+        samples_arm: Samples per frame for an arm. With 160 halved instead of 40 that all descend,
+            none of five seeds on the rendered arm is lost; with 40 two were.
         samples_body: Samples per frame for a body.
         modes_arm: Modes kept for an arm.
         modes_body: Modes kept for a body.
@@ -146,7 +145,7 @@ class Preset:
     jumps_every: int = 0
     keep_alike: bool = True
     coarse_every: int = 3
-    optimiser: TrustRegionNewton = field(default_factory=lambda: _FEW_STEPS)
+    optimiser: TrustRegionNewton = field(default_factory=lambda: _OURS)
     converged_only: bool = False
     terms: str = "default"
     levels: Literal["ours", "ijrr", "rr"] = "ours"
@@ -174,10 +173,9 @@ class Preset:
         )
 
 
-_FEW_STEPS = TrustRegionNewton(max_steps=17, tolerance=1e-2, initial_radius=1 / 16)
+_OURS = TrustRegionNewton(max_steps=60, tolerance=1e-2, initial_radius=1 / 16)
 """Of our rows. The radius is in metres and radians: the edges are searched for some 20 pixels to
-either side, and of first steps of a radian, a half and a quarter most are rejected (measured; 17
-steps end where 20 from a radian on did)."""
+either side, and of first steps of a radian, a half and a quarter most are rejected (measured)."""
 
 _TO_CONVERGENCE = TrustRegionNewton(max_steps=200, tolerance=1e-6, initial_radius=1.0)
 """Of the papers' rows (note 8 [IJRR]); the numbers are ours."""
@@ -194,8 +192,8 @@ _CSS = Preset(
     likelihood_power=0.1,
     power_arm=0.05,
     power_keypoints=0.2,
-    survivors_arm=40,
-    survivors_body=60,
+    survivors_arm=20,
+    survivors_body=15,
     persistence=0.8,
     separation=0.12,
     soft_matching=True,
