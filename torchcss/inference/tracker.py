@@ -291,9 +291,10 @@ class Tracker:
             `num_samples` are kept, by the problem's screening cost. Section 4.2 [RR] scores sampled
             hypotheses by their edges alone.
         survivors: Of more samples than these, successive halving keeps so many: those whose first
-            step promises most take it, twice as many descend five steps, and so many to the end,
-            since a sample that starts far up seldom overtakes. Of those within half the `separation` of each other
-            the best goes first. Zero: all descend to the end, as in Fig. 6.
+            step promises most take it, twice as many go on to the fifth step, and so many to the
+            end, since a sample that starts far up seldom overtakes. Of those within half the
+            `separation` of each other the best goes first. Zero: all descend to the end, as in
+            Fig. 6.
         standard_bhattacharyya: Match modes by the distance of the literature instead of the one
             printed (decision "mode weights").
         soft_matching: In step 5, multiply in the prior's weight at the place of each mode, see
