@@ -70,7 +70,8 @@ def test_small_mode_and_resume(
     assert (least, most) == pytest.approx(tuple(errors))
     assert middle == pytest.approx(sum(errors) / 2)
     assert rows["ijrr_condensation"]["evaluations_per_frame"][0] == 6
-    assert row["evaluations_per_frame"][0] <= PRESETS["ijrr_robust_single"].optimiser.max_steps + 1
+    steps = PRESETS["ijrr_robust_single"].optimiser.max_steps
+    assert 1 < row["evaluations_per_frame"][0] < steps, "one descent, which converges"
     assert {entry["preset"] for entry in report["published"]} >= {
         "ijrr_gaussian_single",
         "ijrr_css",

@@ -211,6 +211,10 @@ def test_what_is_given_beside_a_preset_wins_and_is_recorded():
     assert settings.recovers
     assert not settings.keypoints_first_only
     assert not Settings(recovery=True, keypoints_use="all", terms=("default",)).changed()
+    repelling = Settings(preset="ijrr_gaussian_single", terms=("papers",))
+    assert repelling.changed() == ("terms",)
+    assert "interpenetration" in repelling.used_terms
+    assert "interpenetration" not in Settings(preset="ijrr_gaussian_single").used_terms
 
 
 def test_old_names_and_old_runs_still_open():

@@ -221,11 +221,11 @@ def test_a_new_run_replaces_what_belongs_to_the_last_one(clip: Path, tmp_path: P
         (out / other).write_bytes(b"old")
     before = {path.name: path.read_bytes() for path in out.iterdir()}
     with pytest.raises(ConfigurationError, match="descend"):
-        run(clip, out, preset="condensation", oversampling=2)
+        run(clip, out, preset="ijrr_condensation", oversampling=2)
     with pytest.raises(ConfigurationError, match="no modes to weigh"):
-        run(clip, out, preset="condensation", likelihood_power=0.5)
+        run(clip, out, preset="ijrr_condensation", likelihood_power=0.5)
     with pytest.raises(ConfigurationError, match="no modes to jump from"):
-        run(clip, out, preset="condensation", limb_jumps=4)
+        run(clip, out, preset="ijrr_condensation", limb_jumps=4)
     (tmp_path / "empty.mp4").write_bytes(b"")
     with pytest.raises(VideoError):
         track_video(
@@ -599,8 +599,8 @@ def test_awkward_frames_leave_no_nan_and_lose_nothing():
         ({"likelihood_power": 0.7}, 0.7, 0.1),
         ({"keypoints_use": "first", "likelihood_power": 0.7}, 0.7, 0.1),
         ({"preset": "ijrr_css_heavy_tailed"}, 1.0, 1.0),
-        ({"preset": "css_figure_6"}, 1.0, 1.0),
-        ({"preset": "single"}, 1.0, 1.0),
+        ({"preset": "ijrr_css"}, 1.0, 1.0),
+        ({"preset": "ijrr_single_limits"}, 1.0, 1.0),
         ({"preset": "annealed"}, None, 1.0),
     ],
 )
@@ -623,7 +623,9 @@ def test_every_row_of_the_table_can_be_run_by_its_name(preset: str):
     assert joints is not None
     assert isinstance(joints.potential, Quadratic) != row.robust
     assert choice.curvature is row.curvature
-    assert (choice.find(Interpenetration) is None) == (row.interpenetration is False)
+    assert choice.find(Interpenetration) is not None, "terms that are given win"
+    printed = make_choice(Settings(body="arm7", preset=preset), 2.0).find(Interpenetration)
+    assert (printed is not None) == row.interpenetration
     # The dynamics of particles are the temporal prior, and count once.
     for prior in (TemporalPrior, MixturePrior):
         assert (choice.find(prior) is None) == (row.particles is not None)
@@ -632,7 +634,7 @@ def test_every_row_of_the_table_can_be_run_by_its_name(preset: str):
 def test_a_body_is_segmented_and_an_arm_alone_is_not():
     assert make_choice(Settings(body="body34"), 2.0).find(SegmentationTerm) is not None
     assert (
-        make_choice(Settings(body="body34", preset="condensation"), 2.0).find(SegmentationTerm)
+        make_choice(Settings(body="body34", preset="ijrr_condensation"), 2.0).find(SegmentationTerm)
         is None
     )
     assert make_choice(Settings(body="arm8"), 2.0).find(SegmentationTerm) is None
@@ -657,7 +659,7 @@ def test_a_body_is_segmented_and_an_arm_alone_is_not():
 
 def test_a_particle_filter_weighs_by_the_observation_alone(clip: Path, tmp_path: Path):
     terms = ("joints", "stabiliser", "temporal", "temporal_mixture")
-    summary = run(clip, tmp_path, preset="condensation", terms=terms)
+    summary = run(clip, tmp_path, preset="ijrr_condensation", terms=terms)
     assert set(summary["best_mode_cost_by_term"]) == {"joints", "stabiliser"}
     assert np.isfinite(torchcss.load_track(tmp_path).joints_world).all()
 

@@ -363,7 +363,7 @@ def test_the_setting_is_checked() -> None:
     with pytest.raises(ConfigurationError, match="velocity or surface"):
         Settings(prediction="guess")  # type: ignore[arg-type]
     with pytest.raises(ConfigurationError, match="particles"):
-        Settings(prediction="surface", preset="condensation")
+        Settings(prediction="surface", preset="ijrr_condensation")
 
 
 def tracked(prediction: Literal["velocity", "surface"]) -> list[Posterior]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -14,7 +14,7 @@ from torchcss.errors import ConfigurationError, TrackFileError
 from torchcss.files import prepare_output_folder
 from torchcss.io.run import Run, as_run
 from torchcss.io.tracks import TRACK_NAME, save_track, write_summary
-from torchcss.tracking.settings import Settings
+from torchcss.tracking.settings import Settings, settings_from_plain
 from torchcss.tracking.smooth import SmoothedTrack, Smoothing, smooth_track
 from torchcss.tracking.smooth_images import IMAGES, smooth_frames
 
@@ -100,16 +100,11 @@ def settings_of(run: Run) -> Settings:
     Raises:
         ConfigurationError: If its settings are not those of this version.
     """
-    known = {field.name for field in fields(Settings)}
     try:
-        entries: dict[str, Any] = {k: v for k, v in run.settings.items() if k in known}
-        if entries.get("terms") is not None:
-            entries["terms"] = tuple(entries["terms"])
-        return Settings(**{"body": run.body.name, **entries, "device": "cpu", "dtype": "float64"})
-    except (TypeError, AttributeError) as error:
-        raise ConfigurationError(
-            f"{run.path}: its settings are not those of torchcss: {error}"
-        ) from error
+        told = {"body": run.body.name, **run.settings, "device": "cpu", "dtype": "float64"}
+        return settings_from_plain(told)
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{run.path}: {error}") from error
 
 
 def report(effect: Mapping[str, Any]) -> str:

@@ -27,11 +27,11 @@ degrees of freedom of the t, and that modes of which no joint centre is 3 cm apa
 minima. A filter gets as many evaluations of the cost as a descending tracker may take, 20 per
 sample that descends to the end.
 
-The papers' rows have the papers' terms (`Preset.terms`), no recovery, no flips, no descents on a
-coarser cost, driftless diffusion where that is printed, keypoints in the first frame alone, and
-they start from the covariance of one fit (section 5 of both). Cham and Rehg's "ssd" row has
-Gaussian errors, Gauss-Newton Hessians, no joint limits and no repulsion; [IJRR] names only the
-metric and the optimiser, the rest is our reading.
+The papers' rows (decision "papers' presets") have the papers' terms (`Preset.terms`), no recovery,
+no flips, no descents on a coarser cost, driftless diffusion where that is printed, keypoints in the
+first frame alone, and they start from the covariance of one fit (section 5 of both). Cham and
+Rehg's "ssd" row has Gaussian errors, Gauss-Newton Hessians, no joint limits and no repulsion;
+[IJRR] names only the metric and the optimiser, the rest is our reading.
 """
 
 from __future__ import annotations
@@ -96,8 +96,7 @@ class Preset:
             frame. Ours that descend from scaled covariances have 1, realistic noise; the papers' 0.
         robust: Whether the cost's potentials are robust (False: `Quadratic`).
         limits: Whether joint limits hold, see `bounds`.
-        interpenetration: Whether parts repel each other, unless the user names the terms; None: as
-            `terms` has it.
+        interpenetration: Whether the row's terms let parts repel each other.
         curvature: Which Hessian the cost gives.
         separation: Distance of some joint centre, metres, from which two modes count as two
             explanations, see `Tracker`. The papers have none; their modes are distinct minima. By
@@ -138,7 +137,7 @@ class Preset:
     noise: float = 1.0
     robust: bool = True
     limits: bool = True
-    interpenetration: bool | None = None
+    interpenetration: bool = True
     curvature: Curvature = Curvature.EXACT
     separation: float = 0.0
     soft_matching: bool = False
@@ -223,7 +222,6 @@ _IJRR_CSS = _printed(
         samples_arm=40,
         samples_body=60,
         noise=0.0,
-        interpenetration=True,
         separation=_CONFOUNDED,
         keep_alike=False,
     )
@@ -250,7 +248,6 @@ _CHAM_REHG = _printed(
         modes_body=10,
         persistence=1.0,
         noise=3.0,
-        interpenetration=True,
     )
 )
 _HEAP_HOGG = Preset(
@@ -310,7 +307,6 @@ PRESETS: dict[str, Preset] = {
             samples_body=49,  # 7 modes and 6 steps from each
             forgetting=0.0,
             noise=0.0,
-            interpenetration=True,
             curvature=Curvature.GAUSS_NEWTON,
         ),
         paper="rr",
@@ -341,7 +337,7 @@ PRESETS: dict[str, Preset] = {
     "heap_hogg_ssd": _least_squares(
         _HEAP_HOGG, "Heap and Hogg's multiple-hypothesis tracker in 3D, least squares"
     ),
-    "ijrr_condensation": replace(_printed(_CONDENSATION), interpenetration=True),
+    "ijrr_condensation": _printed(_CONDENSATION),
     "condensation_inflated": replace(
         _CONDENSATION,
         what="CONDENSATION from the posterior to the power 1/8 ([IJRR] section 9)",

@@ -219,8 +219,7 @@ class Settings:
     @property
     def used_terms(self) -> tuple[str, ...]:
         """The terms: those given, or the preset's."""
-        given = self.terms
-        return named_terms([PRESETS[self.preset].terms]) if given is None else given
+        return _preset_terms(PRESETS[self.preset]) if self.terms is None else self.terms
 
     @property
     def keypoints_first_only(self) -> bool:
@@ -243,7 +242,7 @@ class Settings:
             "likelihood_power": power is not None,
             "limb_jumps": self.limb_jumps > 0,
             "keypoints_use": self.keypoints_first_only != (row.keypoints_use == "first"),
-            "terms": set(self.used_terms) != set(named_terms([row.terms])),
+            "terms": set(self.used_terms) != set(_preset_terms(row)),
             "curvature": self.curvature not in (None, row.curvature.value),
             "weights": any(weight != 1 for weight in self.weights.values()),
             "recovery": self.recovers != row.recovery,
@@ -254,6 +253,12 @@ class Settings:
     def torch_dtype(self) -> torch.dtype:
         """The floating type."""
         return torch.float32 if self.dtype == "float32" else torch.float64
+
+
+def _preset_terms(row: Preset) -> tuple[str, ...]:
+    """The terms of a row of the table."""
+    left_out = () if row.interpenetration else ("interpenetration",)
+    return tuple(term for term in named_terms([row.terms]) if term not in left_out)
 
 
 def _check_terms(terms: tuple[str, ...]) -> None:
@@ -337,9 +342,6 @@ def make_choice(settings: Settings, sigma: float, free_root: bool | None = None)
     row = PRESETS[settings.preset]
     potential = Lorentzian if row.robust else Quadratic
     chosen = set(settings.used_terms)
-    if row.interpenetration is not None and settings.terms is None:
-        chosen.discard("interpenetration")
-        chosen |= {"interpenetration"} if row.interpenetration else set()
     if row.particles is not None:
         chosen -= {"segmentation", "temporal", "temporal_mixture"}
     if not (has_free_root(settings.body) if free_root is None else free_root):
