@@ -29,7 +29,7 @@ from torchcss.studies.demo import run_demo
 from torchcss.studies.evaluation import evaluate
 from torchcss.tracking.settings import Settings
 
-BASE = ("joints", "stabiliser", "temporal")
+BASE = ("joints", "stabiliser", "temporal_mixture")
 EDGES = ("contour", *BASE)
 BOUNDARIES = ("motion_boundaries", *EDGES)
 FLOW = ("flow", *BOUNDARIES)
@@ -47,7 +47,10 @@ ROWS = {
     "+ background": ("background", *SEGMENTATION),
     "+ silhouette": ("silhouette", "background", *SEGMENTATION),
     "+ edge energy": ("edge_energy", *SEGMENTATION),
-    "+ previous mixture": ("temporal_mixture", *SEGMENTATION),
+    "parent mode for mixture": (
+        "temporal",
+        *(name for name in SEGMENTATION if name != "temporal_mixture"),
+    ),
     "contour + flow": ("flow", *EDGES),
     "contour + interpenetration": ("interpenetration", *EDGES),
     "edge energy for contour": ("edge_energy", *BASE),

@@ -84,7 +84,7 @@ class Config:
     largest: float = 0.02
     """Norm at which the gradient of a frame is cut off, metres: a minimum that is nearly flat along
     some direction moves very far along it, and says little."""
-    learnt: tuple[str, ...] = ("contour", "region", "flow", "temporal")
+    learnt: tuple[str, ...] = ("contour", "region", "flow", "temporal_mixture")
     """Terms and priors whose weights are learnt; not segmentation, which has no derivatives and
     moves no minimum. What keeps a search from far-away poses, as the
     stabiliser does, cannot be learnt from modes that stay near the truth."""

@@ -9,6 +9,7 @@ import torch
 
 from torchcss.body.model import differentiate_twice
 from torchcss.cost.temporal import MixturePrior, TemporalPrior
+from torchcss.inference.dynamics import Diffusion
 from torchcss.inference.mixture import GaussianMixture
 
 
@@ -91,3 +92,18 @@ def test_far_from_every_mode(dtype: torch.dtype, generator: torch.Generator) -> 
             assert torch.isfinite(part).all()
         torch.testing.assert_close(model.value, torch.full((2,), 6.0, dtype=dtype))
         assert not model.gradient.any()
+
+
+def test_what_no_image_shows_drifts_apart_as_a_random_walk() -> None:
+    """Fifty blank frames: each posterior is its prior, the posterior before and the motion."""
+    motion, n = 0.14, 3
+    dynamics, prior = Diffusion(deviation=motion), MixturePrior(nu=40.0)
+    mean, weight = torch.zeros(1, n).double(), torch.zeros(1).double()
+    covariance = 0.01**2 * torch.eye(n).double()[None]
+    for _ in range(50):
+        ahead = dynamics.predict(GaussianMixture(mean, covariance, weight), mean)
+        covariance = prior.local_model(mean, prior.density(ahead)).hessian.inverse()
+    walked = (0.01**2 + 50 * motion**2) ** 0.5
+    deviation = covariance[0].diagonal().sqrt()
+    torch.testing.assert_close(deviation, torch.full_like(deviation, walked), rtol=1e-9, atol=0)
+    assert (prior.height(n), MixturePrior().height(n)) == (40.0, n)

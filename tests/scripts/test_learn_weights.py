@@ -12,6 +12,7 @@ from torchcss.errors import ConfigurationError, TorchcssError
 from torchcss.tracking.settings import Settings
 
 SMALL = script.Config(frames=3, epochs=2, starts=2, track=True,
+    begin={"contour": 0.1, "region": 0.1},
     tracking=Settings(body="arm8", keypoints_use="first", working_size=160))  # fmt: skip
 
 

@@ -1,10 +1,11 @@
-"""Temporal prior: each sample near the mode that it descends from.
+"""Temporal prior: `p(x_t | R_{t-1})` of eq. 10 [IJRR] in the cost.
 
-This is `p(x_t | R_{t-1})` of eq. 10 [IJRR]. The papers start each search from it but leave it out
-of the cost; in directions that no image term sees, modes then drift. Here the driftless diffusion
-about the parent mode may join the cost, long-tailed so that a fast motion is unlikely and not
-impossible. `TemporalPrior`, the default, is evaluated per sample against its own parent;
-`MixturePrior` is the density of the whole previous mixture, correlations and all.
+The papers start each search from it but leave it out of the cost; in directions that no image term
+sees, modes then drift. `MixturePrior`, the default, is the density of the whole previous mixture,
+moved one frame ahead, correlations and all: what no image has shown for many frames drifts apart as
+a random walk does. `TemporalPrior` is the driftless diffusion about each sample's own parent mode,
+which forgets how well that was known. Both are long-tailed, so that a fast motion is unlikely and
+not impossible.
 """
 
 from __future__ import annotations
@@ -88,13 +89,18 @@ class MixturePrior(Term):
     there is no pull, so that a fast motion is unlikely and not impossible.
 
     Attributes:
-        nu: Height of the tails, nats.
+        nu: Height of the tails, nats; None: the number n of parameters. A mode that moved as is
+            expected is at n / 2 on average; twice that is new.
     """
 
     name: ClassVar[str] = "temporal_mixture"
     kind: ClassVar[Kind] = "prior"
 
-    nu: float = 12.0
+    nu: float | None = None
+
+    def height(self, size: int) -> float:
+        """Height of the tails in a space of so many parameters, nats."""
+        return float(size) if self.nu is None else self.nu
 
     def prepare(self, context: FrameContext) -> OnStates | None:
         """Bind the prior to the modes before; None without them."""
@@ -130,7 +136,7 @@ class MixturePrior(Term):
         offset = (x[..., None, :] - density.mean).clamp(-limit, limit)
         pull = (density.precision @ offset[..., None])[..., 0]
         exponent = density.log_amplitude - 0.5 * (offset * pull).sum(-1)
-        tail = exponent.new_full((*exponent.shape[:-1], 1), -self.nu)
+        tail = exponent.new_full((*exponent.shape[:-1], 1), -self.height(x.shape[-1]))
         everything = torch.cat([exponent, tail], dim=-1)
         share = everything.softmax(-1)[..., :-1]
         gradient = (share[..., None] * pull).sum(-2)

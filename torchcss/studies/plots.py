@@ -30,6 +30,7 @@ _TERM_COLOURS = {
     "joints": "green",
     "stabiliser": "purple",
     "temporal": "vermilion",
+    "temporal_mixture": "vermilion",
     "edge_energy": "sky",
     "interpenetration": "yellow",
 }

@@ -387,7 +387,7 @@ def pack_priors(
             most = float(density.precision.amax())
             far = 1e-4 * (torch.finfo(body.dtype).max / most) ** 0.5
             fields = (array(field, np.float64) for field in density)
-            mixture = Mixture(weight, term.nu, far, *fields)
+            mixture = Mixture(weight, term.height(size), far, *fields)
     modes = max((len(centre) for _, _, centre, _ in tails), default=1)
     centre = np.zeros((len(tails), modes, size))
     for row, (_, _, mean, _) in enumerate(tails):
