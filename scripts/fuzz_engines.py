@@ -295,7 +295,7 @@ def run_case(seed: int, name: str, states: int) -> tuple[list[Difference], int]:
     return found, states - len(x)
 
 
-def main(config: Config) -> dict[str, Any]:
+def compare_engines(config: Config) -> dict[str, Any]:
     """Try all cases, print those that differ; return what is written."""
     torch.set_num_threads(1)
     rows: list[Difference] = []
@@ -324,11 +324,11 @@ def main(config: Config) -> dict[str, Any]:
     return report
 
 
-def start_and_tell(config: Config) -> None:
+def main(config: Config) -> None:
     """Exit with 1 where a case differs."""
-    if main(config)["failed"]:
+    if compare_engines(config)["failed"]:
         sys.exit(1)
 
 
 if __name__ == "__main__":
-    start(start_and_tell, Config, __doc__)
+    start(main, Config, __doc__)

@@ -12,7 +12,7 @@ import torch
 
 def test_engines_agree_at_random(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "fuzz.json"
-    script.main(script.Config(cases=5, states=6, out=out))
+    script.compare_engines(script.Config(cases=5, states=6, out=out))
     assert json.loads(out.read_text())["failed"] == []
     assert "5 cases, 0 differ" in capsys.readouterr().out
 
@@ -20,7 +20,7 @@ def test_engines_agree_at_random(tmp_path: Path, capsys: pytest.CaptureFixture[s
 def test_a_difference_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(script.NATS, "float32", 1e-12)
     monkeypatch.setitem(script.RELATIVE, "float32", 0.0)
-    report = script.main(script.Config(cases=1, states=4, bodies=("arm8",)))
+    report = script.compare_engines(script.Config(cases=1, states=4, bodies=("arm8",)))
     (row,) = report["failed"]
     assert row["dtype"] == "float32"
     assert row["terms"]

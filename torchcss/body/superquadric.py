@@ -35,10 +35,9 @@ from torch import Tensor
 Triple = tuple[Tensor, Tensor, Tensor]
 
 _LEAST_SQUARE = {torch.float32: 1e-12, torch.float64: 1e-24}
+_MOST_SQUARE = {torch.float32: 400.0, torch.float64: 1e12}
 _LEAST_POWER = {torch.float32: 1e-30, torch.float64: 1e-280}
-MOST_SQUARE = 400.0
-"""Bounds on squared coordinates and on powers, so that the type holds all products. The upper one
-is the same for all types, so that what is far from a thin part is."""
+"""Bounds on squared coordinates and on powers, so that the type holds all products."""
 
 EXPONENTS = (0.1, 2.0)
 """From all but a box to a diamond; powers beyond these leave single precision."""
@@ -263,7 +262,7 @@ def _factors(shape: Superquadrics, x: Tensor, y: Tensor, z: Tensor) -> _Factors:
     u, v = x * ix, y * iy
     # Added, not clamped to, so that autograd sees the curvature where a coordinate is zero.
     least = _LEAST_SQUARE[x.dtype]
-    uu, vv, ww = ((a.square() + least).clamp(max=MOST_SQUARE) for a in (u, v, w))
+    uu, vv, ww = ((a.square() + least).clamp(max=_MOST_SQUARE[x.dtype]) for a in (u, v, w))
     pu, pv, pw = _power(uu, shape.around), _power(vv, shape.around), _power(ww, shape.along)
     of_u, of_v = pu * uu, pv * vv
     section = (of_u + of_v).clamp(min=_LEAST_POWER[x.dtype])

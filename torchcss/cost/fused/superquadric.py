@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from torchcss.body.superquadric import MOST_SQUARE
 from torchcss.cost.fused.projection import Spatial
 from torchcss.cost.fused.records import Array
 from torchcss.kernels.compiler import by_precision, exp, inlined, kernel, log, sqrt
@@ -83,7 +82,7 @@ def narrowed(shape: Shape, w: float) -> tuple[float, float]:
 
 @inlined
 def _bounded_square(x: float) -> float:
-    return min(x * x + by_precision(x, 1e-12, 1e-24), MOST_SQUARE)
+    return min(x * x + by_precision(x, 1e-12, 1e-24), by_precision(x, 400.0, 1e12))
 
 
 @inlined
