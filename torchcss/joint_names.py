@@ -77,6 +77,31 @@ ALIASES: Final[dict[str, tuple[str | None, ...]]] = {
         "r_hip", "r_knee", "r_ankle", "l_hip", "l_knee", "l_ankle",
         "r_eye", "l_eye", "r_ear", "l_ear",
     ),
+    # MMPose, RTMPose and DWPose: COCO's order and the feet, then face and hands.
+    "COCO-133": (
+        "nose", "l_eye", "r_eye", "l_ear", "r_ear",
+        "l_shoulder", "r_shoulder", "l_elbow", "r_elbow", "l_wrist", "r_wrist",
+        "l_hip", "r_hip", "l_knee", "r_knee", "l_ankle", "r_ankle",
+        "l_toe", None, "l_heel", "r_toe", None, "r_heel",
+        *(None,) * 110,
+    ),
+    "MPII-16": (
+        "r_ankle", "r_knee", "r_hip", "l_hip", "l_knee", "l_ankle",
+        "HumanoidRoot", "vt1", "vc7", "skull_tip",
+        "r_wrist", "r_elbow", "r_shoulder", "l_shoulder", "l_elbow", "l_wrist",
+    ),
+    # The head's place is its middle, which is none of ours.
+    "HumanEva-15": (
+        "HumanoidRoot", "vt1", "l_shoulder", "l_elbow", "l_wrist", "r_shoulder", "r_elbow",
+        "r_wrist", "l_hip", "l_knee", "l_ankle", "r_hip", "r_knee", "r_ankle", None,
+    ),
+    # The first 18 of BODY_25, the middle of the hips among them.
+    "BODY_18": (
+        "nose", "vt1",
+        "r_shoulder", "r_elbow", "r_wrist", "l_shoulder", "l_elbow", "l_wrist",
+        "HumanoidRoot", "r_hip", "r_knee", "r_ankle", "l_hip", "l_knee", "l_ankle",
+        "r_eye", "l_eye", "r_ear",
+    ),
     "Halpe-26": _HALPE_26,
     "Halpe-136": (*_HALPE_26, *(None,) * 110),
     # The eyes' inner and outer corners, the mouth and the knuckles are no joints of ours.
@@ -91,6 +116,12 @@ ALIASES: Final[dict[str, tuple[str | None, ...]]] = {
     "H36M-17": (
         "HumanoidRoot", "r_hip", "r_knee", "r_ankle", "l_hip", "l_knee", "l_ankle",
         None, "vt1", None, "skull_tip",
+        "l_shoulder", "l_elbow", "l_wrist", "r_shoulder", "r_elbow", "r_wrist",
+    ),
+    # Without the place between nose and neck.
+    "H36M-16": (
+        "HumanoidRoot", "r_hip", "r_knee", "r_ankle", "l_hip", "l_knee", "l_ankle",
+        None, "vt1", "skull_tip",
         "l_shoulder", "l_elbow", "l_wrist", "r_shoulder", "r_elbow", "r_wrist",
     ),
     # 'foot' is the ball of the foot, 'hand' the knuckles, 'head' the joint under the skull.
@@ -185,9 +216,19 @@ def layout_of_names(names: tuple[str, ...]) -> tuple[str | None, ...]:
     """
     found: list[str | None] = []
     for name in names:
-        canonical = canonical_joint_name(name)
+        canonical = canonical_joint_name(name) or _numbered_side(name, names)
         found.append(None if canonical in found else canonical)
     return tuple(found)
+
+
+def _numbered_side(name: str, names: Sequence[str]) -> str | None:
+    """DeepLabCut's human model numbers the sides: ankle1 is the right one, ankle2 the left."""
+    pairs = [re.fullmatch(r"([a-z]+)[ _]?([12])", each.lower()) for each in names]
+    numbered = {match[1] for match in pairs if match}
+    if not {"ankle", "knee", "hip", "wrist", "elbow", "shoulder"} <= numbered:
+        return None
+    match = re.fullmatch(r"([a-z]+)[ _]?([12])", name.lower())
+    return None if match is None else canonical_joint_name(f"{'rl'[int(match[2]) - 1]}_{match[1]}")
 
 
 LIMB_PLACES: Final[tuple[str, ...]] = ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")

@@ -58,6 +58,7 @@ class TrackOptions:
         resume: Go on with what an interrupted run of the same settings left in the folder; start
             where there is nothing.
         checkpoint_every: Seconds of wall time between checkpoints.
+        frame_rate: Frames per second of a folder of images; None: 30.
     """
 
     stride: int = 1
@@ -71,6 +72,7 @@ class TrackOptions:
     live: Sink | None = None
     resume: bool = False
     checkpoint_every: float = CHECKPOINT_EVERY
+    frame_rate: float | None = None
 
     def __post_init__(self) -> None:
         if not self.checkpoint_every >= 0:
@@ -121,6 +123,7 @@ def track_video(
         masks=options.masks,
         layout=options.layout,
         normalised=options.normalised,
+        frame_rate=options.frame_rate,
     )
     views = _open_views((own, *options.others), Path(camera), selection)
     generator = torch.Generator().manual_seed(settings.seed)

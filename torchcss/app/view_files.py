@@ -51,7 +51,15 @@ class OpenView(NamedTuple):
     def notes(self) -> list[str]:
         """What the files' readers have to say, for the user."""
         said = () if self.keypoints is None else self.keypoints.report
-        return [note for note in (self.camera.units_note, *said) if note]
+        return [note for note in (self.rate_note, self.camera.units_note, *said) if note]
+
+    @property
+    def rate_note(self) -> str | None:
+        """How fast a folder of images is taken to be."""
+        if self.reader.image_names is None:
+            return None
+        given = "as given" if self.files.frame_rate else "assumed: say it with --frame-rate"
+        return f"{float(self.reader.info.frame_rate):g} images a second, {given}"
 
     def view(self, like: Tensor) -> CameraView:
         """The camera that looks on, for a session.
@@ -135,7 +143,9 @@ def open_view(
             f"{files.video}: offset {files.offset}: the camera starts {-start} frames after the "
             "first one to be tracked; begin later, or make it the first camera"
         )
-    reader = VideoReader(files.video, start=start, stop=stop, stride=stride)
+    reader = VideoReader(
+        files.video, start=start, stop=stop, stride=stride, image_frame_rate=files.frame_rate
+    )
     width, height = reader.info.width, reader.info.height
     masks = None
     if files.masks is not None:
@@ -159,5 +169,7 @@ def open_view(
         layout=files.layout,
         normalised=files.normalised,
         first_frame=start,
+        frame_names=reader.image_names,
+        frame_rate=None if reader.image_names else float(reader.info.frame_rate),
     )
     return OpenView(files, reader, masks, loaded, keypoints, typical_sigma(keypoints))

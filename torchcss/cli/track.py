@@ -102,6 +102,7 @@ class Track:
                 layout=self.options.layout,
                 normalised=self.options.normalised,
                 offset=offset,
+                frame_rate=self.options.frame_rate,
             )
             for video, keypoints, offset, name in zip(
                 self.other_videos,

@@ -68,7 +68,8 @@ class VideoReader:
         start: First frame.
         stop: The frame before which reading ends; None or beyond the end: to the last.
         stride: Every how many frames one is taken.
-        image_frame_rate: Frames per second of images, which do not say it themselves.
+        image_frame_rate: Frames per second of images, which do not say it themselves; None: 30.
+            A video says its own.
 
     Attributes:
         info: Frame rate and size, as the file states them.
@@ -86,11 +87,13 @@ class VideoReader:
         start: int = 0,
         stop: int | None = None,
         stride: int = 1,
-        image_frame_rate: float | Fraction = 30,
+        image_frame_rate: float | Fraction | None = None,
     ) -> None:
         self.path = Path(path)
         self._start, self._stop, self._stride = start, stop, stride
-        self._image_frame_rate = Fraction(image_frame_rate).limit_denominator(1001)
+        self._image_frame_rate = Fraction(
+            30 if image_frame_rate is None else image_frame_rate
+        ).limit_denominator(1001)
         if stride < 1:
             raise VideoError(f"{self.path}: stride must be at least 1, got {stride}")
         if start < 0:
@@ -117,6 +120,11 @@ class VideoReader:
             return None
         stop = num_frames if self._stop is None else min(self._stop, num_frames)
         return len(range(self._start, stop, self._stride))
+
+    @property
+    def image_names(self) -> list[str] | None:
+        """Names of the pictures of a folder in order, or None where it is a video."""
+        return None if self._images is None else [image.name for image in self._images]
 
     def count_frames(self) -> int:
         """Count the frames without decoding them; those before the damage, if there is any."""
@@ -175,6 +183,16 @@ class VideoReader:
                 stream = container.streams.video[0]
                 rate = stream.average_rate or stream.guessed_rate or stream.base_rate
                 num_frames = stream.frames or None
+                if (
+                    num_frames
+                    and rate
+                    and stream.duration
+                    and stream.time_base
+                    and "mp4" in container.format.name
+                ):
+                    # An edit list may show a part of the frames that are stored.
+                    shown = round(stream.duration * stream.time_base * rate)
+                    num_frames = num_frames if abs(shown - num_frames) <= 1 else self.count_frames()
                 first = next(iter(_decode(container)), None)
                 if first is None:
                     raise self._not_a_video("its first frame cannot be decoded")

@@ -32,6 +32,7 @@ class ViewFiles:
         normalised: Whether keypoints are fractions of the image, and which, see
             `torchcss.io.keypoints.read.Scale`.
         offset: This video's frame at the time of the first camera's frame 0.
+        frame_rate: Frames per second of a folder of images, which does not say it; None: 30.
     """
 
     video: Path
@@ -41,6 +42,7 @@ class ViewFiles:
     layout: str | None = None
     normalised: bool | Scale = "pixels"
     offset: int = 0
+    frame_rate: float | None = None
 
 
 class RecordedCamera(NamedTuple):

@@ -1,47 +1,109 @@
-"""2D joints as arrays: our own NPZ `keypoints [T J 2]`, `confidence [T J]`, `joint_names [J]`."""
+"""2D joints as arrays: our own NPZ, and what people save of what a detector returns.
+
+Ours is `keypoints [T J 2]`, `confidence [T J]`, `joint_names [J]`. Read as well, as NPY or as the
+only array of an NPZ: pairs or triples `[T J 2]`, `[T J 3]` (x, y, confidence), in a row `[T 3 J]`,
+of several people `[T P J 3]`, of one picture `[J 3]`, and MoveNet's `[T 1 1 J 3]` (y, x,
+confidence, fractions). Confidences may be called `scores` and the like.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from torchcss.errors import KeypointError
-from torchcss.io.keypoints.people import People
+from torchcss.io.keypoints.people import People, Person, is_there, screened
+from torchcss.joint_names import ALIASES
+
+_PLACES = (
+    "keypoints",
+    "keypoints_2d",
+    "keypoints2d",
+    "joints_2d",
+    "joints2d",
+    "kps",
+    "poses",
+    "positions",
+)
+_CONFIDENCES = (
+    "confidence", "confidences", "scores", "score", "keypoint_scores", "conf", "likelihood",
+)  # fmt: skip
+_COUNTS = {len(joints) for joints in ALIASES.values()}
 
 
 def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
-    """Read our own layout of arrays."""
-    if "keypoints" not in arrays:
+    """Read arrays of joints.
+
+    Raises:
+        KeypointError: If there are none of the shapes above.
+    """
+    name = next((name for name in _PLACES if name in arrays), None)
+    if name is None and len(arrays) == 1:
+        name = next(iter(arrays))
+    if name is None:
         raise KeypointError(
             f"{path}: expected the arrays keypoints, confidence and joint_names, "
             f"found {', '.join(arrays) or 'none'}"
         )
-    keypoints = arrays["keypoints"]
-    if keypoints.ndim != 3 or keypoints.shape[2] != 2 or keypoints.dtype.kind not in "iuf":
-        raise KeypointError(
-            f"{path}: keypoints: expected numbers [frames, joints, 2], "
-            f"got {keypoints.dtype} {list(keypoints.shape)}"
+    report = [f"format: {path.suffix[1:].upper()}"]
+    values, is_movenet = _people(path, name, arrays[name]), arrays[name].ndim == 5
+    if is_movenet:
+        values = values[..., [1, 0, 2]]
+        report = ["format: MoveNet's arrays, y before x, fractions of the image"]
+    given = next((key for key in _CONFIDENCES if key in arrays), None)
+    if given is not None:
+        values = np.concatenate(
+            [values[..., :2], _confidence(path, given, arrays[given], values.shape)[..., None]], -1
         )
-    shape = keypoints.shape[:2]
-    if 0 in shape:
-        raise KeypointError(f"{path}: keypoints: expected frames and joints, got {list(shape)}")
-    finite = np.isfinite(keypoints[..., 0]) & np.isfinite(keypoints[..., 1])
-    confidence = arrays.get("confidence", finite.astype(np.float64))
-    if confidence.shape != shape or confidence.dtype.kind not in "biuf":
-        raise KeypointError(
-            f"{path}: confidence: expected numbers {list(shape)}, "
-            f"got {confidence.dtype} {list(confidence.shape)}"
-        )
-    names = arrays.get("joint_names")
-    if names is not None and (names.shape != shape[1:] or names.dtype.kind != "U"):
-        raise KeypointError(
-            f"{path}: joint_names: expected {shape[1]} names, got {names.dtype} {list(names.shape)}"
-        )
-    found = np.dstack([keypoints, confidence]).astype(np.float64)
-    report = ["format: NPZ"]
-    if "confidence" not in arrays:
+    elif values.shape[-1] == 2:
         report.append("no confidence in the file: 1 for every joint that is a number")
-    known = None if names is None else tuple(map(str, names))
-    return People([[person] for person in found], known, report)
+        places = np.where(np.isfinite(values), values, np.nan)
+        values = screened(places)
+    else:
+        report.append(f"confidence: the third numbers of {name}")
+    people = [[Person(p) for p in frame if len(frame) == 1 or is_there(p)] for frame in values]
+    names = _names(path, arrays.get("joint_names"), values.shape[2])
+    return People(people, names, report, corner_fractions=is_movenet)
+
+
+def _people(path: Path, name: str, array: np.ndarray) -> np.ndarray:
+    """`[t p j 2]` or `[t p j 3]`, from any of the shapes."""
+    shape: Sequence[int] = array.shape
+    if array.dtype.kind in "iuf" and 0 not in shape:
+        values = array.astype(np.float64)
+        if len(shape) == 2 and shape[1] in (2, 3) and shape[0] in _COUNTS:
+            return values[None, None]
+        if len(shape) == 2:
+            size = next((n for n in (3, 2) if shape[1] % n == 0 and shape[1] // n in _COUNTS), 0)
+            if size:
+                return values.reshape(shape[0], 1, -1, size)
+        if len(shape) == 3 and shape[2] in (2, 3):
+            return values[:, None]
+        if len(shape) == 4 and shape[3] in (2, 3):
+            return values
+        if len(shape) == 5 and tuple(shape[1:3]) == (1, 1) and shape[4] == 3:
+            return values[:, 0]
+    raise KeypointError(
+        f"{path}: {name}: expected numbers [frames, joints, 2 or 3] or [frames, people, joints, "
+        f"2 or 3], got {array.dtype} {list(shape)}"
+    )
+
+
+def _confidence(path: Path, name: str, array: np.ndarray, shape: Sequence[int]) -> np.ndarray:
+    if array.dtype.kind not in "biuf" or array.size != int(np.prod(shape[:3])):
+        raise KeypointError(
+            f"{path}: {name}: expected numbers {[n for n in shape[:3] if n != 1]}, "
+            f"got {array.dtype} {list(array.shape)}"
+        )
+    return array.astype(np.float64).reshape(tuple(shape[:3]))
+
+
+def _names(path: Path, names: np.ndarray | None, num_joints: int) -> tuple[str, ...] | None:
+    if names is not None and (names.shape != (num_joints,) or names.dtype.kind != "U"):
+        raise KeypointError(
+            f"{path}: joint_names: expected {num_joints} names, got {names.dtype} "
+            f"{list(names.shape)}"
+        )
+    return None if names is None else tuple(map(str, names))

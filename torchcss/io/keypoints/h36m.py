@@ -1,11 +1,13 @@
-"""2D joints in VideoPose3D's archives, `data_2d_h36m_*.npz`: by subject, action and camera.
+"""2D joints in VideoPose3D's archives, `data_2d_*.npz`: by subject, action and camera.
 
 `positions_2d` is a dictionary of dictionaries of lists of `[T J 2]`, pixels; `metadata` says
-`layout_name` and `num_joints`. NumPy stores such things as Python objects. They are read here
-without running what they might ask for: only plain containers and arrays of numbers are allowed.
+`layout_name` and `num_joints`. Which of the recordings is meant stands behind the path,
+`FILE.npz#S9/Walking 1/0`; not needed where there is only one. The detections of one video, of which
+such archives are made, have `boxes` and `keypoints`: per frame and class `[P 4 J]`, x, y, logit,
+probability.
 
-Which of the recordings is meant stands behind the path, `FILE.npz#S9/Walking 1/0`; not needed where
-there is only one.
+NumPy stores such things as Python objects. They are read here without running what they might ask
+for: only plain containers and arrays of numbers are allowed.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ from __future__ import annotations
 import io
 import pickle
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +23,12 @@ import numpy as np
 
 from torchcss.errors import KeypointError
 from torchcss.files import one_line, shortened
-from torchcss.io.keypoints.people import People, screened
+from torchcss.io.keypoints.people import People, Person, screened
 
-_LAYOUTS = {"h36m": "H36M-17", "coco": "COCO-17"}
+_LAYOUTS = {
+    ("h36m", 17): "H36M-17", ("h36m", 16): "H36M-16", ("coco", 17): "COCO-17",
+    ("mpii", 16): "MPII-16", ("humaneva15", 15): "HumanEva-15", ("humaneva", 15): "HumanEva-15",
+}  # fmt: skip
 _MOST_BYTES = 2**31
 
 _ALLOWED = {
@@ -36,10 +42,11 @@ _ALLOWED = {
 """What an archive of arrays needs, old NumPy or new."""
 
 
-class _PlainUnpickler(pickle.Unpickler):
+class PlainUnpickler(pickle.Unpickler):
     """Unpickles containers and arrays, and nothing that could run a programme."""
 
     def find_class(self, module_name: str, global_name: str) -> Any:
+        """Return what the data asks for, if it is harmless."""
         if (module_name, global_name) not in _ALLOWED:
             raise pickle.UnpicklingError(f"it asks for {module_name}.{global_name}")
         return super().find_class(module_name.replace(".core.", "._core."), global_name)
@@ -49,7 +56,8 @@ def is_h36m(path: Path) -> bool:
     """Whether a file is such an archive."""
     try:
         with zipfile.ZipFile(path) as archive:
-            return "positions_2d.npy" in archive.namelist()
+            names = set(archive.namelist())
+            return "positions_2d.npy" in names or {"boxes.npy", "keypoints.npy"} <= names
     except (OSError, ValueError, NotImplementedError, zipfile.BadZipFile):
         return False
 
@@ -65,25 +73,28 @@ def read_h36m(path: Path, selection: str) -> People:
         KeypointError: If the archive is damaged, or which recording is meant is not clear; the
             message names those that there are.
     """
-    recordings = _object(path, "positions_2d")
-    chosen: Any = recordings
-    wanted = [part for part in selection.split("/") if part]
-    steps: list[str] = []
+    if not _has(path, "positions_2d"):
+        return _read_detections(path)
+    chosen: Any = _object(path, "positions_2d")
+    rest, steps = selection, []
     for kind in ("subject", "action", "camera"):
         options = _options(path, chosen, kind)
-        step = wanted[len(steps)] if len(steps) < len(wanted) else None
-        if step is None and len(options) == 1:
+        # Names may hold slashes themselves.
+        fitting = [name for name in options if f"{rest}/".startswith(f"{name}/")]
+        step = max(fitting, key=len, default=None)
+        if not rest and len(options) == 1:
             step = next(iter(options))
-        if step not in options:
-            problem = "say which" if step is None else f"no {kind} {step!r}"
+        if step is None:
+            problem = "say which" if not rest else f"no {kind} {rest.split('/')[0]!r}"
             prefix = "/".join([*steps, kind.upper()])
             raise KeypointError(
                 f"{path}: {problem} recording, as {path.name}#{prefix}...; there are: "
                 f"{', '.join(options)}"
             )
-        steps.append(str(step))
-        chosen = options[str(step)]
-    if len(wanted) > len(steps):
+        rest = rest[len(step) + 1 :] if rest else ""
+        steps.append(step)
+        chosen = options[step]
+    if rest:
         raise KeypointError(f"{path}: expected SUBJECT/ACTION/CAMERA, found {selection!r}")
     where = f"{path}: {'/'.join(steps)}"
     try:
@@ -95,20 +106,57 @@ def read_h36m(path: Path, selection: str) -> People:
             f"{where}: expected numbers [frames, joints, 2], got {list(points.shape)}"
         )
     places = np.where(np.isfinite(points[..., :2]), points[..., :2], np.nan)
-    found = screened(places, points[..., 2] if points.shape[2] == 3 else 1.0)
+    found = screened(places, points[..., 2] if points.shape[2] == 3 else None)
     report = [f"format: VideoPose3D's archive, {'/'.join(steps)}"]
-    return People([[person] for person in found], None, report, _layout(path, points.shape[1]))
+    metadata = _metadata(path)
+    layout = _LAYOUTS.get((str(metadata.get("layout_name")), points.shape[1]))
+    sizes = metadata.get("video_metadata")
+    size = _size(sizes.get(steps[0]) if isinstance(sizes, dict) else None)
+    return People([[Person(person)] for person in found], None, report, layout, size_wh=size)
 
 
-def _layout(path: Path, num_joints: int) -> str | None:
-    """The layout that the metadata name; None: by the number of joints."""
+def _read_detections(path: Path) -> People:
+    """Read what a detector found in one video, the people of every frame."""
+    entries = np.asarray(_object(path, "keypoints"), dtype=object)
+    frames: list[list[Person]] = []
+    for index, entry in enumerate(entries):
+        person = entry[-1] if isinstance(entry, (list, np.ndarray)) and len(entry) else ()
+        try:
+            found = np.asarray(person, dtype=np.float64)
+        except (ValueError, TypeError):
+            found = np.zeros(1)
+        shape: Sequence[int] = found.shape
+        if found.size and (len(shape) != 3 or shape[1] not in (3, 4)):
+            raise KeypointError(
+                f"{path}: frame {index}: expected numbers [people, 4, joints], got "
+                f"{list(found.shape)}"
+            )
+        rows = found.swapaxes(1, 2)[..., [0, 1, -1]] if found.size else ()
+        frames.append([Person(joints) for joints in rows])
+    size = _size(_metadata(path))
+    return People(frames, None, ["format: VideoPose3D's detections"], size_wh=size)
+
+
+def _has(path: Path, name: str) -> bool:
+    with zipfile.ZipFile(path) as archive:
+        return f"{name}.npy" in archive.namelist()
+
+
+def _metadata(path: Path) -> dict[str, Any]:
+    """What an archive says of itself, if anything."""
     try:
         metadata = _object(path, "metadata")
     except KeypointError:
+        return {}
+    return metadata if isinstance(metadata, dict) else {}
+
+
+def _size(entry: object) -> tuple[float, float] | None:
+    """Width and height of a video, where they are said."""
+    found = [entry.get(key) for key in ("w", "h")] if isinstance(entry, dict) else [None]
+    if not all(isinstance(side, (int, np.integer)) and side > 0 for side in found):
         return None
-    name = metadata.get("layout_name") if isinstance(metadata, dict) else None
-    layout = _LAYOUTS.get(name) if isinstance(name, str) else None
-    return layout if num_joints == 17 else None
+    return float(found[0]), float(found[1])  # type: ignore[arg-type]
 
 
 def _options(path: Path, value: Any, kind: str) -> dict[str, Any]:
@@ -141,9 +189,9 @@ def _object(path: Path, name: str) -> Any:
         if read_header is None:
             raise ValueError(f"version {version} of NumPy's format")
         shape, _, dtype = read_header(source)
-        if not dtype.hasobject or shape != ():
-            raise ValueError(f"expected one object, got {dtype} {list(shape)}")
-        content = _PlainUnpickler(source, encoding="latin1").load()
+        if not dtype.hasobject:
+            raise ValueError(f"expected objects, got {dtype} {list(shape)}")
+        content = PlainUnpickler(source, encoding="latin1").load()
     except Exception as error:  # zipfile, pickle and NumPy raise whatever the damage leads to
         raise KeypointError(
             f"{path}: {name}: cannot be read: {one_line(error)}; get a complete copy"

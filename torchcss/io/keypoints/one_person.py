@@ -8,40 +8,83 @@ _JUMP = 0.5
 """How far (in sizes of the person) a person may move from one frame to the next and be the same."""
 
 
-def follow(frames: list[np.ndarray], first_frame: int, report: list[str]) -> np.ndarray:
-    """Return `[t j 3]`: the person that continuity chooses among those of every frame."""
+def follow(
+    frames: list[np.ndarray], tracks: list[list[str | None]], first_frame: int, report: list[str]
+) -> np.ndarray:
+    """Return `[t j 3]`: the person that is followed among those of every frame.
+
+    Args:
+        frames: The people of every frame, `[p j 3]`.
+        tracks: By what the file knows each of them again; None where it does not.
+        first_frame: Where the most prominent person is chosen, to be followed from there by the
+            file's own tracks, and where these end by continuity.
+        report: Gets a line of what was done.
+    """
     num_joints = frames[first_frame].shape[1]
     chosen = np.zeros((len(frames), num_joints, 3))
     most = max(len(frame) for frame in frames)
-    if most <= 1:
+    if most <= 1 and len({track for of in tracks for track in of}) <= 1:
         for index, frame in enumerate(frames):
             if len(frame):
                 chosen[index] = frame[0]
         return chosen
     start = frames[first_frame]
-    chosen[first_frame] = start[int(np.argmax([_prominence(person) for person in start]))]
-    lost = []
+    place = int(np.argmax([_prominence(person) for person in start]))
+    chosen[first_frame] = start[place]
+    own, lost = tracks[first_frame][place], []
     for order in (range(first_frame + 1, len(frames)), range(first_frame - 1, -1, -1)):
-        last, missed = chosen[first_frame], 0
+        last, missed, track, others = chosen[first_frame], 0, own, {*tracks[first_frame]} - {None}
         for index in order:
-            candidates = [person for person in frames[index] if (person[:, 2] > 0.0).any()]
-            distances = [_distance(last, person) for person in candidates]
-            # After frames without the person it may have gone farther.
-            if distances and min(distances) <= _JUMP * (1.0 + 0.2 * missed):
-                last, missed = candidates[int(np.argmin(distances))], 0
-                chosen[index] = last
-            else:
+            choice = _next(last, frames[index], tracks[index], track, others, missed)
+            others |= {*tracks[index]} - {None}
+            if choice is None:
                 missed += 1
                 lost.append(index)
+                continue
+            last, missed, track = frames[index][choice], 0, tracks[index][choice]
+            chosen[index] = last
+    named = "" if own is None else f", {own!r} of the file,"
     report.append(
         f"up to {most} people in a frame: "
-        f"followed the most prominent one of frame {first_frame} by continuity"
+        f"followed the most prominent one of frame {first_frame}{named} by "
+        + ("continuity" if own is None else "the file's tracks")
     )
     if lost:
         report.append(
             f"in {len(lost)} frames (first: {min(lost)}) nobody was near enough to be that person"
         )
     return chosen
+
+
+def _next(
+    last: np.ndarray,
+    people: np.ndarray,
+    tracks: list[str | None],
+    track: str | None,
+    others: set[str | None],
+    missed: int,
+) -> int | None:
+    """Who is the person in the next frame; None: nobody.
+
+    Args:
+        last: The person where it was seen last.
+        people: Everybody of the frame.
+        tracks: Their tracks.
+        track: The person's track; its frame is known if it is there.
+        others: Tracks seen so far, which are other people.
+        missed: Frames since the person was seen.
+    """
+    seen = [index for index, person in enumerate(people) if (person[:, 2] > 0.0).any()]
+    if track is not None and track in tracks and tracks.index(track) in seen:
+        return tracks.index(track)
+    if track is not None:
+        seen = [index for index in seen if tracks[index] not in others]
+    distances = {index: _distance(last, people[index]) for index in seen}
+    nearest = min(distances, key=distances.__getitem__, default=None)
+    # After frames without the person it may have gone farther.
+    if nearest is None or distances[nearest] > _JUMP * (1.0 + 0.2 * missed):
+        return None
+    return nearest
 
 
 def size_of(person: np.ndarray) -> float:

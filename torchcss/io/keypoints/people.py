@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,97 +13,160 @@ from torchcss.errors import KeypointError
 from torchcss.files import real_numbers, shortened
 
 FRAME_NAMES = (
-    "frame", "frame_number", "frame_index", "frame_id", "frame_no", "frame_num", "image_id",
+    "frame", "frame_number", "frame_index", "frame_idx", "frame_id", "frame_no", "frame_num",
+    "frameid", "image_id",
 )  # fmt: skip
 """What files call the number of a frame."""
 
-_MOST_FRAMES = 1_000_000
+CONFIDENCE_NAMES = (
+    "confidence", "conf", "c", "score", "keypoint_score", "likelihood", "p", "prob", "probability",
+    "visibility", "visible", "vis", "v", "presence",
+)  # fmt: skip
+"""What files call the confidence of a joint, the best first where there are several."""
 
-Person = Float[np.ndarray, "j 3"]
-"""u, v and confidence of every joint."""
+TRACK_NAMES = (
+    "track_id", "track", "idx", "id_", "person_id", "personID", "person", "tracking_id",
+    "individual", "id",
+)  # fmt: skip
+"""What files call that by which a person is known again in another frame."""
+
+Key = int | float | str
+"""The number of a frame, its time in seconds, or the name of its picture."""
+
+
+class Person(NamedTuple):
+    """A person in one frame.
+
+    Attributes:
+        joints: u, v and confidence of every joint.
+        track: By what the file knows the person again in other frames; None: it does not.
+    """
+
+    joints: Float[np.ndarray, "j 3"]
+    track: str | None = None
 
 
 class People(NamedTuple):
     """All detections of a file.
 
     Attributes:
-        frames: The people of every frame in order; or by number, where the file may leave out
-            frames in which nobody is seen.
+        frames: The people of every frame in order; or by number, time or picture, where the file
+            says so and may leave out frames in which nobody is seen.
         names: The file's own joint names, or None where it has only an order.
         report: Lines for the user.
         layout: The layout, where the format says it.
         corner_fractions: Coordinates are pixels, or fractions of the image from its corner.
-        from_zero: Frames that have numbers are known to be counted from 0.
+        first: The number of the first frame, where the format says it.
+        whole: All frames are there that were looked at: the lowest number is the first frame.
+        size_wh: Size of the images in which the file's pixels count, if it says so.
     """
 
-    frames: list[list[Person]] | dict[int, list[Person]]
+    frames: list[list[Person]] | dict[Key, list[Person]]
     names: tuple[str, ...] | None
     report: list[str]
     layout: str | None = None
     corner_fractions: bool = False
-    from_zero: bool = False
+    first: int | None = None
+    whole: bool = False
+    size_wh: tuple[float, float] | None = None
 
 
-def triples(value: object, where: str) -> Person:
-    """Return x, y, confidence of every joint from a list of them in a row."""
-    numbers = real_numbers(value, where, KeypointError)
-    if numbers.ndim != 1 or not numbers.size or numbers.size % 3:
-        raise KeypointError(
-            f"{where}: expected x, y, confidence for every joint in one list, "
-            f"found {numbers.size} numbers"
-        )
-    return numbers.reshape(-1, 3)
+class Marked(NamedTuple):
+    """A person of a file that may name the joints of everyone otherwise.
+
+    Attributes:
+        joints: u, v and confidence of every joint.
+        names: Their names, if there are any.
+        track: As in `Person`.
+    """
+
+    joints: Float[np.ndarray, "j 3"]
+    names: tuple[str, ...] | None
+    track: str | None = None
+
+
+def united(
+    where: object, frames: Mapping[Key, Sequence[Marked]]
+) -> tuple[dict[Key, list[Person]], tuple[str, ...] | None]:
+    """People whose joints are all in one order, and the names; joints that someone lacks are zero.
+
+    Raises:
+        KeypointError: If some have names and others not, or one has a name twice.
+    """
+    everyone = [person for people in frames.values() for person in people]
+    if all(person.names is None for person in everyone):
+        return {
+            key: [Person(p.joints, p.track) for p in people] for key, people in frames.items()
+        }, None
+    names = tuple(dict.fromkeys(name for person in everyone for name in person.names or ()))
+    place = {name: index for index, name in enumerate(names)}
+    found: dict[Key, list[Person]] = {}
+    for key, people in frames.items():
+        for person in people:
+            if person.names is None or len(set(person.names)) < len(person.joints):
+                raise KeypointError(
+                    f"{where}: {key}: expected a name of its own for every joint, found "
+                    f"{shortened(person.names)}"
+                )
+            joints = np.zeros((len(names), 3))
+            joints[[place[name] for name in person.names]] = person.joints
+            found.setdefault(key, []).append(Person(joints, person.track))
+        found.setdefault(key, [])
+    return found, names
+
+
+def numbers(value: object, where: str) -> np.ndarray:
+    """Nested lists of numbers, in which null is NaN, as an array.
+
+    Raises:
+        KeypointError: If it is ragged or holds anything else.
+    """
+    return real_numbers(_without_null(value), where, KeypointError)
+
+
+def _without_null(value: object) -> object:
+    if isinstance(value, list):
+        return [_without_null(entry) for entry in value]
+    return np.nan if value is None else value
 
 
 def screened(
-    places: Float[np.ndarray, "*b 2"], confidence: Float[np.ndarray, "*b"] | float = 1.0
+    places: Float[np.ndarray, "*b 2"], confidence: Float[np.ndarray, "*b"] | float | None = None
 ) -> Float[np.ndarray, "*b 3"]:
-    """Places with their confidence, which is 0 where the place is NaN."""
+    """Places with their confidence, which is 0 where there is no place.
+
+    Args:
+        places: u and v; NaN where there is none.
+        confidence: Of each; NaN or None where the file does not say: 1, but at (0, 0), which is
+            how many programs write what is not there, 0.
+    """
+    given = np.broadcast_to(np.nan if confidence is None else confidence, places.shape[:-1])
+    assumed = (places != 0).any(-1).astype(np.float64)
+    given = np.where(np.isnan(given), assumed, given)[..., None]
     seen = ~np.isnan(places).any(-1, keepdims=True)
-    given = np.broadcast_to(confidence, places.shape[:-1])[..., None]
     return np.where(seen, np.concatenate([places, given], axis=-1), 0.0)
 
 
-def in_order(
-    path: Path, people: People, num_frames: int | None, report: list[str]
-) -> list[Float[np.ndarray, "p j 3"]]:
-    """All people of every frame; frames that the file leaves out are empty.
+def is_there(joints: Float[np.ndarray, "j 3"]) -> bool:
+    """Whether a person is there at all: someone whose joints are all NaN or zero is nobody."""
+    return bool((np.nan_to_num(joints[:, 2]) > 0).any() or np.isfinite(joints[:, :2]).any())
 
-    Some programs count from 1, which shows where the last number is that of all frames.
 
-    Args:
-        path: The file.
-        people: What was found in it.
-        num_frames: Number of frames of the video; None: as many as the file has.
-        report: Gets a line that says from where frames are counted.
-
-    Raises:
-        KeypointError: If a number is none of a frame, or the layout changes.
-    """
-    frames = people.frames
-    if isinstance(frames, dict):
-        last = max(frames, default=-1)
-        from_one = not people.from_zero and 0 not in frames and last == num_frames
-        origin = int(bool(frames) and from_one)
-        # Frames at the end in which nobody is seen are often left out.
-        total = max(last + 1 - origin, num_frames or 0)
-        if total > _MOST_FRAMES:
-            raise KeypointError(f"{path}: {last} is not a frame number; number the frames from 0")
-        report.append(f"frame {origin} is the first frame")
-        frames = [frames.get(index + origin, []) for index in range(total)]
-    counts = sorted({len(person) for frame in frames for person in frame})
-    if len(counts) > 1:
-        raise KeypointError(
-            f"{path}: people with {' and '.join(map(str, counts))} joints; "
-            "expected one layout in the whole file"
-        )
-    nobody = np.zeros((0, *counts, 3) if counts else (0, 0, 3))
-    return [np.stack(frame) if len(frame) else nobody for frame in frames]
+def track_of(entry: Mapping[str, object], names: Sequence[str] = TRACK_NAMES) -> str | None:
+    """By what a file knows a person again, out of what it says of him."""
+    for name in names:
+        value = entry.get(name)
+        while isinstance(value, list) and len(value) == 1:
+            value = value[0]
+        if isinstance(value, (int, float, str)) and not isinstance(value, bool):
+            text = str(value)
+            return None if text in ("-1", "") else text
+    return None
 
 
 def frame_number(where: object, text: str) -> int:
     """The number of a frame, alone or at the end of a picture's name."""
-    match = re.fullmatch(r"(?:.*[^0-9-])?([0-9]{1,7})(?:\.0*|\.[A-Za-z]+)?", text)
+    match = re.fullmatch(r"(?:.*[^0-9-])?([0-9]{1,9})(?:\.0*|\.[A-Za-z]+)?", text)
     if match is None:
         raise KeypointError(f"{where}: expected a frame number, found {shortened(text)}")
     return int(match[1])

@@ -23,30 +23,25 @@ By default: `read_keypoints(path, image_size_wh=(w, h), num_frames=t)`.
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
 
 from torchcss.errors import KeypointError
-from torchcss.files import load_array, load_arrays, load_json, shortened
+from torchcss.files import load_array, load_arrays, shortened
 from torchcss.io.keypoints.arrays import read_arrays
+from torchcss.io.keypoints.findings import findings
+from torchcss.io.keypoints.frames import Film, in_order
 from torchcss.io.keypoints.h36m import is_h36m, read_h36m
-from torchcss.io.keypoints.json_files import (
-    openpose_people,
-    read_clicked,
-    read_coco,
-    read_openpose_folder,
-)
-from torchcss.io.keypoints.mediapipe import (
-    is_landmark_array,
-    is_mediapipe,
-    read_landmark_array,
-    read_landmarks,
-)
+from torchcss.io.keypoints.hdf5 import read_hdf5
+from torchcss.io.keypoints.json_files import read_folder, read_json
+from torchcss.io.keypoints.labels import read_labels
+from torchcss.io.keypoints.mediapipe import is_landmark_array, read_landmark_array
 from torchcss.io.keypoints.one_person import follow, size_of
-from torchcss.io.keypoints.people import People, in_order
+from torchcss.io.keypoints.people import People, Person, is_there
 from torchcss.io.keypoints.tables import read_table
 from torchcss.joint_names import ALIASES, JOINT_NAMES, layout_of_names
 from torchcss.types import Keypoints
@@ -60,8 +55,8 @@ OWN_NAMES = "own"
 # Which layout a number of unnamed joints means; the first is the default.
 _LAYOUTS_BY_COUNT: dict[int, tuple[str, ...]] = {}
 for _name in (
-    "COCO-17", "COCO-18", "BODY_25", "BODY_25B", "MediaPipe-33", "SMPL-24", "H36M-17",
-    "Halpe-26", "Halpe-136",
+    "COCO-17", "COCO-18", "BODY_18", "BODY_25", "BODY_25B", "MediaPipe-33", "SMPL-24", "H36M-17",
+    "Halpe-26", "Halpe-136", "COCO-133", "MPII-16", "H36M-16", "HumanEva-15",
 ):  # fmt: skip
     _LAYOUTS_BY_COUNT.setdefault(len(ALIASES[_name]), ())
     _LAYOUTS_BY_COUNT[len(ALIASES[_name])] += (_name,)
@@ -87,6 +82,8 @@ def read_keypoints(
     layout: str | None = None,
     normalised: bool | Scale = False,
     first_frame: int = 0,
+    frame_names: Sequence[str] | None = None,
+    frame_rate: float | None = None,
 ) -> Keypoints:
     """Read the 2D joints of one person from any of the formats above.
 
@@ -102,6 +99,9 @@ def read_keypoints(
         normalised: True, `"zero-one"` or `"plus-minus-one"` for coordinates that are fractions of
             the image, which are then converted: the range ends at the centres of the border pixels.
         first_frame: The frame in which tracking starts; there somebody must be seen.
+        frame_names: Names of the video's pictures, if it is a folder of them: a file that names
+            pictures is then read by name.
+        frame_rate: Frames per second of the video, for files that say times.
 
     Returns:
         Joints of the person chosen, float64.
@@ -117,34 +117,52 @@ def read_keypoints(
             f"{path}: unknown layout {layout!r}; the known ones are "
             f"{', '.join((*ALIASES, OWN_NAMES))}"
         )
-    people = _read(path, image_size_wh)
+    people = _read(path, image_size_wh, num_frames)
     report = list(people.report)
-    frames = in_order(path, people, num_frames, report)
+    everyone = in_order(path, people, Film(num_frames, frame_names, frame_rate), report)
+    everyone = [[p for p in frame if is_there(p.joints)] for frame in everyone]
+    frames = _stacked(path, everyone)
     _check_counts(path, frames, people.names, num_frames, first_frame)
     frames = _checked_numbers(path, frames, people.names, report)
     _check_somebody(path, frames, first_frame)
     points = np.concatenate([frame[frame[..., 2] > 0.0][:, :2] for frame in frames])
     if people.corner_fractions:
         scale, shift, note = _from_corner(path, points, image_size_wh)
+    elif people.size_wh is not None:
+        scale, shift, note = _from_other_size(path, people.size_wh, image_size_wh)
     else:
         scale, shift, note = _from_border_pixels(path, points, image_size_wh, normalised)
     report += note
     _check_places(path, scale * points + shift, image_size_wh)
     for frame in frames:
         frame[..., :2] = scale * frame[..., :2] + shift
-    chosen = follow(frames, first_frame, report)
+    tracks = [[person.track for person in frame] for frame in everyone]
+    chosen = follow(frames, tracks, first_frame, report)
     names = _joint_names(path, people, chosen, layout or people.layout, report)
+    report += findings(chosen, names, image_size_wh, first_frame)
     positions = np.where(chosen[..., 2:] > 0.0, chosen[..., :2], 0.0)
     confidence = torch.from_numpy(chosen[..., 2].copy())
     return Keypoints(torch.from_numpy(positions), confidence, names, report=tuple(report))
 
 
+def _stacked(path: Path, frames: Sequence[Sequence[Person]]) -> list[np.ndarray]:
+    """`[p j 3]` of every frame."""
+    counts = sorted({len(person.joints) for frame in frames for person in frame})
+    if len(counts) > 1:
+        raise KeypointError(
+            f"{path}: people with {' and '.join(map(str, counts))} joints; "
+            "expected one layout in the whole file"
+        )
+    nobody = np.zeros((0, *counts, 3) if counts else (0, 0, 3))
+    return [np.stack([p.joints for p in frame]) if frame else nobody for frame in frames]
+
+
 # The formats.
 
 
-def _read(path: Path, image_size_wh: tuple[int, int]) -> People:
+def _read(path: Path, image_size_wh: tuple[int, int], num_frames: int | None) -> People:
     if path.is_dir():
-        return read_openpose_folder(path)
+        return _read_folder(path, image_size_wh)
     archive, mark, selection = str(path).rpartition("#")
     if mark and not path.exists():
         path = Path(archive)
@@ -162,30 +180,23 @@ def _read(path: Path, image_size_wh: tuple[int, int]) -> People:
         return _read_numpy(path)
     if suffix in (".csv", ".tsv"):
         return read_table(path)
-    if suffix in (".h5", ".hdf5"):
-        raise KeypointError(
-            f"{path}: DeepLabCut's HDF5 holds pickled objects, which could run a programme; save "
-            "it as CSV (save_as_csv=True, or deeplabcut.analyze_videos_converth5_to_csv)"
-        )
-    return _read_json(path, load_json(path, KeypointError), image_size_wh)
+    if suffix in (".h5", ".hdf5", ".slp"):
+        return read_hdf5(path)
+    return read_json(path, image_size_wh, num_frames)
 
 
-def _read_json(path: Path, content: Any, image_size_wh: tuple[int, int]) -> People:
-    keys = content.keys() if isinstance(content, dict) else set()
-    if "annotations" in keys:
-        return read_coco(path, content["annotations"], content)
-    if "people" in keys:
-        return People([openpose_people(path, content)], None, ["format: OpenPose, one frame"])
-    if is_mediapipe(content):
-        return read_landmarks(path, content)
-    if isinstance(content, list):
-        return read_coco(path, content, {})
-    if keys & {"joints", "frames"}:
-        return read_clicked(path, content, image_size_wh)
+def _read_folder(path: Path, image_size_wh: tuple[int, int]) -> People:
+    """A file for every frame; or a folder of one camera's folder of them."""
+    for pattern, read in (("*.json", read_folder), ("*.txt", None)):
+        if next(path.glob(pattern), None) is not None:
+            return read(path) if read is not None else read_labels(path, image_size_wh)
+    folders = sorted(entry.name for entry in path.iterdir() if entry.is_dir())
+    if len(folders) == 1:
+        return _read_folder(path / folders[0], image_size_wh)
     raise KeypointError(
-        f"{path}: not a keypoint file; expected OpenPose's 'people', COCO's 'annotations' or list "
-        "of detections, MediaPipe's landmarks, or clicked 'joints' or 'frames', found "
-        f"{shortened(content)}"
+        f"{path}: no JSON files in this folder; expected OpenPose's, EasyMocap's or YOLO's labels, "
+        "one for every frame"
+        + (f"; give one of {shortened(', '.join(folders))}" if folders else "")
     )
 
 
@@ -195,7 +206,7 @@ def _read_numpy(path: Path) -> People:
     else:
         arrays = dict(load_arrays(path, KeypointError))
     found = [name for name, array in arrays.items() if is_landmark_array(array)]
-    if len(found) == 1:
+    if len(found) == 1 and len(arrays) == 1:
         return read_landmark_array(found[0], arrays[found[0]])
     return read_arrays(path, arrays)
 
@@ -238,8 +249,9 @@ def _checked_numbers(
     """Refuse numbers that are not finite where they count; bring confidences into their range."""
     checked, clipped = [], 0
     for index, frame in enumerate(frames):
-        confidence = frame[..., 2]
-        finite = np.isfinite(frame[..., :2]).all(-1)
+        # All three not a number is how some programs write a joint that they did not find.
+        frame = np.where(np.isnan(frame).all(-1, keepdims=True), 0.0, frame)
+        confidence, finite = frame[..., 2], np.isfinite(frame[..., :2]).all(-1)
         bad = np.isnan(confidence) | (~finite & (confidence != 0.0))
         if bad.any():
             joint = int(np.argwhere(bad)[0, -1])
@@ -290,6 +302,26 @@ def _from_corner(path: Path, points: np.ndarray, image_size_wh: tuple[int, int])
         )
     # Pixel centres are at integers.
     return np.array(image_size_wh), -0.5, ["fractions of the image converted to pixels"]
+
+
+def _from_other_size(
+    path: Path, size_wh: tuple[float, float], image_size_wh: tuple[int, int]
+) -> Change:
+    """Pixels of images of another size, if it is the same picture."""
+    scale = np.array(image_size_wh) / size_wh
+    if abs(scale[0] / scale[1] - 1) > 0.02:
+        raise KeypointError(
+            f"{path}: made from images of {size_wh[0]:g} x {size_wh[1]:g} pixels, the video has "
+            f"{image_size_wh[0]} x {image_size_wh[1]}, which is another shape; make the keypoints "
+            "from this very video"
+        )
+    if (scale == 1).all():
+        return 1.0, 0.0, []
+    note = (
+        f"scaled from images of {size_wh[0]:g} x {size_wh[1]:g} pixels, as the file says, to "
+        f"{image_size_wh[0]} x {image_size_wh[1]}"
+    )
+    return scale, 0.0, [note]
 
 
 def _from_border_pixels(
@@ -382,15 +414,17 @@ def _recognise(chosen: np.ndarray) -> tuple[str, str]:
     candidates = _LAYOUTS_BY_COUNT[chosen.shape[1]]
     if len(candidates) == 1:
         return candidates[0], f"by its {chosen.shape[1]} joints"
-    if "BODY_25" in candidates:
-        # In BODY_25 joint 8 is computed as the middle of the hips, 9 and 12.
+    pair = {25: ("BODY_25", "BODY_25B"), 18: ("BODY_18", "COCO-18")}.get(chosen.shape[1])
+    if pair is not None:
+        # In OpenPose's order joint 8 is computed as the middle of the hips, 9 and 12.
         seen = (chosen[:, [8, 9, 12], 2] > 0.0).all(axis=1)
         if seen.any():
             gap = chosen[:, 8, :2] - 0.5 * (chosen[:, 9, :2] + chosen[:, 12, :2])
             sizes = np.array([size_of(person) for person in chosen])
             share = float(np.median((np.linalg.norm(gap, axis=1) / sizes)[seen]))
-            layout = "BODY_25" if share < 0.08 else "BODY_25B"
-            where = "is" if share < 0.08 else "is not"
-            return layout, f"by its 25 joints, of which 8 {where} the middle of 9 and 12"
+            layout, where = (pair[0], "is") if share < 0.08 else (pair[1], "is not")
+            return layout, (
+                f"by its {chosen.shape[1]} joints, of which 8 {where} the middle of 9 and 12"
+            )
     others = ", ".join(candidates[1:])
     return candidates[0], f"by its {chosen.shape[1]} joints ({others} has as many: set layout)"

@@ -1,10 +1,12 @@
-"""2D joints in CSV: DeepLabCut's, MediaPipe's as people save them, and any table with a heading.
+"""2D joints in CSV: DeepLabCut's, SLEAP's, MediaPipe's as people save them, any with a heading.
 
 *DeepLabCut.* Headings `scorer`, `individuals` (with several animals), `bodyparts` and `coords`; one
-row for every frame, `x, y, likelihood` for every body part. What was not found is empty.
+row for every frame, `x, y, likelihood` for every body part, and what else smoothers put there,
+which is left out. What was not found is empty.
 
-*Wide.* One row for every frame, columns named by joint and number: `x1 y1 z1 v1 ...`,
-`landmark_0_x`, `left_hip_x`, `nose.visibility`; a column `frame` may number the rows.
+*Wide.* One row for every person in every frame, columns named by joint and number: `x1 y1 z1 v1`,
+`landmark_0_x`, `left_hip_x`, `nose.visibility`, `LWrist_c`. A column may number the frames, or say
+their times; another one says who it is (SLEAP's `track`).
 
 *Long.* One row for every joint of every frame: `frame, landmark, x, y, visibility`.
 
@@ -26,20 +28,31 @@ import numpy as np
 from torchcss.errors import KeypointError
 from torchcss.files import read_text, shortened
 from torchcss.io.keypoints.mediapipe import LAYOUT, NAMES
-from torchcss.io.keypoints.people import FRAME_NAMES, People, Person, frame_number, screened
+from torchcss.io.keypoints.people import (
+    CONFIDENCE_NAMES,
+    FRAME_NAMES,
+    Key,
+    People,
+    Person,
+    frame_number,
+    screened,
+)
 
 _PARTS = {
     **dict.fromkeys(("x", "u"), 0),
     **dict.fromkeys(("y", "v_px"), 1),
-    **dict.fromkeys(
-        ("v", "vis", "visibility", "conf", "confidence", "score", "likelihood", "p"), 2
-    ),
+    **dict.fromkeys(CONFIDENCE_NAMES, 2),
     **dict.fromkeys(("z", "presence"), 3),
 }
 """What a column's name says that it is: 0, 1 coordinates, 2 confidence, 3 not used."""
 
 _JOINTS = ("landmark", "landmark_id", "landmark_name", "landmark_index", "joint", "joint_name",
            "joint_id", "bodypart", "keypoint", "name", "id", "index")  # fmt: skip
+
+_TRACKS = ("track", "track_id", "track_name", "person", "person_id", "individual", "individuals")
+_TIMES = {"timestamp_ms": 1e-3, "time_ms": 1e-3, "timestamp_s": 1.0, "time_s": 1.0, "time": 1.0,
+          "timestamp": 1.0}  # fmt: skip
+"""Columns of times, in seconds unless the name says otherwise."""
 
 Row = tuple[int, list[str]]
 """A row's number in the file, from 1, and its cells."""
@@ -53,12 +66,16 @@ class _Columns(NamedTuple):
         size: How many columns there are.
         frame: The column that numbers the frames; None: a frame is a row.
         joint: The column that names the joint, if the heading does not.
+        track: The column that says who it is.
+        unit: Seconds, if the column `frame` holds times in that unit.
     """
 
     parts: Mapping[tuple[str, str], Mapping[int, int]]
     size: int
     frame: int | None
     joint: int | None = None
+    track: int | None = None
+    unit: float | None = None
 
 
 def read_table(path: Path) -> People:
@@ -82,34 +99,40 @@ def read_table(path: Path) -> People:
         raise KeypointError(f"{path}: the file is empty")
     firsts = [row[0].lower() for _, row in rows[:4]]
     if "bodyparts" in firsts and "coords" in firsts:
-        columns, body = _deeplabcut(path, rows)
+        columns, body, report = _deeplabcut(path, rows)
         joints, frames = _read_rows(path, columns, body)
-        animals = len({person for person, _ in columns.parts})
-        report = [f"format: DeepLabCut, {animals} individual{'s' * (animals > 1)}"]
-        return People(frames, tuple(joints), report)
+        return People(frames, tuple(joints), report, first=0)
     if len(rows) == 1:
         raise KeypointError(f"{path}: row 1: a heading and nothing below it; get a complete copy")
-    joints, frames = _read_rows(path, _headed(path, rows[0][1]), rows[1:])
+    columns = _headed(path, rows[0][1])
+    report = [_confidence_line(rows[0][1], columns)]
+    joints, frames = _read_rows(path, columns, rows[1:])
     lower = [re.sub(r"[^a-z0-9]+", "_", name.lower()) for name in joints]
     numbered = all(map(str.isdigit, lower))
     if len(joints) == len(NAMES) and (set(lower) == set(NAMES) or numbered):
         key = int if numbered else NAMES.index
         order = sorted(range(len(lower)), key=lambda index: key(lower[index]))
-        frames = {place: [each[order] for each in people] for place, people in frames.items()}
-        report = ["format: CSV of MediaPipe's landmarks"]
+        frames = {
+            place: [each._replace(joints=each.joints[order]) for each in people]
+            for place, people in frames.items()
+        }
+        report.insert(0, "format: CSV of MediaPipe's landmarks")
         return People(frames, None, report, LAYOUT, corner_fractions=True)
-    return People(
-        frames, None if numbered else tuple(joints), ["format: CSV, a heading per column"]
-    )
+    report.insert(0, "format: CSV, a heading per column")
+    first = 0 if any(cell.lower() == "frame_idx" for cell in rows[0][1]) else None  # SLEAP's
+    return People(frames, None if numbered else tuple(joints), report, first=first)
 
 
 def _headed(path: Path, heading: Sequence[str]) -> _Columns:
     """The columns of a table with one heading, long or wide."""
     names = [re.sub(r"[\s.\-]+", "_", cell.lower()) for cell in heading]
-    frame, joint = _first_of(FRAME_NAMES, names), _first_of(_JOINTS, names)
+    frame, unit = _first_of(FRAME_NAMES, names), None
+    if frame is None and (frame := _first_of(tuple(_TIMES), names)) is not None:
+        unit = _TIMES[names[frame]]
+    joint, track = _first_of(_JOINTS, names), _first_of(_TRACKS, names)
     if joint is not None and {"x", "y"} <= set(names):
         parts = {_PARTS[name]: index for index, name in enumerate(names) if name in _PARTS}
-        return _Columns({("", ""): parts}, len(names), frame, joint)
+        return _Columns({("", ""): parts}, len(names), frame, joint, track, unit)
     columns: dict[tuple[str, str], dict[int, int]] = {}
     for index, name in enumerate(names):
         if (split := _split(name)) is not None:
@@ -123,7 +146,15 @@ def _headed(path: Path, heading: Sequence[str]) -> _Columns:
             f"{path}: row 1: expected DeepLabCut's headings, or columns such as nose_x and nose_y, "
             f"found {shortened(', '.join(heading))}"
         )
-    return _Columns(columns, len(names), frame)
+    return _Columns(columns, len(names), frame, None, track, unit)
+
+
+def _confidence_line(heading: Sequence[str], columns: _Columns) -> str:
+    """Which column was taken for the confidence."""
+    found = [heading[parts[2]] for parts in columns.parts.values() if 2 in parts]
+    if not found:
+        return "no confidence in the file: 1 for every joint that has a place other than (0, 0)"
+    return f"confidence: columns such as {found[0]}"
 
 
 def _split(name: str) -> tuple[str, int] | None:
@@ -137,8 +168,8 @@ def _split(name: str) -> tuple[str, int] | None:
     return None
 
 
-def _deeplabcut(path: Path, rows: Sequence[Row]) -> tuple[_Columns, Sequence[Row]]:
-    """The columns of DeepLabCut's headings, and the rows below."""
+def _deeplabcut(path: Path, rows: Sequence[Row]) -> tuple[_Columns, Sequence[Row], list[str]]:
+    """The columns of DeepLabCut's headings, the rows below, and what to report."""
     headings = {row[0].lower(): row for _, row in rows[:4]}
     coords, joints = headings["coords"], headings["bodyparts"]
     kinds = ("x", "y", "likelihood")
@@ -150,27 +181,31 @@ def _deeplabcut(path: Path, rows: Sequence[Row]) -> tuple[_Columns, Sequence[Row
             f"{path}: expected x, y, likelihood under every body part, found "
             f"{shortened(', '.join(coords))}"
         )
-    if foreign := [kind for kind in coords[start:] if kind not in kinds]:
-        raise KeypointError(
-            f"{path}: coords: expected x, y, likelihood, found {shortened(foreign[0])}"
-        )
     parts: dict[tuple[str, str], dict[int, int]] = {}
     for column in range(start, size):
-        own = parts.setdefault((animals[column], joints[column]), {})
-        own[kinds.index(coords[column])] = column
+        if coords[column] in kinds:
+            own = parts.setdefault((animals[column], joints[column]), {})
+            own.setdefault(kinds.index(coords[column]), column)
+    for (_, joint), own in parts.items():
+        if not {0, 1} <= own.keys():
+            raise KeypointError(f"{path}: coords: expected x and y of {joint!r}")
+    people = len({person for person, _ in parts})
+    report = [f"format: DeepLabCut, {people} individual{'s' * (people > 1)}"]
+    if others := sorted({kind for kind in coords[start:] if kind not in kinds}):
+        report.append(f"columns left out: {shortened(', '.join(others))}")
     body = rows[1 + [row[0].lower() for _, row in rows[:4]].index("coords") :]
     if not body:
         raise KeypointError(f"{path}: no frames below the headings; get a complete copy")
     # Of labelled frames the picture's name is the index; of a video's its number.
-    return _Columns(parts, size, start - 1 if start else None), body
+    return _Columns(parts, size, start - 1 if start else None), body, report
 
 
 def _read_rows(
     path: Path, columns: _Columns, body: Sequence[Row]
-) -> tuple[list[str], dict[int, list[Person]]]:
+) -> tuple[list[str], dict[Key, list[Person]]]:
     """Names of the joints, and the people in every frame."""
     joints: dict[str, None] = {}
-    found: dict[int, dict[str, dict[str, list[float]]]] = {}
+    found: dict[Key, dict[str, dict[str, list[float]]]] = {}
     for index, (row, cells) in enumerate(body):
         where = f"{path}: row {row}"
         if len(cells) != columns.size:
@@ -178,12 +213,11 @@ def _read_rows(
                 f"{where}: expected {columns.size} columns, as the heading has, found "
                 f"{len(cells)}; get a complete copy"
             )
-        place = index if columns.joint is None else 0
-        if columns.frame is not None:
-            place = frame_number(where, cells[columns.frame])
+        place = _place(where, columns, cells, index)
+        track = "" if columns.track is None else cells[columns.track]
         for (person, joint), parts in columns.parts.items():
             # Of a wide table every row is a person of its own.
-            person = person or ("" if columns.joint is not None else f"row {row}")
+            person = person or track or ("" if columns.joint is not None else f"row {row}")
             name = joint if columns.joint is None else cells[columns.joint]
             joints[name] = None
             marked = found.setdefault(place, {}).setdefault(person, {})
@@ -197,10 +231,23 @@ def _read_rows(
         values = np.array(
             [[marked.get(name, [np.nan] * 3) for name in names] for marked in people.values()]
         )
-        confidence = np.where(np.isnan(values[..., 2]), 1.0, values[..., 2])
-        persons = screened(values[..., :2], confidence)
-        frames[place] = list(persons[(persons[..., 2] > 0).any(-1)])
+        frames[place] = [
+            Person(joints, None if who.startswith("row ") else who)
+            for who, joints in zip(people, screened(values[..., :2], values[..., 2]), strict=True)
+            if (joints[:, 2] > 0).any()
+        ]
     return names, frames
+
+
+def _place(where: str, columns: _Columns, cells: Sequence[str], index: int) -> Key:
+    """The frame of a row: its number, its time, or which row it is."""
+    if columns.frame is None:
+        return index if columns.joint is None else 0
+    cell = cells[columns.frame]
+    if columns.unit is not None:
+        return columns.unit * _number(where, cell)
+    # Of labelled frames the picture's name.
+    return frame_number(where, cell) if re.fullmatch(r"[0-9.-]*", cell) else cell
 
 
 def _number(where: str, cell: str) -> float:

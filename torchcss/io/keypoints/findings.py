@@ -1,0 +1,78 @@
+"""What looks odd about the keypoints of a person, told to the user after every reading.
+
+Nothing here is refused: all of it can be right. Call `findings`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from torchcss.io.keypoints.one_person import size_of
+
+_CONFIDENT = 0.3
+_APART = 0.05
+"""Share of a person's size that two joints must stand apart for their order to say anything."""
+
+
+def findings(
+    joints: Float[np.ndarray, "t j 3"],
+    names: Sequence[str],
+    image_size_wh: tuple[int, int],
+    first_frame: int,
+) -> list[str]:
+    """Lines about joints outside the image, and about sides that look exchanged.
+
+    Args:
+        joints: The person in every frame, pixels and confidence.
+        names: The joints' names.
+        image_size_wh: Size of the video.
+        first_frame: Where tracking starts.
+    """
+    return [*_outside(joints, image_size_wh, first_frame), *_sides(joints, names)]
+
+
+def _outside(joints: np.ndarray, image_size_wh: tuple[int, int], first_frame: int) -> list[str]:
+    confident = joints[..., 2] > _CONFIDENT
+    low, high = -0.5, np.array(image_size_wh) - 0.5
+    outside = confident & ((joints[..., :2] < low) | (joints[..., :2] > high)).any(-1)
+    counts = [(int(o.sum()), int(c.sum())) for o, c in zip(outside, confident, strict=True)]
+    frames = [index for index, (out, _) in enumerate(counts) if out]
+    if not frames:
+        return []
+    index = first_frame if first_frame in frames else frames[0]
+    out, of = counts[index]
+    line = (
+        f"{out} of {of} confident joints of frame {index} lie outside the image, and some in "
+        f"{len(frames)} of {len(joints)} frames"
+    )
+    if outside.sum() > 0.2 * confident.sum():
+        line += "; were the keypoints made from this video, at this size?"
+    return [line]
+
+
+def _sides(joints: np.ndarray, names: Sequence[str]) -> list[str]:
+    """Whether left and right of the parts of a body contradict each other."""
+    sizes = np.array([size_of(person) for person in joints])
+    facing: dict[str, np.ndarray] = {}  # 1 where the left one is on the right, as of who faces us
+    for place in ("shoulder", "hip", "eye"):
+        if not {f"l_{place}", f"r_{place}"} <= set(names):
+            continue
+        left, right = (joints[:, list(names).index(f"{side}_{place}")] for side in "lr")
+        seen = (left[:, 2] > _CONFIDENT) & (right[:, 2] > _CONFIDENT)
+        gap = (left[:, 0] - right[:, 0]) / sizes
+        far = np.abs(gap) > (_APART if place != "eye" else 0.2 * _APART)
+        facing[place] = np.where(seen & far, np.sign(gap), 0.0)
+    lines = []
+    for one, other in (("shoulder", "hip"), ("eye", "shoulder")):
+        if {one, other} <= set(facing):
+            both = facing[one] * facing[other]
+            known, against = int((both != 0).sum()), int((both < 0).sum())
+            if against > 0.5 * known:
+                lines.append(
+                    f"left and right look exchanged: {one}s and {other}s contradict each other in "
+                    f"{against} of {known} frames; check the layout"
+                )
+    return lines

@@ -1,0 +1,172 @@
+"""Which frame of the video everything in a keypoint file belongs to.
+
+Files that only have an order must have an entry for every frame. Others say numbers, times or the
+names of pictures, and may leave out frames in which nobody is seen.
+
+Call `in_order`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple
+
+import numpy as np
+
+from torchcss.errors import KeypointError
+from torchcss.files import shortened
+from torchcss.io.keypoints.people import Key, People, Person
+
+_MOST_FRAMES = 1_000_000
+
+
+class Film(NamedTuple):
+    """What is known of the video.
+
+    Attributes:
+        num_frames: Its number of frames; None: as many as the file has.
+        names: Names of the pictures, if it is a folder of them.
+        rate: Frames per second.
+    """
+
+    num_frames: int | None = None
+    names: Sequence[str] | None = None
+    rate: float | None = None
+
+
+def in_order(path: Path, people: People, film: Film, report: list[str]) -> list[list[Person]]:
+    """The people of every frame of the video; frames that the file leaves out are empty.
+
+    Args:
+        path: The file, for messages.
+        people: What was found in it.
+        film: The video.
+        report: Gets a line for everything that was assumed.
+
+    Raises:
+        KeypointError: If it is not clear which frames the entries are.
+    """
+    frames = people.frames
+    if isinstance(frames, list):
+        return frames
+    if frames and all(isinstance(key, float) for key in frames):
+        places = _by_time(path, [float(key) for key in frames], film, report)
+    elif (by_name := _by_name(frames, film, report)) is not None:
+        places = by_name
+    else:
+        places = _by_number(path, people, list(frames), film, report)
+    if len({place for place in places if place is not None}) < sum(p is not None for p in places):
+        raise KeypointError(
+            f"{path}: two entries of one frame; expected each frame once, numbered or named"
+        )
+    found = {
+        place: frames[key] for place, key in zip(places, frames, strict=True) if place is not None
+    }
+    total = max(max(found, default=-1) + 1, film.num_frames or 0)
+    if total > _MOST_FRAMES:
+        raise KeypointError(f"{path}: {total - 1} is not a frame number; number the frames from 0")
+    if len(found) < total:
+        report.append(f"{len(found)} of {total} frames are in the file, the others have nobody")
+    return [found.get(index, []) for index in range(total)]
+
+
+def plain_name(name: str) -> str:
+    """The name of a picture without folder, suffixes and what programs append to it."""
+    last = PurePosixPath(name.replace("\\", "/")).name.lower()
+    last = re.sub(r"\.(json|txt|predictions)$", "", last)
+    last = re.sub(r"\.(jpe?g|png|bmp|tiff?|webp|pgm|ppm)$", "", last)
+    return re.sub(r"\.(json|predictions)$|_keypoints$|_pose$", "", last)
+
+
+def _by_name(
+    frames: Mapping[Key, object], film: Film, report: list[str]
+) -> list[int | None] | None:
+    """Places of the pictures; None if the video has no such pictures."""
+    names = {plain_name(name): index for index, name in enumerate(film.names or ())}
+    if len(names) < len(film.names or ()):
+        return None
+    places = [names.get(plain_name(key)) if isinstance(key, str) else None for key in frames]
+    known = sum(place is not None for place in places)
+    if not known:
+        return None
+    report.append("frames by the names of the pictures")
+    if known < len(places):
+        report.append(
+            f"{len(places) - known} entries left out, whose pictures are not in the video"
+        )
+    return places
+
+
+def _by_number(
+    path: Path, people: People, keys: Sequence[Key], film: Film, report: list[str]
+) -> list[int]:
+    numbers = [key if isinstance(key, int) else _number(path, str(key)) for key in keys]
+    if people.whole and None in numbers:
+        report.append("frames in the order of the names")
+        return list(range(len(keys)))
+    if None in numbers:
+        raise KeypointError(
+            f"{path}: {shortened(keys[numbers.index(None)])} has no frame number of its own; "
+            "number the images, or give the folder of pictures as the video"
+        )
+    places = [number for number in numbers if number is not None]
+    if min(places, default=0) < 0:
+        raise KeypointError(f"{path}: {min(places)} is not a frame number; number them from 0")
+    first = _first(path, people, places, film.num_frames)
+    report.append(f"frame {first} is the first frame")
+    return [place - first for place in places]
+
+
+def _first(path: Path, people: People, places: Sequence[int], num_frames: int | None) -> int:
+    """Which number the first frame has."""
+    low, high = min(places, default=0), max(places, default=0)
+    if people.first is not None:
+        return min(people.first, low)
+    if people.whole or not places:
+        return low
+    if low == 0 or num_frames is None or high < num_frames:
+        return 0
+    if high == num_frames:
+        return 1
+    if high - low + 1 == num_frames:
+        return low
+    if low > num_frames:
+        raise KeypointError(
+            f"{path}: frames {low} to {high} for a video of {num_frames}: which of them is the "
+            "first is not known; number them from 0, or give the folder of pictures as the video"
+        )
+    return 0
+
+
+def _number(path: Path, text: str) -> int | None:
+    """The last number in a picture's name."""
+    digits = re.findall(r"[0-9]+", plain_name(text))
+    if not digits or len(digits[-1]) > 12 or text.startswith("-"):
+        return None
+    return int(digits[-1])
+
+
+def _by_time(path: Path, times: Sequence[float], film: Film, report: list[str]) -> list[int]:
+    """Places by time; the interval is the video's, or else the shortest one between entries."""
+    order = np.argsort(times)
+    sorted_times = np.array(times)[order]
+    places = np.empty(len(times), int)
+    if len(times) == film.num_frames:
+        places[order] = np.arange(len(times))
+        report.append("as many times as frames: taken in order")
+        return places.tolist()
+    gaps = np.diff(sorted_times)
+    if film.rate is None and not (len(gaps) and gaps.min() > 0):
+        raise KeypointError(f"{path}: times do not rise from entry to entry; number the frames")
+    if film.rate is not None:
+        interval = 1 / film.rate
+    else:
+        interval = float(gaps.sum() / np.round(gaps / gaps.min()).sum())
+    start = 0.0
+    if film.num_frames is not None and sorted_times[-1] > (film.num_frames - 0.5) * interval:
+        start = float(sorted_times[0])
+    places[order] = np.round((sorted_times - start) / interval)
+    report.append(f"frames by their times, one every {interval:.4g} s, the first at {start:.4g} s")
+    return places.tolist()

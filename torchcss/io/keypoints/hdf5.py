@@ -1,0 +1,148 @@
+"""2D joints in HDF5: SLEAP's analysis files, and DeepLabCut's, which are pandas' tables.
+
+Pandas keeps the columns' names as Python objects; they are read without running what they might ask
+for (`torchcss.io.keypoints.h36m`). Needs h5py, the extra `[hdf5]`.
+
+Call `read_hdf5`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchcss.errors import KeypointError, MissingExtraError
+from torchcss.files import one_line, read_bytes
+from torchcss.io.keypoints.h36m import PlainUnpickler
+from torchcss.io.keypoints.people import Key, People, Person, is_there, screened
+
+_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+_MOST_NUMBERS = 2**28
+_KINDS = ("x", "y", "likelihood")
+
+_SLEAP_ADVICE = (
+    "export it from SLEAP as 'Analysis HDF5' or 'Analysis CSV' (sleap-convert --format analysis)"
+)
+_DLC_ADVICE = "save it as CSV (save_as_csv=True, or deeplabcut.analyze_videos_converth5_to_csv)"
+
+
+def read_hdf5(path: Path) -> People:
+    """Read SLEAP's analysis file or DeepLabCut's table.
+
+    Raises:
+        KeypointError: If it is neither, or damaged; the message says what to export.
+        MissingExtraError: If h5py is not installed.
+    """
+    is_sleap = path.suffix.lower() == ".slp" or ".analysis." in path.name.lower()
+    advice = _SLEAP_ADVICE if is_sleap else f"{_DLC_ADVICE}; or {_SLEAP_ADVICE}"
+    if read_bytes(path, KeypointError, 8) != _SIGNATURE:
+        raise KeypointError(f"{path}: not an HDF5 file; {advice}")
+    if path.suffix.lower() == ".slp":
+        raise KeypointError(f"{path}: SLEAP's project or predictions; {advice}")
+    try:
+        h5py: Any = importlib.import_module("h5py")
+    except ImportError as error:
+        raise MissingExtraError(
+            f"{path}: HDF5 is read by h5py; install it: pip install 'torchcss[hdf5]', or {advice}"
+        ) from error
+    try:
+        with h5py.File(path, "r") as file:
+            if "tracks" in file and "node_names" in file:
+                return _read_sleap(path, file)
+            group = next((each for each in file.values() if hasattr(each, "keys")), None)
+            if group is not None and ("table" in group or "block0_values" in group):
+                return _read_pandas(path, group)
+    except KeypointError:
+        raise
+    except Exception as error:  # h5py and pickle raise whatever the damage leads to
+        raise KeypointError(
+            f"{path}: cannot be read as HDF5: {one_line(error)}; {advice}"
+        ) from error
+    raise KeypointError(f"{path}: neither SLEAP's analysis nor DeepLabCut's table; {advice}")
+
+
+def _array(path: Path, dataset: Any) -> np.ndarray:
+    """A dataset's numbers, if they are of a size that a file of joints has."""
+    if dataset.size > _MOST_NUMBERS:
+        raise KeypointError(f"{path}: {dataset.name}: {dataset.size:,} numbers; not joints")
+    return np.asarray(dataset[()])
+
+
+def _texts(path: Path, dataset: Any) -> list[str]:
+    return [
+        each.decode() if isinstance(each, bytes) else str(each)
+        for each in _array(path, dataset).ravel().tolist()
+    ]
+
+
+def _read_sleap(path: Path, file: Any) -> People:
+    """Read `tracks [people, 2, joints, frames]` and its scores."""
+    names = _texts(path, file["node_names"])
+    points = _array(path, file["tracks"]).astype(np.float64)
+    if points.ndim != 4 or points.shape[1:3] != (2, len(names)):
+        raise KeypointError(
+            f"{path}: tracks: expected numbers [tracks, 2, {len(names)}, frames], got "
+            f"{list(points.shape)}"
+        )
+    points = points.transpose(3, 0, 2, 1)
+    scores = None
+    if "point_scores" in file:
+        scores = _array(path, file["point_scores"]).astype(np.float64).transpose(2, 0, 1)
+    tracks = _texts(path, file["track_names"]) if "track_names" in file else []
+    found = screened(points, scores)
+    frames = [
+        [
+            Person(joints, tracks[index] if index < len(tracks) else None)
+            for index, joints in enumerate(people)
+            if (joints[:, 2] > 0).any()
+        ]
+        for people in found
+    ]
+    return People(frames, tuple(names), [f"format: SLEAP's analysis, {len(points[0])} tracks"])
+
+
+def _read_pandas(path: Path, group: Any) -> People:
+    """Read a table whose columns are scorer, maybe individual, body part and kind of number."""
+    if "table" in group:
+        table = _array(path, group["table"])
+        fields = table.dtype.names or ()
+        values = table[next(name for name in fields if name.startswith("values_block"))]
+        columns = _unpickled(group.attrs["non_index_axes"])[0][1]
+        index = table["index"]
+    else:
+        values, index = _array(path, group["block0_values"]), _array(path, group["axis1"])
+        levels = sorted(key for key in group if key.startswith("axis0_level"))
+        columns = zip(
+            *(
+                np.array(_texts(path, group[key]))[
+                    _array(path, group[key.replace("level", "label")])
+                ]
+                for key in levels
+            ),
+            strict=True,
+        )
+    columns = [list(map(str, column)) for column in columns]
+    who = list(dict.fromkeys(column[-3] for column in columns)) if len(columns[0]) > 3 else [""]
+    names = list(dict.fromkeys(column[-2] for column in columns))
+    joints = np.full((len(values), len(who), len(names), 3), np.nan)
+    for number, column in enumerate(columns):
+        if column[-1] in _KINDS:
+            person = who.index(column[-3]) if len(column) > 3 else 0
+            place = names.index(column[-2]), _KINDS.index(column[-1])
+            joints[:, person, place[0], place[1]] = values[:, number]
+    found = screened(joints[..., :2], joints[..., 2])
+    frames: dict[Key, list[Person]] = {
+        int(key): [Person(p, w or None) for p, w in zip(people, who, strict=True) if is_there(p)]
+        for key, people in zip(index.tolist(), found, strict=True)
+    }
+    report = [f"format: DeepLabCut, {len(who)} individual{'s' * (len(who) > 1)}"]
+    return People(frames, tuple(names), report, first=0)
+
+
+def _unpickled(value: Any) -> Any:
+    """A Python object that pandas keeps as an attribute."""
+    return PlainUnpickler(io.BytesIO(bytes(value)), encoding="latin1").load()
