@@ -1,0 +1,76 @@
+"""2D joints that somebody clicked, by name, in one frame or some: our own JSON.
+
+`{"joints": {"l_wrist": [u, v]}}` for one frame, `{"frames": {"0": {...}}}` for some.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchcss.errors import KeypointError
+from torchcss.files import real_numbers, shortened
+from torchcss.io.keypoints.json_people import JOINTS, PEOPLE
+from torchcss.io.keypoints.people import Key, Marked, People, united
+from torchcss.joint_names import JOINT_NAMES, canonical_joint_name
+
+
+def is_clicked(content: Mapping[str, Any]) -> bool:
+    """Whether a file is of our own format: joints by name, of one frame or of some."""
+    if "joints" in content:
+        return True
+    frames = content.get("frames")
+    detected = {*PEOPLE, *JOINTS} - {"joints"}
+    return isinstance(frames, dict) and not any(
+        each.keys() & detected
+        if isinstance(each, dict)
+        else isinstance(each, list) and bool(each) and isinstance(each[0], (dict, list))
+        for each in frames.values()
+    )
+
+
+def read_clicked(path: Path, content: Mapping[str, Any], image_size_wh: tuple[int, int]) -> People:
+    """Read joints by name, for one frame or for some."""
+    size = content.get("image_size_wh")
+    if size is not None and size != list(image_size_wh):
+        raise KeypointError(
+            f"{path}: clicked in images of {shortened(size)} pixels, "
+            f"the video has {list(image_size_wh)}; click in this video"
+        )
+    frames = content.get("frames", {"0": content.get("joints")})
+    if not isinstance(frames, dict) or not frames:
+        raise KeypointError(f"{path}: expected 'frames' to name frames, found {shortened(frames)}")
+    clicked: dict[Key, list[Marked]] = {}
+    for key, joints in frames.items():
+        if not re.fullmatch(r"[0-9]{1,6}", key):
+            raise KeypointError(f"{path}: expected a frame number, found {shortened(key)}")
+        named = _clicked_joints(f"{path}: frame {key}", joints)
+        rows = np.array(list(named.values())).reshape(-1, 3)
+        clicked[int(key)] = [Marked(rows, tuple(named))] if named else []
+    found, names = united(path, clicked)
+    return People(found, names, ["format: clicked joints"], first=0)
+
+
+def _clicked_joints(where: str, joints: object) -> dict[str, list[float]]:
+    """u, v and confidence of the joints of a frame, by name."""
+    if isinstance(joints, dict) and isinstance(joints.get("joints"), dict):
+        joints = joints["joints"]
+    if not isinstance(joints, dict):
+        raise KeypointError(f"{where}: expected joints by name, found {shortened(joints)}")
+    found = {}
+    for name, place in joints.items():
+        values = real_numbers(place, f"{where}: {name}", KeypointError)
+        if values.shape not in ((2,), (3,)):
+            raise KeypointError(
+                f"{where}: {name}: expected [u, v] or [u, v, confidence], found {shortened(place)}"
+            )
+        if canonical_joint_name(name) is None:
+            raise KeypointError(
+                f"{where}: unknown joint {name!r}; the known ones are {', '.join(JOINT_NAMES)}"
+            )
+        found[name] = [*values.tolist(), 1.0][:3]
+    return found

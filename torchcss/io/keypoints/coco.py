@@ -1,0 +1,91 @@
+"""2D joints in COCO's annotations, of COCO itself, CVAT and their like.
+
+`annotations` of images, `images` with names and sizes, `categories` with the joints' names.
+Call `read_coco`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from torchcss.errors import KeypointError
+from torchcss.files import shortened
+from torchcss.io.keypoints.json_people import one_person, said_size
+from torchcss.io.keypoints.people import Key, People, Person, track_of
+from torchcss.io.video import natural_order
+from torchcss.joint_names import canonical_joint_name
+
+
+def read_coco(path: Path, content: Mapping[str, Any]) -> People:
+    """Read annotations, as COCO, CVAT and their like have them."""
+    entries = content["annotations"]
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise KeypointError(f"{path}: expected a list of detections, found {shortened(entries)}")
+    report = ["format: COCO"]
+    names, category = _coco_names(content, entries, report)
+    found: dict[Key, list[Person]] = {}
+    for index, entry in enumerate(entries):
+        where = f"{path}: detection {index}"
+        image = entry.get("image_id")
+        if not isinstance(image, (int, str)) or isinstance(image, bool):
+            raise KeypointError(f"{where}: expected an image_id, found {shortened(image)}")
+        # COCO also annotates things that have no joints, and other skeletons.
+        if "keypoints" in entry and category in (None, entry.get("category_id")):
+            marked = one_person(where, entry["keypoints"], entry)
+            about = entry.get("attributes")
+            track = track_of({**entry, **(about if isinstance(about, dict) else {})}, ("track_id",))
+            people = found.setdefault(image, [])
+            people += [] if marked is None else [Person(marked.joints, track)]
+    values = {value for people in found.values() for p in people for value in p.joints[:, 2]}
+    if 2 in values and values <= {0, 1, 2}:
+        # 0 not labelled, 1 labelled but hidden, 2 seen.
+        for image, people in found.items():
+            found[image] = [p._replace(joints=p.joints * (1.0, 1.0, 0.5)) for p in people]
+        report.append("visibility 0, 1, 2 of the annotations taken as confidence 0, 0.5, 1")
+    if "images" not in content:
+        return People(found, names, report)
+    frames, size = _by_images(path, content["images"], found)
+    return People(frames, names, report, size_wh=size, whole=True)
+
+
+def _coco_names(
+    content: Mapping[str, Any], entries: Sequence[Mapping[str, Any]], report: list[str]
+) -> tuple[tuple[str, ...] | None, Any]:
+    """Names of the joints; of several skeletons that are used the one with most joints of ours."""
+    used = {str(entry.get("category_id")) for entry in entries if entry.get("keypoints")}
+    listed = content.get("categories")
+    skeletons: list[tuple[int, tuple[str, ...], Any]] = []
+    for category in listed if isinstance(listed, list) else ():
+        names = category.get("keypoints") if isinstance(category, dict) else None
+        if isinstance(names, list) and names and all(isinstance(name, str) for name in names):
+            known = sum(canonical_joint_name(name) is not None for name in names)
+            skeletons.append((known, tuple(names), category.get("id")))
+    several = [each for each in skeletons if str(each[2]) in used]
+    if len(several) < 2:
+        return (several or skeletons or [(0, None, None)])[0][1], None
+    chosen = max(several, key=lambda each: each[0])
+    report.append(f"{len(several)} skeletons: the one of category {chosen[2]} is read")
+    return chosen[1], chosen[2]
+
+
+def _by_images(
+    path: Path, images: object, found: Mapping[Key, list[Person]]
+) -> tuple[dict[Key, list[Person]], tuple[float, float] | None]:
+    """People by the names of their pictures, and the size that all of these have."""
+    if not isinstance(images, list) or not all(
+        isinstance(image, dict) and isinstance(image.get("id"), (int, str)) for image in images
+    ):
+        raise KeypointError(f"{path}: expected 'images' to be a list with an id each")
+    identifiers = {image["id"] for image in images}
+    if unknown := [image for image in found if image not in identifiers]:
+        raise KeypointError(f"{path}: detection of image {unknown[0]!r}, which is not in 'images'")
+    ordered = sorted(images, key=lambda each: natural_order(str(each.get("file_name", each["id"]))))
+    frames: dict[Key, list[Person]] = {
+        str(image.get("file_name", image["id"])): found.get(image["id"], []) for image in ordered
+    }
+    sizes = {said_size(image) for image in images}
+    if len(sizes) > 1:
+        raise KeypointError(f"{path}: pictures of several sizes; expected those of one video")
+    return frames, next(iter(sizes), None)

@@ -1,0 +1,211 @@
+"""The people of one frame in JSON, and the joints of each, however they are nested.
+
+*People* are a list, or stand under `people`, `instances`, `predictions`, `annots`, or by their own
+numbers. *Joints* are `x, y, confidence` in a row, pairs or triples, objects with `x` and `y`, lists
+of x, of y and of confidences, or rows by name; their confidences may stand beside them. What is not
+there is null, empty, or zero.
+
+Call `people_of`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from torchcss.errors import KeypointError
+from torchcss.files import shortened
+from torchcss.io.keypoints.people import CONFIDENCE_NAMES, Marked, numbers, screened, track_of
+
+PEOPLE = ("people", "bodies", "instances", "predictions", "annots", "poses", "persons",
+           "detections")  # fmt: skip
+JOINTS = ("pose_keypoints_2d", "pose_keypoints", "keypoints", "pose_landmarks", "landmarks",
+           "landmark", "joints", "pose", "kps")  # fmt: skip
+_SCORES = ("keypoint_scores", "keypoints_scores", "scores", "confidences", "keypoints_conf")
+
+
+def people_of(where: str, value: Any, *, alone: bool = False) -> list[Marked]:
+    """The people of a frame, out of whatever they are wrapped in.
+
+    Args:
+        where: For messages.
+        value: What the file has.
+        alone: It must hold people, and not be empty in words of its own.
+    """
+    if value is None or value == [] or value == {}:
+        return []
+    if isinstance(value, dict):
+        if "shapes" in value:
+            return _labelme(where, value["shapes"])
+        for key in PEOPLE:
+            if key in value:
+                if not isinstance(value[key], (list, dict, type(None))):
+                    raise KeypointError(f"{where}: expected a list {key!r}")
+                return people_of(f"{where}: {key}", value[key])
+        for key in JOINTS:
+            if key not in value:
+                continue
+            inner = value[key]
+            if isinstance(inner, dict) and inner.keys() & {*JOINTS}:
+                return people_of(where, inner)
+            if isinstance(inner, list) and inner and not is_joints(inner) and not _flat(inner):
+                return people_of(f"{where}: {key}", inner)
+            person = one_person(f"{where}: {key}", inner, value)
+            return [] if person is None else [person]
+        if _is_by_name(value):
+            person = one_person(where, value, {})
+            return [] if person is None else [person]
+        if alone or not all(isinstance(each, (list, dict)) for each in value.values()):
+            raise KeypointError(f"{where}: expected keypoints, found {shortened(list(value))}")
+        # By the people's own numbers.
+        everyone = [
+            (key, person)
+            for key, each in value.items()
+            for person in people_of(f"{where}: {key}", each)
+        ]
+        return [person._replace(track=person.track or key) for key, person in everyone]
+    if isinstance(value, list):
+        if is_joints(value) or _flat(value):
+            person = one_person(where, value, {})
+            return [] if person is None else [person]
+        return [
+            person
+            for index, each in enumerate(value)
+            for person in people_of(f"{where}[{index}]", each)
+        ]
+    raise KeypointError(f"{where}: expected people with keypoints, found {shortened(value)}")
+
+
+def _flat(value: list[Any]) -> bool:
+    return isinstance(value[0], (int, float, str))
+
+
+def is_joints(value: list[Any]) -> bool:
+    """Whether a list is one person's joints: short rows of numbers, or objects with x and y."""
+    first = next((each for each in value if each is not None), None)
+    if isinstance(first, dict):
+        return {"x", "y"} <= first.keys() or "position" in first
+    return (
+        isinstance(first, list) and 2 <= len(first) <= 4 and not isinstance(first[0], (list, dict))
+    )
+
+
+def _is_by_name(value: Mapping[str, Any]) -> bool:
+    return all(is_joints([each]) for each in value.values())
+
+
+def one_person(where: str, value: Any, around: Mapping[str, Any]) -> Marked | None:
+    """One person's joints; None for somebody who is not there."""
+    names: list[Any] | None = None
+    if isinstance(value, dict):
+        if isinstance(value.get("x"), list):  # a list of x, of y, of confidences
+            columns = [value["x"], value.get("y")]
+            columns += [value[key] for key in CONFIDENCE_NAMES if key in value][:1]
+            value = [list(row) for row in zip(*map(listed, columns), strict=False)]
+        else:
+            names, value = list(value), list(value.values())
+    if value is None or value == []:
+        return None
+    if not isinstance(value, list):
+        raise KeypointError(f"{where}: expected numbers, found {shortened(value)}")
+    scores = next((around[key] for key in _SCORES if key in around), None)
+    while isinstance(scores, list) and scores and isinstance(scores[0], list):
+        scores = [each[0] if isinstance(each, list) and each else each for each in scores]
+    if _flat(value) or value[0] is None:
+        joints = _in_a_row(where, numbers(value, where), scores)
+    else:
+        rows = [_row(f"{where}: joint {index}", row) for index, row in enumerate(value)]
+        joints = screened(np.array(rows)[:, :2], np.array(rows)[:, 2])
+        if names is None and isinstance(value[0], dict):
+            said = [row.get("name", row.get("part")) for row in value]
+            names = said if all(isinstance(name, str) for name in said) else None
+        joints = _with_scores(where, joints, scores)
+    return Marked(joints, None if names is None else tuple(map(str, names)), track_of(around))
+
+
+def listed(value: object) -> list[Any]:
+    """A list, empty if the value is none."""
+    return value if isinstance(value, list) else []
+
+
+def _in_a_row(where: str, values: np.ndarray, scores: object) -> np.ndarray:
+    """Joints from a row of triples, or of pairs with their confidences beside it."""
+    pairs = isinstance(scores, list) and values.size == 2 * len(scores)
+    if not values.size or values.size % (2 if pairs else 3):
+        raise KeypointError(
+            f"{where}: expected x, y, confidence for every joint in one list, found "
+            f"{values.size} numbers"
+        )
+    if pairs:
+        return _with_scores(where, screened(values.reshape(-1, 2)), scores)
+    return values.reshape(-1, 3)
+
+
+def _with_scores(where: str, joints: np.ndarray, scores: object) -> np.ndarray:
+    if scores is None or np.isnan(joints).any():
+        return joints
+    confidence = numbers(scores, f"{where}: scores")
+    if confidence.shape != joints.shape[:1]:
+        raise KeypointError(
+            f"{where}: {confidence.size} confidences for {len(joints)} joints; expected as many"
+        )
+    return screened(joints[:, :2], confidence)
+
+
+def _row(where: str, row: Any) -> list[float]:
+    """x, y and confidence, NaN where it is not said, of a list or an object."""
+    if row is None:
+        return [np.nan] * 3
+    if isinstance(row, dict):
+        place = row.get("position", row)
+        if not isinstance(place, dict) or not {"x", "y"} <= place.keys():
+            raise KeypointError(f"{where}: expected x, y and visibility, found {shortened(row)}")
+        given = next((row[key] for key in CONFIDENCE_NAMES if row.get(key) is not None), None)
+        row = [place["x"], place["y"], given]
+    elif isinstance(row, list) and len(row) == 4:
+        row = [row[0], row[1], row[3]]  # x, y, z, visibility
+    values = numbers(row, where)
+    if values.shape not in ((2,), (3,)):
+        raise KeypointError(f"{where}: expected x, y[, confidence], found {shortened(row)}")
+    return [*values.tolist(), np.nan][:3]
+
+
+def _labelme(where: str, shapes: object) -> list[Marked]:
+    """People whose joints are labelled as points, by the number of their group."""
+    people: dict[str, dict[str, list[float]]] = {}
+    for index, shape in enumerate(listed(shapes)):
+        if not isinstance(shape, dict) or shape.get("shape_type") != "point":
+            continue
+        place = f"{where}: shape {index}"
+        point = numbers(shape.get("points"), place)
+        if point.shape != (1, 2):
+            raise KeypointError(f"{place}: expected one point, found {shortened(point.tolist())}")
+        group = people.setdefault(str(shape.get("group_id")), {})
+        label = str(shape.get("label"))
+        if label in group:
+            raise KeypointError(f"{place}: {label!r} twice; give people a group_id of their own")
+        group[label] = [*point[0].tolist(), 1.0]
+    return [
+        Marked(np.array(list(joints.values())), tuple(joints), None if key == "None" else key)
+        for key, joints in people.items()
+    ]
+
+
+def said_size(content: object) -> tuple[float, float] | None:
+    """The size of the image that a file names."""
+    if isinstance(content, list) and content:
+        content = content[0]
+    for keys in (
+        ("canvas_width", "canvas_height"),
+        ("imageWidth", "imageHeight"),
+        ("image_width", "image_height"),
+        ("width", "height"),
+    ):
+        if not isinstance(content, dict) or "x" in content:  # of a box
+            return None
+        width, height = (content.get(key) for key in keys)
+        if isinstance(width, int) and isinstance(height, int) and min(width, height) > 0:
+            return float(width), float(height)
+    return None
