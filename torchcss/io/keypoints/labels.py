@@ -17,7 +17,7 @@ from torchcss.io.keypoints.frames import plain_name
 from torchcss.io.keypoints.people import Key, People, Person, screened
 
 _BOX = 5
-_COUNTS = (17, 26, 133, 18, 25, 33)
+_COUNTS = (17, 26, 133)
 
 
 def read_labels(folder: Path, image_size_wh: tuple[int, int]) -> People:

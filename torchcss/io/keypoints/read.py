@@ -2,20 +2,27 @@
 
 | format | recognised by |
 |---|---|
-| OpenPose | a folder of `*_keypoints.json` (or other JSON with `people`), one file per frame |
-| COCO, AlphaPose | JSON: `annotations`, or a list of `{image_id, keypoints, score}` |
-| MediaPipe | JSON, CSV, NPY or NPZ with 33 landmarks, see `torchcss.io.keypoints.mediapipe` |
-| DeepLabCut | CSV with the headings `bodyparts` and `coords`, one animal or several |
-| Human3.6M | VideoPose3D's NPZ with `positions_2d`; `FILE.npz#SUBJECT/ACTION/CAMERA` |
+| OpenPose, DWPose, Pose2Sim | a folder of JSON with `people`, a file per frame; or a list |
+| EasyMocap, labelme | a folder of JSON with `annots` or `shapes` |
+| YOLO | a folder of text labels; JSON of Ultralytics |
+| COCO, CVAT, AlphaPose | JSON: `annotations`, a list of `{image_id, keypoints}`, or by picture |
+| MMPose, openpifpaf, easy_ViTPose, TensorFlow.js | JSON, see `torchcss.io.keypoints.json_files` |
+| MediaPipe | 33 landmarks as JSON, CSV, NPY or NPZ |
+| DeepLabCut, Lightning Pose | CSV with the headings `bodyparts` and `coords`; HDF5 |
+| SLEAP | its analysis as CSV or HDF5 |
+| VideoPose3D, HumanEva | NPZ with `positions_2d`, `FILE.npz#SUBJECT/ACTION/CAMERA`; detections |
 | CSV | any with columns such as `l_hip_x`, `l_hip_y`, see `torchcss.io.keypoints.tables` |
-| NPZ | arrays `keypoints [T J 2]`, `confidence [T J]`, `joint_names [J]` |
+| NPZ, NPY | `keypoints [T J 2]`, `confidence [T J]`, `joint_names [J]`; pairs or triples |
 | clicked | JSON: `{"joints": {"l_wrist": [u, v]}}` for one frame, or `{"frames": {"0": {...}}}` |
+
+Frame numbers, times and names of pictures are used where a file has them; a file that only has an
+order must have as many entries as the video has frames.
 
 Files that name their joints are read by name; the others by layout, which their number of joints
 tells (25 is BODY_25 or BODY_25B: the places of the points decide). Out come the catalogue's names
 (`torchcss.joint_names`); a joint that has none keeps its own. A missing joint has confidence 0 and
-stands at (0, 0). Of several people, one is followed by continuity. Every such choice is a line of
-`Keypoints.report`, to be shown to the user.
+stands at (0, 0). Of several people, one is followed, by the file's own tracks where it has them.
+Every such choice, and whatever looks odd, is a line of `Keypoints.report`.
 
 By default: `read_keypoints(path, image_size_wh=(w, h), num_frames=t)`.
 """

@@ -1,0 +1,491 @@
+"""Keypoints as other programs write them, made here: orders, units, gaps, several people."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from torchcss.errors import KeypointError
+from torchcss.io.keypoints.read import read_keypoints
+from torchcss.joint_names import ALIASES
+from torchcss.types import Keypoints
+
+SIZE = (640, 480)
+FRAMES = 6
+COCO = ALIASES["COCO-17"]
+OPENPOSE = ALIASES["COCO-18"]
+LIMBS = ("l_wrist", "r_wrist", "l_hip", "r_ankle", "nose")
+PLACES = {
+    "nose": (320, 100), "l_eye": (326, 94), "r_eye": (314, 94), "l_ear": (334, 97),
+    "r_ear": (306, 97), "l_shoulder": (355, 150), "r_shoulder": (285, 150), "l_elbow": (375, 205),
+    "r_elbow": (262, 208), "l_wrist": (388, 255), "r_wrist": (250, 262), "l_hip": (340, 270),
+    "r_hip": (300, 270), "l_knee": (345, 345), "r_knee": (296, 347), "l_ankle": (348, 420),
+    "r_ankle": (293, 424), "vt1": (320, 150), "HumanoidRoot": (320, 270),
+}  # fmt: skip
+
+
+def person(t: int, names: tuple[str | None, ...] = COCO, shift: float = 0.0) -> np.ndarray:
+    """u, v, confidence of every joint in frame t."""
+    rows = [PLACES.get(name or "", (330, 300)) for name in names]
+    confidence = 0.6 + 0.02 * (np.arange(len(names)) % 15)
+    return np.column_stack([np.array(rows, float) + np.array([3 * t + shift, t]), confidence])
+
+
+def flat(t: int, names: tuple[str | None, ...] = COCO) -> list[float]:
+    return person(t, names).ravel().tolist()
+
+
+def other(t: int) -> np.ndarray:
+    """Somebody smaller and less certain who stands to the left."""
+    return person(t) * (0.5, 0.5, 0.6) + (40 - 3 * t, 60, 0)
+
+
+def write(path: Path, content: Any) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return path
+
+
+def read(path: Path | str, **more: Any) -> Keypoints:
+    return read_keypoints(path, **{"image_size_wh": SIZE, "num_frames": FRAMES, **more})
+
+
+def check(found: Keypoints, empty: tuple[int, ...] = (), names: tuple[str, ...] = LIMBS) -> None:
+    assert len(found.positions) == FRAMES
+    for t in range(FRAMES):
+        for name in names:
+            joint = found.names.index(name)
+            if t in empty:
+                assert found.confidence[t, joint] == 0
+                continue
+            u, v = PLACES[name]
+            np.testing.assert_allclose(found.positions[t, joint], (u + 3 * t, v + t), atol=0.6)
+            assert found.confidence[t, joint] > 0
+    assert all("\n" not in line for line in found.report)
+    assert not any("exchanged" in line for line in found.report)
+
+
+# JSON.
+
+
+def mmpose(t: int, of: np.ndarray, **more: Any) -> dict[str, Any]:
+    return {"keypoints": of[:, :2].tolist(), "keypoint_scores": of[:, 2].tolist(),
+            "bbox": [[0, 0, 9, 9]], "bbox_score": 0.9, **more}  # fmt: skip
+
+
+def points(of: np.ndarray, **more: Any) -> dict[str, Any]:
+    """TensorFlow.js: joints as objects."""
+    rows = [{"x": x, "y": y, "score": c, "name": n} for (x, y, c), n in zip(of, TFJS, strict=True)]
+    return {"keypoints": rows, "score": 0.8, **more}
+
+
+def columns(of: np.ndarray, **more: Any) -> dict[str, Any]:
+    """Ultralytics: lists of x, of y, of confidences."""
+    x, y, c = of.T.tolist()
+    return {"name": "person", "class": 0, "confidence": 0.9, "box": {"x1": 0, "y1": 0},
+            "keypoints": {"x": x, "y": y, "visible": c}, **more}  # fmt: skip
+
+
+TFJS = tuple((name or "").replace("l_", "left_").replace("r_", "right_") for name in COCO)
+T = range(FRAMES)
+SEEN = [t for t in T if t != 3]
+
+JSON_FILES: dict[str, tuple[Any, tuple[int, ...]]] = {
+    "mmpose inferencer": (
+        [{"frame_id": t, "instances": [mmpose(t, person(t))] if t != 3 else []} for t in T],
+        (3,),
+    ),
+    "mmpose demo counts from 1": (
+        {
+            "meta_info": {"keypoint_id2name": {str(i): n for i, n in enumerate(TFJS)}},
+            "instance_info": [
+                {"frame_id": t + 1, "instances": [mmpose(t, other(t)), mmpose(t, person(t))]}
+                for t in T
+            ],
+        },
+        (),
+    ),
+    "mmpose tracks": (
+        [
+            {"frame_id": t, "instances": [mmpose(t, other(t), track_id=4),
+                                          mmpose(t, person(t), track_id=9)][:: 1 - 2 * (t % 2)]}
+            for t in T
+        ],
+        (),
+    ),
+    "alphapose open": (
+        {f"{t}.jpg": {"version": 0.1, "people": [{"pose_keypoints_2d": flat(t, OPENPOSE)}]}
+         for t in SEEN},
+        (3,),
+    ),
+    "alphapose cmu": (
+        {f"{t}.jpg": {"version": "AlphaPose v0.3", "bodies": [{"joints": flat(t, OPENPOSE)}]}
+         for t in T},
+        (),
+    ),
+    "alphapose list of ids": (
+        [{"image_id": f"{t}.jpg", "keypoints": flat(t), "score": 2, "idx": [1.0]} for t in SEEN],
+        (3,),
+    ),
+    "openpifpaf": (
+        "".join(
+            json.dumps({"frame": t + 1, "predictions": [{"keypoints": flat(t), "id_": 1}]}) + "\r\n"
+            for t in SEEN
+        ),
+        (3,),
+    ),
+    "tfjs one pose a frame": ([points(person(t)) for t in T], ()),
+    "tfjs lists of poses": (
+        [[points(other(t), id=2), points(person(t), id=1)] if t != 3 else [] for t in T],
+        (3,),
+    ),
+    "posenet": (
+        [
+            {"score": 0.9, "keypoints": [
+                {"part": n.replace("_", " ").title().replace(" ", ""), "score": c,
+                 "position": {"x": x, "y": y}} for (x, y, c), n in zip(person(t), TFJS, strict=True)
+            ]}
+            for t in T
+        ],
+        (),
+    ),
+    "ultralytics": ([[columns(other(t)), columns(person(t))] for t in T], ()),
+    "ultralytics with tracks": (
+        [[columns(person(t), track_id=2)] if t != 3 else [] for t in T],
+        (3,),
+    ),
+    "vitpose": (
+        {
+            "keypoints": [
+                {"0": other(t)[:, [1, 0, 2]].tolist(), "1": person(t)[:, [1, 0, 2]].tolist()}
+                for t in T
+            ],
+            "skeleton": {str(i): name for i, name in enumerate(TFJS)},
+        },
+        (),
+    ),
+    "dwpose frames in a list": (
+        [
+            {"people": [{"pose_keypoints_2d": flat(t, OPENPOSE) if t != 3 else None}],
+             "canvas_width": 640, "canvas_height": 480}
+            for t in T
+        ],
+        (3,),
+    ),
+    "dwpose at half the size": (
+        [
+            {"people": [{"keypoints": (person(t, OPENPOSE) * (0.5, 0.5, 1)).tolist()}],
+             "canvas_width": 320, "canvas_height": 240}
+            for t in T
+        ],
+        (),
+    ),
+    "joints by name": (
+        {f"frame_{t:03d}": dict(zip(TFJS, person(t).tolist(), strict=True)) for t in T},
+        (),
+    ),
+    "times in seconds": (
+        [{"time": t / 25, "keypoints": person(t).tolist()} for t in SEEN],
+        (3,),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", JSON_FILES)
+def test_json(tmp_path: Path, kind: str) -> None:
+    content, empty = JSON_FILES[kind]
+    check(read(write(tmp_path / "a.json", content)), empty)
+
+
+FOLDERS: dict[str, Callable[[int], tuple[str, Any]]] = {
+    "openpose of old": lambda t: (
+        f"v_{t:012d}_keypoints.json",
+        {"version": 0.2, "people": [{"pose_keypoints": flat(t, OPENPOSE)}]},
+    ),
+    "openpifpaf": lambda t: (f"{t:03d}.jpg.predictions.json", [{"keypoints": flat(t), "bbox": []}]),
+    "mmpose": lambda t: (f"{t:03d}.json", [mmpose(t, person(t)), mmpose(t, other(t))]),
+    "easymocap": lambda t: (
+        f"cam1/{t:06d}.json",
+        {"filename": f"{t:06d}.jpg", "height": 480, "width": 640,
+         "annots": [{"personID": 1, "keypoints": other(t).tolist()},
+                    {"personID": 0, "keypoints": person(t).tolist()}]},
+    ),
+    "labelme": lambda t: (
+        f"p{t}.json",
+        {"imagePath": f"p{t}.png", "imageWidth": 640, "imageHeight": 480, "shapes": [
+            {"label": n, "points": [[x, y]], "shape_type": "point", "group_id": None}
+            for (x, y, _), n in zip(person(t), TFJS, strict=True)
+        ] + [{"label": "person", "points": [[0, 0], [9, 9]], "shape_type": "rectangle"}]},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", FOLDERS)
+def test_folders(tmp_path: Path, kind: str) -> None:
+    for t in SEEN:
+        name, content = FOLDERS[kind](t)
+        write(tmp_path / name, content)
+    found = read(tmp_path)
+    check(found, (3,))
+    assert any("5 of 6 frames" in line for line in found.report)
+
+
+def test_a_folder_with_folders_of_several_cameras(tmp_path: Path) -> None:
+    for camera in ("a", "b"):
+        write(tmp_path / camera / "0.json", {"people": []})
+    with pytest.raises(KeypointError, match="give one of 'a, b'"):
+        read(tmp_path)
+
+
+def test_pictures_by_name(tmp_path: Path) -> None:
+    names = [f"img_{t + 100}.jpg" for t in T]
+    entries = [{"image_id": f"in/IMG_{t + 100}.png", "keypoints": flat(t)} for t in (1, 2, 4)]
+    path = write(tmp_path / "a.json", entries)
+    found = read(path, frame_names=names, first_frame=1)
+    check(found, (0, 3, 5))
+    assert any("3 of 6 frames" in line for line in found.report)
+    with pytest.raises(KeypointError, match="give the folder of pictures as the video"):
+        read(path)
+
+
+def test_openpose_people_who_keep_their_place(tmp_path: Path) -> None:
+    nobody = np.full((17, 3), np.nan)
+    for t in T:
+        people = [nobody if t == 4 else person(t), nobody if t < 3 else person(t, shift=-150)]
+        content = {"people": [{"person_id": [-1], "pose_keypoints_2d": p.ravel().tolist()}
+                              for p in people]}  # fmt: skip
+        write(tmp_path / f"{t}.json", content)
+    check(read(tmp_path), (4,))
+
+
+def test_coco_with_two_skeletons(tmp_path: Path) -> None:
+    hand = {"id": 2, "keypoints": ["thumb", "index", "palm"]}
+    body = {"id": 7, "keypoints": list(TFJS)}
+    content = {
+        "categories": [hand, body],
+        "images": [{"id": t, "file_name": f"f{t}.png", "width": 320, "height": 240} for t in T],
+        "annotations": [
+            {"image_id": t, "category_id": 7, "attributes": {"track_id": 1},
+             "keypoints": (person(t) * (0.5, 0.5, 0) + (0, 0, 2)).ravel().tolist()} for t in SEEN
+        ] + [{"image_id": 0, "category_id": 2, "keypoints": [1, 1, 2] * 3},
+             {"image_id": 3, "category_id": 7, "keypoints": []}],
+    }  # fmt: skip
+    path = write(tmp_path / "a.json", content)
+    found = read(path)
+    check(found, (3,))
+    assert any("2 skeletons" in line for line in found.report)
+    assert any("scaled from images of 320 x 240" in line for line in found.report)
+    with pytest.raises(KeypointError, match="320 x 240 pixels, the video has 640 x 640"):
+        read(path, image_size_wh=(640, 640))
+
+
+@pytest.mark.parametrize("more", ["", " 0.91", " 0.91 3"])
+@pytest.mark.parametrize("size", [2, 3])
+def test_yolo_labels(tmp_path: Path, more: str, size: int) -> None:
+    for t in SEEN:
+        lines = []
+        for p, track in ((other(t), "8"), (person(t), "3")):
+            values = (p / (*SIZE, 1))[:, :size]
+            words = ["0 .5 .5 .2 .8", *(f"{value:.6f}" for value in values.flat)]
+            lines.append(" ".join(words) + more.replace("3", track))
+        write(tmp_path / f"clip_{t + 1}.txt", "\n".join(lines) + "\n")
+    check(read(tmp_path), (3,))
+
+
+# Arrays.
+
+
+@pytest.mark.parametrize("form", ["triples", "pairs", "row", "people", "scores", "movenet"])
+def test_arrays(tmp_path: Path, form: str) -> None:
+    frames = np.stack([person(t) for t in T])
+    path = tmp_path / "a.npy"
+    if form == "scores":
+        path = tmp_path / "a.npz"
+        np.savez(path, keypoints=frames[:, None, :, :2], scores=frames[:, None, :, 2])
+    elif form == "movenet":
+        np.save(path, (frames / (*SIZE, 1))[:, None, None][..., [1, 0, 2]].astype(np.float32))
+    else:
+        np.save(path, {
+            "triples": frames, "pairs": frames[..., :2], "row": frames.reshape(FRAMES, -1),
+            "people": np.stack([np.stack([other(t), person(t)]) for t in T]),
+        }[form])  # fmt: skip
+    found = read(path)
+    check(found)
+    expected = 1.0 if form == "pairs" else 0.6
+    np.testing.assert_allclose(found.confidence[0, 0], expected, atol=1e-6)
+    if form == "triples":
+        np.save(path, frames[0])
+        assert len(read(path, num_frames=1).positions) == 1
+
+
+def test_detections_of_videopose3d(tmp_path: Path) -> None:
+    def found(p: np.ndarray) -> np.ndarray:
+        logit = np.zeros(17)
+        return np.stack([p[:, 0], p[:, 1], logit, p[:, 2]])
+
+    keypoints = np.empty((FRAMES, 2), object)
+    boxes = np.empty((FRAMES, 2), object)
+    for t in T:
+        people = [found(other(t)), found(person(t))] if t != 3 else []
+        keypoints[t, 0] = boxes[t, 0] = []
+        keypoints[t, 1], boxes[t, 1] = np.array(people), np.zeros((len(people), 5))
+    metadata = np.array({"w": 640, "h": 480}, dtype=object)
+    np.savez(tmp_path / "clip.mp4.npz", boxes=boxes, keypoints=keypoints, metadata=metadata)
+    check(read(tmp_path / "clip.mp4.npz"), (3,))
+
+
+# Tables.
+
+
+def table(names: tuple[str, ...], ends: tuple[str, str, str], rows: list[list[Any]]) -> str:
+    heading = [name + end for name in names for end in ends]
+    return "\r\n".join(",".join(map(str, row)) for row in [heading, *rows]) + "\r\n"
+
+
+@pytest.mark.parametrize("end", ["_c", "_score", ".likelihood", "_prob", "_confidence", "_vis"])
+def test_confidence_columns(tmp_path: Path, end: str) -> None:
+    marks = np.stack([person(t) for t in T])
+    marks[2:4, 9] = 0.0
+    text = table(TFJS, ("_x", "_y", end), [frame.ravel().tolist() for frame in marks])
+    path = tmp_path / "a.csv"
+    path.write_text(text, encoding="utf-8-sig", newline="")
+    found = read(path)
+    check(found, names=("r_wrist", "nose"))
+    wrist = found.names.index("l_wrist")
+    assert found.confidence[:, wrist].bool().tolist() == [True, True, False, False, True, True]
+    assert any(f"nose{end}" in line for line in found.report)
+
+
+def test_no_confidence_and_zero_is_missing(tmp_path: Path) -> None:
+    marks = np.stack([person(t)[:, :2] for t in T])
+    marks[1, 9] = 0.0
+    heading = ",".join(f"{name}_{axis}" for name in TFJS for axis in "xy")
+    rows = [",".join(map(str, frame.ravel())) for frame in marks]
+    found = read(write(tmp_path / "a.csv", "\n".join([heading, *rows])))
+    assert found.confidence[:, 9].tolist() == [1, 0, 1, 1, 1, 1]
+
+
+def test_sleap_csv_of_two_tracks(tmp_path: Path) -> None:
+    heading = [f"{name}.{end}" for name in TFJS for end in ("x", "y", "score")]
+    lines = [",".join(["track", "frame_idx", "instance.score", *heading])]
+    for t in SEEN:
+        for track, p in (("track_1", other(t)), ("track_0", person(t))):
+            lines.append(",".join([track, str(t), "0.9", *(f"{v}" for v in p.flat)]))
+    check(read(write(tmp_path / "a.analysis.csv", "\n".join(lines))), (3,))
+
+
+def test_deeplabcut_with_columns_of_a_smoother(tmp_path: Path) -> None:
+    kinds = ("x", "y", "likelihood", "x_ens_median", "y_posterior_var")
+    head = [
+        [title, *cells]
+        for title, cells in (
+            ("scorer", ["net"] * 85),
+            ("bodyparts", [name for name in TFJS for _ in kinds]),
+            ("coords", list(kinds) * 17),
+        )
+    ]
+    body = [[str(t), *(f"{v}" for row in person(t) for v in (*row, 7, 8))] for t in T]
+    text = "\n".join(",".join(row) for row in [*head, *body])
+    found = read(write(tmp_path / "eks.csv", text))
+    check(found)
+    assert any("x_ens_median" in line for line in found.report)
+
+
+# HDF5.
+
+
+def test_sleap_hdf5(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    people = np.stack([np.stack([other(t), person(t)]) for t in T])
+    people[3] = np.nan
+    with h5py.File(tmp_path / "a.analysis.h5", "w") as file:
+        file["tracks"] = people[..., :2].transpose(1, 3, 2, 0)
+        file["point_scores"] = people[..., 2].transpose(1, 2, 0)
+        file["node_names"] = np.array(TFJS, "S")
+        file["track_names"] = np.array(["one", "two"], "S")
+    check(read(tmp_path / "a.analysis.h5"), (3,))
+
+
+@pytest.mark.parametrize("form", ["table", "fixed"])
+@pytest.mark.parametrize("animals", [("",), ("one", "two")])
+def test_deeplabcut_hdf5(tmp_path: Path, form: str, animals: tuple[str, ...]) -> None:
+    """As pandas keeps a table: its columns are pickled, or stand in levels."""
+    h5py = pytest.importorskip("h5py")
+    import pickle
+
+    columns = [
+        ("net", *((animal,) if animal else ()), name, kind)
+        for animal in animals for name in TFJS for kind in ("x", "y", "likelihood")
+    ]  # fmt: skip
+    people = [(other, person) if len(animals) > 1 else (person,)] * FRAMES
+    values = np.stack([np.concatenate([of(t).ravel() for of in people[t]]) for t in T])
+    with h5py.File(tmp_path / "clipDLC.h5", "w") as file:
+        group = file.create_group("df_with_missing")
+        if form == "table":
+            rows = np.zeros(FRAMES, [("index", "i8"), ("values_block_0", "f8", values.shape[1])])
+            rows["index"], rows["values_block_0"] = np.arange(FRAMES), values
+            group["table"] = rows
+            group.attrs["non_index_axes"] = np.bytes_(pickle.dumps([(1, columns)], protocol=0))
+        else:
+            group["block0_values"], group["axis1"] = values, np.arange(FRAMES)
+            for level, names in enumerate(zip(*columns, strict=True)):
+                known = sorted(set(names))
+                group[f"axis0_level{level}"] = np.array(known, "S")
+                group[f"axis0_label{level}"] = np.array([known.index(name) for name in names], "i1")
+    check(read(tmp_path / "clipDLC.h5"))
+
+
+def test_hdf5_that_would_run_something(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    h5py = pytest.importorskip("h5py")
+    monkeypatch.chdir(tmp_path)
+    with h5py.File("a.h5", "w") as file:
+        group = file.create_group("df")
+        group["table"] = np.zeros(1, [("index", "i8"), ("values_block_0", "f8", 3)])
+        group.attrs["non_index_axes"] = np.bytes_(b"cos\nsystem\n(S'touch ran'\ntR.")
+    with pytest.raises(KeypointError, match=r"asks for .*system"):
+        read(tmp_path / "a.h5")
+    assert not (tmp_path / "ran").exists()
+
+
+def test_hdf5_without_h5py(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import sys
+
+    from torchcss.errors import MissingExtraError
+
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    (tmp_path / "a.analysis.h5").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(64))
+    with pytest.raises(MissingExtraError, match=r"torchcss\[hdf5\].*Analysis CSV"):
+        read(tmp_path / "a.analysis.h5")
+
+
+# What is told.
+
+
+def test_findings(tmp_path: Path) -> None:
+    frames = np.stack([person(t) for t in T])
+    frames[..., 0] += 300
+    np.save(tmp_path / "a.npy", frames)
+    found = read(tmp_path / "a.npy")
+    assert any("of 17 confident joints of frame 0 lie outside" in line for line in found.report)
+    frames = np.stack([person(t) for t in T])
+    frames[:, [11, 12]] = frames[:, [12, 11]]
+    np.save(tmp_path / "b.npy", frames)
+    found = read(tmp_path / "b.npy")
+    assert any("left and right look exchanged: shoulders and hips" in line for line in found.report)
+
+
+def test_tracks_of_the_file_win_over_nearness(tmp_path: Path) -> None:
+    entries = []
+    for t in T:
+        right, left = person(t, shift=-200 + 80 * t), person(t, shift=200 - 80 * t) * (1, 1, 0.6)
+        entries += [{"image_id": t, "keypoints": p.ravel().tolist(), "idx": i}
+                    for i, p in ((3, left), (7, right))]  # fmt: skip
+    found = read(write(tmp_path / "a.json", entries))
+    u = found.positions[:, 0, 0]
+    np.testing.assert_allclose(u, [120 + 83 * t for t in T])
+    assert any("'7' of the file" in line for line in found.report)
