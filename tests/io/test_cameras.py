@@ -192,7 +192,7 @@ def test_image_size() -> None:
         ({"image_size_wh": [640.5, 480]}, "whole"),
         ({"image_size_wh": [0, 480]}, "."),
         ({"image_size_wh": [float("inf"), 480]}, "image size"),
-        ({"distortion": [0.0] * 8}, "distortion"),
+        ({"distortion": [0.1] * 8}, "distortion of 8"),
         ({"distortion": [float("nan")] * 5}, "distortion"),
         ({"R": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "."),
         ({"R": [[2, 0, 0], [0, 1, 0], [0, 0, 1]]}, "."),

@@ -345,12 +345,6 @@ NOT_YET: dict[str, str] = {
     "body_urdf_floating": "refused",
     "body_urdf_mimic_missing": "refused",
     "body_urdf_prefix": "refused",
-    "cam_anipose_mm": "silently wrong",
-    "cam_caliscope": "refused",
-    "cam_colmap": "refused",
-    "cam_easymocap_01": "refused",
-    "cam_opencv_yml": "refused",
-    "cam_ros_yaml": "refused",
 }
 """Cases that fail, and how."""
 

@@ -25,10 +25,12 @@ class Track:
     video: Annotated[Path, tyro.conf.Positional]
     """A video in any container, or a folder of images."""
     camera: Path
-    """Calibration: cameras.json, a Pose2Sim .toml, or EasyMocap's intri.yml."""
+    """Calibration: cameras.json, or the file of Pose2Sim, Anipose, Caliscope, EasyMocap, OpenCV,
+    ROS, Kalibr, COLMAP or MATLAB."""
     keypoints: Path
-    """2D joints: OpenPose folder, COCO, AlphaPose, MediaPipe or clicked joints as JSON, CSV (also
-    DeepLabCut's), NPZ (also VideoPose3D's: FILE.npz#SUBJECT/ACTION/CAMERA)."""
+    """2D joints: what a detector or an annotation tool writes, as a folder (OpenPose, YOLO,
+    EasyMocap), JSON, CSV, HDF5 or arrays, or clicked; of an archive of several recordings
+    FILE.npz#SUBJECT/ACTION/CAMERA."""
     out: Path = Path("out/track")
     """Output folder."""
     start: int = 0

@@ -1,11 +1,9 @@
-"""Cameras from calibration files: `cameras.json`, Pose2Sim's `Calib.toml`, EasyMocap's pair.
+"""Cameras from calibration files: our own `cameras.json` and those of `torchcss.io.calibrations`.
 
 `cameras.json` holds `{"units": "metre, pixel", "cameras": {name: {...}}}`; each camera has `K`
 (3 x 3, pixels), `image_size_wh`, optionally `distortion` (k1 k2 p1 p2 k3), the world-to-camera `R`
-and `t`, and `video`, the name of the file that it took. Pose2Sim's file has one table per camera
-with `name`, `size`, `matrix`, `distortions`, `rotation` (Rodrigues vector) and `translation` in
-metres. EasyMocap's `intri.yml` and `extri.yml` often lack the image size,
-which is then the video's.
+and `t`, and `video`, the name of the file that it took. Where a file lacks the image size, it is
+the video's.
 
 Units are metres inside (decision "units"). Where the extrinsics are in another unit, or absent,
 the camera is used in its own frame, x right, y down, z forward: one view needs no more than the
@@ -19,17 +17,16 @@ from __future__ import annotations
 
 import os
 import re
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import yaml
 
 from torchcss.body.rotations import from_axis_angle
 from torchcss.errors import CameraError
-from torchcss.files import load_json, one_line, read_text, real_numbers, shortened
+from torchcss.files import real_numbers, shortened
+from torchcss.io.calibrations import Entry, read_entries
 from torchcss.io.video import VideoReader
 from torchcss.vision.camera import Camera
 
@@ -42,7 +39,7 @@ class LoadedCamera(NamedTuple):
     Attributes:
         camera: The camera; in its own frame unless `metric`.
         metric: Whether the world frame is the file's, in metres.
-        units_note: Why the camera is in its own frame, for the user; None if `metric`.
+        units_note: Why the camera is in its own frame, or which unit was assumed, for the user.
         video: Name of the video file that the camera took, where the calibration says it.
     """
 
@@ -50,20 +47,6 @@ class LoadedCamera(NamedTuple):
     metric: bool
     units_note: str | None
     video: str | None
-
-
-class _Entry(NamedTuple):
-    """One camera of a file, whatever the format; `None` for what the file does not have."""
-
-    K: Any
-    image_size_wh: Any
-    distortion: Any
-    rotation: Any
-    translation: Any
-    units: Any = "metre"
-    video: Any = None
-    fisheye: Any = False
-    from_easymocap: bool = False
 
 
 def read_camera(
@@ -78,7 +61,7 @@ def read_camera(
 
 def read_cameras(path: str | os.PathLike[str]) -> dict[str, Camera]:
     """Read all cameras of a calibration file, by name; see `load_camera`."""
-    return {name: load_camera(path, name).camera for name in _read_entries(Path(path))}
+    return {name: load_camera(path, name).camera for name in read_entries(Path(path))}
 
 
 def load_camera(
@@ -90,8 +73,8 @@ def load_camera(
     """Read one camera of a calibration file, and what the file says about it.
 
     Args:
-        path: A `.json` or Pose2Sim `.toml` file, EasyMocap's `intri.yml` or the folder that it is
-            in.
+        path: A file of any of the formats, or the folder of EasyMocap's `intri.yml` or COLMAP's
+            `cameras.txt`.
         name: Which camera. None: the one of `video`, or the only one.
         video: The video to be tracked; the camera whose `video`, or else whose name, is the name of
             this file is taken.
@@ -103,7 +86,7 @@ def load_camera(
         CameraError: If the file is missing or malformed, or which camera is meant is not clear.
     """
     path = Path(path)
-    entries = _read_entries(path)
+    entries = read_entries(path)
     name = _choose(path, entries, name, None if video is None else Path(video))
     entry, where = entries[name], f"{path}: camera {name!r}"
     if entry.fisheye:
@@ -111,9 +94,7 @@ def load_camera(
             f"{where}: a fisheye lens is not supported; undistort the video first and give the "
             "camera of the undistorted images"
         )
-    if entry.image_size_wh is None and entry.from_easymocap:
-        if video is None:
-            raise CameraError(f"{where}: EasyMocap does not say the image size; give the video")
+    if entry.image_size_wh is None and video is not None and Path(video).exists():
         info = VideoReader(video).info
         entry = entry._replace(image_size_wh=[info.width, info.height])
     camera = _make_camera(entry, name, path)
@@ -121,10 +102,10 @@ def load_camera(
     video_name = entry.video if isinstance(entry.video, str) else None
     if note is not None:
         camera = camera.in_own_frame()
-    return LoadedCamera(camera, note is None, note, video_name)
+    return LoadedCamera(camera, note is None, note or entry.note, video_name)
 
 
-def _make_camera(entry: _Entry, name: str, path: Path) -> Camera:
+def _make_camera(entry: Entry, name: str, path: Path) -> Camera:
     """The camera of an entry, in the file's world, after its numbers are checked."""
     where = f"{path}: camera {name!r}"
     given = {
@@ -134,9 +115,12 @@ def _make_camera(entry: _Entry, name: str, path: Path) -> Camera:
         "rotation": entry.rotation,
         "translation": entry.translation,
     }
-    for key, value in (("K (matrix)", entry.K), ("image_size_wh (size)", entry.image_size_wh)):
-        if value is None:
-            raise CameraError(f"{where}: {key} is missing")
+    if entry.K is None:
+        raise CameraError(f"{where}: K (matrix) is missing")
+    if entry.image_size_wh is None:
+        raise CameraError(
+            f"{where}: the file does not say the image size; give the video, or image_size_wh"
+        )
     intrinsics, size, distortion, rotation, translation = (
         None if value is None else real_numbers(value, f"{where}: {key}", CameraError)
         for key, value in given.items()
@@ -154,13 +138,31 @@ def _make_camera(entry: _Entry, name: str, path: Path) -> Camera:
         return Camera(
             intrinsics,
             (int(size[0]), int(size[1])),
-            distortion=distortion,
+            distortion=None if distortion is None else _five(distortion, where),
             R_camera_world=rotation,
             t_camera_world=translation,
             name=name,
         )
     except CameraError as error:
         raise CameraError(f"{path}: camera {error}") from error
+
+
+def _five(distortion: np.ndarray, where: str) -> np.ndarray:
+    """Coefficients in the number that a camera takes; OpenCV's others must be zero.
+
+    Raises:
+        CameraError: If they are not.
+    """
+    if distortion.ndim == 1 and len(distortion) < 4:  # k1, k2 of simpler models
+        if len(distortion) == 3:
+            raise CameraError(f"{where}: distortion: expected k1 k2 p1 p2 [k3], found 3 numbers")
+        return np.concatenate([distortion, np.zeros(4 - len(distortion))])
+    if distortion.ndim == 1 and (distortion[5:] != 0).any():
+        raise CameraError(
+            f"{where}: distortion of {len(distortion)} coefficients (OpenCV's rational model) is "
+            "not supported; calibrate with five, or undistort the video first"
+        )
+    return distortion[:5]
 
 
 def camera_entry(camera: Camera) -> dict[str, Any]:
@@ -224,7 +226,7 @@ def check_image_size(camera: Camera, width: int, height: int) -> None:
     )
 
 
-def _own_frame_note(name: str, entry: _Entry) -> str | None:
+def _own_frame_note(name: str, entry: Entry) -> str | None:
     """Say why the file's world frame cannot be used, or None if it can."""
     if entry.rotation is None or entry.translation is None:
         why = "has no extrinsics"
@@ -238,12 +240,15 @@ def _own_frame_note(name: str, entry: _Entry) -> str | None:
     return f"camera {name!r} {why}: tracking in the camera's own frame (x right, y down, z forward)"
 
 
-def _choose(path: Path, entries: Mapping[str, _Entry], name: str | None, video: Path | None) -> str:
+def _choose(path: Path, entries: Mapping[str, Entry], name: str | None, video: Path | None) -> str:
     names = ", ".join(entries)
     if not entries:
         raise CameraError(f"{path}: no cameras in the file")
     if name is not None:
         if name not in entries:
+            found = [each for each in entries if _letters(each) == _letters(name)]
+            if len(found) == 1:
+                return found[0]
             raise CameraError(f"{path}: no camera {name!r}; the file has {names}")
         return name
     if len(entries) == 1:
@@ -261,58 +266,8 @@ def _choose(path: Path, entries: Mapping[str, _Entry], name: str | None, video: 
 
 
 def _letters(name: str) -> str:
-    """A name without case and separators: `cam_01` is `cam01`."""
-    return re.sub(r"[^a-z0-9]", "", name.lower())
-
-
-def _read_entries(path: Path) -> dict[str, _Entry]:
-    suffix = path.suffix.lower()
-    if suffix in (".yml", ".yaml") or (path.is_dir() and (path / INTRINSICS).is_file()):
-        return _read_easymocap(path)
-    return _read_pose2sim(path) if suffix == ".toml" else _read_json(path)
-
-
-def _read_json(path: Path) -> dict[str, _Entry]:
-    content = load_json(path, CameraError)
-    cameras = content.get("cameras") if isinstance(content, dict) else None
-    if not isinstance(cameras, dict):
-        raise CameraError(
-            f"{path}: expected an object 'cameras' with a camera under each name, "
-            f"found {shortened(content)}"
-        )
-    entries = {}
-    for name, values in cameras.items():
-        if not isinstance(values, dict):
-            raise CameraError(
-                f"{path}: camera {name!r}: expected an object, found {shortened(values)}"
-            )
-        found = map(values.get, ("K", "image_size_wh", "distortion", "R", "t"))
-        entries[name] = _Entry._make(
-            (*found, content.get("units"), values.get("video"), False, False)
-        )
-    return entries
-
-
-def _read_pose2sim(path: Path) -> dict[str, _Entry]:
-    text = read_text(path, CameraError)
-    try:
-        content = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise CameraError(f"{path}: cannot be read as TOML: {one_line(error)}") from error
-    entries = {}
-    for table, values in content.items():
-        if not isinstance(values, dict) or table == "metadata":
-            continue
-        name = values.get("name", table)
-        if not isinstance(name, str) or name in entries:
-            raise CameraError(
-                f"{path}: table {table!r}: expected a name of its own, found {shortened(name)}"
-            )
-        keys = ("matrix", "size", "distortions", "rotation", "translation")
-        entries[name] = _Entry._make(
-            (*map(values.get, keys), "metre", None, values.get("fisheye"), False)
-        )
-    return entries
+    """A name without case, separators and leading word: `cam_01` is `Cam01` and `01`."""
+    return re.sub(r"^(cam|camera|port)(?=[0-9])", "", re.sub(r"[^a-z0-9]", "", name.lower()))
 
 
 def rotation_matrix(vector: np.ndarray, where: str = "rotation") -> np.ndarray:
@@ -335,68 +290,3 @@ def rotation_matrix(vector: np.ndarray, where: str = "rotation") -> np.ndarray:
             "around; expected radians"
         )
     return from_axis_angle(vector)
-
-
-INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
-
-
-class _Loader(yaml.SafeLoader):
-    """Plain values and OpenCV's matrices."""
-
-
-def _matrix(loader: yaml.SafeLoader, node: yaml.Node) -> list[Any]:
-    """A matrix as nested lists; one of a single row or column as a list."""
-    values = loader.construct_mapping(node, deep=True) if isinstance(node, yaml.MappingNode) else {}
-    rows, columns, data = (values.get(key) for key in ("rows", "cols", "data"))
-    if not (isinstance(rows, int) and isinstance(columns, int) and isinstance(data, list)):
-        raise yaml.YAMLError("an opencv-matrix has rows, cols and data")
-    if rows < 1 or columns < 1 or rows * columns != len(data):
-        raise yaml.YAMLError(
-            f"line {node.start_mark.line + 1}: an opencv-matrix of {rows} rows and {columns} "
-            f"columns has other than as many numbers"
-        )
-    if 1 in (rows, columns):
-        return data
-    return [data[row * columns : (row + 1) * columns] for row in range(rows)]
-
-
-_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)
-
-
-def _read_easymocap(path: Path) -> dict[str, _Entry]:
-    """EasyMocap's cameras: `path` is the folder, or either file; the other is beside it."""
-    folder = path if path.is_dir() else path.parent
-    intrinsics = path if path.name != EXTRINSICS and not path.is_dir() else folder / INTRINSICS
-    extrinsics = folder / EXTRINSICS
-    first = _load(intrinsics)
-    second = _load(extrinsics) if extrinsics.is_file() else {}
-    names = first.get("names")
-    if not isinstance(names, list) or not all(isinstance(name, (str, int)) for name in names):
-        raise CameraError(
-            f"{intrinsics}: expected 'names', as EasyMocap writes them, found {shortened(names)}"
-        )
-    cameras = {}
-    for name in map(str, names):
-        size = [first.get(f"W_{name}"), first.get(f"H_{name}")]
-        cameras[name] = _Entry(
-            first.get(f"K_{name}"),
-            None if None in size else size,
-            first.get(f"dist_{name}", first.get(f"D_{name}")),
-            second.get(f"Rot_{name}", second.get(f"R_{name}")),
-            second.get(f"T_{name}"),
-            from_easymocap=True,
-        )
-    return cameras
-
-
-def _load(path: Path) -> dict[str, Any]:
-    text = read_text(path, CameraError)
-    if text.startswith("%YAML:1.0"):
-        text = text.partition("\n")[2]
-    try:
-        content = yaml.load(text, Loader=_Loader)
-    except (yaml.YAMLError, ValueError, TypeError, RecursionError, OverflowError) as error:
-        raise CameraError(f"{path}: cannot be read as YAML: {one_line(error)}") from error
-    if not isinstance(content, dict):
-        raise CameraError(f"{path}: not EasyMocap's; expected names, found {shortened(content)}")
-    return content

@@ -1,0 +1,256 @@
+"""Cameras as other programs calibrate them: shapes, units, where pixels begin."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from torchcss.errors import CameraError
+from torchcss.io.cameras import load_camera, read_cameras
+from torchcss.io.video import VideoWriter
+
+SIZE = (640, 480)
+FX, FY, CX, CY = 611.25, 612.75, 317.5, 243.0
+K = [[FX, 0.0, CX], [0.0, FY, CY], [0.0, 0.0, 1.0]]
+LENS = [0.11, -0.24, 0.0012, -0.0021, 0.07]
+
+
+def yaml_matrix(name: str, values: list[Any], rows: int, tag: str = "!!opencv-matrix") -> str:
+    data = np.ravel(values).tolist()
+    columns = len(data) // rows
+    return f"{name}: {tag}\n   rows: {rows}\n   cols: {columns}\n   dt: d\n   data: {data}\n"
+
+
+SIZES = "image_width: 640\nimage_height: 480\n"
+OPENCV = "%YAML:1.0\n---\n" + SIZES
+XML = (
+    "<?xml version='1.0'?><opencv_storage><image_width>640</image_width>"
+    "<image_height>480</image_height><camera_matrix type_id='opencv-matrix'><rows>3</rows>"
+    f"<cols>3</cols><dt>d</dt><data>{' '.join(map(str, np.ravel(K)))}</data></camera_matrix>"
+    "<distortion_coefficients type_id='opencv-matrix'><rows>5</rows><cols>1</cols><dt>d</dt>"
+    f"<data>\n {' '.join(map(str, LENS))}</data></distortion_coefficients></opencv_storage>"
+)
+MATRIX = {"type_id": "opencv-matrix", "rows": 3, "cols": 3, "dt": "d", "data": np.ravel(K).tolist()}
+
+FILES: dict[str, tuple[str, str]] = {
+    "OpenCV, a column": (
+        "a.yml",
+        OPENCV + yaml_matrix("camera_matrix", K, 3)
+        + yaml_matrix("distortion_coefficients", LENS, 5),
+    ),
+    "OpenCV, a row, eight of which three are zero": (
+        "a.yaml",
+        OPENCV + yaml_matrix("camera_matrix", K, 3)
+        + yaml_matrix("distortion_coefficients", [*LENS, 0, 0, 0], 1),
+    ),
+    "OpenCV's JSON": (
+        "a.json",
+        json.dumps({"camera_matrix": MATRIX, "distortion_coefficients": [LENS], "width": 640,
+                    "height": 480}),
+    ),
+    "lists, as tutorials save them": (
+        "a.json", json.dumps({"mtx": K, "dist": [LENS], "resolution": [640, 480]})
+    ),
+    "OpenCV's XML": ("a.xml", XML),
+    "ROS": (
+        "a.yaml",
+        SIZES + "camera_name: left\n" + yaml_matrix("camera_matrix", K, 3, "")
+        + "distortion_model: plumb_bob\n" + yaml_matrix("distortion_coefficients", LENS, 1, "")
+        + yaml_matrix("projection_matrix", [1.0] * 12, 3, ""),
+    ),
+    "ROS's message": (
+        "a.yaml",
+        f"width: 640\nheight: 480\ndistortion_model: plumb_bob\nD: {LENS}\n"
+        f"K: {np.ravel(K).tolist()}\nR: [1.0, 0, 0, 0, 1, 0, 0, 0, 1]\nP: {[0.0] * 12}\n",
+    ),
+    "a list of cameras": (
+        "a.json",
+        json.dumps({"cameras": [{"name": "a", "K": K, "distCoef": LENS, "size": [640, 480]}]}),
+    ),
+}  # fmt: skip
+
+
+def check(path: Path, lens: list[float] = LENS, within: float = 1e-9, **more: Any) -> None:
+    found = load_camera(path, **more)
+    np.testing.assert_allclose(found.camera.K, K, atol=within)
+    np.testing.assert_allclose(found.camera.distortion[: len(lens)], lens)
+    assert found.camera.image_size_wh == SIZE
+    assert not found.metric
+    assert "no extrinsics" in str(found.units_note)
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_one_camera(tmp_path: Path, kind: str) -> None:
+    name, text = FILES[kind]
+    (tmp_path / name).write_text(text)
+    check(tmp_path / name)
+
+
+@pytest.mark.parametrize("shape", [(5,), (1, 5), (5, 1)])
+def test_arrays_take_the_size_of_the_video(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    path = tmp_path / "calibration.npz"
+    lens = np.array(LENS).reshape(shape)
+    np.savez(path, mtx=np.array(K), dist=lens, rvecs=np.zeros((9, 3, 1)), tvecs=np.zeros((9, 3, 1)))
+    with pytest.raises(CameraError, match="does not say the image size"):
+        load_camera(path)
+    with VideoWriter(tmp_path / "a.mp4", 25) as film:
+        film.write(np.zeros((480, 640, 3), np.uint8))
+    check(path, video=tmp_path / "a.mp4")
+
+
+@pytest.mark.parametrize("is_new", [True, False])
+def test_matlab(tmp_path: Path, is_new: bool) -> None:
+    scipy_io = pytest.importorskip("scipy.io")
+    one_based = np.array(K) + np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]])
+    values = {
+        "ImageSize": [480, 640], "RadialDistortion": [0.11, -0.24, 0.07],
+        "TangentialDistortion": [0.0012, -0.0021],
+        **({"K": one_based} if is_new else {"IntrinsicMatrix": one_based.T}),
+    }  # fmt: skip
+    scipy_io.savemat(tmp_path / "a.mat", {"cameraParams": values} if is_new else values)
+    check(tmp_path / "a.mat")
+
+
+def test_bouguets_toolbox(tmp_path: Path) -> None:
+    scipy_io = pytest.importorskip("scipy.io")
+    values = {"fc": [[FX], [FY]], "cc": [[CX], [CY]], "kc": np.array(LENS)[:, None], "nx": 640}
+    scipy_io.savemat(tmp_path / "Calib_Results.mat", {**values, "ny": 480})
+    check(tmp_path / "Calib_Results.mat")
+
+
+@pytest.mark.parametrize(
+    ("model", "numbers", "lens"),
+    [
+        ("SIMPLE_PINHOLE", [FX, CX, CY], []),
+        ("PINHOLE", [FX, FY, CX, CY], []),
+        ("SIMPLE_RADIAL", [FX, CX, CY, 0.1], [0.1]),
+        ("RADIAL", [FX, CX, CY, 0.1, -0.2], [0.1, -0.2]),
+        ("OPENCV", [FX, FY, CX, CY, *LENS[:4]], LENS[:4]),
+        ("FULL_OPENCV", [FX, FY, CX, CY, *LENS, 0, 0, 0], LENS),
+    ],
+)
+def test_colmap(tmp_path: Path, model: str, numbers: list[float], lens: list[float]) -> None:
+    path = tmp_path / "cameras.txt"
+    path.write_text(f"# Camera list\n3 {model} 640 480 {' '.join(map(str, numbers))}\n")
+    for place in (path, tmp_path):
+        camera = load_camera(place).camera
+        fy = FY if FY in numbers else FX
+        expected = [[FX, 0, CX - 0.5], [0, fy, CY - 0.5], [0, 0, 1]]
+        np.testing.assert_allclose(camera.K, expected)
+        np.testing.assert_allclose(camera.distortion[: len(lens)], lens)
+    assert camera.name == "3"
+
+
+KALIBR = """cam0:
+  camera_model: pinhole
+  distortion_coeffs: [0.11, -0.24, 0.0012, -0.0021]
+  distortion_model: radtan
+  intrinsics: [611.25, 612.75, 317.5, 243.0]
+  resolution: [640, 480]
+cam1:
+  T_cn_cnm1:
+  - [0.0, -1.0, 0.0, 0.1]
+  - [1.0, 0.0, 0.0, 0.2]
+  - [0.0, 0.0, 1.0, 0.3]
+  - [0.0, 0.0, 0.0, 1.0]
+  camera_model: pinhole
+  distortion_coeffs: [0.0, 0.0, 0.0, 0.0]
+  distortion_model: radtan
+  intrinsics: [600.0, 600.0, 320.0, 240.0]
+  resolution: [640, 480]
+"""
+
+
+def test_kalibr(tmp_path: Path) -> None:
+    path = tmp_path / "camchain.yaml"
+    path.write_text(KALIBR)
+    found = load_camera(path, "cam1")
+    assert found.metric
+    assert found.camera.t_camera_world.tolist() == [0.1, 0.2, 0.3]
+    assert found.camera.R_camera_world[0].tolist() == [0, -1, 0]
+    np.testing.assert_allclose(load_camera(path, "cam0").camera.K, K)
+    path.write_text(KALIBR.partition("cam1:")[0])
+    check(path, LENS[:4])
+    path.write_text(KALIBR.replace("radtan", "equidistant"))
+    with pytest.raises(CameraError, match="fisheye"):
+        load_camera(path, "cam0")
+    path.write_text(KALIBR.replace("[1.0, 0.0, 0.0, 0.2]", "[1.0, 0.0]"))
+    with pytest.raises(CameraError, match="T_cn_cnm1"):
+        load_camera(path, "cam1")
+
+
+def table(name: str, t: list[float], more: str = "") -> str:
+    return (
+        f'[{name}]\nname = "{name[-1]}"\nsize = [640, 480]\nmatrix = {K}\ndistortions = {LENS}\n'
+        f"rotation = [0.1, 0.2, 0.3]\ntranslation = {t}\n{more}\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("t", "metric", "scale", "words"),
+    [
+        ([-790.0, 155.0, 2510.0], True, 0.001, "millimetres"),
+        ([-0.79, 0.155, 2.51], True, 1.0, None),
+        ([-7.9, 1.55, 25.1], False, None, "unknown unit"),
+    ],
+)
+def test_unit_of_anipose(
+    tmp_path: Path, t: list[float], metric: bool, scale: float | None, words: str | None
+) -> None:
+    path = tmp_path / "calibration.toml"
+    text = table("cam_0", [0.0, 0.0, 0.0]) + table("cam_1", t) + "[metadata]\nerror = 0.4\n"
+    path.write_text(text)
+    found = load_camera(path, "1")
+    assert found.metric is metric
+    if scale is not None:
+        np.testing.assert_allclose(found.camera.t_camera_world, scale * np.array(t))
+    assert (found.units_note is None) if words is None else words in str(found.units_note)
+
+
+def test_caliscope_leaves_out_what_is_not_calibrated(tmp_path: Path) -> None:
+    path = tmp_path / "camera_array.toml"
+    camera = table("cameras.0", [0.25, -0.1, 1.9]).replace('name = "0"\n', "cam_id = 0\n")
+    path.write_text(camera + "[cameras.1]\ncam_id = 1\nsize = [640, 480]\n")
+    assert load_camera(path).camera.name == "0"
+    assert load_camera(path, "cam_0").metric
+    path.write_text(camera + camera.replace("cameras.0", "cameras.1"))
+    assert load_camera(path, video=tmp_path / "cam_1.mp4").camera.name == "1"
+
+
+def test_easymocap_names_stay_text(tmp_path: Path) -> None:
+    names = ["01", "08", "10"]
+    text = "%YAML:1.0\n---\nnames:\n" + "".join(f"  - {name}\n" for name in names)
+    for name in names:
+        text += yaml_matrix(f"K_{name}", K, 3) + f"H_{name}: 480\nW_{name}: 640\n"
+    (tmp_path / "intri.yml").write_text(text)
+    assert list(read_cameras(tmp_path)) == names
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("a.yml", "a: &a [1, 2]\nb: [*a, *a]\n", "aliases"),
+        ("a.yml", "a: 1\n", "camera_matrix"),
+        ("a.yml", "- 1\n", "no calibration"),
+        ("a.yml", OPENCV + yaml_matrix("camera_matrix", K, 3)
+         + yaml_matrix("distortion_coefficients", [*LENS, 0.1, 0, 0], 1), "distortion of 8"),
+        ("a.txt", "1 OPENCV 640 480 1 2 3\n", "line 1: expected COLMAP"),
+        ("a.txt", "1 OPENCV_FISHEYE 640 480 1 2 3 4 5 6 7 8\n", "fisheye"),
+        ("a.xml", "<!DOCTYPE a [<!ENTITY b 'c'>]><a>&b;</a>", "entities"),
+        ("a.xml", "<opencv_storage/>", "camera_matrix"),
+        ("a.mat", "MATLAB 5.0 MAT-file", "cannot be read as MATLAB's"),
+        ("a.json", '{"camera_matrix": [1, 2], "width": 640, "height": 480}', "K"),
+    ],
+)  # fmt: skip
+def test_bad_files(tmp_path: Path, name: str, text: str, words: str) -> None:
+    if name.endswith(".mat"):
+        pytest.importorskip("scipy.io")
+    (tmp_path / name).write_text(text)
+    with pytest.raises(CameraError, match=words) as caught:
+        load_camera(tmp_path / name)
+    assert "\n" not in str(caught.value)
+    assert str(tmp_path) in str(caught.value)

@@ -1,0 +1,490 @@
+"""What calibration files say of their cameras, format by format, before anything is checked.
+
+| format | recognised by |
+|---|---|
+| ours | JSON: `cameras`, by name or in a list |
+| Pose2Sim, Anipose, FreeMoCap, Caliscope | `.toml`: a table for each camera |
+| EasyMocap | `intri.yml` with `names`, beside it `extri.yml` |
+| OpenCV, ROS | YAML, JSON or XML with `camera_matrix` |
+| Kalibr | YAML: `cam0` with `intrinsics` |
+| COLMAP | `cameras.txt` |
+| MATLAB | `.mat`: `cameraParams` as a structure, or Bouguet's `fc`, `cc`, `kc` (needs SciPy) |
+| arrays | `.npz`: `mtx`, `dist`, and the like |
+
+Most of them are the same few things in other words (`_WORDS`). COLMAP's principal point counts from
+the corner of the image, MATLAB's from 1; both are brought to pixel centres at integers.
+
+Call `read_entries`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import re
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+
+from torchcss.body.files.xml import parse_xml
+from torchcss.errors import BodyError, CameraError, MissingExtraError
+from torchcss.files import load_arrays, load_json, one_line, read_bytes, read_text, shortened
+
+INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
+
+
+class Entry(NamedTuple):
+    """One camera of a file, whatever the format; `None` for what the file does not have.
+
+    Attributes:
+        K: Intrinsic matrix, pixel centres at integers.
+        image_size_wh: Width and height.
+        distortion: In OpenCV's order.
+        rotation: World to camera, a matrix or axis times angle.
+        translation: World to camera.
+        units: Unit of the world and of pixels.
+        video: Name of the video.
+        fisheye: Whether the lens is one that is not supported.
+        note: What was assumed, for the user.
+    """
+
+    K: Any
+    image_size_wh: Any
+    distortion: Any
+    rotation: Any
+    translation: Any
+    units: Any = "metre"
+    video: Any = None
+    fisheye: Any = False
+    note: str | None = None
+
+
+_WORDS = {
+    "K": ("K", "camera_matrix", "matrix", "intrinsic_matrix", "cameraMatrix", "mtx", "k",
+          "intrinsics", "camera_intrinsics", "IntrinsicMatrix"),
+    "distortion": ("distortion", "distortions", "distortion_coefficients", "distortion_coeffs",
+                   "dist_coeffs", "dist_coeff", "distCoeffs", "distCoef", "dist", "D", "d"),
+    "rotation": ("R", "rotation", "Rot", "rvec", "rotation_matrix"),
+    "translation": ("t", "translation", "T", "tvec"),
+    "size": ("image_size_wh", "size", "resolution", "image_size", "img_size", "image_shape_wh"),
+}  # fmt: skip
+"""What a camera's numbers are called, the first that is there."""
+
+_SIZES = (("image_width", "image_height"), ("width", "height"), ("w", "h"), ("W", "H"))
+_FISHEYE = ("equidistant", "fisheye", "kannala_brandt", "omni", "ds", "eucm", "fov")
+
+_COLMAP = {
+    "SIMPLE_PINHOLE": "f cx cy", "PINHOLE": "fx fy cx cy", "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2", "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+}  # fmt: skip
+"""The parameters of COLMAP's camera models."""
+
+
+def read_entries(path: Path) -> dict[str, Entry]:
+    """The cameras of a calibration file by name.
+
+    Raises:
+        CameraError: If the file is missing, damaged or none of the formats.
+        MissingExtraError: If SciPy is needed and not installed.
+    """
+    suffix = path.suffix.lower()
+    if path.is_dir():
+        inner = next((path / n for n in (INTRINSICS, "cameras.txt") if (path / n).is_file()), path)
+        return _read_easymocap(inner) if inner.name == INTRINSICS else _read_colmap(inner)
+    if suffix in (".yml", ".yaml"):
+        return _read_yaml(path)
+    if suffix == ".toml":
+        return _read_toml(path)
+    if suffix == ".txt":
+        return _read_colmap(path)
+    if suffix == ".xml":
+        return _alone(path, _opencv_xml(path))
+    if suffix == ".npz":
+        arrays = load_arrays(path, CameraError)
+        return _alone(path, {name: array.tolist() for name, array in arrays.items()})
+    if suffix == ".mat":
+        return _read_matlab(path)
+    return _read_json(path)
+
+
+# The same things in other words.
+
+
+def _entry(values: Mapping[str, Any], units: Any = "metre") -> Entry:
+    """A camera of a mapping, by whatever words it uses."""
+    found = {
+        key: next((_plain(values[w]) for w in words if values.get(w) is not None), None)
+        for key, words in _WORDS.items()
+    }
+    for pair in _SIZES:
+        size = [values.get(key) for key in pair]
+        if found["size"] is None and None not in size:
+            found["size"] = size
+    model = str(values.get("distortion_model", values.get("camera_model", ""))).lower()
+    fisheye = values.get("fisheye", False) or any(word in model.split("-") for word in _FISHEYE)
+    return Entry(
+        _intrinsic_matrix(found["K"]),
+        found["size"],
+        _flat(found["distortion"]),
+        found["rotation"] if _depth(found["rotation"], 3) else _flat(found["rotation"]),
+        _flat(found["translation"]),
+        units,
+        values.get("video"),
+        fisheye,
+    )
+
+
+def _plain(value: Any) -> Any:
+    """A matrix as OpenCV's JSON and ROS have it, as lists."""
+    if isinstance(value, dict) and isinstance(value.get("data"), list):
+        rows, columns = value.get("rows"), value.get("cols")
+        data = value["data"]
+        if isinstance(rows, int) and isinstance(columns, int) and rows * columns == len(data):
+            return [data[i : i + columns] for i in range(0, len(data), columns)] if columns else []
+    return value
+
+
+def _depth(value: Any, rows: int) -> bool:
+    """Whether a value is a list of so many lists of as many."""
+    return (
+        isinstance(value, list)
+        and len(value) == rows
+        and all(isinstance(row, list) and len(row) == rows for row in value)
+    )
+
+
+def _flat(value: Any) -> Any:
+    """Nested lists as one list, as OpenCV writes vectors in rows or columns."""
+    while isinstance(value, list) and any(isinstance(each, list) for each in value):
+        value = [item for each in value for item in (each if isinstance(each, list) else [each])]
+    if isinstance(value, list) and len(value) == 9:  # a rotation in a row
+        return [value[:3], value[3:6], value[6:]]
+    return value
+
+
+def _intrinsic_matrix(value: Any) -> Any:
+    """K of a matrix, of its nine numbers in a row, or of fx, fy, cx, cy."""
+    if not isinstance(value, list) or any(isinstance(each, list) for each in value):
+        return value
+    if len(value) == 4:
+        fx, fy, cx, cy = value
+        return [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
+    return _flat(value)
+
+
+def _has_camera(values: object) -> bool:
+    return isinstance(values, Mapping) and any(word in values for word in _WORDS["K"])
+
+
+def _alone(path: Path, values: Mapping[str, Any]) -> dict[str, Entry]:
+    """The one camera of a file without extrinsics: those of the board's pictures are none."""
+    if not _has_camera(values):
+        raise CameraError(
+            f"{path}: expected a calibration with camera_matrix, found {shortened(list(values))}"
+        )
+    name = str(values.get("camera_name", values.get("name", path.stem)))
+    return {name: _entry(values)._replace(rotation=None, translation=None)}
+
+
+# Formats.
+
+
+def _read_json(path: Path) -> dict[str, Entry]:
+    content = load_json(path, CameraError)
+    cameras = content.get("cameras") if isinstance(content, dict) else None
+    if cameras is None and _has_camera(content):
+        return _alone(path, content)
+    if isinstance(cameras, list) and all(isinstance(each, dict) for each in cameras):
+        cameras = {str(each.get("name", index)): each for index, each in enumerate(cameras)}
+    if not isinstance(cameras, dict):
+        raise CameraError(
+            f"{path}: expected an object 'cameras' with a camera under each name, "
+            f"found {shortened(content)}"
+        )
+    for name, values in cameras.items():
+        if not isinstance(values, dict):
+            raise CameraError(
+                f"{path}: camera {name!r}: expected an object, found {shortened(values)}"
+            )
+    return {name: _entry(values, content.get("units")) for name, values in cameras.items()}
+
+
+def _read_toml(path: Path) -> dict[str, Entry]:
+    """Pose2Sim's metres, Caliscope's, or Anipose's unit, which is that of the board."""
+    text = read_text(path, CameraError)
+    try:
+        content = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise CameraError(f"{path}: cannot be read as TOML: {one_line(error)}") from error
+    tables = content["cameras"] if isinstance(content.get("cameras"), dict) else content
+    tables = {
+        name: each
+        for name, each in tables.items()
+        if isinstance(each, dict) and name not in ("metadata", "charuco")
+    }
+    if any(map(_has_camera, tables.values())):  # others are not calibrated
+        tables = {name: each for name, each in tables.items() if _has_camera(each)}
+    entries: dict[str, Entry] = {}
+    for table, values in tables.items():
+        name = values.get("name", table)
+        if not isinstance(name, str) or name in entries:
+            raise CameraError(
+                f"{path}: table {table!r}: expected a name of its own, found {shortened(name)}"
+            )
+        entries[name] = _entry(values)
+    return _in_metres(entries, "metadata" in content)
+
+
+def _in_metres(entries: dict[str, Entry], is_anipose: bool) -> dict[str, Entry]:
+    """Millimetres where the cameras would stand hundreds of metres away, else as they are."""
+    lengths = [
+        float(np.linalg.norm(entry.translation))
+        for entry in entries.values()
+        if isinstance(entry.translation, list)
+        and all(isinstance(each, (int, float)) for each in entry.translation)
+    ]
+    farthest = max(lengths, default=0.0)
+    if farthest >= 100:
+        note = (
+            f"its world is taken to be in millimetres: in metres a camera would stand "
+            f"{farthest:.0f} m from the origin"
+        )
+        return {
+            name: entry._replace(
+                translation=[0.001 * each for each in entry.translation], note=note
+            )
+            if isinstance(entry.translation, list)
+            and all(isinstance(each, (int, float)) for each in entry.translation)
+            else entry
+            for name, entry in entries.items()
+        }
+    if is_anipose and farthest > 12:
+        return {name: entry._replace(units=None) for name, entry in entries.items()}
+    return entries
+
+
+def _read_colmap(path: Path) -> dict[str, Entry]:
+    entries: dict[str, Entry] = {}
+    for number, line in enumerate(read_text(path, CameraError).splitlines(), start=1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        where = f"{path}: line {number}"
+        model = words[1] if len(words) > 1 else ""
+        try:
+            size, values = [int(each) for each in words[2:4]], [float(each) for each in words[4:]]
+        except ValueError:
+            size = values = []
+        names = _COLMAP.get(model, "").split()
+        if "FISHEYE" in model:
+            entries[words[0]] = Entry([], size, None, None, None, fisheye=True)
+            continue
+        if not names or len(values) != len(names) or len(size) != 2:
+            raise CameraError(
+                f"{where}: expected COLMAP's camera, CAMERA_ID MODEL WIDTH HEIGHT and the "
+                f"parameters of {', '.join(_COLMAP)}; found {shortened(line)}"
+            )
+        given = dict(zip(names, values, strict=True))
+        fx, fy = given.get("fx", given.get("f")), given.get("fy", given.get("f"))
+        # The corner of the image is (0, 0) there.
+        K = [[fx, 0.0, given["cx"] - 0.5], [0.0, fy, given["cy"] - 0.5], [0.0, 0.0, 1.0]]
+        keys = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+        lens = [given.get(key, 0.0) for key in keys]
+        entries[words[0]] = Entry(K, size, lens, None, None)
+    return entries
+
+
+def _read_yaml(path: Path) -> dict[str, Entry]:
+    """EasyMocap's pair, Kalibr's chain, or one camera of OpenCV or ROS."""
+    content = _load(path)
+    if path.name == EXTRINSICS or "names" in content:
+        return _read_easymocap(path)
+    chain = {name: each for name, each in content.items() if re.fullmatch(r"cam[0-9]+", name)}
+    if chain and all(map(_has_camera, chain.values())):
+        return _kalibr(path, chain)
+    if _has_camera(content):
+        return _alone(path, content)
+    if isinstance(content.get("cameras"), dict) and all(
+        map(_has_camera, content["cameras"].values())
+    ):
+        return {str(name): _entry(each) for name, each in content["cameras"].items()}
+    raise CameraError(
+        f"{path}: expected 'names', as EasyMocap writes them, 'camera_matrix' (OpenCV, ROS) or "
+        f"'cam0' (Kalibr), found {shortened(list(content))}"
+    )
+
+
+def _kalibr(path: Path, chain: Mapping[str, Mapping[str, Any]]) -> dict[str, Entry]:
+    """Cameras whose places are given one from the other; the first is the world."""
+    entries: dict[str, Entry] = {}
+    pose = np.eye(4)
+    for name, values in sorted(chain.items(), key=lambda item: int(item[0][3:])):
+        entry = _entry(values)
+        step = values.get("T_cn_cnm1")
+        if len(chain) > 1 and (step is not None or not entries):
+            try:
+                pose = np.asarray(step, float) @ pose if step is not None else pose
+            except (ValueError, TypeError) as error:
+                raise CameraError(
+                    f"{path}: {name}: T_cn_cnm1: expected 4 rows of 4 numbers, found "
+                    f"{shortened(step)}"
+                ) from error
+            entry = entry._replace(rotation=pose[:3, :3].tolist(), translation=pose[:3, 3].tolist())
+        entries[name] = entry
+    return entries
+
+
+def _read_easymocap(path: Path) -> dict[str, Entry]:
+    """EasyMocap's cameras: `path` is either file; the other is beside it."""
+    intrinsics = path if path.name != EXTRINSICS else path.parent / INTRINSICS
+    extrinsics = path.parent / EXTRINSICS
+    first = _load(intrinsics)
+    second = _load(extrinsics) if extrinsics.is_file() else {}
+    names = first.get("names")
+    if not isinstance(names, list) or not all(isinstance(name, (str, int)) for name in names):
+        raise CameraError(
+            f"{intrinsics}: expected 'names', as EasyMocap writes them, found {shortened(names)}"
+        )
+    cameras = {}
+    for name in map(str, names):
+        size = [first.get(f"W_{name}"), first.get(f"H_{name}")]
+        cameras[name] = Entry(
+            first.get(f"K_{name}"),
+            None if None in size else size,
+            first.get(f"dist_{name}", first.get(f"D_{name}")),
+            second.get(f"Rot_{name}", second.get(f"R_{name}")),
+            second.get(f"T_{name}"),
+        )
+    return cameras
+
+
+def _read_matlab(path: Path) -> dict[str, Entry]:
+    """MATLAB's camera parameters; its pixels count from 1, and old matrices are transposed."""
+    data = read_bytes(path, CameraError, 128)
+    if b"HDF" in data[:16] or data.startswith(b"MATLAB 7.3"):
+        raise CameraError(f"{path}: of version 7.3; save it with save('-v7')")
+    try:
+        matlab: Any = importlib.import_module("scipy.io")
+    except ImportError as error:
+        raise MissingExtraError(f"{path}: a .mat is read by SciPy; pip install scipy") from error
+    try:
+        content = matlab.loadmat(path, simplify_cells=True)
+    except Exception as error:  # SciPy raises whatever the damage leads to
+        raise CameraError(f"{path}: cannot be read as MATLAB's: {one_line(error)}") from error
+    values = {key: _listed(each) for key, each in content.items() if not key.startswith("__")}
+    values = next((each for each in values.values() if isinstance(each, dict)), values)
+    if {"fc", "cc"} <= values.keys():  # Bouguet's toolbox, whose pixels count from 0
+        K = [*values["fc"], *values["cc"]]
+        size = [values.get("nx"), values.get("ny")]
+        entry = _entry({"K": K, "D": values.get("kc")})
+        return {path.stem: entry._replace(image_size_wh=None if None in size else size)}
+    if not _has_camera(values):
+        raise CameraError(
+            f"{path}: expected toStruct(cameraParams) or Bouguet's fc and cc, found "
+            f"{shortened(list(values))}"
+        )
+    try:
+        return {path.stem: _matlab_entry(values)}
+    except (ValueError, TypeError, IndexError) as error:
+        raise CameraError(f"{path}: expected cameraParams, found {one_line(error)}") from error
+
+
+def _matlab_entry(values: Mapping[str, Any]) -> Entry:
+    K = np.array(_entry(values).K, float)
+    K = K.T if K[2, 0] or K[2, 1] else K  # old ones have the principal point below
+    K[:2, 2] -= 1
+    radial = np.ravel(values.get("RadialDistortion", values.get("RDistort", [0, 0])))
+    tangential = np.ravel(values.get("TangentialDistortion", values.get("TDistort", [0, 0])))
+    k1, k2, k3 = [*radial.tolist(), 0.0, 0.0, 0.0][:3]
+    p1, p2 = [*tangential.tolist(), 0.0, 0.0][:2]
+    size = values.get("ImageSize")
+    wh = [int(size[1]), int(size[0])] if isinstance(size, list) and len(size) == 2 else None
+    return Entry(K.tolist(), wh, [k1, k2, p1, p2, k3], None, None)
+
+
+def _listed(value: Any) -> Any:
+    """Arrays as lists, in structures too."""
+    if isinstance(value, dict):
+        return {key: _listed(each) for key, each in value.items()}
+    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
+
+
+def _opencv_xml(path: Path) -> dict[str, Any]:
+    """What OpenCV stores as XML."""
+    try:
+        root = parse_xml(path, read_bytes(path, CameraError), "OpenCV's XML")
+    except BodyError as error:
+        raise CameraError(str(error)) from error
+    found: dict[str, Any] = {}
+    for element in root:
+        parts = {part.tag: (part.text or "").split() for part in element}
+        words = parts["data"] if {"rows", "cols", "data"} <= parts.keys() else None
+        try:
+            if words is not None:
+                rows, columns = int(parts["rows"][0]), int(parts["cols"][0])
+                data = [float(word) for word in words]
+                found[element.tag] = _plain({"rows": rows, "cols": columns, "data": data})
+            else:
+                found[element.tag] = json.loads((element.text or "").strip() or "null")
+        except (ValueError, IndexError):
+            found[element.tag] = (element.text or "").strip()
+    return found
+
+
+# YAML.
+
+
+class _Loader(yaml.SafeLoader):
+    """Plain values and OpenCV's matrices; names such as 01 stay text, and nothing is repeated."""
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """Refuse aliases, by which a small file becomes a huge one."""
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError("it repeats parts of itself by aliases; write them out")
+        return super().compose_node(parent, index)
+
+
+def _matrix(loader: yaml.SafeLoader, node: yaml.Node) -> list[Any]:
+    """A matrix as nested lists; one of a single row or column as a list."""
+    values = loader.construct_mapping(node, deep=True) if isinstance(node, yaml.MappingNode) else {}
+    rows, columns, data = (values.get(key) for key in ("rows", "cols", "data"))
+    if not (isinstance(rows, int) and isinstance(columns, int) and isinstance(data, list)):
+        raise yaml.YAMLError("an opencv-matrix has rows, cols and data")
+    if rows < 1 or columns < 1 or rows * columns != len(data):
+        raise yaml.YAMLError(
+            f"line {node.start_mark.line + 1}: an opencv-matrix of {rows} rows and {columns} "
+            f"columns has other than as many numbers"
+        )
+    if 1 in (rows, columns):
+        return data
+    return [data[row * columns : (row + 1) * columns] for row in range(rows)]
+
+
+def _whole(loader: yaml.SafeLoader, node: yaml.ScalarNode) -> int | str:
+    is_text = re.fullmatch(r"0[0-9]+", node.value)
+    return node.value if is_text else yaml.SafeLoader.construct_yaml_int(loader, node)
+
+
+_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)
+_Loader.add_constructor("tag:yaml.org,2002:int", _whole)
+
+
+def _load(path: Path) -> dict[str, Any]:
+    text = read_text(path, CameraError)
+    if text.startswith("%YAML:1.0"):
+        text = text.partition("\n")[2]
+    try:
+        content = yaml.load(text, Loader=_Loader)
+    except (yaml.YAMLError, ValueError, TypeError, RecursionError, OverflowError) as error:
+        raise CameraError(f"{path}: cannot be read as YAML: {one_line(error)}") from error
+    if not isinstance(content, dict):
+        raise CameraError(
+            f"{path}: no calibration; expected names, camera_matrix or cam0, found "
+            f"{shortened(content)}"
+        )
+    return {str(key): value for key, value in content.items()}
