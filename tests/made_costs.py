@@ -21,6 +21,7 @@ from torchcss.cost.temporal import MixturePrior
 from torchcss.cost.term import OnStates, Term
 from torchcss.cost.total import TrackingCost
 from torchcss.inference.mixture import GaussianMixture, Prior
+from torchcss.tracking.settings import Settings, make_choice
 from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FrameFeatures
@@ -116,6 +117,20 @@ def changed(cost: TrackingCost, **fields: Any) -> TrackingCost:
     """A cost of one view with other things in the view."""
     view, past = (replace(context, **fields) for context in (cost.views[0], cost.past[0]))
     return replace(cost, views=(view, *cost.views[1:]), past=(past,))
+
+
+def printed_cost(cost: TrackingCost, preset: str) -> TrackingCost:
+    """The same view with the terms of a preset, and with motion boundaries."""
+    features = cost.views[0].features
+    assert features is not None
+    noise = torch.rand(features.grey.shape, generator=torch.Generator().manual_seed(4))
+    cost = changed(
+        cost,
+        features=features._replace(motion_boundary=noise.to(features.grey)),
+        boundary_emphasis=0.3,
+    )
+    name = "arm8" if cost.body.num_parts < 6 else "body34"
+    return replace(cost, choice=make_choice(Settings(preset=preset, body=name), 2.0), bound={})
 
 
 def make_full_cost(

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from made_costs import changed, make_full_cost, random_states
+from made_costs import changed, make_full_cost, printed_cost, random_states
+from made_engines import awkward_states
 
 from torchcss.cost.term import differentiated
 from torchcss.cost.total import TrackingCost
@@ -47,6 +48,24 @@ def test_the_closed_forms_are_the_derivatives_of_the_cost(
         for got, expected in zip(closed, other, strict=True):
             scale = max(float(expected.abs().max()), 1.0)
             torch.testing.assert_close(got, expected, rtol=0, atol=1e-8 * scale)
+
+
+@pytest.mark.parametrize("preset", ["ijrr_css", "rr_multiple_hypothesis", "ijrr_gaussian_single"])
+@pytest.mark.parametrize("name", ["arm8", "body34"])
+def test_the_printed_costs_have_their_derivatives(
+    name: str, preset: str, generator: torch.Generator
+) -> None:
+    """Also behind the camera, out of the picture, at bounds, folded up and straight."""
+    cost = printed_cost(make_full_cost(name), preset)
+    assert {"contour", "flow", "stabiliser"} <= set(cost.terms(cost.body.rest[None]))
+    x = awkward_states(cost, generator)
+    exact = replace(cost, choice=replace(cost.choice, curvature=Curvature.EXACT))
+    autograd = replace(cost, choice=replace(cost.choice, curvature=Curvature.AUTOGRAD))
+    for got, expected in zip(exact.local_model(x), autograd.local_model(x), strict=True):
+        scale = expected.abs().flatten(1).amax(1) if expected.dim() > 1 else expected.abs()
+        error = (got - expected).abs()
+        error = error.flatten(1).amax(1) if error.dim() > 1 else error
+        assert float((error / scale.clamp(min=1)).max()) < 1e-8
 
 
 def test_a_term_with_a_value_alone_gets_its_derivatives(generator: torch.Generator) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
@@ -13,12 +14,18 @@ from torch import Tensor
 from torchcss.cost import contour
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.visibility import SeenNodes
-from torchcss.robust import Leclerc
+from torchcss.robust import Leclerc, Quadratic
 from torchcss.types import PointCost
 from torchcss.vision.camera import Camera
 
 WIDTH, HEIGHT = 128, 96
 TERM = ContourTerm()
+AS_PRINTED = ContourTerm(assignment="sum", fitted_level=1.0)
+PRINTED = {
+    "ijrr": AS_PRINTED,
+    "rr": replace(AS_PRINTED, strength=True, occlusion_factor=0.9, potential_kind=Leclerc),
+    "gaussian": replace(AS_PRINTED, assignment="nearest", sigma=8.5, potential_kind=Quadratic),
+}
 
 
 def make_camera(distortion: list[float] | None = None) -> Camera:
@@ -52,6 +59,12 @@ def rough_field(generator: torch.Generator) -> Tensor:
     return 0.9 * field / (0.5 + field.norm(dim=0)).clamp(min=1.0)
 
 
+def weighed_field(generator: torch.Generator) -> Tensor:
+    """The same with weights of 0.3 to 1."""
+    weight = 0.3 + 0.7 * torch.rand(1, HEIGHT, WIDTH, generator=generator, dtype=torch.float64)
+    return torch.cat([rough_field(generator), weight])
+
+
 def random_nodes(camera: Camera, *batch: int, generator: torch.Generator) -> SeenNodes:
     """Nodes in view, their normals at right angles to the line of sight."""
 
@@ -82,16 +95,18 @@ def node_costs(field: Tensor, u: Tensor, term: ContourTerm = TERM) -> tuple[Tens
 
 @pytest.mark.parametrize("distortion", [None, [-0.2, 0.05, -0.004, 0.004, 0.0]])
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
-@pytest.mark.parametrize("kind", ["Lorentzian", "Leclerc"])
+@pytest.mark.parametrize("kind", ["Lorentzian", "Leclerc", *PRINTED])
 def test_derivatives_are_those_of_fixed_matches(
     distortion: list[float] | None,
     batch: tuple[int, ...],
     kind: str,
     generator: torch.Generator,
 ) -> None:
-    term = ContourTerm(nu=1.7) if kind == "Lorentzian" else ContourTerm(potential_kind=Leclerc)
+    ours = {"Lorentzian": ContourTerm(nu=1.7), "Leclerc": ContourTerm(potential_kind=Leclerc)}
+    term = {**ours, **PRINTED}[kind]
     camera = make_camera(distortion)
-    field = rough_field(generator)
+    field = weighed_field(generator)
+    field = field[:2] if kind in ours else field
     nodes = random_nodes(camera, *batch, generator=generator)
     got = term.point_cost(nodes, camera, field)
     model = camera.project_with_derivatives(nodes.points)
@@ -144,11 +159,13 @@ def test_the_image_normal_is_that_of_the_projected_contour(generator: torch.Gene
 
 
 @pytest.mark.parametrize(("window", "step"), [(12.0, 1.0), (7.5, 1.7)])
+@pytest.mark.parametrize("kind", ["ours", *PRINTED])
 def test_the_search_is_that_of_its_plain_twin(
-    window: float, step: float, generator: torch.Generator
+    window: float, step: float, kind: str, generator: torch.Generator
 ) -> None:
     """All over the image and beyond: lines that leave it, or lie outside, among them."""
-    term, field = ContourTerm(window=window, step=step), rough_field(generator)
+    term = replace(PRINTED.get(kind, TERM), window=window, step=step)
+    field = weighed_field(generator)
     size = torch.tensor([WIDTH + 30.0, HEIGHT + 30.0], dtype=torch.float64)
     uv = size * torch.rand(60, 2, generator=generator, dtype=torch.float64) - 15
     angle = 7 * torch.rand(60, generator=generator, dtype=torch.float64)
@@ -157,7 +174,7 @@ def test_the_search_is_that_of_its_plain_twin(
     rows = zip(*(part.tolist() for part in found), strict=True)
     got = sorted((node, distance, weight) for node, distance, weight in rows if weight > 1e-6)
     expected = sorted(row for row in edges_along_lines(term, uv, normal, field) if row[2] > 1e-6)
-    assert len(got) > 60
+    assert len(got) > (30 if kind == "gaussian" else 60)
     torch.testing.assert_close(torch.tensor(got), torch.tensor(expected), rtol=0, atol=2e-4)
 
 
@@ -323,6 +340,44 @@ def test_hidden_and_absent_nodes_have_no_pull(generator: torch.Generator) -> Non
     seen = TERM.point_cost(nodes._replace(exists=one, visible=one), camera, field)
     assert (seen.value >= 0).all()
     assert (seen.value <= TERM.unmatched + 1e-6).all()
+
+
+def printed_cost(u: float, term: ContourTerm, *ridge: tuple[float, float, float]) -> float:
+    """Cost of a node beside edges of weight one."""
+    field = torch.cat([ridges(*ridge), torch.ones(1, HEIGHT, WIDTH).double()])
+    return float(node_costs(field, torch.tensor([u]).double(), term)[0])
+
+
+def test_edges_add_up_as_printed() -> None:
+    """Eq. 8: a second and a third edge each add half of their rho, and none is better than one."""
+    edges = [(67.0, 1.0, 0.9), (72.0, 1.0, 0.9), (58.0, 1.0, 0.9)]
+    halves = [0.5 * math.log(1 + (d / 2.5) ** 2) for d in (3.0, 8.0, 6.0)]
+    for count in (1, 2, 3):
+        got = printed_cost(64.0, AS_PRINTED, *edges[:count])
+        assert got == pytest.approx(sum(halves[:count]), abs=0.02)
+    nearest = PRINTED["gaussian"]
+    assert printed_cost(64.0, nearest, *edges) == pytest.approx(0.5 * (3 / 8.5) ** 2, abs=0.01)
+    assert printed_cost(64.0, AS_PRINTED) == AS_PRINTED.fitted_level
+    assert printed_cost(64.0, AS_PRINTED, (66.0, 1.0, 0.19)) == AS_PRINTED.fitted_level
+
+
+def test_weights_are_within_rho_as_printed() -> None:
+    """At the edge's own pixel; in [RR] times the strength."""
+    field = torch.cat([ridges((67.0, 1.0, 0.9)), torch.ones(1, HEIGHT, WIDTH).double()])
+    field[2, :, 66:69] = 0.5
+    u = torch.tensor([64.0], dtype=torch.float64)
+    for strength, weight in ((False, 0.5), (True, 0.45)):
+        got = node_costs(field, u, replace(AS_PRINTED, strength=strength))[0]
+        assert float(got) == pytest.approx(0.5 * math.log(1 + weight * (3 / 2.5) ** 2), abs=0.01)
+
+
+@pytest.mark.parametrize("term", PRINTED.values(), ids=PRINTED)
+def test_no_limb_gains_by_hiding_as_printed(term: ContourTerm) -> None:
+    """A node on its edge costs less than one that is hidden, or that faces away."""
+    hidden = min(term.occlusion_factor, 1.0) * term.fitted_level * term.nu
+    assert printed_cost(64.0, term, (64.0, 1.0, 0.9)) < 0.1 * hidden
+    if term.assignment == "nearest":  # and wherever its edge is in the window
+        assert printed_cost(64.0, term, (75.0, 1.0, 0.9)) < hidden
 
 
 def test_no_nodes() -> None:

@@ -272,6 +272,9 @@ def test_costs_without_a_measurement(generator: torch.Generator) -> None:
     assert not term.point_cost(
         seen(points, 0 * normals, one, camera), camera, targets
     ).gradient.any()
+    # Eq. 9 has no constant for what was not measured.
+    printed = FlowTerm(nu=2.0, printed=True)
+    assert not printed.value(seen(points, towards, one, camera), camera, silent).any()
 
 
 def test_nodes_out_of_sight_at_the_parent_have_no_target(generator: torch.Generator) -> None:

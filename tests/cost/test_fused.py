@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from made_costs import changed, make_full_cost, random_states
+from made_costs import changed, make_full_cost, printed_cost, random_states
 from made_engines import assert_close, awkward_states, colours_of
 
 from torchcss.body.shape import with_shape
@@ -104,15 +104,28 @@ def test_awkward_poses(name: str, dtype: str, generator: torch.Generator) -> Non
     assert_close(cost, awkward_states(cost, generator), dtype)
 
 
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("preset", ["ijrr_css", "rr_multiple_hypothesis", "ijrr_gaussian_single"])
+@pytest.mark.parametrize("name", BODIES)
+def test_printed_costs(name: str, preset: str, dtype: str, generator: torch.Generator) -> None:
+    cost = printed_cost(make_full_cost(name), preset)
+    x = awkward_states(cost, generator)
+    if dtype == "float32":  # of greater costs, Gaussian ones, single precision has no hundredths
+        x = x[cost.value(x) < 1e4]
+        assert len(x) > 3
+    assert_close(cost, x, dtype)
+
+
 CHECK = """
 import torch
 from dataclasses import replace
 from made_engines import assert_close, awkward_states, colours_of
-from made_costs import make_full_cost
+from made_costs import make_full_cost, printed_cost
 cost = colours_of(make_full_cost("arm8"))
 x = awkward_states(cost, torch.Generator().manual_seed(0))[[0, 7, 9]]
-assert_close(cost, x, "float64")
-assert_close(cost, x, "float32")
+for each in (cost, printed_cost(cost, "ijrr_css"), printed_cost(cost, "ijrr_gaussian_single")):
+    assert_close(each, x, "float64")
+    assert_close(each, x, "float32")
 print("checked")
 """
 

@@ -92,3 +92,15 @@ def test_far_tails_stay_finite(dtype: torch.dtype, far: float) -> None:
         assert torch.isfinite(part).all()
     assert model.value[0] > 40
     assert (model.gradient[:, 0] * x[:, 0] >= 0).all()
+
+
+def test_the_papers_stabilise_what_is_hard_to_estimate() -> None:
+    """Section 3.2.2: clavicles, spine, neck and twists; not what moves the limbs in the image."""
+    for name, free in (("arm8", 3), ("body34", 14)):
+        body = load_body(name)
+        held = Stabiliser(hidden_only=True).deviation(body).isfinite()
+        everything = Stabiliser().deviation(body).isfinite()
+        assert int((everything & ~held).sum()) == free
+        names = {name for name, has in zip(body.state_names, held.tolist(), strict=True) if has}
+        assert not any("elbow" in name or "knee" in name or "root" in name for name in names)
+        assert {"r_clavicle_protraction", "r_shoulder_twist"} <= names

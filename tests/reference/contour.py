@@ -37,8 +37,13 @@ def cost_of_fixed_matches(
     moved = ((projection.uv - uv) * normal_uv).sum(-1)
     cost = torch.full_like(moved, term.unmatched)
     node, distance, weight = assignments
-    rho = term.potential((distance - moved.flatten()[node]).square()).rho
-    wells = weight * projection.valid.flatten()[node] * (term.unmatched - 0.5 * rho)
+    squared = (distance - moved.flatten()[node]).square()
+    if term.assignment == "shared":
+        wells = weight * (term.unmatched - 0.5 * term.potential(squared).rho)
+    else:
+        number = torch.zeros_like(cost).flatten().index_add(0, node, torch.ones_like(distance))
+        wells = term.nu / number[node] - 0.5 * term.potential(weight * squared).rho
+    wells = projection.valid.flatten()[node] * wells
     cost = cost - torch.zeros_like(cost).flatten().index_add(0, node, wells).reshape(cost.shape)
     absent = term.fitted_level * term.nu
     hidden = term.occlusion_factor * absent
@@ -55,7 +60,7 @@ def edges_along_lines(
         response = []
         for k in range(-reach, reach + 1):
             field, inside = sample_bilinear(edge_field, start + k * term.step * along)
-            response.append(float((field @ along).abs() * inside))
+            response.append(float((field[:2] @ along).abs() * inside))
         edges = []
         for i in range(2, len(response) - 2):
             before, left, middle, right, after = response[i - 2 : i + 3]
@@ -71,8 +76,20 @@ def edges_along_lines(
             fall = min(middle - low, middle - high) / max(height, 1e-3)
             sharpness = fall * 2 / (1.5 * term.step) ** 2 / 0.05
             distance = (i - reach + shift) * term.step
-            if abs(distance) < term.window and sharpness > 0:
+            if abs(distance) >= term.window:
+                continue
+            if term.assignment != "shared":
+                if height >= term.least_edge:
+                    place = start + distance * along
+                    weight = float(sample_bilinear(edge_field, place)[0][2])
+                    edges.append((distance, weight * (height if term.strength else 1.0)))
+            elif sharpness > 0:
                 edges.append((distance, height * min(sharpness, 1.0)))
+        if term.assignment != "shared":
+            if term.assignment == "nearest":
+                edges = sorted(edges, key=lambda edge: abs(edge[0]))[:1]
+            found += [(node, *edge) for edge in edges]
+            continue
         entered = [min(1.0, (term.window - abs(d)) / (0.25 * term.window)) for d, _ in edges]
         total = sum(w * share for (_, w), share in zip(edges, entered, strict=True))
         found += [(node, distance, weight / max(total, 1.0)) for distance, weight in edges]

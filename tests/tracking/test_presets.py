@@ -3,9 +3,14 @@ from dataclasses import replace
 import problems
 import pytest
 import torch
+from made_costs import make_full_cost, printed_cost
 
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.flow import FlowTerm
+from torchcss.cost.interior import InteriorNodes
+from torchcss.cost.stabiliser import Stabiliser
+from torchcss.cost.term import OnPoints
+from torchcss.cost.visibility import ContourPredictor
 from torchcss.errors import ConfigurationError
 from torchcss.inference.dynamics import ConstantVelocity
 from torchcss.inference.mixture import GaussianMixture
@@ -25,6 +30,7 @@ from torchcss.tracking.settings import (
     TERMS,
     Settings,
     make_choice,
+    make_extractor,
     settings_from_plain,
 )
 from torchcss.types import Bounds, Curvature, Status
@@ -158,14 +164,27 @@ def test_nothing_of_ours_is_in_the_papers_rows(name, body):
     assert row.jumps_every == 0
     assert row.persistence == (1.0 if "cham_rehg" in name else 0.0)
     choice = make_choice(settings, 2.0)
-    expected = set(PAPER_TERMS) - {"motion_boundaries"}
+    expected = set(PAPER_TERMS) - {"motion_boundaries", "foreground"}
     if not row.interpenetration:
         expected.discard("interpenetration")
     assert {term.name for term in choice.terms} == expected
-    for term in (choice.find(ContourTerm), choice.find(FlowTerm)):
-        assert term is not None
-        assert term.fitted_level == 1.0
+    contour, flow = choice.find(ContourTerm), choice.find(FlowTerm)
+    assert contour is not None
+    assert flow is not None
+    for term in (contour, flow):
+        assert (term.fitted_level, term.weight) == (1.0, settings.contour_weight)
         assert (term.occlusion_factor > 1) == name.startswith("ijrr_")
+    assert flow.printed
+    assert contour.assignment == ("sum" if row.robust else "nearest")
+    assert contour.strength == name.startswith("rr_")
+    assert contour.foreground == name.startswith("ijrr_")
+    stabiliser = choice.find(Stabiliser)
+    assert stabiliser is not None
+    assert stabiliser.hidden_only
+    assert (stabiliser.nu == 9.0) == row.robust
+    extractor = make_extractor(settings)
+    assert (extractor.edges.window is None) == name.startswith("rr_")
+    assert extractor.colour == contour.foreground
     tracker = make_tracker(name, body, motion=0.1)
     if isinstance(tracker, Tracker):
         optimiser = tracker.optimiser
@@ -192,12 +211,27 @@ def test_figure_6_draws_from_scaled_covariances_and_nothing_else(name):
     assert not tracker.keep_alike
 
 
+@pytest.mark.parametrize("name", ["ijrr_css", "ijrr_gaussian_single"])
+def test_both_terms_are_divided_by_one_number_of_nodes(name):
+    """N of eq. 5."""
+    cost = printed_cost(make_full_cost("arm8"), name)
+    view = cost.views[0]
+    count = sum(view.tables.of(kind).num_nodes for kind in (ContourPredictor, InteriorNodes))
+    for kind in (ContourTerm, FlowTerm):
+        term = cost.choice.find(kind)
+        assert term is not None
+        bound = cost.bound[term, view]
+        assert isinstance(bound, OnPoints)
+        assert bound.scale == pytest.approx(Settings().contour_weight / count)
+
+
 def test_which_rows_have_physical_constraints():
     said = {name: (PRESETS[name].limits, PRESETS[name].interpenetration) for name in PAPERS}
     assert said["ijrr_gaussian_single"] == said["ijrr_robust_single"] == (False, False)
     assert said["ijrr_cham_rehg_ssd"] == (False, False)
     assert said["ijrr_single_limits"] == said["ijrr_css_limits"] == (True, False)
     assert said["ijrr_css"] == said["ijrr_css_constrained"] == (True, True)
+    assert said["rr_multiple_hypothesis"] == (True, False)
     assert PRESETS["rr_multiple_hypothesis"].curvature is Curvature.GAUSS_NEWTON
     assert PRESETS["ijrr_css"].curvature is Curvature.EXACT
 

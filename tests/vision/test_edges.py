@@ -70,6 +70,17 @@ def test_normalisation_evens_out_light_and_the_floor_keeps_noise_quiet(
     assert edge_features(noise).energy.mean() < 0.02
 
 
+def test_without_a_window_contrast_is_not_normalised() -> None:
+    """[RR] 3.2: a step of one floor has half the energy, in whatever surroundings."""
+    plain = EdgeConfiguration(window=None, floor=0.1)
+    for low in (0.1, 0.5):
+        energy = edge_features(step_image(low=low, high=low + 0.1), plain).energy
+        assert float(energy.max()) == pytest.approx(0.5, abs=0.1)
+    strong = edge_features(step_image(low=0.1, high=0.9), plain).energy[30, 39]
+    weak = edge_features(step_image(low=0.3, high=0.35), plain).energy[30, 39]
+    assert weak < 0.3 * strong
+
+
 def test_smoothing_does_not_change_the_scale() -> None:
     """The factor sqrt(2 pi) smoothing makes the peak that of the step, less Sobel's own blur."""
     peaks = [

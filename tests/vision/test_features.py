@@ -196,6 +196,7 @@ def test_edge_fields_emphasise_what_moves(generator: torch.Generator) -> None:
     for k in (0.0, 0.3, 1.0):
         expected = plain * (1.0 - k * features.motion_boundary) * weight
         torch.testing.assert_close(features.edge_field(boundary_emphasis=k), expected)
+        torch.testing.assert_close(plain * features.edge_weight(boundary_emphasis=k), expected)
     torch.testing.assert_close(features.edge_field(), features.edge_field(boundary_emphasis=0.3))
     still = features._replace(motion_boundary=None, mask=None)
     torch.testing.assert_close(still.edge_field(), plain)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, TypeVar
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -16,9 +17,15 @@ from torchcss.types import Keypoints
 from torchcss.vision.appearance import Appearance
 from torchcss.vision.background import Background
 from torchcss.vision.camera import Camera
+from torchcss.vision.edges import foreground_weight
 from torchcss.vision.features import FrameFeatures
+from torchcss.vision.sampling import gaussian_blur
 
 _T = TypeVar("_T")
+
+_GRAIN = 2.0
+"""Pixels over which the belief in the foreground is smoothed before it weighs edges: single pixels
+that look like the body are none."""
 
 
 class BodyTables:
@@ -49,7 +56,8 @@ class FrameContext:
         camera: The camera, at the size of the features.
         tables: Tables of the body; by default made when a term asks for them.
         features: Features of the picture; None: the picture is missing.
-        edge_field: Edge energy times gradient direction.
+        edge_field: Edge energy times gradient direction, weighed by boundaries and foreground.
+        boundary_emphasis: Weight of the boundaries in it, see `FrameFeatures.edge_field`.
         keypoints: Those of the frame, in the features' pixels, or one set for each of the modes.
         appearance: What the body's parts and their surroundings look like.
         background: What is behind the body.
@@ -64,6 +72,7 @@ class FrameContext:
     tables: BodyTables = field(default=None)  # type: ignore[assignment]
     features: FrameFeatures | None = None
     edge_field: Float[Tensor, "2 h w"] | None = None
+    boundary_emphasis: float = 0.0
     keypoints: Keypoints | None = None
     appearance: Appearance | None = None
     background: Background | None = None
@@ -80,6 +89,24 @@ class FrameContext:
     def is_out(self) -> bool:
         """Whether there is no picture."""
         return self.features is None and self.edge_field is None
+
+    def weighed_edges(self, *, foreground: bool) -> Float[Tensor, "3 h w"] | None:
+        """Edge energy times direction as found, and the weight of each pixel; None: no picture.
+
+        Args:
+            foreground: Whether what is learnt of body and background weighs them where no mask was
+                given (section 8 [IJRR]).
+        """
+        field, features = self.edge_field, self.features
+        if field is None or features is None:
+            return None if field is None else torch.cat([field, torch.ones_like(field[:1])])
+        found = features.edge_energy * features.edge_direction
+        weight = features.edge_weight(boundary_emphasis=self.boundary_emphasis)
+        ratio = self.foreground(background=True) if foreground and features.mask is None else None
+        if ratio is not None:
+            belief = gaussian_blur(0.5 + 0.5 * ratio.amax(0)[None, None], _GRAIN)[0, 0]
+            weight = weight * foreground_weight(belief)
+        return torch.cat([found, weight[None]]).to(field)
 
     def foreground(self, *, background: bool) -> Float[Tensor, "layers h w"] | None:
         """Foreground log-likelihood ratio of every pixel for each layer of parts, through a tanh.

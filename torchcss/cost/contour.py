@@ -14,6 +14,17 @@ edge changes nothing, and one that appears on a slope starts with weight zero: t
 continuous. Only the distance along the normal counts (the aperture problem), `W_e = w_e m m^T`.
 Derivatives hold nodes, normals and assignments fixed.
 
+As printed (`assignment="sum"`, eq. 8 [IJRR], 7 [RR]) a node costs the sum of all its edges,
+
+    sum_e 1/2 rho(W_e d_e^2)
+
+with the weight of the edge's own pixel inside rho: `W = 1 - k S_p` in [IJRR], times that of the
+foreground where it is known (section 8); times the strength of the edge in [RR]. The papers do not
+say which maxima are edges (here: those of at least `least_edge`), nor what a visible node without
+an edge costs (here: `nu_bf`; decision "printed cost"). The cost jumps where an edge enters the
+window. With "nearest" the nearest edge alone counts, for Gaussian errors, under which a second edge
+would outweigh the first.
+
 Rings without a contour cost `nu_bf`, existing nodes that are hidden `nu_occ = k nu_bf` (eq. 5).
 Both lie between a good fit and a bad one, U: as [IJRR] advises, their level is the error per node
 of a fitted model, and hidden nodes cost slightly more.
@@ -23,17 +34,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchcss.cost.context import FrameContext
+from torchcss.cost.interior import count_nodes
 from torchcss.cost.outline import ImageNodes, OutlineTerm
-from torchcss.cost.term import OnPoints
+from torchcss.cost.term import Need, OnPoints
 from torchcss.cost.visibility import places
-from torchcss.robust import Lorentzian, RobustPotential
+from torchcss.robust import Lorentzian, RobustPotential, RobustValue
 from torchcss.vision.sampling import inside_image, interpolate_bilinear
 
 
@@ -43,12 +55,22 @@ class EdgeAssignments(NamedTuple):
     Attributes:
         node: The node of each edge.
         distance: Signed distance from the node along its outward normal, pixels.
-        weight: Weight of the assignment; zero outside the window and where the maximum is flat.
+        weight: Weight of the assignment; zero outside the window and where the maximum is flat. As
+            printed: W.
     """
 
     node: Int[Tensor, " e"]
     distance: Float[Tensor, " e"]
     weight: Float[Tensor, " e"]
+
+
+class _Maxima(NamedTuple):
+    """Local maxima of the response on search lines; see `EdgeAssignments`."""
+
+    node: Int[Tensor, " e"]
+    distance: Float[Tensor, " e"]
+    height: Float[Tensor, " e"]
+    sharpness: Float[Tensor, " e"]
 
 
 _TINY = 1e-12
@@ -75,6 +97,10 @@ class ContourTerm(OutlineTerm):
         fitted_level: The mean error per node of a fitted model: 0.5 to 0.8 on the demo, whose
             surface is the model's own, 0.9 on the beam clip.
         potential_kind: The potential rho.
+        assignment: How the edges of a node share its cost; "sum" and "nearest" are as printed.
+        strength: As printed: whether W is in proportion to the edge's response ([RR] 3.2).
+        foreground: As printed: whether what is learnt of body and background weighs the edges.
+        least_edge: As printed: least response of an edge. Ours.
     """
 
     name: ClassVar[str] = "contour"
@@ -85,6 +111,15 @@ class ContourTerm(OutlineTerm):
     step: float = 1.0
     fitted_level: float = 0.9
     potential_kind: type = Lorentzian
+    assignment: Literal["shared", "sum", "nearest"] = "shared"
+    strength: bool = False
+    foreground: bool = False
+    least_edge: float = 0.2
+
+    @property
+    def needs(self) -> frozenset[Need]:
+        """Colours of body and background, if they weigh the edges."""
+        return frozenset(("appearance", "background") if self.foreground else ())
 
     @property
     def potential(self) -> RobustPotential:
@@ -94,18 +129,23 @@ class ContourTerm(OutlineTerm):
     @property
     def unmatched(self) -> float:
         """U, the cost of a visible node without assignment."""
+        if self.assignment != "shared":
+            return self.fitted_level * self.nu
         return 0.5 * float(self.potential(torch.tensor(self.window**2, dtype=torch.float64)).rho)
 
     def prepare(self, context: FrameContext) -> OnPoints | None:
         """Bind the term to the edges of a frame; None without a picture."""
-        field = context.edge_field
-        return None if field is None else self.bind(context, field)
+        if self.assignment == "shared":
+            field = context.edge_field
+            return None if field is None else self.bind(context, field)
+        field = context.weighed_edges(foreground=self.foreground)
+        return None if field is None else self.bind(context, field, count_nodes(context))
 
     def search(
         self,
         uv: Float[Tensor, "*batch p 2"],
         normal_uv: Float[Tensor, "*batch p 2"],
-        edge_field: Float[Tensor, "2 h w"],
+        edge_field: Float[Tensor, "c h w"],
     ) -> EdgeAssignments:
         """Search the image along the normals.
 
@@ -113,8 +153,32 @@ class ContourTerm(OutlineTerm):
             uv: Projected nodes, pixels; those of a batch are numbered in a row.
             normal_uv: Unit outward normals in the image.
             edge_field: Contrast-normalised gradient, of length at most one (edge energy times
-                direction).
+                direction). As printed: `FrameContext.weighed_edges`.
         """
+        maxima = self._maxima(uv, normal_uv, edge_field[:2])
+        if self.assignment == "shared":
+            return self._shared(maxima, uv.shape[:-1].numel())
+        node, distance, height, _ = (
+            part[(maxima.distance.abs() < self.window) & (maxima.height >= self.least_edge)]
+            for part in maxima
+        )
+        if self.assignment == "nearest":
+            far = distance.new_full((uv.shape[:-1].numel(),), torch.inf)
+            least = far.scatter_reduce(0, node, distance.abs(), "amin")
+            nearest = distance.abs() == least.index_select(0, node)
+            node, distance, height = (part[nearest] for part in (node, distance, height))
+        place, along = (v.detach().reshape(-1, 2)[node] for v in (uv, normal_uv))
+        place = place + distance[:, None] * along
+        weight = interpolate_bilinear(edge_field[2:], place)[:, 0]
+        return EdgeAssignments(node, distance, weight * height if self.strength else weight)
+
+    def _maxima(
+        self,
+        uv: Float[Tensor, "*batch p 2"],
+        normal_uv: Float[Tensor, "*batch p 2"],
+        edge_field: Float[Tensor, "2 h w"],
+    ) -> _Maxima:
+        """All local maxima of the response on the search lines, and a little beyond."""
         # Samples run along the first axis in memory, so that neighbours on a line are whole rows.
         start, along = (v.detach().reshape(-1, 2).mT.contiguous() for v in (uv, normal_uv))
         # Samples beyond the window, so that a maximum on its very edge is found too.
@@ -149,6 +213,11 @@ class ContourTerm(OutlineTerm):
         )
         sharpness = fall / height.clamp(min=1e-3) * (2 / (1.5 * self.step) ** 2 / _SHARP_ENOUGH)
         distance = self.step * (slot + (2 - reach) + shift)
+        return _Maxima(node, distance, height, sharpness)
+
+    def _shared(self, maxima: _Maxima, size: int) -> EdgeAssignments:
+        """The maxima of so many nodes with weights that share one."""
+        node, distance, height, sharpness = maxima
         weight = height * sharpness.clamp(0, 1) * (distance.abs() < self.window)
         # Weights share 1; one that enters the window takes its share from the others by degrees.
         share = weight * ((self.window - distance.abs()) / (_FADE * self.window)).clamp(max=1)
@@ -160,19 +229,19 @@ class ContourTerm(OutlineTerm):
         self,
         uv: Float[Tensor, "p 2"],
         normal_uv: Float[Tensor, "p 2"],
-        edge_field: Float[Tensor, "2 h w"],
+        edge_field: Float[Tensor, "c h w"],
     ) -> tuple[Float[Tensor, " p"], Float[Tensor, " p"], Float[Tensor, " p"]]:
         """Depth of the wells of nodes, and the cost's derivatives in the distance moved."""
         # Both components of a pixel side by side: fewer misses of the cache.
         edge_field = edge_field.to(uv).movedim(0, -1).contiguous().movedim(-1, 0)
-        unmatched, blocks = self.unmatched, []
+        blocks = []
         for start, along in zip(uv.split(_LINES), normal_uv.split(_LINES), strict=True):
-            node, distance, weight = self.search(start, along, edge_field)
-            squared = distance.square()
-            rho, first, second = self.potential(squared)
-            # d/dt of 1/2 rho((d - t)^2) at t = 0, t the node's motion along its normal.
+            found = self.search(start, along, edge_field)
+            node, distance, weight = found
+            well, squared, (_, first, second) = self._well(found, distance)
+            # d/dt of 1/2 rho(W (d - t)^2) at t = 0, t the node's motion along its normal.
             rows = (
-                weight * (unmatched - 0.5 * rho).clamp(min=0),
+                well.clamp(min=0) if self.assignment == "shared" else well,
                 -weight * first * distance,
                 weight * (first + 2 * second * squared),
             )
@@ -181,23 +250,36 @@ class ContourTerm(OutlineTerm):
         depth, slope, curvature = (torch.cat(parts) for parts in zip(*blocks, strict=True))
         return depth, slope, curvature
 
+    def _well(
+        self, found: EdgeAssignments, distance: Float[Tensor, " e"]
+    ) -> tuple[Float[Tensor, " e"], Float[Tensor, " e"], RobustValue]:
+        """What edges at some distance take off U, and rho with what it is of."""
+        node, _, weight = found
+        if self.assignment == "shared":
+            squared = distance.square()
+            value = self.potential(squared)
+            return weight * (self.unmatched - 0.5 * value.rho), squared, value
+        squared = weight * distance.square()
+        value = self.potential(squared)
+        share = self.unmatched / node.bincount().to(weight).index_select(0, node)
+        return share - 0.5 * value.rho, squared, value
+
     def match(
         self,
         nodes: ImageNodes,
-        image: Float[Tensor, "2 h w"],
+        image: Float[Tensor, "c h w"],
         at: Float[Tensor, "k 2"] | None = None,
     ) -> Float[Tensor, " k"]:
         """Depth of the nodes' wells below U, see `OutlineTerm.match`."""
         if at is None:
             return self._wells(nodes.uv, nodes.normal, image)[0]
         moved = ((at - nodes.uv) * nodes.normal).sum(-1)
-        node, distance, weight = self.search(nodes.uv, nodes.normal, image)
-        rho = self.potential((distance - moved.index_select(0, node)).square()).rho
-        wells = weight * (self.unmatched - 0.5 * rho)
-        return torch.zeros_like(moved).index_add(0, node, wells)
+        found = self.search(nodes.uv, nodes.normal, image)
+        wells, _, _ = self._well(found, found.distance - moved.index_select(0, found.node))
+        return torch.zeros_like(moved).index_add(0, found.node, wells)
 
     def derivatives(
-        self, nodes: ImageNodes, image: Float[Tensor, "2 h w"]
+        self, nodes: ImageNodes, image: Float[Tensor, "c h w"]
     ) -> tuple[Float[Tensor, " k"], Float[Tensor, "k 2"], Float[Tensor, "k 2 2"]]:
         """See `OutlineTerm.derivatives`."""
         depth, slope, curvature = self._wells(nodes.uv, nodes.normal, image)

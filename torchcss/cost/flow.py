@@ -14,6 +14,7 @@ a mode would gain from having lost sight of its nodes. It does not depend on x.
 
 Every sample is compared with the targets of its own parent mode x'. They are computed once per
 parent: `flow_targets` for all modes of the previous frame, then `FlowTargets.take(parent)`.
+`FlowTerm.printed` is eq. 9 as it stands: without that constant, and divided by N of eq. 5.
 
 At x, a node that faces away costs `nu_bf`, one hidden behind another part `nu_occ = k nu_bf`
 (eq. 5), both at the level of a fitted model as in `torchcss.cost.contour`. Facing is a ramp in the
@@ -37,7 +38,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchcss.cost.context import FrameContext
-from torchcss.cost.interior import InteriorNodes, seen_interior
+from torchcss.cost.interior import InteriorNodes, count_nodes, seen_interior
 from torchcss.cost.term import Kind, Need, OnPoints, Posed, Term
 from torchcss.cost.visibility import SeenNodes
 from torchcss.errors import ShapeError, check_shape
@@ -123,6 +124,7 @@ class FlowTerm(Term):
             and 0.6 to 0.8 on the beam clip.
         occlusion_factor: k of `nu_occ = k nu_bf`, see `ContourTerm`.
         potential_kind: The potential rho.
+        printed: Whether the term is eq. 9 alone; see the module.
     """
 
     name: ClassVar[str] = "flow"
@@ -135,6 +137,12 @@ class FlowTerm(Term):
     fitted_level: float = 0.3
     occlusion_factor: float = 1.1
     potential_kind: type = Lorentzian
+    printed: bool = False
+
+    @property
+    def untold(self) -> float:
+        """Cost of a node without measurement."""
+        return 0.0 if self.printed else self.fitted_level * self.nu
 
     @property
     def needs(self) -> frozenset[Need]:
@@ -149,12 +157,13 @@ class FlowTerm(Term):
         outlier = None if features.flow_outlier is None else features.flow_outlier.to(body.tie)
         before = seen_interior(Posed(context, body, body.pose(modes)))
         nodes = context.tables.of(InteriorNodes)
+        count = count_nodes(context) if self.printed else nodes.num_nodes
         return OnPoints(
             term=self,
             find=seen_interior,
             image=flow_targets(before, context.camera, features.flow.to(body.tie), outlier),
             link=nodes.node_link,
-            scale=self.weight / (max(nodes.num_nodes, 1) * self.nu),
+            scale=self.weight / (max(count, 1) * self.nu),
             size=nodes.num_nodes,
             of_parents=lambda posed, aims: FlowTargets(*(posed.of_parent(part) for part in aims)),
         )
@@ -215,7 +224,7 @@ class FlowTerm(Term):
     ) -> Float[Tensor, "*batch p"]:
         far = self.potential(targets.weight * math.hypot(*camera.image_size_wh) ** 2).rho
         back_facing = self.fitted_level * self.nu
-        untold = (1 - targets.weight) * back_facing
+        untold = (1 - targets.weight) * self.untold
         in_front = nodes.cost(cost + untold, back_facing, self.occlusion_factor)
         return near * in_front + (1 - near) * (0.5 * far + untold)
 

@@ -97,6 +97,7 @@ class FrameCosts:
             edge_field=None
             if features is None
             else features.edge_field(boundary_emphasis=self.boundary_emphasis).to(body.tie),
+            boundary_emphasis=self.boundary_emphasis,
             keypoints=keypoints,
             appearance=appearance,
             background=background,

@@ -8,8 +8,9 @@ from torch import Tensor, nn
 
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.surface import SurfaceSample, surface_points
+from torchcss.cost.context import FrameContext
 from torchcss.cost.term import Posed
-from torchcss.cost.visibility import SeenNodes, seen_nodes
+from torchcss.cost.visibility import ContourPredictor, SeenNodes, seen_nodes
 from torchcss.errors import ConfigurationError
 
 
@@ -77,6 +78,11 @@ class InteriorNodes(nn.Module):
         points = self.points_part @ turn + centre[..., None, :]
         normals = self.normals_part @ turn
         return SurfaceSample(points.flatten(-3, -2), normals.flatten(-3, -2))
+
+
+def count_nodes(context: FrameContext) -> int:
+    """N of eq. 5 of both papers: the nodes on contours and those inside together."""
+    return sum(context.tables.of(kind).num_nodes for kind in (ContourPredictor, InteriorNodes))
 
 
 def interior_nodes(posed: Posed) -> SurfaceSample:

@@ -86,15 +86,22 @@ class OutlineTerm(Term):
     def matched(self, match: Float[Tensor, "*batch p"]) -> Float[Tensor, "*batch p"]:
         """Cost of a node by its match, in units of nu."""
 
-    def bind(self, context: FrameContext, image: Any) -> OnPoints:
-        """The term on what it looks at in a frame."""
+    def bind(self, context: FrameContext, image: Any, count: int | None = None) -> OnPoints:
+        """The term on what it looks at in a frame.
+
+        Args:
+            context: The frame.
+            image: What the term looks at.
+            count: What the sum over nodes is divided by; None: their number.
+        """
         nodes = context.tables.of(ContourPredictor)
+        count = nodes.num_nodes if count is None else count
         return OnPoints(
             term=self,
             find=contour_nodes,
             image=image,
             link=nodes.node_link,
-            scale=self.weight / (max(nodes.num_nodes, 1) * self.nu),
+            scale=self.weight / (max(count, 1) * self.nu),
             size=nodes.num_nodes,
         )
 

@@ -23,6 +23,12 @@ from torchcss.cost.term import Kind, OnStates, Term
 from torchcss.robust import Lorentzian
 from torchcss.types import LocalModel
 
+_SEEN = (
+    *("shoulder_swing", "shoulder_raising", "elbow_flexion"),
+    *("hip_flexion", "hip_abduction", "knee_flexion", "ankle_flexion"),
+)
+"""Parameters that are easy to estimate. Of those that are hard the papers name the clavicles."""
+
 
 def long_tailed(
     x: Float[Tensor, "*batch n"],
@@ -54,6 +60,8 @@ class Stabiliser(Term):
         nu: Height of the tails, nats; the prior lets go at `sqrt(nu)` deviations.
         lengths: Whether free lengths are among the parameters; False: they have a prior of their
             own (`torchcss.cost.anthropometric`), and would count twice.
+        hidden_only: Only parameters that are hard to estimate have the prior, as section 3.2.2
+            wants: none of the swings and flexions of limbs, which move what the image shows.
     """
 
     name: ClassVar[str] = "stabiliser"
@@ -61,6 +69,7 @@ class Stabiliser(Term):
 
     nu: float = 9.0
     lengths: bool = False
+    hidden_only: bool = False
 
     def prepare(self, context: FrameContext) -> OnStates:
         """Bind the prior to the rest values of a body."""
@@ -69,10 +78,12 @@ class Stabiliser(Term):
 
     def deviation(self, body: BodyModel) -> Float[Tensor, " n"]:
         """Standard deviations of a body's parameters; infinite where free."""
-        deviation, lengths = body.sticky_deviation, list(proportion_columns(body).values())
-        if lengths and not self.lengths:
-            deviation = deviation.clone()
-            deviation[lengths] = math.inf
+        deviation, free = body.sticky_deviation.clone(), []
+        if not self.lengths:
+            free += proportion_columns(body).values()
+        if self.hidden_only:
+            free += [k for k, name in enumerate(body.state_names) if name.endswith(_SEEN)]
+        deviation[free] = math.inf
         return deviation
 
     def local_model(

@@ -110,9 +110,8 @@ class Preset:
         optimiser: How samples descend.
         converged_only: See `Tracker`.
         terms: Name of a set of terms, see `torchcss.tracking.settings.named_terms`.
-        levels: What a hidden node and one that faces away cost: "ours", the error per node of a
-            fitted model and a little more; "ijrr" and "rr": `nu_bf = nu` and `nu_occ = k nu`, k
-            above and below 1 (eq. 5 of both; the numbers 1.1 and 0.9 are ours).
+        cost: Whose cost it is: "ours"; "ijrr" or "rr": as printed, see
+            `torchcss.tracking.settings.make_choice`.
         recovery: Whether a loss widens the search, see `torchcss.tracking.recovery`.
         keypoints_use: See `Settings`.
         start: Which fits of the first frame the track starts from: all, or the likeliest with its
@@ -147,7 +146,7 @@ class Preset:
     optimiser: TrustRegionNewton = field(default_factory=lambda: _OURS)
     converged_only: bool = False
     terms: str = "default"
-    levels: Literal["ours", "ijrr", "rr"] = "ours"
+    cost: Literal["ours", "ijrr", "rr"] = "ours"
     recovery: bool = True
     keypoints_use: Literal["first", "all"] = "all"
     start: Literal["fits", "one fit"] = "fits"
@@ -208,7 +207,7 @@ def _printed(row: Preset, *, paper: Literal["ijrr", "rr"] = "ijrr") -> Preset:
         converged_only=True,
         coarse_every=0,
         terms="papers",
-        levels=paper,
+        cost=paper,
         recovery=False,
         keypoints_use="first",
         start="one fit",
@@ -307,6 +306,7 @@ PRESETS: dict[str, Preset] = {
             samples_body=49,  # 7 modes and 6 steps from each
             forgetting=0.0,
             noise=0.0,
+            interpenetration=False,
             curvature=Curvature.GAUSS_NEWTON,
         ),
         paper="rr",

@@ -35,6 +35,7 @@ from torchcss.tracking.presets import PRESETS, Preset, make_tracker, preset_name
 from torchcss.tracking.recovery import Recovery
 from torchcss.tracking.view import CameraView, Observer
 from torchcss.types import Bounds, Curvature
+from torchcss.vision.edges import EdgeConfiguration
 from torchcss.vision.features import FeatureExtractor
 from torchcss.vision.flow import TRACKING
 
@@ -50,16 +51,19 @@ STILL_TERMS = (*(name for name in TERMS if name != "flow"), "background", "silho
 it. Where a body turns quickly the flow falls behind, and holds it back."""
 
 PAPER_TERMS = (
-    *("contour", "motion_boundaries", "flow"),
+    *("contour", "motion_boundaries", "foreground", "flow"),
     *("stabiliser", "anthropometric", "interpenetration"),
 )
-"""What the papers' cost has ([IJRR] sections 3.1 and 3.2, [RR] section 3): edges weighed by motion
-boundaries, flow and priors on parameters; no colours, no prior over time (note 5 [IJRR])."""
+"""What the cost of [IJRR] has (sections 3.1, 3.2 and 8): edges weighed by motion boundaries and
+foreground, flow and priors on parameters; no costs of colours, no prior over time (note 5), no
+`edge_energy`, which eq. 8 and 9 lack. The rows of [RR] leave `foreground` and `interpenetration`
+out."""
 
-_NO_COST = ("motion_boundaries", "background")
+_NO_COST = ("motion_boundaries", "foreground", "background")
 """Names in `Settings.terms` that have no cost of their own. `motion_boundaries` weighs the edges of
-`contour` and `edge_energy` by the motion boundaries, `W = 1 - k S_p`; `background` tells `region`
-and `segmentation` what a camera that stands still sees behind the body."""
+`contour` and `edge_energy` by the motion boundaries, `W = 1 - k S_p`; `foreground` those of a
+`contour` as printed, by what is learnt of body and background where no mask is given; `background`
+tells `region` and `segmentation` what a camera that stands still sees behind the body."""
 
 
 def all_terms() -> tuple[str, ...]:
@@ -257,7 +261,9 @@ class Settings:
 
 def _preset_terms(row: Preset) -> tuple[str, ...]:
     """The terms of a row of the table."""
-    left_out = () if row.interpenetration else ("interpenetration",)
+    left_out = {"interpenetration"} if not row.interpenetration else set()
+    if row.cost == "rr":
+        left_out.add("foreground")
     return tuple(term for term in named_terms([row.terms]) if term not in left_out)
 
 
@@ -310,12 +316,19 @@ def make_extractor(settings: Settings) -> FeatureExtractor:
     kinds = [kind for name, kind in TERM_TABLE.items() if name in settings.used_terms]
     needs = {need for kind in kinds for need in kind().needs}
     flow = TRACKING if "flow" in needs or "motion_boundaries" in settings.used_terms else None
+    report = PRESETS[settings.preset].cost == "rr"
     extractor = FeatureExtractor(
+        edges=EdgeConfiguration(window=None, floor=_CONTRAST) if report else None,
         working_size=settings.working_size,
         flow=flow,
-        colour="appearance" in needs,
+        colour="appearance" in needs or "foreground" in settings.used_terms,
     )
     return extractor.to(dtype=settings.torch_dtype, device=settings.device)
+
+
+_CONTRAST = 0.12
+"""Deviation of grey levels that edges are measured by where contrast is not normalised: about what
+they have beside an outline. Ours."""
 
 
 def boundary_emphasis(settings: Settings) -> float:
@@ -333,6 +346,11 @@ def make_choice(settings: Settings, sigma: float, free_root: bool | None = None)
     what looks like it may be the rest of the person, who is not modelled. On the rendered arm its
     best mode flips in four of five seeds with it, and in none without. Nor does an arm know a
     background, which the rest of the person would be taken for.
+
+    As printed (`Preset.cost`) the contour is eq. 8 [IJRR] or 7 [RR], the flow eq. 9, both divided
+    by N and with the levels of eq. 5, and only what is hard to estimate is stabilised. Gaussian
+    errors look at the nearest edge, and their sigma is wider: by a factor that lets an edge at the
+    end of the window cost what a node costs that faces away, so that no limb gains by hiding.
 
     Args:
         settings: Which terms, and which tracker.
@@ -355,7 +373,11 @@ def make_choice(settings: Settings, sigma: float, free_root: bool | None = None)
         SegmentationTerm(background=background),
         flow,
         JointTerm(sigma=sigma, potential_kind=potential),
-        Stabiliser(lengths="anthropometric" not in chosen),
+        Stabiliser(
+            nu=9.0 if row.robust or row.cost == "ours" else _GAUSSIAN_TAILS,
+            lengths="anthropometric" not in chosen,
+            hidden_only=row.cost != "ours",
+        ),
     )
     terms = {**{name: kind() for name, kind in TERM_TABLE.items()}, **{t.name: t for t in set_up}}
     return CostChoice(
@@ -368,22 +390,49 @@ def make_choice(settings: Settings, sigma: float, free_root: bool | None = None)
 _OCCLUSION_FACTOR = {"ijrr": 1.1, "rr": 0.9}
 """k of `nu_occ = k nu`: above 1 in [IJRR] and below it in [RR], eq. 5 of both. Numbers: ours."""
 
+_GAUSSIAN_TAILS = 1e6
+"""Height of tails that no parameter reaches."""
+
 
 def _node_terms(settings: Settings, row: Preset, potential: type) -> tuple[ContourTerm, FlowTerm]:
-    """The two terms of eq. 5, with the preset's levels."""
+    """The two terms of eq. 5, as the preset has them."""
     contour = ContourTerm(weight=settings.contour_weight, potential_kind=potential)
     flow = FlowTerm(potential_kind=potential)
-    if row.levels != "ours":
-        factor = _OCCLUSION_FACTOR[row.levels]
-        return (
-            replace(contour, fitted_level=1.0, occlusion_factor=factor),
-            replace(flow, fitted_level=1.0, occlusion_factor=factor),
-        )
+    if row.cost != "ours":
+        return _printed(contour, flow, row, foreground="foreground" in settings.used_terms)
     # The weights of motion boundaries make the wells of a fitted model shallower; what is back-
     # facing or hidden must not become cheaper than that. 0.3 takes 12 % on the demo's true states.
     shallower = 0.4 * boundary_emphasis(settings)
     level = contour.unmatched - (1 - shallower) * (contour.unmatched - contour.fitted_level)
     return replace(contour, fitted_level=level), flow
+
+
+def _printed(
+    contour: ContourTerm, flow: FlowTerm, row: Preset, *, foreground: bool
+) -> tuple[ContourTerm, FlowTerm]:
+    """The two terms as printed: one weight for both, and one N."""
+    assert row.cost != "ours"
+    factor = _OCCLUSION_FACTOR[row.cost]
+    wider = 1.0 if row.robust else contour.window / (2**0.5 * contour.sigma)
+    return (
+        replace(
+            contour,
+            sigma=wider * contour.sigma,
+            fitted_level=1.0,
+            occlusion_factor=factor,
+            assignment="sum" if row.robust else "nearest",
+            strength=row.cost == "rr",
+            foreground=foreground,
+        ),
+        replace(
+            flow,
+            weight=contour.weight,
+            sigma=wider * flow.sigma,
+            fitted_level=1.0,
+            occlusion_factor=factor,
+            printed=True,
+        ),
+    )
 
 
 def make_settings_tracker(

@@ -11,6 +11,8 @@ pixels:
     gradient    g = sqrt(2 pi) smoothing Sobel(N)
     energy      E = |g|^2 / (|g|^2 + half_energy_step^2)
 
+Without a window there is no contrast normalisation, as in [RR] 3.2: N = S / floor.
+
 D is the local standard deviation, estimated from absolute deviations so that one strong edge in the
 window does not hide its neighbours; the floor is the noise below which a region counts as flat. The
 factor of g makes a clean step of h deviations have |g| = h, whatever the smoothing. E is in [0, 1).
@@ -46,20 +48,21 @@ class EdgeConfiguration:
 
     Attributes:
         smoothing: Standard deviation of the Gaussian smoothing, pixels.
-        window: Standard deviation of the window of the contrast normalisation, pixels.
-        floor: Least local standard deviation, grey levels of 0..1.
+        window: Standard deviation of the window of the contrast normalisation, pixels; None: there
+            is none.
+        floor: Least local standard deviation, grey levels of 0..1; without a window the only one.
         half_energy_step: The step, in local standard deviations, whose energy is one half.
     """
 
     smoothing: float = 1.2
-    window: float = 16.0
+    window: float | None = 16.0
     floor: float = 0.06
     half_energy_step: float = 1.0
 
     def __post_init__(self) -> None:
         for name in ("smoothing", "window", "floor", "half_energy_step"):
             value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
+            if value is not None and not (math.isfinite(value) and value > 0.0):
                 raise ConfigurationError(f"edges: {name} must be positive and finite, got {value}")
 
 
@@ -95,9 +98,12 @@ def edge_features(
     choice = configuration or EdgeConfiguration()
     height, width = grey.shape
     smooth = gaussian_blur(grey[None, None], choice.smoothing)
-    detail = smooth - gaussian_blur(smooth, choice.window)
-    deviation = math.sqrt(0.5 * math.pi) * gaussian_blur(detail.abs(), choice.window)
-    normalised = detail / torch.sqrt(deviation.square() + choice.floor**2)
+    if choice.window is None:
+        normalised = smooth / choice.floor
+    else:
+        detail = smooth - gaussian_blur(smooth, choice.window)
+        deviation = math.sqrt(0.5 * math.pi) * gaussian_blur(detail.abs(), choice.window)
+        normalised = detail / torch.sqrt(deviation.square() + choice.floor**2)
     gradient = kornia.filters.spatial_gradient(normalised)[0, 0]
     # The border is replicated, which halves the slope across it.
     if width > 1:

@@ -126,14 +126,31 @@ class FrameFeatures(NamedTuple):
         Raises:
             ConfigurationError: If k is not in 0..1.
         """
+        energy = self.edge_energy
+        for weight in self._edge_weights(boundary_emphasis):
+            energy = energy * weight
+        return energy * self.edge_direction
+
+    def edge_weight(self, *, boundary_emphasis: float = 0.3) -> Float[Tensor, "h w"]:
+        """The weights of `edge_field` alone, one where nothing weighs the edges.
+
+        Args:
+            boundary_emphasis: See `edge_field`.
+        """
+        weight = torch.ones_like(self.edge_energy)
+        for factor in self._edge_weights(boundary_emphasis):
+            weight = weight * factor
+        return weight
+
+    def _edge_weights(self, boundary_emphasis: float) -> list[Tensor]:
         if not 0.0 <= boundary_emphasis <= 1.0:
             raise ConfigurationError(f"boundary_emphasis must lie in 0..1, got {boundary_emphasis}")
-        energy = self.edge_energy
+        weights = []
         if self.motion_boundary is not None:
-            energy = energy * (1.0 - boundary_emphasis * self.motion_boundary)
+            weights.append(1.0 - boundary_emphasis * self.motion_boundary)
         if self.mask is not None:
-            energy = energy * foreground_weight(self.mask)
-        return energy * self.edge_direction
+            weights.append(foreground_weight(self.mask))
+        return weights
 
 
 class FeatureExtractor(nn.Module):

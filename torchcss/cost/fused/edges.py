@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from torchcss.cost.fused.potentials import potential_of
 from torchcss.cost.fused.records import Array, Edges, Peaks, Seen
-from torchcss.kernels.compiler import floor, kernel
+from torchcss.kernels.compiler import floor, inlined, kernel
+
+ASSIGNMENTS = ("shared", "sum", "nearest")
+"""`ContourTerm.assignment`; `Edges.assignment` is a place in this list."""
 
 _TINY = 1e-12
 _SHARP_ENOUGH = 0.05
@@ -30,7 +33,10 @@ def match_edges(
         _respond(edges, (seen.u[k], seen.v[k]), (seen.mu[k], seen.mv[k]), workspace[0])
         total = _collect(edges, workspace[0], workspace[1], peaks, total)
     seen.first[count] = total
-    _weigh(edges, peaks, total)
+    if edges.assignment == 0:
+        _weigh(edges, peaks, total)
+    else:
+        _add_up(edges, seen, count, peaks)
     for k in range(count):
         share = well = slope = curvature = edges.scale * 0.0
         for n in range(seen.first[k], seen.first[k + 1]):
@@ -96,10 +102,7 @@ def _weigh(edges: Edges, peaks: Peaks, total: int) -> None:
     for n in range(total):
         left, middle, right = peaks.left[n], peaks.middle[n], peaks.right[n]
         before, after = peaks.before[n], peaks.after[n]
-        curve = max(2.0 * middle - left - right, _TINY)
-        shift = 0.5 * (right - left) / curve
-        side = 2.0 * right - middle - after if shift > 0.0 else 2.0 * left - before - middle
-        height = middle + 0.5 * shift * shift * (curve + abs(shift) * (side - curve))
+        shift, height = _top(before, left, middle, right, after)
         fall = middle - max(
             left + (0.5 - shift) * (before - left), right + (0.5 + shift) * (after - right)
         )
@@ -114,3 +117,74 @@ def _weigh(edges: Edges, peaks: Peaks, total: int) -> None:
         peaks.well[n] = max(edges.unmatched - 0.5 * rho, 0.0)
         peaks.slope[n] = first * distance
         peaks.curvature[n] = first + 2.0 * second * squared
+
+
+@inlined
+def _top(
+    before: float, left: float, middle: float, right: float, after: float
+) -> tuple[float, float]:
+    """Where a maximum is, in steps from its highest sample, and how high."""
+    curve = max(2.0 * middle - left - right, _TINY)
+    shift = 0.5 * (right - left) / curve
+    side = 2.0 * right - middle - after if shift > 0.0 else 2.0 * left - before - middle
+    return shift, middle + 0.5 * shift * shift * (curve + abs(shift) * (side - curve))
+
+
+@kernel
+def _add_up(edges: Edges, seen: Seen, count: int, peaks: Peaks) -> None:
+    """The edges of all nodes as printed: each counts in full, or the nearest alone."""
+    for k in range(count):
+        begin, end = seen.first[k], seen.first[k + 1]
+        number, nearest = 0, edges.window
+        for n in range(begin, end):
+            shift, height = _top(
+                peaks.before[n], peaks.left[n], peaks.middle[n], peaks.right[n], peaks.after[n]
+            )
+            distance = peaks.place[n] + edges.step * shift
+            is_edge = (abs(distance) < edges.window) & (height >= edges.least)
+            peaks.place[n], peaks.middle[n] = distance, height
+            peaks.weight[n] = 1.0 if is_edge else 0.0
+            if is_edge:
+                number, nearest = number + 1, min(nearest, abs(distance))
+        if edges.assignment == 2:
+            number = 0
+            for n in range(begin, end):
+                if abs(peaks.place[n]) > nearest:
+                    peaks.weight[n] = 0.0
+                number += int(peaks.weight[n] > 0.0)
+        for n in range(begin, end):
+            peaks.share[n] = 0.0
+            if peaks.weight[n] > 0.0:
+                _price(edges, (seen.u[k], seen.v[k]), (seen.mu[k], seen.mv[k]), peaks, n)
+                peaks.well[n] += edges.unmatched / number
+
+
+@kernel
+def _price(
+    edges: Edges, place: tuple[float, float], normal: tuple[float, float], peaks: Peaks, n: int
+) -> None:
+    """Cost of an edge along a normal, and its derivatives."""
+    distance = peaks.place[n]
+    weight = _weight_at(edges, place[0] + distance * normal[0], place[1] + distance * normal[1])
+    if edges.strength:
+        weight = weight * peaks.middle[n]
+    squared = weight * distance * distance
+    rho, first, second = potential_of(edges.potential, squared)
+    peaks.well[n] = -0.5 * rho
+    peaks.slope[n] = weight * first * distance
+    peaks.curvature[n] = weight * (first + 2.0 * second * squared)
+
+
+@inlined
+def _weight_at(edges: Edges, x: float, y: float) -> float:
+    """The weight of the edges at a place, beyond the border that of the border."""
+    field, right, bottom = edges.field, edges.corner[0], edges.corner[1]
+    x, y = min(max(x, 0.0), right), min(max(y, 0.0), bottom)
+    left, top = min(floor(x), right - 1.0), min(floor(y), bottom - 1.0)
+    column, row = int(left), int(top)
+    above, below = (
+        field[row, column, 2] + (x - left) * (field[row, column + 1, 2] - field[row, column, 2]),
+        field[row + 1, column, 2]
+        + (x - left) * (field[row + 1, column + 1, 2] - field[row + 1, column, 2]),
+    )
+    return above + (y - top) * (below - above)

@@ -55,7 +55,7 @@ def follow_flow(
             x, y, z = nodes.x[i], nodes.y[i], nodes.z[i]
             k = i - part * size
             weight = target[2, part, k]
-            untold = (1.0 - weight) * flow.back_facing
+            untold = (1.0 - weight) * flow.untold
             near = min(max((z - lens.near) / _NEAR_RAMP, 0.0), 1.0)
             pixel = project(lens, x, y, z)
             if not pixel.valid:

@@ -19,6 +19,7 @@ from torchcss.cost.anthropometric import Anthropometric, proportion_columns
 from torchcss.cost.context import FrameContext
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.flow import FlowTerm
+from torchcss.cost.fused.edges import ASSIGNMENTS
 from torchcss.cost.fused.potentials import KINDS
 from torchcss.cost.fused.records import (
     Array,
@@ -183,6 +184,9 @@ def pack_edges(
         back_facing=real(back_facing),
         hidden=real(term.occlusion_factor * back_facing),
         potential=potential,
+        assignment=ASSIGNMENTS.index(term.assignment),
+        strength=term.strength,
+        least=real(term.least_edge),
     )
 
 
@@ -191,7 +195,9 @@ def no_edges(real: Real) -> Edges:
     zero = real(0)
     steps, field = np.zeros(5, real), np.zeros((2, 2, 2), real)
     corner, potential = np.ones(2, real), no_potential(real)
-    return Edges(zero, field, corner, steps, zero, zero, zero, zero, zero, potential)
+    return Edges(
+        zero, field, corner, steps, zero, zero, zero, zero, zero, potential, 0, False, zero
+    )
 
 
 def pack_colours(
@@ -236,6 +242,7 @@ def pack_flow(
         nodes=array(table, real),
         target=array(rows.reshape(len(rows), 3, *table.shape[::2]), real),
         back_facing=real(back_facing),
+        untold=real(term.untold),
         hidden=real(term.occlusion_factor * back_facing),
         far=real(math.hypot(*context.camera.image_size_wh) ** 2),
         potential=potential,
@@ -246,7 +253,7 @@ def no_flow(num_parts: int, real: Real) -> Flow:
     """Without the flow term."""
     nodes, target = np.zeros((num_parts, 6, 0), real), np.zeros((1, 3, num_parts, 0), real)
     zero, potential = real(0), no_potential(real)
-    return Flow(zero, nodes, target, zero, zero, zero, potential)
+    return Flow(zero, nodes, target, zero, zero, zero, zero, potential)
 
 
 def pack_keypoints(

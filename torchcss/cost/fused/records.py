@@ -131,7 +131,7 @@ class Edges(NamedTuple):
 
     Attributes:
         scale: Nats per unit of a node's cost; zero: there is no such term.
-        field: Edge energy times direction, `[h w 2]`.
+        field: Edge energy times direction, `[h w 2]`; as printed with the weights, `[h w 3]`.
         corner: Last column and last row, as `real` numbers.
         steps: Places of the samples along a normal, pixels.
         step: Distance between them.
@@ -140,6 +140,9 @@ class Edges(NamedTuple):
         back_facing: Cost of a node without a contour.
         hidden: Cost of a hidden node.
         potential: Kind, nu and sigma of the potential.
+        assignment: Place of the term's in `edges.ASSIGNMENTS`.
+        strength: Whether an edge's weight is in proportion to its response.
+        least: Least response of an edge as printed.
     """
 
     scale: Real
@@ -152,6 +155,9 @@ class Edges(NamedTuple):
     back_facing: Real
     hidden: Real
     potential: Potential
+    assignment: int
+    strength: bool
+    least: Real
 
 
 class Colours(NamedTuple):
@@ -186,6 +192,7 @@ class Flow(NamedTuple):
         nodes: Points and normals in the parts' frames, `[parts 6 nodes]`.
         target: Target of each node of each mode before, and its weight, `[modes 3 parts nodes]`.
         back_facing: Cost of a node that faces away.
+        untold: Cost of a node without measurement.
         hidden: Cost of a hidden node.
         far: Squared distance that a node behind the camera counts as, square pixels.
         potential: Kind, nu and sigma of the potential.
@@ -195,6 +202,7 @@ class Flow(NamedTuple):
     nodes: Array
     target: Array
     back_facing: Real
+    untold: Real
     hidden: Real
     far: Real
     potential: Potential
