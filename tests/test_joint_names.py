@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from torchcss.joint_names import (
     ALIASES,
     JOINT_NAMES,
+    LIMB_WORDS,
     canonical_joint_name,
     layout_of_names,
     skeleton_joint_names,
@@ -119,3 +120,73 @@ def test_any_skeleton_has_names_or_none(names: list[str]) -> None:
     found = skeleton_joint_names(names)
     assert len(found) == len(names)
     assert len([name for name in found if name]) == len({name for name in found if name})
+
+
+SIDES = {
+    "left_{0}": str, "l_{0}": str, "L_{0}": str, "{0}_l": str, "{0}.L": str, "{0}_Left": str,
+    "l{0}": str, "left{0}": str, "Left{0}": str.title, "L{0}": str.title, "l{0} ": str.title,
+    "{0}Left": str.title, "{0} L": str.title, "Bip01 L {0}": str.title,
+    "ValveBiped.Bip01_L_{0}": str.title, "J_Bip_L_{0}": str.title, "CC_Base_L_{0}": str.title,
+    "mixamorig:Left{0}": str.title, "mixamorigLeft{0}": str.title, "DEF-{0}.L": str,
+    "m{0}Left": str.title, "Actor:Left{0}": str.title,
+}  # fmt: skip
+"""Where programs put the side, here the left one, and how they write the rest."""
+
+
+def other_side(form: str) -> str:
+    """The same way of writing for the right side."""
+    for left, right in (("Left", "Right"), ("left", "right"), ("_L_", "_R_"), (" L ", " R ")):
+        if left in form:
+            return form.replace(left, right)
+    for left, right in (("L_", "R_"), ("l_", "r_"), ("_l", "_r"), (".L", ".R"), (" L", " R")):
+        if left in form:
+            return form.replace(left, right)
+    return form.replace("l{", "r{").replace("L{", "R{")
+
+
+@pytest.mark.parametrize("form", SIDES)
+@pytest.mark.parametrize("choice", range(max(map(len, LIMB_WORDS.values()))))
+def test_every_name_of_a_limb_with_every_side(form: str, choice: int) -> None:
+    """Both sides alike, whichever words a program uses and wherever the side stands."""
+    words = {place: names[min(choice, len(names) - 1)] for place, names in LIMB_WORDS.items()}
+    expected, names = [], []
+    for side, spelling in (("l", form), ("r", other_side(form))):
+        for place, word in words.items():
+            names.append(spelling.format(SIDES[form](word)))
+            expected.append(f"{side}_{place}")
+    assert len(set(names)) == 12
+    if {"arm", "leg"} & set(words.values()) and not {"upleg", "forearm"} & set(words.values()):
+        return  # alone they mean a whole limb
+    assert skeleton_joint_names(names) == tuple(expected)
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        # Unreal; twists and inverse kinematics beside the limbs.
+        (("pelvis", "spine_01", "clavicle_l", "upperarm_l", "upperarm_twist_01_l", "lowerarm_l",
+          "hand_l", "index_01_l", "thigh_l", "calf_l", "foot_l", "ball_l", "ik_hand_l", "neck_01"),
+         (None, None, None, "l_shoulder", None, "l_elbow", "l_wrist", None, "l_hip", "l_knee",
+          "l_ankle", "l_midtarsal", None, "vt1")),
+        # Rigify's second halves, Genesis' twists.
+        (("DEF-upper_arm.R", "DEF-upper_arm.R.001", "DEF-forearm.R", "DEF-hand.R", "DEF-thigh.R"),
+         ("r_shoulder", None, "r_elbow", "r_wrist", "r_hip")),
+        (("lThighBend", "lThighTwist", "lShin", "lFoot", "lShldrBend", "lForearmBend", "lHand"),
+         ("l_hip", None, "l_knee", "l_ankle", "l_shoulder", "l_elbow", "l_wrist")),
+        # Xsens and Kinect name joints, and have feet beside ankles, hands beside wrists.
+        (("Hips", "RightCollar", "RightShoulder", "RightElbow", "RightWrist", "RightHip",
+          "RightKnee", "RightAnkle", "RightToe", "Head"),
+         (None, None, "r_shoulder", "r_elbow", "r_wrist", "r_hip", "r_knee", "r_ankle",
+          "r_midtarsal", "skullbase")),
+        (("AnkleLeft", "FootLeft", "WristLeft", "HandLeft", "SpineBase"),
+         ("l_ankle", "l_midtarsal", "l_wrist", None, None)),
+        (("leftUpperLeg", "leftLowerLeg", "leftFoot", "leftShoulder", "leftUpperArm"),
+         ("l_hip", "l_knee", "l_ankle", None, "l_shoulder")),
+        (("LThigh", "LShin", "LFoot", "LShoulder", "LUArm", "LFArm", "LHand"),
+         ("l_hip", "l_knee", "l_ankle", None, "l_shoulder", "l_elbow", "l_wrist")),
+    ],
+)  # fmt: skip
+def test_skeletons_of_other_programs(
+    names: tuple[str, ...], expected: tuple[str | None, ...]
+) -> None:
+    assert skeleton_joint_names(names) == expected

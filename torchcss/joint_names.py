@@ -163,6 +163,9 @@ _PLACES: Final[dict[str, str]] = {
     "tophead": "skull_tip",
     "skulltip": "skull_tip",
 }
+_CASE: Final = r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])"
+"""Where a word begins by its case."""
+
 _SIDES: Final[dict[str, str]] = {"l": "l_", "left": "l_", "r": "r_", "right": "r_"}
 
 
@@ -181,7 +184,7 @@ def canonical_joint_name(name: str) -> str | None:
     """
     # Words: at every change from lower to upper case, before the last capital of a run of them
     # (LBigToe is L Big Toe), and at everything that is neither letter nor digit.
-    spaced = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", name)
+    spaced = re.sub(_CASE, " ", name)
     words = [word for word in re.split(r"[^a-z0-9]+", spaced.lower()) if word]
     side = ""
     for end in (0, -1):
@@ -232,23 +235,38 @@ def _numbered_side(name: str, names: Sequence[str]) -> str | None:
 
 
 LIMB_PLACES: Final[tuple[str, ...]] = ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")
-_SKELETONS: Final[tuple[dict[str, str], ...]] = tuple(
-    dict(zip(names, LIMB_PLACES, strict=True))
-    for names in (
-        # MotionBuilder, Mixamo, the BVH conversions of the CMU database.
-        ("upleg", "leg", "foot", "arm", "forearm", "hand"),
-        # Acclaim's bones by their starts, as in models for MuJoCo.
-        ("femur", "tibia", "foot", "humerus", "radius", "hand"),
-        ("thigh", "shin", "foot", "upperarm", "lowerarm", "hand"),
-        # Poser and DAZ Studio, and the BVH conversions of the CMU database that were made for them.
-        ("thigh", "shin", "foot", "shldr", "forearm", "hand"),
-    )
-)
-"""What skeletons call the joint in which a limb's segment starts, without side and prefix."""
 
-_ENDS: Final[dict[str, str]] = dict(
-    zip(("hipjoint", "femur", "tibia", "clavicle", "humerus", "wrist"), LIMB_PLACES, strict=True)
-)
+LIMB_WORDS: Final[dict[str, tuple[str, ...]]] = {
+    "hip": ("upleg", "upperleg", "thigh", "thighbend", "hip"),
+    "knee": ("knee", "lowerleg", "leg", "calf", "shin"),
+    "ankle": ("ankle", "foot"),
+    "shoulder": ("upperarm", "uarm", "arm", "shldr", "shldrbend", "shoulder"),
+    "elbow": ("elbow", "forearm", "lowerarm", "farm", "forearmbend"),
+    "wrist": ("wrist", "hand"),
+}
+"""What skeletons call the joint in which a limb's segment starts, without side and prefix; of
+several that are there the first: MotionBuilder, Mixamo, Rokoko; Unity, VRM and Xsens; Unreal,
+Biped and Character Creator; Rigify; Poser and DAZ Studio; OptiTrack; Kinect, SMPL and robots."""
+
+_SEGMENTS: Final = frozenset(
+    word for place, words in LIMB_WORDS.items() for word in words if word not in (place, "foot")
+) - {"hand"}
+"""Words of a limb's parts; files that use them call no joint after itself."""
+
+_ACCLAIM: Final[dict[str, tuple[str, ...]]] = {
+    place: (word,)
+    for place, word in zip(
+        LIMB_PLACES, ("femur", "tibia", "foot", "humerus", "radius", "hand"), strict=True
+    )
+}
+"""Acclaim's bones by their starts, as in models for MuJoCo."""
+
+_ENDS: Final[dict[str, tuple[str, ...]]] = {
+    place: (word,)
+    for place, word in zip(
+        LIMB_PLACES, ("hipjoint", "femur", "tibia", "clavicle", "humerus", "wrist"), strict=True
+    )
+}
 """The same where joints are the ends of Acclaim's bones. `radius` and `wrist` together are the
 forearm, cut where it twists."""
 
@@ -259,8 +277,12 @@ _SKELETON_PLACES: Final[dict[str, str]] = {
     "headtopend": "skull_tip",
     "toebase": "midtarsal",
     "toes": "midtarsal",
+    "toe": "midtarsal",
+    "ball": "midtarsal",
     "toebaseend": "toe",
+    "toesend": "toe",
     "toeend": "toe",
+    "ballend": "toe",
 }
 """Other joints of skeletons that are places of ours; `head` is where it turns, not its top."""
 
@@ -269,8 +291,9 @@ def skeleton_joint_names(names: Sequence[str], *, ends: bool = False) -> tuple[s
     """Return which of the catalogue's joints the joints of a skeleton are.
 
     A skeleton's joint is called after what it moves: `LeftArm` and `lhumerus` are shoulders, and
-    then `LeftShoulder` is the collar bone's joint. Which way of naming a file follows is what most
-    of its names fit; a file that follows none is read as by `canonical_joint_name`.
+    then `LeftShoulder` is the collar bone's joint. Where its names are those of joints, they are
+    read as by `canonical_joint_name`. The side may stand anywhere; what most names begin with is
+    the character's.
 
     Args:
         names: The skeleton's joint names.
@@ -279,28 +302,65 @@ def skeleton_joint_names(names: Sequence[str], *, ends: bool = False) -> tuple[s
     Returns:
         A member of `JOINT_NAMES`, each once, or `None`, for every joint.
     """
-    candidates: list[list[str | None]] = [
-        [_skeleton_place(name, layout) for name in names]
-        for layout in (*((_ENDS,) if ends else ()), *_SKELETONS, None)
-    ]
-    best = max(candidates, key=lambda found: len({name for name in found if name}))
-    return tuple(
-        name if name is not None and best.index(name) == index else None
-        for index, name in enumerate(best)
-    )
-
-
-def _skeleton_place(name: str, layout: Mapping[str, str] | None) -> str | None:
-    bare = re.sub(r"[^a-z]", "", name.lower().split(":")[-1].removeprefix("mixamorig"))
-    for side in ("left", "right", "l", "r", ""):
-        place = bare.removeprefix(side)
-        if side and place == bare:
-            # Blender's names end in the side: upper_arm.L.
-            words = re.split(r"[^a-z]+", name.lower().split(":")[-1])
-            place = "".join(words[:-1]) if words[-1] == side else bare
-            if place == bare:
-                continue
-        known = _SKELETON_PLACES.get(place) or (layout or {}).get(place)
+    spelt = _spelt(names)
+    tables = (*((_ENDS,) if ends else ()), LIMB_WORDS, _ACCLAIM)
+    table = max(tables, key=lambda table: len(_limbs(spelt, table)))
+    found = _limbs(spelt, table)
+    segments = table is not LIMB_WORDS or any(place in _SEGMENTS for _, place in spelt)
+    result: list[str | None] = [None] * len(names)
+    for name, index in found.items():
+        result[index] = name
+    for index, (side, place) in enumerate(spelt):
+        known = _SKELETON_PLACES.get(place)
         if known is not None and (known in _PAIRED) == bool(side):
-            return f"{side[0]}_{known}" if side else known
-    return canonical_joint_name(name) if layout is None else None
+            name = side + known
+        else:
+            name = None if segments else canonical_joint_name(names[index])
+        if result[index] is None and name not in result:
+            result[index] = name
+    return tuple(result)
+
+
+def _limbs(spelt: Sequence[tuple[str, str]], table: Mapping[str, Sequence[str]]) -> dict[str, int]:
+    """Which joints are those of the limbs, by the catalogue's names."""
+    places = {place for _, place in spelt}
+    # `arm` and `leg` are a limb's upper or lower part only beside words for the other.
+    alone = not places & {"upleg", "upperleg", "thigh", "forearm", "lowerarm"}
+    found: dict[str, int] = {}
+    for limb, words in table.items():
+        for side in ("l_", "r_"):
+            for word in words:
+                if (side, word) in spelt and not (alone and word in ("arm", "leg")):
+                    found[side + limb] = spelt.index((side, word))
+                    break
+    return found
+
+
+def _spelt(names: Sequence[str]) -> list[tuple[str, str]]:
+    """Side and place of every name, in small letters, without what they begin with alike."""
+    known = {*_SKELETON_PLACES, *_PLACES}
+    known.update(
+        word for table in (LIMB_WORDS, _ACCLAIM, _ENDS) for ws in table.values() for word in ws
+    )
+    split: list[tuple[str, list[str]]] = []
+    for name in names:
+        # Changes of case and digits part words; what stands before a colon is a namespace.
+        spaced = re.sub(_CASE, " ", name.split(":")[-1])
+        words = [word for word in re.split(r"[^a-z]+", spaced.lower()) if word]
+        sides = [index for index, word in enumerate(words) if word in _SIDES]
+        split.append((_SIDES[words.pop(sides[0])] if len(sides) == 1 else "", words))
+    every = [word for _, words in split for word in set(words)]
+    common = {word for word in every if 2 * every.count(word) >= len(names)} | {"def"}
+    result: list[tuple[str, str]] = []
+    for side, words in split:
+        while words and words[0] in common and "".join(words) not in known:
+            words = words[1:]
+        place = "".join(words)
+        if not side and place not in known:
+            for prefix in ("left", "right", "l", "r"):  # glued to the word
+                rest = place.removeprefix(prefix)
+                if place.startswith(prefix) and rest in known:
+                    side, place = _SIDES[prefix], rest
+                    break
+        result.append((side, place))
+    return result

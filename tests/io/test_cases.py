@@ -335,29 +335,8 @@ CASES: dict[str, Check] = {
     "vid_folder_rate": folder_rate,
 }
 
-NOT_YET: dict[str, str] = {
-    "body_bvh_biped": "silently wrong",
-    "body_bvh_no_motion": "refused",
-    "body_bvh_unreal": "silently wrong",
-    "body_bvh_z_up": "silently wrong",
-    "body_mjcf_equality": "silently wrong",
-    "body_side_suffix": "silently wrong",
-    "body_urdf_floating": "refused",
-    "body_urdf_mimic_missing": "refused",
-    "body_urdf_prefix": "refused",
-}
-"""Cases that fail, and how."""
 
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=pytest.mark.xfail(strict=True, reason=NOT_YET[name]))
-        if name in NOT_YET
-        else name
-        for name in CASES
-    ],
-)
+@pytest.mark.parametrize("name", CASES)
 def test_case(shared_data: Path, name: str) -> None:
     case = shared_data / "cases" / name
     if not case.is_dir():

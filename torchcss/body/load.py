@@ -52,6 +52,8 @@ from torchcss.joint_names import skeleton_joint_names
 BODY_SUFFIXES = (".urdf", ".xml", ".mjcf", ".bvh")
 
 _AS_IT_IS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+_BVH_Y_UP = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
+"""Z up to Y up, what faced -Y facing +Z."""
 _Y_UP = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
 """Robots are Z up and face +X: to Y up, facing +Z."""
 
@@ -202,20 +204,20 @@ def _read(
             raise BodyError(str(error)) from error
         except ConfigurationError as error:
             raise BodyError(f"{path}: {error}") from error
-        return skeleton, (), _AS_IT_IS
+        return skeleton, (), _BVH_Y_UP if skeleton.is_z_up else _AS_IT_IS
     if units is not None:
         raise BodyError(f"{path}: units are for BVH files; this format is in metres (see scale)")
     data = read_bytes(path, BodyError)
     root = parse_xml(path, data, "a URDF")
     if path.suffix.lower() != ".urdf" and root.tag in ("mujoco", "mujocoinclude"):
         return *read_mjcf(path), _Y_UP
-    joints, solids = read_urdf(path, root)
+    read = read_urdf(path, root)
+    joints = read.joints
     try:
         links = KinematicTree(joints).link_names
     except BodyError as error:
         raise BodyError(f"{path}: {error}") from error
-    note = "limits, axes and solids: as the URDF says"
-    return Skeleton(joints, {}, (note,), links, False), solids, _Y_UP
+    return Skeleton(joints, {}, read.notes, links, read.floats), read.solids, _Y_UP
 
 
 def _middle_of_hips(

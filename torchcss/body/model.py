@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -118,8 +118,8 @@ class BodyModel(nn.Module):
             if joint in body.ties:
                 driver, factor = body.ties[joint]
             elif joint in mimics:
-                driver, factor, offset = mimics[joint]
-                if driver not in self.tree.joint_names or driver in mimics:
+                driver, factor, offset = _driver(joint, mimics)
+                if driver not in self.tree.joint_names:
                     raise BodyError(
                         f"joint {joint!r} mimics {driver!r}, which does not move freely"
                     )
@@ -364,6 +364,17 @@ class BodyModel(nn.Module):
             value = cost.value.detach().sum(-1) + (cost.gradient.detach() * step).sum((-1, -2))
             value = value + 0.5 * bowl.sum(-1)
             return differentiate_twice(value, x)
+
+
+def _driver(joint: str, mimics: Mapping[str, tuple[str, float, float]]) -> tuple[str, float, float]:
+    """Which free joint a joint follows in the end, by which factor, from which offset."""
+    driver, factor, offset = mimics[joint]
+    for _ in mimics:
+        if driver not in mimics:
+            return driver, factor, offset
+        driver, step, shift = mimics[driver]
+        factor, offset = factor * step, offset + factor * shift
+    raise BodyError(f"joint {joint!r} mimics {driver!r}, which mimics it in turn")
 
 
 def differentiate_twice(value: Float[Tensor, "*batch"], x: Float[Tensor, "*batch n"]) -> LocalModel:

@@ -549,7 +549,9 @@ def test_no_frames(tmp_path: Path) -> None:
     check_error(write_acclaim(tmp_path, amc="#\n:DEGREES\n"), "expected frames")
     head = BVH[: BVH.index("1 2 3")]
     check_error(write_bvh(tmp_path, head), "2 frames, as Frames: says")
-    check_error(write_bvh(tmp_path, head.replace("Frames: 2", "Frames: 0")), "at least one frame")
+    check_error(
+        write_bvh(tmp_path, head.replace("Frames: 2", "Frames: 0")), "skeleton without motion"
+    )
     check_error(write_bvh(tmp_path, BVH[: BVH.index("Frames")]), "line 25: expected Frames")
 
 

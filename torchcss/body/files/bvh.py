@@ -29,6 +29,7 @@ from torchcss.body.chain import JointSpecification
 from torchcss.body.files.bvh_parser import Segment, parse_bvh
 from torchcss.body.rotations import about, as_rows, as_vector
 from torchcss.errors import ConfigurationError, MotionCaptureError
+from torchcss.joint_names import skeleton_joint_names
 
 BASE: Final = "world_frame"
 """Name of the root link of a tree from a file that has none itself."""
@@ -41,6 +42,8 @@ UNITS: Final[dict[str, float]] = {
     "cmu": 0.0254 / 0.45,
 }
 """Metres per unit of the files, by name; "cmu" is the unit of the CMU database."""
+
+Z_UP_NOTE: Final = "the file is Z up, as rest pose and motion show: turned to Y up"
 
 MARGIN = math.radians(60)
 """How far a joint may turn beyond what it does in the file."""
@@ -63,6 +66,7 @@ class Skeleton(NamedTuple):
         notes: What was assumed, one line each.
         places: The links that the file names, the joint of each standing at its link's origin.
         has_root: Whether the file lets the whole body move freely.
+        is_z_up: Whether the file's world is Z up where others of its kind are Y up.
     """
 
     joints: tuple[JointSpecification, ...]
@@ -70,6 +74,7 @@ class Skeleton(NamedTuple):
     notes: tuple[str, ...]
     places: tuple[str, ...]
     has_root: bool
+    is_z_up: bool = False
 
 
 def read_bvh_skeleton(path: Path, *, units: str | float | None = None) -> Skeleton:
@@ -84,6 +89,9 @@ def read_bvh_skeleton(path: Path, *, units: str | float | None = None) -> Skelet
         ConfigurationError: If the units are none.
     """
     segments, values, _ = parse_bvh(path)
+    num_frames, is_z_up = len(values), stands_along_z(segments, values)
+    if not num_frames:  # a skeleton alone: one pose, all channels zero
+        values = np.zeros((1, values.shape[1]))
     scale, unit_line = _metres(path, segments, units)
     moves = np.ptp(values, axis=0) > 1e-6
     angles = [turn.column for segment in segments[1:] for turn in segment.turns if turn.is_rotation]
@@ -123,9 +131,11 @@ def read_bvh_skeleton(path: Path, *, units: str | float | None = None) -> Skelet
             joints.append(
                 JointSpecification(name=name, link=segment.name, parent=parent, translation=at)
             )
-    notes = (unit_line, _limits_line(len(values), has_motion, held))
+    notes = [unit_line, _limits_line(num_frames, has_motion, held)]
+    if is_z_up:
+        notes.append(Z_UP_NOTE)
     names = tuple(segment.name for segment in segments)
-    return Skeleton(tuple(joints), sticky, notes, names, True)
+    return Skeleton(tuple(joints), sticky, tuple(notes), names, True, is_z_up)
 
 
 def metres_per_unit(units: str | float | None) -> float | None:
@@ -194,6 +204,34 @@ def rest_positions(segments: Sequence[Segment]) -> Float[np.ndarray, "j 3"]:
     for index, segment in enumerate(segments[1:], start=1):
         rest[index] = rest[segment.parent] + segment.offset
     return rest
+
+
+def stands_along_z(segments: Sequence[Segment], values: Float[np.ndarray, "t c"]) -> bool:
+    """Whether head and feet of a person lie above each other along Z, at rest and in the motion.
+
+    Args:
+        segments: The skeleton.
+        values: Its numbers, of which the root's turn the person.
+    """
+    rest = rest_positions(segments)
+    names = skeleton_joint_names([segment.name for segment in segments])
+    high, low = (
+        [index for index, name in enumerate(names) if name in wanted]
+        for wanted in (
+            ("skullbase", "vt1", "l_shoulder", "r_shoulder"),
+            ("l_ankle", "r_ankle", "l_knee", "r_knee"),
+        )
+    )
+    if not high or not low:
+        return False
+    up = rest[high].mean(0) - rest[low].mean(0)
+    turned = np.broadcast_to(np.eye(3), (max(len(values), 1), 3, 3))
+    for turn in segments[0].turns if len(values) else ():
+        if turn.is_rotation:
+            turned = turned @ about(turn.axis, values[:, turn.column])
+    mean = (turned @ up).mean(0)
+    with np.errstate(invalid="ignore", over="ignore"):
+        return all(bool(v[2] > share * np.linalg.norm(v)) for v, share in ((up, 0.9), (mean, 0.7)))
 
 
 def _metres(

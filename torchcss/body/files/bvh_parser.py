@@ -99,6 +99,11 @@ class _Words:
         """Line of the next word, or of the last one."""
         return self.words[min(self.next, len(self.words) - 1)][0]
 
+    @property
+    def at_end(self) -> bool:
+        """Whether all words are taken."""
+        return self.next >= len(self.words)
+
     def take(self, expected: str) -> str:
         if self.next >= len(self.words):
             raise bad(self.path, self.line, expected, "the end of the file")
@@ -135,6 +140,8 @@ _CHANNEL = re.compile(r"([XYZ])(POSITION|ROTATION)", re.IGNORECASE)
 def parse_bvh(path: Path) -> tuple[list[Segment], Float[np.ndarray, "t c"], float]:
     """Segments, their numbers frame by frame (angles in radians), and frames per second.
 
+    A file that holds a skeleton alone has no frames.
+
     Raises:
         MotionCaptureError: For any bad file.
     """
@@ -152,6 +159,8 @@ def parse_bvh(path: Path) -> tuple[list[Segment], Float[np.ndarray, "t c"], floa
     allowed: tuple[str, ...] = ("ROOT",)
     while True:
         line = words.line
+        if allowed == ("MOTION",) and words.at_end:
+            return segments, np.zeros((0, len(columns))), 30.0
         kind = words.keyword(*allowed)
         if kind == "MOTION":
             break
@@ -215,8 +224,6 @@ def _bvh_frames(
     if number != len(rows):
         found = f"{len(rows)} lines of numbers"
         raise bad(path, lines[-1].number, f"{number} frames, as Frames: says", found)
-    if not number:
-        raise bad(path, first.number, "at least one frame", "none")
     return _table(path, rows, is_angle), _rate(interval, digits)
 
 

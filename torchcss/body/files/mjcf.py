@@ -7,8 +7,9 @@ like otherwise does not matter here, so no mesh or texture is opened.
 
 A hinge or slide is one joint, a ball three hinges with their middle one within a right angle, and a
 free joint the six root parameters. A joint stands at its anchor: joints of one body that have
-different anchors are links of their own. Zero is the pose that the file draws; `ref` shifts limits.
-Links whose geoms are meshes get a shape along their bones.
+different anchors are links of their own. An equality of two joints lets one follow the other. Zero
+is the pose that the file draws; `ref` shifts limits. Links whose geoms are meshes get a shape along
+their bones.
 
 Call `read_mjcf`; `torchcss.load_body("x.xml")` does.
 """
@@ -20,6 +21,7 @@ import math
 import re
 import warnings
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -43,11 +45,15 @@ _SOLIDS = {2: ("sphere", 1), 3: ("capsule", 2), 4: ("ellipsoid", 3), 5: ("cylind
 
 _KEPT = (
     *("compiler", "default", "asset", "model", "worldbody", "body", "frame", "joint", "freejoint"),
-    *("geom", "replicate", "attach", "flexcomp"),
+    *("geom", "replicate", "attach", "flexcomp", "equality"),
 )
 """Elements that say what a body is; others go, with what they hold."""
 
-_NAMES = ("name", "class", "childclass", "prefix", "mesh", "hfield", "model", "body", "file")
+_NAMES = ("name", "class", "childclass", "prefix", "mesh", "hfield", "model", "body", "file",
+          "joint1", "joint2")  # fmt: skip
+_JOINT_EQUALITY = 2
+"""MuJoCo's number of an equality between two joints, which makes one follow the other."""
+
 _MOST_FILES, _MOST_BODIES, _FAR = 50, 10_000, 1e6
 _LIGHT = 1e-6
 """Mass and inertia that every body has at least: the compiler refuses moving ones without."""
@@ -209,6 +215,7 @@ class _Reader:
         self.parts: list[PartSpecification] = []
         self.links: dict[int, str] = {0: BASE}
         self.has_root = False
+        self.names: dict[int, str] = {}
 
     def read(
         self, chosen: int, notes: tuple[str, ...]
@@ -220,7 +227,22 @@ class _Reader:
                 self._part(geom, self.links[body])
         del self.links[0]
         places = tuple(self.links.values())
+        notes += tuple(self._couple())
         return Skeleton(tuple(self.joints), {}, notes, places, self.has_root), tuple(self.parts)
+
+    def _couple(self) -> Iterator[str]:
+        """Let joints follow others by the file's equalities; yield what was left out."""
+        model, mimics = self.model, {}
+        for index in np.flatnonzero(model.eq_type == _JOINT_EQUALITY).tolist():
+            first, second = (int(ids[index]) for ids in (model.eq_obj1id, model.eq_obj2id))
+            if first not in self.names:
+                continue
+            offset, factor, *higher = model.eq_data[index][:5].tolist()
+            if second not in self.names or not factor or any(higher) or not model.eq_active0[index]:
+                yield f"joint {self.names[first]!r}: its equality is left out, which is not linear"
+            else:
+                mimics[self.names[first]] = (self.names[second], factor, offset)
+        self.joints = [replace(each, mimic=mimics.get(each.name)) for each in self.joints]
 
     def _body(self, body: int) -> None:
         model = self.model
@@ -257,6 +279,8 @@ class _Reader:
         """One degree of freedom each; names, kinds, axes and limits only."""
         model, kind = self.model, int(self.model.jnt_type[joint])
         name = model.joint(joint).name or f"{body}_joint{len(self.joints)}"
+        if kind != 1:
+            self.names[joint] = name
         limits, is_limited = model.jnt_range[joint], bool(model.jnt_limited[joint])
         turn = JointSpecification(name=name, link="", parent="", kind="revolute")
         if kind == 1:  # a ball

@@ -1,7 +1,8 @@
 """A body from a URDF file: its tree, limits and simple solids; meshes and inertias are ignored.
 
 pytorch-kinematics reads the joints (`torchcss.body.chain.urdf_joints`). Limits and mimic joints,
-which it leaves out, are read here, and the file is screened before it sees it. Solids are boxes,
+which it leaves out, are read here, and the file is screened before it sees it. A floating joint of
+the root link is a free root, and what hangs on that link beside it is left out. Solids are boxes,
 cylinders, spheres and capsules: the visual ones of a link, or where it has none those for
 collisions.
 
@@ -16,6 +17,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
+from typing import NamedTuple
 
 from torchcss.body.catalog import PartSpecification
 from torchcss.body.chain import JointSpecification, urdf_joints
@@ -33,9 +35,23 @@ _SIZES = {
 }
 
 
-def read_urdf(
-    path: Path, robot: ElementTree.Element
-) -> tuple[tuple[JointSpecification, ...], tuple[PartSpecification, ...]]:
+class Urdf(NamedTuple):
+    """What a URDF says.
+
+    Attributes:
+        joints: Its joints, parents first.
+        solids: Parts of the links that have solids.
+        floats: Whether it moves freely.
+        notes: What was assumed, one line each.
+    """
+
+    joints: tuple[JointSpecification, ...]
+    solids: tuple[PartSpecification, ...]
+    floats: bool
+    notes: tuple[str, ...]
+
+
+def read_urdf(path: Path, robot: ElementTree.Element) -> Urdf:
     """Joints and solids of a URDF.
 
     Args:
@@ -48,8 +64,18 @@ def read_urdf(
     """
     if robot.tag != "robot" or robot.find("link") is None:
         raise BodyError(f"{path}: not a URDF, expected <robot> with links, found <{robot.tag}>")
+    notes = ["limits, axes and solids: as the URDF says"]
+    floats = _take_off_the_world(path, robot, notes)
     elements = {element.get("name", ""): element for element in robot.findall("joint")}
     _check_tree(path, robot, elements)
+    for name, element in elements.items():
+        mimic = element.find("mimic")
+        if mimic is not None and mimic.get("joint") not in elements:
+            element.remove(mimic)
+            notes.append(
+                f"joint {name!r} mimics {mimic.get('joint')!r}, which is no joint: it is taken as "
+                "free"
+            )
     if not elements:
         name = robot.findall("link")[0].get("name", "")
         joints = [JointSpecification(name="root", link=name, parent=None)]
@@ -62,7 +88,35 @@ def read_urdf(
         joint if joint.parent is None else _completed(path, joint, elements[joint.name])
         for joint in joints
     )
-    return tuple(completed), _solids(path, robot)
+    return Urdf(tuple(completed), _solids(path, robot), floats, tuple(notes))
+
+
+def _take_off_the_world(path: Path, robot: ElementTree.Element, notes: list[str]) -> bool:
+    """Keep only what hangs on a floating joint of the root link; whether there is one."""
+    joints = robot.findall("joint")
+    children = {_link(path, joint, "child") for joint in joints}
+    floating = [
+        joint
+        for joint in joints
+        if joint.get("type") == "floating" and _link(path, joint, "parent") not in children
+    ]
+    if len(floating) != 1:
+        return False
+    kept = [_link(path, floating[0], "child")]
+    for link in kept:  # grows while it is walked
+        below = [_link(path, joint, "child") for joint in joints
+                 if _link(path, joint, "parent") == link]  # fmt: skip
+        kept += [child for child in below if child not in kept]
+    world = _link(path, floating[0], "parent")
+    others = [link for link in robot.findall("link") if link.get("name") not in (*kept, world)]
+    if others:
+        names = ", ".join(link.get("name", "") for link in others)
+        notes.append(f"left out, as it hangs on {world!r} beside the body: {shortened(names)}")
+    for element in [*joints, *robot.findall("link")]:
+        name = element.get("name") if element.tag == "link" else _link(path, element, "parent")
+        if name not in kept:
+            robot.remove(element)
+    return True
 
 
 def _check_tree(
@@ -75,7 +129,8 @@ def _check_tree(
         if element.get("type") not in _TYPES:
             raise BodyError(
                 f"{path}: joint {name!r} is of type {element.get('type')!r}; supported are "
-                f"{', '.join(_TYPES)} (split others into joints of one axis)"
+                f"{', '.join(_TYPES)}, and floating at the root (split others into joints of one "
+                "axis)"
             )
     children, parents = (
         [_link(path, element, tag) for element in joints.values()] for tag in ("child", "parent")
@@ -111,7 +166,8 @@ def _kinematics_only(robot: ElementTree.Element) -> ElementTree.Element:
     for joint in robot.findall("joint"):
         # Files often give fixed joints the axis 0 0 0.
         wanted = ("parent", "child", "origin", "axis")[: 3 if joint.get("type") == "fixed" else 4]
-        ElementTree.SubElement(bare, "joint", dict(joint.attrib)).extend(
+        plain = {key: joint.get(key, "") for key in ("name", "type")}
+        ElementTree.SubElement(bare, "joint", plain).extend(
             part for part in joint if part.tag in wanted
         )
     return bare

@@ -32,12 +32,16 @@ def parse_xml(path: Path, data: bytes, what: str) -> ElementTree.Element:
     def refuse(*_: object) -> None:
         raise BodyError(f"{path}: declares XML entities, which {what} does not need; remove them")
 
+    # Without name spaces, so that prefixes which nobody declares are part of the name.
+    parser, tree = expat.ParserCreate(), ElementTree.TreeBuilder()
+    parser.EntityDeclHandler = refuse
+    parser.StartElementHandler = tree.start
+    parser.EndElementHandler = tree.end
+    parser.CharacterDataHandler = tree.data
     try:
-        screen = expat.ParserCreate()
-        screen.EntityDeclHandler = refuse
-        screen.Parse(data, True)
-        return ElementTree.fromstring(data)
-    except (ElementTree.ParseError, expat.ExpatError, ValueError, LookupError) as error:
+        parser.Parse(data, True)
+        return tree.close()
+    except (expat.ExpatError, ValueError, LookupError) as error:
         if isinstance(error, BodyError):
             raise
         raise BodyError(

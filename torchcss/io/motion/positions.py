@@ -2,7 +2,8 @@
 
 Both formats hold a tree of rigid segments and, frame by frame, the angles between them. What is
 read is what both agree on: where every joint of the tree is in the world. World and zero pose are
-Y up in both; distances become metres, angles never leave this module.
+Y up in both, but some programs write BVH that is Z up: where rest pose and motion stand along Z,
+they are turned. Distances become metres, angles never leave this module.
 
 *BVH.* A joint stands at `OFFSET` in its parent's frame. Its rotations apply in the order of its
 channels, about the axes turned by those before: `R = R_parent R_1 R_2 R_3`. Position channels take
@@ -27,12 +28,19 @@ import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from torchcss.body.files.bvh import guess_units, metres_per_unit, rest_positions, skeleton_span
+from torchcss.body.files.bvh import (
+    Z_UP_NOTE,
+    guess_units,
+    metres_per_unit,
+    rest_positions,
+    skeleton_span,
+    stands_along_z,
+)
 from torchcss.body.files.bvh_parser import Segment, parse_bvh
 from torchcss.body.rotations import about
 from torchcss.errors import ConfigurationError, MotionCaptureError
@@ -45,6 +53,10 @@ ACCLAIM_RATE = 120.0
 
 LIMBS: Final[tuple[str, ...]] = tuple(f"{side}_{place}" for place in LIMB_PLACES for side in "lr")
 """The joints that all skeletons have and mean alike."""
+
+
+_Z_TO_Y: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""Turns rows of places that are Z up to Y up."""
 
 
 class MotionCapture(NamedTuple):
@@ -78,6 +90,7 @@ def read_motion_capture(
     skeleton: str | os.PathLike[str] | None = None,
     units: str | float | None = None,
     frame_rate: float | None = None,
+    up: Literal["y", "z"] | None = None,
 ) -> MotionCapture:
     """Read a motion: a `.bvh`, or an `.amc` with its `.asf`.
 
@@ -86,6 +99,7 @@ def read_motion_capture(
         skeleton: The ASF of an AMC; by default the file of the same name beside it.
         units: Metres per unit of the file, or a name of `UNITS`; None: as stated, or guessed.
         frame_rate: Frames per second, instead of what the file says (BVH) or 120 (AMC).
+        up: The file's vertical axis; None: Y, unless a BVH stands along Z at rest and in motion.
 
     Raises:
         MotionCaptureError: If a file is missing, damaged or of another format, or the unit cannot
@@ -97,6 +111,10 @@ def read_motion_capture(
     if frame_rate is not None and not 0 < frame_rate < math.inf:
         raise ConfigurationError(f"frame rate: expected a positive number, got {frame_rate}")
     segments, values, rate, stated, report = _parse(path, skeleton)
+    if not len(values):
+        raise MotionCaptureError(
+            f"{path}: a skeleton without motion; it is a body (load_body), not a motion"
+        )
     if frame_rate is not None:
         rate, report = frame_rate, ()
     report = [f"{len(values)} frames, {rate:g} per second", *report]
@@ -106,6 +124,10 @@ def read_motion_capture(
             scale, line = guess_units(path, skeleton_span(rest, segments), stated)
             report.append(line)
         rest, joints = scale * rest, scale * joints
+        is_z_up = path.suffix.lower() == ".bvh" if up is None else up == "z"
+        if is_z_up and (up is not None or stands_along_z(segments, values)):
+            rest, joints = rest @ _Z_TO_Y, joints @ _Z_TO_Y
+            report.append(Z_UP_NOTE if up is None else "Z up, as given: turned to Y up")
     if not (np.isfinite(rest).all() and np.isfinite(joints).all()):
         frame = int(np.argmin(np.isfinite(joints).all((1, 2))))
         raise MotionCaptureError(
