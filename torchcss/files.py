@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import errno
 import json
+import math
 import os
+import reprlib
 import tempfile
+import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 
@@ -141,15 +144,21 @@ class Line(NamedTuple):
     words: list[str]
 
 
+MOST_TEXT, MOST_ARRAYS = 2**30, 2**32
+"""Bytes of the largest file that is read whole, and of the largest set of arrays."""
+
+
 def read_bytes(path: Path, error_class: type[TorchcssError], size: int = -1) -> bytes:
     """The content of a file, or its first `size` bytes.
 
     Raises:
-        error_class: If the file is missing, empty, a folder or cannot be read.
+        error_class: If the file is missing, empty, huge, a folder or cannot be read.
     """
     try:
         if path.is_dir():
             raise error_class(f"{path}: expected a file, found a folder")
+        if size < 0 and (length := path.stat().st_size) > MOST_TEXT:
+            raise error_class(f"{path}: {length:,} bytes; expected {MOST_TEXT:,} at most")
         with path.open("rb") as stream:
             data = stream.read(size)
     except FileNotFoundError as error:
@@ -201,9 +210,14 @@ def one_line(error: BaseException) -> str:
     return " ".join(str(error).split())[:120] or type(error).__name__
 
 
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel, _SHORT.maxdict, _SHORT.maxlist, _SHORT.maxtuple = 4, 6, 12, 12
+_SHORT.maxstring = _SHORT.maxother = 70
+
+
 def shortened(value: object) -> str:
-    """A piece of a file for a message, in one short line."""
-    text = " ".join(repr(value).split())
+    """A piece of a file for a message, in one short line, however deep it is."""
+    text = " ".join(_SHORT.repr(value).split())
     return text if len(text) <= 60 else text[:57] + "..."
 
 
@@ -233,6 +247,7 @@ def load_arrays(path: Path, error_class: type[TorchcssError]) -> Mapping[str, np
         raise error_class(f"{path}: not an NPZ file; expected what numpy.savez writes")
     try:
         # The stream is ours: NumPy does not close its own where the archive turns out damaged.
+        _check_sizes(path)
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     except Exception as error:  # zipfile, zlib and NumPy raise a dozen kinds for damaged archives
@@ -242,6 +257,34 @@ def load_arrays(path: Path, error_class: type[TorchcssError]) -> Mapping[str, np
             else f"{one_line(error)}; get a complete copy"
         )
         raise error_class(f"{path}: cannot be read as an NPZ file: {reason}") from error
+
+
+def _check_sizes(path: Path) -> None:
+    """Refuse arrays that would take more memory than the file can fill, before any is taken.
+
+    Raises:
+        ValueError: If they would.
+    """
+    with zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        if (total := sum(member.file_size for member in members)) > MOST_ARRAYS:
+            raise ValueError(f"{total:,} bytes of arrays; expected {MOST_ARRAYS:,} at most")
+        for member in members:
+            with archive.open(member) as stream:
+                _check_header(stream, member.file_size)
+
+
+def _check_header(stream: IO[bytes], size: int) -> None:
+    """Refuse an array whose heading says more numbers than there are bytes."""
+    header = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }.get(np.lib.format.read_magic(stream))
+    if header is None:
+        return  # NumPy says what is wrong
+    shape, _, dtype = header(stream)
+    if math.prod(shape) * max(dtype.itemsize, 1) > size:
+        raise ValueError(f"its heading says {list(shape)} of {dtype}, which is more than it holds")
 
 
 def load_array(path: Path, error_class: type[TorchcssError]) -> np.ndarray:
@@ -254,6 +297,8 @@ def load_array(path: Path, error_class: type[TorchcssError]) -> np.ndarray:
         raise error_class(f"{path}: not an NPY file; expected what numpy.save writes")
     try:
         with path.open("rb") as stream:
+            _check_header(stream, path.stat().st_size)
+            stream.seek(0)
             return np.load(stream, allow_pickle=False)
     except Exception as error:  # what a damaged header leads to
         raise error_class(f"{path}: cannot be read as an NPY file: {one_line(error)}") from error

@@ -13,6 +13,7 @@ import torch
 import torchcss
 from torchcss.body.catalog import LENGTHS
 from torchcss.body.load import load_body
+from torchcss.body.root import has_root
 from torchcss.cost.part_map import part_map
 from torchcss.cost.view import View
 from torchcss.errors import BodyError, CameraError, ConfigurationError, KeypointError
@@ -347,6 +348,20 @@ def test_arms_and_single_precision():
     # An elbow that bends the other way, or not: some hypothesis is the truth.
     apart = (placed.body.pose(placed.mixture.mean).joints - body.pose(x).joints).norm(dim=-1)
     assert float(apart.mean(-1).min()) < 0.06
+
+
+def test_an_arm_that_shall_move_about(generator: torch.Generator):
+    body = load_body("arm7").with_base(torch.eye(3), torch.tensor([0.0, 0.2, -1.5]))
+    camera = person().camera
+    keypoints = Keypoints(
+        camera.project(body.pose(body.bounds.project(body.rest + 0.2)).joints).uv,
+        torch.ones(4),
+        body.joint_names,
+    )
+    options = InitialiseOptions(sigma=1.0, search=SMALL, contours=False, free_root=True)
+    found = initialise(None, keypoints, camera, "arm7", generator=generator, options=options)
+    assert has_root(found.body)
+    assert found.body.num_parameters == body.num_parameters + 6
 
 
 def test_only_the_papers_proportions_if_asked():

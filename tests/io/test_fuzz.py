@@ -8,6 +8,7 @@ folder in place of the file.
 from __future__ import annotations
 
 import json
+import pickle
 import re
 import shutil
 from collections.abc import Callable
@@ -21,6 +22,7 @@ from common.flow_files import read_flow, write_flow
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from made_tracks import make_track
+from scipy.io import savemat
 
 from torchcss.body.load import load_body
 from torchcss.errors import TorchcssError, TrackFileError
@@ -142,6 +144,21 @@ translation = [0.0, 1.0, 3.0]
 """
 
 
+CAMERA_MATRIX = """camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 60., 0., 32., 0., 60., 24., 0., 0., 1. ]
+"""
+KALIBR = """cam0:
+  camera_model: pinhole
+  distortion_coeffs: [0.1, 0.0, 0.0, 0.0]
+  distortion_model: radtan
+  intrinsics: [60.0, 60.0, 32.0, 24.0]
+  resolution: [64, 48]
+"""
+
+
 class Reader(NamedTuple):
     """A file of the folder, and what reads it there."""
 
@@ -183,11 +200,28 @@ READERS = (
     Reader("deeplabcut.csv", keypoints),
     Reader("h36m.npz", keypoints),
     Reader("openpose/0_keypoints.json", beside(keypoints)),
+    Reader("labels/a_1.txt", beside(keypoints)),
+    Reader("labelme/0.json", beside(keypoints)),
+    Reader("mmpose.json", keypoints),
+    Reader("openpifpaf.json", keypoints),
+    Reader("vitpose.json", keypoints),
+    Reader("ultralytics.json", keypoints),
+    Reader("annotations.json", keypoints),
+    Reader("triples.npy", keypoints),
+    Reader("sleap.csv", keypoints),
+    Reader("sleap.analysis.h5", keypoints),
+    Reader("deeplabcut.h5", keypoints),
     Reader("clicked.json", joints),
     Reader("joints.csv", joints),
     Reader("cameras.json", read_camera),
     Reader("calib.toml", read_camera),
     Reader("easymocap/intri.yml", beside(read_camera)),
+    Reader("opencv.yml", read_camera),
+    Reader("kalibr.yaml", read_camera),
+    Reader("cameras.txt", read_camera),
+    Reader("opencv.xml", read_camera),
+    Reader("camera.npz", read_camera),
+    Reader("camera.mat", read_camera),
     Reader("motion.bvh", read_motion_capture),
     Reader("motion.amc", read_motion_capture),
     Reader("motion.asf", lambda path: read_motion_capture(path.with_suffix(".amc"))),
@@ -220,6 +254,70 @@ def landmark_rows() -> np.ndarray:
     return np.concatenate([values[..., :2] / SIZE, np.zeros((T, 33, 1)), values[..., 2:]], axis=-1)
 
 
+def write_keypoints(folder: Path, marks: np.ndarray) -> None:
+    """Files of detectors and annotation tools."""
+    for name in ("labels", "labelme"):
+        (folder / name).mkdir()
+    names = [f"left_{place}" for place in ("hip", "knee", "wrist")]
+    for t, frame in enumerate(marks):
+        words = " ".join(f"{v:.4f}" for v in (frame / (*SIZE, 1)).flat)
+        (folder / "labels" / f"a_{t + 1}.txt").write_text(f"0 .5 .5 .2 .8 {words}\n")
+        shapes = [{"label": name, "points": [row[:2]], "shape_type": "point"}
+                  for name, row in zip(names, frame.tolist(), strict=False)]  # fmt: skip
+        (folder / "labelme" / f"{t}.json").write_text(json.dumps({"shapes": shapes}))
+    frames = [{"keypoints": f[:, :2].tolist(), "keypoint_scores": f[:, 2].tolist()} for f in marks]
+    x = [{"keypoints": dict(zip(("x", "y", "visible"), f.T.tolist(), strict=True))} for f in marks]
+    annotations = [{"image_id": t, "keypoints": f.ravel().tolist()} for t, f in enumerate(marks)]
+    images = [{"id": t, "file_name": f"{t}.png", "width": 64, "height": 48} for t in range(T)]
+    skeleton = {str(i): name for i, name in enumerate(names)}
+    contents: dict[str, Any] = {
+        "mmpose": [{"frame_id": t, "instances": [frame]} for t, frame in enumerate(frames)],
+        "vitpose": {"keypoints": [{"0": f[:3, [1, 0, 2]].tolist()} for f in marks],
+                    "skeleton": skeleton},
+        "ultralytics": [[frame] for frame in x],
+        "annotations": {"images": images, "annotations": annotations},
+    }  # fmt: skip
+    for name, content in contents.items():
+        (folder / f"{name}.json").write_text(json.dumps(content))
+    lines = [json.dumps({"frame": t + 1, "predictions": [{"keypoints": f.ravel().tolist()}]})
+             for t, f in enumerate(marks)]  # fmt: skip
+    (folder / "openpifpaf.json").write_text("\n".join(lines))
+    np.save(folder / "triples.npy", marks)
+    heading = ",".join(f"{name}.{end}" for name in names for end in ("x", "y", "score"))
+    rows = [f"a,{t},0.9,{','.join(map(str, f[:3].flat))}" for t, f in enumerate(marks)]
+    (folder / "sleap.csv").write_text(
+        "\n".join([f"track,frame_idx,instance.score,{heading}", *rows])
+    )
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(folder / "sleap.analysis.h5", "w") as file:
+        file["tracks"] = marks[None, ..., :2].transpose(0, 3, 2, 1)
+        file["point_scores"] = marks[None, ..., 2].transpose(0, 2, 1)
+        file["node_names"] = np.array([f"joint{i}" for i in range(14)] + names, "S")
+    columns = [("net", name, kind) for name in names for kind in ("x", "y", "likelihood")]
+    with h5py.File(folder / "deeplabcut.h5", "w") as file:
+        table = np.zeros(T, [("index", "i8"), ("values_block_0", "f8", 9)])
+        table["index"], table["values_block_0"] = np.arange(T), marks[:, :3].reshape(T, 9)
+        group = file.create_group("df")
+        group["table"] = table
+        group.attrs["non_index_axes"] = np.bytes_(pickle.dumps([(1, columns)], protocol=0))
+
+
+def write_calibrations(folder: Path) -> None:
+    """Cameras of other programs."""
+    K = [[60.0, 0.0, 32.0], [0.0, 60.0, 24.0], [0.0, 0.0, 1.0]]
+    sizes = "%YAML:1.0\n---\nimage_width: 64\nimage_height: 48\n"
+    (folder / "opencv.yml").write_text(sizes + CAMERA_MATRIX)
+    (folder / "kalibr.yaml").write_text(KALIBR)
+    (folder / "cameras.txt").write_text("# Cameras\n1 PINHOLE 64 48 60 60 32 24\n")
+    (folder / "opencv.xml").write_text(
+        "<opencv_storage><image_width>64</image_width><image_height>48</image_height>"
+        "<camera_matrix type_id='opencv-matrix'><rows>3</rows><cols>3</cols><data>"
+        f"{' '.join(map(str, np.ravel(K)))}</data></camera_matrix></opencv_storage>"
+    )
+    np.savez(folder / "camera.npz", mtx=np.array(K), dist=np.zeros((1, 5)), size=np.array(SIZE))
+    savemat(folder / "camera.mat", {"K": np.array(K), "ImageSize": SIZE[::-1]}, do_compression=True)
+
+
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a valid file for every reader."""
@@ -248,6 +346,8 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
         positions_2d=np.array(recordings, dtype=object),
         metadata=np.array({"layout_name": "h36m"}, dtype=object),
     )
+    write_keypoints(folder, marks)
+    write_calibrations(folder)
     (folder / "openpose").mkdir()
     for t, frame in enumerate(marks):
         content = {"people": [{"pose_keypoints_2d": frame.ravel().tolist()}]}

@@ -211,6 +211,7 @@ def initialise_video(
         working_size=settings.working_size,
         dtype=settings.torch_dtype,
         device=settings.device,
+        free_root=settings.free_root,
     )
     return initialise(
         read_frame(video, start),

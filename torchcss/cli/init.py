@@ -31,6 +31,8 @@ class Init:
     """Folder for body.npz, the overlays, side.png, proportions.csv and summary.json."""
     body: str = "body34"
     """arm7, arm8, body30, body32 or body34, or a URDF, MJCF or BVH file."""
+    free_root: bool = False
+    """Let a body move about that by itself stands in one place, as robots from files do."""
     stature: float | None = None
     """Height of the standing person, metres; by default the prior sets the scale."""
     proportions: Literal["all", "papers"] = "all"
@@ -72,6 +74,7 @@ class Init:
             search=Search(proportions=proportions),
             dtype=torch.float32 if self.dtype == "float32" else torch.float64,
             device=self.device,
+            free_root=self.free_root,
         )
         found, summary = initialise_image(
             self.image,

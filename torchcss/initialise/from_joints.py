@@ -152,7 +152,7 @@ def _with_lengths_held(
     starts = columns_of(free, body, candidates)
     body, starts, _ = move_base(body, *root_pose(body, starts[0]), starts)
     refined = refine(cost.with_body(body), starts, options.search)
-    if not has_free_root(free.name):
+    if not (options.free_root or has_free_root(free.name)):
         # The root of the best fit becomes the arm's base, and only its angles are searched.
         best = refined.mean[int(refined.cost.nan_to_num(math.inf).argmin())]
         arm = with_lengths(free, lengths, scale, free_root=None).with_base(*root_pose(body, best))

@@ -35,6 +35,7 @@ class InitialiseOptions:
         potential_kind: Robust potential of the keypoints.
         dtype: Type of the body.
         device: Where to compute.
+        free_root: Let a body move about that by itself stands in one place.
     """
 
     sigma: float | None = None
@@ -48,6 +49,7 @@ class InitialiseOptions:
     potential_kind: type = Lorentzian
     dtype: torch.dtype = torch.float64
     device: torch.device | str = "cpu"
+    free_root: bool = False
 
     def __post_init__(self) -> None:
         if self.num_modes is not None and self.num_modes < 1:

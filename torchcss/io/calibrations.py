@@ -22,7 +22,9 @@ from __future__ import annotations
 import importlib
 import json
 import re
+import struct
 import tomllib
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -76,6 +78,12 @@ _WORDS = {
 
 _SIZES = (("image_width", "image_height"), ("width", "height"), ("w", "h"), ("W", "H"))
 _FISHEYE = ("equidistant", "fisheye", "kannala_brandt", "omni", "ds", "eucm", "fov")
+
+_MOST_MATLAB = 2**26
+"""Bytes of the largest calibration of MATLAB's, unpacked; they hold the pictures' corners too."""
+
+_DEEPEST = 50
+"""Brackets in brackets of a calibration in YAML."""
 
 _COLMAP = {
     "SIMPLE_PINHOLE": "f cx cy", "PINHOLE": "fx fy cx cy", "SIMPLE_RADIAL": "f cx cy k1",
@@ -372,6 +380,7 @@ def _read_matlab(path: Path) -> dict[str, Entry]:
         matlab: Any = importlib.import_module("scipy.io")
     except ImportError as error:
         raise MissingExtraError(f"{path}: a .mat is read by SciPy; pip install scipy") from error
+    _check_matlab_size(path)
     try:
         content = matlab.loadmat(path, simplify_cells=True)
     except Exception as error:  # SciPy raises whatever the damage leads to
@@ -392,6 +401,24 @@ def _read_matlab(path: Path) -> dict[str, Entry]:
         return {path.stem: _matlab_entry(values)}
     except (ValueError, TypeError, IndexError) as error:
         raise CameraError(f"{path}: expected cameraParams, found {one_line(error)}") from error
+
+
+def _check_matlab_size(path: Path) -> None:
+    """Refuse a file that unpacks to more than a calibration, before any of it is unpacked."""
+    data, at, total = read_bytes(path, CameraError), 128, 0
+    order = ">" if data[126:128] == b"MI" else "<"
+    while at + 8 <= len(data):
+        kind, size = struct.unpack_from(f"{order}II", data, at)
+        packed, at = data[at + 8 : at + 8 + size], at + 8 + size
+        try:
+            unpacked = (
+                zlib.decompressobj().decompress(packed, _MOST_MATLAB) if kind == 15 else packed
+            )
+        except zlib.error as error:
+            raise CameraError(f"{path}: damaged: {error}; get a complete copy") from error
+        total += len(unpacked)
+        if total >= _MOST_MATLAB:
+            raise CameraError(f"{path}: more than {_MOST_MATLAB:,} bytes; not a calibration")
 
 
 def _matlab_entry(values: Mapping[str, Any]) -> Entry:
@@ -447,6 +474,12 @@ class _Loader(yaml.SafeLoader):
         if self.check_event(yaml.AliasEvent):
             raise yaml.YAMLError("it repeats parts of itself by aliases; write them out")
         return super().compose_node(parent, index)
+
+    def fetch_flow_collection_start(self, TokenClass: Any) -> None:
+        """Refuse brackets in brackets without end, which take long to read."""
+        if self.flow_level > _DEEPEST:
+            raise yaml.YAMLError(f"brackets nested more than {_DEEPEST} deep")
+        super().fetch_flow_collection_start(TokenClass)
 
 
 def _matrix(loader: yaml.SafeLoader, node: yaml.Node) -> list[Any]:

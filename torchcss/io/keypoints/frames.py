@@ -65,11 +65,21 @@ def in_order(path: Path, people: People, film: Film, report: list[str]) -> list[
         place: frames[key] for place, key in zip(places, frames, strict=True) if place is not None
     }
     total = max(max(found, default=-1) + 1, film.num_frames or 0)
+    if film.num_frames is not None and total > film.num_frames:
+        raise wrong_count(path, film.num_frames, total)
     if total > _MOST_FRAMES:
         raise KeypointError(f"{path}: {total - 1} is not a frame number; number the frames from 0")
     if len(found) < total:
         report.append(f"{len(found)} of {total} frames are in the file, the others have nobody")
     return [found.get(index, []) for index in range(total)]
+
+
+def wrong_count(path: Path, expected: int, found: int) -> KeypointError:
+    """The error for a file that has other frames than the video."""
+    return KeypointError(
+        f"{path}: expected {expected} frames, as the video has, found {found}; "
+        "make the keypoints from this very video"
+    )
 
 
 def plain_name(name: str) -> str:
@@ -160,13 +170,22 @@ def _by_time(path: Path, times: Sequence[float], film: Film, report: list[str]) 
     gaps = np.diff(sorted_times)
     if film.rate is None and not (len(gaps) and gaps.min() > 0):
         raise KeypointError(f"{path}: times do not rise from entry to entry; number the frames")
-    if film.rate is not None:
-        interval = 1 / film.rate
-    else:
-        interval = float(gaps.sum() / np.round(gaps / gaps.min()).sum())
-    start = 0.0
-    if film.num_frames is not None and sorted_times[-1] > (film.num_frames - 0.5) * interval:
-        start = float(sorted_times[0])
-    places[order] = np.round((sorted_times - start) / interval)
+    with np.errstate(all="ignore"):
+        interval = 1 / film.rate if film.rate else _interval(gaps)
+        start = 0.0
+        if film.num_frames is not None and sorted_times[-1] > (film.num_frames - 0.5) * interval:
+            start = float(sorted_times[0])
+        found = np.round((sorted_times - start) / interval)
+    if not ((found >= 0) & (found < _MOST_FRAMES)).all():
+        raise KeypointError(
+            f"{path}: times from {sorted_times[0]:.4g} to {sorted_times[-1]:.4g} s, one every "
+            f"{interval:.3g} s, are no video's; number the frames"
+        )
+    places[order] = found
     report.append(f"frames by their times, one every {interval:.4g} s, the first at {start:.4g} s")
     return places.tolist()
+
+
+def _interval(gaps: np.ndarray) -> float:
+    """The time of a frame, of which all gaps are about a multiple."""
+    return float(gaps.sum() / np.round(gaps / gaps.min()).sum())

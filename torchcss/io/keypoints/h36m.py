@@ -29,7 +29,7 @@ _LAYOUTS = {
     ("h36m", 17): "H36M-17", ("h36m", 16): "H36M-16", ("coco", 17): "COCO-17",
     ("mpii", 16): "MPII-16", ("humaneva15", 15): "HumanEva-15", ("humaneva", 15): "HumanEva-15",
 }  # fmt: skip
-_MOST_BYTES = 2**31
+_MOST_BYTES = 2**30
 
 _ALLOWED = {
     ("builtins", "dict"), ("builtins", "list"), ("builtins", "tuple"), ("builtins", "set"),

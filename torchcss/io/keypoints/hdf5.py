@@ -1,7 +1,8 @@
 """2D joints in HDF5: SLEAP's analysis files, and DeepLabCut's, which are pandas' tables.
 
 Pandas keeps the columns' names as Python objects; they are read without running what they might ask
-for (`torchcss.io.keypoints.h36m`). Needs h5py, the extra `[hdf5]`.
+for (`torchcss.io.keypoints.h36m`). Links into other files are not followed. Needs h5py, the extra
+`[hdf5]`.
 
 Call `read_hdf5`.
 """
@@ -21,7 +22,7 @@ from torchcss.io.keypoints.h36m import PlainUnpickler
 from torchcss.io.keypoints.people import Key, People, Person, is_there, screened
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
-_MOST_NUMBERS = 2**28
+_MOST_NUMBERS = 2**26
 _KINDS = ("x", "y", "likelihood")
 
 _SLEAP_ADVICE = (
@@ -67,6 +68,8 @@ def read_hdf5(path: Path) -> People:
 
 def _array(path: Path, dataset: Any) -> np.ndarray:
     """A dataset's numbers, if they are of a size that a file of joints has."""
+    if dataset.is_virtual or dataset.external or Path(dataset.file.filename) != path:
+        raise KeypointError(f"{path}: {dataset.name}: lies in another file; copy it into this one")
     if dataset.size > _MOST_NUMBERS:
         raise KeypointError(f"{path}: {dataset.name}: {dataset.size:,} numbers; not joints")
     return np.asarray(dataset[()])

@@ -41,7 +41,7 @@ from torchcss.errors import KeypointError
 from torchcss.files import load_array, load_arrays, shortened
 from torchcss.io.keypoints.arrays import read_arrays
 from torchcss.io.keypoints.findings import findings
-from torchcss.io.keypoints.frames import Film, in_order
+from torchcss.io.keypoints.frames import Film, in_order, wrong_count
 from torchcss.io.keypoints.h36m import is_h36m, read_h36m
 from torchcss.io.keypoints.hdf5 import read_hdf5
 from torchcss.io.keypoints.json_files import read_folder, read_json
@@ -230,10 +230,7 @@ def _check_counts(
 ) -> None:
     """Refuse another number of frames than the video's, and of names than joints."""
     if num_frames is not None and len(frames) != num_frames:
-        raise KeypointError(
-            f"{path}: expected {num_frames} frames, as the video has, found {len(frames)}; "
-            "make the keypoints from this very video"
-        )
+        raise wrong_count(path, num_frames, len(frames))
     if not 0 <= first_frame < max(1, len(frames)):
         raise KeypointError(
             f"{path}: the first frame {first_frame} is beyond the file, "

@@ -1,0 +1,215 @@
+"""Files of strangers: nothing in them runs, and no small file takes much memory or time."""
+
+from __future__ import annotations
+
+import io
+import json
+import pickle
+import struct
+import time
+import tracemalloc
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from torchcss.body.load import load_body
+from torchcss.errors import TorchcssError
+from torchcss.files import shortened
+from torchcss.io.cameras import load_camera
+from torchcss.io.keypoints.read import read_keypoints
+from torchcss.io.tracks import load_track
+
+MOST_MEGABYTES = 60
+
+
+def keypoints(path: Path) -> object:
+    return read_keypoints(path, image_size_wh=(640, 480), num_frames=6)
+
+
+def refused(read: Callable[[Path], object], path: Path) -> str:
+    """What a reader says of a bad file, in little time and memory."""
+    tracemalloc.start()
+    began = time.process_time()
+    try:
+        with pytest.raises(TorchcssError) as caught:
+            read(path)
+        most = tracemalloc.get_traced_memory()[1] / 1e6
+    finally:
+        tracemalloc.stop()
+    assert time.process_time() - began < 10
+    assert most < MOST_MEGABYTES
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def header(shape: tuple[int, ...], descr: str = "<f8") -> bytes:
+    """The heading of an NPY file."""
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        stream, {"descr": descr, "fortran_order": False, "shape": shape}
+    )
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize("read", [keypoints, load_track, load_camera])
+def test_arrays_that_are_larger_than_their_file(
+    tmp_path: Path, read: Callable[[Path], object]
+) -> None:
+    path = tmp_path / "a.npz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("keypoints.npy", header((10**6, 17, 2)) + bytes(800))
+    assert "more than it holds" in refused(read, path)
+    if read is keypoints:
+        (tmp_path / "a.npy").write_bytes(header((10**6, 17, 3)) + bytes(800))
+        assert "more than it holds" in refused(read, tmp_path / "a.npy")
+
+
+def test_archives_that_unpack_to_more_than_there_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torchcss.files.MOST_ARRAYS", 10**6)
+    path = tmp_path / "a.npz"
+    np.savez_compressed(path, keypoints=np.zeros((10**5, 17, 2)))
+    assert "27,200," in refused(keypoints, path)
+    monkeypatch.setattr("torchcss.files.MOST_TEXT", 1000)
+    (tmp_path / "a.json").write_text(" " * 1001)
+    assert "1,001 bytes" in refused(keypoints, tmp_path / "a.json")
+
+
+@pytest.mark.parametrize("read", [keypoints, load_track, load_camera])
+def test_pickles_in_arrays(tmp_path: Path, read: Callable[[Path], object]) -> None:
+    np.savez(tmp_path / "a.npz", keypoints=np.array([{1: 2}], dtype=object))
+    assert "pickled" in refused(read, tmp_path / "a.npz")
+
+
+class Runs:
+    def __reduce__(self) -> tuple[Any, ...]:
+        return eval, ("open('ran', 'w')",)
+
+
+def nested(depth: int) -> list[Any]:
+    """A list that holds itself, in a way, 2 ** depth times."""
+    inner: list[Any] = ["lol"]
+    for _ in range(depth):
+        inner = [inner, inner]
+    return inner
+
+
+def test_pickles_of_videopose3d(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "a.npz"
+
+    def archive(value: object) -> None:
+        data = header((), "|O") + pickle.dumps(np.array(value, dtype=object))
+        with zipfile.ZipFile(path, "w") as file:
+            file.writestr("positions_2d.npy", data)
+
+    archive({"S1": Runs()})
+    assert "builtins.eval" in refused(keypoints, path)
+    archive({"S1": {"a": {"bomb": nested(60)}}})
+    refused(keypoints, path)
+    assert not (tmp_path / "ran").exists()
+
+
+def test_messages_of_deep_values_are_short() -> None:
+    assert len(shortened(nested(60))) <= 60
+    assert len(shortened({"a" * 10_000: "b" * 10_000})) <= 60
+
+
+def bomb(depth: int = 10) -> str:
+    """Entities that double: a kilobyte of XML that becomes gigabytes."""
+    lines = ["<!ENTITY e0 'lol'>"]
+    lines += [f"<!ENTITY e{i} '{f'&e{i - 1};' * 10}'>" for i in range(1, depth)]
+    return f"<!DOCTYPE a [{''.join(lines)}]>"
+
+
+@pytest.mark.parametrize(
+    ("name", "read", "text"),
+    [
+        ("a.urdf", load_body, "<robot name='&e9;'><link name='a'/></robot>"),
+        ("a.xml", load_body, "<mujoco><worldbody>&e9;</worldbody></mujoco>"),
+        ("a.xml", load_camera, "<opencv_storage><K>&e9;</K></opencv_storage>"),
+    ],
+)  # fmt: skip
+def test_entities_of_xml(
+    tmp_path: Path, name: str, read: Callable[[Path], object], text: str
+) -> None:
+    (tmp_path / name).write_text(bomb() + text)
+    assert "entities" in refused(read, tmp_path / name)
+    secret = tmp_path / "secret"
+    secret.write_text("treasure")
+    (tmp_path / name).write_text(f"<!DOCTYPE a [<!ENTITY e9 SYSTEM '{secret}'>]>{text}")
+    assert "treasure" not in refused(read, tmp_path / name)
+
+
+def test_aliases_and_objects_of_yaml(tmp_path: Path) -> None:
+    path = tmp_path / "a.yml"
+    lines = ["a0: &a0 [lol, lol]"]
+    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 12)]
+    path.write_text("\n".join(lines))
+    assert "aliases" in refused(load_camera, path)
+    path.write_text("names: !!python/object/apply:os.system ['touch ran']\n")
+    refused(load_camera, path)
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize("suffix", [".json", ".toml", ".yml", ".csv", ".txt"])
+def test_brackets_without_end(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    path.write_text("a = " * (suffix == ".toml") + "[" * 100_000)
+    refused(keypoints if suffix in (".json", ".csv") else load_camera, path)
+
+
+def test_frames_that_are_far_away(tmp_path: Path) -> None:
+    person = [300.0, 200.0, 1.0] * 17
+    path = tmp_path / "a.json"
+    for number in (999_999, 10**9, 10**30):
+        path.write_text(json.dumps([{"image_id": n, "keypoints": person} for n in (0, number)]))
+        refused(keypoints, path)
+    path.write_text(json.dumps([{"time": t, "keypoints": person} for t in (0.0, 1e-300, 1e300)]))
+    refused(keypoints, path)
+
+
+def test_matlab_that_unpacks_to_more_than_there_is(tmp_path: Path) -> None:
+    path = tmp_path / "a.mat"
+    packed = zlib.compress(bytes(2**26), 9)
+    path.write_bytes(bytes(126) + b"IM" + struct.pack("<II", 15, len(packed)) + packed)
+    tracemalloc.start()
+    with pytest.raises(TorchcssError, match="not a calibration"):
+        load_camera(path)
+    tracemalloc.stop()
+
+
+def test_hdf5_that_claims_much_or_links_elsewhere(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    path, other = tmp_path / "a.analysis.h5", tmp_path / "other.h5"
+    with h5py.File(path, "w") as file:
+        file["node_names"] = np.array(["nose"], "S")
+        file.create_dataset("tracks", (10**6, 2, 1, 10**6), "f8", chunks=True)
+    assert "not joints" in refused(keypoints, path)
+    with h5py.File(other, "w") as file:
+        file["tracks"] = np.ones((1, 2, 1, 6))
+    with h5py.File(path, "w") as file:
+        file["node_names"] = np.array(["nose"], "S")
+        file["tracks"] = h5py.ExternalLink(str(other), "tracks")
+    assert "another file" in refused(keypoints, path)
+
+
+def test_meshes_and_includes_stay_in_the_folder(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    (tmp_path / "secret.xml").write_text("<mujoco><worldbody/></mujoco>")
+    folder = tmp_path / "robot"
+    folder.mkdir()
+    path = folder / "a.xml"
+    path.write_text("<mujoco><include file='../secret.xml'/></mujoco>")
+    assert "not in its folder" in refused(load_body, path)
+    (folder / "a.urdf").write_text(
+        "<robot name='a'><link name='b'><visual><geometry><mesh filename='/etc/passwd'/>"
+        "</geometry></visual></link></robot>"
+    )
+    assert load_body(folder / "a.urdf").part_names == ()
