@@ -358,7 +358,7 @@ def test_edges_add_up_as_printed() -> None:
     nearest = PRINTED["gaussian"]
     assert printed_cost(64.0, nearest, *edges) == pytest.approx(0.5 * (3 / 8.5) ** 2, abs=0.01)
     assert printed_cost(64.0, AS_PRINTED) == AS_PRINTED.fitted_level
-    assert printed_cost(64.0, AS_PRINTED, (66.0, 1.0, 0.19)) == AS_PRINTED.fitted_level
+    assert printed_cost(64.0, AS_PRINTED, (66.0, 1.0, 0.39)) == AS_PRINTED.fitted_level
 
 
 def test_weights_are_within_rho_as_printed() -> None:

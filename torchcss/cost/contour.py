@@ -114,7 +114,7 @@ class ContourTerm(OutlineTerm):
     assignment: Literal["shared", "sum", "nearest"] = "shared"
     strength: bool = False
     foreground: bool = False
-    least_edge: float = 0.2
+    least_edge: float = 0.4
 
     @property
     def needs(self) -> frozenset[Need]:
