@@ -107,3 +107,40 @@ def test_whitening_ignores_units(seed, spread):
         rtol=1e-6,
         atol=0,
     )
+
+
+@pytest.mark.parametrize("batch", BATCHES)
+def test_constrained_inverse_is_as_printed(batch, generator):
+    """Nothing is capped, and what a bound holds has no width."""
+    hessian = 1e-6 * random_covariance(*batch, 4, generator=generator)
+    free = torch.tensor([True, False, True, True]).expand(*batch, 4)
+    got, floored = linalg.constrained_inverse(hessian, free, torch.ones(4).double())
+    assert not bool(floored.any())
+    assert floored.shape == batch
+    keep = [0, 2, 3]
+    expected = torch.linalg.inv(hessian[..., keep, :][..., :, keep])
+    torch.testing.assert_close(got[..., keep, :][..., :, keep], expected)
+    assert not bool(got[..., 1, :].any())
+    assert not bool(got[..., :, 1].any())
+
+
+def test_constrained_inverse_floors_what_is_not_positive_definite():
+    hessian = torch.diag_embed(
+        torch.tensor([[4.0, -1.0, 0.1, -9.0], [4.0, 2.0, 0.1, -9.0], [4.0, 0.0, 0.1, 1.0]])
+    ).double()
+    free = torch.tensor([[True] * 4, [True, True, True, False], [True] * 4])
+    prior = torch.tensor([1.0, 1.0, 4.0, 9.0]).double()
+    got, floored = linalg.constrained_inverse(hessian, free, prior)
+    assert floored.tolist() == [True, False, True], "a held direction does not count"
+    expected = torch.tensor([[0.25, 1, 4, 9], [0.25, 0.5, 10, 0], [0.25, 1, 4, 1]]).double()
+    torch.testing.assert_close(got.diagonal(dim1=-2, dim2=-1), expected)
+
+
+def test_least_width_is_given_to_what_has_none_alone(generator):
+    covariance = random_covariance(3, generator=generator)
+    assert torch.equal(linalg.with_least_width(covariance), covariance)
+    covariance[1] = covariance[:, 1] = 0
+    got = linalg.with_least_width(covariance)
+    assert float(got[1, 1]) == linalg.LEAST_DEVIATION**2
+    covariance[1, 1] = got[1, 1]
+    assert torch.equal(got, covariance)

@@ -8,8 +8,9 @@ covariances therefore first divides by the standard deviations, so that the answ
 on the units nor on the overall size, and then treats a direction whose share of the variance is
 below the numerical resolution as one of exactly that resolution.
 
-What to call: `damped_cholesky` and `mask_free` inside iterations (cheap), `inverse_on_free` once at
-convergence, `covariance_factor` to sample, `squared_mahalanobis` and `log_determinant` to compare.
+What to call: `damped_cholesky` and `mask_free` inside iterations (cheap), `inverse_on_free` or
+`constrained_inverse` once at convergence, `covariance_factor` to sample, `squared_mahalanobis` and
+`log_determinant` to compare.
 """
 
 from __future__ import annotations
@@ -20,6 +21,15 @@ from torch import Tensor
 
 CHUNK = 256
 """Matrices inverted at a time: a few copies of them stay in the caches."""
+
+
+LEAST_CURVATURE = 1.0
+"""Floor on the eigenvalues of a Hessian that is not positive definite on the free variables, nats
+per squared deviation of the prior. Ours: the papers invert the Hessian and say nothing of this."""
+
+LEAST_DEVIATION = 1e-2
+"""Metres or radians within which a parameter that a bound holds counts as the same, where modes of
+`constrained_inverse` are compared. Ours."""
 
 
 def symmetric_part(matrix: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n n"]:
@@ -153,6 +163,45 @@ def _inverse_at_least_one(
         values, vectors = torch.linalg.eigh(scaled[~informed])
         inverse[~informed] = (vectors / values.clamp(min=1)[:, None, :]) @ vectors.mT
     return symmetric_part(inverse)
+
+
+def constrained_inverse(
+    hessian: Float[Tensor, "*batch n n"],
+    free: Bool[Tensor, "*batch n"],
+    prior_variance: Float[Tensor, " n"],
+) -> tuple[Float[Tensor, "*batch n n"], Bool[Tensor, "*batch"]]:
+    """Covariance of a mode as the papers print it: `H^-1` on the free variables, zero elsewhere.
+
+    Note 8 and Fig. 6 step 2.3 [IJRR], section 4.2 [RR]; nothing is capped. Where the Hessian is not
+    positive definite on the free variables, its eigenvalues in units of the prior's deviations are
+    raised to `LEAST_CURVATURE`. Computed in float64.
+
+    Args:
+        hessian: Second derivative of the cost in nats, finite; need not be definite.
+        free: Variables that no bound holds.
+        prior_variance: Positive variance of each parameter before the image is seen.
+
+    Returns:
+        Covariances in the Hessian's dtype, and for which of them the floor was needed.
+    """
+    deviation = prior_variance.to(device=hessian.device, dtype=torch.float64).sqrt()
+    units = torch.outer(deviation, deviation)
+    scaled = mask_free(symmetric_part(hessian.detach().double()) * units, free)
+    values, vectors = torch.linalg.eigh(scaled)
+    rounding = hessian.shape[-1] * torch.finfo(hessian.dtype).eps * values.abs().amax(-1)
+    floored = values[..., 0] <= rounding
+    values = torch.where(floored[..., None], values.clamp(min=LEAST_CURVATURE), values)
+    inverse = symmetric_part((vectors / values[..., None, :]) @ vectors.mT) * units
+    both = free[..., :, None] & free[..., None, :]
+    return torch.where(both, inverse, 0.0).to(hessian.dtype), floored
+
+
+def with_least_width(
+    covariance: Float[Tensor, "*batch n n"], deviation: float = LEAST_DEVIATION
+) -> Float[Tensor, "*batch n n"]:
+    """Give parameters without any width a little, so that the covariance has an inverse."""
+    without = covariance.diagonal(dim1=-2, dim2=-1) <= 0
+    return covariance + deviation**2 * torch.diag_embed(without).to(covariance)
 
 
 def _standardised(

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from torchcss.errors import ConfigurationError
+from torchcss.inference.grid_tracker import GridTracker
 from torchcss.inference.loss_monitor import LossMonitor, MonitorState, widened
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.particle import AnnealedParticleFilter, ParticleFilter
@@ -157,6 +158,8 @@ def test_every_tracker_of_the_table_searches_more_widely(preset: str, generator:
     assert narrow.num_samples == 10
     if isinstance(narrow, (ParticleFilter, AnnealedParticleFilter)):
         assert wide.num_modes == 2
+    elif isinstance(narrow, GridTracker):
+        assert wide.num_modes == 4
     else:
         assert isinstance(narrow, Tracker)
         assert isinstance(wide, Tracker)

@@ -15,8 +15,10 @@ from torchcss.inference.problem import SearchProblem
 from torchcss.inference.proposals import (
     CovarianceScaled,
     EigenDirectionGrid,
+    HeavyTailed,
     Move,
     Samples,
+    Spherical,
     with_moves,
 )
 from torchcss.inference.tracker import Tracker
@@ -564,3 +566,92 @@ def test_halving_never_drops_the_modes_that_go_on(generator):
     torch.testing.assert_close(
         state.mixture.mean.sort(dim=0).values, well.minima.sort(dim=0).values, rtol=0, atol=0.05
     )
+
+
+PRINTED = replace(
+    CSS,
+    proposal=CovarianceScaled(covariance_scale=8, include_modes=False),
+    coarse_every=0,
+    converged_only=True,
+    capped=False,
+)
+
+
+def test_covariances_as_printed_are_not_capped(generator):
+    """A shallow bowl: its deviation of 100 exceeds the prior's by far."""
+    bowl = SearchProblem(problems.Bowl(1e-4 * torch.eye(2).double(), torch.zeros(2).double()))
+    for tracker, variance in ((CSS, 9.0), (PRINTED, 1e4)):
+        state, info = tracker.step(tracker.init(single(), generator=generator), bowl, BOUNDS)
+        expected = variance * torch.eye(2).double()
+        torch.testing.assert_close(state.mixture.covariance[0], expected)
+        assert int(info.num_floored) == 0
+
+
+def test_floored_covariances_are_counted(generator):
+    flat = SearchProblem(
+        problems.Bowl(torch.diag(torch.tensor([4.0, 0.0])).double(), torch.zeros(2).double())
+    )
+    _, info = PRINTED.step(PRINTED.init(single(), generator=generator), flat, BOUNDS)
+    assert int(info.num_floored) == 40
+    _, info = CSS.step(CSS.init(single(), generator=generator), flat, BOUNDS)
+    assert int(info.num_floored) == 0
+
+
+@pytest.mark.parametrize("kind", [CovarianceScaled, HeavyTailed, Spherical])
+def test_a_held_parameter_is_never_sampled(generator, kind):
+    """The minimum is at the bound of the first, flattest parameter, in both frames."""
+    bounds = problems.box(2, -6, 0.5)
+    problem = SearchProblem(
+        problems.Bowl(torch.diag(torch.tensor([1e-3, 1.0])).double(), torch.tensor([4.0, 0.0]))
+    )
+    proposal = kind(covariance_scale=4, include_modes=False)
+    tracker = replace(PRINTED, proposal=proposal)
+    state, _ = tracker.step(tracker.init(single(), generator=generator), problem, bounds)
+    assert state.mixture.mean[0, 0] == 0.5
+    assert not bool(state.mixture.covariance[0, 0].any())
+    samples = proposal.sample(state.mixture, 50, bounds, generator=generator)
+    assert bool((samples.x[:, 0] == 0.5).all())
+    assert float(samples.x[:, 1].std()) > 0.5
+    state, info = tracker.step(state, problem, bounds)
+    assert float(info.cost[0]) == pytest.approx(0.5 * 1e-3 * 3.5**2)
+    assert all(bool(part.isfinite().all()) for part in state.mixture)
+
+
+@dataclass(frozen=True)
+class Rippled(problems.Alike):
+    """Two valleys 4 apart, each with ripples half a centimetre long."""
+
+    height: float = 0.3
+
+    def _cost(self):
+        def function(x):
+            wells = 8 * ((x[0] / 2) ** 2 - 1) ** 2 + 0.5 * x[1] ** 2
+            return wells - self.height * torch.cos(2 * torch.pi * x[0] / 0.005)
+
+        return problems.AutogradCost(function)
+
+    def value(self, x):
+        return self._cost().value(x)
+
+    def local_model(self, x):
+        return self._cost().local_model(x)
+
+
+def test_ripples_do_not_fool_the_test_for_confounded_minima(generator):
+    """[IJRR] 3.3: after convergence modes are separated or confounded."""
+    start = single((2.0, 0.0), (1e-4, 0.01))
+    both = GaussianMixture(*(torch.cat([part, part]) for part in start))
+    both = both._replace(mean=torch.tensor([[-2.0, 0.0], [2.0, 0.0]]).double())
+    problem = SearchProblem(Rippled(), landmarks=lambda x: x[:, None])
+    found = {}
+    for separation in (0.0, 0.03):
+        tracker = replace(PRINTED, num_modes=5, separation=separation, keep_alike=False)
+        state, info = tracker.step(tracker.init(both, generator=generator), problem, BOUNDS)
+        assert int(info.num_distinct) > 5, "every ripple is a minimum of its own"
+        found[separation] = state.mixture.mean[:, 0]
+    apart = torch.pdist(found[0.0][:, None])
+    assert float(apart.min()) < 0.006
+    apart = torch.pdist(found[0.03][:, None])
+    assert float(apart.min()) >= 0.03
+    assert bool((found[0.03] > 1).any())
+    assert bool((found[0.03] < -1).any())

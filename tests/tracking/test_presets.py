@@ -13,6 +13,8 @@ from torchcss.cost.term import OnPoints
 from torchcss.cost.visibility import ContourPredictor
 from torchcss.errors import ConfigurationError
 from torchcss.inference.dynamics import ConstantVelocity
+from torchcss.inference.grid_tracker import GridTracker
+from torchcss.inference.importance import fair_samples
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.particle import AnnealedParticleFilter, ParticleFilter
 from torchcss.inference.problem import SearchProblem
@@ -20,8 +22,9 @@ from torchcss.inference.proposals import (
     ChamRehg,
     Condensation,
     CovarianceScaled,
+    EigenDirectionGrid,
     HeavyTailed,
-    Samples,
+    Spherical,
 )
 from torchcss.inference.tracker import Tracker
 from torchcss.tracking.presets import ALIASES, PRESETS, Preset, make_tracker
@@ -107,19 +110,18 @@ def test_weights_of_css_and_of_figure_6():
         assert not printed.soft_matching
 
 
-def test_the_reports_numbers_of_hypotheses():
-    """Section 6 [RR]: three for the arm, seven for the body, from one mode."""
-    for body, expected in [("arm7", 3), ("body30", 7)]:
-        tracker = make_tracker("rr_multiple_hypothesis", body)
-        assert isinstance(tracker, Tracker)
-        one = GaussianMixture(
-            torch.zeros(1, 9), torch.eye(9)[None] * torch.arange(1.0, 10), torch.zeros(1)
-        )
-        samples = tracker.proposal.sample(
-            one, tracker.num_samples, problems.unbounded(9), generator=torch.Generator()
-        )
-        assert isinstance(samples, Samples)
-        assert len(samples.x) == expected == tracker.num_modes
+@pytest.mark.parametrize(
+    ("body", "k", "directions"), [("arm7", 3, 1), ("arm8", 3, 1), ("body30", 7, 3)]
+)
+def test_the_reports_numbers_of_hypotheses(body, k, directions):
+    """Section 6 [RR]: three for the arm along one direction, seven for the body along three."""
+    tracker = make_tracker("rr_multiple_hypothesis", body, motion=0.1)
+    assert isinstance(tracker, GridTracker)
+    assert tracker.num_modes == k
+    assert tracker.pattern == EigenDirectionGrid(num_directions=directions, num_steps=1)
+    # One fit gives as many hypotheses, and k of them a pool of k times as many.
+    assert tracker.num_samples == k * k
+    assert k == 1 + 2 * directions
 
 
 def test_limits_can_be_lifted():
@@ -186,11 +188,13 @@ def test_nothing_of_ours_is_in_the_papers_rows(name, body):
     assert (extractor.edges.window is None) == name.startswith("rr_")
     assert extractor.colour == contour.foreground
     tracker = make_tracker(name, body, motion=0.1)
-    if isinstance(tracker, Tracker):
+    if isinstance(tracker, (Tracker, GridTracker)):
         optimiser = tracker.optimiser
         assert optimiser.max_steps >= 100
         assert (optimiser.tolerance, optimiser.initial_radius) == (1e-6, 1.0)
+    if isinstance(tracker, Tracker):
         assert tracker.converged_only
+        assert not tracker.capped
         assert (tracker.coarse_every, tracker.survivors, tracker.soft_matching) == (0, 0, False)
         if "single" not in name:
             modes = {"ijrr_cham_rehg": 10, "ijrr_cham_rehg_ssd": 10}
@@ -202,13 +206,51 @@ def test_figure_6_draws_from_scaled_covariances_and_nothing_else(name):
     tracker = make_tracker(name, "arm8", motion=0.1)
     assert isinstance(tracker, Tracker)
     proposal = tracker.proposal
-    assert isinstance(proposal, (CovarianceScaled, HeavyTailed))
+    assert isinstance(proposal, (CovarianceScaled, HeavyTailed, Spherical))
     assert proposal.covariance_scale == (4 if isinstance(proposal, HeavyTailed) else 8)
-    assert proposal.max_deviation is None
+    assert 4 <= proposal.covariance_scale <= 14, "Fig. 6 step 1"
+    if not isinstance(proposal, Spherical):
+        assert proposal.max_deviation is None
+    assert (proposal.stratified, proposal.correlated_projection) == (False, False)
     assert not proposal.include_modes
     assert tracker.dynamics.deviation == 0
     assert (tracker.forgetting, tracker.likelihood_power) == (1, 1)
     assert not tracker.keep_alike
+    assert (tracker.laplace_evidence, tracker.standard_bhattacharyya) == (False, False)
+    assert (tracker.separation, tracker.oversampling) == (0.03, 1)
+    assert PRESETS[name].optimiser == PRESETS["ijrr_css"].optimiser
+
+
+@pytest.mark.parametrize("name", ["ijrr_css", "ijrr_css_heavy_tailed", "ijrr_css_spherical"])
+def test_samples_of_every_tail_lead_back_to_the_prior(name, generator):
+    """Section 8 [IJRR]: weighed, they are fair samples of what they were drawn about."""
+    tracker = make_tracker(name, "arm8")
+    assert isinstance(tracker, Tracker)
+    prior = START._replace(covariance=torch.diag(torch.tensor([0.04, 0.01])).double()[None])
+    samples = tracker.proposal.sample(prior, 20_000, problems.unbounded(2), generator=generator)
+    fair = fair_samples(samples, samples.log_weight, 20_000, generator=generator).x
+    # An effective sample size of some thousands: four standard errors.
+    torch.testing.assert_close(fair.mean(0), prior.mean[0], rtol=0, atol=0.02)
+    torch.testing.assert_close(fair.T.cov(), prior.covariance[0], rtol=0.1, atol=2e-3)
+
+
+def test_condensation_is_inflated_in_posterior_and_dynamics():
+    """Section 9 [IJRR]; both are weighed back."""
+    row = PRESETS["condensation_inflated"]
+    tracker = make_tracker("condensation_inflated", "body34", motion=0.1)
+    assert isinstance(tracker, ParticleFilter)
+    assert (tracker.dilution, tracker.noise_scale) == (1 / 8, 8.0)
+    assert (row.noise, row.terms, row.recovery) == (1.0, "papers", False)
+
+
+@pytest.mark.parametrize(
+    "given", [{"oversampling": 2}, {"prediction": "surface"}, {"limb_jumps": 1},
+              {"likelihood_power": 0.5}],
+)  # fmt: skip
+@pytest.mark.parametrize("preset", ["rr_multiple_hypothesis", "ijrr_condensation"])
+def test_what_is_for_samples_that_descend_is_refused_elsewhere(preset, given):
+    with pytest.raises(ConfigurationError, match="does not descend from samples"):
+        Settings(preset=preset, **given)
 
 
 @pytest.mark.parametrize("name", ["ijrr_css", "ijrr_gaussian_single"])

@@ -316,6 +316,7 @@ class _Totals:
         iterations: Iterations of the optimiser, of all samples.
         distinct: Distinct modes found.
         lost: Frames that counted as lost.
+        floored: Ends of descents whose covariance was floored, see `TrackerInfo.num_floored`.
         statuses: How many samples ended with each `Status`, by its number.
         events: When the target was lost and found.
     """
@@ -327,6 +328,7 @@ class _Totals:
     iterations: int = 0
     distinct: int = 0
     lost: int = 0
+    floored: int = 0
     statuses: Tensor = field(default_factory=lambda: torch.zeros(len(Status), dtype=torch.long))
     events: list[dict[str, Any]] = field(default_factory=list)
 
@@ -343,6 +345,7 @@ class _Totals:
         self.iterations += int(frame.info.num_steps.sum())
         self.distinct += int(frame.info.num_distinct)
         self.lost += frame.lost
+        self.floored += int(frame.info.num_floored)
         self.statuses += frame.info.status_counts.cpu()
         was_lost = bool(self.events) and self.events[-1]["event"] == "lost"
         if frame.lost != was_lost:
@@ -379,6 +382,7 @@ class _Totals:
             "distinct_modes_per_frame": self.distinct / num_frames,
             "events": self.events,
             "frames_searched_widely": self.lost,
+            "covariances_floored": self.floored,
             "optimiser_status": {s.name.lower(): int(self.statuses[s]) for s in Status},
             "best_mode_cost_by_term": {k: v / num_frames for k, v in self.terms.items()},
             "share_of_cost_by_term": _shares(self.terms),

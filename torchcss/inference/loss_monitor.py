@@ -25,6 +25,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from torchcss.errors import ConfigurationError
+from torchcss.inference.grid_tracker import GridTracker
 from torchcss.inference.particle import AnnealedParticleFilter, ParticleFilter
 from torchcss.inference.proposals import CovarianceScaled, HeavyTailed
 from torchcss.inference.tracker import SequenceTracker, Tracker
@@ -130,6 +131,12 @@ def widened(
     """
     if isinstance(tracker, (ParticleFilter, AnnealedParticleFilter)):
         return replace(tracker, num_samples=samples * tracker.num_samples)
+    if isinstance(tracker, GridTracker):
+        return replace(
+            tracker,
+            num_samples=samples * tracker.num_samples,
+            num_modes=modes * tracker.num_modes,
+        )
     if not isinstance(tracker, Tracker):
         return tracker
     proposal = tracker.proposal

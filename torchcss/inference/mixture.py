@@ -29,6 +29,7 @@ from torchcss.linalg import (
     squared_mahalanobis,
     symmetric_part,
     whitener,
+    with_least_width,
 )
 
 _STATES_AT_ONCE = 1024
@@ -260,7 +261,7 @@ def distinct_modes(
     while len(order) and len(kept) != most:
         best, order = order[0], order[1:]
         kept.append(best)
-        whitened = (mean[order] - mean[best]) @ whitener(covariance[best]).mT
+        whitened = (mean[order] - mean[best]) @ whitener(with_least_width(covariance[best])).mT
         order = order[whitened.square().sum(-1) > distance**2]
     return torch.stack(kept) if kept else order[:0]
 
@@ -370,10 +371,11 @@ def bhattacharyya(
             weights").
     """
     n = _same_state("bhattacharyya", first, second)
-    between = 0.5 * (first.covariance[:, None] + second.covariance[None, :])
+    one, other = with_least_width(first.covariance), with_least_width(second.covariance)
+    between = 0.5 * (one[:, None] + other[None, :])
     apart = first.mean[:, None] - second.mean[None, :]
     squared = (whitener(between) @ apart[..., None])[..., 0].square().sum(-1)
-    own = log_determinant(first.covariance)[:, None] + log_determinant(second.covariance)[None, :]
+    own = log_determinant(one)[:, None] + log_determinant(other)[None, :]
     overlap = 0.5 * (log_determinant(between) - 0.5 * own)
     if standard:
         return squared / 8 + overlap

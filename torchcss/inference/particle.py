@@ -179,6 +179,7 @@ class _Filter(ABC):
             num_samples=torch.tensor(weighed.num_weighed),
             num_distinct=torch.tensor(len(summary.mean) if some else 0),
             effective_sample_size=survival(summary.log_weight).effective_sample_size,
+            num_floored=torch.tensor(0),
             survival=survival(weighed.log_weight),
             prior=prior,
         )

@@ -451,7 +451,7 @@ class Spherical(_ScaledProposal):
     """Sample a ball of the same volume as each mode's ellipsoid: the paper's control, Table 1.
 
     The ball's standard deviation is the geometric mean of those along the covariance's
-    eigen-directions (decision "matched volume").
+    eigen-directions (decision "matched volume"). It lies in the parameters that have any width.
 
     Attributes:
         covariance_scale: Factor on the variance.
@@ -463,10 +463,10 @@ class Spherical(_ScaledProposal):
 
     def law(self, mixture: GaussianMixture) -> _Law:
         """Balls."""
-        n = mixture.mean.shape[-1]
-        variance = (log_determinant(mixture.covariance) / n).exp()
-        eye = torch.eye(n, dtype=variance.dtype, device=variance.device)
-        ball = variance[:, None, None] * eye
+        free = mixture.covariance.diagonal(dim1=-2, dim2=-1) > 0
+        volume = log_determinant(mask_free(mixture.covariance, free))
+        variance = (volume / free.sum(-1).clamp(min=1)).exp()
+        ball = torch.diag_embed(torch.where(free, variance[:, None], 0.0))
         return _Law(mixture._replace(covariance=self._factor**2 * ball))
 
 

@@ -54,7 +54,7 @@ from torchcss.inference.chain import (
     with_slope,
 )
 from torchcss.inference.trust_region import default_prior_variance
-from torchcss.linalg import symmetric_part, whitener
+from torchcss.linalg import symmetric_part, whitener, with_least_width
 from torchcss.types import Bounds, Differentiable, LocalModel, Status
 
 __all__ = [
@@ -103,6 +103,10 @@ class Refined(NamedTuple):
     num_steps: Int[Tensor, ""]
 
 
+_KNOWN = 1e-6
+"""Deviation of what a mode knows exactly, a parameter that a bound holds, as evidence."""
+
+
 class GaussianEvidence(NamedTuple):
     """Frames of which each says `1/2 (x - mean)^T precision (x - mean)`; a `Differentiable`.
 
@@ -128,7 +132,7 @@ class GaussianEvidence(NamedTuple):
             covariance: Their covariances.
             seen: False for a frame without evidence.
         """
-        white = whitener(covariance.double())
+        white = whitener(with_least_width(covariance.double(), _KNOWN))
         precision = symmetric_part(white.mT @ white)
         if seen is not None:
             precision = torch.where(seen[:, None, None], precision, 0.0)

@@ -45,8 +45,13 @@ from torchcss.inference.mixture import (
 )
 from torchcss.inference.problem import SearchProblem
 from torchcss.inference.proposals import Proposal, Samples
-from torchcss.inference.trust_region import TrustRegionNewton, TrustRegionState, check_bounds
-from torchcss.linalg import log_determinant
+from torchcss.inference.trust_region import (
+    TrustRegionNewton,
+    TrustRegionState,
+    check_bounds,
+    default_prior_variance,
+)
+from torchcss.linalg import constrained_inverse, log_determinant
 from torchcss.types import Bounds, Modes, Status
 
 _ROUNDS = ((0, 6.0), (1, 2.0), (5, 1.0))
@@ -83,9 +88,9 @@ class TrackerState(NamedTuple):
         velocity: How far each mode moved in the last frame; zero for a new mode.
         generator_state: State of the random number generator.
         frame: Number of frames seen, a scalar.
-        particles: What the mixture sums up, for particle filters. They draw new particles from the
-            mixture where there are none; so whoever maps the mixture to other coordinates maps the
-            particles too, or drops them.
+        particles: What the mixture sums up, for particle filters; where the next frame's descents
+            begin, for `GridTracker`. Both make new ones from the mixture where there are none; so
+            whoever maps the mixture to other coordinates maps the particles too, or drops them.
     """
 
     mixture: GaussianMixture
@@ -111,6 +116,8 @@ class TrackerInfo(NamedTuple):
         num_distinct: Distinct modes found before pruning, a scalar; 0 if modes were carried over.
         effective_sample_size: `1 / sum w^2` over the weights of the distinct modes, a scalar: how
             many modes share the posterior.
+        num_floored: Ends of descents whose covariance needed `LEAST_CURVATURE`, see
+            `constrained_inverse`, a scalar; 0 for trackers that cap all covariances.
         survival: How evenly the samples' importance weights are spread: those back to the prior
             for samples that descend (section 8 [IJRR]), those of the posterior for particles.
         prior: The prior of the frame: the modes before, one frame ahead, and where moves led.
@@ -124,6 +131,7 @@ class TrackerInfo(NamedTuple):
     num_samples: Int[Tensor, ""]
     num_distinct: Int[Tensor, ""]
     effective_sample_size: Float[Tensor, ""]
+    num_floored: Int[Tensor, ""]
     survival: Survival
     prior: Prior
 
@@ -131,7 +139,8 @@ class TrackerInfo(NamedTuple):
 class SequenceTracker(Protocol):
     """Anything that follows a mixture through a sequence of frames.
 
-    `Tracker`, `ParticleFilter` and `AnnealedParticleFilter` are; see `Tracker` for the arguments.
+    `Tracker`, `GridTracker`, `ParticleFilter` and `AnnealedParticleFilter` are; see `Tracker` for
+    the arguments.
     """
 
     @property
@@ -310,6 +319,8 @@ class Tracker:
         keep_alike: Whether places that `separation` leaves go to modes alike; False: fewer than K
             are kept.
         converged_only: Keep nothing that stopped at the optimiser's step limit.
+        capped: Whether no covariance is wider than the prior (`inverse_on_free`); False: they are
+            as printed (`constrained_inverse`), and what a bound holds is not sampled.
     """
 
     proposal: Proposal
@@ -330,6 +341,7 @@ class Tracker:
     separation: float = 0.0
     keep_alike: bool = True
     converged_only: bool = False
+    capped: bool = True
 
     def __post_init__(self) -> None:
         for name in ("num_samples", "num_modes", "duplicate_distance", "oversampling"):
@@ -391,7 +403,7 @@ class Tracker:
 
         # 2.3: descend from every sample, and discard minima found before.
         search = self._halve(self._begin(problem, samples, prior, bounds), space)
-        modes, distinct = self._minima(search, space)
+        modes, distinct, floored = self._minima(search, space)
         if len(distinct):
             # 3: weights by the likelihood at the modes. 4 to 6: the best K, with their pasts.
             found = search.problem.take(distinct), Modes(*(part[distinct] for part in modes))
@@ -408,6 +420,7 @@ class Tracker:
             num_samples=torch.tensor(started),
             num_distinct=torch.tensor(len(distinct)),
             effective_sample_size=kept.effective_sample_size,
+            num_floored=floored,
             survival=spread,
             prior=prior,
         )
@@ -493,7 +506,7 @@ class Tracker:
 
     def _promising(self, search: _Search, modes: Modes, size: int) -> Int[Tensor, " k"]:
         """Which samples go on, in their order; the modes of the last frame are never given up."""
-        energy, is_mode = _finite_cost(modes), search.is_mode
+        energy, is_mode = finite_cost(modes), search.is_mode
         lowest = energy.nan_to_num(posinf=0.0).amin()
         energy = torch.where(is_mode, lowest - 1, energy)
         order = energy.argsort(stable=True)
@@ -513,19 +526,23 @@ class Tracker:
         best = torch.cat([own, best[~is_mode[best]]])
         return best[: max(size, len(own))].sort().values
 
-    def _minima(self, search: _Search, space: _Space) -> tuple[Modes, Int[Tensor, " m"]]:
-        """Descend to the end; all ends, and which are distinct, by ascending cost."""
+    def _minima(
+        self, search: _Search, space: _Space
+    ) -> tuple[Modes, Int[Tensor, " m"], Int[Tensor, ""]]:
+        """Descend to the end: all ends, which are distinct by ascending cost, `num_floored`."""
         bounds = space.bounds
         descents = self.optimiser.descend(
             search.problem.cost, search.descents, bounds, scale=space.scale
         )
         modes = self.optimiser.modes(descents, bounds, prior_variance=space.prior_variance)
-        energy = _finite_cost(modes)
-        if self.converged_only:
-            energy = torch.where(modes.status == Status.STEP_LIMIT, torch.inf, energy)
-        return modes, distinct_modes(
+        floored = torch.tensor(0)
+        if not self.capped:
+            modes, floored = as_printed(modes, descents, bounds, space.prior_variance)
+        energy = finite_cost(modes, converged_only=self.converged_only)
+        distinct = distinct_modes(
             modes.mean, modes.covariance, energy, distance=self.duplicate_distance
         )
+        return modes, distinct, floored
 
     def _posterior(
         self,
@@ -631,5 +648,36 @@ def _start(modes: GaussianMixture, prior: Prior) -> Float[Tensor, "k n"]:
     return torch.where(prior.mixture.mean == expected, modes.mean[prior.parent], prior.mixture.mean)
 
 
-def _finite_cost(modes: Modes) -> Float[Tensor, " s"]:
-    return torch.where(modes.status == Status.NON_FINITE, torch.inf, modes.cost)
+def finite_cost(modes: Modes, *, converged_only: bool = False) -> Float[Tensor, " s"]:
+    """Costs by which ends of descents are told apart.
+
+    Args:
+        modes: The ends; those that are not finite cost infinitely much.
+        converged_only: Whether those that stopped at the step limit do so too.
+    """
+    out = modes.status == Status.NON_FINITE
+    if converged_only:
+        out = out | (modes.status == Status.STEP_LIMIT)
+    return torch.where(out, torch.inf, modes.cost)
+
+
+def as_printed(
+    modes: Modes,
+    descents: TrustRegionState,
+    bounds: Bounds,
+    prior_variance: Float[Tensor, " n"] | None,
+) -> tuple[Modes, Int[Tensor, ""]]:
+    """Modes with the covariances of `constrained_inverse`, and how many of these were floored.
+
+    Args:
+        modes: Ends of descents.
+        descents: The descents, with the Hessians there.
+        bounds: Box limits on the state.
+        prior_variance: See `TrustRegionNewton.minimise`.
+    """
+    if prior_variance is None:
+        prior_variance = default_prior_variance(bounds)
+    free = modes.active == 0
+    covariance, floored = constrained_inverse(descents.model.hessian, free, prior_variance)
+    finite = modes.status != Status.NON_FINITE
+    return modes._replace(covariance=covariance), (floored & finite).sum()

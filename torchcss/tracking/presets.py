@@ -9,15 +9,16 @@ gives beside it wins (`Settings.changed`).
 | css | covariance scaled sampling, modes kept apart, soft matching, jumps | ours |
 | ijrr_css | covariance scaled sampling as printed | [IJRR] Fig. 6 |
 | ijrr_css_heavy_tailed | the same with Student t tails | [IJRR] Fig. 6, section 8 |
+| ijrr_css_spherical | the same from balls of the same volume | [IJRR] section 7 |
 | ijrr_css_limits, ijrr_css_constrained | without and with non-self-intersection | [IJRR] 6.2 |
 | ijrr_gaussian_single, ijrr_robust_single | one mode: Gaussian errors, robust errors | [IJRR] 6 |
 | ijrr_single_limits | one robust mode with limits, without non-self-intersection | [IJRR] 6.1 |
 | ijrr_cham_rehg, ijrr_cham_rehg_ssd | Cham and Rehg (1999) in 3D, robust and not | [IJRR] 6.1 |
 | ijrr_condensation | the particle filter | [IJRR] 1.1 |
-| rr_multiple_hypothesis | a regular pattern along the most uncertain directions | [RR] Fig. 4 |
+| rr_multiple_hypothesis | hypotheses descend, patterns about them are scored | [RR] Fig. 4 |
 | condensation_modes | ijrr_css, sampled by dynamical noise | ours, after [IJRR] 6 |
 | heap_hogg, heap_hogg_ssd | Heap and Hogg (1998) in 3D, robust and not | ours, after [IJRR] 6.1 |
-| condensation_inflated | with an inflated posterior | ours, after [IJRR] 9 |
+| condensation_inflated | with inflated posterior and noise, weighed back | ours, after [IJRR] 9 |
 | annealed | the annealed particle filter | ours, after [IJRR] 1.2 |
 
 Modes are the papers': 3 for an arm, 7 for a body, 10 for Cham and Rehg's. What the papers leave
@@ -46,6 +47,7 @@ import torch
 from torchcss.body.load import has_free_root
 from torchcss.errors import ConfigurationError
 from torchcss.inference.dynamics import ConstantVelocity
+from torchcss.inference.grid_tracker import GridTracker
 from torchcss.inference.particle import AnnealedParticleFilter, ParticleFilter
 from torchcss.inference.proposals import (
     ChamRehg,
@@ -54,6 +56,7 @@ from torchcss.inference.proposals import (
     EigenDirectionGrid,
     HeavyTailed,
     Proposal,
+    Spherical,
 )
 from torchcss.inference.tracker import SequenceTracker, Tracker
 from torchcss.inference.trust_region import TrustRegionNewton
@@ -67,7 +70,8 @@ class Preset:
     Attributes:
         what: The tracker in a line.
         proposal: Where samples go, for trackers that descend from them; one that searches by
-            dynamical noise gets its `deviation` from `noise`.
+            dynamical noise gets its `deviation` from `noise`. An `EigenDirectionGrid` makes a
+            `GridTracker`.
         particles: The particle filter instead; its numbers and dynamics are filled in.
         samples_arm: Samples per frame for an arm. With 160 halved instead of 40 that all descend,
             none of five seeds on the rendered arm is lost; with 40 two were.
@@ -109,6 +113,7 @@ class Preset:
         coarse_every: See `Tracker`.
         optimiser: How samples descend.
         converged_only: See `Tracker`.
+        capped: See `Tracker`.
         terms: Name of a set of terms, see `torchcss.tracking.settings.named_terms`.
         cost: Whose cost it is: "ours"; "ijrr" or "rr": as printed, see
             `torchcss.tracking.settings.make_choice`.
@@ -145,6 +150,7 @@ class Preset:
     coarse_every: int = 3
     optimiser: TrustRegionNewton = field(default_factory=lambda: _OURS)
     converged_only: bool = False
+    capped: bool = True
     terms: str = "default"
     cost: Literal["ours", "ijrr", "rr"] = "ours"
     recovery: bool = True
@@ -157,6 +163,11 @@ class Preset:
                 f"Preset: expected either a proposal or a particle filter, got {self.proposal} and "
                 f"{self.particles}; give one of the two"
             )
+
+    @property
+    def descends_from_samples(self) -> bool:
+        """Whether it makes a `Tracker`, not a filter of particles or a `GridTracker`."""
+        return self.particles is None and not isinstance(self.proposal, EigenDirectionGrid)
 
     def bounds(self, limits: Bounds) -> Bounds:
         """Bounds that the tracker obeys: the joint limits, or none.
@@ -205,6 +216,7 @@ def _printed(row: Preset, *, paper: Literal["ijrr", "rr"] = "ijrr") -> Preset:
         row,
         optimiser=_TO_CONVERGENCE,
         converged_only=True,
+        capped=False,
         coarse_every=0,
         terms="papers",
         cost=paper,
@@ -287,6 +299,11 @@ PRESETS: dict[str, Preset] = {
         what="covariance scaled sampling with Student t tails ([IJRR] Fig. 6)",
         proposal=HeavyTailed(covariance_scale=4.0, degrees_of_freedom=3, include_modes=False),
     ),
+    "ijrr_css_spherical": replace(
+        _IJRR_CSS,
+        what="the control: balls of the volume of the scaled covariances ([IJRR] section 7)",
+        proposal=Spherical(covariance_scale=8.0, include_modes=False),
+    ),
     "ijrr_css_limits": replace(
         _IJRR_CSS,
         what="as printed with joint limits, without non-self-intersection ([IJRR] section 6.2)",
@@ -298,14 +315,11 @@ PRESETS: dict[str, Preset] = {
     ),
     "rr_multiple_hypothesis": _printed(
         Preset(
-            what="a pattern along the most uncertain directions, one pool ([RR] Fig. 4); all "
-            "descend, before the pool is pruned",
+            what="hypotheses descend; patterns about their minima are scored ([RR] Fig. 4)",
             proposal=EigenDirectionGrid(num_directions=3, num_steps=1),
             proposal_arm=EigenDirectionGrid(num_directions=1, num_steps=1),
-            samples_arm=9,  # 3 modes and 2 steps from each
-            samples_body=49,  # 7 modes and 6 steps from each
-            forgetting=0.0,
-            noise=0.0,
+            samples_arm=9,  # 3 minima and 2 steps from each
+            samples_body=49,  # 7 minima and 6 steps from each
             interpenetration=False,
             curvature=Curvature.GAUSS_NEWTON,
         ),
@@ -339,9 +353,10 @@ PRESETS: dict[str, Preset] = {
     ),
     "ijrr_condensation": _printed(_CONDENSATION),
     "condensation_inflated": replace(
-        _CONDENSATION,
-        what="CONDENSATION from the posterior to the power 1/8 ([IJRR] section 9)",
-        particles=ParticleFilter(num_samples=1, num_modes=1, dilution=1 / 8),
+        _printed(_CONDENSATION),
+        what="CONDENSATION: posterior to the power 1/8, noise 8 times as wide ([IJRR] section 9)",
+        particles=ParticleFilter(num_samples=1, num_modes=1, dilution=1 / 8, noise_scale=8.0),
+        noise=1.0,
     ),
     "annealed": replace(
         _CONDENSATION,
@@ -424,6 +439,13 @@ def make_tracker(
         )
     proposal = (row.proposal_arm if arm else None) or row.proposal
     assert proposal is not None
+    if isinstance(proposal, EigenDirectionGrid):
+        return GridTracker(
+            pattern=proposal,
+            num_samples=num_samples,
+            num_modes=num_modes,
+            optimiser=row.optimiser,
+        )
     evidence = row.power_arm if arm and row.power_arm is not None else row.likelihood_power
     # Who searches by noise adds it in the proposal; the dynamics themselves then add none.
     if isinstance(proposal, (ChamRehg, Condensation)):
@@ -435,6 +457,7 @@ def make_tracker(
         optimiser=row.optimiser,
         coarse_every=row.coarse_every,
         converged_only=row.converged_only,
+        capped=row.capped,
         keep_alike=row.keep_alike,
         forgetting=row.forgetting,
         likelihood_power=evidence,

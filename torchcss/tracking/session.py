@@ -61,7 +61,7 @@ from torchcss.tracking.view import (
     ViewMemory,
     ViewObservation,
 )
-from torchcss.types import Frame
+from torchcss.types import Bounds, Frame
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import Window
 
@@ -184,7 +184,9 @@ class TrackingSession:
         generator = generator or torch.Generator().manual_seed(settings.seed)
         self._begin(settings, first.body, views, frame_interval)
         nothing = len(self._observers)
-        mixture = first.mixture.prune(1) if self.plan.one_fit else first.mixture
+        mixture = first.mixture
+        if self.plan.one_fit:
+            mixture = _one_fit(mixture, self._bounds)
         self.state = SessionState(
             tracker=self.plan.tracker.init(mixture, generator=generator),
             body=first.body,
@@ -398,7 +400,8 @@ class TrackingSession:
     def _tracker(self, observation: Observation, cost: TrackingCost) -> SequenceTracker:
         """The tracker of a frame: wider after a loss, with the moves and dynamics that it asks for.
 
-        Particle filters have neither: they search by the noise of their own dynamics.
+        Particle filters have neither: they search by the noise of their own dynamics. Nor has a
+        `GridTracker`.
         """
         plan, state = self.plan, self.state
         tracker, recovery = plan.tracker, plan.recovery
@@ -444,6 +447,14 @@ class TrackingSession:
         best = modes.mean[:1]
         values = cost.terms(best) | cost.weight_only_terms(best)
         return {name: float(value[0]) for name, value in values.items()}
+
+
+def _one_fit(mixture: GaussianMixture, bounds: Bounds) -> GaussianMixture:
+    """The likeliest fit alone; what a bound holds has no width (section 5 of both papers)."""
+    best = mixture.prune(1)
+    free = (best.mean > bounds.lower.to(best.mean)) & (best.mean < bounds.upper.to(best.mean))
+    both = free[:, :, None] & free[:, None, :]
+    return best._replace(covariance=torch.where(both, best.covariance, 0.0))
 
 
 def _per_view(terms: dict[str, float], observation: Observation) -> dict[str, float]:

@@ -88,13 +88,13 @@ def named_terms(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(term for name in names for term in _SETS.get(name, (name,))))
 
 
-_NOT_OF_PARTICLES = {
-    "oversampling": (1, "do not descend"),
-    "prediction": ("velocity", "move by noise, each for itself"),
-    "likelihood_power": (None, "have no modes to weigh"),
-    "limb_jumps": (0, "have no modes to jump from"),
+_OF_SAMPLES = {
+    "oversampling": 1,
+    "prediction": "velocity",
+    "likelihood_power": None,
+    "limb_jumps": 0,
 }
-"""Settings of trackers that descend: their defaults, and why particle filters have none."""
+"""Settings of trackers that descend from samples, and their defaults."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,11 +175,11 @@ class Settings:
             _check_terms(self.terms)
         self._check_names()
         self._check_numbers()
-        if PRESETS[self.preset].particles is not None:
-            for name, (default, why) in _NOT_OF_PARTICLES.items():
+        if not PRESETS[self.preset].descends_from_samples:
+            for name, default in _OF_SAMPLES.items():
                 if getattr(self, name) != default:
                     raise ConfigurationError(
-                        f"{name}: the particles of {self.preset} {why}; leave it out"
+                        f"{name}: {self.preset} does not descend from samples; leave it out"
                     )
         try:
             torch.empty(0, device=self.device)
