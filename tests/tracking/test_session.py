@@ -224,7 +224,7 @@ def test_a_new_run_replaces_what_belongs_to_the_last_one(clip: Path, tmp_path: P
         run(clip, out, preset="ijrr_condensation", oversampling=2)
     with pytest.raises(ConfigurationError, match="likelihood_power"):
         run(clip, out, preset="ijrr_condensation", likelihood_power=0.5)
-    with pytest.raises(ConfigurationError, match="no modes to jump from"):
+    with pytest.raises(ConfigurationError, match="limb_jumps"):
         run(clip, out, preset="ijrr_condensation", limb_jumps=4)
     (tmp_path / "empty.mp4").write_bytes(b"")
     with pytest.raises(VideoError):
