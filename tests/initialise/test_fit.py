@@ -53,8 +53,11 @@ def find(someone: Person, search: Search = SMALL, **options) -> Initialisation:
         Keypoints(someone.keypoints, someone.confidence, someone.joint_names),
         someone.camera,
         generator=torch.Generator().manual_seed(0),
+        # Random persons are in poses that nobody takes.
         options=InitialiseOptions(
-            sigma=2.0, search=search, **{"least_joints": LEAST_JOINTS, **options}
+            sigma=2.0,
+            search=search,
+            **{"least_joints": LEAST_JOINTS, "pose_prior": False, **options},
         ),
     )
 
@@ -180,7 +183,9 @@ def test_colours_tell_the_outline_of_a_chequered_shirt():
         found = initialise(
             picture.numpy(), keypoints.scaled(someone.camera.image_size_wh, (width, height)),
             camera, generator=torch.Generator().manual_seed(0),
-            options=InitialiseOptions(search=SMALL, num_modes=2, colours=colours),
+            options=InitialiseOptions(
+                search=SMALL, num_modes=2, colours=colours, pose_prior=False
+            ),
         )  # fmt: skip
         drawn = part_map(found.body, found.mixture.mean[0], camera) >= 0
         overlap.append(float(mask_overlap(drawn, truth)))
@@ -243,7 +248,7 @@ def test_few_joints_leave_the_prior_and_say_so():
     one = marks(someone)
     two = {name: one[name] for name in ("l_shoulder", "l_elbow")}
     generator = torch.Generator().manual_seed(0)
-    options = InitialiseOptions(search=SMALL, num_modes=2)
+    options = InitialiseOptions(search=SMALL, num_modes=2, pose_prior=False)
     found = initialise(None, two, someone.camera, generator=generator, options=options)
     line = next(line for line in found.report if line.startswith("not determined"))
     for name in ("r_knee_flexion", "l_hip_twist", "neck_twist"):
@@ -254,6 +259,19 @@ def test_few_joints_leave_the_prior_and_say_so():
     assert deviation == pytest.approx(float(found.body.sticky_deviation[knee]), rel=0.25)
     with pytest.raises(KeypointError, match="at least 3"):
         find(someone._replace(confidence=(torch.arange(14) < 2).double()))
+
+
+def test_unseen_legs_stand_as_people_do():
+    """With the prior on poses the legs of somebody seen to the hips are where legs usually are."""
+    someone = person()
+    above = {name: place for name, place in marks(someone).items()
+             if not name.endswith(("knee", "ankle"))}  # fmt: skip
+    generator, knees = torch.Generator().manual_seed(0), ["l_knee_flexion", "r_knee_flexion"]
+    options = InitialiseOptions(search=SMALL, num_modes=2)
+    found = initialise(None, above, someone.camera, generator=generator, options=options)
+    column = [found.body.state_index(name) for name in knees]
+    spread = found.mixture.covariance[0].diagonal().sqrt()[column]
+    assert bool((spread < 0.8 * found.body.sticky_deviation[column]).all())
 
 
 def test_swapped_sides_are_reported_and_left_as_they_are():

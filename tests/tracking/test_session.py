@@ -194,9 +194,9 @@ def test_same_seed_same_track(clip: Path, tmp_path: Path):
 def test_all_terms_track(clip: Path, tmp_path: Path):
     summary = run(clip, tmp_path, terms=all_terms(), engine="eager")
     # Weights of edges and the background are no terms; lengths are not free while tracking; an arm
-    # is not segmented and has no silhouette.
+    # is not segmented, and has neither silhouette nor a person's poses.
     without = {"motion_boundaries", "foreground", "background", "anthropometric"}
-    names = set(all_terms()) - without - {"segmentation", "silhouette"}
+    names = set(all_terms()) - without - {"segmentation", "silhouette", "pose_prior"}
     assert set(summary["best_mode_cost_by_term"]) == set(summary["share_of_cost_by_term"]) == names
     times = summary["share_of_search_time_by_term"]
     assert set(times) == names | {"pose", "visibility", "lift", "optimiser"}

@@ -206,6 +206,7 @@ def initialise_video(
     options = InitialiseOptions(
         sigma=sigma,
         least_joints=LEAST_JOINTS,
+        pose_prior="pose_prior" in settings.used_terms,
         contours="contour" in settings.used_terms,
         colours="region" in settings.used_terms,
         working_size=settings.working_size,

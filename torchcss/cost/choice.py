@@ -12,6 +12,7 @@ from torchcss.cost.edge_energy import EdgeEnergyTerm
 from torchcss.cost.flow import FlowTerm
 from torchcss.cost.interpenetration import Interpenetration
 from torchcss.cost.joints import JointTerm
+from torchcss.cost.pose_prior import PosePrior
 from torchcss.cost.region import RegionTerm
 from torchcss.cost.segmentation import SegmentationTerm
 from torchcss.cost.silhouette import SilhouetteTerm
@@ -31,6 +32,7 @@ TERM_TABLE: dict[str, type[Term]] = {
     "joints": JointTerm,
     "stabiliser": Stabiliser,
     "anthropometric": Anthropometric,
+    "pose_prior": PosePrior,
     "temporal": TemporalPrior,
     "temporal_mixture": MixturePrior,
     "interpenetration": Interpenetration,

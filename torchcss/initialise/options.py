@@ -9,6 +9,7 @@ import torch
 from torchcss.cost.anthropometric import Anthropometric
 from torchcss.cost.choice import CostChoice
 from torchcss.cost.joints import JointTerm
+from torchcss.cost.pose_prior import PosePrior
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.errors import ConfigurationError
 from torchcss.initialise.multi_start import Search
@@ -28,6 +29,7 @@ class InitialiseOptions:
         num_modes: Most hypotheses; 1 for the best alone, None for all.
         least_joints: Fewest joints of the body that have to be known; with fewer than
             `LEAST_JOINTS` much stays at its prior.
+        pose_prior: Prefer poses that people take (`torchcss.cost.pose_prior`).
         contours: Run the second and third stage on the picture's contours.
         colours: Let them see the colours on either side too.
         working_size: Longer side of the picture on which contours are searched.
@@ -42,6 +44,7 @@ class InitialiseOptions:
     stature: float | None = None
     num_modes: int | None = 8
     least_joints: int = 1
+    pose_prior: bool = True
     contours: bool = True
     colours: bool = True
     working_size: int = 640
@@ -67,5 +70,6 @@ class InitialiseOptions:
                 JointTerm(sigma=self.sigma, potential_kind=self.potential_kind),
                 Stabiliser(),
                 Anthropometric(stature=0.0) if known else Anthropometric(),
+                *((PosePrior(),) if self.pose_prior else ()),
             )
         )

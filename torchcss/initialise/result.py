@@ -252,7 +252,9 @@ def undetermined_line(body: BodyModel, modes: Modes, joints: TrackingCost) -> st
     prior = torch.minimum(
         default_prior_variance(body.bounds).sqrt(), body.sticky_deviation
     ).nan_to_num(posinf=math.inf)
-    image = replace(joints, choice=joints.choice.without("stabiliser", "anthropometric"))
+    image = replace(
+        joints, choice=joints.choice.without("stabiliser", "anthropometric", "pose_prior")
+    )
     curvature = image.local_model(modes.mean[:1]).hessian[0].diagonal()
     free = torch.as_tensor(modes.active[0]) == 0
     deviation = modes.covariance[0].diagonal().sqrt()

@@ -41,7 +41,7 @@ from torchcss.vision.flow import TRACKING
 
 TERMS = (
     *("contour", "motion_boundaries", "region", "segmentation", "flow", "joints"),
-    *("stabiliser", "anthropometric", "interpenetration", "temporal_mixture"),
+    *("stabiliser", "anthropometric", "pose_prior", "interpenetration", "temporal_mixture"),
 )
 """Terms and priors of the cost by default: all that do not stand in for one another, but for
 `background` and `silhouette`, which take dark clothes before a dark wall for the wall."""

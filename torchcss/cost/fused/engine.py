@@ -26,10 +26,12 @@ from torchcss.cost.context import FrameContext
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.flow import FlowTerm
 from torchcss.cost.fused import pack
+from torchcss.cost.fused.pose_prior import add_pose_prior
 from torchcss.cost.fused.priors import add_priors
 from torchcss.cost.fused.records import (
     Array,
     Gaussian,
+    Limbs,
     LongTails,
     Mixture,
     Parts,
@@ -37,12 +39,12 @@ from torchcss.cost.fused.records import (
     Result,
     Tree,
     View,
-    Workspace,
 )
 from torchcss.cost.fused.repulsion import add_repulsion
 from torchcss.cost.fused.view import add_view
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
 from torchcss.cost.joints import JointTerm
+from torchcss.cost.pose_prior import PosePrior, body_density
 from torchcss.cost.region import RegionTerm
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.temporal import MixturePrior, TemporalPrior
@@ -78,6 +80,7 @@ class _PackedView(NamedTuple):
 class _PackedPrior(NamedTuple):
     priors: tuple[LongTails, Gaussian, Mixture]
     repulsion: tuple[Tree, Parts, Repulsion, Workspaces] | None
+    limbs: tuple[Tree, Limbs, Workspaces] | None
 
 
 class _Samples(NamedTuple):
@@ -93,11 +96,11 @@ class Workspaces:
         make: Makes one.
     """
 
-    def __init__(self, make: Callable[[], Workspace]) -> None:
-        self._make, self._idle = make, deque[Workspace]()
+    def __init__(self, make: Callable[[], Any]) -> None:
+        self._make, self._idle = make, deque[Any]()
 
     @contextmanager
-    def lent(self) -> Iterator[Workspace]:
+    def lent(self) -> Iterator[Any]:
         """A workspace that nobody else has."""
         try:
             workspace = self._idle.pop()
@@ -207,6 +210,10 @@ class FusedEngine:
             tree, parts, repulsion, workspaces = prior.repulsion
             with workspaces.lent() as workspace:
                 _run(add_repulsion, x, tree, parts, repulsion, exact, workspace, result)
+        if prior.limbs is not None:
+            tree, limbs, workspaces = prior.limbs
+            with workspaces.lent() as scratch:
+                _run(add_pose_prior, x, tree, limbs, scratch, result)
         for context in views:
             packed, others = self._view(cost, past, context)
             left_out |= others
@@ -228,7 +235,7 @@ class FusedEngine:
     def _pack_prior(
         self, cost: TrackingCost, past: FrameContext
     ) -> tuple[_PackedPrior, frozenset[str]]:
-        priors, others, repulsion = [], set(), None
+        priors, others, repulsion, limbs = [], set(), None, None
         for term in cost.choice.terms:
             if term.kind != "prior" or cost.bound[term, past] is None:
                 continue
@@ -238,9 +245,22 @@ class FusedEngine:
             elif type(term) is Interpenetration:
                 if weight * past.tables.of(InterpenetrationPairs).num_pairs:
                     repulsion = self._pack_repulsion(term, weight, past)
+            elif type(term) is PosePrior:
+                limbs = self._pack_limbs(weight, past)
             else:
                 others.add(term.name)
-        return _PackedPrior(pack.pack_priors(priors, past), repulsion), frozenset(others)
+        return _PackedPrior(pack.pack_priors(priors, past), repulsion, limbs), frozenset(others)
+
+    def _pack_limbs(
+        self, weight: float, past: FrameContext
+    ) -> tuple[Tree, Limbs, Workspaces] | None:
+        density = past.tables.of(body_density)
+        if density is None:
+            return None
+        tree = pack.pack_tree(past.body, past.camera)
+        limbs = pack.pack_limbs(past.body, density, weight)
+        make = partial(pack.make_limb_scratch, tree, limbs, past.body.num_parameters)
+        return tree, limbs, Workspaces(make)
 
     def _pack_repulsion(
         self, term: Interpenetration, weight: float, past: FrameContext

@@ -29,6 +29,8 @@ from torchcss.cost.fused.records import (
     Flow,
     Gaussian,
     Lens,
+    Limbs,
+    LimbScratch,
     Lines,
     LongTails,
     Mixture,
@@ -47,6 +49,7 @@ from torchcss.cost.fused.records import (
 from torchcss.cost.interior import InteriorNodes
 from torchcss.cost.interpenetration import END, Interpenetration, InterpenetrationPairs
 from torchcss.cost.joints import OUTLIER_LENGTHS, JointTerm
+from torchcss.cost.pose_prior import TRUNK, BodyDensity, Group, side_of
 from torchcss.cost.region import RegionTerm
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.temporal import MixturePrior, TemporalPrior
@@ -359,6 +362,65 @@ def make_workspace(
         peaks=fields(Peaks, nodes * (steps // 2)),
         response=np.zeros(steps, real),
         maxima=np.zeros(steps, np.int64),
+    )
+
+
+def pack_limbs(body: BodyModel, density: BodyDensity, scale: float) -> Limbs:
+    """The prior on poses."""
+    double, which = np.float64, density.which
+    link, offset = body.marker_link[which.joint], body.marker_offset[which.joint]
+    homogeneous = torch.cat([offset, torch.ones_like(offset[:, :1])], dim=1)[:, :, None]
+    row, place = _carried(body, link, homogeneous)
+    above = array(body.tree.ancestors[:, link], double)
+    difference = array(which.difference, double)
+    parts = [density.densities[group.name] for group in which.groups]
+    number, size = (max(part.mean.shape[axis] for part in parts) for axis in (0, 1))
+    mean, height = (np.zeros((len(parts), number, *more)) for more in ((size,), ()))
+    precision = np.zeros((len(parts), number, size, size))
+    for g, part in enumerate(parts):
+        k, d = part.mean.shape
+        mean[g, :k, :d], height[g, :k] = array(part.mean, double), array(part.height, double)
+        precision[g, :k, :d, :d] = array(part.precision, double)
+    return Limbs(
+        scale=scale,
+        row=row,
+        place=place[:, :, 0].copy(),
+        above=above,
+        difference=difference,
+        first=np.array([group.row.start for group in which.groups]),
+        segments=np.array([len(group.known) for group in which.groups]),
+        line=np.array([group.line for group in which.groups]),
+        side=np.stack([array(side_of(group.name, body.tie), double) for group in which.groups]),
+        bends=np.stack([_bends(group, difference, above) for group in which.groups]),
+        number=np.array([len(part.mean) for part in parts]),
+        mean=mean,
+        precision=precision,
+        height=height,
+        uniform=np.array([part.uniform for part in parts]),
+    )
+
+
+def _bends(group: Group, difference: Array, above: Array) -> Array:
+    """The joints that move some but not all of what a group's directions are made from."""
+    segments = [group.line, TRUNK, *range(group.row.start, group.row.stop)]
+    share = above[:, np.any(difference[segments] != 0, axis=0)].mean(axis=1)
+    return (share > 0) & (share < 1)
+
+
+def make_limb_scratch(tree: Tree, limbs: Limbs, num_parameters: int) -> LimbScratch:
+    """Memory for the prior on poses of one state."""
+    joints, (segments, points) = len(tree.parent), limbs.difference.shape
+    number, size = limbs.mean.shape[1:]
+    shapes = dict(
+        frames=(1 + joints, 3, 4), reference=(3,), twists=(joints, 6), point=(points, 3),
+        velocity=(points, 3), unit=(segments, 3), length=(segments,), moved=(joints, segments, 3),
+        axes=(2, 3, 3), normal=(2,), spin=(joints, 2, 3), turned=(3,), direction=(size,),
+        slope=(num_parameters, size), share=(number,), pulls=(number, size), pull=(size,),
+        bend=(size, size), bent=(size,),
+    )  # fmt: skip
+    return LimbScratch(
+        **{name: np.zeros(shape) for name, shape in shapes.items()},
+        touched=np.zeros(num_parameters, bool),
     )
 
 

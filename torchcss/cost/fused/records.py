@@ -304,6 +304,92 @@ class Mixture(NamedTuple):
     height: Array
 
 
+class Limbs(NamedTuple):
+    """Directions of limbs and their density, by groups; see `torchcss.cost.pose_prior`.
+
+    Attributes:
+        scale: Factor on the prior.
+        row: Row of the frame that carries each end of a segment.
+        place: Its place in that frame.
+        above: Which joints move it, `[joint point]`, zero or one.
+        difference: What takes the ends to segments.
+        first: First segment of each group.
+        segments: Number of its segments.
+        line: The line that its frame lies along: hips or shoulders.
+        side: Factors on its axes: a right arm is mirrored.
+        bends: Which joints move its directions, `[group joint]`.
+        number: Number of its Gaussians.
+        mean: Their means, `[group k d]`.
+        precision: Their inverse covariances.
+        height: Logarithms of their densities at their means.
+        uniform: Logarithm of the uniform part of each group.
+    """
+
+    scale: float
+    row: Array
+    place: Array
+    above: Array
+    difference: Array
+    first: Array
+    segments: Array
+    line: Array
+    side: Array
+    bends: Array
+    number: Array
+    mean: Array
+    precision: Array
+    height: Array
+    uniform: Array
+
+
+class LimbScratch(NamedTuple):
+    """What is found of one state on the way to `Limbs`' density.
+
+    Attributes:
+        frames: Frames of base and joints.
+        reference: Point of reference of the twists, zero.
+        twists: How joints move what hangs on them.
+        point: Ends of the segments.
+        velocity: How they move with one joint.
+        unit: Directions of the segments.
+        length: Their lengths.
+        moved: How the directions move with each joint.
+        axes: Frames along hips and shoulders, by rows.
+        normal: Length of left x trunk of each.
+        spin: How they turn with each joint.
+        turned: What a frame's turning adds.
+        direction: Directions of one group in its frame.
+        slope: How they move with each parameter.
+        touched: Whether they do.
+        share: Shares of the Gaussians.
+        pulls: Their pulls.
+        pull: All of them together.
+        bend: Mean precision.
+        bent: Its product with one slope.
+    """
+
+    frames: Array
+    reference: Array
+    twists: Array
+    point: Array
+    velocity: Array
+    unit: Array
+    length: Array
+    moved: Array
+    axes: Array
+    normal: Array
+    spin: Array
+    turned: Array
+    direction: Array
+    slope: Array
+    touched: Array
+    share: Array
+    pulls: Array
+    pull: Array
+    bend: Array
+    bent: Array
+
+
 class Repulsion(NamedTuple):
     """What keeps parts apart; see `torchcss.cost.interpenetration`.
 
