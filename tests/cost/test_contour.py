@@ -164,7 +164,7 @@ def test_the_search_is_that_of_its_plain_twin(
     window: float, step: float, kind: str, generator: torch.Generator
 ) -> None:
     """All over the image and beyond: lines that leave it, or lie outside, among them."""
-    term = replace(PRINTED.get(kind, TERM), window=window, step=step)
+    term = replace(PRINTED.get(kind, TERM), window=window, step=step, least_edge=0.2)
     field = weighed_field(generator)
     size = torch.tensor([WIDTH + 30.0, HEIGHT + 30.0], dtype=torch.float64)
     uv = size * torch.rand(60, 2, generator=generator, dtype=torch.float64) - 15

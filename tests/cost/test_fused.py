@@ -109,10 +109,12 @@ def test_awkward_poses(name: str, dtype: str, generator: torch.Generator) -> Non
 @pytest.mark.parametrize("name", BODIES)
 def test_printed_costs(name: str, preset: str, dtype: str, generator: torch.Generator) -> None:
     cost = printed_cost(make_full_cost(name), preset)
-    x = awkward_states(cost, generator)
-    if dtype == "float32":  # of greater costs, Gaussian ones, single precision has no hundredths
-        x = x[cost.value(x) < 1e4]
-        assert len(x) > 3
+    usual = random_states(cost.body, 12, generator=generator)
+    x = torch.cat([usual, awkward_states(cost, generator)])
+    if dtype == "float32" and preset == "ijrr_gaussian_single":
+        # Gaussian flow costs thousands of nats where a pose is wrong, more than single precision
+        # has hundredths of.
+        cost = replace(cost, choice=cost.choice.without("flow"))
     assert_close(cost, x, dtype)
 
 
