@@ -36,6 +36,7 @@ FLOW = ("flow", *BOUNDARIES)
 BODY = ("interpenetration", *FLOW)
 REGION = ("region", *BODY)
 SEGMENTATION = ("segmentation", *REGION)
+POSES = ("pose_prior", *SEGMENTATION)
 ROWS = {
     "joints and priors only": BASE,
     "+ contour": EDGES,
@@ -44,12 +45,13 @@ ROWS = {
     "+ interpenetration": BODY,
     "+ region": REGION,
     "+ segmentation": SEGMENTATION,
-    "+ background": ("background", *SEGMENTATION),
-    "+ silhouette": ("silhouette", "background", *SEGMENTATION),
-    "+ edge energy": ("edge_energy", *SEGMENTATION),
+    "+ pose prior": POSES,
+    "+ background": ("background", *POSES),
+    "+ silhouette": ("silhouette", "background", *POSES),
+    "+ edge energy": ("edge_energy", *POSES),
     "parent mode for mixture": (
         "temporal",
-        *(name for name in SEGMENTATION if name != "temporal_mixture"),
+        *(name for name in POSES if name != "temporal_mixture"),
     ),
     "contour + flow": ("flow", *EDGES),
     "contour + interpenetration": ("interpenetration", *EDGES),

@@ -279,7 +279,10 @@ THREE = LINKS + "<link name='c'/>" + joint("<limit lower='-1' upper='2'/>")
         pytest.param("<?xml version='1.0' encoding='latin-17'?><robot/>", "parse", id="encoding"),
         pytest.param("<mujoco><worldbody/></mujoco>", "found <mujoco>", id="MJCF"),
         pytest.param(robot(""), "expected <robot> with links", id="no links"),
-        pytest.param(robot(LINKS + joint(kind="floating")), "'floating'; supported", id="floating"),
+        pytest.param(
+            robot(THREE + joint(kind="floating", name="k", parent="b", child="c")),
+            "'floating'; supported", id="floating below the root",
+        ),
         pytest.param(robot(LINKS + joint(kind="planar")), "'planar'; supported", id="planar"),
         pytest.param(robot(THREE + joint(child="c")), "same name", id="duplicate joint"),
         pytest.param(robot(LINKS + LINKS + joint()), "a link occurs twice", id="duplicate link"),
@@ -312,9 +315,6 @@ THREE = LINKS + "<link name='c'/>" + joint("<limit lower='-1' upper='2'/>")
             robot(LINKS + joint("<limit lower='1' upper='0'/>")), "lower limit 1", id="no range"
         ),
         pytest.param(
-            robot(THREE + joint("<mimic joint='z'/>", name="k", child="c")), "'z'", id="mimics none"
-        ),
-        pytest.param(
             robot(THREE + joint("<mimic joint='k'/>", name="k", child="c")), "'k'", id="mimics self"
         ),
         pytest.param(
@@ -338,6 +338,12 @@ def test_bad_files_are_refused_in_one_line(tmp_path: Path, text: str, message: s
     with pytest.raises(BodyError, match=message) as caught:
         load(tmp_path, text)
     assert "\n" not in str(caught.value)
+
+
+def test_a_joint_that_mimics_none_is_free_and_said(tmp_path: Path) -> None:
+    body = load(tmp_path, robot(THREE + joint("<mimic joint='z'/>", name="k", child="c")))
+    assert body.num_parameters == 2
+    assert any("'k' mimics 'z'" in note for note in body.notes)
 
 
 def test_missing_files_are_refused(tmp_path: Path) -> None:

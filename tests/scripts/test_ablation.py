@@ -37,7 +37,7 @@ def test_clip_in_small(shared_data: Path):
 def test_rows_are_of_known_terms_and_end_with_the_default():
     assert all(set(terms) <= set(all_terms()) for terms in script.ROWS.values())
     # Keypoints' lengths are fitted in the first pose; the prior on them is silent in a track.
-    assert set(script.ROWS["+ segmentation"]) == set(TERMS) - {"anthropometric"}
+    assert set(script.ROWS["+ pose prior"]) == set(TERMS) - {"anthropometric"}
 
 
 @pytest.mark.parametrize(

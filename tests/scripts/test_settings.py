@@ -22,7 +22,7 @@ PACKAGE = Path(torchcss.__file__).parent
 SCRIPTS = PACKAGE.parent / "scripts"
 
 CHANGED: dict[str, Any] = {
-    "body": "arm7", "free_root": True, "preset": "rr_multiple_hypothesis", "samples": 7, "modes": 2,
+    "body": "arm7", "free_root": True, "preset": "ijrr_css", "samples": 7, "modes": 2,
     "prediction": "surface", "oversampling": 2, "likelihood_power": 0.3, "limb_jumps": 1,
     "keypoints_use": "first", "terms": ("contour", "region", "segmentation"),
     "curvature": "gauss-newton", "working_size": 160, "contour_weight": 120.0,

@@ -362,7 +362,7 @@ def test_the_setting_is_checked() -> None:
     assert Settings(prediction="surface").prediction == "surface"
     with pytest.raises(ConfigurationError, match="velocity or surface"):
         Settings(prediction="guess")  # type: ignore[arg-type]
-    with pytest.raises(ConfigurationError, match="particles"):
+    with pytest.raises(ConfigurationError, match="does not descend from samples"):
         Settings(prediction="surface", preset="ijrr_condensation")
 
 
