@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 import importlib
 import inspect
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -107,3 +109,15 @@ def test_the_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert figures["many_parameters"] == [["b/y.py:2 f", 9]]
     assert "b/y.py:2 f 9" in capsys.readouterr().out
     assert count("x = '''a\nb'''\n").lines == {1, 2}
+
+
+SLOW = ("av", "kornia", "matplotlib", "numba", "pytorch_kinematics", "scipy")
+"""Libraries that take long to import."""
+
+
+def test_a_command_starts_without_what_it_does_not_use() -> None:
+    code = f"import sys, torchcss.cli.main; print([m for m in {SLOW} if m in sys.modules])"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=REPOSITORY
+    )
+    assert done.stdout.strip() == "[]", done.stdout

@@ -95,6 +95,9 @@ def test_the_evaluation_has_the_poses_of_the_chain(
     turn = torch.linalg.matrix_exp(reference.skew(torch.tensor([1.0, -0.2, 0.7]).double()))
     body = body.with_base(turn, torch.tensor([0.3, -2.0, 1.0]))
     x = torch.randn(2, 3, body.num_parameters, generator=generator, dtype=torch.float64)
+    tree, chain = body.tree, body.tree.chain
+    assert list(tree.joint_names) == chain.get_joint_parameter_names()
+    assert list(tree.link_names) == sorted(chain.frame_to_idx, key=chain.frame_to_idx.__getitem__)
     theirs, ours = body.forward_kinematics(x), body.pose(x).tree
     torch.testing.assert_close(ours.rotation, theirs[..., :3, :3], rtol=0, atol=1e-12)
     torch.testing.assert_close(ours.translation, theirs[..., :3, 3], rtol=0, atol=1e-12)

@@ -36,7 +36,6 @@ from torchcss.io.keypoints.one_image import read_joints
 from torchcss.io.keypoints.read import Scale
 from torchcss.io.tracks import write_summary
 from torchcss.io.video import read_frame
-from torchcss.show.initialisation_views import draw_hypotheses, proportion_table
 from torchcss.show.overlay import draw_poses
 from torchcss.tracking.settings import Settings, check_seed
 from torchcss.types import Keypoints
@@ -138,6 +137,8 @@ def initialise_image(
     check_seed(seed)
     options = options or InitialiseOptions()
     picture = read_frame(image, files.frame)
+    from torchcss.show.initialisation_views import proportion_table
+
     height, width = picture.shape[:2]
     prepare_output_folder(out)
     camera, notes = files.read_camera(image, width, height)
@@ -226,6 +227,8 @@ def initialise_video(
 
 
 def _draw(out: Path, found: Initialisation, picture: Any, camera: Camera, known: Tensor) -> None:
+    from torchcss.show.initialisation_views import draw_hypotheses
+
     pictures = {
         f"stage{number}.png": draw_poses(
             picture, stage.body, stage.state[None], camera, keypoints=known,

@@ -1,9 +1,9 @@
 """The chain of a body: its joints in order, and forward kinematics, by pytorch-kinematics.
 
-This is the only module that knows the library. `make_chain` builds its `Chain` from a list of
-`JointSpecification`; `link_poses` is forward kinematics for any leading shape; `urdf_joints` reads
-the joints of a URDF. The evaluation of costs has kinematics of its own, the faster twin of these:
-`torchcss.body.kinematics`.
+This is the only module that knows the library, which is imported where it is first used: it takes
+a second. `make_chain` builds its `Chain` from a list of `JointSpecification`; `link_poses` is
+forward kinematics for any leading shape; `urdf_joints` reads the joints of a URDF. The evaluation
+of costs has kinematics of its own, the faster twin of these: `torchcss.body.kinematics`.
 """
 
 from __future__ import annotations
@@ -11,14 +11,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pytorch_kinematics as pk
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.errors import BodyError
+
+if TYPE_CHECKING:
+    from pytorch_kinematics import Chain
 
 _FAR = 1e6
 """Metres beyond which nothing is a body's, and squares would overflow."""
@@ -53,16 +56,14 @@ class JointSpecification:
     mimic: tuple[str, float, float] | None = None
 
 
-def make_chain(joints: Sequence[JointSpecification]) -> pk.Chain:
+def make_chain(joints: Sequence[JointSpecification]) -> Chain:
     """The library's chain of some joints, in double precision.
 
     Args:
-        joints: The joints, parents before children; exactly one entry has no parent (the root).
-
-    Raises:
-        BodyError: On duplicate names, unknown parents or kinds, loops, or zero axes.
+        joints: Joints that `check_joints` accepts.
     """
-    _check(joints)
+    import pytorch_kinematics as pk
+
     frames: dict[str | None, pk.Frame] = {}
     for joint in joints:
         matrix = torch.from_numpy(offset_matrix(joint))
@@ -86,8 +87,26 @@ def make_chain(joints: Sequence[JointSpecification]) -> pk.Chain:
     return pk.Chain(frames[None], dtype=torch.float64)
 
 
+def link_order(joints: Sequence[JointSpecification]) -> list[str]:
+    """The links breadth first: the order of the chain's frames."""
+    order = [joint.link for joint in joints if joint.parent is None]
+    for link in order:
+        order += [joint.link for joint in joints if joint.parent == link]
+    return order
+
+
+def joint_order(joints: Sequence[JointSpecification]) -> list[str]:
+    """The moving joints depth first: the order of the chain's parameters."""
+    order: list[JointSpecification] = []
+    ahead = [joint for joint in joints if joint.parent is None]
+    while ahead:
+        order.append(ahead.pop(0))
+        ahead = [joint for joint in joints if joint.parent == order[-1].link] + ahead
+    return [joint.name for joint in order if joint.kind != "fixed"]
+
+
 def link_poses(
-    chain: pk.Chain, q: Float[Tensor, "*batch q"], *, twice: bool = True
+    chain: Chain, q: Float[Tensor, "*batch q"], *, twice: bool = True
 ) -> Float[Tensor, "*batch l 4 4"]:
     """Pose of every link in the frame of the root, in the order of the chain's frames.
 
@@ -123,6 +142,8 @@ def urdf_joints(data: bytes) -> list[JointSpecification]:
     Raises:
         BodyError: If the library cannot read it.
     """
+    import pytorch_kinematics as pk
+
     try:
         chain = pk.build_chain_from_urdf(data)
     except Exception as error:  # it raises many kinds, all of them mean a bad file
@@ -153,7 +174,15 @@ def urdf_joints(data: bytes) -> list[JointSpecification]:
     return joints
 
 
-def _check(joints: Sequence[JointSpecification]) -> None:
+def check_joints(joints: Sequence[JointSpecification]) -> None:
+    """Check that joints make one tree that can be computed with.
+
+    Args:
+        joints: The joints, parents before children; exactly one entry has no parent (the root).
+
+    Raises:
+        BodyError: On duplicate names, unknown parents or kinds, loops, or zero axes.
+    """
     names = [joint.name for joint in joints if joint.parent is not None]
     links = [joint.link for joint in joints]
     for what, values in (("joint", names), ("link", links)):

@@ -4,7 +4,7 @@ A tree is a set of links joined by joints of one degree of freedom. `KinematicTr
 the pose of every link, eq. 1 [IJRR] (the map A), and the world twist `(omega_j, v_j)` of every
 joint: a point p carried by a link below joint j moves with `dp/dq_j = omega_j x p + v_j`.
 
-pytorch-kinematics owns the chain (`torchcss.body.chain`): it puts joints and links in order, and
+pytorch-kinematics owns the chain (`torchcss.body.chain`): joints and links are in its order, and
 `KinematicTree.link_poses` and `BodyModel.forward_kinematics` are its forward kinematics. `forward`
 is the faster twin that the cost is evaluated with, tested against it on every body. Joints at the
 same depth of the tree are turned together, in frames whose z axis is the joint's, so that a turn
@@ -15,17 +15,29 @@ through; what is returned are views of that memory.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from torchcss.body.chain import JointSpecification, link_poses, make_chain, offset_matrix
+from torchcss.body.chain import (
+    JointSpecification,
+    check_joints,
+    joint_order,
+    link_order,
+    link_poses,
+    make_chain,
+    offset_matrix,
+)
 from torchcss.body.rotations import frame_along
 from torchcss.errors import BodyError, ShapeError, check_shape
 from torchcss.types import Bounds
+
+if TYPE_CHECKING:
+    from torchcss.body.chain import Chain
 
 
 class TreePose(NamedTuple):
@@ -55,7 +67,6 @@ class KinematicTree(nn.Module):
 
     Attributes:
         specifications: The joints that it was made of.
-        chain: The library's chain, for forward kinematics.
         joint_names: Names of the moving joints, depth first; the order of `q`.
         link_names: Names of the links; the order of axis `l`.
         ancestors: `[q l]`, True where the joint moves the link.
@@ -78,13 +89,12 @@ class KinematicTree(nn.Module):
 
     def __init__(self, joints: Sequence[JointSpecification]) -> None:
         super().__init__()
+        check_joints(joints)
         self.specifications = tuple(joints)
-        self.chain = make_chain(joints)
         by_name = {joint.name: joint for joint in joints}
-        self.joint_names = tuple(self.chain.get_joint_parameter_names())
+        self.joint_names = tuple(joint_order(joints))
         moving = [by_name[name] for name in self.joint_names]
-        place_of = self.chain.frame_to_idx
-        self.link_names = tuple(sorted(place_of, key=lambda link: place_of[link]))
+        self.link_names = tuple(link_order(joints))
         parents = {joint.link: joint.parent for joint in joints}
         row_of = {joint.link: row for row, joint in enumerate(moving)}
         ancestors = torch.zeros(len(moving), len(self.link_names), dtype=torch.bool)
@@ -158,6 +168,11 @@ class KinematicTree(nn.Module):
         self.register_buffer(
             "link_place", indices([place[carrier[name]] for name in self.link_names])
         )
+
+    @cached_property
+    def chain(self) -> Chain:
+        """The library's chain, for forward kinematics."""
+        return make_chain(self.specifications)
 
     @property
     def num_joints(self) -> int:

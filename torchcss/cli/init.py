@@ -16,7 +16,6 @@ from torchcss.files import prepare_output_folder
 from torchcss.initialise.multi_start import PAPER_PROPORTIONS, Search
 from torchcss.initialise.options import InitialiseOptions
 from torchcss.io.video import read_frame
-from torchcss.show.click import click_joints, write_clicked
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,6 +54,8 @@ class Init:
 
     def run(self) -> None:
         """Run the verb."""
+        from torchcss.show.click import click_joints, write_clicked
+
         files, keypoints = self.files, None
         if self.click == (files.joints is not None):
             raise KeypointError("give a file with --joints, or --click to mark the joints")

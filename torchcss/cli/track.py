@@ -9,7 +9,6 @@ from typing import Annotated
 
 import tyro
 
-from torchcss.app.live import LiveViewer
 from torchcss.app.smooth import report, smooth
 from torchcss.app.track import TrackOptions, track_video
 from torchcss.cli.options import SettingsOptions
@@ -66,6 +65,8 @@ class Track:
         others = self.others()
         live, save, connect = None, self.live_save, self.live_connect
         if self.live or connect is not None or save is not None:
+            from torchcss.app.live import LiveViewer
+
             spawn = self.live and connect is None
             live = LiveViewer(self.out.name, save=save, connect=connect, spawn=spawn)
         with nullcontext() if live is None else closing(live):

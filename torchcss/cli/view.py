@@ -9,9 +9,7 @@ from typing import Annotated
 import tyro
 
 from torchcss.io.run import Given, Run
-from torchcss.show.posterior_plots import plot_track
 from torchcss.show.track_pictures import has_pictures
-from torchcss.show.viewer import view_track
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,6 +26,8 @@ class View:
 
     def run(self) -> None:
         """Run the verb."""
+        from torchcss.show.viewer import view_track
+
         run = Run.open(self.track, self.given)
         view_track(run, save=self.save, connect=self.connect, anew=self.given.video is not None)
         if not has_pictures(run):
@@ -50,6 +50,8 @@ class Plot:
 
     def run(self) -> None:
         """Run the verb."""
+        from torchcss.show.posterior_plots import plot_track
+
         run = Run.open(self.track, self.given)
         anew = self.given.video is not None
         for path in plot_track(run, self.out, frame=self.frame, anew=anew):

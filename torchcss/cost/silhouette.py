@@ -31,7 +31,6 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
-import kornia
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -270,12 +269,14 @@ class SilhouetteTerm(Term):
 
     def _distance(self, free: Tensor, like: Tensor, reach: float) -> Tensor:
         """Distance from a mask along the farther axis, as a share of the reach, blurred."""
+        from kornia.filters import gaussian_blur2d
+
         steps = min(max(round(reach), 1), max(free.shape))
         out = [~free]
         for _ in range(steps - 1):
             free = grow(free[None], 1)[0]
             out.append(~free)
         distance = torch.stack(out).to(like).mean(0)
-        return kornia.filters.gaussian_blur2d(
-            distance[None, None], (5, 5), (1.0, 1.0), border_type="replicate"
-        )[0, 0]
+        return gaussian_blur2d(distance[None, None], (5, 5), (1.0, 1.0), border_type="replicate")[
+            0, 0
+        ]

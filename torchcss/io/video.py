@@ -20,18 +20,19 @@ from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
-import av
-import av.container
 import numpy as np
-from av.error import FFmpegError
 from jaxtyping import UInt8
 from PIL import Image, ImageOps
 
 from torchcss.errors import ConfigurationError, ShapeError, VideoError
 from torchcss.files import output_error, temporary_name
 from torchcss.types import Frame
+
+if TYPE_CHECKING:  # PyAV takes long to import: only where a video is read or written
+    from av import VideoFrame
+    from av.container import InputContainer
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 """What counts as a frame in a folder of images."""
@@ -132,7 +133,7 @@ class VideoReader:
             return len(self._images)
         count = 0
         # What cannot be demuxed ends the count, as it ends the reading.
-        with suppress(FFmpegError, OSError), self._open() as container:
+        with suppress(*_av_errors()), self._open() as container:
             for packet in container.demux(video=0):
                 if packet.is_corrupt:
                     break
@@ -163,7 +164,9 @@ class VideoReader:
 
     # Containers.
 
-    def _open(self) -> av.container.InputContainer:
+    def _open(self) -> InputContainer:
+        import av
+
         # Only this file: playlists that name other files or addresses are refused.
         return av.open(f"file:{self.path}", container_options={"protocol_whitelist": "file"})
 
@@ -199,7 +202,7 @@ class VideoReader:
                 height, width = _upright(first).shape[:2]
         except VideoError:
             raise
-        except (FFmpegError, OSError, ValueError, _Damage) as error:
+        except (*_av_errors(), ValueError, _Damage) as error:
             raise self._not_a_video(error) from error
         return VideoInfo(rate or Fraction(25), width, height, num_frames)
 
@@ -230,7 +233,7 @@ class VideoReader:
                 container_name = container.format.name
         except VideoError:
             raise
-        except (FFmpegError, OSError, ValueError, _Damage) as error:
+        except (*_av_errors(), ValueError, _Damage) as error:
             damage, container_name = _reason(error), ""
         if self._stop is not None and num_read >= self._stop:
             return
@@ -253,7 +256,7 @@ class VideoReader:
             raise self._beyond_the_end(num_read)
 
     def _time(
-        self, picture: av.VideoFrame, index: int, origin: float | None, last: float | None
+        self, picture: VideoFrame, index: int, origin: float | None, last: float | None
     ) -> float:
         if picture.time is None or origin is None:
             time = float(index / self.info.frame_rate)
@@ -368,20 +371,24 @@ class VideoWriter:
                 f"got {[height, width]}"
             )
         image = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+        from av import VideoFrame
+
         try:
             if self._size_hw is None:
                 self._size_hw = (height, width)
                 self._open(image.shape[1], image.shape[0])
-            picture = av.VideoFrame.from_ndarray(image, format="rgb24")
+            picture = VideoFrame.from_ndarray(image, format="rgb24")
             picture.pts = self.num_frames
             self._container.mux(self._stream.encode(picture))
-        except (FFmpegError, OSError) as error:
+        except _av_errors() as error:
             raise output_error(self.path, _as_os_error(error)) from error
         self.num_frames += 1
 
     def _open(self, width: int, height: int) -> None:
         # Written in fragments, so that even a killed process leaves a playable partial file, and
         # turned into an ordinary MP4 when it is closed.
+        import av
+
         options = {"flush_packets": "1"}
         if self.path.suffix.lower() != ".mkv":
             options["movflags"] = "hybrid_fragmented"
@@ -411,7 +418,7 @@ class VideoWriter:
                 container.close()
             if self.num_frames:
                 os.replace(self._partial, self.path)
-        except (FFmpegError, OSError) as error:
+        except _av_errors() as error:
             if self.num_frames and not self.path.exists():
                 with suppress(OSError):
                     os.replace(self._partial, self.path)
@@ -500,11 +507,18 @@ def natural_order(name: str) -> tuple[tuple[int, int | str], ...]:
     )
 
 
+def _av_errors() -> tuple[type[Exception], ...]:
+    """What PyAV raises where a file is at fault."""
+    from av.error import FFmpegError
+
+    return FFmpegError, OSError
+
+
 class _Damage(Exception):
     """The container goes on, but not with whole frames."""
 
 
-def _decode(container: av.container.InputContainer) -> Iterator[av.VideoFrame]:
+def _decode(container: InputContainer) -> Iterator[VideoFrame]:
     """Yield the frames of the first video stream; raise at the first damage, after those before."""
     stream = container.streams.video[0]
     decoder = stream.codec_context
@@ -521,19 +535,19 @@ def _decode(container: av.container.InputContainer) -> Iterator[av.VideoFrame]:
                 damage = _Damage("the file is cut off or damaged")
                 break
             pictures = packet.decode()
-        except (FFmpegError, OSError) as error:
+        except _av_errors() as error:
             damage = error
             break
         yield from pictures
     # Frames that the decoder holds back to reorder them are whole.
     pictures = []
-    with suppress(FFmpegError, OSError):
+    with suppress(*_av_errors()):
         pictures = decoder.decode(None)
     yield from (picture for picture in pictures if not picture.is_corrupt)
     raise damage
 
 
-def _upright(picture: av.VideoFrame) -> UInt8[np.ndarray, "h w 3"]:
+def _upright(picture: VideoFrame) -> UInt8[np.ndarray, "h w 3"]:
     """Return the picture as a player shows it."""
     image = picture.to_ndarray(format="rgb24")
     quarter_turns = round(picture.rotation / 90)

@@ -13,7 +13,7 @@ of its arguments, for the processor at hand (`torchcss.kernels.pipeline`):
 With `TORCHCSS_CHECK_KERNELS=1` kernels are not compiled. They run as plain Python on arrays that
 refuse any index out of range (`torchcss.kernels.checked`): slow, for tests.
 
-Where numba cannot be imported `AVAILABLE` is False, and nobody calls a kernel.
+Where numba is not installed `AVAILABLE` is False, and nobody calls a kernel.
 """
 
 from __future__ import annotations
@@ -21,16 +21,12 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable
+from importlib.util import find_spec
 from typing import Any, TypeVar
 
 import numpy as np
 
-try:
-    import numba
-except ImportError:  # a plain install has it; some platforms do not
-    numba = None
-
-AVAILABLE = numba is not None
+AVAILABLE = find_spec("numba") is not None  # a plain install has it; some platforms do not
 """Whether kernels can be compiled."""
 
 CHECKED = os.environ.get("TORCHCSS_CHECK_KERNELS", "") == "1"

@@ -33,7 +33,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from kornia.geometry.conversions import rotation_matrix_to_quaternion
 from PIL import Image
 from torch import Tensor
 from tqdm import tqdm
@@ -432,6 +431,8 @@ def ellipsoids(
     Args:
         covariance: Covariances of points, square metres.
     """
+    from kornia.geometry.conversions import rotation_matrix_to_quaternion
+
     values, axes = np.linalg.eigh(covariance)
     # Eigenvectors may form a mirrored frame, which no rotation is.
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]

@@ -29,7 +29,6 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import kornia
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -94,6 +93,8 @@ def edge_features(
         ShapeError: If the image is not `[h, w]` with at least one pixel or not of a real floating
             point type.
     """
+    from kornia.filters import spatial_gradient
+
     _check_image("grey", grey)
     choice = configuration or EdgeConfiguration()
     height, width = grey.shape
@@ -104,7 +105,7 @@ def edge_features(
         detail = smooth - gaussian_blur(smooth, choice.window)
         deviation = math.sqrt(0.5 * math.pi) * gaussian_blur(detail.abs(), choice.window)
         normalised = detail / torch.sqrt(deviation.square() + choice.floor**2)
-    gradient = kornia.filters.spatial_gradient(normalised)[0, 0]
+    gradient = spatial_gradient(normalised)[0, 0]
     # The border is replicated, which halves the slope across it.
     if width > 1:
         gradient[0, :, 0] *= 2.0

@@ -48,7 +48,6 @@ from torch.nn import functional
 from torchcss.errors import ConfigurationError, FrameError, ShapeError
 from torchcss.kernels import compiler
 from torchcss.robust import Leclerc, Lorentzian, Quadratic
-from torchcss.vision import flow_kernels
 
 Potential = Quadratic | Lorentzian | Leclerc
 
@@ -283,6 +282,8 @@ def _structure(images: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
     """Smooth part of each image: least total variation near the image (Chambolle 2004)."""
     step = 0.249 / _STRUCTURE_SCALE
     if _compiled(images):
+        from torchcss.vision import flow_kernels
+
         structure = torch.empty_like(images)
         for out, image in zip(structure.flatten(0, 1), images.flatten(0, 1), strict=True):
             smooth = flow_kernels.structure(image.numpy(), _STRUCTURE_SCALE, step, _STRUCTURE_STEPS)
@@ -446,6 +447,8 @@ def _solve(
     root = weight.sqrt()
     q = root * constancy.gradient
     if _compiled(flow):
+        from torchcss.vision import flow_kernels
+
         flow, target = flow.clone(), -q * (root * constancy.offset)
         links = functional.pad(right, (1, 1)), functional.pad(down, (0, 0, 1, 1))
         for x, a, b, (across,), (along,) in zip(flow, q, target, *links, strict=True):
@@ -517,6 +520,8 @@ def _median(images: Float[Tensor, "b c h w"], radius: int) -> Float[Tensor, "b c
     """
     height, width = images.shape[-2:]
     if _compiled(images) and radius:
+        from torchcss.vision import flow_kernels
+
         padded = functional.pad(images, (radius,) * 4, mode="replicate").flatten(0, 1)
         out = torch.empty_like(images)
         for plane, filtered in zip(padded, out.flatten(0, 1), strict=True):

@@ -15,7 +15,6 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 
-import kornia
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -36,11 +35,11 @@ def gaussian_blur(image: Float[Tensor, "*batch h w"], sigma: float) -> Float[Ten
     """
     height, width = image.shape[-2:]
     if sigma < _WIDE:
+        from kornia.filters import gaussian_blur2d
+
         size = 2 * math.ceil(3.0 * sigma) + 1
         flat = image.reshape(-1, 1, height, width)
-        blurred = kornia.filters.gaussian_blur2d(
-            flat, (size, size), (sigma, sigma), border_type="replicate"
-        )
+        blurred = gaussian_blur2d(flat, (size, size), (sigma, sigma), border_type="replicate")
         return blurred.reshape(image.shape)
     down, along = _blur_matrix(height, sigma).to(image), _blur_matrix(width, sigma).to(image)
     return down @ image @ along.T
