@@ -20,7 +20,9 @@ decrease predicted for the step that was actually taken. Each iteration evaluate
 once, at the candidate: its value decides on acceptance, its derivatives are kept if accepted.
 
 No item of a batch influences another: radius, damping, acceptance and `Status` are per item, and
-`minimise` drops items as they finish, and restricts the cost to those that are left.
+`minimise` drops items as they finish, and restricts the cost to those that are left. On a CPU
+all but the evaluation is one compiled call (`torchcss.inference.planning`), and what stands here in
+torch is its plain twin; a GPU and a machine without numba take that.
 
 An item stops as
 
@@ -38,13 +40,18 @@ Call `TrustRegionNewton().minimise(cost, x0, bounds)`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchcss.errors import ConfigurationError, ShapeError, check_shape
+from torchcss.inference import planning
+from torchcss.inference.planning import FUTILE, GOOD_ERROR, LEAST_RATIO, PLEASANT
+from torchcss.kernels import compiler
+from torchcss.kernels.checked import run
 from torchcss.linalg import (
     cholesky_apply,
     damped_cholesky,
@@ -101,11 +108,22 @@ class TrustRegionInfo(NamedTuple):
     decrease: Float[Tensor, " b"]
 
 
-_LEAST_RATIO = 1e-4
-"""Share of the predicted decrease below which a step is not worth taking."""
-_FUTILE = 1e-3
-"""Share of the tolerance that a damped step after a rejection must promise. At 1, items stop
-halfway along curved valleys; towards 0, a cost that jumps takes more steps to stop."""
+class _Trial(NamedTuple):
+    """Where every item was evaluated, and what the cost is there.
+
+    Attributes:
+        x: The states, admissible.
+        model: Cost and derivatives.
+        share: Which share of the second-order parts the Hessians contain.
+        greatest_radius: Bound on trust radii.
+    """
+
+    x: Float[Tensor, "b n"]
+    model: LocalModel
+    share: Float[Tensor, " b"]
+    greatest_radius: float
+
+
 _PINNING_ROUNDS = 12
 """Solves that may be spent on finding which bounds a step ends at."""
 _FAST, _SLOW = 0.02, 0.005
@@ -115,11 +133,6 @@ _POOL_SIZE = 1024
 """Items worked on at a time on a CPU."""
 _FACTOR_CHUNK = 128
 """Matrices factored at a time: they and their factors stay in the caches."""
-_PLEASANT = 0.25
-"""Weight of the prediction's error where the cost falls by more than was predicted."""
-_GOOD_ERROR = 0.25
-"""Relative error of the predicted decrease at which the radius stays as it is (measured: see
-`_next_radius`)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -213,26 +226,62 @@ class TrustRegionNewton:
             The next state, and what became of the steps.
         """
         bounds, weight = _like(bounds, state.x), _weight(state.x, scale)
-        running, value = state.status == Status.RUNNING, state.model.value
         candidate = bounds.project(state.x + state.step)
-        blends = isinstance(cost, BlendedCost)
-        if blends:
-            share = _share_of_second_order(value, state.predicted)
+        greatest_radius = torch.inf
+        if isinstance(cost, BlendedCost):
+            greatest_radius = self.initial_radius
+            share = _share_of_second_order(state.model.value, state.predicted)
             model = cost.blended_model(candidate, share)
         else:
-            share = torch.ones_like(value)
+            share = torch.ones_like(state.radius)
             model = cost.local_model(candidate)
         # Contiguous, because sums over other layouts round differently in other batches.
         model = LocalModel(*(part.detach().contiguous() for part in model))
+        trial = _Trial(candidate, model, share, greatest_radius)
+        if _is_compiled(candidate):
+            return self._advance_compiled(state, trial, bounds, weight)
+        return self._advance(state, trial, bounds, weight)
+
+    def _advance_compiled(
+        self, state: TrustRegionState, trial: _Trial, bounds: Bounds, weight: Float[Tensor, " n"]
+    ) -> tuple[TrustRegionState, TrustRegionInfo]:
+        """The same as `_advance` in one compiled call."""
+        x, model, *rest = state
+        fields = [f.clone(memory_format=torch.contiguous_format) for f in (x, *model, *rest)]
+        info = TrustRegionInfo(
+            torch.empty_like(state.status, dtype=torch.bool), torch.empty_like(state.radius)
+        )
+        arrays, real = [_array(field) for field in fields], _real(x)
+        run(
+            planning.advance,
+            planning.Items(planning.Points(*arrays[:5]), *arrays[5:]),
+            planning.Points(*map(_array, (trial.x, *trial.model, trial.share))),
+            planning.Space(*map(_array, (*bounds, weight, weight.reciprocal()))),
+            planning.Rules(
+                tolerance=real(self.tolerance),
+                greatest_radius=real(trial.greatest_radius),
+                factorisations=self.factorisations,
+                pinning_rounds=_PINNING_ROUNDS,
+                max_steps=self.max_steps,
+            ),
+            planning.make_memory(x.shape[-1], real),
+            *map(_array, info),
+        )
+        return TrustRegionState(fields[0], LocalModel(*fields[1:4]), *fields[4:]), info
+
+    def _advance(
+        self, state: TrustRegionState, trial: _Trial, bounds: Bounds, weight: Float[Tensor, " n"]
+    ) -> tuple[TrustRegionState, TrustRegionInfo]:
+        """Keep the trials that lower the cost, and plan the next steps."""
+        candidate, model, share, greatest_radius = trial
+        running, value = state.status == Status.RUNNING, state.model.value
         finite = _is_finite(model) & candidate.isfinite().all(-1)
         decrease = torch.where(finite, value - model.value, -torch.inf)
         stays = state.predicted == 0
         ratio = decrease / torch.where(stays, 1.0, state.predicted)
-        accepted = running & finite & (stays | ((decrease >= 0) & (ratio > _LEAST_RATIO)))
+        accepted = running & finite & (stays | ((decrease >= 0) & (ratio > LEAST_RATIO)))
         length = (weight * state.step.square()).sum(-1).sqrt()
-        radius = _next_radius(state.radius, length, ratio, accepted)
-        if blends:
-            radius = radius.clamp(max=self.initial_radius)
+        radius = _next_radius(state.radius, length, ratio, accepted).clamp(max=greatest_radius)
         unusable = running & value.isinf() & ~accepted
         state = TrustRegionState(
             x=torch.where(accepted[:, None], candidate, state.x),
@@ -399,16 +448,16 @@ class TrustRegionNewton:
         converged = (predicted < self.tolerance) & (damping <= floor)
         # A short damped step that succeeds is progress along a curved valley, not an end.
         resolution = 4 * torch.finfo(x.dtype).eps * model.value.abs()
-        futile = (~accepted & (predicted < _FUTILE * self.tolerance)) | (predicted <= resolution)
+        futile = (~accepted & (predicted < FUTILE * self.tolerance)) | (predicted <= resolution)
         # No item ends on a model that is not exact: it is evaluated once more where it stands.
         ends = running & (converged | futile)
         exact = state.share == 1
         again = ends & ~exact
         reason = torch.where(converged, int(Status.CONVERGED), int(Status.SMALL_STEP))
         return state._replace(
-            step=torch.where(again[:, None], 0.0, step),
-            damping=damping,
-            predicted=torch.where(again, 0.0, predicted),
+            step=torch.where(running[:, None], torch.where(again[:, None], 0.0, step), state.step),
+            damping=torch.where(running, damping, state.damping),
+            predicted=torch.where(running, torch.where(again, 0.0, predicted), state.predicted),
             status=torch.where(ends & exact, reason, state.status),
         )
 
@@ -525,8 +574,8 @@ def _next_radius(radius: Tensor, length: Tensor, ratio: Tensor, accepted: Tensor
     too little all along the way, and would go in ever shorter steps (36 on the Lorentzian
     reprojection cost, instead of 15).
     """
-    error = torch.where(ratio > 1, _PLEASANT * (ratio - 1), 1 - ratio).clamp(min=1e-3)
-    factor = (_GOOD_ERROR / error).sqrt().clamp(0.2, 2.0)
+    error = torch.where(ratio > 1, PLEASANT * (ratio - 1), 1 - ratio).clamp(min=1e-3)
+    factor = (GOOD_ERROR / error).sqrt().clamp(0.2, 2.0)
     factor = torch.where(accepted, factor, factor.clamp(max=0.5))
     return torch.where(
         factor < 1, factor * torch.minimum(length, radius), torch.maximum(factor * length, radius)
@@ -711,6 +760,22 @@ def _is_finite(model: LocalModel) -> Bool[Tensor, " b"]:
     # A sum is finite if its terms are (short of overflow), and far cheaper than looking at each.
     parts = model.value + model.gradient.sum(-1) + model.hessian.flatten(1).sum(-1)
     return parts.isfinite()
+
+
+def _is_compiled(x: Tensor) -> bool:
+    """Whether the step of these items has a compiled twin."""
+    known = x.device.type == "cpu" and x.dtype in (torch.float32, torch.float64)
+    return compiler.AVAILABLE and known and not torch.compiler.is_compiling()
+
+
+def _real(x: Tensor) -> Any:
+    """Numpy's type of the same precision."""
+    return np.float32 if x.dtype == torch.float32 else np.float64
+
+
+def _array(tensor: Tensor) -> planning.Array:
+    """The same memory, where it is contiguous: other layouts round differently."""
+    return tensor.detach().contiguous().numpy()
 
 
 def _share_of_second_order(value: Float[Tensor, " b"], predicted: Float[Tensor, " b"]) -> Tensor:

@@ -5,9 +5,12 @@ With `TORCHCSS_CHECK_KERNELS=1` kernels run as plain Python on these; see `compi
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import numpy as np
+
+from torchcss.kernels import compiler
 
 _Record = TypeVar("_Record")
 
@@ -42,3 +45,8 @@ def checked(record: _Record) -> _Record:
         fields: Any = record
         return fields._make(parts)
     return record
+
+
+def run(kernel: Callable[..., None], *arguments: Any) -> None:
+    """Call a kernel; in the checked mode with arrays that check their indices."""
+    kernel(*(checked(argument) for argument in arguments) if compiler.CHECKED else arguments)

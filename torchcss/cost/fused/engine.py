@@ -51,7 +51,7 @@ from torchcss.cost.temporal import MixturePrior, TemporalPrior
 from torchcss.cost.term import OnPoints
 from torchcss.cost.visibility import ContourPredictor
 from torchcss.kernels import compiler
-from torchcss.kernels.checked import checked
+from torchcss.kernels.checked import run
 from torchcss.types import Curvature, LocalModel
 
 if TYPE_CHECKING:
@@ -205,15 +205,15 @@ class FusedEngine:
         prior, left_out = self._prior(cost, past)
         left_out = set(left_out)
         mode = _rows(component, prior.priors[0].centre.shape[1], len(x))
-        _run(add_priors, x, mode, *prior.priors, result)
+        run(add_priors, x, mode, *prior.priors, result)
         if prior.repulsion is not None:
             tree, parts, repulsion, workspaces = prior.repulsion
             with workspaces.lent() as workspace:
-                _run(add_repulsion, x, tree, parts, repulsion, exact, workspace, result)
+                run(add_repulsion, x, tree, parts, repulsion, exact, workspace, result)
         if prior.limbs is not None:
             tree, limbs, workspaces = prior.limbs
             with workspaces.lent() as scratch:
-                _run(add_pose_prior, x, tree, limbs, scratch, result)
+                run(add_pose_prior, x, tree, limbs, scratch, result)
         for context in views:
             packed, others = self._view(cost, past, context)
             left_out |= others
@@ -221,7 +221,7 @@ class FusedEngine:
                 modes = len(packed.view.flow.target)
                 with packed.workspaces.lent() as workspace:
                     mode = _rows(parent, modes, len(x))
-                    _run(add_view, x, mode, *packed[:3], workspace, result)
+                    run(add_view, x, mode, *packed[:3], workspace, result)
         return left_out
 
     def _prior(self, cost: TrackingCost, past: FrameContext) -> tuple[_PackedPrior, frozenset[str]]:
@@ -341,11 +341,6 @@ class FusedEngine:
             pack.make_workspace, tree, view.curves, interior, 1, (len(edges.steps), real)
         )
         return _PackedView(tree, parts, view, Workspaces(make)), frozenset(others)
-
-
-def _run(kernel: Callable[..., None], *arguments: Any) -> None:
-    """Call a kernel; in the checked mode with arrays that check their indices."""
-    kernel(*(checked(argument) for argument in arguments) if compiler.CHECKED else arguments)
 
 
 def _rows(parent: Array | None, modes: int, size: int) -> Array:

@@ -1,0 +1,216 @@
+"""The compiled step of the trust region gives what its twin in torch gives."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import problems
+import pytest
+import torch
+from torch import Tensor
+
+from torchcss.inference import trust_region
+from torchcss.inference.trust_region import TrustRegionNewton, TrustRegionState
+from torchcss.kernels import compiler
+from torchcss.studies.reprojection import reprojection_problem
+from torchcss.types import Bounds, CostFunction, LocalModel, Status
+
+pytestmark = pytest.mark.skipif(not compiler.COMPILED, reason="numba is not installed")
+
+NEWTON = TrustRegionNewton()
+
+
+@dataclass(frozen=True)
+class Indefinite(problems.Alike):
+    """A quadratic without a minimum but at its bounds; some of its parameters do not matter."""
+
+    hessian: Tensor
+    slope: Tensor
+
+    def value(self, x: Tensor) -> Tensor:
+        return ((0.5 * x @ self.hessian + self.slope) * x).sum(-1)
+
+    def local_model(self, x: Tensor) -> LocalModel:
+        hessian = self.hessian.expand(*x.shape, -1)  # of no memory of its own
+        return LocalModel(self.value(x), x @ self.hessian + self.slope, hessian)
+
+
+class Torn(problems.Rosenbrock):
+    """Not a number, or infinite, in a part of the plane."""
+
+    def local_model(self, x: Tensor) -> LocalModel:
+        value, gradient, hessian = super().local_model(x)
+        value = torch.where(x[..., 0] > 1.5, torch.inf, value)
+        gradient = torch.where(x[..., 1:] < -1.5, torch.nan, gradient)
+        hessian = torch.where((x[..., :1] < -1.5)[..., None], torch.nan, hessian)
+        return LocalModel(value, gradient, hessian)
+
+
+def randn(*shape: int, generator: torch.Generator) -> Tensor:
+    return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+
+def made(name: str, generator: torch.Generator) -> tuple[CostFunction, Tensor, Bounds]:
+    """A cost, starts, some of them awkward, and bounds."""
+    a, inf = randn(7, 7, generator=generator), torch.inf
+    if name == "body34":
+        problem = reprojection_problem("body34", generator=generator)
+        x0 = problem.truth + 0.6 * randn(40, 34, generator=generator)
+        return problem.cost, problem.bounds.project(x0), problem.bounds
+    cost, n, width = {
+        "quadratic": (problems.Bowl(a @ a.T, a[0]), 7, 2.0),
+        "indefinite": (Indefinite(a + a.T, a[0]), 7, 1.0),
+        "flat": (Indefinite(torch.diag((a[0] > 0) * a[0]), 0 * a[0]), 7, 1.0),
+        "saddle": (problems.DoubleWell(), 2, inf),
+        "valley": (problems.Rosenbrock(), 5, inf),
+        "in a box": (problems.Rosenbrock(), 5, 0.7),
+        "waves": (problems.CosineSum.random(6, 20, generator=generator, stiffness=1.0), 6, 1.5),
+        "free waves": (problems.CosineSum.random(6, 20, generator=generator), 6, inf),
+        "one variable": (problems.CosineSum.random(1, 5, generator=generator), 1, 2.0),
+        "no room": (problems.CosineSum.random(6, 20, generator=generator), 6, 0.0),
+        "jumps": (problems.Jumping(problems.Rosenbrock(), 1e-2), 3, inf),
+        "torn": (Torn(), 2, inf),
+        "limbs": (
+            problems.ReprojectedLimbs(truth=0.4 * a.flatten()[:14], limbs=2, joints=4), 14, 2.5,
+        ),
+    }[name]  # fmt: skip
+    x0 = 2 * randn(60, n, generator=generator)
+    x0[:3] = 0.0  # at a saddle, or on a ridge
+    x0[3, 0] = torch.nan
+    bounds = problems.box(n, -width, width)
+    if name != "indefinite":  # which would fall without end
+        bounds.upper[-1] = torch.inf
+    return cost, x0, bounds
+
+
+def check_twins(monkeypatch: pytest.MonkeyPatch, tolerance: float) -> list[Tensor]:
+    """Let every compiled step from now on be compared with its twin.
+
+    Returns:
+        For every step to come, which items are the same by both.
+    """
+    compiled, seen = TrustRegionNewton._advance_compiled, []
+
+    def both(self, state, trial, bounds, weight):
+        before = [part.clone() for part in fields(state)]
+        got = compiled(self, state, trial, bounds, weight)
+        assert alike(before, fields(state), 0.0).all()
+        expected = self._advance(state, trial, bounds, weight)
+        seen.append(alike(fields(got[0]), fields(expected[0]), tolerance))
+        assert torch.equal(got[1].accepted, expected[1].accepted)
+        assert bool(alike(got[1][1:], expected[1][1:], tolerance).all())
+        return got
+
+    monkeypatch.setattr(TrustRegionNewton, "_advance_compiled", both)
+    return seen
+
+
+def alike(ours: Sequence[Tensor], theirs: Sequence[Tensor], tolerance: float) -> Tensor:
+    """Which items are the same in all tensors."""
+    near = [
+        torch.isclose(a, b, rtol=tolerance, atol=tolerance, equal_nan=True).reshape(len(a), -1)
+        for a, b in zip(ours, theirs, strict=True)
+    ]
+    return torch.cat(near, dim=1).all(1)
+
+
+def fields(state: TrustRegionState) -> tuple[Tensor, ...]:
+    return state.x, *state.model, *state[2:]
+
+
+NAMES = [
+    *("quadratic", "indefinite", "flat", "saddle", "valley", "in a box", "waves", "free waves"),
+    *("one variable", "no room", "jumps", "torn", "limbs", "body34"),
+]
+
+
+@pytest.mark.parametrize("single", [False, True])
+@pytest.mark.parametrize("name", NAMES)
+def test_a_step_is_that_of_the_twin(name, single, monkeypatch, generator):
+    cost, x0, bounds = made(name, generator)
+    if single:
+        cost, x0 = in_single_precision(cost), x0.float()
+        bounds = Bounds(*(bound.float() for bound in bounds))
+    scale = 0.5 + torch.rand(x0.shape[-1], generator=generator)
+    seen = check_twins(monkeypatch, 1e-2 if single else 1e-6)
+    NEWTON.minimise(cost, x0, bounds, scale=scale)
+    # In single precision rounding decides now and then whether a matrix counts as definite.
+    assert float(torch.cat(seen).double().mean()) >= (0.98 if single else 1.0)
+    assert len(seen) > 1
+
+
+def in_single_precision(cost):
+    class Single(problems.Alike):
+        def local_model(self, x):
+            return LocalModel(*(part.float() for part in cost.local_model(x.double())))
+
+    return Single()
+
+
+@pytest.mark.parametrize("limit", ["factorisations", "pinning"])
+def test_what_is_not_solved_in_time(limit, monkeypatch, generator):
+    cost, x0, bounds = made("waves", generator)
+    seen = check_twins(monkeypatch, 1e-6)
+    if limit == "pinning":
+        monkeypatch.setattr(trust_region, "_PINNING_ROUNDS", 1)
+    newton = TrustRegionNewton(factorisations=1 if limit == "factorisations" else 8, max_steps=20)
+    newton.minimise(cost, x0, bounds)
+    assert bool(torch.cat(seen).all())
+    assert len(seen) > 5
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_what_has_stopped_stays_as_it_is(compiled, monkeypatch, generator):
+    monkeypatch.setattr(trust_region, "_is_compiled", lambda x: compiled)
+    cost, x0, bounds = made("waves", generator)
+    newton = TrustRegionNewton(max_steps=4)
+    state = newton.descend(cost, newton.start(x0), bounds)
+    assert set(state.status.tolist()) >= {Status.STEP_LIMIT, Status.NON_FINITE}
+    after, info = newton.step(cost, state, bounds)
+    assert bool(alike(fields(after), fields(state), 0.0).all())
+    assert not bool(info.accepted.any())
+
+
+def test_an_item_depends_on_no_other(generator):
+    """Not on the pool's size, nor on its order, nor on a place in it: bit for bit."""
+    cost, x0, bounds = made("body34", generator)
+    state, weight = NEWTON.init(cost, x0, bounds), torch.ones(34).double()
+    for _ in range(6):
+        x = bounds.project(state.x + state.step)
+        model, share = cost.local_model(x), torch.ones(len(x)).double()
+        trial = trust_region._Trial(x, model, share, torch.inf)
+        whole, _ = NEWTON._advance_compiled(state, trial, bounds, weight)
+        for items in (torch.arange(40).flip(0), torch.tensor([17]), torch.arange(5, 29, 3)):
+            model_of = LocalModel(*(part[items] for part in model))
+            part = trust_region._Trial(x[items], model_of, share[items], torch.inf)
+            some, _ = NEWTON._advance_compiled(state.take(items), part, bounds, weight)
+            assert all(map(torch.equal, fields(some), fields(whole.take(items))))
+        state = whole
+
+
+CHECK = """
+import torch
+from test_planning import NEWTON, made
+cost, x0, bounds = made("waves", torch.Generator().manual_seed(0))
+print(NEWTON.minimise(cost, x0[:12], bounds).cost.nan_to_num(posinf=0.0).sum().item())
+"""
+
+
+def test_no_index_is_out_of_range(generator):
+    here = Path(__file__).parent
+    paths = [str(here), str(here.parent), str(here.parents[1])]
+    environment = {
+        **os.environ,
+        "TORCHCSS_CHECK_KERNELS": "1",
+        "PYTHONPATH": os.pathsep.join(paths),
+    }
+    run = [sys.executable, "-c", CHECK]
+    done = subprocess.run(run, env=environment, capture_output=True, text=True, check=False)
+    cost, x0, bounds = made("waves", generator)
+    expected = NEWTON.minimise(cost, x0[:12], bounds).cost.nan_to_num(posinf=0.0).sum()
+    assert float(done.stdout) == pytest.approx(float(expected), abs=1e-6), done.stderr
