@@ -2,7 +2,8 @@
 
     python scripts/learn_pose_prior.py --data DIR --out torchcss/cost/pose_prior.npz --report J
 
-DIR holds motions of the CMU database as `SUBJECT_TRIAL.bvh`, of which the first frame is a T-pose.
+DIR holds motions of the CMU database as `SUBJECT_TRIAL.bvh`, of which the first frame is a T-pose
+and the second axis up.
 Whole subjects are held out, and others left out whose motions drive a clip that trackers are judged
 on. Of each clip those poses are used that differ from the one used before. Expectation maximisation
 fits the mixtures to them and their mirror images.
@@ -42,6 +43,9 @@ from torchcss.io.motion.positions import limb_positions, read_motion_capture
 
 Poses = dict[str, Float[Tensor, "t d"]]
 """Directions by group."""
+
+_UP = (0.0, 1.0, 0.0)
+"""Which way is up in the motions."""
 
 LEVELS = [0.1 * tenth for tenth in range(1, 10)]
 
@@ -95,7 +99,7 @@ def main(config: Config) -> dict[str, Any]:
         "stabilisers": fit(before, config, generator),
     }
     rows = [[name, *judge(m, learnt_from, truth, generator)] for name, m in fits.items()]
-    uniform = -9 * math.log(4 * math.pi) - math.log(2 * math.pi)
+    uniform = -10 * math.log(4 * math.pi) - math.log(2 * math.pi)
     rows.append(["uniform", uniform, uniform, math.nan, math.nan])
     columns = ("density", "train", "held out", "in 90 %", "calibration error")
     table = Table("Log density of poses", columns, rows)
@@ -113,8 +117,8 @@ def read_poses(config: Config) -> dict[str, Poses]:
     found: dict[str, list[Poses]] = {}
     for path in sorted(config.data.glob("*.bvh")):
         names, _, places = limb_positions(read_motion_capture(path))
-        which = directions_of(names, torch.zeros((), dtype=torch.float64))
-        if which is None or sum(len(group.known) for group in which.groups) < 10:
+        which = directions_of(names, torch.zeros((), dtype=torch.float64), _UP)
+        if which is None or sum(len(group.known) for group in which.groups) < 11:
             raise ConfigurationError(f"{path}: expected all limbs among the joints, found {names}")
         every = limb_directions(torch.from_numpy(places[1:]), which)
         kept = thinned(torch.cat([*every.values()], dim=-1), config.apart)
@@ -152,9 +156,13 @@ def stabiliser_poses(number: int, generator: torch.Generator) -> Poses:
         z = math.sqrt(nu) * normal[:, 0] / normal[:, 1:].norm(dim=-1)
         x[left] = (body.sticky_mean + 0 * x)[left] + (spread + 0 * x)[left] * z
         left = left & ((x < body.lower) | (x > body.upper))
-    which = directions_of(body.joint_names, body.tie)
+    which = directions_of(body.joint_names, body.tie, _UP)
     assert which is not None
-    return limb_directions(body.pose(x).joints, which)
+    poses = limb_directions(body.pose(x).joints, which)
+    # They say nothing of which way is up.
+    anywhere = torch.randn(number, 3, generator=generator).to(x)
+    poses["legs"][:, -3:] = torch.nn.functional.normalize(anywhere, dim=-1)
+    return poses
 
 
 def fit(poses: Poses, config: Config, generator: torch.Generator) -> dict[str, PoseMixture]:

@@ -24,6 +24,7 @@ from torchcss.cost.pose_prior import (
     mirrored,
 )
 from torchcss.initialise.options import InitialiseOptions
+from torchcss.vision.camera import Upright
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +39,11 @@ def density(body: BodyModel) -> BodyDensity:
     return found
 
 
+def cross_matrix(axis: torch.Tensor) -> torch.Tensor:
+    """What multiplies a vector by an axis from the left."""
+    return torch.linalg.cross(axis.expand(3, 3), torch.eye(3).to(axis), dim=-1).mT
+
+
 def awkward(body: BodyModel, generator: torch.Generator) -> torch.Tensor:
     """Anywhere, at rest, all angles zero, and at both bounds."""
     some = random_states(body, 4, generator=generator)
@@ -45,11 +51,17 @@ def awkward(body: BodyModel, generator: torch.Generator) -> torch.Tensor:
     return torch.cat([some, body.rest[None], 0 * some[:1], far, body.bounds.project(-far)])
 
 
+UPS = [None, Upright((0.0, -1.0, 0.0), 0.2), Upright((0.0, 0.0, 1.0), 0.0)]
+"""Not known, a camera that is about level, and a world."""
+
+
+@pytest.mark.parametrize("up", UPS)
 @pytest.mark.parametrize("name", ["body30", "body32", "body34"])
-def test_derivatives(name: str, generator: torch.Generator) -> None:
+def test_derivatives(name: str, up: Upright | None, generator: torch.Generator) -> None:
     body = load_body(name)
-    density = body_density(body)
+    density = body_density(body, up)
     assert density is not None
+    assert len(density.which.groups[1].known) == (4 if up is None else 5)
     x = awkward(body, generator).requires_grad_()
     cost = density.cost(body.pose(x).joints)
     (gradient,) = torch.autograd.grad(cost.sum(), x)
@@ -93,6 +105,29 @@ def test_it_is_a_density_on_the_spheres(generator: torch.Generator) -> None:
         assert float(mean) * (4 * math.pi) ** len(known) == pytest.approx(1.0, abs=0.15)
 
 
+def test_tilts_of_a_body_count_where_up_is_known(
+    body: BodyModel, generator: torch.Generator
+) -> None:
+    joints = body.pose(random_states(body, 6, generator=generator)).joints
+    standing = body.pose(body.rest).joints
+    hips, shoulders = (
+        standing[[body.joint_index(f"{side}_{part}") for side in "lr"]].mean(0)
+        for part in ("hip", "shoulder")
+    )
+    up = torch.nn.functional.normalize(shoulders - hips, dim=-1)
+    (x, y, z), across = up.tolist(), torch.linalg.cross(up, up.roll(1), dim=-1)
+
+    def costs(deviation: float, about: torch.Tensor, angle: float) -> torch.Tensor:
+        density = body_density(body, Upright((x, y, z), deviation))
+        assert density is not None
+        turn = torch.linalg.matrix_exp(angle * cross_matrix(about / about.norm()))
+        return density.cost(torch.cat([joints, standing[None]]) @ turn.mT)
+
+    torch.testing.assert_close(costs(0.0, up, 1.0), costs(0.0, up, 0.0))
+    sure, unsure = (costs(s, across, 0.8)[-1] - costs(s, up, 0.0)[-1] for s in (0.0, 0.4))
+    assert sure > unsure > 1
+
+
 def test_only_the_directions_of_limbs_matter(
     body: BodyModel, density: BodyDensity, generator: torch.Generator
 ) -> None:
@@ -106,9 +141,9 @@ def test_only_the_directions_of_limbs_matter(
     torch.testing.assert_close(density.cost(1.7 * body.pose(x).joints), cost)
 
 
-def test_a_mirror_image_is_equally_dense(
-    body: BodyModel, density: BodyDensity, generator: torch.Generator
-) -> None:
+def test_a_mirror_image_is_equally_dense(body: BodyModel, generator: torch.Generator) -> None:
+    density = body_density(body, UPS[2])
+    assert density is not None
     joints = body.pose(random_states(body, 6, generator=generator)).joints
     names = ["r" + n[1:] if n[:2] == "l_" else "l" + n[1:] if n[:2] == "r_" else n
              for n in body.joint_names]  # fmt: skip

@@ -32,7 +32,7 @@ def test_it_learns_and_judges(script: ModuleType, shared_data: Path, tmp_path: P
     assert json.loads(report.read_text())["held_out"] == found["held_out"] > 0
     with np.load(out) as learnt, np.load(FILE) as shipped:
         assert set(learnt) == set(shipped)
-        assert learnt["legs_mean"].shape == (2, 12)
+        assert learnt["legs_mean"].shape == (2, 15)
 
 
 def test_without_the_subjects_it_says_so(script: ModuleType, tmp_path: Path) -> None:

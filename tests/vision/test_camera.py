@@ -422,3 +422,27 @@ def test_bad_points_are_refused() -> None:
         camera.rays(torch.zeros(4, 3))
     with pytest.raises(CameraError, match="scale factor"):
         camera.scaled(0.0)
+
+
+@pytest.mark.parametrize(
+    ("rotation", "up"),
+    [
+        pytest.param([[1, 0, 0], [0, 0, -1], [0, 1, 0]], (0, 0, 1), id="level, z up"),
+        pytest.param([[1, 0, 0], [0, 0.8, -0.6], [0, 0.6, 0.8]], (0, -1, 0), id="y down"),
+        pytest.param([[1, 0, 0], [0, -0.8, 0.6], [0, -0.6, -0.8]], (0, 1, 0), id="y up"),
+        pytest.param([[1, 0, 0], [0, 0.7, -0.7141428], [0, 0.7141428, 0.7]], None, id="neither"),
+    ],
+)  # fmt: skip
+def test_up_is_the_axis_of_the_world_nearest_to_the_pictures(
+    rotation: list[list[float]], up: tuple[float, ...] | None
+) -> None:
+    placed = Camera(np.eye(3), (4, 3), R_camera_world=np.array(rotation))
+    assert (placed.up and placed.up.direction) == up
+    assert placed.up is None or placed.up.deviation == 0
+
+
+def test_a_camera_without_a_world_is_about_level() -> None:
+    own = make_camera().in_own_frame().up
+    assert own is not None
+    assert own.direction == (0, -1, 0)
+    assert own.deviation > 0

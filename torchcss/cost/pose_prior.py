@@ -4,9 +4,10 @@ One camera often leaves several poses that look alike, and people take some of t
 than others. The prior is a density of directions, which mean the same on every skeleton that has
 the limbs: of trunk and shoulders and of both legs' segments, in a frame whose axes are the line of
 the hips, up along the trunk, and to the front; and of each arm's segments, in a frame with the line
-of the shoulders instead. Size, place, heading and tilt of the body, twists of limbs, hands, feet
-and head do not matter. Trunk, legs and each arm are independent of one another (on people who were
-held out that is worth five nats a pose), each group u of directions a mixture
+of the shoulders instead. Where it is known which way is up (`Camera.up`), that is a direction of
+the legs' group, so that tilts of the body count. Its size, place and heading, twists of limbs,
+hands, feet and head do not matter. Trunk, legs and each arm are independent of one another (on
+people who were held out that is worth five nats a pose), each group u of directions a mixture
 
     p(u) = e c + (1 - e) sum_k w_k N(u; m_k, S_k) / Z_k
 
@@ -26,9 +27,9 @@ EIA-0196217.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
@@ -41,6 +42,7 @@ from torchcss.body.model import BodyModel, BodyPose
 from torchcss.cost.context import FrameContext
 from torchcss.cost.term import Kind, OnStates, Term
 from torchcss.types import LocalModel
+from torchcss.vision.camera import Upright
 
 FILE = Path(__file__).with_name("pose_prior.npz")
 
@@ -50,12 +52,15 @@ GROUPS: dict[str, tuple[tuple[str, str], ...]] = {
     "trunk": (("hips", "shoulders"), ("r_shoulder", "l_shoulder")),
     "legs": (
         *(("l_hip", "l_knee"), ("r_hip", "r_knee")),
-        *(("l_knee", "l_ankle"), ("r_knee", "r_ankle")),
+        *(("l_knee", "l_ankle"), ("r_knee", "r_ankle"), ("ground", "sky")),
     ),
     "l_arm": (("l_shoulder", "l_elbow"), ("l_elbow", "l_wrist")),
     "r_arm": (("r_shoulder", "r_elbow"), ("r_elbow", "r_wrist")),
 }
-"""The ends of the directions of each group; `hips` and `shoulders` are the middles of the two."""
+"""The ends of the directions of each group; `hips` and `shoulders` are the middles of the two.
+From ground to sky is up."""
+
+UP = ("ground", "sky")
 
 UNIFORM_SHARE = 0.05
 """Share e of the uniform density."""
@@ -90,25 +95,30 @@ class Directions(NamedTuple):
         joint: The joint centres at their ends.
         difference: What takes these points to segments: the lines of hips and shoulders, the trunk,
             and then those of the groups.
+        fixed: Those segments that no joint moves, up; zero for the others.
         groups: The groups.
     """
 
     joint: Int[Tensor, " p"]
     difference: Float[Tensor, "m p"]
+    fixed: Float[Tensor, "m 3"]
     groups: tuple[Group, ...]
 
 
-def directions_of(names: tuple[str, ...], like: Tensor) -> Directions | None:
+def directions_of(
+    names: tuple[str, ...], like: Tensor, up: tuple[float, float, float] | None = None
+) -> Directions | None:
     """The directions among named joint centres; None without hips and shoulders.
 
     Args:
         names: The joint centres.
         like: Gives type and device.
+        up: Which way is up in the world; None: not known.
     """
     if not set(_CORNERS) <= set(names):
         return None
     middle = {place: {f"{s}_{place[:-1]}": 0.5 for s in "lr"} for place in ("hips", "shoulders")}
-    known_names = {*names, *middle}
+    known_names = {*names, *middle, *(UP if up is not None else ())}
     ends = [("r_hip", "l_hip"), ("r_shoulder", "l_shoulder"), ("hips", "shoulders")]
     groups = []
     for name, segments in GROUPS.items():
@@ -117,16 +127,20 @@ def directions_of(names: tuple[str, ...], like: Tensor) -> Directions | None:
         if known:
             groups.append(Group(name, known, row, int("arm" in name)))
         ends += [segments[i] for i in known]
+    moving = [pair for pair in ends if pair != UP]
     points = list(
-        dict.fromkeys((*_CORNERS, *(p for pair in ends for p in pair if p not in middle)))
+        dict.fromkeys((*_CORNERS, *(p for pair in moving for p in pair if p not in middle)))
     )
-    rows = like.new_zeros(len(ends), len(points))
-    for row, pair in zip(rows, ends, strict=True):
+    rows, fixed = like.new_zeros(len(ends), len(points)), like.new_zeros(len(ends), 3)
+    for row, still, pair in zip(rows, fixed, ends, strict=True):
+        if pair == UP:
+            still[:] = still.new_tensor(up)
+            continue
         for end, sign in zip(pair, (-1.0, 1.0), strict=True):
             for point, share in middle.get(end, {end: 1.0}).items():
                 row[points.index(point)] += sign * share
     joint = torch.tensor([names.index(name) for name in points], device=like.device)
-    return Directions(joint, rows, tuple(groups))
+    return Directions(joint, rows, fixed, tuple(groups))
 
 
 class _Axes(NamedTuple):
@@ -159,7 +173,7 @@ def limb_directions(
         joints: Joint centres.
         which: The directions that there are.
     """
-    unit, _ = _units(which.difference @ joints[..., which.joint, :])
+    unit, _ = _units(which.difference @ joints[..., which.joint, :] + which.fixed)
     frames = [_axes(unit, line).axes for line in (0, 1)]
     return {
         group.name: (
@@ -185,7 +199,7 @@ def direction_slopes(
         which: The directions that there are.
     """
     points = pose.joints[..., which.joint, :]
-    unit, length = _units(which.difference @ points)
+    unit, length = _units(which.difference @ points + which.fixed)
     slope = which.difference @ _point_slopes(body, pose, points, which)
     across = unit[..., None, :, :]
     slope = (slope - (slope * across).sum(-1, keepdim=True) * across) / length[..., None, :, :]
@@ -246,16 +260,26 @@ class PoseMixture(NamedTuple):
         both = PoseMixture(*(torch.cat(pair) for pair in pairs))
         return both._replace(weight=0.5 * both.weight)
 
-    def density(self, group: str, known: tuple[int, ...], share: float = UNIFORM_SHARE) -> Density:
+    def density(
+        self,
+        group: str,
+        known: tuple[int, ...],
+        *,
+        tilt: float = 0.0,
+        share: float = UNIFORM_SHARE,
+    ) -> Density:
         """The density of some of the directions of a group.
 
         Args:
             group: The group.
             known: Which of its directions.
+            tilt: How far off the direction of up may be, radians.
             share: Share of the uniform density.
         """
         rows = [3 * direction + axis for direction in known for axis in range(3)]
         mean, covariance = self.mean[:, rows], self.covariance[:, rows][:, :, rows]
+        unsure = [tilt**2 * (GROUPS[group][direction] == UP) for direction in known]
+        covariance = covariance + covariance.new_tensor(unsure).repeat_interleave(3).diag()
         flat = group == "trunk" and 0 in known
         root = torch.linalg.cholesky(covariance)
         on_spheres = _log_on_spheres(mean, covariance, flat=flat)
@@ -340,7 +364,7 @@ def mirrored(directions: Float[Tensor, "*batch d"], group: str) -> Float[Tensor,
     if group == "trunk":
         # The line of the shoulders goes from right to left in the image too.
         return torch.cat([each[..., :1, :], -each[..., 1:, :]], dim=-2).flatten(-2)
-    return each.unflatten(-2, (-1, 2)).flip(-2).flatten(-3)
+    return each[..., [1, 0, 3, 2, 4], :].flatten(-2)
 
 
 @cache
@@ -385,17 +409,29 @@ class BodyDensity(NamedTuple):
         return LocalModel(value, gradient, hessian)  # type: ignore[arg-type]
 
 
-def body_density(body: BodyModel) -> BodyDensity | None:
-    """The density of a body's poses that was learnt; None if it lacks the limbs of a person."""
-    which = directions_of(body.joint_names, body.tie)
-    if which is None or len(which.groups) == 1:
+def body_density(body: BodyModel, up: Upright | None = None) -> BodyDensity | None:
+    """The density of a body's poses that was learnt; None if it lacks the limbs of a person.
+
+    Args:
+        body: The body.
+        up: Which way is up; None: not known.
+    """
+    which = directions_of(body.joint_names, body.tie, up and up.direction)
+    if which is None or len(which.joint) == len(_CORNERS):
         return None
     learnt = learnt_mixtures()
     densities = {}
     for group in which.groups:
         mixture = PoseMixture(*(numbers.to(body.tie) for numbers in learnt[group.name]))
-        densities[group.name] = mixture.density(group.name, group.known)
+        tilt = 0.0 if up is None else up.deviation
+        densities[group.name] = mixture.density(group.name, group.known, tilt=tilt)
     return BodyDensity(which, densities)
+
+
+@cache
+def density_where(up: Upright | None) -> Callable[[BodyModel], BodyDensity | None]:
+    """`body_density` as what makes a table of a body; the same function for the same up."""
+    return partial(body_density, up=up)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -407,7 +443,7 @@ class PosePrior(Term):
 
     def prepare(self, context: FrameContext) -> OnStates | None:
         """Bind the prior to a body; None if it lacks the limbs of a person."""
-        density = context.tables.of(body_density)
+        density = context.tables.of(density_where(context.camera.up))
         if density is None:
             return None
         return OnStates(

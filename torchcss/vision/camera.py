@@ -55,6 +55,12 @@ from torchcss.errors import CameraError, check_shape
 from torchcss.types import PointCost
 from torchcss.vision.sampling import inside_image
 
+_LEAST_UPRIGHT = math.cos(math.radians(40))
+"""How near an axis of the world must be to the picture's up to be that of the world."""
+
+_LEVEL = 0.2
+"""Radians by which cameras are off level, on each axis."""
+
 GRAZING_RADIUS = 1.0e4
 """Normalised radius (0.006 degrees from the image plane) beyond which powers overflow float32."""
 
@@ -103,6 +109,18 @@ class ProjectionModel(NamedTuple):
     lens_aa: Float[Tensor, "*batch p"]
     lens_ab: Float[Tensor, "*batch p"]
     lens_bb: Float[Tensor, "*batch p"]
+
+
+class Upright(NamedTuple):
+    """Which way is up, away from the ground.
+
+    Attributes:
+        direction: A unit vector of the world.
+        deviation: How far off it may be, radians.
+    """
+
+    direction: tuple[float, float, float]
+    deviation: float
 
 
 class Camera(nn.Module):
@@ -225,6 +243,23 @@ class Camera(nn.Module):
         return -self.R_camera_world.mT @ self.t_camera_world
 
     # From the world to the image.
+
+    @property
+    def up(self) -> Upright | None:
+        """Which way is up: the axis of the world that is nearest to the picture's.
+
+        Worlds are measured with one axis along gravity, and cameras are held about level. A camera
+        that was never placed in a world is its own: it is taken as level. None if no axis is near.
+        """
+        picture_up = -self.R_camera_world[1]
+        axis = int(picture_up.abs().argmax())
+        height = float(picture_up[axis])
+        if abs(height) < _LEAST_UPRIGHT:
+            return None
+        direction = [0.0, 0.0, 0.0]
+        direction[axis] = math.copysign(1.0, height)
+        own_frame = bool((self.R_camera_world.diagonal() == 1).all())
+        return Upright((direction[0], direction[1], direction[2]), _LEVEL if own_frame else 0.0)
 
     def to_camera_frame(self, points_world: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """Return the points in the camera's frame, `R x + t`, metres."""

@@ -44,7 +44,7 @@ from torchcss.cost.fused.repulsion import add_repulsion
 from torchcss.cost.fused.view import add_view
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
 from torchcss.cost.joints import JointTerm
-from torchcss.cost.pose_prior import PosePrior, body_density
+from torchcss.cost.pose_prior import PosePrior, density_where
 from torchcss.cost.region import RegionTerm
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.temporal import MixturePrior, TemporalPrior
@@ -254,7 +254,7 @@ class FusedEngine:
     def _pack_limbs(
         self, weight: float, past: FrameContext
     ) -> tuple[Tree, Limbs, Workspaces] | None:
-        density = past.tables.of(body_density)
+        density = past.tables.of(density_where(past.camera.up))
         if density is None:
             return None
         tree = pack.pack_tree(past.body, past.camera)

@@ -49,7 +49,7 @@ from torchcss.cost.fused.records import (
 from torchcss.cost.interior import InteriorNodes
 from torchcss.cost.interpenetration import END, Interpenetration, InterpenetrationPairs
 from torchcss.cost.joints import OUTLIER_LENGTHS, JointTerm
-from torchcss.cost.pose_prior import TRUNK, BodyDensity, Group, side_of
+from torchcss.cost.pose_prior import TRUNK, BodyDensity, Directions, Group, side_of
 from torchcss.cost.region import RegionTerm
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.temporal import MixturePrior, TemporalPrior
@@ -387,11 +387,12 @@ def pack_limbs(body: BodyModel, density: BodyDensity, scale: float) -> Limbs:
         place=place[:, :, 0].copy(),
         above=above,
         difference=difference,
+        fixed=array(which.fixed, double),
         first=np.array([group.row.start for group in which.groups]),
         segments=np.array([len(group.known) for group in which.groups]),
         line=np.array([group.line for group in which.groups]),
         side=np.stack([array(side_of(group.name, body.tie), double) for group in which.groups]),
-        bends=np.stack([_bends(group, difference, above) for group in which.groups]),
+        bends=np.stack([_bends(group, which, above) for group in which.groups]),
         number=np.array([len(part.mean) for part in parts]),
         mean=mean,
         precision=precision,
@@ -400,11 +401,12 @@ def pack_limbs(body: BodyModel, density: BodyDensity, scale: float) -> Limbs:
     )
 
 
-def _bends(group: Group, difference: Array, above: Array) -> Array:
+def _bends(group: Group, which: Directions, above: Array) -> Array:
     """The joints that move some but not all of what a group's directions are made from."""
     segments = [group.line, TRUNK, *range(group.row.start, group.row.stop)]
-    share = above[:, np.any(difference[segments] != 0, axis=0)].mean(axis=1)
-    return (share > 0) & (share < 1)
+    ends = array((which.difference[segments] != 0).any(0), bool)
+    share = above[:, ends].mean(axis=1)
+    return (share > 0) & ((share < 1) | bool(which.fixed[segments].any()))
 
 
 def make_limb_scratch(tree: Tree, limbs: Limbs, num_parameters: int) -> LimbScratch:

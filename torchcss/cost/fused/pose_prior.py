@@ -58,7 +58,7 @@ def _find_units(limbs: Limbs, scratch: LimbScratch) -> None:
     for m in range(len(limbs.difference)):
         square = 0.0
         for i in range(3):
-            apart = 0.0
+            apart = limbs.fixed[m, i]
             for p in range(len(limbs.row)):
                 apart += limbs.difference[m, p] * scratch.point[p, i]
             scratch.unit[m, i] = apart

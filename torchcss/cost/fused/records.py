@@ -313,6 +313,7 @@ class Limbs(NamedTuple):
         place: Its place in that frame.
         above: Which joints move it, `[joint point]`, zero or one.
         difference: What takes the ends to segments.
+        fixed: Segments that no joint moves; zero for the others.
         first: First segment of each group.
         segments: Number of its segments.
         line: The line that its frame lies along: hips or shoulders.
@@ -330,6 +331,7 @@ class Limbs(NamedTuple):
     place: Array
     above: Array
     difference: Array
+    fixed: Array
     first: Array
     segments: Array
     line: Array
