@@ -12,21 +12,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from torchcss.inference.trust_region import FUTILE, GOOD_ERROR, LEAST_RATIO, PLEASANT
 from torchcss.kernels.compiler import by_precision, entry, inlined, kernel, sqrt
 from torchcss.types import Status
 
 Array = np.ndarray[Any, Any]
-
-LEAST_RATIO = 1e-4
-"""Share of the predicted decrease below which a step is not worth taking."""
-FUTILE = 1e-3
-"""Share of the tolerance that a damped step after a rejection must promise. At 1, items stop
-halfway along curved valleys; towards 0, a cost that jumps takes more steps to stop."""
-PLEASANT = 0.25
-"""Weight of the prediction's error where the cost falls by more than was predicted."""
-GOOD_ERROR = 0.25
-"""Relative error of the predicted decrease at which the radius stays as it is (measured: see
-`trust_region._next_radius`)."""
 
 _RUNNING = int(Status.RUNNING)
 _CONVERGED = int(Status.CONVERGED)

@@ -48,8 +48,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchcss.errors import ConfigurationError, ShapeError, check_shape
-from torchcss.inference import planning
-from torchcss.inference.planning import FUTILE, GOOD_ERROR, LEAST_RATIO, PLEASANT
 from torchcss.kernels import compiler
 from torchcss.kernels.checked import run
 from torchcss.linalg import (
@@ -60,6 +58,17 @@ from torchcss.linalg import (
     wall,
 )
 from torchcss.types import BlendedCost, Bounds, CostFunction, LocalModel, Modes, Status
+
+LEAST_RATIO = 1e-4
+"""Share of the predicted decrease below which a step is not worth taking."""
+FUTILE = 1e-3
+"""Share of the tolerance that a damped step after a rejection must promise. At 1, items stop
+halfway along curved valleys; towards 0, a cost that jumps takes more steps to stop."""
+PLEASANT = 0.25
+"""Weight of the prediction's error where the cost falls by more than was predicted."""
+GOOD_ERROR = 0.25
+"""Relative error of the predicted decrease at which the radius stays as it is (measured: see
+`_next_radius`)."""
 
 
 class TrustRegionState(NamedTuple):
@@ -246,6 +255,8 @@ class TrustRegionNewton:
         self, state: TrustRegionState, trial: _Trial, bounds: Bounds, weight: Float[Tensor, " n"]
     ) -> tuple[TrustRegionState, TrustRegionInfo]:
         """The same as `_advance` in one compiled call."""
+        from torchcss.inference import planning  # compiled: only where it is used
+
         x, model, *rest = state
         fields = [f.clone(memory_format=torch.contiguous_format) for f in (x, *model, *rest)]
         info = TrustRegionInfo(
@@ -773,7 +784,7 @@ def _real(x: Tensor) -> Any:
     return np.float32 if x.dtype == torch.float32 else np.float64
 
 
-def _array(tensor: Tensor) -> planning.Array:
+def _array(tensor: Tensor) -> np.ndarray:
     """The same memory, where it is contiguous: other layouts round differently."""
     return tensor.detach().contiguous().numpy()
 
