@@ -24,7 +24,7 @@ ALLOWED: dict[str, set[str]] = {
     "cost": {"kernels", "inference", "body", "vision"},
     "initialise": {"inference", "body", "vision", "cost"},
     "io": {"inference", "body", "vision", "cost", "initialise"},
-    "tracking": {"inference", "body", "vision", "cost", "initialise", "io"},
+    "tracking": {"inference", "body", "vision", "cost", "initialise"},
     "show": {"inference", "body", "vision", "cost", "initialise", "io", "tracking"},
     "solve": {"inference", "body", "vision", "cost", "initialise", "io", "tracking"},
     "app": {

@@ -2,23 +2,47 @@
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Mapping
-from dataclasses import replace
-from typing import Any
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, replace
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from jaxtyping import Float, Int
+from torch import Tensor
 
 from torchcss.app.view_files import Selection, moments, open_view
+from torchcss.body.bases import pose_track
 from torchcss.errors import ConfigurationError, TrackFileError
 from torchcss.files import prepare_output_folder
-from torchcss.io.run import Run, as_run
-from torchcss.io.tracks import TRACK_NAME, save_track, write_summary
+from torchcss.inference.smoothing import Refined
+from torchcss.io.run import Run, as_run, body_of_track
+from torchcss.io.tracks import TRACK_NAME, Track, save_track, write_summary
+from torchcss.tracking import smooth_images
 from torchcss.tracking.settings import Settings, settings_from_plain
-from torchcss.tracking.smooth import SmoothedTrack, Smoothing, smooth_track
-from torchcss.tracking.smooth_images import IMAGES, smooth_frames
+from torchcss.tracking.smooth import Smoothed, Smoothing, TrackedModes, smooth_modes
+from torchcss.tracking.smooth_images import IMAGES, Images
+from torchcss.tracking.view import CameraView
+from torchcss.types import Status
 
 SMOOTH_NAME = "smooth.npz"
+
+
+class SmoothedTrack(NamedTuple):
+    """A smoothed track.
+
+    Attributes:
+        track: One mode per frame; the alternatives stay in the track that it came from.
+        modes: Which of the modes of the track it came from each frame's was.
+        effect: What it changed, for people; numbers and lists.
+    """
+
+    track: Track
+    modes: Int[np.ndarray, " t"]
+    effect: dict[str, Any]
 
 
 def smooth(
@@ -52,12 +76,149 @@ def smooth(
         )
     track = run.track._replace(body=run.body)
     run = replace(run, track=track)
-    done = _with_images(run, choice or IMAGES) if images else smooth_track(track, choice=choice)
+    done = _with_images(run, choice or IMAGES) if images else smooth_track(track, choice)
     save_track(path, done.track)
     entry = {"file": path, **done.effect, "modes": done.modes}
     summary = {**run.summary, "smoothed": entry}
     write_summary(into, summary)
     return Run(path=path, track=done.track, summary=summary)
+
+
+def smooth_track(track: Track, choice: Smoothing | None = None) -> SmoothedTrack:
+    """Smooth a track (`torchcss.tracking.smooth`).
+
+    Args:
+        track: The track, with several modes per frame or one.
+        choice: How to smooth.
+
+    Raises:
+        TrackFileError: If the track is empty, its times do not rise, or it does not say which body
+            it is of.
+    """
+    choice, began = choice or Smoothing(), time.perf_counter()
+    done = smooth_modes(body_of_track(track), _tensors(track), choice)
+    return _smoothed(track, done, done.refined, done.cost, choice, began)
+
+
+def smooth_frames(
+    track: Track,
+    images: Iterable[Images],
+    *,
+    settings: Settings,
+    views: Sequence[CameraView],
+    choice: Smoothing = IMAGES,
+) -> SmoothedTrack:
+    """Smooth a track, and fit the result to the images again (`torchcss.tracking.smooth_images`).
+
+    Args:
+        track: The track.
+        images: The images of its frames, in order.
+        settings: How it was tracked.
+        views: The cameras that look on.
+        choice: How to smooth.
+
+    Raises:
+        TorchcssError: As `smooth_track`; or if frames are missing.
+    """
+    began, body = time.perf_counter(), body_of_track(track)
+    done = smooth_images.smooth_frames(
+        body, _tensors(track), images, settings=settings, views=views, choice=choice
+    )
+    refined = done.refined
+    smoothed = _smoothed(track, done.first, refined, refined.cost, choice, began)
+    smoothed.effect.update(
+        evidence_of="images",
+        mean_cost_before_images=float(done.cost_at_start.mean()),
+        mean_cost_after_images=float(refined.cost.mean()),
+        status=Status(int(refined.status)).name.lower(),
+        iterations=int(refined.num_steps),
+    )
+    return smoothed
+
+
+def _tensors(track: Track) -> TrackedModes:
+    """The modes of a track as tensors."""
+    return TrackedModes(
+        *map(
+            torch.from_numpy,
+            (
+                *(track.frames, track.times, track.base_transform),
+                *(track.state, track.covariance, track.log_weight, track.cost),
+            ),
+        ),
+        likelihood_power=track.likelihood_power,
+    )
+
+
+def _smoothed(
+    track: Track,
+    first: Smoothed,
+    refined: Refined,
+    cost: Float[Tensor, " t"],
+    choice: Smoothing,
+    began: float,
+) -> SmoothedTrack:
+    """The states as a track of one mode per frame, and what they changed."""
+    bases = torch.from_numpy(track.base_transform)
+    joints = pose_track(body_of_track(track), refined.mean, bases).joints
+    parent = np.zeros((len(track.frames), 1), dtype=np.int64)
+    parent[:1] = -1
+    result = track._replace(
+        state=refined.mean[:, None].numpy(),
+        covariance=refined.covariance[:, None].numpy(),
+        log_weight=np.zeros((len(track.frames), 1)),
+        cost=cost[:, None].numpy(),
+        parent=parent,
+        joints_world=joints[:, None].numpy(),
+        likelihood_power=1 / choice.persistence,
+    )
+    modes = first.modes.numpy()
+    effect = {
+        **asdict(choice),
+        "evidence_of": "modes",
+        "seconds": time.perf_counter() - began,
+        **_effect(track, modes, result),
+        "frames_without_evidence": track.frames[~first.seen.numpy()],
+        "states_at_a_limit": int(refined.active.sum()),
+    }
+    return SmoothedTrack(result, modes, effect)
+
+
+def jitter(joints: Float[np.ndarray, "t j 3"], times: Float[np.ndarray, " t"]) -> float:
+    """Mean acceleration of the joints, m/s^2; NaN for fewer than three frames."""
+    if len(times) < 3:
+        return math.nan
+    step = np.diff(times)[:, None, None]
+    velocity = np.diff(joints, axis=0) / step
+    change = np.diff(velocity, axis=0) / (0.5 * (step[1:] + step[:-1]))
+    return float(np.linalg.norm(change, axis=-1).mean())
+
+
+def _effect(track: Track, modes: Int[np.ndarray, " t"], smooth: Track) -> dict[str, Any]:
+    """What smoothing changed.
+
+    Args:
+        track: The track that was smoothed.
+        modes: The path through its modes.
+        smooth: What came out.
+    """
+    everywhere = np.arange(len(modes))
+    parent = track.parent[everywhere, modes]
+    switched = (parent[1:] != modes[:-1]) & (parent[1:] >= 0)
+    best, path, after = (
+        track.joints_world[:, 0],
+        track.joints_world[everywhere, modes],
+        smooth.joints_world[:, 0],
+    )
+    return {
+        "frames_not_the_trackers_best": int((modes != 0).sum()),
+        "path_switches": int(switched.sum()),
+        "mean_change_mm": 1000 * float(np.linalg.norm(after - best, axis=-1).mean()),
+        "greatest_change_mm": 1000 * float(np.linalg.norm(after - best, axis=-1).max()),
+        "jitter_before_m_per_s2": jitter(best, track.times),
+        "jitter_of_the_path_m_per_s2": jitter(path, track.times),
+        "jitter_after_m_per_s2": jitter(after, track.times),
+    }
 
 
 def _with_images(run: Run, choice: Smoothing) -> SmoothedTrack:

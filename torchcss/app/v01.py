@@ -9,16 +9,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from torchcss.app.smooth import smooth
+from torchcss.app import smooth as smoothing
+from torchcss.app.smooth import SmoothedTrack, smooth
 from torchcss.body.model import BodyModel
 from torchcss.initialise.result import Initialisation
 from torchcss.io.export import Export, ExportOptions, export
 from torchcss.io.run import Given, GivenKeypoints, Run, body_of_track
 from torchcss.io.tracks import Track
-from torchcss.tracking import smooth as smoothing
 from torchcss.tracking.session import Images, Posterior, TrackingSession
 from torchcss.tracking.settings import Settings
-from torchcss.tracking.smooth import SmoothedTrack, Smoothing
+from torchcss.tracking.smooth import Smoothing
 from torchcss.tracking.view import CameraView
 
 StrPath = str | os.PathLike[str]
@@ -27,9 +27,9 @@ StrPath = str | os.PathLike[str]
 def smooth_track(
     track: Track, body: BodyModel | None = None, *, choice: Smoothing | None = None
 ) -> SmoothedTrack:
-    """As `torchcss.tracking.smooth.smooth_track`; a track of version 0.1 needs the body."""
+    """As `torchcss.app.smooth.smooth_track`; a track of version 0.1 needs the body."""
     _say("smooth_track", "torchcss.smooth(run)")
-    return smoothing.smooth_track(_with(track, body), choice=choice)
+    return smoothing.smooth_track(_with(track, body), choice)
 
 
 def smooth_file(

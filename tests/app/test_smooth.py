@@ -13,7 +13,7 @@ from made_clip import track
 from made_tracks import make_track
 
 from torchcss import load_body, load_track
-from torchcss.app.smooth import smooth
+from torchcss.app.smooth import smooth, smooth_track
 from torchcss.body.model import BodyModel
 from torchcss.body.root import move_base
 from torchcss.cli import main as cli
@@ -29,7 +29,7 @@ from torchcss.io.tracks import (
     save_track,
     write_summary,
 )
-from torchcss.tracking.smooth import Smoothing, smooth_track
+from torchcss.tracking.smooth import Smoothing
 from torchcss.vision.camera import Camera
 
 RATE = 30.0
@@ -108,7 +108,7 @@ def body() -> BodyModel:
 
 def test_smoothing_takes_the_other_mode_and_the_noise_away(body: BodyModel):
     track, truth = noisy_track(body)
-    done = smooth_track(track, choice=Smoothing(likelihood_power=0.5, persistence=2.0))
+    done = smooth_track(track, Smoothing(likelihood_power=0.5, persistence=2.0))
     # Every fifth frame's best mode was the other pose.
     right = [1 if index % 5 == 2 else 0 for index in range(30)]
     assert done.modes.tolist() == right
@@ -133,12 +133,12 @@ def test_smoothing_takes_the_other_mode_and_the_noise_away(body: BodyModel):
 def test_the_acceleration_ratio_and_the_persistence_do_what_they_say(body: BodyModel):
     track, _ = noisy_track(body)
     jitters = [
-        smooth_track(track, choice=choice).effect["jitter_after_m_per_s2"]
+        smooth_track(track, choice).effect["jitter_after_m_per_s2"]
         for choice in (Smoothing(acceleration_ratio=ratio) for ratio in (2.0, 10.0, 50.0))
     ]
     assert jitters == sorted(jitters)
     # The persistence scales covariances and moves nothing.
-    some, all_ = (smooth_track(track, choice=Smoothing(persistence=p)) for p in (2.0, 1.0))
+    some, all_ = (smooth_track(track, Smoothing(persistence=p)) for p in (2.0, 1.0))
     assert some.track.state == pytest.approx(all_.track.state, abs=1e-8)
     # (A variable at its limit has the prior's variance, whatever the persistence.)
     sizes = [np.diagonal(one.track.covariance[:, 0], axis1=-2, axis2=-1) for one in (some, all_)]

@@ -13,15 +13,14 @@ import torch
 from made_clip import track
 
 from torchcss import load_track
-from torchcss.app.smooth import settings_of
+from torchcss.app.smooth import settings_of, smooth_frames, smooth_track
 from torchcss.cli import main as cli
 from torchcss.errors import ConfigurationError, VideoError
 from torchcss.io.run import Run
 from torchcss.io.tracks import FrameModes, Track, TrackWriter, read_summary
 from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
 from torchcss.tracking.settings import Settings
-from torchcss.tracking.smooth import Smoothing, smooth_track
-from torchcss.tracking.smooth_images import smooth_frames
+from torchcss.tracking.smooth import Smoothing
 from torchcss.tracking.view import CameraView
 from torchcss.types import Frame, Keypoints
 
