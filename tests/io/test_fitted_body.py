@@ -156,6 +156,7 @@ def robot_with_changed_parameters(path: Path) -> Initialisation:
     body = found.body
     body.lower[-1], body.upper[-1] = -0.5, 0.75
     body.sticky_mean[-1], body.sticky_deviation[-1] = 0.1, 0.3
+    body.motion_rate[-1] = 1.25
     body.neighbours = (("b", "b"),)
     return found
 
@@ -166,7 +167,7 @@ def test_changed_limits_prior_and_neighbours_survive(tmp_path: Path, generator: 
     write_fitted_body(tmp_path / "body.npz", found, camera(generator))
     back = read_fitted_body(tmp_path).body
     assert back.neighbours == (("b", "b"),)
-    for name in ("lower", "upper", "sticky_mean", "sticky_deviation"):
+    for name in ("lower", "upper", "sticky_mean", "sticky_deviation", "motion_rate"):
         assert torch.equal(back.get_buffer(name), body.get_buffer(name))
 
 
@@ -174,7 +175,7 @@ def test_a_file_without_limits_has_those_of_its_body(tmp_path: Path, generator: 
     path = tmp_path / "body.npz"
     write_fitted_body(path, robot_with_changed_parameters(tmp_path / "r.urdf"), camera(generator))
     older = dict(np.load(path))
-    for name in ("lower", "upper", "sticky_mean", "sticky_deviation", "neighbours"):
+    for name in ("lower", "upper", "sticky_mean", "sticky_deviation", "motion_rate", "neighbours"):
         del older[name]
     np.savez(path, **older)
     body, plain = read_fitted_body(path).body, load_body(tmp_path / "r.urdf", free_root=True)

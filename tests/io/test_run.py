@@ -40,10 +40,14 @@ def camera(name: str, shift: float) -> Camera:
 
 @pytest.fixture
 def robot(tmp_path: Path) -> BodyModel:
-    """An arm from a file that is gone, with another shape than the file's."""
+    """An arm from a file that is gone, with another shape, limits and priors than the file's."""
     path = write_arm(tmp_path / "arm.urdf")
     body = load_body(path, free_root=True)
     path.unlink()
+    body.lower[-1], body.upper[-1] = -0.7, 0.9
+    body.sticky_mean[-1], body.sticky_deviation[-1] = 0.1, 0.3
+    body.motion_rate[-1] = 1.25
+    body.neighbours = (body.part_names[:2],)
     return with_shape(body, 1.2 * body.part_shape)
 
 
@@ -98,7 +102,9 @@ def assert_same_body(one: BodyModel, other: BodyModel) -> None:
     assert (one.name, one.state_names, one.part_names) == (
         other.name, other.state_names, other.part_names,
     )  # fmt: skip
-    assert torch.equal(one.part_shape, other.part_shape)
+    assert one.neighbours == other.neighbours
+    for name, tensor in one.state_dict().items():
+        assert torch.equal(tensor, other.state_dict()[name]), name
     x = (
         0.3
         * torch.randn(5, one.num_parameters, generator=torch.Generator().manual_seed(0)).double()

@@ -17,9 +17,9 @@ from torchcss.body.catalog import BODY_NAMES, specification
 from torchcss.body.model import BodyModel
 from torchcss.body.shape import with_shape
 from torchcss.body.uncertainty import joint_jacobian
-from torchcss.errors import TrackFileError
+from torchcss.errors import BodyError, TrackFileError
 from torchcss.io.run import body_of_track
-from torchcss.io.track_body import body_from_plain, body_to_plain
+from torchcss.io.track_body import PARAMETER_NUMBERS, body_from_plain, body_to_plain
 
 LENGTHS = {"thigh": 0.41, "neck": 0.07, "hand": 0.17, "forearm": 0.26, "shoulder_width": 0.16}
 
@@ -50,8 +50,10 @@ def test_free_lengths_and_single_precision_come_back():
     body = load_body("body34", free_proportions=True)
     assert_same(stored(body), body)
     single = load_body("arm8", dtype=torch.float32)
-    # Shapes are those that it has, rounded; the rest is what it was built of.
+    # Shapes, limits and priors are those that it has, rounded; the rest is what it was built of.
     exact = load_body("arm8")
+    for name in PARAMETER_NUMBERS:
+        exact.register_buffer(name, single.get_buffer(name).double())
     assert_same(stored(single), with_shape(exact, single.part_shape.double()))
 
 
@@ -61,6 +63,14 @@ def test_a_body_from_a_file_needs_its_file_no_more(tmp_path: Path):
     plain = body_to_plain(body)
     path.unlink()
     assert_same(body_from_plain(json.loads(json.dumps(plain))), body)
+
+
+def test_a_file_without_changed_limits_has_those_of_its_body():
+    plain = body_to_plain(load_body("arm8"))
+    del plain["parameters"]
+    assert_same(body_from_plain(plain), load_body("arm8"))
+    with pytest.raises(BodyError, match="unknown: expected one of lower"):
+        body_from_plain({**plain, "parameters": {"unknown": [1.0]}})
 
 
 def test_poses_are_those_of_the_track():

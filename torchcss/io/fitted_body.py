@@ -13,6 +13,7 @@ One NPZ file, schema version 1. K hypotheses, n parameters, P parts, L lengths:
 | `state_names` | n | names of the parameters |
 | `lower`, `upper` | n, n | limits of the parameters, infinite where there are none |
 | `sticky_mean`, `sticky_deviation` | n, n | the prior that draws them to rest; infinite: none |
+| `motion_rate` | n | expected velocities, radians or metres per second |
 | `neighbours` | N 2 | names of the parts that touch in every pose |
 | `state`, `covariance`, `log_weight`, `cost` | K n, K n n, K, K | the hypotheses, best first |
 | `base_rotation`, `base_translation` | 3 3, 3 | frame in which the root moves, in the world |
@@ -41,6 +42,7 @@ from torchcss.errors import BodyError
 from torchcss.files import load_arrays, save_arrays
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.initialise.result import Initialisation
+from torchcss.io.track_body import PARAMETER_NUMBERS, set_numbers
 from torchcss.vision.camera import Camera
 
 SCHEMA_VERSION = 1
@@ -61,10 +63,7 @@ def write_fitted_body(path: str | os.PathLike[str], found: Initialisation, camer
     body, mixture = found.body, found.mixture
     tensors = {
         "part_shape": body.part_shape,
-        "lower": body.lower,
-        "upper": body.upper,
-        "sticky_mean": body.sticky_mean,
-        "sticky_deviation": body.sticky_deviation,
+        **{name: getattr(body, name) for name in PARAMETER_NUMBERS},
         "state": mixture.mean,
         "covariance": mixture.covariance,
         "log_weight": mixture.log_weight,
@@ -166,24 +165,16 @@ def _load_body(
         if not {part for pair in pairs for part in pair} <= set(body.part_names):
             raise BodyError(f"{path}: neighbours: expected names of parts of {name}")
         body.neighbours = tuple((first, second) for first, second in pairs)
-    _set_parameters(path, arrays, body)
+    numbers = {
+        key: torch.from_numpy(np.array(arrays[key], dtype=np.float64))
+        for key in PARAMETER_NUMBERS
+        if key in arrays
+    }
+    try:
+        set_numbers(body, numbers)
+    except BodyError as error:
+        raise BodyError(f"{path}: {error}") from error
     return body
-
-
-def _set_parameters(path: Path, arrays: Mapping[str, np.ndarray], body: BodyModel) -> None:
-    """Give a body the limits and the prior of its file, where the file has them."""
-    for key in ("lower", "upper", "sticky_mean", "sticky_deviation"):
-        if key not in arrays:
-            continue
-        numbers = torch.from_numpy(np.array(arrays[key], dtype=np.float64))
-        if numbers.shape != (body.num_parameters,) or bool(numbers.isnan().any()):
-            raise BodyError(
-                f"{path}: {key}: expected {body.num_parameters} numbers, "
-                f"got {list(numbers.shape)} or one that is none"
-            )
-        body.register_buffer(key, numbers)
-    if bool((body.lower > body.upper).any()) or bool((body.sticky_deviation <= 0).any()):
-        raise BodyError(f"{path}: expected lower <= upper and positive sticky_deviation")
 
 
 def _read_tensors(
