@@ -20,7 +20,6 @@ def path_cost(
     cost: np.ndarray,
     times: np.ndarray,
     velocity: np.ndarray,
-    acceleration: np.ndarray,
     evidence: float,
 ) -> float:
     """Negative log of a path: evidence, and the densities of its motions relative to none."""
@@ -31,16 +30,9 @@ def path_cost(
     for t, k in enumerate(path):
         if np.isfinite(cost[t]).any():
             total += evidence * cost[t, k]
-        step = times[t] - times[t - 1] if t else math.nan
-        if t >= 1 and np.isfinite(velocity).all():
-            motion = np.diag((velocity * step) ** 2)
+        if t >= 1:
+            motion = np.diag((velocity * (times[t] - times[t - 1])) ** 2)
             total += surprise(x[t] - x[t - 1], motion, spread[t] + spread[t - 1])
-        if t >= 2 and np.isfinite(acceleration).all():
-            before = times[t - 1] - times[t - 2]
-            ratio = step / before
-            turn = np.diag((acceleration * step * (step + before) / 2) ** 2)
-            wide = spread[t] + (1 + ratio) ** 2 * spread[t - 1] + ratio**2 * spread[t - 2]
-            total += surprise(x[t] - x[t - 1] - ratio * (x[t - 1] - x[t - 2]), turn, wide)
     return total
 
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import csv
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -152,10 +152,7 @@ def initialise_image(
     known = keypoints.confidence[:, None] > 0
     _draw(out, found, picture, camera, torch.where(known, keypoints.positions, torch.nan))
     rows = proportion_table(found.lengths, found.scale)
-    with replace_file(out / "proportions.csv") as partial, partial.open("w", newline="") as file:
-        writer = csv.DictWriter(file, ["name", "fitted_m", "standard_m", "difference_percent"])
-        writer.writeheader()
-        writer.writerows(rows)
+    _write_table(out / "proportions.csv", rows)
     summary: dict[str, Any] = {
         "image": image,
         "frame": files.frame,
@@ -176,6 +173,14 @@ def initialise_image(
         summary["stature_known"] = options.stature is not None
     write_summary(out / "summary.json", summary)
     return found, summary
+
+
+def _write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write the table of proportions as CSV."""
+    with replace_file(path) as partial, partial.open("w", newline="") as file:
+        writer = csv.DictWriter(file, ["name", "fitted_m", "standard_m", "difference_percent"])
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def initialise_video(

@@ -7,8 +7,7 @@ modes of an earlier one was right, and a motion that is possible tells where in 
 
     sum_t  evidence * cost_t(k_t)  -  sum_t log N(x_t - x_t-1; 0, Q_t + Sigma_t-1 + Sigma_t)
 
-and, where the transition has an acceleration, over pairs of modes in the same way. `refine` then
-moves the states of the path together, to the least of
+`refine` then moves the states of the path together, to the least of
 
     sum_t  f_t(x_t)  +  1/2 sum_t |(x_t - x_t-1) / (v d_t)|^2
                      +  1/2 sum_t |(x_t - x_t-1 - (d_t / d_t-1) (x_t-1 - x_t-2)) / (a e_t)|^2
@@ -33,7 +32,7 @@ t + 1. Everything is computed in float64 and returned in the type that came in.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -168,8 +167,7 @@ def best_path(
         cost: Negative logarithm of each mode's likelihood (or weight), nats; `inf`: no such mode.
             A frame without any is passed over: all its modes cost the same.
         times: Seconds, increasing; gaps make steps longer.
-        transition: What motion is to be expected. If it judges accelerations, pairs of modes are
-            the states of the search, in time `T K^3`.
+        transition: What velocities are to be expected; accelerations are for `refine`.
         evidence: Factor on the costs.
         changes: Where coordinates change, see the module's page.
         period: Period of each parameter, infinite for most: differences are taken the short way.
@@ -179,63 +177,44 @@ def best_path(
 
     Raises:
         ShapeError: If the shapes do not agree, or a mode of finite cost is not finite.
-        ConfigurationError: If the times do not increase, or the evidence is not positive.
+        ConfigurationError: If the times do not increase, the evidence is not positive, or the
+            transition judges accelerations.
     """
+    if transition.judges_acceleration:
+        raise ConfigurationError("best_path: it judges velocities alone; leave accelerations out")
+    state, spread, node = _checked_modes(mean, covariance, cost, evidence)
+    motion, _ = transition.deviations(_checked_times(times, len(state)), state.shape[-1])
+    edges = []
+    for step, deviation in enumerate(motion):
+        own = None if spread is None else spread[step]
+        before, wide = _carried(state[step], own, step, changes)
+        apart = _short_way(state[step + 1][None] - before[:, None], period)
+        if spread is not None and wide is not None:
+            wide = wide[:, None] + spread[step + 1][None]
+        edges.append(_gaussian_cost(apart, deviation, wide))
+    return _viterbi(node, edges)
+
+
+def _checked_modes(
+    mean: Tensor, covariance: Tensor | None, cost: Tensor, evidence: float
+) -> tuple[Float[Tensor, "t k n"], Float[Tensor, "t k n n"] | None, Float[Tensor, "t k"]]:
+    """Means, covariances and what each mode costs the path, in float64."""
     check_shape("mean", mean, None, None, None)
     t, k, n = mean.shape
     check_shape("cost", cost, t, k)
     if covariance is not None:
         check_shape("covariance", covariance, t, k, n, n)
-    times = _checked_times(times, t)
     if not evidence > 0:
         raise ConfigurationError(f"best_path: expected a positive evidence, got {evidence}")
-    node, present = evidence * cost.double(), cost.isfinite()
     if bool(cost.isnan().any()):
         raise ShapeError("best_path: costs hold NaN; expected numbers, inf for a missing mode")
-    node = torch.where(present.any(1, keepdim=True), node, 0.0)
-    state = mean.double()
-    spread = None if covariance is None else covariance.double()
-    finite = state.isfinite().all(-1)
-    if spread is not None:
-        finite &= spread.isfinite().all(-1).all(-1)
+    present, finite = cost.isfinite(), mean.isfinite().all(-1)
+    if covariance is not None:
+        finite = finite & covariance.isfinite().flatten(-2).all(-1)
     if not bool(finite[present].all()):
         raise ShapeError("best_path: expected finite means and covariances of the modes")
-    motion, turn = transition.deviations(times, n)
-
-    def edge(step: int) -> Float[Tensor, "k k"]:
-        """Cost of going from each mode of a frame to each of the next."""
-        before, wide = _carried(
-            state[step], None if spread is None else spread[step], step, changes
-        )
-        apart = _short_way(state[step + 1][None] - before[:, None], period)
-        if spread is not None and wide is not None:
-            wide = wide[:, None] + spread[step + 1][None]
-        return _gaussian_cost(apart, motion[step], wide)
-
-    if not transition.judges_acceleration or t < 3:
-        edges = [edge(step) for step in range(t - 1)]
-        return _viterbi(node, edges)
-
-    def corner(step: int) -> Float[Tensor, "k k k"]:
-        """Cost of the change of motion over three frames, by the modes of the three."""
-        ratio = float((times[step + 2] - times[step + 1]) / (times[step + 1] - times[step]))
-        first, first_wide = state[step], None if spread is None else spread[step]
-        for hop in (step, step + 1):
-            first, first_wide = _carried(first, first_wide, hop, changes)
-        middle, wide = state[step + 1], None if spread is None else spread[step + 1]
-        middle, wide = _carried(middle, wide, step + 1, changes)
-        last = state[step + 2]
-        moved = _short_way(last[None] - middle[:, None], period)
-        came = _short_way(middle[None] - first[:, None], period)
-        if wide is not None and first_wide is not None and spread is not None:
-            wide = (
-                ratio**2 * first_wide[:, None, None]
-                + (1 + ratio) ** 2 * wide[:, None]
-                + spread[step + 2]
-            )
-        return _gaussian_cost(moved[None] - ratio * came[:, :, None], turn[step], wide)
-
-    return _second_order_viterbi(node, edge, corner)
+    node = torch.where(present.any(1, keepdim=True), evidence * cost.double(), 0.0)
+    return mean.double(), None if covariance is None else covariance.double(), node
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -364,17 +343,13 @@ def refine_in_windows(
     """
     x, times, limits = _checked(start, times, bounds)
     t, weight, changes = len(x), _damping_weight(x, choice.scale), changes or {}
-    queue, held = iter(costs), {}
+    queue = iter(costs)
+    held: dict[int, Differentiable] = {}
     models: list[LocalModel] = []
     worst, steps, first = Status.CONVERGED, 0, 0
     while len(models) < t:
         last = min(first + windows.window, t)
-        for frame in range(max([*held, first - 1]) + 1, last):
-            held[frame] = next(queue, None)
-            if held[frame] is None:
-                raise ConfigurationError(
-                    f"refine_in_windows: expected a cost for each of {t} frames, got {frame}"
-                )
+        _ask_for(queue, held, range(max([*held, first - 1]) + 1, last), t)
         # The neighbours that transitions reach stay where they are.
         before, after = max(first - 2, 0), min(last + 2, t)
         near = range(before, after)
@@ -385,21 +360,16 @@ def refine_in_windows(
             torch.where(moves, limits.upper[before:after], part),
         )
         # (Nothing keeps the costs of a window but `held`.)
-        part, chain, status, taken = descend(
-            ChainSum(
-                _FrameByFrame([held.get(frame) for frame in near]),
-                choice.likelihood_power,
-                times[before:after],
-                transition,
-                {step - before: change for step, change in changes.items() if step in near},
-                start.dtype,
-            ),
-            part,
-            box,
-            weight,
-            choice.max_steps,
-            choice.tolerance,
+        total = ChainSum(
+            _FrameByFrame([held.get(frame) for frame in near]),
+            choice.likelihood_power,
+            times[before:after],
+            transition,
+            {step - before: change for step, change in changes.items() if step in near},
+            start.dtype,
         )
+        ended = descend(total, part, box, weight, choice.max_steps, choice.tolerance)
+        part, chain, status, taken = ended
         x[before:after] = part
         worst, steps = max(worst, status), steps + taken
         done = t if last == t else last - windows.overlap
@@ -410,6 +380,19 @@ def refine_in_windows(
     frames = LocalModel(*(torch.stack(entries) for entries in zip(*models, strict=True)))
     chain = Chain.of(frames, motion_terms(x, times, transition, changes))
     return _refined(x, chain, worst, steps, limits, choice, start)
+
+
+def _ask_for(
+    queue: Iterator[Differentiable], held: dict[int, Differentiable], frames: range, of: int
+) -> None:
+    """Hold the costs of the next frames too."""
+    for frame in frames:
+        cost = next(queue, None)
+        if cost is None:
+            raise ConfigurationError(
+                f"refine_in_windows: expected a cost for each of {of} frames, got {frame}"
+            )
+        held[frame] = cost
 
 
 # --- best path -----------------------------------------------------------------------------------
@@ -463,25 +446,6 @@ def _viterbi(node: Float[Tensor, "t k"], edges: list[Tensor]) -> Path:
     mode = [int(best.argmin())]
     for came_from in reversed(back):
         mode.append(int(came_from[mode[-1]]))
-    return Path(torch.tensor(mode[::-1], device=node.device), best.min())
-
-
-def _second_order_viterbi(
-    node: Float[Tensor, "t k"],
-    edge: Callable[[int], Float[Tensor, "k k"]],
-    corner: Callable[[int], Float[Tensor, "k k k"]],
-) -> Path:
-    """The same with a cost of every three frames: the states are pairs of neighbouring modes."""
-    t, k = node.shape
-    best, back = node[0][:, None] + edge(0) + node[1], []
-    for step in range(t - 2):
-        reached, came_from = (best[:, :, None] + corner(step)).min(0)
-        back.append(came_from)
-        best = reached + edge(step + 1) + node[step + 2]
-    before, last = divmod(int(best.flatten().argmin()), k)
-    mode = [last, before]
-    for came_from in reversed(back):
-        mode.append(int(came_from[mode[-1], mode[-2]]))
     return Path(torch.tensor(mode[::-1], device=node.device), best.min())
 
 

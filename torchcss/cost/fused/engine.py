@@ -30,10 +30,12 @@ from torchcss.cost.fused.pose_prior import add_pose_prior
 from torchcss.cost.fused.priors import add_priors
 from torchcss.cost.fused.records import (
     Array,
+    Flow,
     Gaussian,
     Limbs,
     LongTails,
     Mixture,
+    PackedKeypoints,
     Parts,
     Repulsion,
     Result,
@@ -312,17 +314,8 @@ class FusedEngine:
         num = len(parts.row)
         edges = made.get("edges", pack.no_edges(real))
         colours = made.get("colours", pack.no_colours(num, real))
-        # What is the same for all modes is there once for each that the flow knows, or the reverse.
-        flow, keypoints = (
-            made.get("flow", pack.no_flow(num, real)),
-            made.get("keypoints", pack.no_keypoints()),
-        )
-        modes = max(len(flow.target), len(keypoints.target))
-        flow, keypoints = (
-            record._replace(target=np.repeat(record.target, modes, 0))
-            if len(record.target) < modes
-            else record
-            for record in (flow, keypoints)
+        flow, keypoints = _for_all_modes(
+            made.get("flow", pack.no_flow(num, real)), made.get("keypoints", pack.no_keypoints())
         )
         nothing = edges.scale * edges.back_facing + colours.scale * colours.back_facing
         view = View(
@@ -341,6 +334,16 @@ class FusedEngine:
             pack.make_workspace, tree, view.curves, interior, 1, (len(edges.steps), real)
         )
         return _PackedView(tree, parts, view, Workspaces(make)), frozenset(others)
+
+
+def _for_all_modes(flow: Flow, keypoints: PackedKeypoints) -> tuple[Flow, PackedKeypoints]:
+    """With as many modes each: what is the same for all of them is repeated."""
+    modes = max(len(flow.target), len(keypoints.target))
+    targets = (
+        np.repeat(record.target, modes, 0) if len(record.target) < modes else record.target
+        for record in (flow, keypoints)
+    )
+    return flow._replace(target=next(targets)), keypoints._replace(target=next(targets))
 
 
 def _rows(parent: Array | None, modes: int, size: int) -> Array:
