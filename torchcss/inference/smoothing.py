@@ -359,7 +359,7 @@ def refine_in_windows(
             torch.where(moves, limits.lower[before:after], part),
             torch.where(moves, limits.upper[before:after], part),
         )
-        # (Nothing keeps the costs of a window but `held`.)
+        # Nothing keeps the costs of a window but `held`.
         total = ChainSum(
             _FrameByFrame([held.get(frame) for frame in near]),
             choice.likelihood_power,
@@ -369,6 +369,7 @@ def refine_in_windows(
             start.dtype,
         )
         ended = descend(total, part, box, weight, choice.max_steps, choice.tolerance)
+        del total
         part, chain, status, taken = ended
         x[before:after] = part
         worst, steps = max(worst, status), steps + taken
