@@ -60,6 +60,10 @@ class ConfigurationError(TorchcssError, ValueError):
     """An option has a value that makes no sense, alone or together with another."""
 
 
+class DetectorError(TorchcssError, ValueError):
+    """A detector of keypoints has no model, or one that cannot be used."""
+
+
 class MissingExtraError(TorchcssError, ImportError):
     """An optional package is needed; the message says which extra installs it."""
 

@@ -1,4 +1,4 @@
-"""From files to files: video, camera and keypoints in, a first pose found, the track written.
+"""From files to files: a video in, with its camera and keypoints where there are, a first pose found, the track written.
 
 `track_video` is what `torchcss track` calls, `resume` what it calls with `--resume`. The loop
 itself is `TrackingSession`, which takes any images; `torchcss.app.recorder.Recorder` writes what
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -18,12 +18,15 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
+from torchcss.app.detect import DetectOptions, detect_video
 from torchcss.app.init import initialise_video
+from torchcss.app.lens import Lens
 from torchcss.app.recorder import CHECKPOINT_EVERY, Begun, Recorder, Sink
 from torchcss.app.view_files import OpenView, Selection, moments, open_view
 from torchcss.cost.view import View
 from torchcss.errors import CameraError, ConfigurationError, TrackFileError
 from torchcss.initialise.result import Initialisation
+from torchcss.io.cameras import LoadedCamera
 from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body, write_fitted_body
 from torchcss.io.keypoints.read import Scale
 from torchcss.io.run import Run
@@ -59,6 +62,11 @@ class TrackOptions:
             where there is nothing.
         checkpoint_every: Seconds of wall time between checkpoints.
         frame_rate: Frames per second of a folder of images; None: 30.
+        person: Who of several people is followed: prominent, largest, leftmost or centre in the
+            first frame, or the keypoint file's number of a person.
+        focal: Focal length in pixels, of a camera that nobody calibrated.
+        fov: The same as angle between the left and the right border of the image, degrees.
+        detect: What finds the keypoints where no file of them is given.
     """
 
     stride: int = 1
@@ -73,6 +81,10 @@ class TrackOptions:
     resume: bool = False
     checkpoint_every: float = CHECKPOINT_EVERY
     frame_rate: float | None = None
+    person: str = "prominent"
+    focal: float | None = None
+    fov: float | None = None
+    detect: DetectOptions = field(default_factory=DetectOptions)
 
     def __post_init__(self) -> None:
         if not self.checkpoint_every >= 0:
@@ -84,8 +96,8 @@ class TrackOptions:
 def track_video(
     video: str | os.PathLike[str],
     *,
-    camera: str | os.PathLike[str],
-    keypoints: str | os.PathLike[str],
+    camera: str | os.PathLike[str] | None = None,
+    keypoints: str | os.PathLike[str] | None = None,
     out: str | os.PathLike[str],
     settings: Settings | None = None,
     start: int = 0,
@@ -96,8 +108,9 @@ def track_video(
 
     Args:
         video: A video, or a folder of images.
-        camera: Calibration file, see `torchcss.io.cameras`.
-        keypoints: 2D joints, see `torchcss.io.keypoints`.
+        camera: Calibration file, see `torchcss.io.cameras`; None: see `torchcss.app.lens`.
+        keypoints: 2D joints, see `torchcss.io.keypoints`; None: they are detected, and written into
+            the folder.
         out: Folder for `track.npz`, `summary.json`, `checkpoint.npz`, `overlay.mp4`, and the body
             at its first pose, `body.npz`.
         settings: How to track.
@@ -116,16 +129,23 @@ def track_video(
     selection = Selection(start=start, stop=stop, stride=options.stride)
     if options.resume and (begun := _begun(out)) is not None:
         return _go_on(begun, settings, selection, options)
+    video = Path(video)
+    if keypoints is None:
+        found = out / "keypoints.npz"
+        keypoints = detect_video(video, found, options.detect, frame_rate=options.frame_rate)
     own = ViewFiles(
-        video=Path(video),
+        video=video,
         keypoints=Path(keypoints),
         camera_name=options.camera_name,
         masks=options.masks,
         layout=options.layout,
         normalised=options.normalised,
         frame_rate=options.frame_rate,
+        person=options.person,
     )
-    views = _open_views((own, *options.others), Path(camera), selection)
+    lens = Lens(focal=options.focal, fov=options.fov)
+    calibration = lens.camera_of(video) if camera is None else lens.unless(Path(camera))
+    views = _open_views((own, *options.others), calibration, selection)
     generator = torch.Generator().manual_seed(settings.seed)
     eye = views[0].camera.camera.to(dtype=settings.torch_dtype, device=settings.device)
     first = _first_pose(views, eye, settings, start, options, generator)
@@ -236,13 +256,15 @@ def _check_same(run: Run, settings: Settings, selection: Selection, known: dict[
         )
 
 
-def _open_views(files: Sequence[ViewFiles], camera: Path, selection: Selection) -> list[OpenView]:
+def _open_views(
+    files: Sequence[ViewFiles], camera: Path | LoadedCamera, selection: Selection
+) -> list[OpenView]:
     """The files of all cameras of one calibration, the places of several in one world."""
     views = [open_view(each, camera, selection) for each in files]
     for opened in views:
         if len(views) > 1 and not opened.camera.metric:
             raise CameraError(
-                f"{camera}: several cameras need their places in one world, in metres; that of "
+                f"{files[0].video}: several cameras need their places in one world, in metres; that of "
                 f"{opened.files.video} is not known so: give R and t"
             )
     return views

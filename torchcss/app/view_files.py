@@ -15,7 +15,9 @@ from torch import Tensor
 from torchcss.errors import VideoError
 from torchcss.initialise.keypoint_checks import typical_sigma
 from torchcss.io.cameras import LoadedCamera, check_image_size, load_camera
-from torchcss.io.keypoints.read import read_keypoints
+from torchcss.io.keypoints.frames import Film
+from torchcss.io.keypoints.one_person import Whom
+from torchcss.io.keypoints.read import read_person
 from torchcss.io.video import VideoReader
 from torchcss.io.view_files import RecordedCamera, ViewFiles
 from torchcss.tracking.view import CameraView
@@ -122,13 +124,13 @@ class Selection:
 
 
 def open_view(
-    files: ViewFiles, camera: Path | Camera, selection: Selection | None = None
+    files: ViewFiles, camera: Path | Camera | LoadedCamera, selection: Selection | None = None
 ) -> OpenView:
     """Open the files of a view.
 
     Args:
         files: The files.
-        camera: The calibration file, or the camera.
+        camera: The calibration file, or the camera, or one with what is said about it.
         selection: Which frames; None: all.
 
     Raises:
@@ -157,19 +159,25 @@ def open_view(
             )
     if isinstance(camera, Camera):
         loaded = LoadedCamera(camera, metric=True, units_note=None, video=None)
+    elif isinstance(camera, LoadedCamera):
+        loaded = camera
     else:
         loaded = load_camera(camera, files.camera_name, video=files.video)
     check_image_size(loaded.camera, width, height)
     if files.keypoints is None:
         return OpenView(files, reader, masks, loaded, None, 1.0)
-    keypoints = read_keypoints(
+    film = Film(
+        reader.info.num_frames or reader.count_frames(),
+        reader.image_names,
+        None if reader.image_names else float(reader.info.frame_rate),
+    )
+    keypoints = read_person(
         files.keypoints,
-        image_size_wh=(width, height),
-        num_frames=reader.info.num_frames or reader.count_frames(),
+        film=film,
+        whom=Whom(start, files.person, (width, height)),
         layout=files.layout,
         normalised=files.normalised,
-        first_frame=start,
-        frame_names=reader.image_names,
-        frame_rate=None if reader.image_names else float(reader.info.frame_rate),
     )
-    return OpenView(files, reader, masks, loaded, keypoints, typical_sigma(keypoints))
+    sigma = keypoints.relative_noise * typical_sigma(keypoints)
+    keypoints = keypoints._replace(relative_noise=1.0)
+    return OpenView(files, reader, masks, loaded, keypoints, sigma)

@@ -4,6 +4,7 @@
 |---|---|
 | `torchcss demo` | renders a sequence, tracks it and prints the error against the truth |
 | `torchcss init IMAGE` | fits a body to one picture with marked joints |
+| `torchcss detect VIDEO` | finds the keypoints of a video |
 | `torchcss track VIDEO` | tracks a body through a video |
 | `torchcss smooth TRACK` | makes one smooth trajectory of a track's modes |
 | `torchcss export TRACK` | writes a track for another program |
@@ -24,6 +25,7 @@ from typing import Annotated
 import tyro
 
 from torchcss.app.recorder import Terminated
+from torchcss.cli.detect import Detect
 from torchcss.cli.export import Export
 from torchcss.cli.init import Init
 from torchcss.cli.options import SettingsOptions
@@ -58,6 +60,7 @@ class Demo:
 Verb = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Init, tyro.conf.subcommand("init")]
+    | Annotated[Detect, tyro.conf.subcommand("detect")]
     | Annotated[Track, tyro.conf.subcommand("track")]
     | Annotated[Smooth, tyro.conf.subcommand("smooth")]
     | Annotated[Export, tyro.conf.subcommand("export")]

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image, ImageOps
+from PIL import ExifTags, Image, ImageOps
 
 from torchcss.errors import ConfigurationError, ShapeError, VideoError
 from torchcss.files import output_error, temporary_name
@@ -41,6 +41,11 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".p
 _NOT_VIDEOS = frozenset({"tty", "ansi", "bin", "xbin", "adf", "idf", "rawvideo", "subviewer"})
 
 _SECONDS_BETWEEN_KEY_FRAMES = 1
+
+_FOCAL_35MM = ("focal_length.35mm_equivalent", "focallengthin35mmfilm", "focallength35efl")
+"""How the keys end under which cameras write the focal length as of 35 mm film."""
+
+_SHORTEST_MM, _LONGEST_MM = 8.0, 1000.0
 
 
 class VideoInfo(NamedTuple):
@@ -127,13 +132,18 @@ class VideoReader:
         """Names of the pictures of a folder in order, or None where it is a video."""
         return None if self._images is None else [image.name for image in self._images]
 
+    @property
+    def first_image(self) -> Path | None:
+        """The first picture of a folder, or None where it is a video."""
+        return None if self._images is None else self._images[0]
+
     def count_frames(self) -> int:
         """Count the frames without decoding them; those before the damage, if there is any."""
         if self._images is not None:
             return len(self._images)
         count = 0
         # What cannot be demuxed ends the count, as it ends the reading.
-        with suppress(*_av_errors()), self._open() as container:
+        with suppress(*_av_errors()), self.opened() as container:
             for packet in container.demux(video=0):
                 if packet.is_corrupt:
                     break
@@ -164,7 +174,8 @@ class VideoReader:
 
     # Containers.
 
-    def _open(self) -> InputContainer:
+    def opened(self) -> InputContainer:
+        """The video's container, to be closed by the caller."""
         import av
 
         # Only this file: playlists that name other files or addresses are refused.
@@ -178,7 +189,7 @@ class VideoReader:
 
     def _probe_container(self) -> VideoInfo:
         try:
-            with self._open() as container:
+            with self.opened() as container:
                 if _NOT_VIDEOS.intersection(container.format.name.split(",")):
                     raise self._not_a_video("it holds text or raw bytes")
                 if not container.streams.video:
@@ -212,7 +223,7 @@ class VideoReader:
         time: float | None = None
         damage: str | None = None
         try:
-            with self._open() as container:
+            with self.opened() as container:
                 for picture in _decode(container):
                     index, num_read = num_read, num_read + 1
                     if origin is None and picture.time is not None:
@@ -494,6 +505,31 @@ def read_frame(path: str | os.PathLike[str], index: int = 0) -> UInt8[np.ndarray
     """
     with VideoReader(path, start=index, stop=index + 1) as frames:
         return next(iter(frames)).image
+
+
+def focal_length_35mm(path: str | os.PathLike[str]) -> float | None:
+    """What a file says of its lens: the focal length in mm that shows as much on 35 mm film.
+
+    Read are Apple's and Android's keys of a video, and EXIF's of a picture or of the first one of a
+    folder. None: nothing, or nothing that can be read.
+    """
+    reader = VideoReader(path)
+    value: Any = None
+    with suppress(*_av_errors(), ValueError, SyntaxError):
+        if reader.first_image is not None:
+            with Image.open(reader.first_image) as picture:
+                value = picture.getexif().get_ifd(ExifTags.IFD.Exif).get(
+                    ExifTags.Base.FocalLengthIn35mmFilm
+                )
+        else:
+            with reader.opened() as container:
+                said = {**container.metadata, **container.streams.video[0].metadata}
+            value = next((said[key] for key in said if key.lower().endswith(_FOCAL_35MM)), None)
+    try:
+        focal = float(value)
+    except (TypeError, ValueError):
+        return None
+    return focal if _SHORTEST_MM <= focal <= _LONGEST_MM else None
 
 
 def natural_order(name: str) -> tuple[tuple[int, int | str], ...]:

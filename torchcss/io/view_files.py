@@ -33,6 +33,8 @@ class ViewFiles:
             `torchcss.io.keypoints.read.Scale`.
         offset: This video's frame at the time of the first camera's frame 0.
         frame_rate: Frames per second of a folder of images, which does not say it; None: 30.
+        person: Who of several people is followed: `prominent`, `largest`, `leftmost` or `centre` in
+            the first frame, or the keypoint file's number of a person.
     """
 
     video: Path
@@ -43,6 +45,7 @@ class ViewFiles:
     normalised: bool | Scale = "pixels"
     offset: int = 0
     frame_rate: float | None = None
+    person: str = "prominent"
 
 
 class RecordedCamera(NamedTuple):

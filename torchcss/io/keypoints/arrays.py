@@ -1,9 +1,11 @@
 """2D joints as arrays: our own NPZ, and what people save of what a detector returns.
 
-Ours is `keypoints [T J 2]`, `confidence [T J]`, `joint_names [J]`. Read as well, as NPY or as the
-only array of an NPZ: pairs or triples `[T J 2]`, `[T J 3]` (x, y, confidence), in a row `[T 3 J]`,
-of several people `[T P J 3]`, of one picture `[J 3]`, and MoveNet's `[T 1 1 J 3]` (y, x,
-confidence, fractions). Confidences may be called `scores` and the like.
+Ours is `keypoints [T J 2]`, `confidence [T J]`, `joint_names [J]`; of several people `[T P J 2]`,
+`[T P J]` and `person_ids [P]`; and `image_size_wh [2]` and `relative_noise []` (`People`). Read as
+well, as NPY or as the only array of an NPZ: pairs or triples `[T J 2]`, `[T J 3]` (x, y,
+confidence), in a row `[T 3 J]`, of several people `[T P J 3]`, of one picture `[J 3]`, and
+MoveNet's `[T 1 1 J 3]` (y, x, confidence, fractions). Confidences may be called `scores` and the
+like.
 """
 
 from __future__ import annotations
@@ -63,9 +65,40 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
         values = screened(places)
     else:
         report.append(f"confidence: the third numbers of {name}")
-    people = [[Person(p) for p in frame if len(frame) == 1 or is_there(p)] for frame in values]
-    names = _names(path, arrays.get("joint_names"), values.shape[2])
-    return People(people, names, report, corner_fractions=is_movenet)
+    tracks = _tracks(path, arrays.get("person_ids"), values.shape[1])
+    people = [
+        [
+            Person(joints, track)
+            for joints, track in zip(frame, tracks, strict=True)
+            if len(frame) == 1 or is_there(joints)
+        ]
+        for frame in values
+    ]
+    size, noise = arrays.get("image_size_wh"), arrays.get("relative_noise")
+    return People(
+        people,
+        _names(path, arrays.get("joint_names"), values.shape[2]),
+        report,
+        corner_fractions=is_movenet,
+        size_wh=None if size is None else tuple(_positive(path, "image_size_wh", size, 2)),
+        relative_noise=1.0 if noise is None else _positive(path, "relative_noise", noise, 1)[0],
+    )
+
+
+def _tracks(path: Path, ids: np.ndarray | None, count: int) -> list[str | None]:
+    if ids is None:
+        return [None] * count
+    if ids.shape != (count,) or ids.dtype.kind not in "iuU":
+        raise KeypointError(
+            f"{path}: person_ids: expected {count} numbers, got {ids.dtype} {list(ids.shape)}"
+        )
+    return [str(number) for number in ids]
+
+
+def _positive(path: Path, name: str, array: np.ndarray, count: int) -> list[float]:
+    if array.size != count or array.dtype.kind not in "iuf" or not (array > 0).all():
+        raise KeypointError(f"{path}: {name}: expected {count} positive numbers, got {array}")
+    return [float(number) for number in array.ravel()]
 
 
 def _people(path: Path, name: str, array: np.ndarray) -> np.ndarray:

@@ -1,25 +1,99 @@
-"""Which of several people is the one: the most prominent at first, then by continuity."""
+"""Which of several people is the one: as the user says at first, then by continuity."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+
+from torchcss.errors import KeypointError
 
 _JUMP = 0.5
 """How far (in sizes of the person) a person may move from one frame to the next and be the same."""
 
 
+class Whom(NamedTuple):
+    """Who is to be followed.
+
+    Attributes:
+        frame: The frame in which the person is chosen.
+        person: `prominent`, `largest`, `leftmost` or `centre` in that frame, or the file's track.
+        image_size_wh: Size of the image, of which the centre is meant.
+    """
+
+    frame: int
+    person: str
+    image_size_wh: tuple[int, int]
+
+    def choose(self, people: np.ndarray, tracks: list[str | None]) -> int:
+        """The person's place among those of the frame.
+
+        Raises:
+            KeypointError: If nobody is called so.
+        """
+        middles = np.array([p[p[:, 2] > 0.0, :2].mean(0) if p.any() else (0, 0) for p in people])
+        away = np.linalg.norm(middles - 0.5 * np.array(self.image_size_wh), axis=1)
+        ranks = {
+            "prominent": [-_prominence(person) for person in people],
+            "largest": [-size_of(person) for person in people],
+            "leftmost": middles[:, 0],
+            "centre": away,
+        }
+        if self.person in ranks:
+            return int(np.argmin(ranks[self.person]))
+        if self.person in tracks:
+            return tracks.index(self.person)
+        known = ", ".join(str(track) for track in tracks if track is not None) or "no numbers"
+        raise KeypointError(
+            f"person {self.person!r} is not in frame {self.frame}, where tracking starts; there "
+            f"are {known}; or say largest, leftmost or centre"
+        )
+
+
+def identified(frames: list[np.ndarray]) -> list[list[int]]:
+    """Who is who in a film, by motion: a number for everybody in every frame.
+
+    Whoever is nearest to where a person was seen last, and near enough, is that person.
+
+    Args:
+        frames: The people of every frame, `[p j 3]`.
+    """
+    seen: dict[int, tuple[np.ndarray, int]] = {}  # by number: the last joints, and their frame
+    numbers: list[list[int]] = []
+    for index, people in enumerate(frames):
+        pairs = sorted(
+            (_distance(last, person), number, place)
+            for number, (last, _) in seen.items()
+            for place, person in enumerate(people)
+        )
+        own: dict[int, int] = {}
+        for distance, number, place in pairs:
+            reach = _JUMP * (1.0 + 0.2 * (index - seen[number][1] - 1))
+            if distance <= reach and place not in own and number not in own.values():
+                own[place] = number
+        for place, person in enumerate(people):
+            seen[own.setdefault(place, len(seen))] = person, index
+        numbers.append([own[place] for place in range(len(people))])
+    return numbers
+
+
 def follow(
-    frames: list[np.ndarray], tracks: list[list[str | None]], first_frame: int, report: list[str]
+    frames: list[np.ndarray], tracks: list[list[str | None]], whom: Whom, report: list[str]
 ) -> np.ndarray:
     """Return `[t j 3]`: the person that is followed among those of every frame.
 
     Args:
         frames: The people of every frame, `[p j 3]`.
         tracks: By what the file knows each of them again; None where it does not.
-        first_frame: Where the most prominent person is chosen, to be followed from there by the
-            file's own tracks, and where these end by continuity.
+        whom: Who is followed from where, by the file's own tracks, and where these end by
+            continuity.
         report: Gets a line of what was done.
+
+    Raises:
+        KeypointError: If that person is not there.
     """
+    first_frame, start = whom.frame, frames[whom.frame]
+    place = whom.choose(start, tracks[first_frame])
     num_joints = frames[first_frame].shape[1]
     chosen = np.zeros((len(frames), num_joints, 3))
     most = max(len(frame) for frame in frames)
@@ -28,8 +102,6 @@ def follow(
             if len(frame):
                 chosen[index] = frame[0]
         return chosen
-    start = frames[first_frame]
-    place = int(np.argmax([_prominence(person) for person in start]))
     chosen[first_frame] = start[place]
     own, lost = tracks[first_frame][place], []
     for order in (range(first_frame + 1, len(frames)), range(first_frame - 1, -1, -1)):
@@ -44,10 +116,14 @@ def follow(
             last, missed, track = frames[index][choice], 0, tracks[index][choice]
             chosen[index] = last
     named = "" if own is None else f", {own!r} of the file,"
+    which = {"prominent": "most prominent", "centre": "most central"}.get(whom.person, whom.person)
+    rest = [str(track) for track in tracks[first_frame] if track not in (None, own)]
     report.append(
-        f"up to {most} people in a frame: "
-        f"followed the most prominent one of frame {first_frame}{named} by "
+        f"up to {most} people in a frame: followed "
+        + (f"the {which} one" if whom.person != own else "the one asked for")
+        + f" of frame {first_frame}{named} by "
         + ("continuity" if own is None else "the file's tracks")
+        + (f"; --person {' or '.join(rest)} follows another" if rest else "")
     )
     if lost:
         report.append(

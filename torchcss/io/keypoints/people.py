@@ -59,6 +59,8 @@ class People(NamedTuple):
         first: The number of the first frame, where the format says it.
         whole: All frames are there that were looked at: the lowest number is the first frame.
         size_wh: Size of the images in which the file's pixels count, if it says so.
+        relative_noise: Standard deviation of a place of confidence 1, in multiples of what
+            detectors have.
     """
 
     frames: list[list[Person]] | dict[Key, list[Person]]
@@ -69,6 +71,7 @@ class People(NamedTuple):
     first: int | None = None
     whole: bool = False
     size_wh: tuple[float, float] | None = None
+    relative_noise: float = 1.0
 
 
 class Marked(NamedTuple):

@@ -47,7 +47,7 @@ from torchcss.io.keypoints.hdf5 import read_hdf5
 from torchcss.io.keypoints.json_files import read_folder, read_json
 from torchcss.io.keypoints.labels import read_labels
 from torchcss.io.keypoints.mediapipe import is_landmark_array, read_landmark_array
-from torchcss.io.keypoints.one_person import follow, size_of
+from torchcss.io.keypoints.one_person import Whom, follow, size_of
 from torchcss.io.keypoints.people import People, Person, is_there
 from torchcss.io.keypoints.tables import read_table
 from torchcss.joint_names import ALIASES, JOINT_NAMES, layout_of_names
@@ -118,7 +118,32 @@ def read_keypoints(
             number of frames, nobody in the first frame, coordinates that cannot be pixels, or a
             confident joint that is not a number.
     """
-    path = Path(path)
+    film = Film(num_frames, frame_names, frame_rate)
+    whom = Whom(first_frame, "prominent", image_size_wh)
+    return read_person(path, film=film, whom=whom, layout=layout, normalised=normalised)
+
+
+def read_person(
+    path: str | os.PathLike[str],
+    *,
+    film: Film,
+    whom: Whom,
+    layout: str | None = None,
+    normalised: bool | Scale = False,
+) -> Keypoints:
+    """The same, for a film of which more is known, and a person of choice.
+
+    Args:
+        path: As for `read_keypoints`.
+        film: The video.
+        whom: Who is followed, and the size of the images.
+        layout: As for `read_keypoints`.
+        normalised: The same.
+
+    Raises:
+        KeypointError: The same, or that person is not in the file.
+    """
+    path, (first_frame, _, image_size_wh), num_frames = Path(path), whom, film.num_frames
     if layout is not None and layout not in (OWN_NAMES, *ALIASES):
         raise KeypointError(
             f"{path}: unknown layout {layout!r}; the known ones are "
@@ -126,7 +151,7 @@ def read_keypoints(
         )
     people = _read(path, image_size_wh, num_frames)
     report = list(people.report)
-    everyone = in_order(path, people, Film(num_frames, frame_names, frame_rate), report)
+    everyone = in_order(path, people, film, report)
     everyone = [[p for p in frame if is_there(p.joints)] for frame in everyone]
     frames = _stacked(path, everyone)
     _check_counts(path, frames, people.names, num_frames, first_frame)
@@ -144,12 +169,14 @@ def read_keypoints(
     for frame in frames:
         frame[..., :2] = scale * frame[..., :2] + shift
     tracks = [[person.track for person in frame] for frame in everyone]
-    chosen = follow(frames, tracks, first_frame, report)
+    chosen = follow(frames, tracks, whom, report)
     names = _joint_names(path, people, chosen, layout or people.layout, report)
     report += findings(chosen, names, image_size_wh, first_frame)
     positions = np.where(chosen[..., 2:] > 0.0, chosen[..., :2], 0.0)
     confidence = torch.from_numpy(chosen[..., 2].copy())
-    return Keypoints(torch.from_numpy(positions), confidence, names, report=tuple(report))
+    return Keypoints(
+        torch.from_numpy(positions), confidence, names, people.relative_noise, tuple(report)
+    )
 
 
 def _stacked(path: Path, frames: Sequence[Sequence[Person]]) -> list[np.ndarray]:

@@ -1,0 +1,40 @@
+"""The verb `torchcss detect`: a video to its keypoints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from torchcss.app.detect import DetectOptions, detect_video
+from torchcss.errors import VideoError
+from torchcss.io.detector_model import download_model
+
+
+@dataclass(frozen=True, kw_only=True)
+class Detect:
+    """Find the keypoints of everybody in a video; --download-model fetches the detector's model."""
+
+    video: Annotated[Path | None, tyro.conf.Positional] = None
+    """A video in any container, or a folder of images."""
+    out: Path = Path("keypoints.npz")
+    """The file to write, which `torchcss track --keypoints` takes."""
+    download_model: bool = False
+    """Fetch MediaPipe's model into the cache folder, and nothing else where no video is given."""
+    frame_rate: float | None = None
+    """Frames per second of a folder of images; by default 30."""
+    options: Annotated[DetectOptions, tyro.conf.OmitArgPrefixes] = field(
+        default_factory=DetectOptions
+    )
+
+    def run(self) -> None:
+        """Run the verb."""
+        if self.download_model:
+            download_model()
+        if self.video is not None:
+            detect_video(self.video, self.out, self.options, frame_rate=self.frame_rate)
+            print(f"keypoints are in {self.out}")
+        elif not self.download_model:
+            raise VideoError("give a video, or --download-model")
