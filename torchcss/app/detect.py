@@ -84,7 +84,7 @@ def detect_video(
 def write_people(
     out: Path, frames: Sequence[np.ndarray], detector: Detector, image_size_wh: tuple[int, int]
 ) -> None:
-    """Write who is where in every frame, every person under one number.
+    """Write who is where in every frame, every person under one number; joints that bodies have.
 
     Args:
         out: The file.
@@ -94,16 +94,16 @@ def write_people(
     """
     ids = identified(list(frames))
     count = 1 + max((number for people in ids for number in people), default=0)
-    names = ALIASES[detector.layout]
-    joints = np.zeros((len(frames), count, len(names), 3))
+    names = {name: column for column, name in enumerate(ALIASES[detector.layout]) if name}
+    joints = np.tile((np.nan, np.nan, 0.0), (len(frames), count, len(names), 1))
     for index, (people, numbers) in enumerate(zip(frames, ids, strict=True)):
-        joints[index, numbers] = people
+        joints[index, numbers] = people[:, list(names.values())]
     save_arrays(
         out,
         {
             "keypoints": joints[..., :2],
             "confidence": joints[..., 2],
-            "joint_names": [name or f"{detector.layout}[{i}]" for i, name in enumerate(names)],
+            "joint_names": list(names),
             "person_ids": np.arange(count),
             "image_size_wh": image_size_wh,
             "relative_noise": detector.relative_noise,

@@ -1,4 +1,4 @@
-"""From files to files: a video in, with its camera and keypoints where there are, a first pose found, the track written.
+"""From files to files: a video in, a first pose found, the track written.
 
 `track_video` is what `torchcss track` calls, `resume` what it calls with `--resume`. The loop
 itself is `TrackingSession`, which takes any images; `torchcss.app.recorder.Recorder` writes what
@@ -264,8 +264,8 @@ def _open_views(
     for opened in views:
         if len(views) > 1 and not opened.camera.metric:
             raise CameraError(
-                f"{files[0].video}: several cameras need their places in one world, in metres; that of "
-                f"{opened.files.video} is not known so: give R and t"
+                f"{files[0].video}: several cameras need their places in one world, in metres; "
+                f"that of {opened.files.video} is not known so: give R and t"
             )
     return views
 

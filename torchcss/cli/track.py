@@ -24,12 +24,12 @@ class Track:
     video: Annotated[Path, tyro.conf.Positional]
     """A video in any container, or a folder of images."""
     camera: Path | None = None
-    """Calibration, if there is one: cameras.json, or the file of Pose2Sim, Anipose, Caliscope, EasyMocap, OpenCV,
-    ROS, Kalibr, COLMAP or MATLAB."""
+    """Calibration, if there is one: cameras.json, or the file of Pose2Sim, Anipose, Caliscope,
+    EasyMocap, OpenCV, ROS, Kalibr, COLMAP or MATLAB."""
     keypoints: Path | None = None
-    """2D joints; by default they are detected, as torchcss detect does. What a detector or an annotation tool writes, as a folder (OpenPose, YOLO,
-    EasyMocap), JSON, CSV, HDF5 or arrays, or clicked; of an archive of several recordings
-    FILE.npz#SUBJECT/ACTION/CAMERA."""
+    """2D joints; by default they are detected, as torchcss detect does. What a detector or an
+    annotation tool writes, as a folder (OpenPose, YOLO, EasyMocap), JSON, CSV, HDF5 or arrays, or
+    clicked; of an archive of several recordings FILE.npz#SUBJECT/ACTION/CAMERA."""
     out: Path = Path("out/track")
     """Output folder."""
     start: int = 0

@@ -518,8 +518,10 @@ def focal_length_35mm(path: str | os.PathLike[str]) -> float | None:
     with suppress(*_av_errors(), ValueError, SyntaxError):
         if reader.first_image is not None:
             with Image.open(reader.first_image) as picture:
-                value = picture.getexif().get_ifd(ExifTags.IFD.Exif).get(
-                    ExifTags.Base.FocalLengthIn35mmFilm
+                value = (
+                    picture.getexif()
+                    .get_ifd(ExifTags.IFD.Exif)
+                    .get(ExifTags.Base.FocalLengthIn35mmFilm)
                 )
         else:
             with reader.opened() as container:

@@ -80,7 +80,7 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
         _names(path, arrays.get("joint_names"), values.shape[2]),
         report,
         corner_fractions=is_movenet,
-        size_wh=None if size is None else tuple(_positive(path, "image_size_wh", size, 2)),
+        size_wh=None if size is None else _size(path, size),
         relative_noise=1.0 if noise is None else _positive(path, "relative_noise", noise, 1)[0],
     )
 
@@ -93,6 +93,11 @@ def _tracks(path: Path, ids: np.ndarray | None, count: int) -> list[str | None]:
             f"{path}: person_ids: expected {count} numbers, got {ids.dtype} {list(ids.shape)}"
         )
     return [str(number) for number in ids]
+
+
+def _size(path: Path, array: np.ndarray) -> tuple[float, float]:
+    width, height = _positive(path, "image_size_wh", array, 2)
+    return width, height
 
 
 def _positive(path: Path, name: str, array: np.ndarray, count: int) -> list[float]:

@@ -1,0 +1,106 @@
+"""From a video to its keypoints, with a detector made for the purpose; and on to a track."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import torchcss
+from torchcss.app.detect import detect_video
+from torchcss.errors import KeypointError
+from torchcss.io.keypoints.frames import Film
+from torchcss.io.keypoints.one_person import Whom
+from torchcss.io.keypoints.read import read_person
+from torchcss.types import Frame, Keypoints
+
+SIZE = (64, 48)
+
+
+class Crowd:
+    """Sees these people, in an order that changes from frame to frame."""
+
+    layout = "COCO-17"
+    relative_noise = 1.5
+
+    def __init__(self, places: list[list[tuple[float, float, float]]]) -> None:
+        self.places, self.closed = places, False
+
+    def detect(self, frame: Frame) -> np.ndarray:
+        spread = np.random.default_rng(0).uniform(-1, 1, (17, 2))
+        people = [
+            np.column_stack([(x, y) + size * spread, np.full(17, 0.9)])
+            for x, y, size in self.places[frame.index]
+        ]
+        return np.array(people[:: (-1) ** frame.index]).reshape(-1, 17, 3)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+@pytest.fixture
+def crowd() -> Crowd:
+    small, large, middle = (8.0, 10.0, 4.0), (48.0, 24.0, 9.0), (30.0, 24.0, 6.0)
+    return Crowd([[small, large, middle], [small, large], [small, middle, large]])
+
+
+def read(path: Path, person: str, frame: int = 0) -> Keypoints:
+    return read_person(path, film=Film(3), whom=Whom(frame, person, SIZE))
+
+
+@pytest.mark.parametrize(
+    ("person", "u", "known"),
+    [("largest", 48, 3), ("leftmost", 8, 3), ("centre", 30, 2), ("0", 8, 3), ("1", 48, 3),
+     ("prominent", 48, 3)],
+)  # fmt: skip
+def test_everybody_is_found_and_known_again(
+    files: Path,
+    crowd: Crowd,
+    person: str,
+    u: float,
+    known: int,
+) -> None:
+    path = detect_video(files / "video.mp4", files / "found.npz", detector=crowd)
+    assert crowd.closed
+    keypoints = read(path, person)
+    seen = keypoints.confidence.amax(-1) > 0
+    assert int(seen.sum()) == known
+    assert keypoints.positions[seen].mean((0, 1))[0] == pytest.approx(u, abs=3)
+    assert keypoints.relative_noise == 1.5
+    assert any("--person" in line for line in keypoints.report)
+
+
+def test_who_is_not_there_is_told(files: Path, crowd: Crowd) -> None:
+    path = detect_video(files / "video.mp4", files / "found.npz", detector=crowd)
+    with pytest.raises(KeypointError, match=r"person '2' is not in frame 1.*there are 0, 1"):
+        read(path, "2", frame=1)
+    with pytest.raises(KeypointError, match="largest, leftmost or centre"):
+        read(path, "7")
+
+
+def test_nobody_is_one_line(files: Path) -> None:
+    with pytest.raises(KeypointError, match=r"nobody found in 3 frames.*--keypoints"):
+        detect_video(files / "video.mp4", files / "found.npz", detector=Crowd([[], [], []]))
+    assert not (files / "found.npz").exists()
+
+
+def test_a_video_alone_is_tracked(
+    files: Path,
+    crowd: Crowd,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("torchcss.app.detect.open_detector", lambda *_: crowd)
+    settings = torchcss.Settings(body="arm7", samples=3, modes=2, overlay=False)
+    options = torchcss.TrackOptions(person="leftmost", fov=60.0)
+    out = files / "out"
+    run = torchcss.track_video(files / "video.mp4", out=out, settings=settings, options=options)
+    assert len(run.track.frames) == 3
+    camera, given = run.cameras[0]
+    assert float(camera.K[0, 0]) == pytest.approx(32 / np.tan(np.radians(30)))
+    assert given is not None
+    assert given.keypoints == out / "keypoints.npz"
+    assert given.person == "leftmost"
+    notes = "\n".join(run.summary["notes"])
+    assert "followed the leftmost one of frame 0" in notes
+    assert "as given" in notes
