@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from made_costs import make_full_cost, random_states
+from made_costs import changed, make_full_cost, random_states
 
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
@@ -24,7 +24,7 @@ from torchcss.cost.pose_prior import (
     mirrored,
 )
 from torchcss.initialise.options import InitialiseOptions
-from torchcss.vision.camera import Upright
+from torchcss.vision.camera import Camera, Upright
 
 
 @pytest.fixture(scope="module")
@@ -178,9 +178,15 @@ def test_what_a_body_lacks_is_left_out(body: BodyModel) -> None:
     assert body_density(load_body("arm8")) is None
 
 
+@pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize("name", ["body34", "arm8"])
-def test_as_a_term_of_both_engines(name: str, generator: torch.Generator) -> None:
+def test_as_a_term_of_both_engines(name: str, turned: bool, generator: torch.Generator) -> None:
     cost = make_full_cost(name, own_parents=5)
+    if turned:
+        turn = torch.linalg.matrix_exp(cross_matrix(cost.body.tie.new_tensor([1.7, 0.3, -0.4])))
+        size = cost.camera.image_size_wh
+        cost = changed(cost, camera=Camera(cost.camera.K, size, R_camera_world=turn))
+        assert cost.camera.up is not None
     cost = replace(cost, choice=cost.choice.having(PosePrior()).only(["pose_prior", "stabiliser"]))
     x = random_states(cost.body, 5, generator=generator)
     assert ("pose_prior" in cost.terms(x)) == (name == "body34")

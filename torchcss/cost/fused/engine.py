@@ -260,7 +260,7 @@ class FusedEngine:
         if density is None:
             return None
         tree = pack.pack_tree(past.body, past.camera)
-        limbs = pack.pack_limbs(past.body, density, weight)
+        limbs = pack.pack_limbs(past.body, density, weight, past.camera)
         make = partial(pack.make_limb_scratch, tree, limbs, past.body.num_parameters)
         return tree, limbs, Workspaces(make)
 

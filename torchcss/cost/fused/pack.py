@@ -365,8 +365,8 @@ def make_workspace(
     )
 
 
-def pack_limbs(body: BodyModel, density: BodyDensity, scale: float) -> Limbs:
-    """The prior on poses."""
+def pack_limbs(body: BodyModel, density: BodyDensity, scale: float, camera: Camera) -> Limbs:
+    """The prior on poses, its directions in the camera's frame."""
     double, which = np.float64, density.which
     link, offset = body.marker_link[which.joint], body.marker_offset[which.joint]
     homogeneous = torch.cat([offset, torch.ones_like(offset[:, :1])], dim=1)[:, :, None]
@@ -387,7 +387,7 @@ def pack_limbs(body: BodyModel, density: BodyDensity, scale: float) -> Limbs:
         place=place[:, :, 0].copy(),
         above=above,
         difference=difference,
-        fixed=array(which.fixed, double),
+        fixed=array(which.fixed, double) @ array(camera.R_camera_world, double).T,
         first=np.array([group.row.start for group in which.groups]),
         segments=np.array([len(group.known) for group in which.groups]),
         line=np.array([group.line for group in which.groups]),
