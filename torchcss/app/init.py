@@ -211,6 +211,7 @@ def initialise_video(
     """
     options = InitialiseOptions(
         sigma=sigma,
+        stature=settings.stature,
         least_joints=LEAST_JOINTS,
         pose_prior="pose_prior" in settings.used_terms,
         contours="contour" in settings.used_terms,

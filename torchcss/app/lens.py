@@ -1,8 +1,8 @@
 """The camera of a video that nobody calibrated: its focal length, told, read or assumed.
 
 The principal point is the middle of the image, and there is no distortion. The focal length is what
-the user says, else what the file says of its lens (`torchcss.io.video.focal_length_35mm`), else a
-field of view in the middle of what telephones and cameras have.
+the user says, else what the file says of its lens (`torchcss.io.video.focal_length_35mm`), else it
+is fitted to the keypoints (`torchcss.initialise.focal`) and held while tracking.
 """
 
 from __future__ import annotations
@@ -11,10 +11,20 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
+
+from torchcss.app.view_files import OpenView
 from torchcss.errors import CameraError
 from torchcss.initialise.fit import default_camera
+from torchcss.initialise.focal import fit_focal
+from torchcss.initialise.options import InitialiseOptions
 from torchcss.io.cameras import LoadedCamera
 from torchcss.io.video import VideoReader, focal_length_35mm
+from torchcss.tracking.settings import Settings
+from torchcss.vision.camera import Camera
+
+PERSONS = ("body30", "body32", "body34")
+"""Bodies to which a focal length is fitted."""
 
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 
@@ -26,10 +36,12 @@ class Lens:
     Attributes:
         focal: Focal length in pixels.
         fov: Angle between the left and the right border of the image, degrees.
+        source: Who says so.
     """
 
     focal: float | None = None
     fov: float | None = None
+    source: str = "as given"
 
     def unless(self, calibration: Path) -> Path:
         """The calibration file, which says it all.
@@ -37,11 +49,28 @@ class Lens:
         Raises:
             CameraError: If a focal length is given beside it.
         """
-        if self.focal is not None or self.fov is not None:
+        if self.is_known:
             raise CameraError("give --camera, --focal or --fov, not several")
         return calibration
 
-    def camera_of(self, video: Path) -> LoadedCamera:
+    def of(self, video: Path) -> Lens:
+        """The lens, with what the video's file says of it where the user says nothing.
+
+        Raises:
+            VideoError: If the video cannot be read.
+        """
+        if self.is_known or (equivalent := focal_length_35mm(video)) is None:
+            return self
+        info = VideoReader(video).info
+        focal = equivalent * math.hypot(info.width, info.height) / _DIAGONAL_35MM
+        return Lens(focal=focal, source=f"from the file's own {equivalent:g} mm on 35 mm film")
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the focal length is told."""
+        return self.focal is not None or self.fov is not None
+
+    def camera(self, video: Path) -> LoadedCamera:
         """The camera of a video, in its own frame, and what was assumed.
 
         Raises:
@@ -49,11 +78,40 @@ class Lens:
             VideoError: If the video cannot be read.
         """
         info = VideoReader(video).info
-        size, focal, said = (info.width, info.height), self.focal, ""
-        if focal is None and self.fov is None and (equivalent := focal_length_35mm(video)):
-            focal = equivalent * math.hypot(*size) / _DIAGONAL_35MM
-            said = f", from the file's own: {equivalent:g} mm on 35 mm film"
-        camera, note = default_camera(*size, focal_px=focal, field_of_view_degrees=self.fov)
-        if said:
-            note = note.replace(", as given", said)
+        camera, note = default_camera(
+            info.width, info.height, focal_px=self.focal, field_of_view_degrees=self.fov
+        )
+        note = note.replace("as given", self.source)
         return LoadedCamera(camera, metric=False, units_note=note, video=None)
+
+
+def fitted(view: OpenView, settings: Settings) -> OpenView:
+    """The view of a camera whose focal length is fitted to its keypoints, for a person's body.
+
+    Args:
+        view: The view of a camera that was assumed; as it is where the body is no person's.
+        settings: How to track.
+    """
+    if view.keypoints is None or settings.body not in PERSONS:
+        return view
+    size = view.camera.camera.image_size_wh
+    found = fit_focal(
+        settings.body,
+        view.keypoints,
+        size,
+        options=InitialiseOptions(
+            sigma=view.sigma,
+            stature=settings.stature,
+            pose_prior="pose_prior" in settings.used_terms,
+        ),
+        generator=torch.Generator().manual_seed(settings.seed),
+    )
+    angle = 2 * math.degrees(math.atan(0.5 * max(size) / found.pixels))
+    how = f"fitted to {found.num_frames} frames" if found.num_frames else "assumed, too little seen"
+    note = (
+        f"camera: not given; focal length {found.pixels:.0f} px ({angle:.0f} degrees along the "
+        f"longer side), {how}, known to {100 * found.deviation:.0f} %: distances are as uncertain; "
+        "say --focal or --fov if you know it"
+    )
+    camera = Camera.pinhole(*size, focal_px=found.pixels, name="fitted")
+    return view._replace(camera=view.camera._replace(camera=camera, units_note=note))

@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from torchcss.app.detect import DetectOptions, detect_video
 from torchcss.app.init import initialise_video
-from torchcss.app.lens import Lens
+from torchcss.app.lens import Lens, fitted
 from torchcss.app.recorder import CHECKPOINT_EVERY, Begun, Recorder, Sink
 from torchcss.app.view_files import OpenView, Selection, moments, open_view
 from torchcss.cost.view import View
@@ -144,8 +144,12 @@ def track_video(
         person=options.person,
     )
     lens = Lens(focal=options.focal, fov=options.fov)
-    calibration = lens.camera_of(video) if camera is None else lens.unless(Path(camera))
-    views = _open_views((own, *options.others), calibration, selection)
+    if camera is None:
+        lens = lens.of(video)
+        views = _open_views((own, *options.others), lens.camera(video), selection)
+        views = views if lens.is_known else [fitted(views[0], settings)]
+    else:
+        views = _open_views((own, *options.others), lens.unless(Path(camera)), selection)
     generator = torch.Generator().manual_seed(settings.seed)
     eye = views[0].camera.camera.to(dtype=settings.torch_dtype, device=settings.device)
     first = _first_pose(views, eye, settings, start, options, generator)

@@ -99,7 +99,7 @@ def fit_joints(
         _check_in_view(body, view.camera)
         fits = multi_start_fits(cost, search=options.search, generator=generator)
         return as_initialisation(body, best_distinct(fits, options.num_modes), notes)
-    free = _hang_before_camera(free, view.camera, match_joints(keypoints, free.joint_names))
+    free = hang_before_camera(free, view.camera, match_joints(keypoints, free.joint_names))
     return _with_lengths_fitted(cost.with_body(free), generator, options, scale, notes)
 
 
@@ -174,7 +174,7 @@ def _check_in_view(body: BodyModel, camera: Camera) -> None:
         )
 
 
-def _hang_before_camera(body: BodyModel, camera: Camera, targets: JointTargets) -> BodyModel:
+def hang_before_camera(body: BodyModel, camera: Camera, targets: JointTargets) -> BodyModel:
     """Base: upright in the image, facing the camera, as far as the limbs' lengths suggest."""
     seen = targets.weight > 0
     index, target = targets.joint[seen], targets.position[seen]

@@ -136,7 +136,7 @@ def multi_start_fits(cost: TrackingCost, *, search: Search, generator: torch.Gen
     body = cost.body
     bounds = search.bounds(body)
     fits = descend(
-        cost, _starts(body, search.num_starts, generator), bounds,
+        cost, starts_about(body, search.num_starts, generator), bounds,
         ((_WIDE, 12), (_MIDDLE, 12)) if search.anneal else (),
     )  # fmt: skip
     starts = [fits]
@@ -186,7 +186,7 @@ def _widened(cost: TrackingCost, factor: float) -> TrackingCost:
     return replace(cost, choice=cost.choice.having(wide))
 
 
-def _starts(body: BodyModel, num: int, generator: torch.Generator) -> Float[Tensor, "b n"]:
+def starts_about(body: BodyModel, num: int, generator: torch.Generator) -> Float[Tensor, "b n"]:
     """Poses all around the vertical, spread about the stabilisers' rest; the first at rest."""
     size = (num, body.num_parameters)
     noise = torch.randn(size, generator=generator, dtype=torch.float64).to(body.tie)

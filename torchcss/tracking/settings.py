@@ -104,6 +104,7 @@ class Settings:
     Attributes:
         body: Body to track: arm7, arm8, body30, body32, body34, or a URDF, MJCF or BVH file.
         free_root: Let a body move about that by itself stands in one place, as robots do.
+        stature: Height of the standing person, metres, where it is known: it sets the size.
         preset: Tracker, a name in `presets.PRESETS`; one of `presets.ALIASES` becomes that.
         samples: Samples per frame; the preset's number by default.
         modes: Modes kept; the preset's number by default.
@@ -145,6 +146,7 @@ class Settings:
 
     body: str = "body34"
     free_root: bool = False
+    stature: float | None = None
     preset: str = "css"
     samples: int | None = None
     modes: int | None = None

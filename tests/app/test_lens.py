@@ -1,0 +1,100 @@
+"""What is known of a lens: told, in the file, or fitted."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from PIL import ExifTags, Image
+
+import torchcss
+from torchcss.app.lens import Lens
+from torchcss.errors import CameraError
+from torchcss.io.video import VideoWriter, focal_length_35mm
+
+KEY = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
+
+
+def video(path: Path, **metadata: str) -> Path:
+    """A short film whose container says more."""
+    with av.open(path, "w", options={"movflags": "use_metadata_tags"}) as container:
+        container.metadata.update(metadata)
+        stream = container.add_stream("libx264", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        picture = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), format="rgb24")
+        container.mux(stream.encode(picture))
+        container.mux(stream.encode(None))
+    return path
+
+
+def focal(lens: Lens, path: Path) -> float:
+    return float(lens.of(path).camera(path).camera.K[0, 0])
+
+
+def test_the_file_says_it(tmp_path: Path) -> None:
+    path = video(tmp_path / "a.mov", **{KEY: "26"})
+    assert focal_length_35mm(path) == 26
+    assert focal(Lens(), path) == pytest.approx(26 * 80 / math.hypot(36, 24))
+    assert "26 mm" in (Lens().of(path).camera(path).units_note or "")
+    assert focal(Lens(focal=99.0), path) == 99  # the user knows better
+
+
+@pytest.mark.parametrize("said", ["", "none", "0", "nan", "1e9", "-26"])
+def test_nonsense_in_the_file_is_no_answer(tmp_path: Path, said: str) -> None:
+    path = video(tmp_path / "a.mov", **{KEY: said})
+    assert focal_length_35mm(path) is None
+    assert not Lens().of(path).is_known
+
+
+def test_pictures_say_it_by_exif(tmp_path: Path) -> None:
+    picture = Image.new("RGB", (64, 48))
+    exif = Image.Exif()
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = 28
+    picture.save(tmp_path / "0.jpg", exif=exif)
+    assert focal_length_35mm(tmp_path) == 28
+    Image.new("RGB", (64, 48)).save(tmp_path / "0.jpg")
+    assert focal_length_35mm(tmp_path) is None
+
+
+def test_a_camera_is_said_once() -> None:
+    with pytest.raises(CameraError, match="not several"):
+        Lens(fov=60.0).unless(Path("cameras.json"))
+    assert Lens().unless(Path("cameras.json")) == Path("cameras.json")
+    with pytest.raises(CameraError):
+        torchcss.Camera.pinhole(64, 48, focal_px=10.0, field_of_view_degrees=20.0)
+
+
+def test_what_is_unknown_is_fitted_and_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with VideoWriter(tmp_path / "video.mp4", 25) as film:
+        for shade in (10, 20, 30, 40, 50):
+            film.write(np.full((96, 128, 3), shade, dtype=np.uint8))
+    places = {
+        "l_shoulder": (70, 30), "r_shoulder": (56, 30), "l_elbow": (76, 40), "r_elbow": (50, 40),
+        "l_wrist": (74, 50), "r_wrist": (52, 50), "l_hip": (67, 52), "r_hip": (59, 52),
+        "l_knee": (68, 68), "r_knee": (58, 68), "l_ankle": (68, 84), "r_ankle": (58, 84),
+    }  # fmt: skip
+    np.savez(
+        tmp_path / "keypoints.npz",
+        keypoints=np.tile(np.array(list(places.values()), dtype=float), (5, 1, 1)),
+        confidence=np.ones((5, len(places))),
+        joint_names=list(places),
+    )
+    run = torchcss.track_video(
+        tmp_path / "video.mp4",
+        keypoints=tmp_path / "keypoints.npz",
+        out=tmp_path / "out",
+        settings=torchcss.Settings(samples=3, modes=2, overlay=False, stature=1.9),
+        stop=1,
+    )
+    notes = "\n".join(run.summary["notes"])
+    assert "fitted to 5 frames" in notes
+    assert "--focal or --fov" in notes
+    camera = run.cameras[0].camera
+    assert camera.name == "fitted"
+    assert 0.5 < float(camera.K[0, 0]) / 128 < 1.6
+    assert "1.9" in notes  # the stature, which sets the size
