@@ -161,7 +161,7 @@ class Recorder:
         ended, writer = "interrupted", self._writer
         self._began = saved = time.perf_counter()
         with ExitStack() as stack:
-            stack.enter_context(_ended_by_sigterm())
+            stack.enter_context(ended_by_sigterm())
             for sink in self.sinks:
                 stack.push(partial(_close, sink))
             bar = stack.enter_context(
@@ -282,7 +282,7 @@ def modes_of(frame: Posterior, *, is_first: bool = False) -> FrameModes:
 
 
 @contextmanager
-def _ended_by_sigterm() -> Iterator[None]:
+def ended_by_sigterm() -> Iterator[None]:
     """A request to end interrupts as Ctrl-C does; handlers belong to the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield

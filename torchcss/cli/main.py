@@ -6,6 +6,7 @@
 | `torchcss init IMAGE` | fits a body to one picture with marked joints |
 | `torchcss detect VIDEO` | finds the keypoints of a video |
 | `torchcss track VIDEO` | tracks a body through a video |
+| `torchcss batch MANIFEST` | tracks many clips, by several processes |
 | `torchcss smooth TRACK` | makes one smooth trajectory of a track's modes |
 | `torchcss export TRACK` | writes a track for another program |
 | `torchcss view TRACK` | shows a track in space over its pictures (rerun) |
@@ -24,6 +25,7 @@ from typing import Annotated
 
 import tyro
 
+from torchcss.app.batch import Batch
 from torchcss.app.recorder import Terminated
 from torchcss.cli.detect import Detect
 from torchcss.cli.export import Export
@@ -62,6 +64,7 @@ Verb = (
     | Annotated[Init, tyro.conf.subcommand("init")]
     | Annotated[Detect, tyro.conf.subcommand("detect")]
     | Annotated[Track, tyro.conf.subcommand("track")]
+    | Annotated[Batch, tyro.conf.subcommand("batch")]
     | Annotated[Smooth, tyro.conf.subcommand("smooth")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[View, tyro.conf.subcommand("view")]

@@ -1,0 +1,468 @@
+"""Many clips, by as many processes as there are, on one machine or on several that share a folder.
+
+    torchcss batch clips.csv --out results --workers 4
+    torchrun --nproc-per-node 4 -m torchcss.app.batch clips.csv --out results
+
+What is true lies in the folder and nowhere else. A process claims a clip (`torchcss.app.claims`),
+tracks it in a folder of that claim, going on from what an earlier claim left, and publishes it by
+renaming that folder to the clip's name. Whoever was taken over meanwhile writes into a folder that
+nobody looks at, and publishes nothing. The same command goes on with an interrupted batch.
+
+    OUT/NAME/                a clip that is done, as `torchcss track` leaves it
+    OUT/batch.json, .html    the state of every clip
+    OUT/.batch/              the manifest, claims, work, and what failed why
+"""
+
+from __future__ import annotations
+
+import csv
+import html
+import json
+import multiprocessing
+import os
+import shutil
+import sys
+import time
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import redirect_stderr, redirect_stdout, suppress
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import tyro
+
+from torchcss.app.claims import Claim, Claims
+from torchcss.app.recorder import Picture, ended_by_sigterm
+from torchcss.app.track import TrackOptions, track_video
+from torchcss.errors import ConfigurationError, OutputError, TorchcssError
+from torchcss.files import load_json, one_line, prepare_output_folder, read_text, write_text
+from torchcss.io.checkpoint import CHECKPOINT_NAME
+from torchcss.io.tracks import TRACK_NAME
+from torchcss.io.video import VideoReader
+from torchcss.tracking.session import Posterior
+from torchcss.tracking.settings import Settings, settings_from_plain
+
+FILES = ("video", "camera", "keypoints", "masks", "init")
+"""Columns that are paths, from the manifest's folder on."""
+
+OPTIONS = ("camera_name", "layout", "person", "frame_rate", "focal", "fov", "stride")
+"""Columns that are options of the files, see `TrackOptions`."""
+
+SETTINGS = ("body", "preset", "seed", "samples", "modes", "keypoints_use", "working_size")
+"""Columns that are settings of this clip alone."""
+
+_NUMBERS = {
+    **dict.fromkeys(("start", "stop", "stride", "seed", "samples", "modes", "working_size"), int),
+    **dict.fromkeys(("frame_rate", "focal", "fov"), float),
+}
+_COLUMNS = ("name", "start", "stop", *FILES, *OPTIONS, *SETTINGS)
+_POLL_S = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Batch:
+    """Track many clips; the same command goes on with what was interrupted."""
+
+    manifest: Annotated[Path, tyro.conf.Positional]
+    """CSV or JSON lines with the columns video, camera, keypoints, name and options; or a folder of
+    folders that hold video.mp4, cameras.json and keypoints2d.npz, or of videos."""
+    out: Path = Path("out/batch")
+    """Folder of the results, one folder a clip."""
+    workers: int = 1
+    """Processes on this machine, one thread each."""
+    retry_failed: bool = False
+    """Try clips again that failed by their own files, too. Failures of the disk, and clips whose
+    files have changed, are tried again in any case."""
+    patience: float = 60.0
+    """Seconds for which a process has to show no sign of life until its clip is taken over."""
+    settings: Annotated[Settings, tyro.conf.arg(name="")] = field(default_factory=Settings)
+
+    def __post_init__(self) -> None:
+        if self.workers < 1 or not self.patience > 0:
+            raise ConfigurationError(
+                f"expected at least 1 worker and some patience, got {self.workers} and "
+                f"{self.patience}"
+            )
+
+    def run(self) -> None:
+        """Run the batch; how it ended is in `batch.json` and printed.
+
+        Raises:
+            TorchcssError: If the manifest or the folder is of no use. What is wrong with a clip is
+                its own failure.
+        """
+        job = Job.begin(self)
+        if self.workers > 1 and "RANK" not in os.environ:
+            self._with_workers(job)
+        else:
+            work(job)
+        print(job.report())
+
+    def _with_workers(self, job: Job) -> None:
+        """Start processes, and show how far they are."""
+        os.environ["OMP_NUM_THREADS"] = "1"  # for those that start now
+        spawn = multiprocessing.get_context("spawn")
+        workers = [spawn.Process(target=_worker, args=(job,)) for _ in range(self.workers)]
+        shown: dict[str, State] = {}
+        try:
+            for worker in workers:
+                worker.start()
+            while any(worker.is_alive() for worker in workers):
+                states = job.states()
+                for name, state in states.items():
+                    if shown.get(name) != state:
+                        print(f"{name}: {state.text}", flush=True)
+                shown = states
+                time.sleep(_POLL_S)
+        finally:
+            for worker in workers:
+                worker.terminate()
+                worker.join()
+
+
+def _worker(job: Job) -> None:
+    with ended_by_sigterm(), suppress(KeyboardInterrupt):
+        work(job)
+
+
+class Clip(NamedTuple):
+    """A row of a manifest.
+
+    Attributes:
+        name: Of its output folder.
+        row: Its other columns.
+    """
+
+    name: str
+    row: Mapping[str, Any]
+
+    def path(self, column: str) -> Path | None:
+        """One of its files."""
+        return Path(self.row[column]) if column in self.row else None
+
+    def fingerprint(self) -> list[list[int]]:
+        """What changes when its files do."""
+        found = []
+        for column in FILES:
+            with suppress(OSError):
+                if column in self.row:
+                    about = os.stat(self.row[column])
+                    found.append([about.st_size, about.st_mtime_ns])
+        return found
+
+
+def read_manifest(path: Path) -> list[Clip]:
+    """The clips of a CSV, of JSON lines, or of a folder.
+
+    Raises:
+        ConfigurationError: If it is none, a column is unknown, or two clips have one name.
+    """
+    if path.is_dir():
+        rows = list(_rows_of_folder(path))
+    elif path.suffix.lower() == ".csv":
+        rows = list(csv.DictReader(read_text(path, ConfigurationError).splitlines()))
+    else:
+        rows = []
+        for number, line in enumerate(read_text(path, ConfigurationError).splitlines(), 1):
+            try:
+                rows += [json.loads(line)] if line.strip() else []
+            except ValueError as error:
+                raise ConfigurationError(f"{path}: line {number}: no JSON: {error}") from error
+    folder = path if path.is_dir() else path.parent
+    clips = [_clip(row, f"{path}: row {number}", folder) for number, row in enumerate(rows, 1)]
+    if not clips:
+        raise ConfigurationError(f"{path}: no clips in it")
+    names = [clip.name for clip in clips]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise ConfigurationError(f"{path}: two clips are called {twice[0]}; give a column name")
+    return clips
+
+
+def _rows_of_folder(folder: Path) -> Iterator[dict[str, str]]:
+    usual = {"camera": "cameras.json", "keypoints": "keypoints2d.npz"}
+    for inner in sorted(folder.iterdir()):
+        if inner.is_dir() and (inner / "video.mp4").is_file():
+            beside = {c: str(inner / n) for c, n in usual.items() if (inner / n).is_file()}
+            yield {"name": inner.name, "video": str(inner / "video.mp4"), **beside}
+        elif inner.suffix.lower() in (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"):
+            yield {"video": str(inner)}
+
+
+def _clip(row: object, where: str, folder: Path) -> Clip:
+    if not isinstance(row, Mapping) or not row.get("video"):
+        raise ConfigurationError(f"{where}: expected a column video")
+    if unknown := sorted(str(name) for name in row if name not in _COLUMNS):
+        raise ConfigurationError(
+            f"{where}: unknown column {unknown[0]!r}; there are {', '.join(_COLUMNS)}"
+        )
+    given = {name: value for name, value in row.items() if value not in (None, "")}
+    for name, kind in _NUMBERS.items():
+        if name in given:
+            try:
+                given[name] = kind(given[name])
+            except (TypeError, ValueError) as error:
+                raise ConfigurationError(
+                    f"{where}: {name}: expected a number, got {given[name]!r}"
+                ) from error
+    for name in FILES:
+        if name in given:
+            given[name] = os.path.abspath(folder / str(given[name]))
+    name = str(given.pop("name", Path(given["video"]).stem))
+    if name.startswith(".") or name != Path(name).name:
+        raise ConfigurationError(f"{where}: {name!r} cannot be the name of a folder")
+    return Clip(name, given)
+
+
+class State(NamedTuple):
+    """How far a clip is: waiting, tracking, done or failed, and what there is to say about it."""
+
+    kind: str
+    about: str = ""
+
+    @property
+    def text(self) -> str:
+        """For people."""
+        return f"{self.kind} {self.about}".strip()
+
+
+class Job(NamedTuple):
+    """A batch as every process sees it.
+
+    Attributes:
+        clips: What is to be tracked.
+        settings: How, where a row does not say otherwise.
+        out: The folder.
+        claims: Who tracks what.
+    """
+
+    clips: tuple[Clip, ...]
+    settings: Settings
+    out: Path
+    claims: Claims
+
+    @classmethod
+    def begin(cls, batch: Batch) -> Job:
+        """Read the manifest, and write it where there is none of another batch.
+
+        Raises:
+            ConfigurationError: If the folder holds another batch.
+        """
+        clips, out = read_manifest(batch.manifest), prepare_output_folder(batch.out)
+        for name in ("claims", "work", "failed"):
+            prepare_output_folder(out / ".batch" / name)
+        plain = asdict(batch.settings)
+        about = json.loads(
+            json.dumps({"clips": [clip._asdict() for clip in clips], "settings": plain})
+        )
+        path = out / ".batch" / "manifest.json"
+        if not path.exists():
+            write_text(path, json.dumps(about, indent=1))
+        elif (before := load_json(path, ConfigurationError)) != about:
+            what = "settings" if before.get("settings") != about["settings"] else "clips"
+            raise ConfigurationError(
+                f"{out}: holds a batch of other {what}; give the same command, or another --out"
+            )
+        claims = Claims(out / ".batch" / "claims", patience_s=batch.patience)
+        job = cls(tuple(clips), batch.settings, out, claims)
+        job._forgive(all_failures=batch.retry_failed)
+        return job
+
+    def _forgive(self, *, all_failures: bool) -> None:
+        """Let clips be tried again."""
+        for clip in self.clips:
+            failure = self.failure(clip)
+            if failure is not None and (
+                all_failures or failure["of_disk"] or failure["files"] != clip.fingerprint()
+            ):
+                self._failed(clip).unlink(missing_ok=True)
+
+    def _failed(self, clip: Clip) -> Path:
+        return self.out / ".batch" / "failed" / f"{clip.name}.json"
+
+    def failure(self, clip: Clip) -> dict[str, Any] | None:
+        """Why a clip failed; None if it did not."""
+        path = self._failed(clip)
+        return load_json(path, ConfigurationError) if path.exists() else None
+
+    def is_done(self, clip: Clip) -> bool:
+        """Whether a clip was published."""
+        return (self.out / clip.name / TRACK_NAME).is_file()
+
+    def states(self) -> dict[str, State]:
+        """How far every clip is."""
+        return {clip.name: self._state(clip) for clip in self.clips}
+
+    def _state(self, clip: Clip) -> State:
+        if self.is_done(clip):
+            return State("done")
+        if (failure := self.failure(clip)) is not None:
+            return State("failed", failure["line"])
+        seen = self.claims.sight(clip.name)
+        if seen is None or seen.released:
+            return State("waiting")
+        return State("tracking", seen.progress)
+
+    def fail(self, clip: Clip, error: BaseException) -> None:
+        """Say why a clip failed."""
+        about = {
+            "line": one_line(error),
+            "of_disk": isinstance(error, OSError),
+            "files": clip.fingerprint(),
+        }
+        # A disk that is full takes no note either: then the clip is tried again.
+        with suppress(OutputError):
+            write_text(self._failed(clip), json.dumps(about))
+
+    def report(self) -> str:
+        """Write `batch.json` and `batch.html`; how many clips ended how."""
+        states = self.states()
+        kinds = [state.kind for state in states.values()]
+        counts = {kind: kinds.count(kind) for kind in ("done", "failed", "tracking", "waiting")}
+        plain = {name: state._asdict() for name, state in states.items()}
+        write_text(self.out / "batch.json", json.dumps({**counts, "clips": plain}, indent=1))
+        rows = "".join(
+            f"<tr><td><a href='{html.escape(name)}/'>{html.escape(name)}</a></td>"
+            f"<td>{state.kind}</td><td>{html.escape(state.about)}</td></tr>\n"
+            for name, state in states.items()
+        )
+        head = "<!doctype html><meta charset='utf-8'><title>batch</title>"
+        style = "<style>body{font:15px sans-serif}td{padding:2px 12px}</style>"
+        write_text(self.out / "batch.html", f"{head}{style}<table>\n{rows}</table>\n")
+        failed = [f"{name}: {s.about}" for name, s in states.items() if s.kind == "failed"]
+        summed = ", ".join(f"{number} {kind}" for kind, number in counts.items() if number)
+        return "\n".join([*failed, f"{summed}; see {self.out / 'batch.html'}"])
+
+
+def work(job: Job) -> None:
+    """Track clips until none is left: the loop of one process.
+
+    Raises:
+        KeyboardInterrupt: If the process was asked to end; what was tracked is on disk.
+    """
+    while True:
+        left = [c for c in job.clips if not job.is_done(c) and job.failure(c) is None]
+        if not left:
+            return
+        for clip in left:
+            claim = job.claims.take(clip.name)
+            if claim is not None:
+                _track(job, clip, claim)
+                break
+        else:
+            time.sleep(_POLL_S)  # others have them all; one of them may die
+
+
+class TakenOver(Exception):
+    """Somebody else has the clip now."""
+
+
+class _Watch:
+    """A sink that tells how far a clip is, and ends the tracking when somebody took over."""
+
+    def __init__(self, claim: Claim) -> None:
+        self._claim, self.first, self.done = claim, 0, 0
+        self.total: int | None = None
+
+    def progress(self) -> str:
+        """For the table of states."""
+        return f"{self.done} frames" if not self.total else f"{100 * self.done // self.total} %"
+
+    def add(self, frame: Posterior, picture: Picture) -> None:
+        """Before this frame is in a checkpoint, see that the claim holds."""
+        self.done = frame.frame.index + 1 - self.first
+        if not self._claim.holds:
+            raise TakenOver
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def _track(job: Job, clip: Clip, claim: Claim) -> None:
+    """Track a claimed clip and publish it, or say why it failed."""
+    place = job.out / ".batch" / "work" / f"{clip.name}.{claim.generation}"
+    watch = _Watch(claim)
+    try:
+        with claim.alive(watch.progress):
+            _go_on_from(place)
+            with (
+                (place / "log.txt").open("a", encoding="utf-8") as log,
+                redirect_stdout(log),
+                redirect_stderr(log),
+            ):
+                try:
+                    _track_into(place, job, clip, watch)
+                except Exception:
+                    traceback.print_exc()
+                    raise
+            if claim.holds:
+                _publish(place, job.out / clip.name)
+    except TakenOver:
+        return
+    except Exception as error:
+        job.fail(clip, error)
+    finally:
+        claim.release()
+
+
+def _track_into(place: Path, job: Job, clip: Clip, watch: _Watch) -> None:
+    row = clip.row
+    begin, end = row.get("start", 0), row.get("stop")
+    watch.first = begin
+    watch.total = VideoReader(row["video"], start=begin, stop=end).num_selected
+    own = {name: row[name] for name in SETTINGS if name in row}
+    options = {name: row[name] for name in OPTIONS if name in row}
+    track_video(
+        row["video"],
+        camera=clip.path("camera"),
+        keypoints=clip.path("keypoints"),
+        out=place,
+        settings=settings_from_plain({**asdict(job.settings), **own}),
+        start=begin,
+        stop=end,
+        options=TrackOptions(
+            masks=clip.path("masks"), init=clip.path("init"), live=watch, resume=True, **options
+        ),
+    )
+
+
+def _go_on_from(place: Path) -> None:
+    """Copy what the claim before has left; its owner may still write into its own folder."""
+    name, _, generation = place.name.rpartition(".")
+    before = place.with_name(f"{name}.{int(generation) - 1}")
+    shutil.rmtree(place, ignore_errors=True)
+    place.mkdir(parents=True)
+    if before.is_dir():
+        # The checkpoint first: the track may be newer than that, but not older.
+        for file in sorted(before.iterdir(), key=lambda file: file.name != CHECKPOINT_NAME):
+            with suppress(OSError):
+                shutil.copy2(file, place / file.name)
+
+
+def _publish(place: Path, out: Path) -> None:
+    """Give the folder its final name; whoever comes second leaves it."""
+    with suppress(FileExistsError, NotADirectoryError):
+        try:
+            os.rename(place, out)
+        except OSError as error:
+            if not (out / TRACK_NAME).is_file():
+                raise OutputError(f"{out}: is in the way of the result; move it") from error
+    for old in place.parent.glob(f"{out.name}.*"):
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """One process of a batch, for `torchrun` and schedulers."""
+    try:
+        with ended_by_sigterm():
+            tyro.cli(Batch, args=arguments, description=__doc__).run()
+    except TorchcssError as error:
+        print(f"torchcss: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 0
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

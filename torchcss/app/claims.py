@@ -1,0 +1,150 @@
+"""Who works on what, told by files alone: for processes of many machines that share a folder.
+
+A claim is a file `NAME.GENERATION`, made by one exclusive act (a hard link of a file that is
+complete, which network file systems honour): of several that try, one succeeds. Its owner shows
+that it lives by adding lines; their number is a counter, and the last one says how far it is. A
+claim whose counter stands still, as long as another process watches it by a clock of its own, may
+be taken over: by a claim of the next generation. Clocks of two machines are never compared. An
+owner that wakes up finds the newer generation, and has to write nothing more.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import NamedTuple
+
+from torchcss.files import output_error
+
+_RELEASED = "released"
+
+
+class Sight(NamedTuple):
+    """What is seen of the newest claim to something.
+
+    Attributes:
+        generation: Its number, from 1 on.
+        owner: Machine and process.
+        counter: How often it has shown that its owner lives.
+        progress: What its owner said last.
+    """
+
+    generation: int
+    owner: str
+    counter: int
+    progress: str
+
+    @property
+    def released(self) -> bool:
+        """Whether its owner has let it go."""
+        return self.progress == _RELEASED
+
+
+class Claim:
+    """One's own claim.
+
+    Attributes:
+        name: What is claimed.
+        generation: The how manyth claim to it this is.
+    """
+
+    def __init__(self, claims: Claims, name: str, generation: int) -> None:
+        self.name, self.generation = name, generation
+        self._claims, self._path = claims, claims.folder / f"{name}.{generation}"
+
+    @property
+    def holds(self) -> bool:
+        """Whether nobody has taken over."""
+        seen = self._claims.sight(self.name)
+        return seen is not None and seen.generation == self.generation
+
+    def beat(self, progress: str) -> None:
+        """Show that the owner lives, and how far it is."""
+        with suppress(OSError), self._path.open("a", encoding="utf-8") as file:
+            file.write(progress + "\n")
+
+    def release(self) -> None:
+        """Let it go: the next one may claim at once."""
+        self.beat(_RELEASED)
+
+    @contextmanager
+    def alive(self, progress: Callable[[], str]) -> Iterator[None]:
+        """Beat from a thread of its own while the body runs."""
+        over = threading.Event()
+
+        def beat() -> None:
+            while not over.wait(self._claims.beat_s):
+                self.beat(progress())
+
+        thread = threading.Thread(target=beat, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            thread.join()
+
+
+class Claims:
+    """The claims of a folder.
+
+    Args:
+        folder: Where their files lie.
+        patience_s: How long a counter has to stand still until its claim may be taken over.
+        clock: Seconds of this process; need not agree with any other.
+    """
+
+    def __init__(
+        self, folder: Path, *, patience_s: float = 60.0, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.folder, self.patience_s, self.beat_s = folder, patience_s, patience_s / 10
+        self._clock = clock
+        self._watched: dict[str, tuple[tuple[int, int], float]] = {}
+
+    def sight(self, name: str) -> Sight | None:
+        """The newest claim to something; None: nobody has claimed it."""
+        found = [
+            int(path.suffix[1:])
+            for path in self.folder.glob(f"{name}.*")
+            if path.stem == name and path.suffix[1:].isdigit()
+        ]
+        if not found:
+            return None
+        lines = (self.folder / f"{name}.{max(found)}").read_text(encoding="utf-8").splitlines()
+        return Sight(max(found), lines[0], len(lines), lines[-1] if len(lines) > 1 else "")
+
+    def take(self, name: str) -> Claim | None:
+        """Claim something; None where somebody else has it, or was faster.
+
+        Raises:
+            OutputError: If the folder cannot be written.
+        """
+        seen = self.sight(name)
+        if seen is not None and not (seen.released or self._stands_still(name, seen)):
+            return None
+        generation = 1 if seen is None else seen.generation + 1
+        draft = self.folder / f".{uuid.uuid4().hex}"
+        try:
+            draft.write_text(f"{socket.gethostname()} process {os.getpid()}\n", encoding="utf-8")
+            os.link(draft, self.folder / f"{name}.{generation}")
+        except FileExistsError:
+            return None
+        except OSError as error:
+            raise output_error(self.folder, error) from error
+        finally:
+            draft.unlink(missing_ok=True)
+        return Claim(self, name, generation)
+
+    def _stands_still(self, name: str, seen: Sight) -> bool:
+        now, state = self._clock(), (seen.generation, seen.counter)
+        before, since = self._watched.get(name, (state, now))
+        if before != state:
+            since = now
+        self._watched[name] = state, since
+        return now - since >= self.patience_s
