@@ -306,7 +306,7 @@ class Job(NamedTuple):
     def fail(self, clip: Clip, error: BaseException) -> None:
         """Say why a clip failed."""
         about = {
-            "line": one_line(error),
+            "line": str(error) if isinstance(error, TorchcssError) else one_line(error),
             "of_disk": isinstance(error, OSError),
             "files": clip.fingerprint(),
         }

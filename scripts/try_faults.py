@@ -1,0 +1,281 @@
+"""Disturb batches in the ways that machines have, and see that nothing is lost.
+
+    python scripts/try_faults.py --rounds 50 --out faults.json
+
+Each round tracks the same clips, parts of the demo's, in a new folder with several processes of
+`torchcss.app.batch`, and at a random moment does one thing to one of them, to its disk or to its
+clip:
+
+| fault | what happens |
+|---|---|
+| kill | a process is killed |
+| sleep | a process is stopped, taken over, and woken up |
+| end | a process is asked to end, as schedulers do: within ten seconds, with status 0 |
+| disk | no file may be larger than a part of the track |
+| video | a video is cut off, and whole again later |
+| folder | the folder cannot be written (left out for root, who may) |
+
+When the cause is gone, the same command is given again. A round is lost if a clip is missing, or
+differs by a bit from that of an undisturbed batch, or if a half file is left.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from common import Table, start, write_report
+
+from torchcss.app.batch import Batch
+from torchcss.io.tracks import load_track
+from torchcss.studies.demo import CLIP
+from torchcss.tracking.settings import Settings
+
+SETTINGS = Settings(body="arm8", samples=8, modes=2, keypoints_use="first", overlay=False)
+_WORDS = [
+    "--body",
+    "arm8",
+    "--samples",
+    "8",
+    "--modes",
+    "2",
+    "--keypoints-use",
+    "first",
+    "--no-overlay",
+]
+_SOON_S, _LATE_S, _POLL_S = 10.0, 300.0, 0.02
+_SMALL = 12_000
+"""Bytes of a file that is smaller than a track of some frames."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """How much is tried."""
+
+    rounds: int = 20
+    """Rounds."""
+    clips: int = 3
+    """Clips of a batch."""
+    frames: int = 12
+    """Frames of a clip."""
+    processes: int = 2
+    """Processes of a batch."""
+    patience: float = 2.0
+    """Seconds until a process that shows no life is taken over."""
+    faults: tuple[str, ...] = ("kill", "sleep", "end", "disk", "video", "folder")
+    """What is tried, in turns."""
+    folder: Path = Path("faults")
+    """Where batches are written; those of rounds that went well are removed."""
+    seed: int = 0
+    """Seed of the moments."""
+    out: Path | None = None
+    """JSON file to write."""
+
+
+class Lost(Exception):
+    """What was lost in a round."""
+
+
+@dataclass(frozen=True)
+class Round:
+    """One batch in a folder of its own."""
+
+    config: Config
+    folder: Path
+    moment: random.Random
+
+    @property
+    def out(self) -> Path:
+        """The batch's folder."""
+        return self.folder / "out"
+
+    @property
+    def video(self) -> Path:
+        """The first clip's video; the others share another."""
+        return self.folder / "first.mp4"
+
+    @property
+    def printed(self) -> str:
+        """What its processes have printed."""
+        return (self.folder / "printed.txt").read_text(encoding="utf-8")
+
+    def prepare(self) -> None:
+        """Write the manifest."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+        self.folder.mkdir(parents=True)
+        shutil.copy(CLIP / "video.mp4", self.video)
+        rows = [
+            {
+                "name": f"clip{number}",
+                "video": str(CLIP / "video.mp4" if number else self.video.resolve()),
+                "camera": str(CLIP / "cameras.json"),
+                "keypoints": str(CLIP / "keypoints.npz"),
+                "init": str(CLIP / "body.npz"),
+                "stop": self.config.frames,
+                "seed": number,
+            }
+            for number in range(self.config.clips)
+        ]
+        (self.folder / "clips.jsonl").write_text("\n".join(map(json.dumps, rows)))
+
+    def begin(self, prepare: Callable[[], None] | None = None) -> subprocess.Popen[bytes]:
+        """Start one process of the batch."""
+        words = [sys.executable, "-m", "torchcss.app.batch", str(self.folder / "clips.jsonl")]
+        words += ["--out", str(self.out), "--patience", str(self.config.patience), *_WORDS]
+        with (self.folder / "printed.txt").open("ab") as printed:
+            return subprocess.Popen(
+                words, stdout=printed, stderr=printed, preexec_fn=prepare,
+                env={**os.environ, "OMP_NUM_THREADS": "1"},
+            )  # fmt: skip
+
+    def again(self) -> None:
+        """The same command, here, when the cause is gone."""
+        Batch(
+            manifest=self.folder / "clips.jsonl", out=self.out, settings=SETTINGS,
+            patience=self.config.patience,
+        ).run()  # fmt: skip
+
+    def wait_for(self, what: Callable[[], bool], process: subprocess.Popen[bytes]) -> None:
+        """Until something is so, or the process has ended."""
+        until = time.monotonic() + _LATE_S
+        while process.poll() is None and not what():
+            if time.monotonic() > until:
+                raise Lost("nothing happened for five minutes")
+            time.sleep(_POLL_S)
+
+    def is_tracking(self) -> bool:
+        """Whether some frames of a clip are in a checkpoint."""
+        return any((self.out / ".batch" / "work").glob("*/checkpoint.npz"))
+
+    def catch(self, process: subprocess.Popen[bytes]) -> None:
+        """Wait until it tracks, and a random while longer."""
+        self.wait_for(self.is_tracking, process)
+        time.sleep(self.moment.uniform(0, 1.0))
+
+
+def kill(batch: Round) -> None:
+    """SIGKILL."""
+    processes = [batch.begin() for _ in range(batch.config.processes)]
+    batch.catch(processes[0])
+    processes[0].kill()
+    for process in processes:
+        process.wait(_LATE_S)
+
+
+def sleep(batch: Round) -> None:
+    """SIGSTOP, and SIGCONT when all is done by others."""
+    process = batch.begin()
+    batch.catch(process)
+    process.send_signal(signal.SIGSTOP)
+    batch.again()
+    process.send_signal(signal.SIGCONT)
+    _expect(process.wait(_LATE_S) == 0, "a process that was taken over ended with an error")
+
+
+def end(batch: Round) -> None:
+    """SIGTERM."""
+    process = batch.begin()
+    batch.catch(process)
+    process.terminate()
+    try:
+        _expect(process.wait(_SOON_S) == 0, "SIGTERM: not status 0")
+    except subprocess.TimeoutExpired as error:
+        raise Lost("SIGTERM: did not end within ten seconds") from error
+
+
+def disk(batch: Round) -> None:
+    """RLIMIT_FSIZE."""
+
+    def little_space() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (_SMALL, _SMALL))
+
+    _expect(batch.begin(little_space).wait(_LATE_S) == 0, "a full disk ended a process")
+    _expect("cannot be written" in batch.printed, "the disk: no clip failed")
+
+
+def video(batch: Round) -> None:
+    """A video is cut off."""
+    whole = batch.video.read_bytes()
+    batch.video.write_bytes(whole[: len(whole) // 3])
+    _expect(batch.begin().wait(_LATE_S) == 0, "a damaged video ended a process")
+    _expect("1 failed" in batch.printed, "a damaged video: no clip failed")
+    batch.video.write_bytes(whole)
+
+
+def folder(batch: Round) -> None:
+    """The folder of the work cannot be written."""
+    place = batch.out / ".batch" / "work"
+    place.mkdir(parents=True)
+    place.chmod(0o500)
+    batch.begin().wait(_LATE_S)
+    place.chmod(0o700)
+
+
+FAULTS = {f.__name__: f for f in (kill, sleep, end, disk, video, folder)}
+
+
+def _expect(so: bool, what: str) -> None:
+    if not so:
+        raise Lost(what)
+
+
+def compare(batch: Round, undisturbed: Path) -> None:
+    """That every clip is there, whole, once, and the same."""
+    batch.again()
+    left = [path.name for path in (batch.out / ".batch" / "work").iterdir()]
+    _expect(not left, f"left in work: {left}")
+    for number in range(batch.config.clips):
+        name = f"clip{number}"
+        found, expected = (load_track(out / name) for out in (batch.out, undisturbed))
+        for field in ("frames", "state", "covariance", "log_weight", "cost", "joints_world"):
+            same = np.array_equal(getattr(found, field), getattr(expected, field))
+            _expect(same, f"{name}: {field} differs")
+        state = json.loads((batch.out / name / "summary.json").read_text())["ended"]
+        _expect(state == "complete", f"{name}: {state}")
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Try, print and write; return what is written."""
+    calm = Round(config, config.folder / "undisturbed", random.Random())
+    calm.prepare()
+    calm.again()
+    rows = []
+    for number in range(config.rounds):
+        name = config.faults[number % len(config.faults)]
+        if name == "folder" and os.geteuid() == 0:
+            rows.append([number, name, "left out: root may write everywhere"])
+            continue
+        batch = Round(config, config.folder / f"round{number}", random.Random(config.seed + number))
+        batch.prepare()
+        try:
+            FAULTS[name](batch)
+            compare(batch, calm.out)
+        except (Lost, subprocess.TimeoutExpired) as error:
+            rows.append([number, name, f"lost: {error}"])
+        else:
+            rows.append([number, name, "nothing lost"])
+            shutil.rmtree(batch.folder)
+        print(*rows[-1], flush=True)
+    table = Table("Faults", ("round", "fault", "outcome"), rows)
+    table.print()
+    lost = sum(str(row[2]).startswith("lost") for row in rows)
+    report = {"rounds": len(rows), "lost": lost, "rows": rows}
+    write_report(config.out, report, table)
+    return report
+
+
+if __name__ == "__main__":
+    start(main, Config, __doc__)

@@ -1,0 +1,89 @@
+"""Claims: one of several gets a clip, and who shows no life is taken over."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+
+from torchcss.app.claims import Claims
+from torchcss.errors import OutputError
+
+
+class Clock:
+    """Seconds that pass when a test says so."""
+
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_one_of_several_gets_it(tmp_path: Path) -> None:
+    first, second = Claims(tmp_path), Claims(tmp_path)
+    claim = first.take("clip.a")
+    assert claim is not None
+    assert claim.holds
+    assert second.take("clip.a") is None
+    assert second.take("clip") is not None, "another name"
+    seen = second.sight("clip.a")
+    assert seen is not None
+    assert (seen.generation, seen.progress) == (1, "")
+    claim.beat("40 %")
+    seen = second.sight("clip.a")
+    assert seen is not None
+    assert (seen.counter, seen.progress) == (2, "40 %")
+
+
+def test_who_lives_keeps_it_and_who_stands_still_is_taken_over(tmp_path: Path) -> None:
+    clock = Clock()
+    claim, other = Claims(tmp_path).take("a"), Claims(tmp_path, patience_s=10, clock=clock)
+    assert claim is not None
+    for _ in range(5):
+        assert other.take("a") is None
+        clock.now += 9
+        claim.beat("")
+    assert other.take("a") is None
+    clock.now += 9.9
+    assert other.take("a") is None
+    assert claim.holds
+    clock.now += 0.2
+    taken = other.take("a")
+    assert taken is not None
+    assert taken.generation == 2
+    assert not claim.holds
+
+
+def test_a_clock_that_jumps_back_takes_nothing_over(tmp_path: Path) -> None:
+    clock = Clock()
+    assert Claims(tmp_path).take("a") is not None
+    other = Claims(tmp_path, patience_s=10, clock=clock)
+    for now in (1000.0, 0.0, -1000.0, 9.0):
+        clock.now = now
+        assert other.take("a") is None
+
+
+def test_what_is_released_can_be_claimed_at_once(tmp_path: Path) -> None:
+    claim = Claims(tmp_path).take("a")
+    assert claim is not None
+    claim.release()
+    again = Claims(tmp_path).take("a")
+    assert again is not None
+    assert again.generation == 2
+
+
+def test_it_beats_by_itself(tmp_path: Path) -> None:
+    claims = Claims(tmp_path, patience_s=0.1)
+    claim = claims.take("a")
+    assert claim is not None
+    with claim.alive(lambda: "half"):
+        time.sleep(0.3)
+    seen = claims.sight("a")
+    assert seen is not None
+    assert seen.progress == "half"
+
+
+def test_a_folder_that_is_gone(tmp_path: Path) -> None:
+    with pytest.raises(OutputError):
+        Claims(tmp_path / "nowhere").take("a")
