@@ -125,6 +125,7 @@ def test_track_starts_from_it(scene: Path, result: Path, tmp_path: Path, capsys)
         (("--normalised", "zero-one"), "expected fractions of the image"),
         (("--body", "octopus"), "octopus"),
         (("--click",), "no window can be opened"),
+        (("--coarse-pose", "nowhere.json"), "nowhere.json"),
     ],
 )
 def test_one_clear_line(scene: Path, tmp_path: Path, options: tuple, message: str, capsys):
@@ -132,6 +133,20 @@ def test_one_clear_line(scene: Path, tmp_path: Path, options: tuple, message: st
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert line.startswith("torchcss: ")
     assert message in line
+
+
+def test_the_papers_stages_from_a_coarse_pose(scene: Path, tmp_path: Path, capsys):
+    camera = ("--camera", str(scene / "cameras.json"))
+    pose = tmp_path / "pose.json"
+    pose.write_text(json.dumps({"r_elbow_flexion": 0.5}))
+    papers = ("--initialisation", "papers", "--coarse-pose", str(pose), *camera)
+    assert init(scene, tmp_path / "out", *papers) == 0
+    assert "1 hypotheses" in capsys.readouterr().out
+    for text, message in (("[1]", "numbers by parameter"), ('{"tail": 1}', "tail"),
+                          ('{"r_elbow_flexion": "far"}', "numbers by parameter")):  # fmt: skip
+        pose.write_text(text)
+        assert init(scene, tmp_path / "other", *papers) == 2
+        assert message in capsys.readouterr().err
 
 
 def few_starts(monkeypatch: pytest.MonkeyPatch) -> None:

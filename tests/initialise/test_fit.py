@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from importlib import import_module
 from typing import Any
@@ -14,12 +15,25 @@ import torchcss
 from torchcss.body.catalog import LENGTHS
 from torchcss.body.load import load_body
 from torchcss.body.root import has_root
+from torchcss.cost.anthropometric import Anthropometric
+from torchcss.cost.context import FrameContext
+from torchcss.cost.interpenetration import Interpenetration
+from torchcss.cost.joints import JointTerm, match_joints
 from torchcss.cost.part_map import part_map
+from torchcss.cost.stabiliser import Stabiliser
+from torchcss.cost.total import TrackingCost
 from torchcss.cost.view import View
 from torchcss.errors import BodyError, CameraError, ConfigurationError, KeypointError
 from torchcss.initialise.fit import DEFAULT_VIEW_DEGREES, default_camera, initialise
+from torchcss.initialise.from_joints import hang_before_camera
 from torchcss.initialise.keypoint_checks import default_sigma, typical_sigma
-from torchcss.initialise.multi_start import PAPER_PROPORTIONS, SINGLE_START, Search
+from torchcss.initialise.multi_start import (
+    PAPER_PROPORTIONS,
+    PAPERS,
+    SINGLE_START,
+    Search,
+    multi_start_fits,
+)
 from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
 from torchcss.initialise.result import Initialisation, hang_on_best, stature_of
 from torchcss.studies.metrics import LIMB_JOINTS, mask_overlap, pa_mpjpe_mm
@@ -389,6 +403,54 @@ def test_only_the_papers_proportions_if_asked():
     assert fitted == set(PAPER_PROPORTIONS)
     with pytest.raises(ConfigurationError, match="tail"):
         Search(proportions=("tail",))
+
+
+def test_the_papers_stages_are_one_fit_that_keeps_parts_apart():
+    options = InitialiseOptions(search=replace(SMALL, coarse_pose={"root_yaw": 1.0})).as_papers()
+    assert options.search == replace(PAPERS, coarse_pose={"root_yaw": 1.0})
+    assert options.num_modes == 1
+    assert not options.colours
+    choice = replace(options, sigma=2.0).joint_choice
+    assert [type(term) for term in choice.terms] == [
+        JointTerm, Stabiliser, Anthropometric, Interpenetration
+    ]  # fmt: skip
+    stabiliser = choice.find(Stabiliser)
+    assert stabiliser is not None
+    assert stabiliser.hidden_only
+
+
+def test_a_coarse_pose_leads_a_single_start_to_the_fit(found: Initialisation):
+    someone = person()
+    names = found.free_body.state_names
+    coarse = dict(zip(names, found.free_mixture.mean[0].tolist(), strict=True))
+    near = find(someone, replace(PAPERS, coarse_pose=coarse), num_modes=1, printed=True)
+    assert len(near.cost) == 1
+    assert abs(error_mm(near, someone)[0] - error_mm(found, someone)[0]) < 5
+    at_rest = find(someone, PAPERS, num_modes=1, printed=True)
+    assert error_mm(at_rest, someone)[0] > error_mm(near, someone)[0] + 20
+    with pytest.raises(BodyError, match="tail"):
+        find(someone, replace(PAPERS, coarse_pose={"tail": 0.0}))
+
+
+@pytest.mark.parametrize("yaw", [0.0, math.pi / 2, math.pi])
+def test_a_start_is_turned_as_the_joints_say(yaw: float, generator: torch.Generator):
+    someone = person()
+    seen = Keypoints(someone.keypoints, someone.confidence, someone.joint_names)
+    body = load_body("body34", free_proportions=True)
+    body = hang_before_camera(body, someone.camera, match_joints(seen, body.joint_names))
+    x = body.rest[None].clone()
+    x[:, body.state_index("root_yaw")] = yaw
+    marked = body.pose(x).joints[0]
+    keypoints = Keypoints(
+        someone.camera.project(marked).uv, torch.ones(len(marked)).to(marked), body.joint_names
+    )
+    cost = TrackingCost(
+        choice=InitialiseOptions(sigma=2.0).joint_choice,
+        views=(FrameContext(body=body, camera=someone.camera, keypoints=keypoints),),
+    )
+    fits = multi_start_fits(cost, search=PAPERS, generator=generator)
+    turned = fits.mean[0, body.state_index("root_yaw")]
+    assert torch.cos(turned - yaw) > 0.9
 
 
 def test_default_sigma_follows_the_persons_size():

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 import tyro
 
 from torchcss.app.init import PictureFiles, initialise_image
 from torchcss.body.catalog import PROPORTIONS
-from torchcss.errors import KeypointError
-from torchcss.files import prepare_output_folder
+from torchcss.errors import ConfigurationError, KeypointError
+from torchcss.files import load_json, prepare_output_folder
 from torchcss.initialise.multi_start import PAPER_PROPORTIONS, Search
 from torchcss.initialise.options import InitialiseOptions
 from torchcss.io.video import read_frame
@@ -36,6 +37,10 @@ class Init:
     """Height of the standing person, metres; by default the prior sets the scale."""
     proportions: Literal["all", "papers"] = "all"
     """Lengths to fit: all, or the papers' (hips, clavicles, neck and skull)."""
+    initialisation: Literal["ours", "papers"] = "ours"
+    """From many starts, or the papers' three stages: one fit from a coarse pose, no colours."""
+    coarse_pose: Path | None = None
+    """JSON file of a pose to start from: radians by parameter of the body."""
     hypotheses: Literal["best", "all"] | int = 8
     """How many hypotheses to keep: best, all, or a number."""
     contours: bool = True
@@ -72,11 +77,13 @@ class Init:
             num_modes={"best": 1, "all": None}.get(str(self.hypotheses), self.hypotheses),  # type: ignore[arg-type]
             contours=self.contours,
             colours=self.colours,
-            search=Search(proportions=proportions),
+            search=Search(proportions=proportions, coarse_pose=_coarse_pose(self.coarse_pose)),
             dtype=torch.float32 if self.dtype == "float32" else torch.float64,
             device=self.device,
             free_root=self.free_root,
         )
+        if self.initialisation == "papers":
+            options = options.as_papers()
         found, summary = initialise_image(
             self.image,
             self.out,
@@ -94,3 +101,18 @@ class Init:
                 f"{row['difference_percent']:+11.1f} %"
             )
         print(f"{len(found.cost)} hypotheses in {summary['seconds']:.1f} s; look at {self.out}")
+
+
+def _coarse_pose(path: Path | None) -> dict[str, float]:
+    if path is None:
+        return {}
+    pose: Any = load_json(path, ConfigurationError)
+    if not isinstance(pose, dict) or not all(_is_number(value) for value in pose.values()):
+        raise ConfigurationError(
+            f'{path}: expected numbers by parameter, such as {{"l_elbow_flexion": 1}}'
+        )
+    return pose
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and math.isfinite(value)

@@ -22,7 +22,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float
@@ -73,6 +74,9 @@ class Search:
         max_steps: Iterations of the last descent.
         proportions: Which lengths are fitted, all by default; the others stay the standard
             humanoid's.
+        coarse_pose: The first start, radians by parameter; the others are at rest (`sticky_mean`).
+        turn: Turn the first start about the vertical to where the keypoints cost least, unless it
+            says `root_yaw`.
     """
 
     num_starts: int = 64
@@ -85,6 +89,8 @@ class Search:
     leave_out: bool = True
     max_steps: int = 40
     proportions: tuple[str, ...] = PROPORTIONS
+    coarse_pose: Mapping[str, float] = field(default_factory=dict)
+    turn: bool = False
 
     def __post_init__(self) -> None:
         for name, least in (("num_starts", 1), ("num_trunks", 1), ("num_flips", 0),
@@ -121,6 +127,12 @@ SINGLE_START = Search(
 )
 """One descent from the rest pose: what a local fit without search does."""
 
+PAPERS = replace(SINGLE_START, turn=True)
+"""Section 5 [IJRR]: one descent from a coarse pose, else from rest, turned as the joints say."""
+
+_TURNS = 8
+"""Directions that a turned start is looked for in."""
+
 
 def multi_start_fits(cost: TrackingCost, *, search: Search, generator: torch.Generator) -> Modes:
     """Descend from many starts to the minima of a cost of keypoints.
@@ -135,8 +147,10 @@ def multi_start_fits(cost: TrackingCost, *, search: Search, generator: torch.Gen
     """
     body = cost.body
     bounds = search.bounds(body)
+    first = starts_about(body, search.num_starts, generator)
+    first[:1] = _coarse_start(cost, first[:1], search)
     fits = descend(
-        cost, starts_about(body, search.num_starts, generator), bounds,
+        cost, first, bounds,
         ((_WIDE, 12), (_MIDDLE, 12)) if search.anneal else (),
     )  # fmt: skip
     starts = [fits]
@@ -198,6 +212,21 @@ def starts_about(body: BodyModel, num: int, generator: torch.Generator) -> Float
         x[:, columns] = 0.1 * noise[:, columns]
         turn = torch.arange(num, device=x.device).to(x) * (2 * math.pi / num)
         x[:, body.state_index("root_yaw")] = torch.remainder(turn + math.pi, 2 * math.pi) - math.pi
+    return body.bounds.project(x)
+
+
+def _coarse_start(
+    cost: TrackingCost, x: Float[Tensor, "1 n"], search: Search
+) -> Float[Tensor, "1 n"]:
+    """A start with the parameters of the coarse pose, turned as the keypoints say."""
+    body, x = cost.body, x.clone()
+    for name, value in search.coarse_pose.items():
+        x[:, body.state_index(name)] = value
+    if search.turn and has_root(body) and "root_yaw" not in search.coarse_pose:
+        x = x.repeat(_TURNS, 1)
+        turn = torch.arange(_TURNS).to(x) * (2 * math.pi / _TURNS)
+        x[:, body.state_index("root_yaw")] = torch.remainder(turn + math.pi, 2 * math.pi) - math.pi
+        x = x[_widened(cost, _WIDE).value(x).argmin()][None]
     return body.bounds.project(x)
 
 

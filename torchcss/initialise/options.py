@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 
 from torchcss.cost.anthropometric import Anthropometric
 from torchcss.cost.choice import CostChoice
+from torchcss.cost.interpenetration import Interpenetration
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.pose_prior import PosePrior
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.errors import ConfigurationError
-from torchcss.initialise.multi_start import Search
+from torchcss.initialise.multi_start import PAPERS, Search
 from torchcss.robust import Lorentzian
 
 LEAST_JOINTS = 3
@@ -30,6 +31,9 @@ class InitialiseOptions:
         least_joints: Fewest joints of the body that have to be known; with fewer than
             `LEAST_JOINTS` much stays at its prior.
         pose_prior: Prefer poses that people take (`torchcss.cost.pose_prior`).
+        printed: Take the papers' priors: no pose prior, stabilisers on what is hard to estimate
+            alone, and repulsion in all stages. While the second and third stage fit the shape,
+            repulsion sees the parts as they were before; afterwards as they were found.
         contours: Run the second and third stage on the picture's contours.
         colours: Let them see the colours on either side too.
         working_size: Longer side of the picture on which contours are searched.
@@ -45,6 +49,7 @@ class InitialiseOptions:
     num_modes: int | None = 8
     least_joints: int = 1
     pose_prior: bool = True
+    printed: bool = False
     contours: bool = True
     colours: bool = True
     working_size: int = 640
@@ -60,6 +65,17 @@ class InitialiseOptions:
                 f"expected at least 1 hypothesis to be kept, got {self.num_modes}"
             )
 
+    def as_papers(self) -> InitialiseOptions:
+        """The same, with the three stages of section 5 [IJRR] and nothing of ours.
+
+        One fit from a coarse pose to joints and edges, with limits, stabilisers, proportions and
+        repulsion.
+        """
+        search = replace(
+            PAPERS, proportions=self.search.proportions, coarse_pose=self.search.coarse_pose
+        )
+        return replace(self, search=search, num_modes=1, printed=True, colours=False)
+
     @property
     def joint_choice(self) -> CostChoice:
         """Terms of the first stage: keypoints of known noise, and the priors of a single image."""
@@ -68,8 +84,9 @@ class InitialiseOptions:
         return CostChoice(
             terms=(
                 JointTerm(sigma=self.sigma, potential_kind=self.potential_kind),
-                Stabiliser(),
+                Stabiliser(hidden_only=self.printed),
                 Anthropometric(stature=0.0) if known else Anthropometric(),
-                *((PosePrior(),) if self.pose_prior else ()),
+                *((PosePrior(),) if self.pose_prior and not self.printed else ()),
+                *((Interpenetration(),) if self.printed else ()),
             )
         )
