@@ -108,9 +108,8 @@ def _coarse_pose(path: Path | None) -> dict[str, float]:
         return {}
     pose: Any = load_json(path, ConfigurationError)
     if not isinstance(pose, dict) or not all(_is_number(value) for value in pose.values()):
-        raise ConfigurationError(
-            f'{path}: expected numbers by parameter, such as {{"l_elbow_flexion": 1}}'
-        )
+        example = '{"l_elbow_flexion": 1.2}'
+        raise ConfigurationError(f"{path}: expected numbers by parameter, such as {example}")
     return pose
 
 
