@@ -46,7 +46,7 @@ from torchcss.tracking.settings import Settings, settings_from_plain
 FILES = ("video", "camera", "keypoints", "masks", "init")
 """Columns that are paths, from the manifest's folder on."""
 
-OPTIONS = ("camera_name", "layout", "person", "frame_rate", "focal", "fov", "stride")
+OPTIONS = ("camera_name", "layout", "person", "frame_rate", "sigma", "focal", "fov", "stride")
 """Columns that are options of the files, see `TrackOptions`."""
 
 SETTINGS = ("body", "preset", "seed", "samples", "modes", "keypoints_use", "working_size")
@@ -54,7 +54,7 @@ SETTINGS = ("body", "preset", "seed", "samples", "modes", "keypoints_use", "work
 
 _NUMBERS = {
     **dict.fromkeys(("start", "stop", "stride", "seed", "samples", "modes", "working_size"), int),
-    **dict.fromkeys(("frame_rate", "focal", "fov"), float),
+    **dict.fromkeys(("frame_rate", "sigma", "focal", "fov"), float),
 }
 _COLUMNS = ("name", "start", "stop", *FILES, *OPTIONS, *SETTINGS)
 _POLL_S = 0.5

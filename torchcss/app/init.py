@@ -191,6 +191,7 @@ def initialise_video(
     *,
     start: int,
     sigma: float,
+    learn_noise: bool = False,
     generator: torch.Generator,
     others: Sequence[View] = (),
 ) -> Initialisation:
@@ -203,6 +204,7 @@ def initialise_video(
         settings: Body, terms, working size, type and device.
         start: The frame.
         sigma: Noise of the keypoints, pixels of the full image.
+        learn_noise: Take that as a guess.
         generator: Source of the starting poses.
         others: What further cameras see of that moment, see `initialise`.
 
@@ -212,6 +214,7 @@ def initialise_video(
     options = InitialiseOptions(
         sigma=sigma,
         stature=settings.stature,
+        learn_noise=learn_noise,
         least_joints=LEAST_JOINTS,
         pose_prior="pose_prior" in settings.used_terms,
         contours="contour" in settings.used_terms,

@@ -64,6 +64,7 @@ class TrackOptions:
         frame_rate: Frames per second of a folder of images; None: 30.
         person: Who of several people is followed: prominent, largest, leftmost or centre in the
             first frame, or the keypoint file's number of a person.
+        sigma: Noise of a wrist's keypoint, pixels; None: learnt from the first frame's.
         focal: Focal length in pixels, of a camera that nobody calibrated.
         fov: The same as angle between the left and the right border of the image, degrees.
         detect: What finds the keypoints where no file of them is given.
@@ -82,11 +83,14 @@ class TrackOptions:
     checkpoint_every: float = CHECKPOINT_EVERY
     frame_rate: float | None = None
     person: str = "prominent"
+    sigma: float | None = None
     focal: float | None = None
     fov: float | None = None
     detect: DetectOptions = field(default_factory=DetectOptions)
 
     def __post_init__(self) -> None:
+        if self.sigma is not None and not self.sigma > 0:
+            raise ConfigurationError(f"sigma must be positive, got {self.sigma}")
         if not self.checkpoint_every >= 0:
             raise ConfigurationError(
                 f"checkpoint_every must be at least 0 seconds, got {self.checkpoint_every}"
@@ -142,6 +146,7 @@ def track_video(
         normalised=options.normalised,
         frame_rate=options.frame_rate,
         person=options.person,
+        sigma=options.sigma,
     )
     lens = Lens(focal=options.focal, fov=options.fov)
     if camera is None:
@@ -153,6 +158,7 @@ def track_video(
     generator = torch.Generator().manual_seed(settings.seed)
     eye = views[0].camera.camera.to(dtype=settings.torch_dtype, device=settings.device)
     first = _first_pose(views, eye, settings, start, options, generator)
+    views = [opened.with_noise(first.noise) for opened in views]
     notes = [*(note for opened in views for note in opened.notes), *first.report]
     tqdm.write("\n".join(notes))
     interval = options.stride / float(views[0].reader.info.frame_rate)
@@ -300,6 +306,7 @@ def _first_pose(
         settings,
         start=start,
         sigma=view.sigma,
+        learn_noise=view.files.sigma is None,
         generator=generator,
         others=[_first_view(each, start, view.sigma, settings) for each in beside],
     )

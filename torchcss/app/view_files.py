@@ -44,6 +44,13 @@ class OpenView(NamedTuple):
     keypoints: Keypoints | None
     sigma: float
 
+    def with_noise(self, factor: float) -> OpenView:
+        """The same with so many times the noise, which is known from now on."""
+        if self.keypoints is None or self.files.sigma is not None:
+            return self
+        sigma = factor * self.sigma
+        return self._replace(files=replace(self.files, sigma=sigma), sigma=sigma)
+
     @property
     def recorded(self) -> RecordedCamera:
         """The camera with its files, as a run holds it."""
@@ -178,6 +185,6 @@ def open_view(
         layout=files.layout,
         normalised=files.normalised,
     )
-    sigma = keypoints.relative_noise * typical_sigma(keypoints)
+    sigma = files.sigma or keypoints.relative_noise * typical_sigma(keypoints)
     keypoints = keypoints._replace(relative_noise=1.0)
     return OpenView(files, reader, masks, loaded, keypoints, sigma)

@@ -38,6 +38,7 @@ from torchcss.errors import CameraError
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.initialise.from_joints import fit_joints
 from torchcss.initialise.keypoint_checks import default_sigma, keypoints_by_name, swapped_sides
+from torchcss.initialise.noise import briefly, noise_factor
 from torchcss.initialise.options import InitialiseOptions
 from torchcss.initialise.outliers import best_distinct
 from torchcss.initialise.result import (
@@ -117,10 +118,19 @@ def initialise(
             f"has {tuple(image.shape[1::-1])}; use camera.resized if it was only resized"
         )
     camera = camera.to(dtype=options.dtype, device=options.device)
-    if not options.sigma:
-        options = replace(options, sigma=default_sigma(keypoints))
+    learns = options.sigma is None if options.learn_noise is None else options.learn_noise
+    sigma = options.sigma or default_sigma(keypoints)
+    options = replace(options, sigma=sigma)
     view, others = View(camera=camera, keypoints=keypoints), tuple(others)
+    noise = 1.0
+    if learns:
+        brief = replace(options, search=briefly(options.search))
+        rough = fit_joints(body, view, generator=generator, options=brief, others=others)
+        noise = _noise(rough, view, others, options)
+        options = replace(options, sigma=noise * sigma)
+        notes = (*notes, f"keypoints: noise of a wrist {noise * sigma:.1f} px, from the best fit")
     first = fit_joints(body, view, generator=generator, options=options, others=others)
+    first = first._replace(noise=noise)
     given = keypoints.only(first.body.joint_names).to(first.body.tie)
     alone = TrackingCost(
         choice=options.joint_choice,
@@ -140,6 +150,24 @@ def initialise(
         for each in scaled
     )  # fmt: skip
     return _with_contours(first, replace(cost, views=(*cost.views, *beside)), options)
+
+
+def _noise(
+    first: Initialisation, view: View, others: tuple[View, ...], options: InitialiseOptions
+) -> float:
+    """How many times as noisy as the options say keypoints are."""
+    body, fits = first.free_body or first.body, first.free_mixture or first.mixture
+    views = tuple(
+        FrameContext(
+            body=body,
+            camera=each.camera,
+            keypoints=each.keypoints and each.keypoints.only(body.joint_names).to(body.tie),
+        )
+        for each in (view, *others)
+    )
+    # Else an unusual pose would pass for noise.
+    cost = TrackingCost(choice=options.joint_choice.without("pose_prior"), views=views)
+    return noise_factor(cost, fits.mean[0], options.search)
 
 
 def _factor(camera: Camera, working: Camera) -> float:

@@ -26,6 +26,8 @@ class InitialiseOptions:
 
     Attributes:
         sigma: Noise of a wrist's keypoint, pixels; None: 0.6 % of the person's size.
+        learn_noise: Take that as a guess, and learn the noise from the best fit's errors
+            (`torchcss.initialise.noise`); None: where `sigma` is not given.
         stature: Height of the standing person, metres, where it is known.
         num_modes: Most hypotheses; 1 for the best alone, None for all.
         least_joints: Fewest joints of the body that have to be known; with fewer than
@@ -45,6 +47,7 @@ class InitialiseOptions:
     """
 
     sigma: float | None = None
+    learn_noise: bool | None = None
     stature: float | None = None
     num_modes: int | None = 8
     least_joints: int = 1

@@ -68,6 +68,7 @@ class Initialisation(NamedTuple):
         free_body: The same body with its lengths as parameters; None where they were given.
         free_mixture: The fits of pose and lengths together, best first, on `free_body`.
         left_out: Joints whose keypoints fit no pose and were left out.
+        noise: How many times as noisy as was assumed keypoints were found to be.
     """
 
     body: BodyModel
@@ -80,6 +81,7 @@ class Initialisation(NamedTuple):
     free_body: BodyModel | None = None
     free_mixture: GaussianMixture | None = None
     left_out: tuple[str, ...] = ()
+    noise: float = 1.0
 
     def hypotheses(self, num: int, *, generator: torch.Generator) -> Float[Tensor, "num n"]:
         """The first `num` states to believe in: the fits, then samples of their mixture.

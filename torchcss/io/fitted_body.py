@@ -79,6 +79,7 @@ def write_fitted_body(path: str | os.PathLike[str], found: Initialisation, camer
         "body": body.name,
         "body_file": os.path.abspath(body.name) if _is_file(body.name) else "",
         "scale": found.scale,
+        "noise": found.noise,
         "length_names": np.array(list(found.lengths), dtype=np.str_),
         "lengths": np.array(list(found.lengths.values()), dtype=np.float64),
         "part_names": np.array(body.part_names, dtype=np.str_),
@@ -144,7 +145,8 @@ def read_fitted_body(
     mixture = GaussianMixture(tensors["state"], tensors["covariance"], tensors["log_weight"])
     note = f"first pose: {len(mixture.mean)} hypotheses from {path}"
     body = body.with_base(rotation, translation)
-    return Initialisation(body, mixture, tensors["cost"], (note,), lengths, scale)
+    noise = float(arrays.get("noise", 1.0))  # earlier files lack it
+    return Initialisation(body, mixture, tensors["cost"], (note,), lengths, scale, noise=noise)
 
 
 def _load_body(

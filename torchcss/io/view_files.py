@@ -35,6 +35,7 @@ class ViewFiles:
         frame_rate: Frames per second of a folder of images, which does not say it; None: 30.
         person: Who of several people is followed: `prominent`, `largest`, `leftmost` or `centre` in
             the first frame, or the keypoint file's number of a person.
+        sigma: Noise of a wrist's keypoint, pixels; None: learnt from the first frame's.
     """
 
     video: Path
@@ -46,6 +47,7 @@ class ViewFiles:
     offset: int = 0
     frame_rate: float | None = None
     person: str = "prominent"
+    sigma: float | None = None
 
 
 class RecordedCamera(NamedTuple):
