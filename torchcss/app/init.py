@@ -28,6 +28,7 @@ from torchcss.cost.view import View
 from torchcss.errors import CameraError, KeypointError
 from torchcss.files import prepare_output_folder, replace_file
 from torchcss.initialise.fit import default_camera, initialise
+from torchcss.initialise.noise import Noise
 from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
 from torchcss.initialise.result import Initialisation, stature_of
 from torchcss.io.cameras import check_image_size, load_camera
@@ -190,8 +191,7 @@ def initialise_video(
     settings: Settings,
     *,
     start: int,
-    sigma: float,
-    learn_noise: bool = False,
+    noise: Noise,
     generator: torch.Generator,
     others: Sequence[View] = (),
 ) -> Initialisation:
@@ -203,8 +203,7 @@ def initialise_video(
         camera: Its camera.
         settings: Body, terms, working size, type and device.
         start: The frame.
-        sigma: Noise of the keypoints, pixels of the full image.
-        learn_noise: Take that as a guess.
+        noise: Noise of the keypoints.
         generator: Source of the starting poses.
         others: What further cameras see of that moment, see `initialise`.
 
@@ -212,9 +211,9 @@ def initialise_video(
         TorchcssError: If the frame cannot be read, or too few joints are known in it.
     """
     options = InitialiseOptions(
-        sigma=sigma,
+        sigma=noise.sigma,
         stature=settings.stature,
-        learn_noise=learn_noise,
+        learn_noise=noise.is_guess,
         least_joints=LEAST_JOINTS,
         pose_prior="pose_prior" in settings.used_terms,
         contours="contour" in settings.used_terms,

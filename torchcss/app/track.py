@@ -25,6 +25,7 @@ from torchcss.app.recorder import CHECKPOINT_EVERY, Begun, Recorder, Sink
 from torchcss.app.view_files import OpenView, Selection, moments, open_view
 from torchcss.cost.view import View
 from torchcss.errors import CameraError, ConfigurationError, TrackFileError
+from torchcss.initialise.noise import Noise
 from torchcss.initialise.result import Initialisation
 from torchcss.io.cameras import LoadedCamera
 from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body, write_fitted_body
@@ -305,8 +306,7 @@ def _first_pose(
         eye,
         settings,
         start=start,
-        sigma=view.sigma,
-        learn_noise=view.files.sigma is None,
+        noise=Noise(view.sigma, is_guess=view.files.sigma is None),
         generator=generator,
         others=[_first_view(each, start, view.sigma, settings) for each in beside],
     )

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -35,6 +36,18 @@ _TURNS = 4
 
 _LEAST = 1e-6
 """Curvature of what nothing tells."""
+
+
+class Noise(NamedTuple):
+    """What is known of the noise of keypoints.
+
+    Attributes:
+        sigma: That of a wrist's, pixels of the full image.
+        is_guess: Whether it is to be learnt, from there.
+    """
+
+    sigma: float
+    is_guess: bool = False
 
 
 def briefly(search: Search) -> Search:

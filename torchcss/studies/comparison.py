@@ -17,6 +17,7 @@ from torchcss.body.root import has_root
 from torchcss.errors import TorchcssError
 from torchcss.initialise.fit import initialise
 from torchcss.initialise.keypoint_checks import typical_sigma
+from torchcss.initialise.noise import Noise
 from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
 from torchcss.initialise.result import Initialisation
 from torchcss.io.video import VideoReader
@@ -69,7 +70,13 @@ def find_start(sequence: RecordedSequence, settings: Settings, *, start: int = 0
         return Start(first, sigma, generator)
     sigma = typical_sigma(keypoints)
     first = initialise_video(
-        sequence.video, keypoints, camera, settings, start=start, sigma=sigma, generator=generator
+        sequence.video,
+        keypoints,
+        camera,
+        settings,
+        start=start,
+        noise=Noise(sigma),
+        generator=generator,
     )
     return Start(first, sigma, generator)
 
