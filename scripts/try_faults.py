@@ -24,7 +24,6 @@ from __future__ import annotations
 import json
 import os
 import random
-import resource
 import shutil
 import signal
 import subprocess
@@ -130,15 +129,14 @@ class Round:
         ]
         (self.folder / "clips.jsonl").write_text("\n".join(map(json.dumps, rows)))
 
-    def begin(self, prepare: Callable[[], None] | None = None) -> subprocess.Popen[bytes]:
-        """Start one process of the batch."""
-        words = [sys.executable, "-m", "torchcss.app.batch", str(self.folder / "clips.jsonl")]
+    def begin(self, first: str = "") -> subprocess.Popen[bytes]:
+        """Start one process of the batch, which runs a line of Python first."""
+        code = f"{first}import sys; from torchcss.app.batch import main; sys.exit(main())"
+        words = [sys.executable, "-c", code, str(self.folder / "clips.jsonl")]
         words += ["--out", str(self.out), "--patience", str(self.config.patience), *_WORDS]
+        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
         with (self.folder / "printed.txt").open("ab") as printed:
-            return subprocess.Popen(
-                words, stdout=printed, stderr=printed, preexec_fn=prepare,
-                env={**os.environ, "OMP_NUM_THREADS": "1"},
-            )  # fmt: skip
+            return subprocess.Popen(words, stdout=printed, stderr=printed, env=environment)
 
     def again(self) -> None:
         """The same command, here, when the cause is gone."""
@@ -197,12 +195,8 @@ def end(batch: Round) -> None:
 
 def disk(batch: Round) -> None:
     """RLIMIT_FSIZE."""
-
-    def little_space() -> None:
-        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (_SMALL, _SMALL))
-
-    _expect(batch.begin(little_space).wait(_LATE_S) == 0, "a full disk ended a process")
+    limit = f"import resource as r; r.setrlimit(r.RLIMIT_FSIZE, ({_SMALL}, {_SMALL})); "
+    _expect(batch.begin(limit).wait(_LATE_S) == 0, "a full disk ended a process")
     _expect("cannot be written" in batch.printed, "the disk: no clip failed")
 
 
