@@ -25,7 +25,7 @@ def small(script: ModuleType, **options):
 def test_small_mode(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("scipy")
     out = tmp_path / "tables" / "solvers.json"
-    names = (script.OURS, script.TRF)
+    names = (script.OURS, script.EAGER, script.TRF)
     script.main(small(script, solvers=names, out=out))
     report = json.loads(out.read_text())
     assert set(report["solvers"]) == set(names)
@@ -57,7 +57,7 @@ def test_absent_libraries_are_left_out(script: ModuleType, monkeypatch: pytest.M
 
     monkeypatch.setattr(script, "measure", measure)
     report = script.main(small(script))
-    assert asked == list(report["solvers"]) == [script.OURS]
+    assert asked == list(report["solvers"]) == [script.OURS, script.EAGER]
 
 
 @pytest.mark.parametrize("potential", ["quadratic", "lorentzian"])

@@ -54,15 +54,18 @@ def sum_points(points: Points, begin: int, end: int, reference: Array, sums: Arr
 
 @kernel
 def lift(
-    tree: Tree, sums: Array, twists: Array, exact: bool, gradient: Array, hessian: Array
+    tree: Tree, sums: Array, twists: Array, share: float, gradient: Array, hessian: Array
 ) -> None:
-    """Add the derivatives in the state. The sums per frame become sums per joint and below."""
+    """Add the derivatives in the state. The sums per frame become sums per joint and below.
+
+    `share` of the curvature of the kinematics counts: 1 is exact, 0 is Gauss-Newton.
+    """
     for j in range(len(tree.parent) - 1, -1, -1):
         above, own = sums[tree.parent[j]], sums[1 + j]
         for n in range(33):
             above[n] += own[n]
     for j in range(len(tree.parent)):
-        slope, turning, shifting = react(sums[1 + j], twists[j], exact)
+        slope, turning, shifting = react(sums[1 + j], twists[j], share)
         factor, column = tree.factor[j], tree.column[j]
         gradient[column] += factor * slope
         i = j
@@ -81,7 +84,7 @@ Triple = tuple[float, float, float]
 
 
 @inlined
-def react(sums: Array, twist: Array, exact: bool) -> tuple[float, Triple, Triple]:
+def react(sums: Array, twist: Array, share: float) -> tuple[float, Triple, Triple]:
     """Slope along a joint, and how the wrench on what it carries changes with its motion."""
     wx, wy, wz, vx, vy, vz = twist[0], twist[1], twist[2], twist[3], twist[4], twist[5]
     sxx, sxy, sxz, syy, syz, szz = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
@@ -98,8 +101,7 @@ def react(sums: Array, twist: Array, exact: bool) -> tuple[float, Triple, Triple
     sx = mxx * wx + myx * wy + mzx * wz + sxx * vx + sxy * vy + sxz * vz
     sy = mxy * wx + myy * wy + mzy * wz + sxy * vx + syy * vy + syz * vz
     sz = mxz * wx + myz * wy + mzz * wz + sxz * vx + syz * vy + szz * vz
-    if exact:
-        tx += pxy * wy + pxz * wz - (pyy + pzz) * wx + fz * vy - fy * vz
-        ty += pyx * wx + pyz * wz - (pxx + pzz) * wy + fx * vz - fz * vx
-        tz += pzx * wx + pzy * wy - (pxx + pyy) * wz + fy * vx - fx * vy
+    tx += share * (pxy * wy + pxz * wz - (pyy + pzz) * wx + fz * vy - fy * vz)
+    ty += share * (pyx * wx + pyz * wz - (pxx + pzz) * wy + fx * vz - fz * vx)
+    tz += share * (pzx * wx + pzy * wy - (pxx + pyy) * wz + fy * vx - fx * vy)
     return slope, (tx, ty, tz), (sx, sy, sz)

@@ -93,7 +93,7 @@ def pack_tree(body: BodyModel, camera: Camera) -> Tree:
     )
 
 
-def _carried(body: BodyModel, link: Tensor, own: Tensor) -> tuple[Array, Array]:
+def carried(body: BodyModel, link: Tensor, own: Tensor) -> tuple[Array, Array]:
     """Rows of the frames that carry some links, and what is fixed in the links in these frames."""
     tree = body.tree
     place = tree.link_place[link]
@@ -107,7 +107,7 @@ def pack_parts(body: BodyModel, predictor: ContourPredictor | None, real: Real) 
     num, like = body.num_parts, body.tie
     own = torch.cat([body.part_rotation, body.part_translation[:, :, None]], dim=2)
     last = like.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(num, 1, 4)
-    row, constant = _carried(body, body.part_link, torch.cat([own, last], dim=1))
+    row, constant = carried(body, body.part_link, torch.cat([own, last], dim=1))
     ramp = 0.010 if predictor is None else predictor.ramp
     clearance = 0.005 if predictor is None else predictor.clearance
     table = tabulate_parts(body.part_shape, ramp)
@@ -269,7 +269,7 @@ def pack_keypoints(
         return None
     offset = body.marker_offset[joint]
     homogeneous = torch.cat([offset, torch.ones_like(offset[:, :1])], dim=1)[:, :, None]
-    row, place = _carried(body, bound.link, homogeneous)
+    row, place = carried(body, bound.link, homogeneous)
     target = torch.cat([position, precision[..., None]], dim=-1).mT
     return PackedKeypoints(
         scale=real(weight * bound.scale),
@@ -370,7 +370,7 @@ def pack_limbs(body: BodyModel, density: BodyDensity, scale: float, camera: Came
     double, which = np.float64, density.which
     link, offset = body.marker_link[which.joint], body.marker_offset[which.joint]
     homogeneous = torch.cat([offset, torch.ones_like(offset[:, :1])], dim=1)[:, :, None]
-    row, place = _carried(body, link, homogeneous)
+    row, place = carried(body, link, homogeneous)
     above = array(body.tree.ancestors[:, link], double)
     difference = array(which.difference, double)
     parts = [density.densities[group.name] for group in which.groups]

@@ -288,7 +288,7 @@ def _lift_pair(
         twist[3] = factor * (joint[3] + wy * cz - wz * cy)
         twist[4] = factor * (joint[4] + wz * cx - wx * cz)
         twist[5] = factor * (joint[5] + wx * cy - wy * cx)
-        slope, turning, shifting = react(workspace.sums[0], twist, exact)
+        slope, turning, shifting = react(workspace.sums[0], twist, 1.0 if exact else 0.0)
         column = tree.column[chain[n]]
         gradient[column] += slope
         for m in range(n + 1):

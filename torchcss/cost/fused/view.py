@@ -34,7 +34,7 @@ def add_view(
         workspace: Memory for what is found on the way.
         result: Where it is added.
     """
-    slopes = len(result.gradient[0]) > 0
+    slopes, share = len(result.gradient[0]) > 0, 1.0 if view.exact else 0.0
     for b in range(len(x)):
         pose_tree(x[b], tree, workspace.frames)
         pose_parts(workspace.frames, parts, workspace.frame, workspace.posed)
@@ -57,7 +57,7 @@ def add_view(
         if slopes:
             find_twists(workspace.frames, tree, workspace.reference, workspace.twists)
             gradient, hessian = result.gradient[b], result.hessian[b]
-            lift(tree, workspace.sums, workspace.twists, view.exact, gradient, hessian)
+            lift(tree, workspace.sums, workspace.twists, share, gradient, hessian)
 
 
 @kernel
