@@ -11,9 +11,8 @@ from torch import Tensor
 
 from torchcss.cost.fused.pack import array, carried, pack_potential, pack_tree
 from torchcss.cost.fused.records import Array, Points, Result, Tree
-from torchcss.cost.fused.reprojection import Reprojection, Scratch, add_reprojection
+from torchcss.cost.fused.reprojection import Reprojection, Scratch, evaluate
 from torchcss.errors import ConfigurationError, check_shape
-from torchcss.kernels.checked import run
 from torchcss.studies.reprojection import ReprojectionCost
 from torchcss.types import LocalModel
 
@@ -84,7 +83,7 @@ class CompiledReprojection(NamedTuple):
         shares = np.ones(number) if share is None else array(share.reshape(number), np.float64)
         result = Result(np.zeros(number), np.zeros((number, size)), np.zeros((number, size, size)))
         states = array(x.reshape(number, -1), np.float64)
-        run(add_reprojection, states, shares, *self, self._scratch(), result)
+        evaluate(states, shares, self.tree, self.seen, self._scratch(), result)
         value, gradient, hessian = map(torch.from_numpy, result)
         return LocalModel(
             value.reshape(batch),
