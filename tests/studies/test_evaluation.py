@@ -322,7 +322,8 @@ def measure(
         root_aligned_mm=mm, procrustes_mm=mm / 2, within=np.full((k, j), 0.7),
         angle_deviations=np.linspace(4, 2, k), joints_m=np.zeros((j, 3)),
         reference_m=np.zeros((j, 3)), overlap=0.8, outside_degrees=0.0,
-        penetration_m=np.zeros(k), samples=10, evaluations=100,
+        penetration_m=np.zeros(k), along_mm=3.0, across_mm=4.0, apart_weight=0.25,
+        at_bound=("r_elbow_flexion",), samples=10, evaluations=100,
         seconds={"features": 1.0, "cost": 0.1, "search": 0.5},
     )._replace(**changes)  # fmt: skip
 
@@ -357,6 +358,29 @@ def test_a_run_is_summed_up_until_it_is_lost() -> None:
     assert (row["samples_per_frame"], row["evaluations_per_frame"]) == (10, 100)
     assert row["search_s_per_frame"] == 0.5
     assert len(row["per_frame"]["root_aligned_mm"]) == 24
+    assert (row["along_mm"], row["across_mm"], row["apart_weight"]) == (3.0, 4.0, 0.25)
+    assert row["per_frame"]["at_bound"][-1] == ("r_elbow_flexion",)
+
+
+def test_errors_along_and_across_the_line_of_sight_and_explanations() -> None:
+    body, states = arm_and_states()
+    sequence = recorded(body, states)
+    evaluator = Evaluator(sequence, body, Thresholds.of(sequence))
+    swung = states[0].clone()
+    swung[body.state_index("r_elbow_flexion")] = body.upper[body.state_index("r_elbow_flexion")]
+    modes = torch.stack([swung, states[0], swung + 1e-4])
+    measures = evaluator(tracked(body, modes, weight=(0.5, 0.3, 0.2)), START, 0.0)
+    whole = np.sqrt((measures.absolute_mm[0] ** 2).mean())
+    assert math.hypot(measures.along_mm, measures.across_mm) == pytest.approx(whole)
+    assert measures.apart_weight == pytest.approx(0.3)
+    assert measures.at_bound == ("r_elbow_flexion",)
+    # Moved towards the camera as a whole, the arm errs along the line of sight.
+    frame = tracked(body, states[:1])
+    sight = sequence.joints_world[0].mean(0) - CAMERA.centre_world.numpy()
+    frame.joints_world = frame.joints_world + torch.from_numpy(0.1 * sight / np.linalg.norm(sight))
+    measures = evaluator(frame, START, 0.0)
+    assert measures.along_mm == pytest.approx(100, abs=2)
+    assert measures.across_mm < 20
 
 
 def test_a_run_that_is_lost_at_once_and_one_that_is_not() -> None:

@@ -20,6 +20,10 @@ several runs one of medians. What the words mean (the figures are those of `Thre
   Mahalanobis distance per parameter).
 * *Calibration*: how often the true joints lie in the 50, 90, and 95 % regions of a mode, the
   joint's covariance `J S J^T` (`torchcss.body.uncertainty`) enlarged by the reference's own.
+* *Along* and *across* are root mean square errors of the best mode's joints, roots on each other,
+  in the direction of the camera's line of sight to the true body, and in the picture's plane.
+* A posterior is *multimodal* by the weight of the modes with a joint 3 cm from the best mode's.
+* A joint is *at its bound* within half a degree of a limit.
 * A pose is *impossible* if an angle is more than a degree beyond its limit, or if a part is deeper
   than 2 cm inside another one.
 """
@@ -76,6 +80,9 @@ ARM_LOST_MM = 150.0
 
 LOSSES = ("lost_s", "limb_lost_s", "limb_lost_of_modes_s")
 """Entries of a row that are times of a loss, NaN where there was none."""
+
+APART_M = 0.03
+"""How far some joint of two modes is apart if they are two explanations, metres."""
 
 _PLACE = ROOT_NAMES[:3]
 """Where a body stands."""
@@ -138,6 +145,10 @@ class FrameMeasures(NamedTuple):
         overlap: Of the best mode's silhouette with the true one; NaN if that is not known.
         outside_degrees: How far the best mode's worst angle is beyond its limit.
         penetration_m: How deep the deepest node of every mode is inside another part, metres.
+        along_mm: Error along the line of sight; NaN where the reference is unknown.
+        across_mm: Error across it.
+        apart_weight: Weight of the modes that are another explanation than the best one.
+        at_bound: Parameters of the best mode at their bounds.
         samples: Samples drawn.
         evaluations: Evaluations of the cost: with two derivatives for each iteration of a
             descending sample, or the value alone for each weighing of a particle.
@@ -158,6 +169,10 @@ class FrameMeasures(NamedTuple):
     overlap: float
     outside_degrees: float
     penetration_m: Float[np.ndarray, " k"]
+    along_mm: float
+    across_mm: float
+    apart_weight: float
+    at_bound: tuple[str, ...]
     samples: int
     evaluations: int
     seconds: dict[str, float]
@@ -362,6 +377,9 @@ class Evaluator:
             overlap=overlap,
             outside_degrees=_outside(body, mixture.mean[0]),
             penetration_m=penetration_depth(body, poses, self._pairs, self._surface).cpu().numpy(),
+            **self._directions(joints[0], reference),
+            apart_weight=_apart_weight(joints, mixture.weight.double().cpu().numpy()),
+            at_bound=_at_bound(body, mixture.mean[0]),
             samples=int(tracked.info.num_samples),
             evaluations=num_evaluations(tracked.info),
             seconds={
@@ -370,6 +388,26 @@ class Evaluator:
                 "search": tracked.seconds["search"],
             },
         )
+
+    def _directions(
+        self, joints: Float[np.ndarray, "j 3"], reference: Float[np.ndarray, "j 3"]
+    ) -> dict[str, float]:
+        """Errors of the compared joints along the line of sight and across it."""
+        away, count = joints - reference, len(self.compared)
+        if self._rooted:
+            hips = [self._common.index(name) for name in ("l_hip", "r_hip")]
+            away = away - away[hips].mean(0)
+        away, known = away[:count], np.isfinite(reference[:count]).all(-1)
+        if not known.any() or not np.isfinite(away[known]).all():
+            return {"along_mm": math.nan, "across_mm": math.nan}
+        centre = self.sequence.camera.centre_world.double().cpu().numpy()
+        sight = reference[:count][known].mean(0) - centre
+        along = away[known] @ (sight / np.linalg.norm(sight))
+        squared = (away[known] ** 2).sum(-1) - along**2
+        return {
+            "along_mm": 1000 * float(np.sqrt((along**2).mean())),
+            "across_mm": 1000 * float(np.sqrt(squared.mean())),
+        }
 
     def _angle_deviations(self, tracked: Posterior) -> np.ndarray:
         """Standard deviations per angle between each mode and the truth."""
@@ -388,6 +426,22 @@ class Evaluator:
         away = torch.remainder(away + math.pi, 2 * math.pi) - math.pi
         spread = spread[:, angles][:, :, angles]
         return (squared_mahalanobis(away, spread) / len(angles)).sqrt().numpy()
+
+
+def _apart_weight(joints: Float[np.ndarray, "k j 3"], weight: Float[np.ndarray, " k"]) -> float:
+    """Weight of the modes of which some joint is `APART_M` from where the best mode has it."""
+    apart = np.linalg.norm(joints - joints[:1], axis=-1).max(-1) > APART_M
+    return float(weight[apart].sum())
+
+
+def _at_bound(body: BodyModel, x: Float[Tensor, " n"]) -> tuple[str, ...]:
+    """Joint parameters within half a degree of a limit."""
+    close = torch.minimum((x - body.lower).abs(), (body.upper - x).abs()) < math.radians(0.5)
+    return tuple(
+        name
+        for name, near in zip(body.state_names, close.tolist(), strict=True)
+        if near and name not in ROOT_NAMES
+    )
 
 
 def _outside(body: BodyModel, x: Float[Tensor, " n"]) -> float:
@@ -439,6 +493,9 @@ def summarise(
             interval_s,
         ),
         **_impossible(held, thresholds),
+        "along_mm": _mean([m.along_mm for m in held]),
+        "across_mm": _mean([m.across_mm for m in held]),
+        "apart_weight": _mean([m.apart_weight for m in held]),
         "samples_per_frame": _mean([m.samples for m in measures]),
         "evaluations_per_frame": _mean([m.evaluations for m in measures]),
         **{
@@ -451,6 +508,11 @@ def summarise(
             "root_aligned_mm": [_mean(m.root_aligned_mm[0]) for m in measures],
             "root_aligned_best_of_modes_mm": [_mean(errors) for errors in nearest],
             "overlap": [m.overlap for m in measures],
+            "along_mm": [m.along_mm for m in measures],
+            "across_mm": [m.across_mm for m in measures],
+            "apart_weight": [m.apart_weight for m in measures],
+            "penetration_mm": [1000 * float(m.penetration_m[0]) for m in measures],
+            "at_bound": [m.at_bound for m in measures],
         },
     }
 
