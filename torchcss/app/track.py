@@ -116,8 +116,8 @@ def track_video(
         camera: Calibration file, see `torchcss.io.cameras`; None: see `torchcss.app.lens`.
         keypoints: 2D joints, see `torchcss.io.keypoints`; None: they are detected, and written into
             the folder.
-        out: Folder for `track.npz`, `summary.json`, `checkpoint.npz`, `overlay.mp4`, and the body
-            at its first pose, `body.npz`.
+        out: Folder for `track.npz`, `summary.json`, `checkpoint.npz`, `overlay.mp4`,
+            `report.html`, and the body at its first pose, `body.npz`.
         settings: How to track.
         start: First frame.
         stop: Frame before which to end.
@@ -243,7 +243,11 @@ def _record(recorder: Recorder, views: Sequence[OpenView]) -> Run:
     recorder.run(recorder.session.track(left), views[0].reader.num_selected)
     run = Run.open(recorder.folder)
     if recorder.session.settings.overlay:
+        # Drawing figures takes long to import.
+        from torchcss.show.report import write_report
+
         write_overlays(run, 1 / recorder.frame_interval)
+        write_report(run)
     return run
 
 

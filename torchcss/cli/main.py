@@ -11,6 +11,7 @@
 | `torchcss export TRACK` | writes a track for another program |
 | `torchcss view TRACK` | shows a track in space over its pictures (rerun) |
 | `torchcss plot TRACK` | draws its modes, trajectories and uncertainties as PNG files |
+| `torchcss report TRACK` | writes one page about it, `report.html`, as `track` does at its end |
 
 Bad input ends with one line on standard error and exit status 2; Ctrl-C with status 130 and
 SIGTERM with 143. What was tracked until then is on disk; `torchcss track ... --resume` goes on.
@@ -33,7 +34,7 @@ from torchcss.cli.init import Init
 from torchcss.cli.options import SettingsOptions
 from torchcss.cli.smooth import Smooth
 from torchcss.cli.track import Track
-from torchcss.cli.view import Plot, View
+from torchcss.cli.view import Plot, Report, View
 from torchcss.errors import OutputError, TorchcssError
 from torchcss.studies.demo import DEMO_SETTINGS, run_demo
 
@@ -55,7 +56,7 @@ class Demo:
             f"{summary['num_frames']} frames, {summary['seconds_per_frame']:.2f} s each\n"
             f"mean error of the best mode   {summary['mpjpe_mm']:6.1f} mm\n"
             f"mean error, best of the modes {summary['mpjpe_best_of_modes_mm']:6.1f} mm\n"
-            f"look at {self.out / 'overlay.mp4'}"
+            f"look at {self.out / 'report.html'}"
         )
 
 
@@ -69,6 +70,7 @@ Verb = (
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Plot, tyro.conf.subcommand("plot")]
+    | Annotated[Report, tyro.conf.subcommand("report")]
 )
 
 

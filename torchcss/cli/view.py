@@ -1,4 +1,4 @@
-"""The verbs `torchcss view` and `torchcss plot`: a finished track to look at."""
+"""The verbs `torchcss view`, `plot` and `report`: a finished track to look at."""
 
 from __future__ import annotations
 
@@ -56,3 +56,19 @@ class Plot:
         anew = self.given.video is not None
         for path in plot_track(run, self.out, frame=self.frame, anew=anew):
             print(f"wrote {path}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """Write report.html: film, figures, what was assumed and how to go on, on one page."""
+
+    track: Annotated[Path, tyro.conf.Positional]
+    """The run's folder, or a track's file in it (track.npz, smooth.npz)."""
+    given: Annotated[Given, tyro.conf.OmitArgPrefixes] = field(default_factory=Given)
+
+    def run(self) -> None:
+        """Run the verb."""
+        from torchcss.show.report import write_report
+
+        run = Run.open(self.track, self.given)
+        print(f"wrote {write_report(run, anew=self.given.video is not None)}")

@@ -1,0 +1,71 @@
+"""The page about a run: everything inside, everything escaped."""
+
+from __future__ import annotations
+
+import base64
+import re
+from html import unescape
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_tracks import make_track
+
+from torchcss.body.load import load_body
+from torchcss.cli import main as cli
+from torchcss.io.run import Run
+from torchcss.io.tracks import TRACK_NAME, save_track, write_summary
+from torchcss.io.video import VideoReader, VideoWriter
+from torchcss.io.view_files import RecordedCamera, ViewFiles
+from torchcss.show import report
+from torchcss.vision.camera import Camera
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A run in a folder whose name is markup, as are its notes and its video."""
+    folder = tmp_path / "a <b> & 'c'"
+    folder.mkdir()
+    camera = Camera.pinhole(800, 600, focal_px=700.0, name="<i>one</i>")
+    files = ViewFiles(video=folder / "gone <u>.mp4", keypoints=None)
+    track = make_track(load_body("arm8"), (2, 3, 1))
+    track = track._replace(cameras=(RecordedCamera(camera, files),))
+    for name in (TRACK_NAME, "smooth.npz"):
+        save_track(folder / name, track)
+    write_summary(folder, {"notes": ["<script>alert(1)</script>", "focal length assumed"]})
+    with VideoWriter(folder / "overlay.mp4", 25) as film:
+        for level in (40, 120, 200):
+            film.write(np.full((600, 800, 3), level, np.uint8))
+    return folder
+
+
+def test_the_page_needs_nothing_else_and_holds_what_was_noted(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(report, "MOST_FRAMES", 2)
+    page = report.write_report(Run.open(folder)).read_text()
+    assert set(re.findall(r'(?:src|href|poster)="(.{11})', page)) == {
+        *("data:video/", "data:image/")
+    }
+    assert not re.search(r"<(script|link|iframe|b>|i>|u>)|https?:|url\(", page)
+    text = unescape(page)
+    for told in ("<script>alert(1)</script>", "focal length 700 pixels (59 degrees", "<i>one</i>"):
+        assert told in text
+    # The film is reduced, and every second frame of it is shown.
+    found = re.search(r"data:video/mp4;base64,([^\"]+)", page)
+    assert found is not None
+    (tmp_path / "film.mp4").write_bytes(base64.b64decode(found[1]))
+    film = [frame.image for frame in VideoReader(tmp_path / "film.mp4")]
+    assert [image.shape for image in film] == [(480, 640, 3)] * 2
+    assert film[1].mean() == pytest.approx(200, abs=4)
+
+
+def test_the_verb_for_a_run_that_is_there(folder: Path) -> None:
+    assert cli.main(["report", str(folder)]) == 0
+    assert f"torchcss smooth '{folder}".replace("'c'", "'\"'\"'c'\"'\"''") in unescape(
+        (folder / "report.html").read_text()
+    )
+    assert cli.main(["report", str(folder / "smooth.npz")]) == 0
+    page = unescape((folder / "smooth_report.html").read_text())
+    assert "torchcss smooth" not in page
+    assert "say where with" in page  # the overlay is the track's, the video is gone

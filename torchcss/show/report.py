@@ -1,0 +1,209 @@
+"""The report of a run: one page, `report.html`, that opens in any browser and needs no network.
+
+It holds the film with the modes drawn over it, the figures of `torchcss.show.track_plots` and
+`posterior_plots` that a user wants first, what was known and what was assumed, and the commands
+that go on from there. Names and notes come from the files of strangers: all text is escaped.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+import shlex
+from collections.abc import Iterable, Sequence
+from html import escape
+from io import BytesIO
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from PIL import Image
+
+from torchcss.files import write_text
+from torchcss.io.run import Run
+from torchcss.io.tracks import TRACK_NAME
+from torchcss.io.video import VideoWriter
+from torchcss.show.posterior_plots import angles_figure
+from torchcss.show.track_pictures import has_pictures, pictures_of, rows_with_modes
+from torchcss.show.track_plots import effective_number, modes_figure, side_view_figure
+
+REPORT_NAME = "report.html"
+
+MOST_FRAMES = 450
+"""Frames of the film in the page; of longer ones every second, third and so on is shown."""
+
+LONGER_SIDE = 640
+"""Pixels to which the film's pictures are reduced. With `MOST_FRAMES`: a few megabytes."""
+
+_CRF = 28
+
+_PAGE = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{title}</title>
+<style>
+body {{ font: 16px/1.5 system-ui, sans-serif; color: #222; max-width: 62rem;
+  margin: 0 auto; padding: 1rem; }}
+h1 {{ font-size: 1.5rem; margin: 0 0 .3rem; overflow-wrap: anywhere; }}
+h2 {{ font-size: 1.15rem; margin: 2rem 0 .4rem; border-bottom: 1px solid #ddd; }}
+p {{ margin: .4rem 0; }}
+video {{ display: block; max-width: 100%; max-height: 80vh; margin: 0 auto; background: #111; }}
+.figure {{ overflow-x: auto; }}
+.figure img {{ display: block; width: 100%; min-width: 40rem; }}
+table {{ border-collapse: collapse; width: 100%; }}
+th, td {{ text-align: left; vertical-align: top; padding: .25rem .8rem .25rem 0;
+  overflow-wrap: anywhere; }}
+th {{ font-weight: 600; white-space: nowrap; }}
+li {{ overflow-wrap: anywhere; }}
+pre {{ background: #f4f4f4; padding: .7rem; overflow-x: auto; font-size: .85rem; }}
+</style></head><body>
+<h1>{title}</h1>
+{body}
+</body></html>
+"""
+
+
+def write_report(run: Run, *, anew: bool = False) -> Path:
+    """Write `report.html` into the folder of a run; of a smoothed track, `smooth_report.html`.
+
+    Args:
+        run: The run.
+        anew: Whether to draw over the video even where the tracker left an overlay.
+
+    Returns:
+        The file.
+
+    Raises:
+        TorchcssError: If the track has no frames, its body is not known, a picture cannot be read,
+            or the file cannot be written.
+    """
+    track, rows = run.track._replace(body=run.body), rows_with_modes(run)
+    camera = run.cameras[0].camera if run.cameras else None
+    frame = int(track.frames[rows[effective_number(track)[rows].argmax()]])
+    sections = (
+        ("Film", _film(run, rows, anew=anew)),
+        (
+            "The modes from the side",
+            "<p>The frame whose weight is spread over most modes. Where the lines part, one camera "
+            "cannot tell which pose it was.</p>"
+            + _image(side_view_figure(track, frame, camera=camera), "the modes from the side"),
+        ),
+        ("Weights over time", _image(modes_figure(track, run.summary), "weights over time")),
+        ("Joint angles", _image(angles_figure(track), "joint angles with bands")),
+        ("What was tracked", _table(_facts(run))),
+        ("Cameras", _table(_cameras(run))),
+        ("What was read, assumed and fitted", _list(run.summary.get("notes", ()))),
+        ("How to go on", f"<pre>{escape(_commands(run))}</pre>"),
+    )
+    title = f"torchcss: {run.path.resolve().parent.name}"
+    body = "\n".join(f"<h2>{name}</h2>\n{content}" for name, content in sections)
+    name = REPORT_NAME if run.path.name == TRACK_NAME else f"{run.path.stem}_{REPORT_NAME}"
+    write_text(run.folder / name, _PAGE.format(title=escape(title), body=body))
+    return run.folder / name
+
+
+def _film(run: Run, rows: np.ndarray, *, anew: bool) -> str:
+    """The film, small enough to lie in the page."""
+    if not has_pictures(run):
+        return "<p>The video is not where it was; say where with <code>--video</code>.</p>"
+    rows = rows[:: math.ceil(len(rows) / MOST_FRAMES)]
+    times = run.track.times[rows]
+    rate = (len(rows) - 1) / float(times[-1] - times[0]) if len(rows) > 1 else 1.0
+    still = BytesIO()
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "film.mp4"
+        with VideoWriter(path, rate, crf=_CRF) as film:
+            for row, image in pictures_of(run, rows, anew=anew):
+                picture = Image.fromarray(image)
+                picture.thumbnail((LONGER_SIDE, LONGER_SIDE))
+                film.write(np.asarray(picture))
+                if row == rows[0]:
+                    picture.save(still, "JPEG")
+        data = _data("video/mp4", path.read_bytes())
+    return (
+        f'<video controls loop muted playsinline poster="{_data("image/jpeg", still.getvalue())}" '
+        f'src="{data}"></video>'
+        "<p>Filled: the best mode. Outlines: the other modes, fainter the less they weigh.</p>"
+    )
+
+
+def _image(figure: Figure, text: str) -> str:
+    """A figure as a picture in the page."""
+    stream = BytesIO()
+    figure.savefig(stream, dpi=110)
+    data = _data("image/png", stream.getvalue())
+    return f'<div class="figure"><img alt="{text}" src="{data}"></div>'
+
+
+def _data(kind: str, content: bytes) -> str:
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def _table(rows: Iterable[tuple[str, str]]) -> str:
+    lines = (f"<tr><th>{escape(name)}</th><td>{escape(text)}</td></tr>" for name, text in rows)
+    return f"<table>{''.join(lines)}</table>"
+
+
+def _list(lines: Sequence[Any]) -> str:
+    items = "".join(f"<li>{escape(str(line))}</li>" for line in lines)
+    return f"<ul>{items}</ul>" if items else "<p>Nothing is noted.</p>"
+
+
+def _facts(run: Run) -> list[tuple[str, str]]:
+    """What was tracked how, as far as the run says."""
+    track, summary, settings = run.track, run.summary, run.settings
+    span = f"{track.frames[0]} to {track.frames[-1]}, {track.times[-1] - track.times[0]:.2f} s"
+    files = run.cameras[0].files if run.cameras else None
+    lost = sum(event["event"] == "lost" for event in summary.get("events", ()))
+    facts = [
+        ("Video", str(files.video) if files else "not known"),
+        (
+            "Frames",
+            f"{len(track.frames)} ({span}), {summary.get('ended', 'not known whether all')}",
+        ),
+        ("Told lost", f"{lost} times"),
+        ("Body", f"{settings.get('body', run.body.name)}, {track.state.shape[2]} parameters"),
+        ("Keypoints", str(files.keypoints) if files and files.keypoints else "not known"),
+        ("Preset", str(settings.get("preset", "not known"))),
+    ]
+    if "thigh" in summary.get("body_lengths_m", ()):
+        stature = settings.get("stature")
+        ask = "not given; it would set the size: --stature METRES"
+        facts.append(("Stature", f"{stature:g} m, as given" if stature else ask))
+        facts.append(("Followed", f"--person {files.person}" if files else "not known"))
+    return facts
+
+
+def _cameras(run: Run) -> list[tuple[str, str]]:
+    """What the cameras are, a line each."""
+    rows = []
+    for camera, _ in run.cameras:
+        width, height = camera.image_size_wh
+        focal = float(camera.K[0, 0])
+        angle = 2 * math.degrees(math.atan(0.5 * max(width, height) / focal))
+        rows.append(
+            (
+                camera.name,
+                f"{width} x {height} pixels, focal length {focal:.0f} pixels ({angle:.0f} degrees "
+                "along the longer side)",
+            )
+        )
+    if run.summary.get("world_is_metric") is False:
+        rows.append(("World", "the first camera's own frame: its axes, not those of the room"))
+    return rows
+
+
+def _commands(run: Run) -> str:
+    """The commands that go on from this run."""
+    path = run.folder if run.path.name == TRACK_NAME else run.path
+    where = shlex.quote(str(path.resolve()))
+    lines = (
+        ("smooth", "", "one smooth trajectory through the modes"),
+        ("export", " --to bvh", "for Blender; trc, mot: OpenSim; csv, npz: with covariances"),
+        ("plot", "", "all figures, as files"),
+        ("view", "", "in space, over the pictures"),
+    )
+    lines = lines if run.path.name == TRACK_NAME else lines[1:]
+    return "\n".join(f"torchcss {verb} {where}{more}   # {what}" for verb, more, what in lines)
