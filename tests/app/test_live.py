@@ -84,6 +84,7 @@ def test_a_live_recording_is_the_track(files: Path, monkeypatch: pytest.MonkeyPa
     for row in range(3):
         np.testing.assert_allclose(strips[row], result.joints_world[row, 0][bones], atol=1e-6)
     film = [frame.image for frame in VideoReader(files / "out" / "overlay.mp4")]
+    assert (files / "out" / "report.html").is_file()
     shown = Image.open(io.BytesIO(bytes(pictures[2][0])))
     # Both are compressed, each in its own way.
     assert np.abs(np.asarray(shown).astype(float) - film[2]).mean() < 6

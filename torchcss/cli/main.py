@@ -44,7 +44,7 @@ class Demo:
     """Track an arm that moves in depth before clutter, and compare with the truth."""
 
     out: Path = Path("out/demo")
-    """Folder for track.npz, summary.json and overlay.mp4."""
+    """Folder for track.npz, summary.json, overlay.mp4 and report.html."""
     frames: int = 50
     """Frames to track, of 50, 25 per second."""
     settings: SettingsOptions = DEMO_SETTINGS

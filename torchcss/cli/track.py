@@ -19,7 +19,7 @@ from torchcss.tracking.settings import Settings
 
 @dataclass(frozen=True, kw_only=True)
 class Track:
-    """Track a body through a video, and write track.npz, summary.json and overlay.mp4."""
+    """Track a body through a video, and write its track, summary, overlay and report.html."""
 
     video: Annotated[Path, tyro.conf.Positional]
     """A video in any container, or a folder of images."""
@@ -82,7 +82,7 @@ class Track:
             )
         print(
             f"{run.summary['num_frames']} frames, {run.summary['seconds_per_frame']:.2f} s each; "
-            f"track, summary{' and overlay' if self.settings.overlay else ''} are in {self.out}"
+            f"look at {self.out / ('report.html' if self.settings.overlay else 'track.npz')}"
         )
         if self.smooth or self.smooth_images:
             done = smooth(run, images=self.smooth_images)

@@ -168,7 +168,7 @@ def _facts(run: Run) -> list[tuple[str, str]]:
         ("Keypoints", str(files.keypoints) if files and files.keypoints else "not known"),
         ("Preset", str(settings.get("preset", "not known"))),
     ]
-    if "thigh" in summary.get("body_lengths_m", ()):
+    if "l_knee" in track.joint_names:
         stature = settings.get("stature")
         ask = "not given; it would set the size: --stature METRES"
         facts.append(("Stature", f"{stature:g} m, as given" if stature else ask))

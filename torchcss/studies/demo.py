@@ -53,7 +53,7 @@ def run_demo(
     """Run the demo.
 
     Args:
-        out: Folder for `track.npz`, `summary.json` and `overlay.mp4`.
+        out: Folder for what `track_video` writes.
         settings: How to track; its body must be "arm8".
         num_frames: Only the first frames.
 

@@ -139,7 +139,7 @@ class Settings:
         engine_dtype: Precision of the kernels; sums are in double precision.
         threads: With two or more, the next frame's features are found while this one is searched.
             Nothing else changes.
-        overlay: Write `overlay.mp4`.
+        overlay: Write `overlay.mp4` and `report.html`.
         recovery: Tell from the costs when the track is lost, and search more widely then; as the
             preset does by default.
     """
