@@ -236,6 +236,92 @@ def test_rotation_metadata_is_applied(tmp_path: Path, quarter_turns: int) -> Non
         assert np.abs(frame.image.astype(int) - expected).mean() < 4
 
 
+# What telephones write.
+
+
+@pytest.mark.parametrize(
+    ("transfer", "signal", "level"),
+    [
+        # BT.2408, table 1: white paper, grey card, and black, in parts of the signal; what an
+        # ordinary screen of gamma 2.2 makes of their light, relative to that of white paper.
+        ("arib-std-b67", 0.75, 255 * (1 - 0.25 * np.exp(-1)) ** (1 / 2.2)),
+        ("arib-std-b67", 0.38, 255 * (26 / 203) ** (1 / 2.2)),
+        ("smpte2084", 0.58, 255 * (1 - 0.25 * np.exp(-1)) ** (1 / 2.2)),
+        ("smpte2084", 0.38, 255 * (26 / 203) ** (1 / 2.2)),
+        ("smpte2084", 0.0, 0.0),
+        ("bt709", 0.58, 255 * 0.58),
+    ],
+)
+def test_ten_bits_of_high_dynamic_range(
+    tmp_path: Path, transfer: str, signal: float, level: float
+) -> None:
+    path = tmp_path / "a.mp4"
+    tags = f"colorprim=bt2020:transfer={transfer}:colormatrix=bt2020nc:range=limited"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx265", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p10le"
+        stream.options = {"x265-params": f"log-level=none:{tags}", "crf": "4"}
+        for _ in range(2):
+            picture = av.VideoFrame(64, 48, "yuv420p10le")
+            for plane, value in zip(picture.planes, (64 + 876 * signal, 512, 512), strict=True):
+                plane.update(np.full(plane.buffer_size // 2, value, "<u2").tobytes())
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode(None))
+    for frame in VideoReader(path):
+        assert frame.image.dtype == np.uint8
+        np.testing.assert_allclose(frame.image, level, atol=3)
+
+
+def test_variable_frame_rates(tmp_path: Path) -> None:
+    """Every frame has the time at which it was filmed; the rate is the mean one."""
+    path = tmp_path / "a.mp4"
+    ticks = np.cumsum(np.random.default_rng(0).integers(1, 4, 30)) - 1
+    ticks -= ticks[0]
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=30, options={"bf": "0"})
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        stream.time_base = stream.codec_context.time_base = Fraction(1, 30)
+        for index, tick in enumerate(ticks):
+            image = np.full((48, 64, 3), grey_level(index), np.uint8)
+            picture = av.VideoFrame.from_ndarray(image, format="rgb24")
+            picture.pts, picture.time_base = int(tick), Fraction(1, 30)
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode(None))
+    reader = VideoReader(path)
+    assert reader.num_selected == len(ticks)
+    assert [frame.time_s * 30 for frame in reader] == pytest.approx(ticks)
+    means = [round(frame.image.mean()) for frame in reader]
+    assert means == pytest.approx([grey_level(index) for index in range(30)], abs=3)
+    assert float(reader.info.frame_rate) == pytest.approx(30 * 30 / ticks[-1], rel=0.1)
+
+
+def test_an_edit_list_hides_frames(tmp_path: Path) -> None:
+    """A telephone trims a film by an edit list: players, and we, begin where it says."""
+    path, hidden = tmp_path / "a.mp4", 4
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=30, options={"bf": "0", "g": "1"})
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for index in range(12):
+            image = np.full((48, 64, 3), grey_level(index), np.uint8)
+            picture = av.VideoFrame.from_ndarray(image, format="rgb24")
+            picture.pts, picture.time_base = index, Fraction(1, 30)
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode(None))
+        assert stream.time_base is not None
+        scale = stream.time_base.denominator
+    data = bytearray(path.read_bytes())
+    place = data.index(b"elst") + 12  # version 0: after version, flags and the number of entries
+    # In the film's thousandths how long, and in the stream's ticks where it begins.
+    data[place : place + 8] = struct.pack(">Ii", 8 * 1000 // 30, hidden * scale // 30)
+    path.write_bytes(bytes(data))
+    reader = VideoReader(path)
+    frames = list(reader)
+    assert reader.count_frames() == reader.num_selected == len(frames) == 12 - hidden
+    assert [frame.index for frame in frames] == list(range(8))
+    assert frames[0].time_s == 0.0
+    assert frames[0].image.mean() == pytest.approx(grey_level(hidden), abs=3)
+
+
 # Damage.
 
 

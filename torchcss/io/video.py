@@ -3,7 +3,8 @@
 A video is a sequence of `Frame(index, time_s, image)`; `index` counts from the first frame of the
 file, whatever `start`, `stop` and `stride` select: keypoints and references keep their place.
 Frames are found by decoding from the beginning, never by seeking: seeking is exact in few
-containers only. Rotation that a telephone writes into the file is applied, as every player does.
+containers only. Rotation that a telephone writes into the file is applied, as every player does,
+and high dynamic range is brought to 8 bit (`torchcss.io.high_dynamic_range`).
 
 A damaged video is read up to the damage. The frames before it are yielded, then a `VideoError` says
 how many there were; whoever consumed them keeps what was computed.
@@ -28,11 +29,13 @@ from PIL import ExifTags, Image, ImageOps
 
 from torchcss.errors import ConfigurationError, ShapeError, VideoError
 from torchcss.files import output_error, temporary_name
+from torchcss.io.high_dynamic_range import table
 from torchcss.types import Frame
 
 if TYPE_CHECKING:  # PyAV takes long to import: only where a video is read or written
     from av import VideoFrame
     from av.container import InputContainer
+    from av.video.stream import VideoStream
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 """What counts as a frame in a folder of images."""
@@ -210,7 +213,7 @@ class VideoReader:
                 first = next(iter(_decode(container)), None)
                 if first is None:
                     raise self._not_a_video("its first frame cannot be decoded")
-                height, width = _upright(first).shape[:2]
+                height, width = _upright(first, stream).shape[:2]
         except VideoError:
             raise
         except (*_av_errors(), ValueError, _Damage) as error:
@@ -233,7 +236,7 @@ class VideoReader:
                         return
                     if index < self._start or (index - self._start) % self._stride:
                         continue
-                    image = _upright(picture)
+                    image = _upright(picture, container.streams.video[0])
                     if image.shape[:2] != (self.info.height, self.info.width):
                         raise VideoError(
                             f"{self.path}: frame {index} has {image.shape[1]} x {image.shape[0]} "
@@ -585,9 +588,13 @@ def _decode(container: InputContainer) -> Iterator[VideoFrame]:
     raise damage
 
 
-def _upright(picture: VideoFrame) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the picture as a player shows it."""
-    image = picture.to_ndarray(format="rgb24")
+def _upright(picture: VideoFrame, stream: VideoStream) -> UInt8[np.ndarray, "h w 3"]:
+    """Return the picture as a player shows it on a screen of standard range."""
+    levels = table(int(stream.codec_context.color_trc or 0))
+    if levels is None:
+        image = picture.to_ndarray(format="rgb24")
+    else:
+        image = np.take(levels, np.asarray(picture.to_ndarray(format="rgb48le"), np.uint16))
     quarter_turns = round(picture.rotation / 90)
     return np.ascontiguousarray(np.rot90(image, quarter_turns)) if quarter_turns else image
 
