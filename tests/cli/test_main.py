@@ -30,6 +30,24 @@ def test_good_files_track(files: Path, capsys: pytest.CaptureFixture[str]):
     assert (files / "out" / "track.npz").exists()
 
 
+def test_for_programs_and_in_silence(files: Path, capfd: pytest.CaptureFixture[str]):
+    assert track(files, "--json", "--smooth") == 0
+    told = capfd.readouterr()
+    found = json.loads(told.out)
+    assert found["summary"] == json.loads((files / "out" / "summary.json").read_text())
+    assert found["summary"]["num_frames"] == 3
+    assert set(found["files"]) >= {"track.npz", "smooth.npz", "overlay.mp4", "report.html"}
+    assert all(Path(path).is_file() for path in found["files"].values())
+    steps = ("finding the first pose", "tracking", "drawing overlay and report")
+    assert sorted(steps, key=told.err.index) == list(steps)
+    assert track(files, "--quiet", "--no-overlay") == 0
+    assert capfd.readouterr() == ("", "")
+    (files / "video.mp4").unlink()
+    assert track(files, "--quiet", "--json") == 2
+    told = capfd.readouterr()
+    assert (told.out, told.err.count("\n")) == ("", 1)
+
+
 SPOILED = {
     "missing video": lambda f: (f / "video.mp4").unlink(),
     "empty video": lambda f: (f / "video.mp4").write_bytes(b""),

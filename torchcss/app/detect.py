@@ -7,6 +7,7 @@ It writes `keypoints [T P J 2]`, `confidence [T P J]`, `joint_names [J]`, `perso
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,7 +63,9 @@ def detect_video(
     options = options or DetectOptions()
     reader = VideoReader(video, image_frame_rate=frame_rate)
     prepare_output_folder(out.parent)
-    detector = detector or open_detector(options.detector, options.detector_model)
+    if detector is None:
+        tqdm.write("loading the detector ...", file=sys.stderr)
+        detector = open_detector(options.detector, options.detector_model)
     try:
         count = reader.num_selected
         frames = [

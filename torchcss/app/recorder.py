@@ -165,7 +165,9 @@ class Recorder:
             for sink in self.sinks:
                 stack.push(partial(_close, sink))
             bar = stack.enter_context(
-                tqdm(frames, total=total, initial=len(writer), unit="frame", dynamic_ncols=True)
+                tqdm(
+                    frames, "tracking", total, initial=len(writer), unit="frame", dynamic_ncols=True
+                )
             )
             try:
                 for frame in bar:

@@ -8,6 +8,7 @@ comes out as it goes.
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -153,11 +154,14 @@ def track_video(
     if camera is None:
         lens = lens.of(video)
         views = _open_views((own, *options.others), lens.camera(video), selection)
-        views = views if lens.is_known else [fitted(views[0], settings)]
+        if not lens.is_known:
+            _now("fitting the focal length to the keypoints")
+            views = [fitted(views[0], settings)]
     else:
         views = _open_views((own, *options.others), lens.unless(Path(camera)), selection)
     generator = torch.Generator().manual_seed(settings.seed)
     eye = views[0].camera.camera.to(dtype=settings.torch_dtype, device=settings.device)
+    _now(f"finding the first pose, in frame {start}")
     first = _first_pose(views, eye, settings, start, options, generator)
     views = [opened.with_noise(first.noise) for opened in views]
     notes = [*(note for opened in views for note in opened.notes), *first.report]
@@ -179,6 +183,11 @@ def track_video(
         checkpoint_every=options.checkpoint_every,
     )
     return _record(recorder, views)
+
+
+def _now(what: str) -> None:
+    """Say what is being done, which may take a while."""
+    tqdm.write(f"{what} ...", file=sys.stderr)
 
 
 def resume(run: Run | str | os.PathLike[str], *, live: Sink | None = None) -> Run:
@@ -246,6 +255,7 @@ def _record(recorder: Recorder, views: Sequence[OpenView]) -> Run:
         # Drawing figures takes long to import.
         from torchcss.show.report import write_report
 
+        _now("drawing overlay and report")
         write_overlays(run, 1 / recorder.frame_interval)
         write_report(run)
     return run

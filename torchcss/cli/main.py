@@ -20,7 +20,7 @@ SIGTERM with 143. What was tracked until then is on disk; `torchcss track ... --
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -31,7 +31,7 @@ from torchcss.app.recorder import Terminated
 from torchcss.cli.detect import Detect
 from torchcss.cli.export import Export
 from torchcss.cli.init import Init
-from torchcss.cli.options import SettingsOptions
+from torchcss.cli.options import SettingsOptions, Terminal, TerminalOptions
 from torchcss.cli.smooth import Smooth
 from torchcss.cli.track import Track
 from torchcss.cli.view import Plot, Report, View
@@ -48,15 +48,18 @@ class Demo:
     frames: int = 50
     """Frames to track, of 50, 25 per second."""
     settings: SettingsOptions = DEMO_SETTINGS
+    terminal: TerminalOptions = field(default_factory=Terminal)
 
     def run(self) -> None:
         """Run the verb."""
-        summary = run_demo(self.out, settings=self.settings, num_frames=self.frames)
-        print(
+        with self.terminal.working():
+            summary = run_demo(self.out, settings=self.settings, num_frames=self.frames)
+        self.terminal.tell(
+            self.out,
             f"{summary['num_frames']} frames, {summary['seconds_per_frame']:.2f} s each\n"
             f"mean error of the best mode   {summary['mpjpe_mm']:6.1f} mm\n"
             f"mean error, best of the modes {summary['mpjpe_best_of_modes_mm']:6.1f} mm\n"
-            f"look at {self.out / 'report.html'}"
+            f"look at {self.out / 'report.html'}",
         )
 
 

@@ -1,19 +1,67 @@
-"""All of `Settings` as options, for every verb and script that tracks.
+"""Options that several verbs have: all of `Settings`, and what is written to the terminal.
 
     @dataclass(frozen=True, kw_only=True)
     class Config:
         settings: SettingsOptions = Settings(body="arm8")
 
-gives the script `--body`, `--preset`, `--terms` and all others, with the defaults of that record.
+gives a script `--body`, `--preset`, `--terms` and all others, with the defaults of that record.
 """
 
 from __future__ import annotations
 
+import json
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from torchcss.io.tracks import read_summary
 from torchcss.tracking.settings import Settings
 
 SettingsOptions = Annotated[Settings, tyro.conf.arg(name="")]
 """How to track; each field is an option of its own name."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Terminal:
+    """What is written to the terminal."""
+
+    quiet: bool = False
+    """Write nothing, errors and what --json asks for excepted."""
+    json: bool = False
+    """For programs: standard output is one JSON object with the run's folder, its files by name and
+    its summary; all else goes to standard error."""
+
+    @contextmanager
+    def working(self) -> Iterator[None]:
+        """While the work is done, which tells of its progress."""
+        with ExitStack() as stack:
+            aside = sys.stderr
+            if self.quiet:
+                aside = stack.enter_context(open(os.devnull, "w"))
+                stack.enter_context(redirect_stderr(aside))
+            if self.quiet or self.json:
+                stack.enter_context(redirect_stdout(aside))
+            yield
+
+    def tell(self, folder: Path, text: str) -> None:
+        """Say what came out.
+
+        Args:
+            folder: The run's folder.
+            text: The same for people.
+        """
+        if self.json:
+            files = {path.name: str(path) for path in sorted(folder.iterdir()) if path.is_file()}
+            told = {"folder": str(folder), "files": files, "summary": read_summary(folder)}
+            print(json.dumps(told))
+        elif not self.quiet:
+            print(text)
+
+
+TerminalOptions = Annotated[Terminal, tyro.conf.OmitArgPrefixes]

@@ -12,6 +12,7 @@ from typing import Annotated
 import tyro
 
 from torchcss.app.smooth import report, smooth
+from torchcss.cli.options import Terminal, TerminalOptions
 from torchcss.errors import ConfigurationError
 from torchcss.io.run import Given, GivenKeypoints, Run
 from torchcss.tracking.smooth import Smoothing
@@ -40,6 +41,7 @@ class Smooth:
     keypoints: Annotated[GivenKeypoints, tyro.conf.OmitArgPrefixes] = field(
         default_factory=GivenKeypoints
     )
+    terminal: TerminalOptions = field(default_factory=Terminal)
 
     def run(self) -> None:
         """Run the verb."""
@@ -58,5 +60,6 @@ class Smooth:
         if self.acceleration_ratio is not None:
             choice = replace(choice, acceleration_ratio=self.acceleration_ratio)
         run = Run.open(self.track, self.given, self.keypoints)
-        done = smooth(run, choice, images=images, out=self.out)
-        print(report(done.summary["smoothed"]))
+        with self.terminal.working():
+            done = smooth(run, choice, images=images, out=self.out)
+        self.terminal.tell(done.folder, report(done.summary["smoothed"]))

@@ -11,7 +11,7 @@ import tyro
 
 from torchcss.app.smooth import report, smooth
 from torchcss.app.track import TrackOptions, track_video
-from torchcss.cli.options import SettingsOptions
+from torchcss.cli.options import SettingsOptions, Terminal, TerminalOptions
 from torchcss.errors import ConfigurationError
 from torchcss.io.view_files import ViewFiles
 from torchcss.tracking.settings import Settings
@@ -59,6 +59,7 @@ class Track:
         TrackOptions, tyro.conf.OmitArgPrefixes, tyro.conf.AvoidSubcommands, tyro.conf.SuppressFixed
     ] = field(default_factory=TrackOptions)
     settings: SettingsOptions = field(default_factory=Settings)
+    terminal: TerminalOptions = field(default_factory=Terminal)
 
     def run(self) -> None:
         """Run the verb."""
@@ -69,7 +70,7 @@ class Track:
 
             spawn = self.live and connect is None
             live = LiveViewer(self.out.name, save=save, connect=connect, spawn=spawn)
-        with nullcontext() if live is None else closing(live):
+        with self.terminal.working(), nullcontext() if live is None else closing(live):
             run = track_video(
                 self.video,
                 camera=self.camera,
@@ -80,13 +81,15 @@ class Track:
                 stop=self.stop,
                 options=replace(self.options, others=others, live=live),
             )
-        print(
+            if self.smooth or self.smooth_images:
+                run = smooth(run, images=self.smooth_images)
+        lines = [
             f"{run.summary['num_frames']} frames, {run.summary['seconds_per_frame']:.2f} s each; "
             f"look at {self.out / ('report.html' if self.settings.overlay else 'track.npz')}"
-        )
-        if self.smooth or self.smooth_images:
-            done = smooth(run, images=self.smooth_images)
-            print(report(done.summary["smoothed"]))
+        ]
+        if "smoothed" in run.summary:
+            lines.append(report(run.summary["smoothed"]))
+        self.terminal.tell(self.out, "\n".join(lines))
 
     def others(self) -> list[ViewFiles]:
         """What the further cameras recorded."""
