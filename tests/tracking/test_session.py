@@ -124,8 +124,8 @@ def tracked(clip: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path,
 
 def test_writes_what_the_design_says(tracked: tuple[Path, Mapping[str, Any]]):
     folder, summary = tracked
-    names = {"track.npz", "summary.json", "checkpoint.npz", "overlay.mp4", "body.npz"}
-    assert {p.name for p in folder.iterdir()} == names
+    names = "track.npz summary.json checkpoint.npz overlay.mp4 body.npz report.html"
+    assert {p.name for p in folder.iterdir()} == set(names.split())
     track = torchcss.load_track(folder)
     assert track.frames.tolist() == list(range(FRAMES))
     assert track.state_names == load_body("arm7").state_names
