@@ -200,17 +200,32 @@ cost, x0, bounds = made("waves", torch.Generator().manual_seed(0))
 print(NEWTON.minimise(cost, x0[:12], bounds).cost.nan_to_num(posinf=0.0).sum().item())
 """
 
+BITS = """
+import torch
+from test_planning import NEWTON, made
+found = NEWTON.minimise(*made("body34", torch.Generator().manual_seed(0)))
+print(found.cost.numpy().tobytes().hex())
+"""
+
+
+def in_a_process(text: str, **variables: str) -> str:
+    """What a program prints in a process of its own."""
+    here = Path(__file__).parent
+    paths = os.pathsep.join([str(here), str(here.parent), str(here.parents[1])])
+    environment = {**os.environ, "PYTHONPATH": paths, **variables}
+    run = [sys.executable, "-c", text]
+    done = subprocess.run(run, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
 
 def test_no_index_is_out_of_range(generator):
-    here = Path(__file__).parent
-    paths = [str(here), str(here.parent), str(here.parents[1])]
-    environment = {
-        **os.environ,
-        "TORCHCSS_CHECK_KERNELS": "1",
-        "PYTHONPATH": os.pathsep.join(paths),
-    }
-    run = [sys.executable, "-c", CHECK]
-    done = subprocess.run(run, env=environment, capture_output=True, text=True, check=False)
+    found = in_a_process(CHECK, TORCHCSS_CHECK_KERNELS="1")
     cost, x0, bounds = made("waves", generator)
     expected = NEWTON.minimise(cost, x0[:12], bounds).cost.nan_to_num(posinf=0.0).sum()
-    assert float(done.stdout) == pytest.approx(float(expected), abs=1e-6), done.stderr
+    assert float(found) == pytest.approx(float(expected), abs=1e-6)
+
+
+def test_a_process_that_compiles_finds_what_one_with_a_cache_finds(tmp_path):
+    first, second = (in_a_process(BITS, TORCHCSS_CACHE=str(tmp_path)) for _ in range(2))
+    assert first == second

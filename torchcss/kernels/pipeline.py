@@ -21,6 +21,7 @@ from typing import Any
 import llvmlite
 import numba
 import numpy as np
+from llvmlite import binding as llvm
 from numba.core import caching, compiler, ir, types
 from numba.core.compiler_machinery import FunctionPass, register_pass
 from numba.core.untyped_passes import IRProcessing
@@ -41,6 +42,7 @@ def compiled(function: Any, role: str) -> Any:
     # Registers how numba makes the functions of `compiler`; it needs `compiled` itself.
     from torchcss.kernels import instructions as _  # noqa: F401
 
+    _ROLES[function] = role
     njit: Any = numba.njit  # its stubs lack some options
     made = njit(
         nogil=True,
@@ -50,7 +52,7 @@ def compiled(function: Any, role: str) -> Any:
         # What kernels alone call needs no way in from Python.
         no_cpython_wrapper=role != "entry",
         no_cfunc_wrapper=True,
-        pipeline_class=_Inlined if role == "inlined" else _Pipeline,
+        pipeline_class=_Pipeline,
     )(function)
     if role == "entry":
         with contextlib.suppress(OSError):  # nowhere to write: it is compiled in every process
@@ -139,37 +141,61 @@ class _Precision(FunctionPass):
 
 
 @register_pass(mutates_CFG=False, analysis_only=False)
-class _Plainly(FunctionPass):
-    """Leaves it to a function's callers to optimise it: it becomes a part of them."""
+class _Whole(FunctionPass):
+    """Makes machine code of entries alone, and all that they call a part of them.
 
-    _name = "torchcss_plainly"
+    A function that is compiled by itself, for its own sake, can be other instructions than the one
+    within an entry, and has the same name. Which of them ran would depend on what the process has
+    compiled before, and sums would round as that has it.
+    """
+
+    _name = "torchcss_whole"
 
     def __init__(self) -> None:
         FunctionPass.__init__(self)
 
     def run_pass(self, state: Any) -> Any:
+        role = _ROLES[state.func_id.func]
         codegen = state.targetctx.codegen()
-        state.library = codegen.create_library(state.func_id.func_qualname)
-        state.library.enable_object_caching()
-        state.library._optimize_final_module = lambda: None
+        state.library = library = codegen.create_library(state.func_id.func_qualname)
+        library.enable_object_caching()
+        if role == "entry":
+            optimize = library._optimize_final_module
+
+            def optimize_as_one() -> None:
+                for function in library._final_module.functions:
+                    if function.linkage == llvm.Linkage.linkonce_odr:
+                        function.linkage = "internal"
+                optimize()
+
+            library._optimize_final_module = optimize_as_one
+            return False
+        if role == "inlined":  # its callers optimise it
+            library._optimize_final_module = lambda: None
+        library._finalize_final_module = lambda: _add_environment(library)
         return False
+
+
+def _add_environment(library: Any) -> None:
+    """Finish the library of a function that is for others: of the process it needs one pointer."""
+    library._finalized = True
+    for variable in library._final_module.global_variables:
+        if variable.name.startswith("_ZN08NumbaEnv"):
+            module = llvm.parse_assembly(f'@"{variable.name}" = common global i8* null')
+            library._codegen._add_module(module)
 
 
 class _Pipeline(compiler.CompilerBase):
     def define_pipelines(self) -> list[Any]:
         passes = compiler.DefaultPassBuilder.define_nopython_pipeline(self.state)
         passes.add_pass_after(_Precision, IRProcessing)
+        passes.add_pass_after(_Whole, _Precision)
         passes.finalize()
         return [passes]
 
 
-class _Inlined(compiler.CompilerBase):
-    def define_pipelines(self) -> list[Any]:
-        passes = compiler.DefaultPassBuilder.define_nopython_pipeline(self.state)
-        passes.add_pass_after(_Precision, IRProcessing)
-        passes.add_pass_after(_Plainly, _Precision)
-        passes.finalize()
-        return [passes]
+_ROLES: dict[Any, str] = {}
+"""What each compiled function is for; see `compiled`."""
 
 
 def _single(value: Any) -> Any:
