@@ -29,6 +29,7 @@ from torchcss.solve.retarget import (
     fit_lengths,
     levelled,
     retarget,
+    with_lengths,
 )
 
 TREE = {
@@ -228,6 +229,24 @@ def test_lengths_stay_in_range(subject: BodyModel) -> None:
     for name, value in large.items():
         assert 0.9 <= value / LENGTHS[name] <= 1.1 + 1e-12
     assert large["head"] == pytest.approx(1.1 * LENGTHS["head"])  # grows with the rest
+
+
+def test_joints_take_lengths_and_keep_directions(
+    subject: BodyModel, generator: torch.Generator
+) -> None:
+    joints = subject.pose(moving(subject, count=6)).joints
+    joints = joints[:, [subject.joint_index(name) for name in LIMBS]]
+    narrow = joints.clone()
+    for side, sign in (("l", 1), ("r", -1)):  # the shoulders 6 cm nearer to each other
+        across = joints[:, LIMBS.index("l_shoulder")] - joints[:, LIMBS.index("r_shoulder")]
+        arm = [LIMBS.index(f"{side}_{joint}") for joint in ("shoulder", "elbow", "wrist")]
+        narrow[:, arm] -= sign * 0.03 * (across / across.norm(dim=-1, keepdim=True))[:, None]
+    restored = with_lengths(LIMBS, narrow, subject.lengths)
+    torch.testing.assert_close(restored, joints, rtol=0, atol=2e-3)
+    elbowless = [i for i, name in enumerate(LIMBS) if "elbow" not in name]
+    names = tuple(LIMBS[i] for i in elbowless)
+    restored = with_lengths(names, narrow[:, elbowless], subject.lengths)
+    torch.testing.assert_close(restored, joints[:, elbowless], rtol=0, atol=2e-3)
 
 
 def test_derivatives_against_autograd(subject: BodyModel, generator: torch.Generator) -> None:

@@ -4,7 +4,9 @@ Two skeletons that stand alike have different angles, but the same places for hi
 shoulders, elbows and wrists. A body is therefore fitted to where these are, frame by frame:
 
 1. *Lengths*, from the median distances between neighbouring joints, left and right alike, within 10
-   % of the standard humanoid (section 3.2.3 [IJRR]).
+   % of the standard humanoid (section 3.2.3 [IJRR]). Where that holds a length, the joints keep
+   their directions and take the body's: else narrow shoulders, which many skeletons of recordings
+   have, would be clavicles bent back to their limits.
 2. *States*, from several starting poses per frame, all in one batch of the bound-constrained
    search of section 4.1 [IJRR]: squared distances in space and the sticky prior of section 3.2.2
    on what the joints do not tell (the twist of a straight arm).
@@ -27,6 +29,7 @@ Call `retarget`.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -51,6 +54,13 @@ _STERNOCLAVICULAR = 0.03
 """Metres from the midline to where the body's shoulder width begins."""
 _TOE_DEPTH = 0.05
 """Metres from the height of the ankle down to the toe, at rest."""
+_ABOVE = {
+    "elbow": ("shoulder", "upper_arm"),
+    "wrist": ("elbow", "forearm"),
+    "knee": ("hip", "thigh"),
+    "ankle": ("knee", "shank"),
+}
+"""The joint above each of a limb's, and the length between them."""
 _UPRIGHT = math.cos(math.radians(30))
 _STEEP = math.radians(75)
 """Pitch of the root from which yaw and roll begin to be the same turn."""
@@ -110,9 +120,9 @@ class Retargeted(NamedTuple):
         states: Its states, within its limits unless the report says otherwise.
         joints: Its joint centres, `BodyModel.joint_names`, metres.
         target_names: The limbs' joints that were followed.
-        targets: Where the source has them, in the same world.
+        targets: Where they shall be: where the source has them, with the body's lengths.
         source: All joints of the source, in the same world.
-        error: Distances between body and source, metres.
+        error: Distances between body and targets, metres.
         at_limit: Angles that a limit holds.
         depth: How deep one part is inside another, metres; 0 if nowhere.
         report: What was found, one line each.
@@ -166,7 +176,9 @@ def retarget(
     model = load_body(body, lengths=lengths)
     others, line = _anchored(motion, model, names, index)
     report += [*level, line]
-    cost = _cost(model, names, index, source, others, choice)
+    limbs = with_lengths(names, source[:, limb], lengths)
+    followed = [*limbs.unbind(1), *(source[:, other.joint] for other in others)]
+    cost = _cost(model, names, torch.stack(followed, 1), others, choice)
     root = _root_by_trunk(names, source[:, limb])
     states = _fit(cost, root, motion.frame_rate, choice, generator)
     model, states = _face_middle(model, states)
@@ -174,8 +186,9 @@ def retarget(
         feet = [model.joint_index(f"{side}_{end}") for side in "lr" for end in ("heel", "toe")]
         floor = model.pose(states).joints[:, feet, 1].amin(-1).quantile(_ON_FLOOR)
         drop = torch.stack([0 * floor, -floor, 0 * floor])
-        model, source = model.with_base(model.base_rotation, drop), source + drop
-    joints, limbs = model.pose(states).joints, source[:, limb]
+        model = model.with_base(model.base_rotation, drop)
+        source, limbs = source + drop, limbs + drop
+    joints = model.pose(states).joints
     columns = [model.joint_index(name) for name in names]
     at_limit = (states <= model.lower + _SLACK) | (states >= model.upper - _SLACK)
     depth, pairs = collision_depth(model, states)
@@ -203,29 +216,9 @@ def fit_lengths(
         Lengths in metres, and a line about those that the range of proportions holds. What no joint
         tells grows with the rest: neck, head and hand.
     """
-    place = {name: limbs[:, i] for i, name in enumerate(names)}
-
-    def between(one: str, other: str) -> float | None:
-        """Median distance, of both sides together if the names lack theirs."""
-        pairs = [(place.get(f"{s}_{one}"), place.get(f"{s}_{other}")) for s in "lr"]
-        both = [float((a - b).norm(dim=-1).median()) for a, b in pairs
-                if a is not None and b is not None]  # fmt: skip
-        return sum(both) / len(both) if both else None
-
-    hips = 0.5 * (place["l_hip"] + place["r_hip"])
-    shoulders = 0.5 * (place["l_shoulder"] + place["r_shoulder"])
-    width = float((place["l_shoulder"] - place["r_shoulder"]).norm(dim=-1).median())
-    measured = {
-        "hip_width": float((place["l_hip"] - place["r_hip"]).norm(dim=-1).median()) / 2,
-        "trunk": float((shoulders - hips).norm(dim=-1).median()),
-        "shoulder_width": width / 2 - _STERNOCLAVICULAR,
-        "upper_arm": between("shoulder", "elbow"),
-        "forearm": between("elbow", "wrist"),
-        "thigh": between("hip", "knee"),
-        "shank": between("knee", "ankle"),
-        "foot": None if foot is None else max(foot**2 - _TOE_DEPTH**2, 0.0) ** 0.5,
-    }
-    known = {name: value for name, value in measured.items() if value is not None}
+    known = _measured(names, limbs)
+    if foot is not None:
+        known["foot"] = max(foot**2 - _TOE_DEPTH**2, 0.0) ** 0.5
     factor = sum(known.values()) / sum(LENGTHS[name] for name in known)
     lengths, held = {}, []
     for name, standard in LENGTHS.items():
@@ -237,6 +230,62 @@ def fit_lengths(
     if not held:
         return lengths, ["lengths: all within 10 % of the standard humanoid's"]
     return lengths, [f"lengths held within 10 % of the standard humanoid's, mm: {', '.join(held)}"]
+
+
+def with_lengths(
+    names: tuple[str, ...], limbs: Float[Tensor, "t limbs 3"], lengths: Mapping[str, float]
+) -> Float[Tensor, "t limbs 3"]:
+    """Joint centres that keep their directions from each other, and take other lengths.
+
+    Args:
+        names: Names of the limbs' joints.
+        limbs: Their positions, metres.
+        lengths: Lengths of the catalogue, metres.
+    """
+    place = {name: limbs[:, i] for i, name in enumerate(names)}
+    factor = {name: lengths[name] / value for name, value in _measured(names, limbs).items()}
+    width = lengths["shoulder_width"] + _STERNOCLAVICULAR
+    shoulders = place["l_shoulder"] - place["r_shoulder"]
+    factor["shoulder_width"] = 2 * width / float(shoulders.norm(dim=-1).median())
+    hips = 0.5 * (place["l_hip"] + place["r_hip"])
+    trunk = 0.5 * (place["l_shoulder"] + place["r_shoulder"]) - hips
+    moved = {}
+    for name, at in place.items():  # each after the one above
+        side, joint = name.split("_")
+        if joint == "hip":
+            moved[name] = hips + factor["hip_width"] * (at - hips)
+        elif joint == "shoulder":
+            across = at - hips - trunk
+            moved[name] = hips + factor["trunk"] * trunk + factor["shoulder_width"] * across
+        else:
+            above, length = _ABOVE[joint]
+            if f"{side}_{above}" not in place:
+                above, length = _ABOVE[above][0], ""
+            above = f"{side}_{above}"
+            moved[name] = moved[above] + factor.get(length, 1.0) * (at - place[above])
+    return torch.stack([moved[name] for name in names], dim=1)
+
+
+def _measured(names: tuple[str, ...], limbs: Float[Tensor, "t limbs 3"]) -> dict[str, float]:
+    """Those lengths of the catalogue that the limbs' joints tell: medians, of both sides alike."""
+    place = {name: limbs[:, i] for i, name in enumerate(names)}
+    hips = 0.5 * (place["l_hip"] + place["r_hip"])
+    shoulders = 0.5 * (place["l_shoulder"] + place["r_shoulder"])
+    width = float((place["l_shoulder"] - place["r_shoulder"]).norm(dim=-1).median())
+    found = {
+        "hip_width": float((place["l_hip"] - place["r_hip"]).norm(dim=-1).median()) / 2,
+        "trunk": float((shoulders - hips).norm(dim=-1).median()),
+        "shoulder_width": width / 2 - _STERNOCLAVICULAR,
+    }
+    for joint, (above, length) in _ABOVE.items():
+        both = [
+            float((place[f"{side}_{joint}"] - place[f"{side}_{above}"]).norm(dim=-1).median())
+            for side in "lr"
+            if {f"{side}_{joint}", f"{side}_{above}"} <= set(place)
+        ]
+        if both:
+            found[length] = sum(both) / len(both)
+    return found
 
 
 def collision_depth(
@@ -440,20 +489,19 @@ def _meeting(parents: tuple[int, ...], one: int, other: int) -> int:
 def _cost(
     body: BodyModel,
     names: tuple[str, ...],
-    index: tuple[int, ...],
-    source: Float[Tensor, "t j 3"],
+    target: Float[Tensor, "t limbs+others 3"],
     others: list[_Anchored],
     choice: Retargeting,
 ) -> PointDistances:
-    """Limbs and other joints where the source has them, frame by frame."""
+    """Limbs and other joints where they shall be, frame by frame."""
     columns = [body.joint_index(name) for name in names]
     sigma = [choice.sigma] * len(names) + [choice.sigma_others] * len(others)
     return PointDistances(
         body=body,
         link=torch.cat([body.marker_link[columns], torch.tensor([o.link for o in others]).long()]),
         offset=torch.cat([body.marker_offset[columns], *(o.offset[None] for o in others)]),
-        target=source[:, [*index, *(other.joint for other in others)]],
-        sigma=torch.tensor(sigma).to(source),
+        target=target,
+        sigma=torch.tensor(sigma).to(target),
     )
 
 
