@@ -168,6 +168,9 @@ class Keypoints(NamedTuple):
         relative_noise: Standard deviation in multiples of what the cost's joint term is told, since
             views in which the body is larger have more pixels of noise.
         report: What a reader recognised, chosen or corrected, one line each.
+        points: Where a detector believes them in space, metres, in the camera's axes from any
+            origin; NaN where it does not say. The search for a first pose starts from them as well;
+            no cost compares with them.
     """
 
     positions: Float[Tensor, "*t j 2"]
@@ -175,6 +178,7 @@ class Keypoints(NamedTuple):
     names: tuple[str, ...]
     relative_noise: float = 1.0
     report: tuple[str, ...] = ()
+    points: Float[Tensor, "*t j 3"] | None = None
 
     @property
     def says_nothing(self) -> bool:
@@ -183,7 +187,11 @@ class Keypoints(NamedTuple):
 
     def at(self, frame: int | Int[Tensor, " s"]) -> Self:
         """The keypoints of one frame, or of some."""
-        return self._replace(positions=self.positions[frame], confidence=self.confidence[frame])
+        return self._replace(
+            positions=self.positions[frame],
+            confidence=self.confidence[frame],
+            points=None if self.points is None else self.points[frame],
+        )
 
     def only(self, names: tuple[str, ...]) -> Self:
         """Those of some joints, in the order in which they are."""
@@ -192,6 +200,7 @@ class Keypoints(NamedTuple):
             positions=self.positions[..., columns, :],
             confidence=self.confidence[..., columns],
             names=tuple(self.names[column] for column in columns),
+            points=None if self.points is None else self.points[..., columns, :],
         )
 
     def without(self, joints: Bool[Tensor, "*t j"]) -> Self:
@@ -210,7 +219,11 @@ class Keypoints(NamedTuple):
 
     def to(self, like: Tensor) -> Self:
         """The same in the type and on the device of a tensor."""
-        return self._replace(positions=self.positions.to(like), confidence=self.confidence.to(like))
+        return self._replace(
+            positions=self.positions.to(like),
+            confidence=self.confidence.to(like),
+            points=None if self.points is None else self.points.to(like),
+        )
 
 
 @dataclass(frozen=True, slots=True)

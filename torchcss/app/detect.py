@@ -2,7 +2,8 @@
 
 `detect_video` is what `torchcss detect` calls, and `torchcss track` where no keypoints are given.
 It writes `keypoints [T P J 2]`, `confidence [T P J]`, `joint_names [J]`, `person_ids [P]`,
-`image_size_wh` and `relative_noise`, which `torchcss.io.keypoints` reads.
+`image_size_wh` and `relative_noise`, which `torchcss.io.keypoints` reads; of a detector that says
+them `points [T P J 3]`, and beside the file the masks, a film (`masks_of`).
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ from tqdm import tqdm
 
 from torchcss.errors import KeypointError
 from torchcss.files import prepare_output_folder, save_arrays
-from torchcss.io.detect import Detector, DetectorName, open_detector
+from torchcss.io.detect import Detected, Detector, DetectorName, open_detector
 from torchcss.io.keypoints.one_person import identified
-from torchcss.io.video import VideoReader
+from torchcss.io.video import VideoReader, VideoWriter
 from torchcss.joint_names import ALIASES
 
 
@@ -49,7 +50,7 @@ def detect_video(
 
     Args:
         video: A video, or a folder of images.
-        out: The file, `.npz`.
+        out: The file, `.npz`; the masks are written beside it.
         options: What finds them.
         frame_rate: Frames per second of a folder of images; None: 30.
         detector: A detector that is loaded already.
@@ -67,13 +68,10 @@ def detect_video(
         tqdm.write("loading the detector ...", file=sys.stderr)
         detector = open_detector(options.detector, options.detector_model)
     try:
-        count = reader.num_selected
-        frames = [
-            detector.detect(frame) for frame in tqdm(reader, "detecting", count, unit="frame")
-        ]
+        frames = _detected(reader, detector, masks_of(out))
     finally:
         detector.close()
-    if not any(len(people) for people in frames):
+    if not any(len(found.joints) for found in frames):
         raise KeypointError(
             f"{video}: nobody found in {len(frames)} frames; the detector needs most of a person "
             "in the picture: mark the joints of one frame (torchcss init --click), or give "
@@ -84,31 +82,52 @@ def detect_video(
     return out
 
 
+def masks_of(keypoints: Path) -> Path:
+    """Where the masks lie that were found with these keypoints: white where anybody is."""
+    return keypoints.with_name(f"{keypoints.stem}_masks.mp4")
+
+
+def _detected(reader: VideoReader, detector: Detector, masks: Path) -> list[Detected]:
+    """The people of every frame; their masks go into a film."""
+    found = []
+    with VideoWriter(masks, reader.info.frame_rate) as film:
+        for frame in tqdm(reader, "detecting", reader.num_selected, unit="frame"):
+            seen = detector.detect(frame)
+            if seen.mask is not None:
+                film.write(np.repeat(seen.mask[..., None], 3, axis=-1))
+            found.append(seen._replace(mask=None))
+    return found
+
+
 def write_people(
-    out: Path, frames: Sequence[np.ndarray], detector: Detector, image_size_wh: tuple[int, int]
+    out: Path, frames: Sequence[Detected], detector: Detector, image_size_wh: tuple[int, int]
 ) -> None:
     """Write who is where in every frame, every person under one number; joints that bodies have.
 
     Args:
         out: The file.
-        frames: The people of every frame, `[p j 3]`.
+        frames: The people of every frame.
         detector: What found them.
         image_size_wh: Size of the images.
     """
-    ids = identified(list(frames))
+    ids = identified([found.joints for found in frames])
     count = 1 + max((number for people in ids for number in people), default=0)
     names = {name: column for column, name in enumerate(ALIASES[detector.layout]) if name}
+    columns = list(names.values())
     joints = np.tile((np.nan, np.nan, 0.0), (len(frames), count, len(names), 1))
-    for index, (people, numbers) in enumerate(zip(frames, ids, strict=True)):
-        joints[index, numbers] = people[:, list(names.values())]
-    save_arrays(
-        out,
-        {
-            "keypoints": joints[..., :2],
-            "confidence": joints[..., 2],
-            "joint_names": list(names),
-            "person_ids": np.arange(count),
-            "image_size_wh": image_size_wh,
-            "relative_noise": detector.relative_noise,
-        },
-    )
+    points = np.full_like(joints, np.nan)
+    for index, (found, numbers) in enumerate(zip(frames, ids, strict=True)):
+        joints[index, numbers] = found.joints[:, columns]
+        if found.points is not None:
+            points[index, numbers] = found.points[:, columns]
+    arrays = {
+        "keypoints": joints[..., :2],
+        "confidence": joints[..., 2],
+        "joint_names": list(names),
+        "person_ids": np.arange(count),
+        "image_size_wh": image_size_wh,
+        "relative_noise": detector.relative_noise,
+    }
+    if np.isfinite(points).any():
+        arrays["points"] = points
+    save_arrays(out, arrays)

@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from torchcss.app.detect import DetectOptions, detect_video
+from torchcss.app.detect import DetectOptions, detect_video, masks_of
 from torchcss.app.init import initialise_video
 from torchcss.app.lens import Lens, fitted
 from torchcss.app.recorder import CHECKPOINT_EVERY, Begun, Recorder, Sink
@@ -135,15 +135,17 @@ def track_video(
     selection = Selection(start=start, stop=stop, stride=options.stride)
     if options.resume and (begun := _begun(out)) is not None:
         return _go_on(begun, settings, selection, options)
-    video = Path(video)
+    video, masks = Path(video), options.masks
     if keypoints is None:
-        found = out / "keypoints.npz"
-        keypoints = detect_video(video, found, options.detect, frame_rate=options.frame_rate)
+        keypoints = out / "keypoints.npz"
+        detect_video(video, keypoints, options.detect, frame_rate=options.frame_rate)
+        if masks is None and masks_of(keypoints).is_file():
+            masks = masks_of(keypoints)
     own = ViewFiles(
         video=video,
         keypoints=Path(keypoints),
         camera_name=options.camera_name,
-        masks=options.masks,
+        masks=masks,
         layout=options.layout,
         normalised=options.normalised,
         frame_rate=options.frame_rate,

@@ -15,6 +15,7 @@ from torch import Tensor
 from torchcss.errors import VideoError
 from torchcss.initialise.keypoint_checks import typical_sigma
 from torchcss.io.cameras import LoadedCamera, check_image_size, load_camera
+from torchcss.io.keypoints.arrays import read_points
 from torchcss.io.keypoints.frames import Film
 from torchcss.io.keypoints.one_person import Whom
 from torchcss.io.keypoints.read import read_person
@@ -94,7 +95,8 @@ class OpenView(NamedTuple):
                     f"the masks end before frame {frame.index}; give one for every frame"
                 )
             else:
-                yield replace(frame, mask=mask.image)
+                height, width = frame.image.shape[:2]
+                yield replace(frame, mask=mask.image[:height, :width])
 
 
 def moments(
@@ -159,7 +161,9 @@ def open_view(
     masks = None
     if files.masks is not None:
         masks = VideoReader(files.masks, start=start, stop=stop, stride=stride)
-        if (masks.info.width, masks.info.height) != (width, height):
+        # Films of odd sizes are a row or column larger.
+        ours = (masks.info.width, masks.info.height)
+        if ours not in ((width, height), (width + width % 2, height + height % 2)):
             raise VideoError(
                 f"{files.masks}: masks must have the video's size {width} x {height}, these have "
                 f"{masks.info.width} x {masks.info.height}"
@@ -186,5 +190,5 @@ def open_view(
         normalised=files.normalised,
     )
     sigma = files.sigma or keypoints.relative_noise * typical_sigma(keypoints)
-    keypoints = keypoints._replace(relative_noise=1.0)
+    keypoints = read_points(files.keypoints, keypoints._replace(relative_noise=1.0))
     return OpenView(files, reader, masks, loaded, keypoints, sigma)

@@ -13,7 +13,8 @@ starts in three batches, every descent bound by the joint limits:
    4^4 combinations of limbs, of which the best are kept.
 3. *Covariance-scaled samples* of the best fits so far, as the tracker draws them.
 
-All of these descend once more, at four times and at the true scale of the keypoints.
+A detector's joints in space, where there are any, are one more start
+(`torchcss.initialise.from_points`). All of these descend once more, at four times and at the true scale of the keypoints.
 
 Call `multi_start_fits`.
 """
@@ -41,6 +42,7 @@ from torchcss.errors import ConfigurationError
 from torchcss.inference.mixture import GaussianMixture, distinct_modes
 from torchcss.inference.proposals import CovarianceScaled
 from torchcss.inference.trust_region import TrustRegionNewton
+from torchcss.initialise.from_points import start_from_points
 from torchcss.types import Bounds, Modes
 
 _WIDE, _MIDDLE = 16.0, 4.0
@@ -153,9 +155,13 @@ def multi_start_fits(cost: TrackingCost, *, search: Search, generator: torch.Gen
         cost, first, bounds,
         ((_WIDE, 12), (_MIDDLE, 12)) if search.anneal else (),
     )  # fmt: skip
-    starts = [fits]
+    beside = fits[:0]
+    if cost.keypoints is not None and cost.keypoints.points is not None:
+        turned = starts_about(body, _TURNS, generator)
+        beside = start_from_points(body, cost.camera, cost.keypoints, turned, bounds)
+    starts = [fits, beside]
     if search.num_flips and (segments := Segments(body)).limbs:
-        trunks = _distinct_trunks(cost, segments, fits, search.num_trunks)
+        trunks = _distinct_trunks(cost, segments, torch.cat(starts), search.num_trunks)
         starts.append(flips(cost, segments, trunks, bounds, search.num_flips))
     if search.num_samples or search.anneal:
         modes = _optimise(_widened(cost, _MIDDLE), fits, bounds, 2)

@@ -1,8 +1,8 @@
 """2D joints as arrays: our own NPZ, and what people save of what a detector returns.
 
 Ours is `keypoints [T J 2]`, `confidence [T J]`, `joint_names [J]`; of several people `[T P J 2]`,
-`[T P J]` and `person_ids [P]`; and `image_size_wh [2]` and `relative_noise []` (`People`). Read as
-well, as NPY or as the only array of an NPZ: pairs or triples `[T J 2]`, `[T J 3]` (x, y,
+`[T P J]` and `person_ids [P]`; and `image_size_wh [2]` and `relative_noise []` (`People`), and
+`points [T P J 3]` (`read_points`). Read as well, as NPY or as the only array of an NPZ: pairs or triples `[T J 2]`, `[T J 3]` (x, y,
 confidence), in a row `[T 3 J]`, of several people `[T P J 3]`, of one picture `[J 3]`, and
 MoveNet's `[T 1 1 J 3]` (y, x, confidence, fractions). Confidences may be called `scores` and the
 like.
@@ -14,10 +14,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from torchcss.errors import KeypointError
+from torchcss.files import load_arrays
 from torchcss.io.keypoints.people import People, Person, is_there, screened
 from torchcss.joint_names import ALIASES
+from torchcss.types import Keypoints
 
 _PLACES = (
     "keypoints",
@@ -83,6 +86,26 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
         size_wh=None if size is None else _size(path, size),
         relative_noise=1.0 if noise is None else _positive(path, "relative_noise", noise, 1)[0],
     )
+
+
+def read_points(path: Path, keypoints: Keypoints) -> Keypoints:
+    """The keypoints with the `points` of the person that they are, where our NPZ has them.
+
+    Args:
+        path: The file that the keypoints were read from, which may be of any format.
+        keypoints: Of every frame, in the pixels of the file.
+    """
+    if path.suffix.lower() != ".npz" or not path.is_file():
+        return keypoints
+    arrays = load_arrays(path, KeypointError)
+    if "points" not in arrays:
+        return keypoints
+    places = torch.as_tensor(arrays["keypoints"]).to(keypoints.positions)
+    column = [list(arrays["joint_names"]).index(name) for name in keypoints.names]
+    gap = (places[:, :, column] - keypoints.positions[:, None]).norm(dim=-1)
+    gap = torch.where(keypoints.confidence[:, None] > 0, gap, 0.0).nan_to_num(torch.inf).sum(-1)
+    points = torch.as_tensor(arrays["points"]).to(places)[:, :, column]
+    return keypoints._replace(points=points[torch.arange(len(gap)), gap.argmin(1)])
 
 
 def _tracks(path: Path, ids: np.ndarray | None, count: int) -> list[str | None]:
