@@ -5,19 +5,23 @@
 The reference is an NPZ file with `joints [T J 3]` in metres, NaN where unknown, and `joint_names`;
 its row i belongs to frame i of the video. Names may be spelt as any detector spells them. Which
 errors there are and what they need is in `torchcss.studies.metrics`; in Python it is
-`torchcss.evaluate`.
+`torchcss.evaluate`. A detector that says where it believes the joints in space, as MediaPipe does,
+is a peer: the last row of the table, in the frames that it saw the person.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import tyro
 from common import Table, start, write_report
 
+from torchcss.app.view_files import open_view
 from torchcss.errors import ConfigurationError
+from torchcss.io.run import Run
 from torchcss.studies.evaluation import Evaluation, evaluate
 from torchcss.studies.metrics import LIMB_JOINTS, LOST_MM
 
@@ -54,20 +58,56 @@ def main(config: Config) -> dict[str, Any]:
     """Evaluate, print, write; return what is written."""
     if config.out is not None and config.out.is_dir():
         raise ConfigurationError(f"--out {config.out}: expected a file to write, found a folder")
-    found = evaluate(
-        config.track,
+    run = Run.open(config.track)
+    found = evaluation(run, config)
+    report = report_of(found, config)
+    print_table(report)
+    columns = [key + suffix for suffix in ("", "_best_of_modes") for key in KINDS]
+    cells = [*(report[f"{column}_mm"] for column in columns), report["num_frames_lost"]]
+    rows = [[str(config.track), *cells]]
+    if (alone := detector_alone(run)) is not None:
+        errors = evaluation(alone, config).errors
+        report["detector"] = {"num_frames": len(alone.track.frames)} | {
+            f"{key}_mm": getattr(errors, KINDS[key]).mean_mm for key in tuple(KINDS)[1:]
+        }
+        aligned, procrustes = errors.root_aligned.mean_mm, errors.procrustes.mean_mm
+        print(f"{'its detector':>16} | {'':8} {aligned:8.1f} {procrustes:8.1f}")
+        rows.append(["its detector", "", aligned, procrustes, "", "", "", ""])
+    write_report(config.out, report, Table("A track", ("track", *columns, "lost"), rows))
+    return report
+
+
+def evaluation(run: Run, config: Config) -> Evaluation:
+    """The run against the reference."""
+    return evaluate(
+        run,
         config.reference,
         joints=config.joints,
         root=config.root,
         array=config.reference_array,
     )
-    report = report_of(found, config)
-    print_table(report)
-    columns = [key + suffix for suffix in ("", "_best_of_modes") for key in KINDS]
-    cells = [*(report[f"{column}_mm"] for column in columns), report["num_frames_lost"]]
-    table = Table("A track", ("track", *columns, "lost"), [[str(config.track), *cells]])
-    write_report(config.out, report, table)
-    return report
+
+
+def detector_alone(run: Run) -> Run | None:
+    """The run with the joints in space that its detector believes in; None: it says none."""
+    if not run.cameras or (files := run.cameras[0].files) is None or not files.video.exists():
+        return None
+    keypoints = open_view(files, run.camera).keypoints
+    if keypoints is None or keypoints.points is None:
+        return None
+    track = run.track
+    points = (keypoints.points[track.frames] @ run.camera.R_camera_world).numpy()
+    rows = np.isfinite(points).all((1, 2))
+    return replace(
+        run,
+        track=track._replace(
+            frames=track.frames[rows],
+            joint_names=keypoints.names,
+            joints_world=points[rows][:, None],
+            log_weight=np.zeros((int(rows.sum()), 1)),
+            body=None,
+        ),
+    )
 
 
 def report_of(found: Evaluation, config: Config) -> dict[str, Any]:

@@ -8,12 +8,16 @@ import numpy as np
 import pytest
 
 import torchcss
-from torchcss.app.detect import detect_video
+from torchcss.app.detect import detect_video, masks_of
+from torchcss.app.view_files import open_view
 from torchcss.errors import KeypointError
+from torchcss.io.detect import Detected
 from torchcss.io.keypoints.frames import Film
 from torchcss.io.keypoints.one_person import Whom
 from torchcss.io.keypoints.read import read_person
+from torchcss.io.view_files import ViewFiles
 from torchcss.types import Frame, Keypoints
+from torchcss.vision.camera import Camera
 
 SIZE = (64, 48)
 
@@ -27,13 +31,22 @@ class Crowd:
     def __init__(self, places: list[list[tuple[float, float, float]]]) -> None:
         self.places, self.closed = places, False
 
-    def detect(self, frame: Frame) -> np.ndarray:
+    def detect(self, frame: Frame) -> Detected:
         spread = np.random.default_rng(0).uniform(-1, 1, (17, 2))
         people = [
             np.column_stack([(x, y) + size * spread, np.full(17, 0.9)])
             for x, y, size in self.places[frame.index]
         ]
-        return np.array(people[:: (-1) ** frame.index]).reshape(-1, 17, 3)
+        order = slice(None, None, (-1) ** frame.index)
+        points = [np.full((17, 3), x) for x, _, _ in self.places[frame.index]]
+        mask = np.zeros(frame.image.shape[:2], dtype=np.uint8)
+        for _, y, _ in self.places[frame.index]:
+            mask[int(y)] = 255
+        return Detected(
+            np.array(people[order]).reshape(-1, 17, 3),
+            np.array(points[order]).reshape(-1, 17, 3),
+            mask,
+        )
 
     def close(self) -> None:
         self.closed = True
@@ -71,6 +84,22 @@ def test_everybody_is_found_and_known_again(
     assert any("--person" in line for line in keypoints.report)
 
 
+def test_points_are_those_of_the_person_and_masks_lie_beside(files: Path, crowd: Crowd) -> None:
+    path = detect_video(files / "video.mp4", files / "found.npz", detector=crowd)
+    camera = Camera.pinhole(*SIZE, focal_px=60.0)
+    for person, x, frames in (("largest", 48.0, (0, 1, 2)), ("centre", 30.0, (0, 2))):
+        given = ViewFiles(
+            video=files / "video.mp4", keypoints=path, masks=masks_of(path), person=person
+        )
+        view = open_view(given, camera)
+        assert view.keypoints is not None
+        assert view.keypoints.points is not None
+        assert (view.keypoints.points[list(frames)] == x).all()
+        masks = [frame.mask for frame in view.images()]
+        assert len(masks) == 3
+        assert all(mask is not None and mask[24].mean() > 200 > mask[40].mean() for mask in masks)
+
+
 def test_who_is_not_there_is_told(files: Path, crowd: Crowd) -> None:
     path = detect_video(files / "video.mp4", files / "found.npz", detector=crowd)
     with pytest.raises(KeypointError, match=r"person '2' is not in frame 1.*there are 0, 1"):
@@ -101,6 +130,7 @@ def test_a_video_alone_is_tracked(
     assert given is not None
     assert given.keypoints == out / "keypoints.npz"
     assert given.person == "leftmost"
+    assert given.masks == out / "keypoints_masks.mp4"
     notes = "\n".join(run.summary["notes"])
     assert "followed the leftmost one of frame 0" in notes
     assert "as given" in notes

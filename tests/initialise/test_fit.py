@@ -473,3 +473,29 @@ def test_typical_sigma_is_that_of_the_middle_frame():
 
 def test_public_name():
     assert torchcss.initialise is initialise
+
+
+def test_a_detectors_points_are_a_start() -> None:
+    someone = person(4, noise_px=0.0)
+    names = tuple(n for n in someone.joint_names if n in someone.body.joint_names)
+    away = someone.camera.R_camera_world.to(torch.float64) @ someone.joints_world(names).T
+    known = Keypoints(someone.keypoints, someone.confidence, someone.joint_names).only(names)
+    told = known._replace(points=1.3 * (away.T - away.T.mean(0)))  # of a larger person
+    alone = Search(num_starts=1, num_flips=0, num_samples=0, leave_out=False)
+    options = InitialiseOptions(sigma=1.0, search=alone, least_joints=LEAST_JOINTS)
+
+    def error(keypoints: Keypoints) -> tuple[float, float]:
+        found = initialise(
+            None, keypoints, someone.camera, generator=torch.Generator().manual_seed(0),
+            options=options,
+        )  # fmt: skip
+        index = [found.body.joint_index(name) for name in LIMB_JOINTS]
+        joints = found.body.pose(found.mixture.mean[:1]).joints[:, index].numpy()
+        truth = someone.joints_world(LIMB_JOINTS).numpy()
+        return float(found.cost[0]), float(pa_mpjpe_mm(joints, truth)[0])
+
+    (cost, near), (cost_alone, far) = error(told), error(known)
+    assert near < 0.6 * far
+    assert cost < cost_alone
+    none = known._replace(points=torch.full_like(told.points, torch.nan))
+    assert error(none) == (cost_alone, far)

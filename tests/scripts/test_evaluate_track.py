@@ -15,8 +15,10 @@ import torch
 import torchcss
 from torchcss.body.load import load_body
 from torchcss.errors import ConfigurationError, ShapeError, TrackFileError
-from torchcss.io.tracks import FrameModes, Track, TrackWriter
+from torchcss.io.tracks import FrameModes, Track, TrackWriter, load_track, save_track
+from torchcss.io.view_files import RecordedCamera, ViewFiles
 from torchcss.studies.metrics import LIMB_JOINTS
+from torchcss.vision.camera import Camera
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "evaluate_track.py"
 
@@ -234,3 +236,33 @@ def test_real_reference(script: ModuleType, shared_data: Path, tmp_path: Path) -
     assert report["num_frames"] == report["num_frames_measured"] == 100
     assert report["num_frames_lost"] == 0
     assert 0 < report["pa_mpjpe_mm"] < report["mpjpe_mm"] < 30
+
+
+def test_its_detector_is_a_peer(
+    script: ModuleType, joints: np.ndarray, files: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Points in a camera's axes, turned against the world's, of which one frame has none."""
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    points = (1.02 * joints[:3] - [1, 2, 3]) @ turn.T
+    points[1] = np.nan
+    places = np.random.default_rng(2).uniform(5, 40, (3, 1, len(LIMB_JOINTS), 2))
+    path = files / "found.npz"
+    np.savez(
+        path,
+        keypoints=places,
+        confidence=np.ones(places.shape[:3]),
+        joint_names=np.array(LIMB_JOINTS),
+        points=points[:, None],
+    )
+    camera = Camera(np.diag([60.0, 60.0, 1.0]), (64, 48), R_camera_world=turn)
+    seen = RecordedCamera(camera, ViewFiles(video=files / "video.mp4", keypoints=path))
+    tracked = joints[:3] + np.random.default_rng(3).normal(scale=0.05, size=joints[:3].shape)
+    track = write_track(files / "run", tracked[:, None], LIMB_JOINTS)
+    save_track(track / "track.npz", load_track(track / "track.npz")._replace(cameras=(seen,)))
+    reference = write_reference(files / "r.npz", joints, list(LIMB_JOINTS))
+    report = script.main(script.Config(track=track, reference=reference))
+    assert report["detector"]["num_frames"] == 2
+    assert report["detector"]["pa_mpjpe_mm"] == pytest.approx(0, abs=1e-6)
+    assert 0 < report["detector"]["root_aligned_mpjpe_mm"] < 40
+    assert report["num_frames"] == 3
+    assert "its detector" in capsys.readouterr().out

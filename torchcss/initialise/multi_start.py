@@ -14,7 +14,8 @@ starts in three batches, every descent bound by the joint limits:
 3. *Covariance-scaled samples* of the best fits so far, as the tracker draws them.
 
 A detector's joints in space, where there are any, are one more start
-(`torchcss.initialise.from_points`). All of these descend once more, at four times and at the true scale of the keypoints.
+(`torchcss.initialise.from_points`). All of these descend once more, at four times and at the true
+scale of the keypoints.
 
 Call `multi_start_fits`.
 """
@@ -155,11 +156,10 @@ def multi_start_fits(cost: TrackingCost, *, search: Search, generator: torch.Gen
         cost, first, bounds,
         ((_WIDE, 12), (_MIDDLE, 12)) if search.anneal else (),
     )  # fmt: skip
-    beside = fits[:0]
+    starts = [fits]
     if cost.keypoints is not None and cost.keypoints.points is not None:
-        turned = starts_about(body, _TURNS, generator)
-        beside = start_from_points(body, cost.camera, cost.keypoints, turned, bounds)
-    starts = [fits, beside]
+        turned = first[:: max(1, len(first) // _TURNS)]
+        starts.append(start_from_points(body, cost.camera, cost.keypoints, turned, bounds))
     if search.num_flips and (segments := Segments(body)).limbs:
         trunks = _distinct_trunks(cost, segments, torch.cat(starts), search.num_trunks)
         starts.append(flips(cost, segments, trunks, bounds, search.num_flips))

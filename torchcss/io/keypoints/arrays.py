@@ -2,10 +2,10 @@
 
 Ours is `keypoints [T J 2]`, `confidence [T J]`, `joint_names [J]`; of several people `[T P J 2]`,
 `[T P J]` and `person_ids [P]`; and `image_size_wh [2]` and `relative_noise []` (`People`), and
-`points [T P J 3]` (`read_points`). Read as well, as NPY or as the only array of an NPZ: pairs or triples `[T J 2]`, `[T J 3]` (x, y,
-confidence), in a row `[T 3 J]`, of several people `[T P J 3]`, of one picture `[J 3]`, and
-MoveNet's `[T 1 1 J 3]` (y, x, confidence, fractions). Confidences may be called `scores` and the
-like.
+`points [T P J 3]` (`read_points`). Read as well, as NPY or as the only array of an NPZ: pairs or
+triples `[T J 2]`, `[T J 3]` (x, y, confidence), in a row `[T 3 J]`, of several people `[T P J 3]`,
+of one picture `[J 3]`, and MoveNet's `[T 1 1 J 3]` (y, x, confidence, fractions). Confidences may
+be called `scores` and the like.
 """
 
 from __future__ import annotations
