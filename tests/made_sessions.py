@@ -21,9 +21,9 @@ def start_at(body: BodyModel, state: Tensor, variance: float = 0.01) -> Initiali
     """One mode of a body, as uncertain in all directions."""
     n = body.num_parameters
     mixture = GaussianMixture(
-        state.reshape(1, n), variance * torch.eye(n).double()[None], torch.zeros(1).double()
+        state.reshape(1, n), variance * torch.eye(n).to(state)[None], state.new_zeros(1)
     )
-    return Initialisation(body, mixture, torch.zeros(1).double(), ())
+    return Initialisation(body, mixture, state.new_zeros(1), ())
 
 
 def seen_by(
