@@ -256,13 +256,14 @@ def test_ten_bits_of_high_dynamic_range(
     tmp_path: Path, transfer: str, signal: float, level: float
 ) -> None:
     path = tmp_path / "a.mp4"
-    tags = f"colorprim=bt2020:transfer={transfer}:colormatrix=bt2020nc:range=limited"
+    tags = f"colorprim=bt2020:transfer={transfer}:colormatrix=bt2020nc:fullrange=off"
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx265", rate=30)
+        stream = container.add_stream("libx264", rate=30)
         stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p10le"
-        stream.options = {"x265-params": f"log-level=none:{tags}", "crf": "4"}
-        for _ in range(2):
+        stream.options = {"x264-params": tags, "crf": "4"}
+        for index in range(2):
             picture = av.VideoFrame(64, 48, "yuv420p10le")
+            picture.pts, picture.time_base = index, Fraction(1, 30)
             for plane, value in zip(picture.planes, (64 + 876 * signal, 512, 512), strict=True):
                 plane.update(np.full(plane.buffer_size // 2, value, "<u2").tobytes())
             container.mux(stream.encode(picture))
