@@ -11,7 +11,8 @@ tracked with every seed. Of each run, over its frames:
 |---|---|
 | PA, root | error of the leading mode after Procrustes, and with the hips on each other, mm |
 | best PA, best root | the same of the mode that is nearest by that error |
-| smooth PA | of the smoothed track |
+| smooth PA, root | of the smoothed track |
+| lag PA, root | of the same with 15 frames after each in view (`--lag`) |
 | rank | place of the nearest mode by weight; 1 is the first |
 | cal. | mean absolute difference between stated and true shares of joints in ten regions |
 | in 90 % | share of joints in the region that should hold 90 % |
@@ -48,11 +49,12 @@ from torchcss.linalg import squared_mahalanobis
 from torchcss.studies.evaluation import Thresholds, evaluate
 from torchcss.studies.metrics import LIMB_JOINTS
 from torchcss.studies.sequences import read_reference
+from torchcss.tracking.smooth import Smoothing
 
 FILES = ("video.mp4", "cameras.json", "keypoints2d.npz", "reference3d.npz")
 LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
-HEADS = ("clip", "PA", "best PA", "root", "best root", "smooth PA", "rank", "cal.", "in 90 %",
-         "NLL", "lost", "s")  # fmt: skip
+HEADS = ("clip", "PA", "best PA", "root", "best root", "smooth PA", "smooth root", "lag PA",
+         "lag root", "rank", "cal.", "in 90 %", "NLL", "lost", "s")  # fmt: skip
 
 
 TRACKING = Settings(overlay=False)
@@ -75,7 +77,9 @@ class Config:
     tracking: SettingsOptions = TRACKING
     """How to track."""
     smooth: bool = True
-    """Whether to smooth each track too."""
+    """Whether to smooth each track too, with all frames in view and with `--lag`."""
+    lag: int = 15
+    """Frames after each that may say something of it, at that lag."""
 
 
 def find_clips(data: Path) -> list[Path]:
@@ -173,7 +177,7 @@ def measure(config: Config, clip: Path, seed: int) -> dict[str, Any]:
         "best PA": errors.procrustes_best_of_modes.mean_mm,
         "root": errors.root_aligned.mean_mm,
         "best root": errors.root_aligned_best_of_modes.mean_mm,
-        "smooth PA": None,
+        **dict.fromkeys(("smooth PA", "smooth root", "lag PA", "lag root")),
         "rank": apart.rank,
         "cal.": float(np.mean([abs(share - level) for level, share in inside.items()])),
         "in 90 %": inside[0.9],
@@ -182,7 +186,10 @@ def measure(config: Config, clip: Path, seed: int) -> dict[str, Any]:
         "s": seconds,
     }
     if config.smooth and len(found.frames) > 2:
-        row["smooth PA"] = evaluate(smooth(run), reference).errors.procrustes.mean_mm
+        for name, lag in (("smooth", None), ("lag", config.lag)):
+            errors = evaluate(smooth(run, Smoothing(lag=lag)), reference).errors
+            row[f"{name} PA"] = errors.procrustes.mean_mm
+            row[f"{name} root"] = errors.root_aligned.mean_mm
     return row
 
 

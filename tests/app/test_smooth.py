@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -147,6 +148,28 @@ def test_the_acceleration_ratio_and_the_persistence_do_what_they_say(body: BodyM
     assert sizes[0][free] == pytest.approx(2 * sizes[1][free], rel=0.1)
 
 
+def test_with_a_lag_no_frame_knows_more_than_so_many_after_it(body: BodyModel):
+    track, truth = noisy_track(body)
+    choice = Smoothing(likelihood_power=0.5, persistence=2.0, lag=4)
+    done = smooth_track(track, choice)
+    # What comes later than the lag changes nothing, what comes within it does.
+    first = track.first(20)
+    early = smooth_track(first, choice)
+    assert np.array_equal(early.track.state[:16], done.track.state[:16])
+    assert np.array_equal(early.modes[:16], done.modes[:16])
+    assert not np.allclose(early.track.state[16:], done.track.state[16:20], atol=1e-9)
+    # As many as there are: the same as all.
+    every = smooth_track(first, replace(choice, lag=20))
+    all_ = smooth_track(first, replace(choice, lag=None))
+    assert every.track.state == pytest.approx(all_.track.state, abs=1e-6)
+    assert every.track.covariance == pytest.approx(all_.track.covariance, abs=1e-9)
+    # None: only what came before.
+    filtered = smooth_track(track, replace(choice, lag=0))
+    errors = [error(one.track, 0, truth) for one in (filtered, done, smooth_track(track, choice))]
+    assert errors[0] > errors[1] >= errors[2]
+    assert done.effect["lag"] == 4
+
+
 @pytest.mark.parametrize(
     ("axis", "tolerance_m"), [((0.0, 1.2, 0.0), 1e-6), ((0.3, 0.4, -0.2), 0.02)]
 )
@@ -273,6 +296,8 @@ def test_bad_choices_and_tracks_are_refused(body: BodyModel):
         Smoothing(likelihood_power=math.inf)
     with pytest.raises(ConfigurationError, match="persistence"):
         Smoothing(persistence=-1.0)
+    with pytest.raises(ConfigurationError, match="lag"):
+        Smoothing(lag=-1)
     with pytest.raises(TrackFileError, match="times"):
         smooth_track(track._replace(times=track.times[::-1].copy()))
     empty = TrackWriter("unused", Track.empty(body.state_names, body.joint_names, body=body))

@@ -29,6 +29,8 @@ def test_a_clip_is_tracked_and_measured(script: ModuleType, tmp_path: Path) -> N
     (row,) = script.main(config)["rows"]
     assert row["best PA"] <= row["PA"] < 400
     assert row["best root"] <= row["root"]
+    assert row["lag PA"] == pytest.approx(row["smooth PA"], abs=1)  # three frames are within it
+    assert 0 < row["lag root"] < 400
     assert 1 <= row["rank"] <= 2
     assert 0 <= row["cal."] <= 1
     assert math.isfinite(row["NLL"])

@@ -37,6 +37,8 @@ class Smooth:
     acceleration_ratio: float | None = None
     """Expected accelerations over expected velocities, 1/s; lower is smoother. 10 by default, 20
     with images."""
+    lag: int | None = None
+    """Most frames after each one that may say something of it; all by default."""
     given: Annotated[Given, tyro.conf.OmitArgPrefixes] = field(default_factory=Given)
     keypoints: Annotated[GivenKeypoints, tyro.conf.OmitArgPrefixes] = field(
         default_factory=GivenKeypoints
@@ -56,6 +58,7 @@ class Smooth:
             IMAGES if images else Smoothing(),
             likelihood_power=self.likelihood_power,
             persistence=self.persistence,
+            lag=self.lag,
         )
         if self.acceleration_ratio is not None:
             choice = replace(choice, acceleration_ratio=self.acceleration_ratio)

@@ -4,6 +4,7 @@ A track holds, for every frame, the modes that the frame and those before it lea
 `smooth_modes` chooses among them with all frames in view (`inference.smoothing.best_path`), takes
 each chosen mode as what its frame says, and moves the states together to where that and the motion
 prior agree, within the joint limits (`inference.smoothing.refine`). It needs nothing but the modes.
+With a lag no frame is told by more than so many after it, as one that waits for them would see it.
 
 The motion prior is the body's `motion_rate` for velocities, and `Smoothing.acceleration_ratio`
 times that for accelerations. A frame in which the tracker had nothing to go by (its modes were kept
@@ -48,13 +49,17 @@ class Smoothing:
         persistence: How many frames say as much, in the covariances, as one that is independent.
             Smoothing averages the noise of single frames, but not what persists: the person's size,
             their clothes.
+        lag: How many frames after each may say something of it; None: all.
     """
 
     likelihood_power: float = 0.2
     acceleration_ratio: float = 10.0
     persistence: float = 40.0
+    lag: int | None = None
 
     def __post_init__(self) -> None:
+        if self.lag is not None and self.lag < 0:
+            raise ConfigurationError(f"lag: expected at least 0 frames, got {self.lag}")
         for name in ("likelihood_power", "acceleration_ratio", "persistence"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ConfigurationError(
@@ -85,6 +90,11 @@ class TrackedModes(NamedTuple):
     cost: Float[Tensor, "t k"]
     likelihood_power: float
 
+    def between(self, first: int, stop: int) -> TrackedModes:
+        """Some of the frames."""
+        fields = (field[first:stop] for field in self[:-1])
+        return TrackedModes(*fields, likelihood_power=self.likelihood_power)
+
 
 class Smoothed(NamedTuple):
     """One trajectory through the modes of a track.
@@ -100,6 +110,11 @@ class Smoothed(NamedTuple):
     cost: Float[Tensor, " t"]
     modes: Int[Tensor, " t"]
     seen: Bool[Tensor, " t"]
+
+    def at(self, frame: int) -> Smoothed:
+        """What was found for one frame."""
+        own = (field[frame] if field.ndim else field for field in self.refined)
+        return Smoothed(Refined(*own), self.cost[frame], self.modes[frame], self.seen[frame])
 
 
 def smooth_modes(body: BodyModel, track: TrackedModes, choice: Smoothing) -> Smoothed:
@@ -117,6 +132,37 @@ def smooth_modes(body: BodyModel, track: TrackedModes, choice: Smoothing) -> Smo
         raise TrackFileError("the track has no frames, of which any could be smoothed")
     if not (track.times.diff() > 0).all():
         raise TrackFileError("the times of the track do not rise; it cannot be smoothed")
+    if choice.lag is None:
+        return _all_in_view(body, track, choice)
+    return _with_lag(body, track, choice, choice.lag)
+
+
+def _with_lag(body: BodyModel, track: TrackedModes, choice: Smoothing, lag: int) -> Smoothed:
+    """Every frame as it is smoothed with `lag` frames after it, and with as many before as matter.
+
+    What is more than twice the lag and a second before hardly moves it.
+    """
+    whole, parts = len(track.times), []
+    for frame in range(whole):
+        recent = int(torch.searchsorted(track.times, track.times[frame] - 1.0))
+        first = max(0, min(recent, frame - 2 * lag))
+        window = track.between(first, min(whole, frame + lag + 1))
+        done = _all_in_view(body, window, choice)
+        parts.append(done.at(frame - first))
+    refined, cost, modes, seen = zip(*parts, strict=True)
+    fields = Refined(*(torch.stack(field) for field in zip(*refined, strict=True)))
+    changes = base_changes(body, track.bases)
+    refined = fields._replace(
+        mean=_unwrapped(fields.mean, changes, _periods(body)),
+        total=fields.total.sum(),
+        status=fields.status.max(),
+        num_steps=fields.num_steps.sum(),
+    )
+    return Smoothed(refined, torch.stack(cost), torch.stack(modes), torch.stack(seen))
+
+
+def _all_in_view(body: BodyModel, track: TrackedModes, choice: Smoothing) -> Smoothed:
+    """Every frame with all before and after it in view."""
     absent = track.log_weight == -math.inf
     cost = track.cost.masked_fill(absent, math.inf)
     seen = cost.isfinite().any(1)

@@ -24,7 +24,7 @@ from tqdm import tqdm
 from torchcss.body.model import BodyModel
 from torchcss.body.root import free_turns
 from torchcss.cost.total import TrackingCost, beside
-from torchcss.errors import VideoError
+from torchcss.errors import ConfigurationError, VideoError
 from torchcss.inference.smoothing import IN_WINDOWS, Refined, refine_in_windows
 from torchcss.tracking.settings import Plan, Settings, make_plan
 from torchcss.tracking.smooth import (
@@ -83,6 +83,8 @@ def smooth_frames(
     Raises:
         TorchcssError: As `smooth_modes`; or if frames are missing.
     """
+    if choice.lag is not None:
+        raise ConfigurationError("lag: the images are fitted with all frames in view; leave it out")
     first = smooth_modes(body, track, choice)
     start = first.refined.mean
     plan = make_plan(settings, body, views[0], 0.0)
