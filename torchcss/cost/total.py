@@ -60,6 +60,10 @@ CHUNK_NODES = 65_536
 """Most nodes evaluated at a time. With arrays of more than these the allocator keeps handing memory
 back to the system, and fetching it again costs as much as half of the arithmetic (measured)."""
 
+ON_DEVICE = 64
+"""How many times as much is evaluated at a time on another device than a CPU: there a call costs
+the same for one sample and for thousands. 2000 samples of body34 take 1 GB so."""
+
 
 class Engine(Protocol):
     """Another way to evaluate a cost, with the same results to a tolerance."""
@@ -262,7 +266,8 @@ class TrackingCost:
                 if all(bound.link is not link for link in links):
                     links.append(bound.link)
                     nodes += bound.size
-        return max(1, min(CHUNK, CHUNK_NODES // nodes))
+        more = 1 if self.body.tie.device.type == "cpu" else ON_DEVICE
+        return max(1, min(CHUNK, CHUNK_NODES // nodes) * more)
 
     def _evaluated(
         self, evaluate: Callable[[_Part], dict[str, Tensor]], x: Float[Tensor, "*batch n"]

@@ -670,10 +670,10 @@ def _solve_damped(
 ) -> tuple[Float[Tensor, "m n"], Float[Tensor, " m"], Bool[Tensor, " m"]]:
     """Steps of some items, `-1/2` the derivative of their squared lengths, and which exist.
 
-    Worked off a few at a time, so that matrices and factors need not leave the caches.
+    On a CPU worked off a few at a time, so that matrices and factors need not leave the caches.
     """
-    parts = []
-    for some, extra in zip(items.split(_FACTOR_CHUNK), damping.split(_FACTOR_CHUNK), strict=True):
+    parts, size = [], _FACTOR_CHUNK if items.device.type == "cpu" else max(1, len(items))
+    for some, extra in zip(items.split(size), damping.split(size), strict=True):
         part = problem.take(some)
         factor, ok = damped_cholesky(part.hessian, extra + part.ridge, overwrite=True)
         step = -torch.where(part.free, cholesky_apply(factor, part.gradient), 0.0)

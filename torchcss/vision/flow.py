@@ -456,49 +456,77 @@ def _solve(
                 x.numpy(), a.numpy(), b.numpy(), across.numpy(), along.numpy(), num_iterations
             )
         return flow
-    q_u, q_v = q[:, :1], q[:, 1:]
-    degree = _degree(weight, right, down)
-    determinant = degree * (degree + q_u.square() + q_v.square())
-    inverse = torch.where(determinant > 0.0, 1.0 / determinant.where(determinant > 0.0, 1.0), 0.0)
-    inverse_uu = (degree + q_v.square()) * inverse
-    inverse_vv = (degree + q_u.square()) * inverse
-    inverse_uv = -q_u * q_v * inverse
+    system = _NormalEquations.of(q, _degree(weight, right, down), right, down)
+    flow = flow.clone()
+    residual = -q * (root * constancy.offset) - system.apply(flow)
+    direction = system.precondition(residual)
+    reduction = _dot(residual, direction)
+    for _ in range(num_iterations):
+        image = system.apply(direction)
+        length = _ratio(reduction, _dot(direction, image))
+        flow.addcmul_(length, direction)
+        residual.addcmul_(length, image, value=-1.0)
+        preconditioned = system.precondition(residual)
+        previous, reduction = reduction, _dot(residual, preconditioned)
+        direction = torch.addcmul(preconditioned, _ratio(reduction, previous), direction)
+    return flow
 
-    def apply_matrix(x: Tensor) -> Tensor:
-        along = (q_u * x[:, :1]).addcmul_(q_v, x[:, 1:])
-        product = (degree * x).addcmul_(q, along)
+
+class _NormalEquations(NamedTuple):
+    """The matrix q q^T + L, and the inverse of each pixel's block of it.
+
+    Attributes:
+        q: See `_solve`.
+        degree: Sum of the weights on the links of each pixel.
+        right: Weights of the links to the right.
+        down: Weights of the links downwards.
+        inverse_uu: Of each block, where it has one.
+        inverse_vv: The same.
+        inverse_uv: The same.
+    """
+
+    q: Float[Tensor, "b 2 h w"]
+    degree: Float[Tensor, "b 1 h w"]
+    right: Float[Tensor, "b 1 h x"]
+    down: Float[Tensor, "b 1 y w"]
+    inverse_uu: Float[Tensor, "b 1 h w"]
+    inverse_vv: Float[Tensor, "b 1 h w"]
+    inverse_uv: Float[Tensor, "b 1 h w"]
+
+    @staticmethod
+    def of(q: Tensor, degree: Tensor, right: Tensor, down: Tensor) -> _NormalEquations:
+        q_u, q_v = q[:, :1], q[:, 1:]
+        inverse = _ratio(torch.ones_like(degree), degree * (degree + q_u.square() + q_v.square()))
+        blocks = (degree + q_v.square()) * inverse, (degree + q_u.square()) * inverse
+        return _NormalEquations(q, degree, right, down, *blocks, -q_u * q_v * inverse)
+
+    def apply(self, x: Float[Tensor, "b 2 h w"]) -> Float[Tensor, "b 2 h w"]:
+        """The matrix times a field."""
+        q, right, down = self.q, self.right, self.down
+        along = (q[:, :1] * x[:, :1]).addcmul_(q[:, 1:], x[:, 1:])
+        product = (self.degree * x).addcmul_(q, along)
         product[..., 1:].addcmul_(right, x[..., :-1], value=-1.0)
         product[..., :-1].addcmul_(right, x[..., 1:], value=-1.0)
         product[..., 1:, :].addcmul_(down, x[..., :-1, :], value=-1.0)
         product[..., :-1, :].addcmul_(down, x[..., 1:, :], value=-1.0)
         return product
 
-    def precondition(x: Tensor) -> Tensor:
-        product = torch.empty_like(x)
-        torch.mul(inverse_uu, x[:, :1], out=product[:, :1]).addcmul_(inverse_uv, x[:, 1:])
-        torch.mul(inverse_vv, x[:, 1:], out=product[:, 1:]).addcmul_(inverse_uv, x[:, :1])
+    def precondition(self, x: Float[Tensor, "b 2 h w"]) -> Float[Tensor, "b 2 h w"]:
+        """The blocks' inverses times a field."""
+        product, (u, v), mixed = torch.empty_like(x), x.split(1, dim=1), self.inverse_uv
+        torch.mul(self.inverse_uu, u, out=product[:, :1]).addcmul_(mixed, v)
+        torch.mul(self.inverse_vv, v, out=product[:, 1:]).addcmul_(mixed, u)
         return product
 
-    def dot(x: Tensor, y: Tensor) -> Tensor:
-        return torch.linalg.vecdot(x.flatten(1), y.flatten(1)).view(-1, 1, 1, 1)
 
-    def ratio(numerator: Tensor, denominator: Tensor) -> Tensor:
-        positive = denominator > 0.0
-        return torch.where(positive, numerator / denominator.where(positive, 1.0), 0.0)
+def _dot(x: Tensor, y: Tensor) -> Float[Tensor, "b 1 1 1"]:
+    return torch.linalg.vecdot(x.flatten(1), y.flatten(1)).view(-1, 1, 1, 1)
 
-    flow = flow.clone()
-    residual = -q * (root * constancy.offset) - apply_matrix(flow)
-    direction = precondition(residual)
-    reduction = dot(residual, direction)
-    for _ in range(num_iterations):
-        image = apply_matrix(direction)
-        length = ratio(reduction, dot(direction, image))
-        flow.addcmul_(length, direction)
-        residual.addcmul_(length, image, value=-1.0)
-        preconditioned = precondition(residual)
-        previous, reduction = reduction, dot(residual, preconditioned)
-        direction = torch.addcmul(preconditioned, ratio(reduction, previous), direction)
-    return flow
+
+def _ratio(numerator: Tensor, denominator: Tensor) -> Tensor:
+    """Zero where the denominator is not positive."""
+    positive = denominator > 0.0
+    return torch.where(positive, numerator / denominator.where(positive, 1.0), 0.0)
 
 
 def _degree(

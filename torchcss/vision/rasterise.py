@@ -95,19 +95,9 @@ def rasterise(
     pixel = torch.nonzero(nearest >= 0)[:, 0]
     face = nearest[pixel]
 
-    # Barycentric coordinates of the winners only: areas of the three sub-triangles, then weighted
-    # by inverse depth. Rounding makes a part negative at a border, and, where corners are 1e8
-    # pixels away, may leave none positive; then the middle of the triangle has to do.
     table = torch.cat((place[faces].flatten(1), distance[faces], area[:, None]), -1)
-    u0, v0, u1, v1, u2, v2, *depths, twice = table.index_select(0, face).unbind(-1)
-    column, row = pixel % width, pixel // width
-    u0, u1, u2, v0, v1, v2 = u0 - column, u1 - column, u2 - column, v0 - row, v1 - row, v2 - row
-    parts = torch.stack((u1 * v2 - v1 * u2, u2 * v0 - v2 * u0, u0 * v1 - v0 * u1)) / twice
-    parts = parts.clamp_min(0)
-    parts = torch.where(parts.sum(0) > 0, parts, 1 / 3)
-    weighted = parts / torch.stack(depths)
+    parts, weighted = _barycentric(table.index_select(0, face), pixel % width, pixel // width)
     total = weighted.sum(0)
-
     barycentric = uv.new_zeros(height * width, 3)
     surface = uv.new_full((height * width,), torch.inf)
     barycentric[pixel] = (weighted / total).T.to(uv)
@@ -117,6 +107,23 @@ def rasterise(
         barycentric=barycentric.view(height, width, 3),
         depth=surface.view(height, width),
     )
+
+
+def _barycentric(
+    triangles: Float[Tensor, "p 10"], column: Int[Tensor, " p"], row: Int[Tensor, " p"]
+) -> tuple[Float[Tensor, "3 p"], Float[Tensor, "3 p"]]:
+    """Shares of the corners in the picture at pixels of triangles, and these by inverse depth.
+
+    The shares are the areas of the three sub-triangles. Rounding makes one negative at a border,
+    and, where corners are 1e8 pixels away, may leave none positive; then the middle of the triangle
+    has to do.
+    """
+    u0, v0, u1, v1, u2, v2, *depths, twice = triangles.unbind(-1)
+    u0, u1, u2, v0, v1, v2 = u0 - column, u1 - column, u2 - column, v0 - row, v1 - row, v2 - row
+    parts = torch.stack((u1 * v2 - v1 * u2, u2 * v0 - v2 * u0, u0 * v1 - v0 * u1)) / twice
+    parts = parts.clamp_min(0)
+    parts = torch.where(parts.sum(0) > 0, parts, 1 / 3)
+    return parts, parts / torch.stack(depths)
 
 
 def nearest_faces(
