@@ -28,6 +28,7 @@ from torchcss.io.tracks import Track, load_track
 from torchcss.io.view_files import ViewFiles
 from torchcss.solve.inverse_kinematics import Solutions, inverse_kinematics
 from torchcss.studies.evaluation import Evaluation, evaluate
+from torchcss.tracking.batch import track_batch
 from torchcss.tracking.session import Observation, Posterior, SessionState, TrackingSession
 from torchcss.tracking.settings import Settings
 from torchcss.tracking.view import CameraView
@@ -68,6 +69,7 @@ __all__ = [
     "smooth_file",
     "smooth_track",
     "smooth_video",
+    "track_batch",
     "track_frames",
     "track_video",
 ]

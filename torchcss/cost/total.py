@@ -458,7 +458,7 @@ def together(costs: Sequence[TrackingCost], sequence: Int[Tensor, " b"]) -> Trac
             each keep their order.
         sequence: Which of the sequences each sample belongs to.
     """
-    renumbered = [_numbered(cost, number) for number, cost in enumerate(costs)]
+    renumbered = [numbered(cost, number) for number, cost in enumerate(costs)]
     parent, component = torch.zeros_like(sequence), torch.zeros_like(sequence)
     for number, cost in enumerate(costs):
         if cost.parent is not None:
@@ -476,8 +476,39 @@ def together(costs: Sequence[TrackingCost], sequence: Int[Tensor, " b"]) -> Trac
     )
 
 
-def _numbered(cost: TrackingCost, number: int) -> TrackingCost:
-    """The same cost as a sequence of that number."""
+def joined(costs: Sequence[TrackingCost], sizes: Sequence[int]) -> TrackingCost:
+    """The cost of the samples of several sequences, those of one after those of the other.
+
+    Args:
+        costs: The cost of each, numbered (`numbered`) in rising order, with equal choices of terms.
+        sizes: Samples of each.
+    """
+
+    def each(indices: Iterable[Tensor | None]) -> Tensor:
+        zero = costs[0].body.tie.new_zeros(0, dtype=torch.long)
+        pairs = zip(indices, sizes, strict=True)
+        return torch.cat([zero.new_zeros(n) if i is None else i for i, n in pairs])
+
+    numbers = (torch.full((n,), c.views[0].sequence) for c, n in zip(costs, sizes, strict=True))
+    return replace(
+        costs[0],
+        views=tuple(view for cost in costs for view in cost.views),
+        past=tuple(past for cost in costs for past in cost.past),
+        bound={key: term for cost in costs for key, term in cost.bound.items()},
+        parent=each(cost.parent for cost in costs),
+        component=each(c.parent if c.component is None else c.component for c in costs),
+        sequence=torch.cat(list(numbers)).to(costs[0].body.tie.device),
+        stopwatch=None,
+    )
+
+
+def numbered(cost: TrackingCost, number: int) -> TrackingCost:
+    """The same cost as that of the sequence of a number.
+
+    Args:
+        cost: The cost of one sequence.
+        number: Its number among those that are evaluated together.
+    """
     contexts = {c: replace(c, sequence=number) for c in (*cost.views, *cost.past)}
     return replace(
         cost,

@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -313,11 +313,17 @@ class TrackingSession:
         index = self._num_seen
         return Frame(index + observer.view.offset, index * self.plan.frame_interval, image)
 
-    def step(self, observation: Observation) -> Posterior:
+    def step(
+        self,
+        observation: Observation,
+        searched: Callable[[TrackingCost], TrackingCost] | None = None,
+    ) -> Posterior:
         """Search one frame; the observations come in their order, each once.
 
         Args:
             observation: What `observe` has returned.
+            searched: What the search sees of the frame's cost, if not the cost itself: the same
+                with another engine, say (`torchcss.tracking.batch`).
         """
         before, plan, stopwatch = self.state, self.plan, Stopwatch()
         body, clock = before.body, [time.perf_counter()]
@@ -327,6 +333,8 @@ class TrackingSession:
         )
         cost = self._cost(observation, memory, stopwatch)
         clock.append(time.perf_counter())
+        if searched is not None:
+            cost = searched(cost)
         tracker = self._tracker(observation, cost)
         after, info = tracker.step(before.tracker, cost.problem(), self._bounds)
         clock.append(time.perf_counter())

@@ -1,0 +1,32 @@
+"""benchmark_batch: both ways of the shipped clip, in small."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from torchcss.errors import ConfigurationError
+
+SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "benchmark_batch.py"
+
+
+def test_both_ways_find_the_same(
+    script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = replace(script.SETTINGS, samples=5, modes=2, working_size=160)
+    out = tmp_path / "J.json"
+    report = script.main(
+        script.Config(settings=settings, sequences=2, frames=2, repeats=1, out=out)
+    )
+    assert report["rounds"][0]["same"]
+    assert "bit for bit" in capsys.readouterr().out
+    assert [row[0] for row in json.loads(out.read_text())["table"]["rows"]][2] == "ratio"
+
+
+def test_a_folder_without_clips_is_refused(script: ModuleType, tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="no clip"):
+        script.main(script.Config(data=tmp_path))

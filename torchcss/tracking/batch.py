@@ -1,0 +1,201 @@
+"""Many sequences side by side: what their searches ask for at a time is evaluated in one call.
+
+    sessions = [TrackingSession(settings, first, views, generator=g) for ...]
+    for posteriors in track_batch(zip(sessions, videos)):
+        ...
+
+Every sequence has a session of its own, with its own body, cameras, base and generator. A frame of
+each is searched in a thread of its own; whoever wants samples evaluated waits until all others do,
+and the samples of those with the same terms then are one batch, each with the index of its
+sequence. No sample influences another, so that the results are those of one after the other: with
+the fused engine bit for bit.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from torchcss.cost.total import Engine, TrackingCost, joined, numbered
+from torchcss.tracking.session import Images, Posterior, TrackingSession
+from torchcss.types import LocalModel
+
+Sequences = Iterable[tuple[TrackingSession, Iterable[Images]]]
+"""Sessions, each with the images of its moments."""
+
+
+def track_batch(sequences: Sequences) -> Iterator[tuple[Posterior | None, ...]]:
+    """Track many sequences side by side, a moment of each at a time.
+
+    Args:
+        sequences: Each session with its images; sessions of one body and the same settings share
+            evaluations, others are tracked beside them. They may be of different lengths.
+
+    Yields:
+        What is known after each moment, one entry a sequence; None for one that has ended.
+
+    Raises:
+        TorchcssError: What is wrong with a sequence, when the others have done the same moment;
+            every session then stands after the last moment that it did, as `checkpoint` tells.
+    """
+    sessions, images = [], []
+    for session, its in sequences:
+        sessions.append(session)
+        images.append(iter(its))
+    if not sessions:
+        return
+    set_up = partial(torch.set_num_threads, torch.get_num_threads())
+    with ThreadPoolExecutor(len(sessions), "sequence", initializer=set_up) as pool:
+        while True:
+            moment = [next(its, None) for its in images]
+            if all(each is None for each in moment):
+                return
+            yield _step(pool, sessions, moment)
+
+
+def _step(
+    pool: ThreadPoolExecutor, sessions: Sequence[TrackingSession], moment: list[Images | None]
+) -> tuple[Posterior | None, ...]:
+    """One moment of all sequences that have not ended."""
+    going = [number for number, images in enumerate(moment) if images is not None]
+    meeting, enabled = _Meeting(len(going)), torch.is_grad_enabled()
+
+    def search(number: int) -> Posterior:
+        images = moment[number]
+        assert images is not None
+        session = sessions[number]
+        try:
+            with torch.set_grad_enabled(enabled):
+                seen = session.observe(images)
+                return session.step(seen, partial(meeting.seat, number))
+        finally:
+            meeting.leave()
+
+    futures: dict[int, Future[Posterior]] = {n: pool.submit(search, n) for n in going}
+    for future in futures.values():
+        future.exception()  # waits
+    found = {number: future.result() for number, future in futures.items()}
+    return tuple(found.get(number) for number in range(len(moment)))
+
+
+@dataclass(eq=False)
+class _Ask:
+    """What one search wants to know.
+
+    Attributes:
+        what: Method of the cost.
+        cost: The cost of its samples, numbered.
+        x: The samples.
+        answer: What comes back; an exception is raised by who asked.
+    """
+
+    what: Literal["value", "local_model"]
+    cost: TrackingCost
+    x: Tensor
+    answer: Any = None
+
+
+@dataclass(eq=False)
+class _Meeting:
+    """Where the searches of one moment meet; the last to come evaluates for all.
+
+    Attributes:
+        size: Searches that have not ended.
+        asks: What those want that wait.
+        turn: Guards both.
+    """
+
+    size: int
+    asks: list[_Ask] = field(default_factory=list)
+    turn: threading.Condition = field(default_factory=threading.Condition)
+
+    def seat(self, number: int, cost: TrackingCost) -> TrackingCost:
+        """The cost of one sequence, whose evaluations wait for those of the others."""
+        return replace(numbered(cost, number), engine=_Seat(self, cost.engine))
+
+    def leave(self) -> None:
+        """One search less to wait for."""
+        with self.turn:
+            self.size -= 1
+            self._answer_if_all_wait()
+
+    def ask(self, ask: _Ask) -> Any:
+        """Wait for an answer."""
+        with self.turn:
+            self.asks.append(ask)
+            self._answer_if_all_wait()
+            self.turn.wait_for(lambda: ask.answer is not None)
+        if isinstance(ask.answer, BaseException):
+            raise ask.answer
+        return ask.answer
+
+    def _answer_if_all_wait(self) -> None:
+        if not self.asks or len(self.asks) < self.size:
+            return
+        left = sorted(self.asks, key=lambda ask: ask.cost.views[0].sequence)
+        self.asks.clear()
+        while left:
+            alike = [ask for ask in left if _is_alike(ask, left[0])]
+            left = [ask for ask in left if ask not in alike]
+            try:
+                _answer(alike)
+            except Exception as error:
+                for ask in alike:
+                    ask.answer = error
+        self.turn.notify_all()
+
+
+@dataclass(frozen=True, eq=False)
+class _Seat:
+    """An `Engine` that asks the meeting.
+
+    Attributes:
+        meeting: The meeting.
+        engine: What evaluates in the end; None: the terms as they are written.
+    """
+
+    meeting: _Meeting
+    engine: Engine | None
+
+    def value(self, cost: TrackingCost, x: Tensor) -> Tensor:
+        """See `TrackingCost.value`."""
+        return self.meeting.ask(_Ask("value", replace(cost, engine=self.engine), x))
+
+    def local_model(self, cost: TrackingCost, x: Tensor) -> LocalModel:
+        """See `TrackingCost.local_model`."""
+        return self.meeting.ask(_Ask("local_model", replace(cost, engine=self.engine), x))
+
+
+def _is_alike(one: _Ask, other: _Ask) -> bool:
+    """Whether two searches can be answered by one evaluation."""
+    if one is other:
+        return True
+    (a, x), (b, y) = (one.cost, one.x), (other.cost, other.x)
+    same = one.what == other.what and a.engine is b.engine and a.choice == b.choice
+    batches = x.ndim == y.ndim == 2 and x.shape[1] == y.shape[1]
+    return same and batches and x.dtype == y.dtype and x.device == y.device
+
+
+def _answer(asks: Sequence[_Ask]) -> None:
+    """Evaluate in one call; each gets its share."""
+    sizes = [ask.x.shape[:-1].numel() for ask in asks]
+    if len(asks) == 1:
+        (ask,) = asks
+        ask.answer = getattr(ask.cost, ask.what)(ask.x)
+        return
+    cost = joined([ask.cost for ask in asks], sizes)
+    x = torch.cat([ask.x for ask in asks])
+    if asks[0].what == "value":
+        shares: Sequence[Any] = cost.value(x).split(sizes)
+    else:
+        parts = (part.split(sizes) for part in cost.local_model(x))
+        shares = [LocalModel(*share) for share in zip(*parts, strict=True)]
+    for ask, share in zip(asks, shares, strict=True):
+        ask.answer = share
