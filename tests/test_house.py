@@ -111,6 +111,10 @@ def test_the_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert count("x = '''a\nb'''\n").lines == {1, 2}
 
 
+def test_functions_are_short() -> None:
+    assert main(Figures(tree=REPOSITORY))["long_functions"] == []
+
+
 SLOW = ("av", "kornia", "matplotlib", "numba", "pytorch_kinematics", "scipy")
 """Libraries that take long to import."""
 

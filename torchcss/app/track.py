@@ -135,32 +135,8 @@ def track_video(
     selection = Selection(start=start, stop=stop, stride=options.stride)
     if options.resume and (begun := _begun(out)) is not None:
         return _go_on(begun, settings, selection, options)
-    video, masks = Path(video), options.masks
-    if keypoints is None:
-        keypoints = out / "keypoints.npz"
-        detect_video(video, keypoints, options.detect, frame_rate=options.frame_rate)
-        if masks is None and masks_of(keypoints).is_file():
-            masks = masks_of(keypoints)
-    own = ViewFiles(
-        video=video,
-        keypoints=Path(keypoints),
-        camera_name=options.camera_name,
-        masks=masks,
-        layout=options.layout,
-        normalised=options.normalised,
-        frame_rate=options.frame_rate,
-        person=options.person,
-        sigma=options.sigma,
-    )
-    lens = Lens(focal=options.focal, fov=options.fov)
-    if camera is None:
-        lens = lens.of(video)
-        views = _open_views((own, *options.others), lens.camera(video), selection)
-        if not lens.is_known:
-            _now("fitting the focal length to the keypoints")
-            views = [fitted(views[0], settings)]
-    else:
-        views = _open_views((own, *options.others), lens.unless(Path(camera)), selection)
+    files = _files_of(Path(video), keypoints, out, options)
+    views = _all_views(files, camera, selection, settings, options)
     generator = torch.Generator().manual_seed(settings.seed)
     eye = views[0].camera.camera.to(dtype=settings.torch_dtype, device=settings.device)
     _now(f"finding the first pose, in frame {start}")
@@ -185,6 +161,51 @@ def track_video(
         checkpoint_every=options.checkpoint_every,
     )
     return _record(recorder, views)
+
+
+def _files_of(
+    video: Path,
+    keypoints: str | os.PathLike[str] | None,
+    out: Path,
+    options: TrackOptions,
+) -> ViewFiles:
+    """The first camera's files; keypoints that are not given are detected."""
+    masks = options.masks
+    if keypoints is None:
+        keypoints = out / "keypoints.npz"
+        detect_video(video, keypoints, options.detect, frame_rate=options.frame_rate)
+        if masks is None and masks_of(keypoints).is_file():
+            masks = masks_of(keypoints)
+    return ViewFiles(
+        video=video,
+        keypoints=Path(keypoints),
+        camera_name=options.camera_name,
+        masks=masks,
+        layout=options.layout,
+        normalised=options.normalised,
+        frame_rate=options.frame_rate,
+        person=options.person,
+        sigma=options.sigma,
+    )
+
+
+def _all_views(
+    own: ViewFiles,
+    camera: str | os.PathLike[str] | None,
+    selection: Selection,
+    settings: Settings,
+    options: TrackOptions,
+) -> list[OpenView]:
+    """The files of all cameras opened, with a focal length that is fitted if nothing tells it."""
+    lens = Lens(focal=options.focal, fov=options.fov)
+    if camera is not None:
+        return _open_views((own, *options.others), lens.unless(Path(camera)), selection)
+    lens = lens.of(own.video)
+    views = _open_views((own, *options.others), lens.camera(own.video), selection)
+    if lens.is_known:
+        return views
+    _now("fitting the focal length to the keypoints")
+    return [fitted(views[0], settings)]
 
 
 def _now(what: str) -> None:

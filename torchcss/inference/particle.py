@@ -160,9 +160,8 @@ class _Filter(ABC):
         # Every mode's parent is that of its heaviest particle.
         origin = parent[best]
         energy = _energy(problem, origin, prior, summary.mean)
-        finite = int((weighed.log_weight > -torch.inf).sum())
         status_counts = torch.zeros(len(Status), dtype=torch.long, device=weighed.x.device)
-        status_counts[Status.NON_FINITE] = len(weighed.x) - finite
+        status_counts[Status.NON_FINITE] = (~(weighed.log_weight > -torch.inf)).sum()
         state = TrackerState(
             summary,
             summary.mean - mixture.mean[origin],

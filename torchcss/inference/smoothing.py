@@ -359,18 +359,16 @@ def refine_in_windows(
             torch.where(moves, limits.lower[before:after], part),
             torch.where(moves, limits.upper[before:after], part),
         )
-        # Nothing keeps the costs of a window but `held`.
-        total = ChainSum(
-            _FrameByFrame([held.get(frame) for frame in near]),
-            choice.likelihood_power,
-            times[before:after],
-            transition,
-            {step - before: change for step, change in changes.items() if step in near},
-            start.dtype,
-        )
-        ended = descend(total, part, box, weight, choice.max_steps, choice.tolerance)
-        del total
-        part, chain, status, taken = ended
+        here = {step - before: change for step, change in changes.items() if step in near}
+        costs_here = _FrameByFrame([held.get(frame) for frame in near])
+        part, chain, status, taken = descend(
+            ChainSum(
+                costs_here, choice.likelihood_power, times[before:after], transition, here,
+                start.dtype,
+            ),
+            part, box, weight, choice.max_steps, choice.tolerance,
+        )  # fmt: skip
+        del costs_here  # Nothing keeps the costs of a window but `held`.
         x[before:after] = part
         worst, steps = max(worst, status), steps + taken
         done = t if last == t else last - windows.overlap

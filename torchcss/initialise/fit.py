@@ -107,16 +107,7 @@ def initialise(
     options = options or InitialiseOptions()
     if not isinstance(keypoints, Keypoints):
         keypoints = keypoints_by_name(keypoints)
-    notes: Sequence[str] = ()
-    if camera is None:
-        if image is None:
-            raise CameraError("neither picture nor camera is given; give one, for the image's size")
-        camera, *notes = default_camera(image.shape[1], image.shape[0])
-    if image is not None and tuple(image.shape[1::-1]) != camera.image_size_wh:
-        raise CameraError(
-            f"camera {camera.name!r} belongs to images of {camera.image_size_wh} pixels, this one "
-            f"has {tuple(image.shape[1::-1])}; use camera.resized if it was only resized"
-        )
+    camera, notes = _camera_of(image, camera)
     camera = camera.to(dtype=options.dtype, device=options.device)
     learns = options.sigma is None if options.learn_noise is None else options.learn_noise
     sigma = options.sigma or default_sigma(keypoints)
@@ -128,7 +119,7 @@ def initialise(
         rough = fit_joints(body, view, generator=generator, options=brief, others=others)
         noise = _noise(rough, view, others, options)
         options = replace(options, sigma=noise * sigma)
-        notes = (*notes, f"keypoints: noise of a wrist {noise * sigma:.1f} px, from the best fit")
+        notes.append(f"keypoints: noise of a wrist {noise * sigma:.1f} px, from the best fit")
     first = fit_joints(body, view, generator=generator, options=options, others=others)
     first = first._replace(noise=noise)
     given = keypoints.only(first.body.joint_names).to(first.body.tie)
@@ -136,10 +127,40 @@ def initialise(
         choice=options.joint_choice,
         views=(FrameContext(body=first.body, camera=camera, keypoints=given),),
     )
-    notes = (*notes, *swapped_sides(alone, first.mixture.mean[0], generator))
+    notes += swapped_sides(alone, first.mixture.mean[0], generator)
     first = first._replace(report=(*notes, *first.report))
     if image is None or not options.contours or isinstance(body, BodyModel):
         return first
+    return _to_the_picture(first, image, view._replace(keypoints=given), others, options)
+
+
+def _camera_of(
+    image: UInt8[np.ndarray, "h w 3"] | Tensor | None, camera: Camera | None
+) -> tuple[Camera, list[str]]:
+    """The camera, checked or assumed, and what to say of it."""
+    if camera is None:
+        if image is None:
+            raise CameraError("neither picture nor camera is given; give one, for the image's size")
+        camera, note = default_camera(image.shape[1], image.shape[0])
+        return camera, [note]
+    if image is not None and tuple(image.shape[1::-1]) != camera.image_size_wh:
+        raise CameraError(
+            f"camera {camera.name!r} belongs to images of {camera.image_size_wh} pixels, this one "
+            f"has {tuple(image.shape[1::-1])}; use camera.resized if it was only resized"
+        )
+    return camera, []
+
+
+def _to_the_picture(
+    first: Initialisation,
+    image: UInt8[np.ndarray, "h w 3"] | Tensor,
+    view: View,
+    others: tuple[View, ...],
+    options: InitialiseOptions,
+) -> Initialisation:
+    """The stages that look at the picture, from a fit to its joints."""
+    given = view.keypoints
+    assert given is not None
     left_out = torch.tensor([name in first.left_out for name in given.names])
     view = view._replace(keypoints=given.without(left_out.to(options.device)))
     cost = _contour_cost(image, first, view, options)

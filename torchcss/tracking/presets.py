@@ -426,16 +426,12 @@ def make_tracker(
     arm = not (has_free_root(body_name) if free_root is None else free_root)
     num_samples = num_samples or (row.samples_arm if arm else row.samples_body)
     num_modes = num_modes or (row.modes_arm if arm else row.modes_body)
-    noise = (
-        tuple(row.noise * m for m in motion) if isinstance(motion, tuple) else row.noise * motion
-    )
+    many = isinstance(motion, tuple)
+    noise = tuple(row.noise * m for m in motion) if many else row.noise * motion
     dynamics = ConstantVelocity(deviation=noise, persistence=row.persistence)
     if row.particles is not None:
         return replace(
-            row.particles,
-            num_samples=num_samples,
-            num_modes=num_modes,
-            dynamics=dynamics,
+            row.particles, num_samples=num_samples, num_modes=num_modes, dynamics=dynamics
         )
     proposal = (row.proposal_arm if arm else None) or row.proposal
     assert proposal is not None

@@ -316,14 +316,14 @@ class TrackingSession:
     def step(
         self,
         observation: Observation,
-        searched: Callable[[TrackingCost], TrackingCost] | None = None,
+        searched: Callable[[TrackingCost], TrackingCost] = lambda cost: cost,
     ) -> Posterior:
         """Search one frame; the observations come in their order, each once.
 
         Args:
             observation: What `observe` has returned.
-            searched: What the search sees of the frame's cost, if not the cost itself: the same
-                with another engine, say (`torchcss.tracking.batch`).
+            searched: What the search sees of the frame's cost: by default the cost itself, else
+                the same with another engine, say (`torchcss.tracking.batch`).
         """
         before, plan, stopwatch = self.state, self.plan, Stopwatch()
         body, clock = before.body, [time.perf_counter()]
@@ -333,18 +333,12 @@ class TrackingSession:
         )
         cost = self._cost(observation, memory, stopwatch)
         clock.append(time.perf_counter())
-        if searched is not None:
-            cost = searched(cost)
-        tracker = self._tracker(observation, cost)
+        tracker, cost = self._tracker(observation, cost), searched(cost)
         after, info = tracker.step(before.tracker, cost.problem(), self._bounds)
         clock.append(time.perf_counter())
-        term_seconds = dict(stopwatch.seconds)
-
-        modes = after.mixture
+        term_seconds, modes = dict(stopwatch.seconds), after.mixture
         terms = self._terms_of_best(cost.of_children(info.origin[:1], info.prior), modes)
-        monitor, lost = before.monitor, False
-        if plan.recovery is not None and monitor is not None:
-            monitor, lost = plan.recovery.judge(monitor, _per_view(terms, observation))
+        monitor, lost = self._judged(terms, observation)
         windows: Windows = (None,) * len(self._observers)
         if not lost:
             memory = tuple(
@@ -376,6 +370,15 @@ class TrackingSession:
             loss_score=0.0 if monitor is None else monitor.score,
             others=tuple(view.frame for view in observation.views[1:]),
         )
+
+    def _judged(
+        self, terms: dict[str, float], observation: Observation
+    ) -> tuple[MonitorState | None, bool]:
+        """What tells a loss after a frame, and whether it tells one."""
+        recovery, monitor = self.plan.recovery, self.state.monitor
+        if recovery is None or monitor is None:
+            return monitor, False
+        return recovery.judge(monitor, _per_view(terms, observation))
 
     def _of_views(
         self, memory: Sequence[ViewMemory], observation: Observation
