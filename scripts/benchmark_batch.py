@@ -76,8 +76,9 @@ def films(config: Config) -> Iterator[Film]:
         folders = sorted(path.parent for path in config.data.glob("*/reference3d.npz"))
         if not folders:
             raise ConfigurationError(f"{config.data}: no clip in it")
-    for seed in range(config.sequences):
-        folder, own = folders[seed % len(folders)], replace(settings, seed=seed)
+    for index in range(config.sequences):
+        folder = folders[index % len(folders)]
+        own = replace(settings, seed=settings.seed + index)
         video = folder / "video.mp4"
         if config.data is None:
             camera = read_camera(folder / "cameras.json", video=video)

@@ -34,6 +34,7 @@ CHANGED: dict[str, Any] = {
 
 VARIED = {
     "ablation": {"body", "terms"},
+    "benchmark_batch": set(),
     "benchmark_engines": set(),
     "evaluate_posterior": set(),
     "failure_modes": {"body", "preset"},
@@ -68,6 +69,7 @@ def arguments(folder: Path, script: str) -> list[str]:
         urdf = made_robots.write_quadruped(folder / "quadruped.urdf")
         return ["--urdf", str(urdf), "--cameras", "1", "--frames", "1"]
     return {
+        "benchmark_batch": ["--sequences", "1", "--frames", "1"],
         "ablation": ["--rows", "+ region", "--frames", "2", "--seeds", "1"],
         "learn_weights": ["--frames", "2", "--epochs", "1", "--starts", "1",
                           "--learnt", "contour", "region"],
