@@ -285,13 +285,11 @@ class Tracker:
             weights").
         forgetting: Power of the prior's weights in step 5. One is Fig. 6; below one, old evidence
             is forgotten by degrees.
-        likelihood_power: Power of a frame's likelihood in the weights, step 3. One is Fig. 6, which
-            takes frames as independent evidence. They are not: what a body model lacks, clutter and
-            occlusion cost the same modes in frame after frame. With a sharp likelihood the first
-            frames then decide for good, or, where much is forgotten, each frame anew.
-        covariance_power: The same power in the covariances that are stated; None: that of the
-            weights. How fast the best mode changes is one question, how far off all of them are
-            together is another.
+        likelihood_power: Power of a frame's likelihood in the weights, step 3, and in the
+            covariances that are stated. One is Fig. 6, which takes frames as independent evidence.
+            They are not: what a body model lacks, clutter and occlusion cost the same modes in
+            frame after frame. With a sharp likelihood the first frames then decide for good, or,
+            where much is forgotten, each frame anew.
         coarse_every: If the problem has a coarse cost, every so many samples descend on that first,
             so that what moved farther than the cost's own basin reaches is found again; 0 for
             never. As many of them as there are modes begin at the modes: one that is seldom sampled
@@ -332,7 +330,6 @@ class Tracker:
     laplace_evidence: bool = False
     forgetting: float = 1.0
     likelihood_power: float = 1.0
-    covariance_power: float | None = None
     coarse_every: int = 3
     oversampling: int = 1
     survivors: int = 0
@@ -355,9 +352,7 @@ class Tracker:
     @property
     def stated_power(self) -> float:
         """Power of a frame's likelihood in the covariances that are stated, see `tempered`."""
-        if self.covariance_power is None:
-            return self.likelihood_power
-        return self.covariance_power
+        return self.likelihood_power
 
     def init(self, mixture: GaussianMixture, *, generator: torch.Generator) -> TrackerState:
         """Start from a mixture, see `initial_state`."""

@@ -89,9 +89,7 @@ class Preset:
             for longer, since it has no `segmentation`: the rest of its person looks the same.
         power_keypoints: `likelihood_power` of a body with keypoints in every frame, if other than
             without: they tell in every frame anew which modes are wrong, and who was right for long
-            leads on less. (An arm does not gain.) The covariances stay those of
-            `likelihood_power`: with 0.3, half of the true joints are in the 90 %
-            regions, with 0.1 three quarters.
+            leads on less. (An arm does not gain.)
         persistence: Share of its last motion that a mode goes on with: 0 is driftless diffusion, 1
             constant velocity. The papers' trackers have 0. With 0.8 a mode does not lag behind a
             limb whose flow is underestimated: on the beam clip it doubles the time that limbs are

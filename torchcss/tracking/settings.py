@@ -113,8 +113,8 @@ class Settings:
             `torchcss.tracking.surface_prediction`. For trackers that descend from samples.
         oversampling: How many times as many samples are drawn; those with the best edges descend,
             see `Tracker`.
-        likelihood_power: Power of a frame's likelihood in the weights of modes, above 0 and at
-            most 1, see `Tracker`; the preset's by default. The stated covariances keep its own.
+        likelihood_power: Power of a frame's likelihood in the weights of modes and in the
+            covariances, above 0 and at most 1, see `Tracker`; the preset's by default.
         limb_jumps: How many other poses of an arm for which the colours do not speak join the
             search, see `torchcss.tracking.limb_moves`; 0 for none. For trackers that descend from
             samples.
@@ -475,9 +475,7 @@ def make_settings_tracker(
     if power is None and marked and moves:
         power = PRESETS[settings.preset].power_keypoints
     if power is not None:
-        tracker = replace(
-            tracker, likelihood_power=power, covariance_power=tracker.likelihood_power
-        )
+        tracker = replace(tracker, likelihood_power=power)
     return replace(tracker, oversampling=settings.oversampling)
 
 

@@ -54,7 +54,7 @@ class Smoothing:
 
     likelihood_power: float = 0.2
     acceleration_ratio: float = 10.0
-    persistence: float = 40.0
+    persistence: float = 20.0
     lag: int | None = None
 
     def __post_init__(self) -> None:
