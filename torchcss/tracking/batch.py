@@ -51,6 +51,9 @@ def track_batch(sequences: Sequences) -> Iterator[tuple[Posterior | None, ...]]:
         images.append(iter(its))
     if not sessions:
         return
+    for device in {session.settings.device for session in sessions}:
+        # The first call loads a device's solvers, which two threads must not do at once.
+        torch.linalg.cholesky_ex(torch.eye(1, device=device))
     set_up = partial(torch.set_num_threads, torch.get_num_threads())
     with ThreadPoolExecutor(len(sessions), "sequence", initializer=set_up) as pool:
         while True:
