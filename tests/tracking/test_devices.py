@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from copy import deepcopy
-from dataclasses import replace
 
 import pytest
 import torch
-from made_sessions import seen_by, session_at
+from made_sessions import moving_arm, seen_by, session_on, standing_person
 
-from torchcss.body.load import load_body
-from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
+from torchcss.studies.render.sequences import SyntheticSequence
 from torchcss.tracking.checkpoint import state_from_tensors, state_tensors
 from torchcss.tracking.presets import PRESETS
 from torchcss.tracking.session import Posterior, TrackingSession
-from torchcss.tracking.settings import Settings
 
 FRAMES = 3
 
@@ -31,35 +28,12 @@ def device(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture(scope="module")
 def arm() -> SyntheticSequence:
-    return arm_sequence(generator=torch.Generator().manual_seed(3), num_frames=FRAMES)
+    return moving_arm(FRAMES)
 
 
 @pytest.fixture(scope="module")
 def person(arm: SyntheticSequence) -> SyntheticSequence:
-    """A person who stands still before the arm: keypoints fit, edges do not."""
-    upright = torch.diag(torch.tensor([1.0, -1.0, -1.0])).double()
-    turned = arm.camera.R_camera_world.T @ upright
-    place = (
-        arm.camera.centre_world
-        + arm.camera.R_camera_world.T @ torch.tensor([0.0, 0.0, 3.5]).double()
-    )
-    body = load_body("body34").with_base(turned, place)
-    states = body.sticky_mean.expand(FRAMES, -1)
-    return replace(arm, body=body, states=states)
-
-
-def session_on(sequence: SyntheticSequence, device: str, **settings) -> TrackingSession:
-    """A session with the sequence's keypoints, from the truth of its first frame."""
-    chosen = Settings(
-        body=sequence.body.name,
-        device=device,
-        engine="eager",
-        **{"samples": 6, "modes": 2, "working_size": 160, **settings},
-    )
-    body = deepcopy(sequence.body).to(dtype=chosen.torch_dtype, device=device)
-    state = sequence.states[0].to(dtype=chosen.torch_dtype, device=device)
-    view = seen_by(sequence.camera, sequence.joints_world, sequence.body.joint_names)
-    return session_at(chosen, body, state, view)
+    return standing_person(arm)
 
 
 def posteriors(sequence: SyntheticSequence, device: str, **settings) -> Iterator[Posterior]:

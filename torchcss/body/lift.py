@@ -72,9 +72,8 @@ def lift_to_joints(
     features = torch.stack(moments, dim=1).flatten(1)
     below = ancestors.to(features)
     if num_points > num_joints:  # fewer products by way of the links
-        links, place = torch.unique(point_link, return_inverse=True)
-        features = features.new_zeros(len(links), features.shape[1]).index_add(0, place, features)
-        below = below[:, links]
+        by_link = features.new_zeros(below.shape[1], features.shape[1])
+        features = by_link.index_add_(0, point_link, features)
     else:
         below = below[:, point_link]
     per_joint = (below @ features).unflatten(1, (33, batch.numel()))

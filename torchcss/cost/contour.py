@@ -34,6 +34,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar, Literal, NamedTuple
 
 import torch
@@ -126,12 +127,13 @@ class ContourTerm(OutlineTerm):
         """`rho` on the squared distance in pixels."""
         return self.potential_kind(nu=self.nu, sigma=self.sigma)
 
-    @property
+    @cached_property
     def unmatched(self) -> float:
         """U, the cost of a visible node without assignment."""
         if self.assignment != "shared":
             return self.fitted_level * self.nu
-        return 0.5 * float(self.potential(torch.tensor(self.window**2, dtype=torch.float64)).rho)
+        end = torch.tensor(self.window**2, dtype=torch.float64, device="cpu")
+        return 0.5 * float(self.potential(end).rho)
 
     def prepare(self, context: FrameContext) -> OnPoints | None:
         """Bind the term to the edges of a frame; None without a picture."""

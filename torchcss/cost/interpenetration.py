@@ -170,7 +170,9 @@ class InterpenetrationPairs(nn.Module):
         distance = (axes @ centre.transpose(-1, -2) - own[..., None]).abs()
         cosines = (axes @ axes.transpose(-1, -2)).abs()
 
-        own_axes = torch.eye(parts).to(axes).repeat_interleave(3, dim=0)
+        own_axes = torch.eye(parts, dtype=axes.dtype, device=axes.device).repeat_interleave(
+            3, dim=0
+        )
 
         def overlap(half: Tensor, other: Tensor) -> Tensor:
             """Whether boxes overlap along the axes of the part in the row."""

@@ -116,7 +116,9 @@ class MixturePrior(Term):
             predicted: The previous posterior, one frame ahead (`Dynamics.predict`).
         """
         size = predicted.mean.shape[-1]
-        identity = torch.eye(size).to(predicted.covariance)
+        identity = torch.eye(
+            size, dtype=predicted.covariance.dtype, device=predicted.covariance.device
+        )
         # A variance of zero (a frozen parameter) is as good as a very small one.
         variance = predicted.covariance.diagonal(dim1=-2, dim2=-1).amax(-1)[:, None, None]
         least = torch.finfo(identity.dtype).eps * variance.clamp(min=_LEAST_VARIANCE)
@@ -132,7 +134,7 @@ class MixturePrior(Term):
             density: What `density` made.
         """
         # The square of a larger number would overflow; the share of a mode is nil there anyway.
-        limit = 1e-4 * (torch.finfo(x.dtype).max / float(density.precision.amax())) ** 0.5
+        limit = 1e-4 * (torch.finfo(x.dtype).max / density.precision.amax()).sqrt()
         offset = (x[..., None, :] - density.mean).clamp(-limit, limit)
         pull = (density.precision @ offset[..., None])[..., 0]
         exponent = density.log_amplitude - 0.5 * (offset * pull).sum(-1)

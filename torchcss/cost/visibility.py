@@ -210,13 +210,14 @@ class ContourPredictor(nn.Module):
         exists, rays = exists.flatten(-2), points - centre_world
         # Past the others to the nodes; and past the neighbours beside them and on behind them.
         reach = BEHIND * body.part_shape.to(rays)[:, :2].mean(-1)
+        beside = torch.arange(2, dtype=reach.dtype, device=reach.device)
         visible, free = line_of_sight(
             body.part_shape,
             rotation,
             eye,
             torch.cat([rays, rays + self.clearance * normals], dim=-2),
             torch.cat([self.other, self.touching]) > 0,
-            behind=torch.outer(torch.arange(2).to(reach).repeat_interleave(self.num_nodes), reach),
+            behind=torch.outer(beside.repeat_interleave(self.num_nodes), reach),
             wanted=torch.cat([exists, exists], dim=-1),
             ramp=self.ramp,
         ).chunk(2, dim=-1)
@@ -390,6 +391,7 @@ class _Parts(NamedTuple):
         within: Squared radius, of a plain part's own ellipsoid, at which it hides for sure.
         plain: Whether a part is round, straight and little tapered: a line of sight then has one
             nearest point, which a few steps find.
+        kinds: The values that `plain` has.
         bent: Whether any part is bent.
     """
 
@@ -398,6 +400,7 @@ class _Parts(NamedTuple):
     around: Float[Tensor, "3 parts"]
     within: Float[Tensor, " parts"]
     plain: Bool[Tensor, " parts"]
+    kinds: tuple[bool, ...]
     bent: bool
 
     def shapes(self, part: Int[Tensor, " m"]) -> Superquadrics:
@@ -425,7 +428,9 @@ def tabulate_parts(shape: Float[Tensor, "parts 9"], margin: float) -> _Parts:
     around = torch.where(is_bent[:, None], radius[:, None], around)
     narrowest = torch.cat([axes[:, :2] * (1 - taper.abs()), axes[:, 2:]], dim=-1).amin(-1)
     within = (1 / smaller - margin / narrowest).clamp(min=0).square()
-    return _Parts(torch.stack(rows), radius, 1 / around.mT, within, plain, bool(is_bent.any()))
+    some = torch.stack([plain.any(), (~plain).any(), is_bent.any()]).tolist()  # one transfer
+    kinds = tuple(kind for kind, there in zip((True, False), some, strict=False) if there)
+    return _Parts(torch.stack(rows), radius, 1 / around.mT, within, plain, kinds, some[2])
 
 
 def _farthest(a: Tensor, b: Tensor, exponent: Tensor) -> Tensor:
@@ -446,10 +451,8 @@ def _sight_gaps(
     gap = torch.full_like(views.length, torch.inf)
     at_once = _PAIRS_AT_ONCE if gap.device.type == "cpu" else 2**6 * _PAIRS_AT_ONCE
     poses = max(1, at_once // others.numel())
-    for plain in (True, False):
+    for plain in parts.kinds:
         candidates = others & (parts.plain == plain)[:, None]
-        if not bool(candidates.any()):
-            continue
         reach = torch.where(candidates, parts.radius[:, None] + behind, -torch.inf)
         for first in range(0, len(gap), poses):
             chunk = slice(first, first + poses)

@@ -288,7 +288,7 @@ def tempered(
     deviation = prior_variance.to(covariance).sqrt()
     units = torch.outer(deviation, deviation)
     own = covariance / units
-    one = torch.eye(own.shape[-1]).to(own)
+    one = torch.eye(own.shape[-1], dtype=own.dtype, device=own.device)
     return symmetric_part(torch.linalg.solve(power * (one - own) + own, own)) * units
 
 

@@ -412,8 +412,8 @@ class Tracker:
             origin=kept.origin,
             status_counts=torch.bincount(modes.status, minlength=len(Status)),
             num_steps=torch.cat([modes.num_steps, search.given_up]),
-            num_samples=torch.tensor(started),
-            num_distinct=torch.tensor(len(distinct)),
+            num_samples=torch.tensor(started, device="cpu"),
+            num_distinct=torch.tensor(len(distinct), device="cpu"),
             effective_sample_size=kept.effective_sample_size,
             num_floored=floored,
             survival=spread,
@@ -530,7 +530,7 @@ class Tracker:
             search.problem.cost, search.descents, bounds, scale=space.scale
         )
         modes = self.optimiser.modes(descents, bounds, prior_variance=space.prior_variance)
-        floored = torch.tensor(0)
+        floored = modes.status.new_zeros(())
         if not self.capped:
             modes, floored = as_printed(modes, descents, bounds, space.prior_variance)
         energy = finite_cost(modes, converged_only=self.converged_only)

@@ -378,7 +378,7 @@ class TrustRegionNewton:
         bounds = _like(bounds, state.x)
         limited = (state.status == Status.STEP_LIMIT) & (state.num_steps < self.max_steps)
         status = torch.where(limited, int(Status.RUNNING), state.status)
-        result = state._replace(status=status).take(torch.arange(len(status)).to(status))
+        result = state._replace(status=status).take(torch.arange(len(status), device=status.device))
         size = self.pool_size or (_POOL_SIZE if status.device.type == "cpu" else len(status))
         queue = torch.nonzero(status == Status.RUNNING)[:, 0]
         items, queue = queue[:size], queue[size:]
@@ -645,8 +645,8 @@ def _damped_step(
         # curvature ("hard case"; a saddle is one). Go along it as far as the radius allows.
         stuck = too_short & ((lo >= 0.5 * lam) | (remaining == 0))
         best = d * (rad / torch.where(size > rad, size, rad))[:, None]
-        if bool(stuck.any()):
-            hard = torch.nonzero(stuck)[:, 0]
+        hard = torch.nonzero(stuck)[:, 0]
+        if len(hard):
             best[hard] = _along_negative_curvature(
                 problem, todo[hard], lam[hard, None] * weight, d[hard], rad[hard]
             )

@@ -137,10 +137,11 @@ def carried(
             for y in (0, 1):
                 u, v = (first + first.new_tensor([x, y])).unbind(-1)
                 inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+                pixel = torch.where(inside, v * width + u, 0.0)
                 part = (share[:, 0] if x else 1 - share[:, 0]) * (
                     share[:, 1] if y else 1 - share[:, 1]
                 )
-                place = image[inside] * (height * width) + (v * width + u)[inside].long()
-                arrived.index_add_(0, place, (mark * part)[inside])
+                place = image * (height * width) + pixel.long()
+                arrived.index_add_(0, place, mark * part * inside)
         found = found.maximum(arrived.clamp(max=1.0))
     return found.reshape(outlier.shape)

@@ -289,12 +289,13 @@ def grid_faces(rings: int, meridians: int) -> Int[Tensor, "f 3"]:
         rings: Latitudes.
         meridians: Longitudes.
     """
-    ring, step = torch.meshgrid(torch.arange(rings - 1), torch.arange(meridians), indexing="ij")
+    rows, columns = (torch.arange(n, device="cpu") for n in (rings - 1, meridians))
+    ring, step = torch.meshgrid(rows, columns, indexing="ij")
     here = ring * meridians + step
     beside = ring * meridians + (step + 1) % meridians
     quads = torch.stack([here, beside, here + meridians, beside + meridians], dim=-1).reshape(-1, 4)
     sides = torch.cat([quads[:, [0, 1, 3]], quads[:, [0, 3, 2]]])
-    fan = torch.arange(1, meridians - 1)
+    fan = torch.arange(1, meridians - 1, device="cpu")
     bottom = torch.stack([torch.zeros_like(fan), fan + 1, fan], dim=-1)
     top = torch.stack([torch.zeros_like(fan), fan, fan + 1], dim=-1) + (rings - 1) * meridians
     return torch.cat([sides, bottom, top])

@@ -39,7 +39,8 @@ def gaussian_blur(image: Float[Tensor, "*batch h w"], sigma: float) -> Float[Ten
 
         size = 2 * math.ceil(3.0 * sigma) + 1
         flat = image.reshape(-1, 1, height, width)
-        blurred = gaussian_blur2d(flat, (size, size), (sigma, sigma), border_type="replicate")
+        sigmas = flat.new_tensor([[sigma, sigma]])
+        blurred = gaussian_blur2d(flat, (size, size), sigmas, border_type="replicate")
         return blurred.reshape(image.shape)
     down, along = _blur_matrix(height, sigma).to(image), _blur_matrix(width, sigma).to(image)
     return down @ image @ along.T
