@@ -53,15 +53,16 @@ def test_surface_derivatives_are_finite_differences(generator: torch.Generator, 
     shape, (eta, omega) = shapes(20, generator), angles(20, generator)
     if bend is not None:
         shape[:, 7] = bend
-    local = surface_derivatives(shape, eta, omega)
+    along = randn(generator, 20, 3)
+    local = surface_derivatives(shape, eta, omega, along)
     for k in range(9):
         step = torch.zeros(9, dtype=torch.float64)
         step[k] = 1e-5
-        ends = [surface_points(shape + sign * step, eta, omega) for sign in (1, -1)]
-        slopes = [surface_derivatives(shape + sign * step, eta, omega).first for sign in (1, -1)]
+        near = [(shape + sign * step, eta, omega) for sign in (1, -1)]
+        slopes = [surface_derivatives(*there, along).first for there in near]
         for got, pair in (
-            (local.first[..., k], [end.points for end in ends]),
-            (local.second[..., k], slopes),
+            (local.first[..., k], [surface_points(*there).points for there in near]),
+            (local.second[..., k], [(along[..., None] * slope).sum(-2) for slope in slopes]),
         ):
             torch.testing.assert_close(got, (pair[0] - pair[1]) / 2e-5, atol=1e-7, rtol=1e-6)
 
@@ -111,10 +112,10 @@ def test_columns_are_exact(name: str, free_proportions: bool, generator: torch.G
     x = body.bounds.project(randn(generator, body.num_parameters))
     both = torch.cat([x, torch.zeros(len(free.names), dtype=torch.float64)])
     pose = body.pose(x)
-    local = surface_derivatives(shape[part], eta, omega)
     rotation, centre = body.part_poses(pose)
-    points = (rotation[part] @ local.points[..., None])[..., 0] + centre[part]
-    got = lift_with_shape(body, pose, points, part, local, cost_at(points), free)
+    local = surface_points(shape[part], eta, omega).points
+    points = (rotation[part] @ local[..., None])[..., 0] + centre[part]
+    got = lift_with_shape(body, pose, points, part, (eta, omega), cost_at(points), free)
     torch.testing.assert_close(got.value, total(both))
     gradient = torch.autograd.functional.jacobian(total, both)
     hessian = torch.autograd.functional.hessian(total, both, vectorize=True)

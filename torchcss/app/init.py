@@ -222,6 +222,7 @@ def initialise_video(
         dtype=settings.torch_dtype,
         device=settings.device,
         free_root=settings.free_root,
+        engine=settings.engine,
     )
     return initialise(
         read_frame(video, start),
@@ -263,4 +264,4 @@ def write_png(path: Path, picture: Any) -> None:
     from PIL import Image
 
     with replace_file(path) as partial:
-        Image.fromarray(picture).save(partial, format="PNG")
+        Image.fromarray(picture).save(partial, format="PNG", compress_level=1)

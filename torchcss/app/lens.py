@@ -103,6 +103,7 @@ def fitted(view: OpenView, settings: Settings) -> OpenView:
             sigma=view.sigma,
             stature=settings.stature,
             pose_prior="pose_prior" in settings.used_terms,
+            engine=settings.engine,
         ),
         generator=torch.Generator().manual_seed(settings.seed),
     )

@@ -111,46 +111,45 @@ def with_shape(body: BodyModel, shape: Float[Tensor, "parts 9"]) -> BodyModel:
 
 
 class ShapeDerivatives(NamedTuple):
-    """Surface points in their part's frame and their derivatives in the nine shape numbers.
+    """Derivatives of surface points, in their part's frame, in the nine shape numbers.
 
     Attributes:
-        points: Metres.
-        first: First derivatives.
-        second: Second derivatives.
+        first: First derivatives of the points.
+        second: Second derivatives of the points along the directions that were given.
     """
 
-    points: Float[Tensor, "p 3"]
     first: Float[Tensor, "p 3 9"]
-    second: Float[Tensor, "p 3 9 9"]
+    second: Float[Tensor, "p 9 9"]
 
 
 def surface_derivatives(
-    shape: Float[Tensor, "p 9"], eta: Float[Tensor, " p"], omega: Float[Tensor, " p"]
+    shape: Float[Tensor, "p 9"],
+    eta: Float[Tensor, " p"],
+    omega: Float[Tensor, " p"],
+    along: Float[Tensor, "p 3"],
 ) -> ShapeDerivatives:
-    """Points of surfaces at held angles, with exact derivatives in the shape numbers.
+    """Exact derivatives of surface points at held angles in the shape numbers.
 
     Args:
         shape: The shape numbers of each point's part.
         eta: Latitudes.
         omega: Longitudes.
+        along: Directions in the part's frame whose second derivatives are wanted.
     """
     with torch.enable_grad():
         s = shape.detach().requires_grad_()
         points = surface_points(s, eta.detach(), omega.detach()).points
-        first, second = [], []
-        for axis in range(3):
-            (slope,) = torch.autograd.grad(points[:, axis].sum(), s, create_graph=True)
-            first.append(slope.detach())
-            rows = [
-                torch.autograd.grad(slope[:, k].sum(), s, retain_graph=True, allow_unused=True)[0]
-                for k in range(9)
-            ]
-            second.append(
-                torch.stack([torch.zeros_like(s) if row is None else row for row in rows], dim=-2)
-            )
-    return ShapeDerivatives(
-        points.detach(), torch.stack(first, dim=-2), torch.stack(second, dim=-3).detach()
-    )
+        first = [
+            torch.autograd.grad(points[:, axis].sum(), s, create_graph=True)[0] for axis in range(3)
+        ]
+        # One pass for each number: every point has its own row of the Hessian.
+        slope = (along[:, :, None] * torch.stack(first, dim=-2)).sum(-2)
+        rows = [
+            torch.autograd.grad(slope[:, k].sum(), s, retain_graph=True, allow_unused=True)[0]
+            for k in range(9)
+        ]
+    second = [torch.zeros_like(s) if row is None else row for row in rows]
+    return ShapeDerivatives(torch.stack(first, dim=-2).detach(), torch.stack(second, dim=-2))
 
 
 def surface_angles(
@@ -181,7 +180,7 @@ def lift_with_shape(
     pose: BodyPose,
     points: Float[Tensor, "p 3"],
     point_part: Int[Tensor, " p"],
-    local: ShapeDerivatives,
+    angles: tuple[Float[Tensor, " p"], Float[Tensor, " p"]],
     cost: PointCost,
     parameters: ShapeParameters,
 ) -> LocalModel:
@@ -192,7 +191,7 @@ def lift_with_shape(
         pose: The pose at which the cost was evaluated, without batch dimension.
         points: World positions, metres.
         point_part: The part of each point.
-        local: The points' derivatives in the part's frame.
+        angles: Latitude and longitude of each point on its part.
         cost: Value, gradient and Hessian of each point's cost in its world position.
         parameters: Which shape numbers are free.
 
@@ -201,12 +200,13 @@ def lift_with_shape(
     """
     by_state = body.lift(pose, points, body.part_link[point_part], cost)
     turn = body.part_poses(pose)[0][point_part]
+    pull = (turn.mT @ cost.gradient[..., None])[..., 0]
+    local = surface_derivatives(body.part_shape[point_part], *angles, pull)
     w = turn @ local.first  # p 3 9
     force = cost.hessian @ w
-    pull = (turn.mT @ cost.gradient[..., None])[..., 0]
     # How gradient, wrench and cost of the points change with the shape numbers of their part.
     slope = (cost.gradient[..., None] * w).sum(-2)
-    square = w.mT @ force + (pull[..., None, None] * local.second).sum(-3)
+    square = w.mT @ force + local.second
     six = wrench(points[..., None].expand_as(force), force)
     six = six + wrench(w, cost.gradient[..., None].expand_as(w), couple=True)
     slope, square, six = (

@@ -25,7 +25,6 @@ from torchcss.body.shape import (
     ShapeParameters,
     lift_with_shape,
     surface_angles,
-    surface_derivatives,
     with_shape,
 )
 from torchcss.cost.outline import OutlineTerm
@@ -112,5 +111,4 @@ class ShapedCost:
         rotation, centre = body.part_poses(pose)
         local = ((points - centre[part])[:, None, :] @ rotation[part])[:, 0]
         angles = surface_angles(shape[part], local)
-        derivatives = surface_derivatives(shape[part], *angles)
-        return lift_with_shape(body, pose, points, part, derivatives, cost, self.parameters)
+        return lift_with_shape(body, pose, points, part, angles, cost, self.parameters)

@@ -126,6 +126,7 @@ def initialise(
     alone = TrackingCost(
         choice=options.joint_choice,
         views=(FrameContext(body=first.body, camera=camera, keypoints=given),),
+        engine=options.evaluator,
     )
     notes += swapped_sides(alone, first.mixture.mean[0], generator)
     first = first._replace(report=(*notes, *first.report))
@@ -187,7 +188,8 @@ def _noise(
         for each in (view, *others)
     )
     # Else an unusual pose would pass for noise.
-    cost = TrackingCost(choice=options.joint_choice.without("pose_prior"), views=views)
+    choice = options.joint_choice.without("pose_prior")
+    cost = TrackingCost(choice=choice, views=views, engine=options.evaluator)
     return noise_factor(cost, fits.mean[0], options.search)
 
 
@@ -214,7 +216,7 @@ def _contour_cost(
     outlines = beside if options.colours else (ContourTerm(),)
     choice = choice.having(replace(joints, sigma=factor * joints.sigma))
     choice = replace(choice, terms=(*outlines, *choice.terms))
-    costs = FrameCosts(first.body, working, choice)
+    costs = FrameCosts(first.body, working, choice, engine=options.evaluator)
     return costs(
         features,
         body=first.body,

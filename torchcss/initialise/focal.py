@@ -113,6 +113,7 @@ def _costs(
     cost = TrackingCost(
         choice=options.joint_choice,
         views=(FrameContext(body=body, camera=cameras[middle], keypoints=keypoints),),
+        engine=options.evaluator,
     )
     bounds = options.search.bounds(body)
     frame = torch.arange(num).repeat_interleave(_NUM_STARTS)

@@ -94,6 +94,7 @@ def fit_joints(
             FrameContext(body=free, camera=each.camera, keypoints=each.keypoints)
             for each in (View(view.camera, keypoints), *others)
         ),
+        engine=options.evaluator,
     )
     if isinstance(body, BodyModel):
         _check_in_view(body, view.camera)

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import torch
 
 from torchcss.cost.anthropometric import Anthropometric
 from torchcss.cost.choice import CostChoice
+from torchcss.cost.fused import engine_for
 from torchcss.cost.interpenetration import Interpenetration
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.pose_prior import PosePrior
 from torchcss.cost.stabiliser import Stabiliser
+from torchcss.cost.total import Engine
 from torchcss.errors import ConfigurationError
 from torchcss.initialise.multi_start import PAPERS, Search
 from torchcss.robust import Lorentzian
@@ -44,6 +47,8 @@ class InitialiseOptions:
         dtype: Type of the body.
         device: Where to compute.
         free_root: Let a body move about that by itself stands in one place.
+        engine: "fused": compiled kernels evaluate the costs, on a CPU where numba is installed;
+            "eager": the terms as they are written.
     """
 
     sigma: float | None = None
@@ -61,6 +66,7 @@ class InitialiseOptions:
     dtype: torch.dtype = torch.float64
     device: torch.device | str = "cpu"
     free_root: bool = False
+    engine: Literal["fused", "eager"] = "fused"
 
     def __post_init__(self) -> None:
         if self.num_modes is not None and self.num_modes < 1:
@@ -78,6 +84,11 @@ class InitialiseOptions:
             PAPERS, proportions=self.search.proportions, coarse_pose=self.search.coarse_pose
         )
         return replace(self, search=search, num_modes=1, printed=True, colours=False)
+
+    @property
+    def evaluator(self) -> Engine | None:
+        """What evaluates the costs; None: the terms as they are written."""
+        return engine_for(self.engine, self.device)
 
     @property
     def joint_choice(self) -> CostChoice:

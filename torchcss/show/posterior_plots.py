@@ -190,8 +190,14 @@ def angles_figure(track: Track) -> Figure:
     moved = np.flatnonzero((np.abs(np.diff(base, axis=0)) > 1e-9).any((1, 2))) + 1
     columns = min(len(track.state_names), 5)
     count = math.ceil(len(track.state_names) / columns)
-    figure = Figure(figsize=(2.6 * columns + 0.6, 1.0 + 1.45 * count), layout="constrained")
-    grid = figure.subplots(count, columns, sharex=True, squeeze=False)
+    # Margins in inches: measuring the labels of so many panels takes as long as drawing them.
+    width, height = 2.6 * columns + 0.6, 1.0 + 1.45 * count
+    figure = Figure(figsize=(width, height))
+    margins = {
+        "left": 0.5 / width, "right": 1 - 0.1 / width, "bottom": 0.5 / height,
+        "top": 1 - 0.65 / height, "wspace": 0.27, "hspace": 0.3,
+    }  # fmt: skip
+    grid = figure.subplots(count, columns, sharex=True, squeeze=False, gridspec_kw=margins)
     for axes in grid.flat[len(track.state_names) :]:
         axes.set_visible(False)
     for index, (axes, name) in enumerate(zip(grid.flat, track.state_names, strict=False)):

@@ -23,6 +23,7 @@ from torchcss.cost.contour import ContourTerm
 from torchcss.cost.edge_energy import EdgeEnergyTerm
 from torchcss.cost.flow import FlowTerm
 from torchcss.cost.frame import FrameCosts
+from torchcss.cost.fused import engine_for
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.region import RegionTerm
 from torchcss.cost.segmentation import SegmentationTerm
@@ -481,12 +482,7 @@ def make_settings_tracker(
 
 def make_engine(settings: Settings) -> Engine | None:
     """What evaluates the cost; None: the terms as they are written."""
-    if settings.engine == "eager" or torch.device(settings.device).type != "cpu":
-        return None
-    # Importing the kernels takes a third of a second.
-    from torchcss.cost.fused.engine import fused_engine
-
-    return fused_engine(settings.engine_dtype)
+    return engine_for(settings.engine, settings.device, settings.engine_dtype)
 
 
 class Plan(NamedTuple):
