@@ -17,6 +17,8 @@ import pytest
 import torch
 from made_sequences import write_arm
 
+from torchcss.app.claims import Claims
+from torchcss.app.lock import LOCK_NAME
 from torchcss.app.recorder import Picture
 from torchcss.app.track import TrackOptions, resume, track_video
 from torchcss.cli import main as cli
@@ -159,6 +161,18 @@ def test_a_killed_process_loses_nothing(
     assert ended in ({-signal.SIGKILL} if kill is signal.SIGKILL else {143, 0})
     assert cli.main(command(clip, tmp_path, "--resume")) == 0
     assert_same_run(whole.folder, tmp_path)
+
+
+def test_a_run_that_was_taken_over_writes_nothing_more(clip: Path, tmp_path: Path) -> None:
+    class Taking(Stumbling):
+        def add(self, frame: Posterior, picture: Picture) -> None:
+            if frame.frame.index == 2:
+                assert Claims(tmp_path / LOCK_NAME).take("run", gone=True) is not None
+
+    few = replace(SETTINGS, samples=1, modes=1, terms=("joints",), overlay=False)
+    with pytest.raises(OutputError, match="another process has taken over"):
+        follow(clip, tmp_path, few, live=Taking(0, KeyboardInterrupt()), checkpoint_every=0)
+    assert len(Run.open(tmp_path).track.frames) == 2
 
 
 def test_a_complete_run_stays_as_it_is(clip: Path, whole: Run) -> None:

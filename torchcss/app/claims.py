@@ -116,17 +116,24 @@ class Claims:
         ]
         if not found:
             return None
-        lines = (self.folder / f"{name}.{max(found)}").read_text(encoding="utf-8").splitlines()
+        try:
+            lines = (self.folder / f"{name}.{max(found)}").read_text(encoding="utf-8").splitlines()
+        except FileNotFoundError:  # removed just now, as that of a lock is
+            return None
         return Sight(max(found), lines[0], len(lines), lines[-1] if len(lines) > 1 else "")
 
-    def take(self, name: str) -> Claim | None:
+    def take(self, name: str, *, gone: bool = False) -> Claim | None:
         """Claim something; None where somebody else has it, or was faster.
+
+        Args:
+            name: What is claimed.
+            gone: Whether the owner of the last claim is known to be gone.
 
         Raises:
             OutputError: If the folder cannot be written.
         """
         seen = self.sight(name)
-        if seen is not None and not (seen.released or self._stands_still(name, seen)):
+        if seen is not None and not (gone or seen.released or self._stands_still(name, seen)):
             return None
         generation = 1 if seen is None else seen.generation + 1
         draft = self.folder / f".{uuid.uuid4().hex}"

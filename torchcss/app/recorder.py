@@ -27,7 +27,9 @@ from jaxtyping import UInt8
 from torch import Tensor
 from tqdm import tqdm
 
+from torchcss.app.claims import Claim
 from torchcss.app.smooth import SMOOTH_NAME
+from torchcss.errors import OutputError
 from torchcss.files import output_error
 from torchcss.io.cameras import calibration
 from torchcss.io.checkpoint import Checkpoint, remove_checkpoint, write_checkpoint
@@ -113,6 +115,7 @@ class Recorder:
         on_first_frame: Writes what else belongs to the run, when its first frame is saved.
         checkpoint_every: Seconds of wall time between checkpoints.
         begun: The run that is gone on with; None: it starts.
+        lock: The lock of the folder: nothing is written when another process has taken it over.
     """
 
     folder: Path
@@ -125,6 +128,7 @@ class Recorder:
     on_first_frame: Callable[[], None] | None = None
     checkpoint_every: float = CHECKPOINT_EVERY
     begun: Begun | None = None
+    lock: Claim | None = None
 
     def __post_init__(self) -> None:
         session, begun = self.session, self.begun
@@ -236,6 +240,8 @@ class Recorder:
 
     def _save(self, ended: str) -> None:
         """Write track, summary and checkpoint, in this order: the checkpoint is never ahead."""
+        if self.lock is not None and not self.lock.holds:
+            raise OutputError(f"{self.folder}: another process has taken over; it goes on there")
         first = len(self._writer) == 1
         self._writer.save()
         if first and self.on_first_frame is not None:

@@ -19,9 +19,11 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
+from torchcss.app.claims import Claim
 from torchcss.app.detect import DetectOptions, detect_video, masks_of
 from torchcss.app.init import initialise_video
 from torchcss.app.lens import Lens, fitted
+from torchcss.app.lock import locked
 from torchcss.app.recorder import CHECKPOINT_EVERY, Begun, Recorder, Sink
 from torchcss.app.view_files import OpenView, Selection, moments, open_view
 from torchcss.cost.view import View
@@ -128,15 +130,30 @@ def track_video(
         The run; its `summary` says what was run and what it cost.
 
     Raises:
-        TorchcssError: With one line that says what was wrong, for any bad input.
+        TorchcssError: With one line that says what was wrong, for any bad input, and where another
+            process writes into the folder.
     """
     settings, options = settings or Settings(), options or TrackOptions()
     out = prepare_output_folder(Path(out))
     selection = Selection(start=start, stop=stop, stride=options.stride)
-    if options.resume and (begun := _begun(out)) is not None:
-        return _go_on(begun, settings, selection, options)
-    files = _files_of(Path(video), keypoints, out, options)
-    views = _all_views(files, camera, selection, settings, options)
+    with locked(out) as lock:
+        if options.resume and (begun := _begun(out)) is not None:
+            return _go_on(begun, settings, selection, options, lock)
+        files = _files_of(Path(video), keypoints, out, options)
+        views = _all_views(files, camera, selection, settings, options)
+        return _begin(views, out, settings, selection, options, lock)
+
+
+def _begin(
+    views: Sequence[OpenView],
+    out: Path,
+    settings: Settings,
+    selection: Selection,
+    options: TrackOptions,
+    lock: Claim,
+) -> Run:
+    """Find the first pose, and track from it."""
+    start = selection.start
     generator = torch.Generator().manual_seed(settings.seed)
     eye = views[0].camera.camera.to(dtype=settings.torch_dtype, device=settings.device)
     _now(f"finding the first pose, in frame {start}")
@@ -159,6 +176,7 @@ def track_video(
         sinks=() if options.live is None else (options.live,),
         on_first_frame=_writes_body(out, options.init, first, eye),
         checkpoint_every=options.checkpoint_every,
+        lock=lock,
     )
     return _record(recorder, views)
 
@@ -224,7 +242,8 @@ def resume(run: Run | str | os.PathLike[str], *, live: Sink | None = None) -> Ru
         The run as it is then; a complete one is left as it is.
 
     Raises:
-        TorchcssError: If it left no checkpoint, or its files are gone.
+        TorchcssError: If it left no checkpoint, its files are gone, or another process goes on
+            with it.
     """
     run = run if isinstance(run, Run) else Run.open(run)
     if run.checkpoint is None:
@@ -233,7 +252,8 @@ def resume(run: Run | str | os.PathLike[str], *, live: Sink | None = None) -> Ru
         )
     known = run.checkpoint.notes["extra"]["frames_selected"]
     settings = settings_from_plain(run.settings)
-    return _go_on(run, settings, Selection(**known), TrackOptions(live=live))
+    with locked(run.folder) as lock:
+        return _go_on(run, settings, Selection(**known), TrackOptions(live=live), lock)
 
 
 def _begun(out: Path) -> Run | None:
@@ -244,7 +264,9 @@ def _begun(out: Path) -> Run | None:
     return None if run.checkpoint is None else run
 
 
-def _go_on(run: Run, settings: Settings, selection: Selection, options: TrackOptions) -> Run:
+def _go_on(
+    run: Run, settings: Settings, selection: Selection, options: TrackOptions, lock: Claim
+) -> Run:
     """Track the frames that a run has not got to."""
     checkpoint, out = run.checkpoint, run.folder
     assert checkpoint is not None
@@ -264,6 +286,7 @@ def _go_on(run: Run, settings: Settings, selection: Selection, options: TrackOpt
         sinks=() if options.live is None else (options.live,),
         checkpoint_every=options.checkpoint_every,
         begun=Begun(run.track.first(checkpoint.num_frames), checkpoint.notes),
+        lock=lock,
     )
     return _record(recorder, views)
 
