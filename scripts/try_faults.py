@@ -11,6 +11,10 @@ clip:
 | kill | a process is killed |
 | sleep | a process is stopped, taken over, and woken up |
 | end | a process is asked to end, as schedulers do: within ten seconds, with status 0 |
+| group | a process of torchrun is killed, which starts all of them again |
+| torchrun | torchrun itself is killed, and the store that it keeps |
+| join | a second torchrun joins the first, which starts all processes again |
+| clock | the clock of a process jumps by hours with every look at it |
 | disk | no file may be larger than a part of the track |
 | video | a video is cut off, and whole again later |
 | folder | the folder cannot be written (left out for root, who may) |
@@ -26,6 +30,7 @@ import os
 import random
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -73,7 +78,9 @@ class Config:
     """Processes of a batch."""
     patience: float = 2.0
     """Seconds until a process that shows no life is taken over."""
-    faults: tuple[str, ...] = ("kill", "sleep", "end", "disk", "video", "folder")
+    faults: tuple[str, ...] = (
+        "kill", "sleep", "end", "disk", "video", "folder", "group", "torchrun", "join", "clock",
+    )  # fmt: skip
     """What is tried, in turns."""
     folder: Path = Path("faults")
     """Where batches are written; those of rounds that went well are removed."""
@@ -132,9 +139,21 @@ class Round:
     def begin(self, first: str = "") -> subprocess.Popen[bytes]:
         """Start one process of the batch, which runs a line of Python first."""
         code = f"{first}import sys; from torchcss.app.batch import main; sys.exit(main())"
-        words = [sys.executable, "-c", code, str(self.folder / "clips.jsonl")]
+        return self._begin("-c", code)
+
+    def torchrun(self, *how: str) -> subprocess.Popen[bytes]:
+        """Start all processes by torchrun."""
+        how = (*(how or ("--standalone",)), f"--nproc-per-node={self.config.processes}")
+        how = (*how, "--max-restarts=3", "-m", "torchcss.app.batch")
+        return self._begin("-m", "torch.distributed.run", *how)
+
+    def _begin(self, *what: str) -> subprocess.Popen[bytes]:
+        words = [sys.executable, *what, str(self.folder / "clips.jsonl")]
         words += ["--out", str(self.out), "--patience", str(self.config.patience), *_WORDS]
-        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+        path = os.pathsep.join(filter(None, sys.path))
+        environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": path}
+        # Else a machine that joins waits in vain for the others' address (seen with torch 2.13).
+        environment["TORCH_DISABLE_SHARE_RDZV_TCP_STORE"] = "1"
         with (self.folder / "printed.txt").open("ab") as printed:
             return subprocess.Popen(words, stdout=printed, stderr=printed, env=environment)
 
@@ -218,7 +237,58 @@ def folder(batch: Round) -> None:
     place.chmod(0o700)
 
 
-FAULTS = {f.__name__: f for f in (kill, sleep, end, disk, video, folder)}
+def group(batch: Round) -> None:
+    """SIGKILL to one of torchrun's processes."""
+    process = batch.torchrun()
+    batch.catch(process)
+    os.kill(batch.moment.choice(_children(process)), signal.SIGKILL)
+    _expect(process.wait(_LATE_S) == 0, "torchrun did not start its processes again")
+
+
+def torchrun(batch: Round) -> None:
+    """SIGKILL to torchrun; its processes do not know, and go on beside the next command's."""
+    process = batch.torchrun()
+    batch.catch(process)
+    process.kill()
+    process.wait(_LATE_S)
+
+
+def join(batch: Round) -> None:
+    """As when a second machine is admitted."""
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        place = f"localhost:{free.getsockname()[1]}"
+    how = ("--nnodes=1:2", "--rdzv-backend=c10d", f"--rdzv-endpoint={place}", "--rdzv-id=batch")
+    processes = [batch.torchrun(*how, "--rdzv-conf=last_call_timeout=2")]
+    batch.catch(processes[0])
+    processes.append(batch.torchrun(*how))
+    _expect(
+        all(process.wait(_LATE_S) == 0 for process in processes), "torchrun ended with an error"
+    )
+
+
+def clock(batch: Round) -> None:
+    """Other times, forwards and backwards."""
+    jump = "import random, time; now = time.time; "
+    jump += "time.time = lambda: now() + random.uniform(-1e5, 1e5); "
+    process = batch.begin(jump)
+    _expect(process.wait(_LATE_S) == 0, "a clock that jumps ended a process")
+
+
+def _children(process: subprocess.Popen[bytes]) -> list[int]:
+    """Numbers of the processes that one has started, on Linux."""
+    listed = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text(encoding="ascii")
+    return [int(number) for number in listed.split()]
+
+
+FAULTS = {
+    f.__name__: f for f in (kill, sleep, end, disk, video, folder, group, torchrun, join, clock)
+}
+_UNABLE: dict[str, tuple[bool, str]] = {
+    "folder": (os.geteuid() == 0, "root may write everywhere"),
+    "group": (sys.platform != "linux", "it is not told whose process is whose"),
+}
+"""What cannot be tried here, and why."""
 
 
 def _expect(so: bool, what: str) -> None:
@@ -249,8 +319,9 @@ def main(config: Config) -> dict[str, Any]:
     rows = []
     for number in range(config.rounds):
         name = config.faults[number % len(config.faults)]
-        if name == "folder" and os.geteuid() == 0:
-            rows.append([number, name, "left out: root may write everywhere"])
+        unable, why = _UNABLE.get(name, (False, ""))
+        if unable:
+            rows.append([number, name, f"left out: {why}"])
             continue
         batch = Round(config, config.folder / f"round{number}", random.Random(config.seed + number))
         batch.prepare()

@@ -92,8 +92,9 @@ def assert_same_run(one: Path, other: Path) -> None:
     assert summaries[0] == summaries[1]
 
 
-@pytest.mark.parametrize("trouble", [KeyboardInterrupt(), OutputError("disk full")])
-@pytest.mark.parametrize("at", [0, 4])
+@pytest.mark.parametrize(
+    ("at", "trouble"), [(0, OutputError("disk full")), (4, KeyboardInterrupt())]
+)
 def test_an_interrupted_run_goes_on(
     clip: Path, whole: Run, tmp_path: Path, at: int, trouble: BaseException
 ) -> None:

@@ -10,7 +10,7 @@ import pytest
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "try_faults.py"
 
 
-@pytest.mark.parametrize("fault", ["kill", "sleep", "end", "disk", "folder"])
+@pytest.mark.parametrize("fault", ["kill", "sleep", "end", "disk", "folder", "group"])
 def test_nothing_is_lost(fault: str, script: ModuleType, tmp_path: Path) -> None:
     config = script.Config(
         rounds=1, clips=1, frames=4, patience=1.0, faults=(fault,), folder=tmp_path, processes=1

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchcss.kernels import compiler
-from torchcss.vision import flow
+from torchcss.vision import boundaries, flow
 
 pytestmark = pytest.mark.skipif(not compiler.COMPILED, reason="numba is not installed")
 
@@ -32,6 +32,16 @@ def test_median(size, radius, monkeypatch, generator):
     images = torch.randn(2, 2, *size, generator=generator)
     got, expected = both(monkeypatch, lambda: flow._median(images, radius))
     assert torch.equal(got, expected)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_carried_marks(size, monkeypatch, generator):
+    marks = torch.rand(2, *size, generator=generator)
+    marks[marks < 0.3] = 0.0
+    moves = 4 * torch.randn(2, 2, *size, generator=generator)
+    moves[0, 0, 0, 0] = torch.nan
+    got, expected = both(monkeypatch, lambda: boundaries.carried(marks, moves, reach=3))
+    torch.testing.assert_close(got, expected, rtol=0, atol=2e-6)
 
 
 @pytest.mark.parametrize("size", SIZES)

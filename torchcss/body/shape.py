@@ -136,20 +136,24 @@ def surface_derivatives(
         omega: Longitudes.
         along: Directions in the part's frame whose second derivatives are wanted.
     """
+    numbers = shape.shape[-1]
     with torch.enable_grad():
-        s = shape.detach().requires_grad_()
-        points = surface_points(s, eta.detach(), omega.detach()).points
+        # A copy of the points for every number: one pass instead of nine small ones. Of each copy
+        # the last pass takes another row of the Hessian.
+        s = shape.detach().repeat(numbers, 1).requires_grad_()
+        points = surface_points(s, eta.detach().repeat(numbers), omega.detach().repeat(numbers))[0]
         first = [
-            torch.autograd.grad(points[:, axis].sum(), s, create_graph=True)[0] for axis in range(3)
+            torch.autograd.grad(points[: len(shape), axis].sum(), s, retain_graph=True)[0]
+            for axis in range(3)
         ]
-        # One pass for each number: every point has its own row of the Hessian.
-        slope = (along[:, :, None] * torch.stack(first, dim=-2)).sum(-2)
-        rows = [
-            torch.autograd.grad(slope[:, k].sum(), s, retain_graph=True, allow_unused=True)[0]
-            for k in range(9)
-        ]
-    second = [torch.zeros_like(s) if row is None else row for row in rows]
-    return ShapeDerivatives(torch.stack(first, dim=-2).detach(), torch.stack(second, dim=-2))
+        moved = (points * along.detach().repeat(numbers, 1)).sum()
+        (slope,) = torch.autograd.grad(moved, s, create_graph=True)
+        rows = slope.unflatten(0, (numbers, -1)).diagonal(dim1=0, dim2=2)
+        (second,) = torch.autograd.grad(rows.sum(), s)
+    return ShapeDerivatives(
+        torch.stack([slope[: len(shape)] for slope in first], dim=-2),
+        second.unflatten(0, (numbers, -1)).movedim(0, 1),
+    )
 
 
 def surface_angles(

@@ -35,7 +35,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.errors import ConfigurationError, ShapeError
-from torchcss.vision.flow import OpticalFlow
+from torchcss.vision.flow import OpticalFlow, has_kernels
 from torchcss.vision.sampling import gaussian_blur
 
 _LEAST_OUTLIER = 1e-3
@@ -123,6 +123,15 @@ def carried(
     """
     height, width = outlier.shape[-2:]
     marks, moves = outlier.reshape(-1, height, width), flow.reshape(-1, 2, height, width)
+    if has_kernels(marks) and moves.dtype == marks.dtype:
+        from torchcss.vision import flow_kernels
+
+        arrived = marks.new_zeros(len(marks), 5, height, width)
+        for mark, move, into in zip(marks, moves, arrived, strict=True):
+            flow_kernels.carry(
+                mark.numpy(), move.contiguous().numpy(), reach, _LEAST_OUTLIER, into.numpy()
+            )
+        return arrived.amax(1).clamp(max=1.0).reshape(outlier.shape)
     found = torch.zeros_like(marks).flatten()
     image, row, column = torch.nonzero(marks > _LEAST_OUTLIER, as_tuple=True)
     mark = marks[image, row, column]
@@ -142,6 +151,6 @@ def carried(
                     share[:, 1] if y else 1 - share[:, 1]
                 )
                 place = image * (height * width) + pixel.long()
-                arrived.index_add_(0, place, mark * part * inside)
+                arrived.index_add_(0, place, torch.where(inside, mark * part, 0.0))
         found = found.maximum(arrived.clamp(max=1.0))
     return found.reshape(outlier.shape)

@@ -272,7 +272,7 @@ def _resize(images: Float[Tensor, "b c h w"], size: tuple[int, int]) -> Float[Te
     )
 
 
-def _compiled(images: Tensor) -> bool:
+def has_kernels(images: Tensor) -> bool:
     """Whether the loops over these images have compiled twins."""
     single = images.dtype == torch.float32 and images.device.type == "cpu"
     return compiler.COMPILED and single and not torch.compiler.is_compiling()
@@ -281,7 +281,7 @@ def _compiled(images: Tensor) -> bool:
 def _structure(images: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
     """Smooth part of each image: least total variation near the image (Chambolle 2004)."""
     step = 0.249 / _STRUCTURE_SCALE
-    if _compiled(images):
+    if has_kernels(images):
         from torchcss.vision import flow_kernels
 
         structure = torch.empty_like(images)
@@ -446,7 +446,7 @@ def _solve(
     """
     root = weight.sqrt()
     q = root * constancy.gradient
-    if _compiled(flow):
+    if has_kernels(flow):
         from torchcss.vision import flow_kernels
 
         flow, target = flow.clone(), -q * (root * constancy.offset)
@@ -547,13 +547,13 @@ def _median(images: Float[Tensor, "b c h w"], radius: int) -> Float[Tensor, "b c
     Strip by strip: what is worked on at a time stays in the cache (twice as fast, measured).
     """
     height, width = images.shape[-2:]
-    if _compiled(images) and radius:
+    if has_kernels(images) and radius == 2:
         from torchcss.vision import flow_kernels
 
         padded = functional.pad(images, (radius,) * 4, mode="replicate").flatten(0, 1)
         out = torch.empty_like(images)
         for plane, filtered in zip(padded, out.flatten(0, 1), strict=True):
-            flow_kernels.median(plane.numpy(), radius, filtered.numpy())
+            flow_kernels.median(plane.numpy(), filtered.numpy())
         return out
     rows = max(1, _STRIP_VALUES // (images.shape[0] * images.shape[1] * width))
     padded = functional.pad(images, (radius,) * 4, mode="replicate")

@@ -1,15 +1,15 @@
-"""The inner loops of the optical flow, compiled; `torchcss.vision.flow` has their twins in torch.
+"""The inner loops of the optical flow, compiled; their twins in torch stand in the modules.
 
 A conjugate-gradient step in torch is a dozen passes over the image, each of which fetches it from
-memory anew. Here a step is three passes, each row at a time. Where numba cannot be
-imported the flow takes torch's way, as it does on a GPU and in double precision.
+memory anew. Here a step is three passes, each row at a time. Where numba cannot be imported the
+flow takes torch's way, as it does on a GPU and in double precision.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from torchcss.kernels.compiler import entry, kernel, sqrt
+from torchcss.kernels.compiler import entry, floor, inlined, kernel, sqrt
 
 
 @kernel
@@ -113,49 +113,54 @@ def solve(flow, q, target, right, down, num_iterations):  # type: ignore[no-unty
         _turn(np.float32(reduction / before), conditioned, x)
 
 
-@kernel
-def _order(planes, low, high, width):  # type: ignore[no-untyped-def]
-    """The lesser of two rows into the first of them, the greater into the second."""
-    for c in range(width):
-        a, b = planes[low, c], planes[high, c]
-        planes[low, c], planes[high, c] = min(a, b), max(a, b)
+@inlined
+def _sorted(a, b, c, d, e):  # type: ignore[no-untyped-def]
+    """Five numbers, the least first, by a network of nine exchanges."""
+    a, b = min(a, b), max(a, b)
+    d, e = min(d, e), max(d, e)
+    c, e = min(c, e), max(c, e)
+    c, d = min(c, d), max(c, d)
+    b, e = min(b, e), max(b, e)
+    a, d = min(a, d), max(a, d)
+    a, c = min(a, c), max(a, c)
+    b, d = min(b, d), max(b, d)
+    b, c = min(b, c), max(b, c)
+    return a, b, c, d, e
 
 
 @entry
-def median(padded, radius, out):  # type: ignore[no-untyped-def]
-    """Median over square windows, as `torchcss.vision.flow._inner_median` finds it, row by row.
+def median(padded, out):  # type: ignore[no-untyped-def]
+    """Median over windows of five by five, as `torchcss.vision.flow._inner_median` finds it.
+
+    Rows are sorted, then columns, which leaves rows sorted. So many are then above or below each
+    number that the median is that of the middle diagonal, of the greatest number of the diagonal
+    before it and of the least of the one behind it. All stays in registers, eight pixels at a time.
 
     Args:
-        padded: `[h+2r w+2r]`, single precision.
-        radius: r.
+        padded: `[h+4 w+4]`, single precision.
         out: `[h w]`.
     """
     height, width = out.shape
-    side = 2 * radius + 1
-    num_kept = side * side // 2 + 2
-    planes = np.empty((num_kept, width), np.float32)
     for row in range(height):
-        for index in range(num_kept):
-            top, left = index // side, index % side
-            planes[index] = padded[row + top, left : left + width]
-        first, kept, waiting = 0, num_kept, num_kept
-        while True:
-            # The least goes to the first place, the greatest to the last; both are dropped.
-            last = first + kept - 1
-            for place in range(kept // 2):
-                _order(planes, first + place, last - place, width)
-            half = (kept + 1) // 2
-            for place in range(1, half):
-                _order(planes, first, first + place, width)
-            for place in range(kept // 2, kept - 1):
-                _order(planes, first + place, last, width)
-            if waiting == side * side:
-                break
-            first, kept = first + 1, kept - 1
-            top, left = waiting // side, waiting % side
-            planes[first + kept - 1] = padded[row + top, left : left + width]
-            waiting += 1
-        out[row] = planes[first + 1]
+        p, q, r = padded[row], padded[row + 1], padded[row + 2]
+        s, t = padded[row + 3], padded[row + 4]
+        for k in range(width):
+            a0, a1, a2, a3, a4 = _sorted(p[k], p[k + 1], p[k + 2], p[k + 3], p[k + 4])
+            b0, b1, b2, b3, b4 = _sorted(q[k], q[k + 1], q[k + 2], q[k + 3], q[k + 4])
+            c0, c1, c2, c3, c4 = _sorted(r[k], r[k + 1], r[k + 2], r[k + 3], r[k + 4])
+            d0, d1, d2, d3, d4 = _sorted(s[k], s[k + 1], s[k + 2], s[k + 3], s[k + 4])
+            e0, e1, e2, e3, e4 = _sorted(t[k], t[k + 1], t[k + 2], t[k + 3], t[k + 4])
+            a0, b0, c0, d0, e0 = _sorted(a0, b0, c0, d0, e0)
+            a1, b1, c1, d1, e1 = _sorted(a1, b1, c1, d1, e1)
+            a2, b2, c2, d2, e2 = _sorted(a2, b2, c2, d2, e2)
+            a3, b3, c3, d3, e3 = _sorted(a3, b3, c3, d3, e3)
+            a4, b4, c4, d4, e4 = _sorted(a4, b4, c4, d4, e4)
+            before = max(max(a3, b2), max(c1, d0))
+            behind = min(min(b4, c3), min(d2, e1))
+            _, one, two, three, _ = _sorted(a4, b3, c2, d1, e0)
+            # The fourth of seven: three, two and one from the diagonal, the rest from the others.
+            low, high = min(before, behind), max(before, behind)
+            out[row, k] = min(three, min(max(two, low), max(one, high)))
 
 
 @entry
@@ -194,3 +199,41 @@ def structure(image, scale, step, num_steps):  # type: ignore[no-untyped-def]
                 inward = along[row, c + 1] - along[row, c] + across[row + 1, c] - across[row, c]
                 smooth[row, c] = image[row, c] + scale * inward
     return smooth
+
+
+@entry
+def carry(marks, flow, reach, least, arrived):  # type: ignore[no-untyped-def]
+    """Spread marks where five neighbours of each go, see `torchcss.vision.boundaries.carried`.
+
+    Args:
+        marks: `[h w]`.
+        flow: `[2 h w]`.
+        reach: Distance of the neighbours.
+        least: Marks that are no greater are left out.
+        arrived: `[5 h w]`, zero; what arrives is added, for each neighbour apart.
+    """
+    height, width = marks.shape
+    for row in range(height):
+        for c in range(width):
+            mark = marks[row, c]
+            if not mark > least:
+                continue
+            for side in range(5):
+                down = reach if side == 3 else (-reach if side == 4 else 0)
+                right = reach if side == 1 else (-reach if side == 2 else 0)
+                there = min(max(row + down, 0), height - 1)
+                beside = min(max(c + right, 0), width - 1)
+                u = flow[0, there, beside] + np.float32(c)
+                v = flow[1, there, beside] + np.float32(row)
+                # Also false for what is not a number.
+                if not (u > -1 and u < width and v > -1 and v < height):
+                    continue
+                left, top = floor(u), floor(v)
+                share_u, share_v = u - left, v - top
+                for y in range(2):
+                    for x in range(2):
+                        i, j = int(top) + y, int(left) + x
+                        if i >= 0 and i < height and j >= 0 and j < width:
+                            part = share_u if x == 1 else 1.0 - share_u
+                            part = part * (share_v if y == 1 else 1.0 - share_v)
+                            arrived[side, i, j] += mark * part
