@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,12 @@ from torchcss.studies.evaluation import silhouette
 from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
 
 NOISE_PX = 1.5
+
+
+@lru_cache(maxsize=8)
+def rendered_arm(seed: int, num_frames: int) -> SyntheticSequence:
+    """The demo's arm. Rendering takes seconds: tests of one process share what is the same."""
+    return arm_sequence(generator=torch.Generator().manual_seed(seed), num_frames=num_frames)
 
 
 def write_arm(folder: Path, num_frames: int, *, seed: int = 0) -> SyntheticSequence:

@@ -6,13 +6,14 @@ from copy import deepcopy
 from dataclasses import replace
 
 import torch
+from made_sequences import rendered_arm
 from torch import Tensor
 
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.initialise.result import Initialisation
-from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
+from torchcss.studies.render.sequences import SyntheticSequence
 from torchcss.tracking.session import TrackingSession
 from torchcss.tracking.settings import Settings
 from torchcss.tracking.view import CameraView
@@ -55,7 +56,7 @@ def session_at(
 
 def moving_arm(frames: int) -> SyntheticSequence:
     """An arm before a plain wall."""
-    return arm_sequence(generator=torch.Generator().manual_seed(3), num_frames=frames)
+    return rendered_arm(3, frames)
 
 
 def standing_person(arm: SyntheticSequence) -> SyntheticSequence:

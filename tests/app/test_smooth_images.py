@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from made_clip import track
+from made_sequences import rendered_arm
 
 from torchcss import load_track
 from torchcss.app.smooth import settings_of, smooth_frames, smooth_track
@@ -18,7 +19,7 @@ from torchcss.cli import main as cli
 from torchcss.errors import ConfigurationError, VideoError
 from torchcss.io.run import Run
 from torchcss.io.tracks import FrameModes, Track, TrackWriter, read_summary
-from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
+from torchcss.studies.render.sequences import SyntheticSequence
 from torchcss.tracking.settings import Settings
 from torchcss.tracking.smooth import Smoothing
 from torchcss.tracking.view import CameraView
@@ -33,7 +34,7 @@ SETTINGS = Settings(
 
 @pytest.fixture(scope="module")
 def sequence() -> SyntheticSequence:
-    return arm_sequence(generator=torch.Generator().manual_seed(0), num_frames=NUM_FRAMES)
+    return rendered_arm(0, NUM_FRAMES)
 
 
 class Setup(NamedTuple):

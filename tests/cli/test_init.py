@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from made_sequences import rendered_arm
 
 from torchcss.app.init import write_png
 from torchcss.cli import init as cli_init
@@ -19,7 +20,6 @@ from torchcss.initialise.multi_start import Search
 from torchcss.initialise.options import InitialiseOptions
 from torchcss.io.tracks import load_track
 from torchcss.io.video import VideoReader, VideoWriter, read_image
-from torchcss.studies.render.sequences import arm_sequence
 from torchcss.types import Keypoints
 
 
@@ -27,7 +27,7 @@ from torchcss.types import Keypoints
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A rendered arm as picture and as video, with its camera and joints as files."""
     folder = tmp_path_factory.mktemp("scene")
-    sequence = arm_sequence(generator=torch.Generator().manual_seed(3), num_frames=2)
+    sequence = rendered_arm(3, 2)
     with VideoWriter(folder / "video.mp4", 25) as film:
         for frame in sequence.frames:
             film.write(frame)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from made_sequences import rendered_arm
 from made_sessions import seen_by, session_at
 
 import torchcss
@@ -17,7 +18,7 @@ from torchcss.body.load import load_body
 from torchcss.cost.total import TrackingCost
 from torchcss.errors import TorchcssError, VideoError
 from torchcss.kernels import compiler
-from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
+from torchcss.studies.render.sequences import SyntheticSequence
 from torchcss.tracking import batch
 from torchcss.tracking.session import Posterior, TrackingSession
 from torchcss.tracking.settings import Settings
@@ -27,10 +28,7 @@ from torchcss.vision.camera import Camera
 @pytest.fixture(scope="module")
 def films() -> list[SyntheticSequence]:
     """Two films of an arm, of two and of three frames, by two cameras, of two builds."""
-    short, long = (
-        arm_sequence(generator=torch.Generator().manual_seed(seed), num_frames=num)
-        for seed, num in ((3, 2), (4, 3))
-    )
+    short, long = (rendered_arm(seed, num) for seed, num in ((3, 2), (4, 3)))
     lengths = {name: 1.05 * value for name, value in long.body.lengths.items()}
     body = load_body("arm8", lengths=lengths)
     body = body.with_base(long.body.base_rotation, long.body.base_translation)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from jaxtyping import Int
+from made_sequences import rendered_arm
 from made_sessions import seen_by, session_at
 from torch import Tensor
 
@@ -16,7 +17,7 @@ from torchcss.cost.choice import TERM_TABLE
 from torchcss.cost.context import FrameContext
 from torchcss.cost.term import Kind, Posed, Term, differentiated
 from torchcss.inference.implicit import TermWeights, weighted_minimum
-from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
+from torchcss.studies.render.sequences import SyntheticSequence
 from torchcss.studies.slices import joint_lines, sample_slice
 from torchcss.tracking.session import Posterior, TrackingSession
 from torchcss.tracking.settings import Settings, all_terms
@@ -60,7 +61,7 @@ class BoundMiddle:
 
 @pytest.fixture(scope="module")
 def sequence() -> SyntheticSequence:
-    return arm_sequence(generator=torch.Generator().manual_seed(3), num_frames=3)
+    return rendered_arm(3, 3)
 
 
 @pytest.fixture

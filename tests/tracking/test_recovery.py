@@ -10,13 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from made_sequences import rendered_arm
 from made_sessions import seen_by, session_at
 
 import torchcss
 from torchcss.app.recorder import Recorder
 from torchcss.inference.loss_monitor import LossMonitor
 from torchcss.io.view_files import RecordedCamera
-from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
+from torchcss.studies.render.sequences import SyntheticSequence
 from torchcss.tracking.recovery import Recovery
 from torchcss.tracking.session import Posterior
 from torchcss.tracking.settings import Settings, watched_terms
@@ -49,7 +50,7 @@ def track(
 
 @pytest.fixture(scope="module")
 def sequence() -> SyntheticSequence:
-    return arm_sequence(generator=torch.Generator().manual_seed(3), num_frames=12)
+    return rendered_arm(3, 12)
 
 
 @pytest.fixture(scope="module")

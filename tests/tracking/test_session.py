@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from made_sequences import rendered_arm
 from made_sessions import seen_by, session_at, start_at
 from torch import Tensor
 
@@ -411,7 +412,7 @@ def test_masks_are_read_along_with_the_video(clip: Path, tmp_path: Path):
 
 def test_masks_weigh_the_edges():
     """A white mask takes two per cent of the weight, a black one most of it."""
-    sequence = arm_sequence(generator=torch.Generator().manual_seed(3), num_frames=1)
+    sequence = rendered_arm(3, 1)
     settings = Settings(body="arm8", terms=("contour",), working_size=160)
     costs = []
     for masks in (None, [np.full((480, 640), 255, np.uint8)], [np.zeros((480, 640), np.uint8)]):
@@ -442,7 +443,7 @@ def track(
 
 def test_poses_of_limbs_join_the_search(monkeypatch: pytest.MonkeyPatch):
     """What descends from them is the best mode's."""
-    sequence = arm_sequence(generator=torch.Generator().manual_seed(0), num_frames=3)
+    sequence = rendered_arm(0, 3)
     settings = Settings(body="arm8", keypoints_use="first", working_size=160)
     asked, column = [], sequence.body.state_index("r_elbow_flexion")
 
@@ -467,7 +468,7 @@ def test_poses_of_limbs_join_the_search(monkeypatch: pytest.MonkeyPatch):
 
 def test_between_steps_only_the_base_touches_the_state(monkeypatch: pytest.MonkeyPatch):
     """A tracker starts from what it returned, but for a base that moves along."""
-    sequence = arm_sequence(generator=torch.Generator().manual_seed(0), num_frames=4)
+    sequence = rendered_arm(0, 4)
     given, returned = [], []
     step = Tracker.step
 
@@ -491,7 +492,7 @@ def test_between_steps_only_the_base_touches_the_state(monkeypatch: pytest.Monke
 
 def test_the_next_frame_may_be_seen_while_this_one_is_searched():
     """Where it is looked at is known a frame ago, so that the bits are the same."""
-    sequence = arm_sequence(generator=torch.Generator().manual_seed(0), num_frames=4)
+    sequence = rendered_arm(0, 4)
     settings = Settings(body="arm8", working_size=160, samples=4, modes=2)
     view = seen_by(sequence.camera)
     one, ahead = (session_at(settings, sequence.body, sequence.states[0], view) for _ in range(2))
@@ -510,7 +511,7 @@ def test_the_next_frame_may_be_seen_while_this_one_is_searched():
 
 @pytest.mark.parametrize("num_frames", [0, 1, 4])
 def test_two_threads_give_the_same_bits(num_frames: int):
-    sequence = arm_sequence(generator=torch.Generator().manual_seed(0), num_frames=4)
+    sequence = rendered_arm(0, 4)
     settings = Settings(body="arm8", working_size=160, samples=4, modes=2)
     view, frames = seen_by(sequence.camera), sequence.frames[:num_frames]
     tracks = [
@@ -524,7 +525,7 @@ def test_two_threads_give_the_same_bits(num_frames: int):
 
 
 def test_what_is_wrong_with_an_image_is_told_by_two_threads_too():
-    sequence = arm_sequence(generator=torch.Generator().manual_seed(0), num_frames=2)
+    sequence = rendered_arm(0, 2)
     settings = Settings(body="arm8", working_size=160, samples=4, modes=2, threads=2)
     session = session_at(settings, sequence.body, sequence.states[0], seen_by(sequence.camera))
     images = [sequence.frames[0], np.zeros((4, 4, 2), np.uint8) + np.arange(2, dtype=np.uint8)]
@@ -536,7 +537,7 @@ def test_what_is_wrong_with_an_image_is_told_by_two_threads_too():
 
 def test_terms_of_the_best_mode_add_up_to_its_cost():
     """In every frame: the priors are about the mixture that the search had, one frame ahead."""
-    sequence = arm_sequence(generator=torch.Generator().manual_seed(0), num_frames=4)
+    sequence = rendered_arm(0, 4)
     settings = Settings(body="arm8", keypoints_use="first", working_size=160, engine="eager")
     for tracked in track(sequence.frames, sequence, settings):
         assert sum(tracked.terms.values()) == pytest.approx(float(tracked.info.cost[0]), rel=1e-9)
@@ -544,7 +545,7 @@ def test_terms_of_the_best_mode_add_up_to_its_cost():
 
 def test_frames_without_detections_have_no_term_of_joints():
     """Detectors write such frames as zeros; they cost nothing, and are not what is usual."""
-    sequence = arm_sequence(generator=torch.Generator().manual_seed(0), num_frames=2)
+    sequence = rendered_arm(0, 2)
     settings = Settings(body="arm8", working_size=160, terms=("joints", "temporal"))
     view = seen_by(sequence.camera, sequence.joints_world, sequence.body.joint_names)
     assert view.keypoints is not None
@@ -576,7 +577,7 @@ def awkward_frames(sequence: SyntheticSequence) -> dict[str, np.ndarray]:
 
 
 def test_awkward_frames_leave_no_nan_and_lose_nothing():
-    sequence = arm_sequence(generator=torch.Generator().manual_seed(3), num_frames=8)
+    sequence = rendered_arm(3, 8)
     frames = awkward_frames(sequence)
     assert all(frame.shape[:2] == (480, 640) for frame in frames.values())
     settings = Settings(body="arm8", terms=all_terms(), working_size=160)
@@ -666,7 +667,7 @@ def test_a_particle_filter_weighs_by_the_observation_alone(clip: Path, tmp_path:
 @pytest.mark.parametrize("size", [(1, 48), (48, 1), (1, 1), (37, 53)])
 def test_images_one_pixel_wide_and_of_odd_sizes(size: tuple[int, int]):
     width, height = size
-    sequence = arm_sequence(generator=torch.Generator().manual_seed(0), num_frames=1)
+    sequence = rendered_arm(0, 1)
     small = Camera(
         [[50.0, 0.0, (width - 1) / 2], [0.0, 50.0, (height - 1) / 2], [0.0, 0.0, 1.0]],
         size,
@@ -681,7 +682,7 @@ def test_images_one_pixel_wide_and_of_odd_sizes(size: tuple[int, int]):
 
 def test_pixels_alone_are_the_next_frame():
     """And a camera alone is a view without keypoints."""
-    sequence = arm_sequence(generator=torch.Generator().manual_seed(0), num_frames=3)
+    sequence = rendered_arm(0, 3)
     settings = Settings(body="arm8", working_size=160, samples=4, modes=2, terms=("contour",))
     first = start_at(sequence.body, sequence.states[0])
     placed = TrackingSession(settings, first, [seen_by(sequence.camera)])

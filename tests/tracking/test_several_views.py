@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from made_sequences import rendered_arm
 from made_sessions import seen_by, session_at
 
 from torchcss.app.track import TrackOptions, track_video
@@ -19,7 +20,7 @@ from torchcss.io.run import Given, Run
 from torchcss.io.tracks import load_track
 from torchcss.io.video import VideoWriter
 from torchcss.io.view_files import ViewFiles
-from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
+from torchcss.studies.render.sequences import SyntheticSequence
 from torchcss.tracking.session import Posterior
 from torchcss.tracking.settings import Settings
 from torchcss.types import Frame
@@ -41,7 +42,7 @@ def beside_it(camera: Camera, target: torch.Tensor) -> Camera:
 
 @pytest.fixture(scope="module")
 def sequence() -> SyntheticSequence:
-    return arm_sequence(generator=torch.Generator().manual_seed(3), num_frames=FRAMES)
+    return rendered_arm(3, FRAMES)
 
 
 @pytest.fixture(scope="module")
