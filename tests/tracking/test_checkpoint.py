@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import subprocess
 import sys
 from dataclasses import replace
@@ -17,6 +18,7 @@ from made_sessions import INTERVAL, seen_by, start_at
 
 from torchcss.errors import ConfigurationError, TrackFileError
 from torchcss.io.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from torchcss.studies.render.sequences import SyntheticSequence
 from torchcss.tracking.checkpoint import state_from_tensors, state_tensors
 from torchcss.tracking.session import TrackingSession
 from torchcss.tracking.settings import Settings, all_terms
@@ -36,9 +38,9 @@ TRACKERS = {
 
 
 def sequence_and_session(
-    settings: Settings, num_frames: int = 6
+    settings: Settings, made: SyntheticSequence | None = None
 ) -> tuple[list[Frame], TrackingSession]:
-    made = rendered_arm(3, num_frames)
+    made = made or rendered_arm(3, 6)
     view = seen_by(made.camera, made.joints_world, made.body.joint_names)
     first = start_at(made.body, made.states[0])
     session = TrackingSession(settings, first, [view], frame_interval=INTERVAL)
@@ -48,7 +50,8 @@ def sequence_and_session(
 def go_on(folder: str, name: str) -> None:
     """What the other process does: the second half, its last state into a file."""
     settings, num_frames = TRACKERS[name]
-    frames, begun = sequence_and_session(settings, num_frames)
+    made = pickle.loads((Path(folder) / "made").read_bytes())
+    frames, begun = sequence_and_session(settings, made)
     checkpoint = read_checkpoint(Path(folder))
     assert checkpoint is not None
     state = state_from_tensors(checkpoint.tensors, begun.state.body)
@@ -63,7 +66,9 @@ def go_on(folder: str, name: str) -> None:
 def test_another_process_goes_on_bit_for_bit(tmp_path: Path, name: str) -> None:
     settings, num_frames = TRACKERS[name]
     half = num_frames // 2
-    frames, session = sequence_and_session(settings, num_frames)
+    made = rendered_arm(3, num_frames)
+    (tmp_path / "made").write_bytes(pickle.dumps(made))
+    frames, session = sequence_and_session(settings, made)
     for _ in session.track(frames[:half]):
         pass
     write_checkpoint(tmp_path, Checkpoint(half, state_tensors(session.checkpoint())))
