@@ -55,6 +55,8 @@ class Init:
     """Where to compute."""
     dtype: Literal["float64", "float32"] = "float64"
     """Floating type."""
+    engine: Literal["fused", "eager"] = "fused"
+    """What evaluates the costs: compiled kernels, on a CPU, or the terms as they are written."""
     files: Annotated[PictureFiles, tyro.conf.OmitArgPrefixes] = field(default_factory=PictureFiles)
 
     def run(self) -> None:
@@ -81,6 +83,7 @@ class Init:
             dtype=torch.float32 if self.dtype == "float32" else torch.float64,
             device=self.device,
             free_root=self.free_root,
+            engine=self.engine,
         )
         if self.initialisation == "papers":
             options = options.as_papers()

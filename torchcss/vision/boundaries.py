@@ -128,7 +128,7 @@ def carried(
 
         arrived = marks.new_zeros(len(marks), 5, height, width)
         for mark, move, into in zip(marks, moves, arrived, strict=True):
-            flow_kernels.carry(
+            flow_kernels.displace(
                 mark.numpy(), move.contiguous().numpy(), reach, _LEAST_OUTLIER, into.numpy()
             )
         return arrived.amax(1).clamp(max=1.0).reshape(outlier.shape)

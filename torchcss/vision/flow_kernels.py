@@ -202,21 +202,21 @@ def structure(image, scale, step, num_steps):  # type: ignore[no-untyped-def]
 
 
 @entry
-def carry(marks, flow, reach, least, arrived):  # type: ignore[no-untyped-def]
-    """Spread marks where five neighbours of each go, see `torchcss.vision.boundaries.carried`.
+def displace(outliers, flow, reach, least, arrived):  # type: ignore[no-untyped-def]
+    """Add outliers where five neighbours of each go, see `torchcss.vision.boundaries.carried`.
 
     Args:
-        marks: `[h w]`.
+        outliers: `[h w]`.
         flow: `[2 h w]`.
         reach: Distance of the neighbours.
-        least: Marks that are no greater are left out.
+        least: Outliers that are no greater are left out.
         arrived: `[5 h w]`, zero; what arrives is added, for each neighbour apart.
     """
-    height, width = marks.shape
+    height, width = outliers.shape
     for row in range(height):
         for c in range(width):
-            mark = marks[row, c]
-            if not mark > least:
+            outlier = outliers[row, c]
+            if not outlier > least:
                 continue
             for side in range(5):
                 down = reach if side == 3 else (-reach if side == 4 else 0)
@@ -236,4 +236,4 @@ def carry(marks, flow, reach, least, arrived):  # type: ignore[no-untyped-def]
                         if i >= 0 and i < height and j >= 0 and j < width:
                             part = share_u if x == 1 else 1.0 - share_u
                             part = part * (share_v if y == 1 else 1.0 - share_v)
-                            arrived[side, i, j] += mark * part
+                            arrived[side, i, j] += outlier * part
