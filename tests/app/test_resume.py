@@ -28,8 +28,9 @@ from torchcss.tracking.session import Posterior
 from torchcss.tracking.settings import Settings
 
 SETTINGS = Settings(
-    body="arm8", samples=4, modes=2, working_size=160, prediction="surface", limb_jumps=1
-)
+    body="arm8", samples=4, modes=2, working_size=160, prediction="surface", limb_jumps=1,
+    overlay=False,
+)  # fmt: skip
 FRAMES = 8
 WALL_TIMES = {
     *("seconds_per_frame", "seconds_per_frame_by_stage", "share_of_search_time_by_term"),
@@ -52,8 +53,14 @@ class Stumbling:
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A clip, and in `first` a first pose for all who do not ask how one is found."""
     folder = tmp_path_factory.mktemp("clip")
     write_arm(folder, FRAMES)
+    few = replace(SETTINGS, samples=1, modes=1, terms=("joints",))
+    track_video(
+        folder / "video.mp4", camera=folder / "cameras.json",
+        keypoints=folder / "keypoints2d.npz", out=folder / "first", settings=few, stop=1,
+    )  # fmt: skip
     return folder
 
 
@@ -64,7 +71,7 @@ def follow(clip: Path, out: Path, settings: Settings = SETTINGS, **options: Any)
         keypoints=clip / "keypoints2d.npz",
         out=out,
         settings=settings,
-        options=TrackOptions(**options),
+        options=TrackOptions(**{"init": clip / "first" / "body.npz", **options}),
     )
 
 
@@ -77,7 +84,8 @@ def whole(clip: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
 def assert_same_run(one: Path, other: Path) -> None:
     """The same files, wall times apart."""
     assert {p.name for p in one.iterdir()} == {p.name for p in other.iterdir()}
-    assert (one / "overlay.mp4").read_bytes() == (other / "overlay.mp4").read_bytes()
+    for film in one.glob("*.mp4"):
+        assert film.read_bytes() == (other / film.name).read_bytes()
     for name in ("track.npz", "body.npz", "checkpoint.npz"):
         ours, theirs = (np.load(folder / name) for folder in (one, other))
         assert set(ours.files) == set(theirs.files)
@@ -142,26 +150,38 @@ def command(clip: Path, out: Path, *more: str) -> list[str]:
     ]
 
 
-@pytest.mark.parametrize("kill", [signal.SIGKILL, signal.SIGTERM])
+WAYS = {
+    signal.SIGTERM: ("--no-overlay", "--init", "first/body.npz"),
+    # All by itself: with the first pose, the film and the report.
+    signal.SIGKILL: (),
+}
+
+
+@pytest.mark.parametrize("kill", WAYS)
 def test_a_killed_process_loses_nothing(
     clip: Path, whole: Run, tmp_path: Path, kill: signal.Signals
 ) -> None:
+    out = tmp_path / "out"
+    same = [str(clip / word) if "/" in word else word for word in WAYS[kill]]
     script = "import sys; from torchcss.cli.main import main; sys.exit(main(sys.argv[1:]))"
-    more = ("--checkpoint-every", "0")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
     environment["OMP_NUM_THREADS"] = str(torch.get_num_threads())
     with subprocess.Popen(
-        [sys.executable, "-c", script, *command(clip, tmp_path, *more)],
+        [sys.executable, "-c", script, *command(clip, out, "--checkpoint-every", "0", *same)],
         env=environment,
         stderr=subprocess.DEVNULL,
     ) as process:
-        while not (tmp_path / "checkpoint.npz").exists() and process.poll() is None:
+        while not (out / "checkpoint.npz").exists() and process.poll() is None:
             time.sleep(0.01)
         process.send_signal(kill)
         ended = process.wait()
     assert ended in ({-signal.SIGKILL} if kill is signal.SIGKILL else {143, 0})
-    assert cli.main(command(clip, tmp_path, "--resume")) == 0
-    assert_same_run(whole.folder, tmp_path)
+    assert cli.main(command(clip, out, "--resume", *same)) == 0
+    expected = whole.folder
+    if kill is signal.SIGKILL:
+        expected = tmp_path / "whole"
+        assert cli.main(command(clip, expected)) == 0
+    assert_same_run(expected, out)
 
 
 def test_a_run_that_was_taken_over_writes_nothing_more(clip: Path, tmp_path: Path) -> None:

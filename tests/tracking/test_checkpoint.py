@@ -31,8 +31,8 @@ SETTINGS = Settings(
 PRINTED = Settings(body="arm8", preset="rr_multiple_hypothesis", working_size=120)
 TRACKERS = {
     "ours": (replace(SETTINGS, terms=None), 20),
-    "all terms": (SETTINGS, 6),
-    "[RR] Fig. 4": (PRINTED, 20),
+    "all terms": (SETTINGS, 4),
+    "[RR] Fig. 4": (PRINTED, 6),
 }
 """Settings, and how many frames are tracked: half of them by another process."""
 
