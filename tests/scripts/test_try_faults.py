@@ -9,7 +9,7 @@ SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "try_faults.py"
 
 
 def test_nothing_is_lost(script: ModuleType, tmp_path: Path) -> None:
-    faults = ("kill", "sleep", "end", "group")
+    faults = ("kill", "sleep", "end", "disk", "folder", "group")
     config = script.Config(
         rounds=len(faults), clips=1, frames=4, patience=1.0, faults=faults, folder=tmp_path,
         processes=1,
