@@ -31,6 +31,7 @@ SETTINGS = Settings(
     body="arm8", samples=4, modes=2, working_size=160, prediction="surface", limb_jumps=1,
     overlay=False,
 )  # fmt: skip
+FILMED = replace(SETTINGS, overlay=True)
 FRAMES = 8
 WALL_TIMES = {
     *("seconds_per_frame", "seconds_per_frame_by_stage", "share_of_search_time_by_term"),
@@ -81,6 +82,12 @@ def whole(clip: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
     return follow(clip, tmp_path_factory.mktemp("whole"))
 
 
+@pytest.fixture(scope="module")
+def filmed(clip: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """The same all by itself: with the search for a first pose, film and report."""
+    return follow(clip, tmp_path_factory.mktemp("filmed"), FILMED, init=None)
+
+
 def assert_same_run(one: Path, other: Path) -> None:
     """The same files, wall times apart."""
     assert {p.name for p in one.iterdir()} == {p.name for p in other.iterdir()}
@@ -100,18 +107,24 @@ def assert_same_run(one: Path, other: Path) -> None:
     assert summaries[0] == summaries[1]
 
 
-@pytest.mark.parametrize(
-    ("at", "trouble"), [(0, OutputError("disk full")), (4, KeyboardInterrupt())]
-)
-def test_an_interrupted_run_goes_on(
-    clip: Path, whole: Run, tmp_path: Path, at: int, trouble: BaseException
-) -> None:
-    with pytest.raises(type(trouble)):
-        follow(clip, tmp_path, live=Stumbling(at, trouble))
+def test_an_interrupted_run_goes_on(clip: Path, whole: Run, tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        follow(clip, tmp_path, live=Stumbling(4, KeyboardInterrupt()))
     assert Run.open(tmp_path).summary["ended"] == "interrupted"
     run = follow(clip, tmp_path, resume=True)
     assert len(run.track.frames) == FRAMES
     assert_same_run(whole.folder, tmp_path)
+
+
+def test_a_run_interrupted_in_its_first_frame_goes_on(
+    clip: Path, filmed: Run, tmp_path: Path
+) -> None:
+    stumbling = Stumbling(0, OutputError("disk full"))
+    with pytest.raises(OutputError):
+        follow(clip, tmp_path, FILMED, init=None, live=stumbling)
+    assert Run.open(tmp_path).summary["ended"] == "interrupted"
+    follow(clip, tmp_path, FILMED, init=None, resume=True)
+    assert_same_run(filmed.folder, tmp_path)
 
 
 def test_frames_after_the_last_checkpoint_are_tracked_again(
@@ -159,29 +172,24 @@ WAYS = {
 
 @pytest.mark.parametrize("kill", WAYS)
 def test_a_killed_process_loses_nothing(
-    clip: Path, whole: Run, tmp_path: Path, kill: signal.Signals
+    clip: Path, whole: Run, filmed: Run, tmp_path: Path, kill: signal.Signals
 ) -> None:
-    out = tmp_path / "out"
     same = [str(clip / word) if "/" in word else word for word in WAYS[kill]]
     script = "import sys; from torchcss.cli.main import main; sys.exit(main(sys.argv[1:]))"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
     environment["OMP_NUM_THREADS"] = str(torch.get_num_threads())
     with subprocess.Popen(
-        [sys.executable, "-c", script, *command(clip, out, "--checkpoint-every", "0", *same)],
+        [sys.executable, "-c", script, *command(clip, tmp_path, "--checkpoint-every", "0", *same)],
         env=environment,
         stderr=subprocess.DEVNULL,
     ) as process:
-        while not (out / "checkpoint.npz").exists() and process.poll() is None:
+        while not (tmp_path / "checkpoint.npz").exists() and process.poll() is None:
             time.sleep(0.01)
         process.send_signal(kill)
         ended = process.wait()
     assert ended in ({-signal.SIGKILL} if kill is signal.SIGKILL else {143, 0})
-    assert cli.main(command(clip, out, "--resume", *same)) == 0
-    expected = whole.folder
-    if kill is signal.SIGKILL:
-        expected = tmp_path / "whole"
-        assert cli.main(command(clip, expected)) == 0
-    assert_same_run(expected, out)
+    assert cli.main(command(clip, tmp_path, "--resume", *same)) == 0
+    assert_same_run((whole if same else filmed).folder, tmp_path)
 
 
 def test_a_run_that_was_taken_over_writes_nothing_more(clip: Path, tmp_path: Path) -> None:

@@ -70,6 +70,7 @@ def by_autograd(term: Interpenetration, body: BodyModel, x: Tensor) -> LocalMode
 @pytest.mark.parametrize(
     ("name", "free", "term"),
     [
+        ("body34", False, TERM),
         ("body34", True, Interpenetration(p=2.0, sharpness=1.5, weight=3.0)),
         ("body30", True, TERM),
         ("arm8", False, Interpenetration(p=3.0, sharpness=1.0)),
