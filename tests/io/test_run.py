@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,10 @@ from torchcss.io.view_files import RecordedCamera, ViewFiles
 from torchcss.show.posterior_plots import plot_track
 from torchcss.show.viewer import view_track
 from torchcss.vision.camera import Camera
+
+needs_viewer = pytest.mark.skipif(
+    find_spec("rerun") is None, reason='the viewer needs pip install ".[viewer]"'
+)
 
 
 def camera(name: str, shift: float) -> Camera:
@@ -95,7 +100,14 @@ def test_a_robot_with_its_shape_and_two_cameras_survives(track: Track, tmp_path:
             assert torchcss.export(one, tmp_path / to, to=to).paths[0].stat().st_size > 100
     assert torchcss.export(tmp_path, tmp_path / "own.bvh").paths == (tmp_path / "own.bvh",)
     assert {path.stem for path in plot_track(again)} >= {"modes", "joints", "side_view"}
-    view_track(again, save=tmp_path / "track.rrd")
+
+
+@needs_viewer
+def test_a_robot_with_its_shape_and_two_cameras_is_viewed(track: Track, tmp_path: Path) -> None:
+    save_track(tmp_path / "track.npz", track)
+    write_summary(tmp_path, {"ended": "complete"})
+    view_track(Run.open(tmp_path), save=tmp_path / "track.rrd")
+    assert (tmp_path / "track.rrd").stat().st_size > 1000
 
 
 def assert_same_body(one: BodyModel, other: BodyModel) -> None:
@@ -187,7 +199,7 @@ def test_an_old_folder_opens_with_what_it_holds(old: Path) -> None:
         (["export", "--to", "bvh"], "--body"),
         (["export", "--to", "csv"], "--body"),
         (["plot"], "--body"),
-        (["view", "--save", "a.rrd"], "--body"),
+        pytest.param(["view", "--save", "a.rrd"], "--body", marks=needs_viewer),
         (["smooth", "--images", "--body", "body30"], "--camera, --video, --keypoints"),
         (["smooth", "--body", "body32"], "other parameters"),
     ],

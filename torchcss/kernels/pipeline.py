@@ -114,7 +114,7 @@ class _Cache(caching.FunctionCache):
         found = super().load_overload(sig, target_context)
         if found is None and not _Cache._said:
             _Cache._said = True
-            print("torchcss: compiling for this processor, once (up to a minute)", file=sys.stderr)
+            print("torchcss: compiling for this processor, once (a minute or two)", file=sys.stderr)
         return found
 
 
