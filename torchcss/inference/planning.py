@@ -168,8 +168,11 @@ def _judge(
         after = _norm(trial.gradient[b], space.inverse)
         if after < before:
             items.damping[b] *= after / before
-        at.x[b], at.gradient[b], at.hessian[b] = trial.x[b], trial.gradient[b], trial.hessian[b]
         at.value[b], at.share[b] = trial.value[b], trial.share[b]
+        for i in range(at.x.shape[1]):
+            at.x[b, i], at.gradient[b, i] = trial.x[b, i], trial.gradient[b, i]
+            for j in range(at.x.shape[1]):
+                at.hessian[b, i, j] = trial.hessian[b, i, j]
     elif math.isinf(at.value[b]):
         items.status[b] = _NON_FINITE
 
@@ -225,10 +228,10 @@ def _plan(items: Items, b: int, space: Space, rules: Rules, memory: Memory, acce
     futile = not accepted and predicted < FUTILE * rules.tolerance
     ends = converged or futile or predicted <= 4.0 * _epsilon(damping) * abs(at.value[b])
     items.damping[b] = damping
-    if ends and at.share[b] != 1.0:
-        items.predicted[b], items.step[b] = 0.0, 0.0
-    else:
-        items.predicted[b], items.step[b] = predicted, step
+    share = 0.0 if ends and at.share[b] != 1.0 else 1.0
+    items.predicted[b] = share * predicted
+    for i in range(len(step)):
+        items.step[b, i] = share * step[i]
     if ends and at.share[b] == 1.0:
         items.status[b] = _CONVERGED if converged else _SMALL_STEP
     elif items.num_steps[b] >= rules.max_steps:

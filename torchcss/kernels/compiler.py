@@ -7,6 +7,7 @@ of its arguments, for the processor at hand (`torchcss.kernels.pipeline`):
   are the floating-point literals and constants of the function; else a literal would turn all that
   it meets into double precision. Whole numbers that meet others have to be turned into them.
 - **Arrays of one call are never the same memory**; loops over several then become vector code.
+- **Kernels take no memory**: the caller passes what they need, and arrays are written by element.
 - The lock of Python is released. Nothing is parallel, and sums run in the order of the code's
   making, whatever the pool: an item's result depends on that item alone.
 

@@ -46,6 +46,7 @@ def compiled(function: Any, role: str) -> Any:
     njit: Any = numba.njit  # its stubs lack some options
     made = njit(
         nogil=True,
+        _nrt=False,  # no kernel takes memory, so that no references are counted
         fastmath=_FREEDOM,
         error_model="numpy",
         forceinline=role == "inlined",
@@ -54,6 +55,9 @@ def compiled(function: Any, role: str) -> Any:
         no_cfunc_wrapper=True,
         pipeline_class=_Pipeline,
     )(function)
+    template = made.get_call_template
+    # One version for all numbers that a caller may write down.
+    made.get_call_template = lambda args, kws: template(map(types.unliteral, args), kws)
     if role == "entry":
         with contextlib.suppress(OSError):  # nowhere to write: it is compiled in every process
             made._cache = _Cache(function)
@@ -114,7 +118,7 @@ class _Cache(caching.FunctionCache):
         found = super().load_overload(sig, target_context)
         if found is None and not _Cache._said:
             _Cache._said = True
-            print("torchcss: compiling for this processor, once (a minute or two)", file=sys.stderr)
+            print("torchcss: compiling for this processor, once (about a minute)", file=sys.stderr)
         return found
 
 
@@ -170,8 +174,7 @@ class _Whole(FunctionPass):
 
             library._optimize_final_module = optimize_as_one
             return False
-        if role == "inlined":  # its callers optimise it
-            library._optimize_final_module = lambda: None
+        library._optimize_final_module = lambda: None  # entries do, with all that they call
         library._finalize_final_module = lambda: _add_environment(library)
         return False
 

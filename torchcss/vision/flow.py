@@ -284,10 +284,11 @@ def _structure(images: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
     if has_kernels(images):
         from torchcss.vision import flow_kernels
 
-        structure = torch.empty_like(images)
+        structure, (height, width) = images.clone(), images.shape[-2:]
         for out, image in zip(structure.flatten(0, 1), images.flatten(0, 1), strict=True):
-            smooth = flow_kernels.structure(image.numpy(), _STRUCTURE_SCALE, step, _STRUCTURE_STEPS)
-            out.copy_(torch.from_numpy(smooth))
+            links = images.new_zeros(height, width + 1), images.new_zeros(height + 1, width)
+            arrays = (memory.numpy() for memory in (*links, out))
+            flow_kernels.structure(image.numpy(), _STRUCTURE_SCALE, step, _STRUCTURE_STEPS, *arrays)
         return structure
     dual_right = images.new_zeros(*images.shape[:-1], images.shape[-1] - 1)
     dual_down = images.new_zeros(*images.shape[:-2], images.shape[-2] - 1, images.shape[-1])
@@ -451,10 +452,10 @@ def _solve(
 
         flow, target = flow.clone(), -q * (root * constancy.offset)
         links = functional.pad(right, (1, 1)), functional.pad(down, (0, 0, 1, 1))
+        memory = flow_kernels.make_memory(*flow.shape[-2:])
         for x, a, b, (across,), (along,) in zip(flow, q, target, *links, strict=True):
-            flow_kernels.solve(
-                x.numpy(), a.numpy(), b.numpy(), across.numpy(), along.numpy(), num_iterations
-            )
+            x, a, b, across, along = (array.numpy() for array in (x, a, b, across, along))
+            flow_kernels.solve(x, a, b, across, along, num_iterations, memory)
         return flow
     system = _NormalEquations.of(q, _degree(weight, right, down), right, down)
     flow = flow.clone()

@@ -7,9 +7,38 @@ flow takes torch's way, as it does on a GPU and in double precision.
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from torchcss.kernels.compiler import entry, floor, inlined, kernel, sqrt
+
+
+class Memory(NamedTuple):
+    """Memory for `solve`.
+
+    Attributes:
+        degree: Sum of each pixel's links, `[h w]`.
+        inverse: Inverse of each pixel's block, `[3 h w]`.
+        x: A direction inside a border of zeros, `[2 h+2 w+2]`.
+        image: The matrix times it, `[2 h w]`.
+        residual: What is left.
+        conditioned: The same, preconditioned.
+    """
+
+    degree: np.ndarray[Any, Any]
+    inverse: np.ndarray[Any, Any]
+    x: np.ndarray[Any, Any]
+    image: np.ndarray[Any, Any]
+    residual: np.ndarray[Any, Any]
+    conditioned: np.ndarray[Any, Any]
+
+
+def make_memory(height: int, width: int) -> Memory:
+    """Memory for images of a size."""
+    inside = [np.empty((channels, height, width), np.float32) for channels in (3, 2, 2, 2)]
+    border = np.zeros((2, height + 2, width + 2), np.float32)
+    return Memory(np.empty((height, width), np.float32), inside[0], border, *inside[1:])
 
 
 @kernel
@@ -69,7 +98,7 @@ def _turn(share, conditioned, x):  # type: ignore[no-untyped-def]
 
 
 @entry
-def solve(flow, q, target, right, down, num_iterations):  # type: ignore[no-untyped-def]
+def solve(flow, q, target, right, down, num_iterations, memory):  # type: ignore[no-untyped-def]
     """Improve a flow, in place, by conjugate gradients on `(q q^T + L) f = target`.
 
     Args:
@@ -79,10 +108,10 @@ def solve(flow, q, target, right, down, num_iterations):  # type: ignore[no-unty
         right: Weights of the links between columns, `[h w+1]`, zero at both ends.
         down: The same between rows, `[h+1 w]`.
         num_iterations: Steps.
+        memory: Memory for what is found on the way; the border of `x` is zero.
     """
     height, width = flow.shape[1:]
-    degree = np.empty((height, width), np.float32)
-    inverse = np.empty((3, height, width), np.float32)
+    degree, inverse, x, image, residual, conditioned = memory
     for row in range(height):
         for c in range(width):
             links = right[row, c] + right[row, c + 1] + down[row, c] + down[row + 1, c]
@@ -93,12 +122,13 @@ def solve(flow, q, target, right, down, num_iterations):  # type: ignore[no-unty
             inverse[0, row, c] = (links + q_v * q_v) * share
             inverse[1, row, c] = (links + q_u * q_u) * share
             inverse[2, row, c] = -q_u * q_v * share
-    x = np.zeros((2, height + 2, width + 2), np.float32)
-    x[:, 1:-1, 1:-1] = flow
-    image, conditioned = np.empty_like(flow), np.empty_like(flow)
+            x[0, row + 1, c + 1], x[1, row + 1, c + 1] = flow[0, row, c], flow[1, row, c]
     _apply(x, q, degree, right, down, image)
-    residual = target - image
-    x[:] = 0.0
+    for row in range(height):
+        for c in range(width):
+            x[0, row + 1, c + 1] = x[1, row + 1, c + 1] = 0.0
+            residual[0, row, c] = target[0, row, c] - image[0, row, c]
+            residual[1, row, c] = target[1, row, c] - image[1, row, c]
     reduction = _descend(0.0, x, image, inverse, flow, residual, conditioned)
     _turn(0.0, conditioned, x)
     for _ in range(num_iterations):
@@ -164,7 +194,7 @@ def median(padded, out):  # type: ignore[no-untyped-def]
 
 
 @entry
-def structure(image, scale, step, num_steps):  # type: ignore[no-untyped-def]
+def structure(image, scale, step, num_steps, along, across, smooth):  # type: ignore[no-untyped-def]
     """The smooth part of an image: least total variation near it (Chambolle 2004).
 
     Args:
@@ -172,15 +202,12 @@ def structure(image, scale, step, num_steps):  # type: ignore[no-untyped-def]
         scale: Weight of the total variation.
         step: Length of a step.
         num_steps: Steps.
+        along: Memory for the links to the right, `[h w+1]`, zero.
+        across: Memory for the links down, `[h+1 w]`, zero.
+        smooth: A copy of the image; becomes its smooth part.
     """
     height, width = image.shape
     scale, step = np.float32(scale), np.float32(step)
-    # Links to the right and down, after a first row and column of zeros.
-    along, across = (
-        np.zeros((height, width + 1), np.float32),
-        np.zeros((height + 1, width), np.float32),
-    )
-    smooth = image.copy()
     for _ in range(num_steps):
         for row in range(height):
             last = row == height - 1
@@ -198,7 +225,6 @@ def structure(image, scale, step, num_steps):  # type: ignore[no-untyped-def]
             for c in range(width):
                 inward = along[row, c + 1] - along[row, c] + across[row + 1, c] - across[row, c]
                 smooth[row, c] = image[row, c] + scale * inward
-    return smooth
 
 
 @entry

@@ -81,6 +81,7 @@ class _PackedView(NamedTuple):
 
 class _PackedPrior(NamedTuple):
     priors: tuple[LongTails, Gaussian, Mixture]
+    workspaces: Workspaces
     repulsion: tuple[Tree, Parts, Repulsion, Workspaces] | None
     limbs: tuple[Tree, Limbs, Workspaces] | None
 
@@ -207,7 +208,8 @@ class FusedEngine:
         prior, left_out = self._prior(cost, past)
         left_out = set(left_out)
         mode = _rows(component, prior.priors[0].centre.shape[1], len(x))
-        run(add_priors, x, mode, *prior.priors, result)
+        with prior.workspaces.lent() as scratch:
+            run(add_priors, x, mode, *prior.priors, scratch, result)
         if prior.repulsion is not None:
             tree, parts, repulsion, workspaces = prior.repulsion
             with workspaces.lent() as workspace:
@@ -251,7 +253,9 @@ class FusedEngine:
                 limbs = self._pack_limbs(weight, past)
             else:
                 others.add(term.name)
-        return _PackedPrior(pack.pack_priors(priors, past), repulsion, limbs), frozenset(others)
+        packed = pack.pack_priors(priors, past)
+        workspaces = Workspaces(partial(pack.make_prior_scratch, packed[-1]))
+        return _PackedPrior(packed, workspaces, repulsion, limbs), frozenset(others)
 
     def _pack_limbs(
         self, weight: float, past: FrameContext

@@ -15,7 +15,9 @@ from torchcss.kernels.compiler import kernel
 @kernel
 def pose_tree(x: Array, tree: Tree, frames: Array) -> None:
     """Frames of the base and of all joints, `[1 + q 3 4]`, at a state."""
-    frames[0] = tree.base
+    for i in range(3):
+        for k in range(4):
+            frames[0, i, k] = tree.base[i, k]
     for j in range(len(tree.parent)):
         above, constant, frame = frames[tree.parent[j]], tree.constant[j], frames[1 + j]
         follow(above, constant, frame)

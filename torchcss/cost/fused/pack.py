@@ -40,6 +40,7 @@ from torchcss.cost.fused.records import (
     Peaks,
     Points,
     Potential,
+    PriorScratch,
     Rays,
     Repulsion,
     Seen,
@@ -424,6 +425,12 @@ def make_limb_scratch(tree: Tree, limbs: Limbs, num_parameters: int) -> LimbScra
         **{name: np.zeros(shape) for name, shape in shapes.items()},
         touched=np.zeros(num_parameters, bool),
     )
+
+
+def make_prior_scratch(mixture: Mixture) -> PriorScratch:
+    """Memory for the priors on the state."""
+    modes, size = mixture.mean.shape
+    return PriorScratch(np.zeros(size), np.zeros(modes), np.zeros((modes, size)))
 
 
 def pack_priors(

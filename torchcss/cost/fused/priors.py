@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from torchcss.cost.fused.records import Array, Gaussian, LongTails, Mixture, Result
+from torchcss.cost.fused.records import Array, Gaussian, LongTails, Mixture, PriorScratch, Result
 from torchcss.kernels.compiler import entry, kernel
 
 _FAR = 1e150
@@ -16,7 +16,13 @@ _FAR = 1e150
 
 @entry
 def add_priors(
-    x: Array, mode: Array, tails: LongTails, gaussian: Gaussian, mixture: Mixture, result: Result
+    x: Array,
+    mode: Array,
+    tails: LongTails,
+    gaussian: Gaussian,
+    mixture: Mixture,
+    scratch: PriorScratch,
+    result: Result,
 ) -> None:
     """Add the priors of all states of a pool.
 
@@ -26,19 +32,18 @@ def add_priors(
         tails: Long-tailed priors.
         gaussian: A Gaussian prior of some parameters.
         mixture: The mixture before.
+        scratch: Memory for what is found on the way.
         result: Where they are added.
     """
-    pull, share = gaussian.mean * 0.0, mixture.height * 0.0
-    pulls = mixture.mean * 0.0
     for b in range(len(x)):
         gradient, hessian = result.gradient[b], result.hessian[b]
         result.value[b] += _long_tails(x[b], mode[b], tails, gradient, hessian)
-        result.value[b] += _gaussian(x[b], gaussian, pull, gradient, hessian)
+        result.value[b] += _gaussian(x[b], gaussian, scratch.pull, gradient, hessian)
         if mixture.weight > 0.0:
-            value = _mixture(x[b], mixture, share, pulls)
+            value = _mixture(x[b], mixture, scratch.share, scratch.pulls)
             result.value[b] += mixture.weight * value
             if len(gradient):
-                _mixture_slopes(mixture, share, pulls, gradient, hessian)
+                _mixture_slopes(mixture, scratch, gradient, hessian)
 
 
 @kernel
@@ -107,13 +112,14 @@ def _mixture(x: Array, mixture: Mixture, share: Array, pulls: Array) -> float:
 
 @kernel
 def _mixture_slopes(
-    mixture: Mixture, share: Array, pulls: Array, gradient: Array, hessian: Array
+    mixture: Mixture, scratch: PriorScratch, gradient: Array, hessian: Array
 ) -> None:
     """Add the derivatives of the cost about the mixture before."""
     size, weight = len(gradient), mixture.weight
-    slope = gradient * 0.0
-    for k in range(len(share)):
-        for i in range(size):
+    share, pulls, slope = scratch.share, scratch.pulls, scratch.pull
+    for i in range(size):
+        slope[i] = 0.0
+        for k in range(len(share)):
             slope[i] += share[k] * pulls[k, i]
     for i in range(size):
         gradient[i] += weight * slope[i]

@@ -304,6 +304,20 @@ class Mixture(NamedTuple):
     height: Array
 
 
+class PriorScratch(NamedTuple):
+    """Memory for `add_priors`.
+
+    Attributes:
+        pull: A gradient, `[n]`.
+        share: Each mode's share in the mixture before, `[k]`.
+        pulls: The gradient about each mode, `[k n]`.
+    """
+
+    pull: Array
+    share: Array
+    pulls: Array
+
+
 class Limbs(NamedTuple):
     """Directions of limbs and their density, by groups; see `torchcss.cost.pose_prior`.
 

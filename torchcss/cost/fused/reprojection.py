@@ -76,7 +76,8 @@ def add_reprojection(
         result.value[b] += _compare(scratch.frames, seen, share[b], scratch.points)
         result.value[b] += _priors(x[b], seen, share[b], gradient, hessian)
         if slopes:
-            scratch.reference[:] = scratch.frames[0, :, 3]
+            for i in range(3):
+                scratch.reference[i] = scratch.frames[0, i, 3]
             scratch.sums[:] = 0.0
             for i in range(len(seen.row)):
                 sums = scratch.sums[seen.row[i]]
