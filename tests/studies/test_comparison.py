@@ -78,6 +78,27 @@ def test_each_tracker_looks_where_its_own_body_can_be(
     assert windows[-2] != windows[-1]
 
 
+def test_trackers_that_look_everywhere_share_what_they_see(
+    sequence: RecordedSequence, begin: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    presets = ("ijrr_single_limits", "ijrr_gaussian_single")
+    alone = [together(sequence, begin, preset, stop=T)[0] for preset in presets]
+    windows = []
+    forward = FeatureExtractor.forward
+
+    def spy(self: FeatureExtractor, *arguments: Any, window: Window | None) -> FrameFeatures:
+        windows.append(window)
+        return forward(self, *arguments, window=window)
+
+    monkeypatch.setattr(FeatureExtractor, "forward", spy)
+    both = together(sequence, begin, *presets, stop=T)
+    assert windows == [None] * T
+    for one, two in zip(both, alone, strict=True):
+        assert one.settings.preset == two.settings.preset
+        for here, there in zip(one.measures, two.measures, strict=True):
+            assert (here.absolute_mm == there.absolute_mm).all()
+
+
 def test_a_lost_run_ends_early(sequence: RecordedSequence, begin: Start) -> None:
     never = Thresholds(lost_mm=-1.0, regain_s=0.04)
     options: dict = {"thresholds": never, "stop": T}

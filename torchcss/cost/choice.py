@@ -70,6 +70,11 @@ class CostChoice:
         """What the pictures have to be prepared for."""
         return frozenset().union(*(term.needs for term in self.terms))
 
+    @property
+    def whole_picture(self) -> bool:
+        """Whether it matters what is seen far from the body: where the background is learnt."""
+        return "background" in self.needs
+
     def weight(self, name: str) -> float:
         """The further factor on a term."""
         return self.weights.get(name, 1.0)

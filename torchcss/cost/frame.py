@@ -156,7 +156,7 @@ class FrameCosts:
             modes: Poses that it may have.
             log_weight: Their weights.
         """
-        if "background" not in self.choice.needs or body.num_parts == 0:
+        if not self.choice.whole_picture or body.num_parts == 0:
             return None
         if features is None or features.colour is None:
             return background

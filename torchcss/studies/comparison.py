@@ -2,12 +2,13 @@
 
 All trackers of one seed start from the same first pose (`find_start`) and see the same images, each
 where its own body can be. `track_together` runs them frame by frame, so that the film is decoded
-once; nothing of a frame stays in memory, and a run can end as soon as it has lost the body.
+once and trackers that look at the whole picture share its features; nothing of a frame stays in
+memory, and a run can end as soon as it has lost the body.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -128,14 +129,18 @@ def track_together(
         )
         for settings, begin in runs
     ]
+    # Sight and one session that sees for all who share it; that session's own run may end.
+    eyes = {key: session for _, session, _ in going if (key := sight(session)) is not None}
     first: Frame | None = None
     for frame in reader:
         first = first or frame
+        used = {sight(session) for _, session, _ in going}
+        seen = {key: each.observe(frame) for key, each in eyes.items() if key in used}
         left = []
         for run, session, evaluator in going:
             ended = None
             try:
-                observation = session.observe(frame)
+                observation = seen.get(sight(session)) or session.observe(frame)
                 posterior = session.step(observation)
                 run.measures.append(evaluator(posterior, first, observation.seconds))
             except (TorchcssError, RuntimeError, ArithmeticError) as error:
@@ -154,6 +159,21 @@ def track_together(
             return
     for run, _, _ in going:
         yield run
+
+
+def sight(session: TrackingSession) -> Hashable | None:
+    """What the features of a picture depend on, the same where two sessions see the same.
+
+    None where a session looks only where its own body can be: nobody else sees what it sees.
+
+    Args:
+        session: A session of one camera.
+    """
+    plan, extractor = session.plan, session.plan.extractor
+    if not plan.choice.whole_picture:
+        return None
+    choices = extractor.edges, extractor.flow, extractor.working_size, extractor.colour
+    return *choices, extractor.luma.dtype, extractor.luma.device, plan.surface_prediction
 
 
 def session_of(sequence: RecordedSequence, settings: Settings, begin: Start) -> TrackingSession:

@@ -151,7 +151,7 @@ class Observer:
             body: The body on the base of that frame.
             modes: The poses.
         """
-        if body.num_parts == 0 or "background" in self.costs.choice.needs:
+        if body.num_parts == 0 or self.costs.choice.whole_picture:
             return None
         rotation, centre = body.part_poses(body.pose(modes))
         surface = body.mesh(_RINGS, _MERIDIANS).points.flatten(1, 2) @ rotation.mT
