@@ -7,6 +7,7 @@ from torchcss.studies.sampling_study import (
     ExactSteps,
     StudyChoice,
     depth_flips,
+    num_shared,
     run_sampler,
     spectrum,
     study_problem,
@@ -38,7 +39,7 @@ def test_options_change_what_they_say(problem):
         return study_problem("arm8", generator=generator, choice=StudyChoice(**options), pose=pose)
 
     torch.testing.assert_close(other().start.mean, problem.start.mean)
-    noisy = other(pixel_noise=4.0)
+    noisy = other(pixel_noise=6.0)
     torch.testing.assert_close(noisy.truth, problem.truth)
     ratio = float(spectrum(noisy.start.covariance)[-1] / spectrum(problem.start.covariance)[-1])
     assert ratio == pytest.approx(2, rel=0.2)
@@ -62,11 +63,24 @@ def test_a_run_sums_itself_up(problem, run):
     assert run.minima.cost.shape == run.minima.distance.shape == (count,)
     assert run.num_double <= count <= run.num_half
     assert run.num_valleys <= count
-    torch.testing.assert_close(run.raw.cost, problem.cost.value(run.found.raw))
+    above = problem.cost.value(run.found.raw) - problem.start.cost
+    torch.testing.assert_close(run.raw.cost, above)
     apart = run.found.raw - problem.start.mean
     torch.testing.assert_close(run.raw.distance, apart.norm(dim=-1))
     expected = (apart @ torch.linalg.inv(problem.start.covariance) * apart).sum(-1).sqrt()
     torch.testing.assert_close(run.raw.deviations, expected)
+
+
+def test_minima_that_two_runs_share(problem, run):
+    found, count = run.found, len(run.found.minima)
+    assert count > 1
+    assert num_shared(found, found, problem.start) == count
+    half = found._replace(minima=found.minima[: count // 2])
+    assert num_shared(half, found, problem.start) == count // 2
+    assert num_shared(found, half, problem.start) >= count // 2
+    nothing = found._replace(minima=found.minima[:0])
+    assert num_shared(nothing, found, problem.start) == 0
+    assert num_shared(found, nothing, problem.start) == 0
 
 
 def test_flips_are_named(problem):

@@ -21,13 +21,14 @@ from torch import Tensor
 
 from torchcss.body.model import BodyModel
 from torchcss.errors import ShapeError
+from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.proposals import Proposal
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.linalg import squared_mahalanobis
 from torchcss.robust import Lorentzian, Quadratic
 from torchcss.studies.minima import FoundMinima, find_minima, joined_minima, other_minima
 from torchcss.studies.reprojection import ReprojectionProblem, reprojection_problem
-from torchcss.types import Bounds, CostFunction, LocalModel
+from torchcss.types import Bounds, CostFunction, LocalModel, Modes
 
 LIMB_JOINTS = (
     "HumanoidRoot", "vt1", "skull_tip", "l_shoulder", "l_elbow", "l_wrist", "r_shoulder", "r_elbow",
@@ -90,7 +91,7 @@ class Lengths(NamedTuple):
     Attributes:
         distance: Euclidean, in the parameters (radians, metres).
         deviations: In the metric of the start's covariance.
-        cost: Nats.
+        cost: Nats above the start's.
     """
 
     distance: Float[Tensor, " s"]
@@ -138,8 +139,8 @@ class StudyChoice:
             an arm shows all that it has.
     """
 
-    pixel_noise: float = 2.0
-    prior_scale: float = 3.0
+    pixel_noise: float = 3.0
+    prior_scale: float = 1.0
     widest: float | None = None
     limits: bool = True
     robust: bool = False
@@ -292,4 +293,32 @@ def run_sampler(
 def _lengths(problem: ReprojectionProblem, x: Tensor, cost: Tensor) -> Lengths:
     apart = x - problem.start.mean
     deviations = squared_mahalanobis(apart, problem.start.covariance).sqrt()
-    return Lengths(apart.norm(dim=-1), deviations, cost)
+    return Lengths(apart.norm(dim=-1), deviations, cost - problem.start.cost)
+
+
+def num_shared(
+    first: FoundMinima, second: FoundMinima, start: Modes, *, distance: float = 1.0
+) -> int:
+    """How many minima of one run another one found too.
+
+    Two minima are the same where they are closer than a threshold in the metric of either; the
+    tests by which a run tells its own minima apart are `other_minima`.
+
+    Args:
+        first: The run whose minima are looked for.
+        second: The run among whose minima they are looked for.
+        start: What both started from.
+        distance: The threshold, standard deviations.
+    """
+    mine, theirs = (
+        GaussianMixture(
+            found.modes.mean[found.minima],
+            found.modes.covariance[found.minima],
+            start.cost.new_zeros(len(found.minima)),
+        )
+        for found in (first, second)
+    )
+    if not len(mine.mean) or not len(theirs.mean):
+        return 0
+    apart = torch.minimum(mine.squared_distance(theirs.mean).mT, theirs.squared_distance(mine.mean))
+    return int((apart.amin(-1) <= distance**2).sum())
