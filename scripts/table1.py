@@ -50,11 +50,13 @@ from torchcss.studies.sampling_study import (
 COLUMNS = ("minima", "distance_raw", "distance", "deviations_raw", "deviations", "cost_raw", "cost")
 CHECKS = {
     "minima_half": "distance / 2", "minima_double": "distance x 2", "valleys": "valleys",
-    "cheap": "cheap", "below_start": "below start", "converged": "converged", "inside": "inside",
-    "upward": "upward", "steps": "steps", "seconds": "seconds",
+    "back": "back", "cheap": "cheap", "below_start": "below start",
+    "converged": "converged", "inside": "inside", "upward": "upward", "steps": "steps",
+    "seconds": "seconds",
 }  # fmt: skip
-"""Minima when the duplicate distance is halved and doubled, those not joined by low paths, those at
-most `cheap` nats above the start, those below it; shares of the samples that pass each test."""
+"""Minima when the duplicate distance is halved and doubled, those not joined by low paths, share of
+the samples that descend back to the start; minima at most `cheap` nats above it, those below it;
+shares of the samples that pass each test."""
 
 TABLE1 = {
     ("CSS", 1.0): (8, 1.148, 2.552, 10.94, 47.60, 117.0, 8.497),
@@ -152,6 +154,7 @@ def row_of(config: Config, run: SamplerRun) -> dict[str, Any]:
         **{f"{name}{kind}_spread": float(values.std()) if len(values) > 1 else math.nan
            for kind, part in lengths.items() for name, values in part._asdict().items()},
         "minima_half": run.num_half, "minima_double": run.num_double, "valleys": run.num_valleys,
+        "back": float((run.ends.deviations <= config.duplicate_distance).double().mean()),
         "cheap": int((run.minima.cost < config.cheap).sum()),
         "below_start": int((run.minima.cost < 0).sum()),
         **{name: float(part.double().mean()) for name, part in tests._asdict().items()},

@@ -36,6 +36,10 @@ def test_small_mode(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFi
         assert row["upward"] >= row["converged"], "what converged curves upwards"
         assert row["minima_double"] <= row["minima"] <= row["minima_half"]
         assert row["valleys"] <= row["minima"]
+        assert 0 < row["back"] <= 1
+    assert rows["CSS", 8.0]["back"] < rows["CSS", 1.0]["back"]
+    for scale in (1.0, 8.0):
+        assert 0 <= rows["SS", scale]["shared"] <= rows["SS", scale]["minima"]
     assert sum(rows["CSS", 8.0]["flips"].values()) > 0
     assert run["spectrum_ratio"]["body34"] > 300
     assert {path.name for path in figures.iterdir()} == {

@@ -105,6 +105,7 @@ class SamplerRun(NamedTuple):
     Attributes:
         found: Samples, descents, tests and minima.
         raw: Of the samples.
+        ends: Of the ends of their descents.
         minima: Of the minima.
         num_half: Minima when the duplicate distance is halved.
         num_double: Minima when it is doubled.
@@ -115,6 +116,7 @@ class SamplerRun(NamedTuple):
 
     found: FoundMinima
     raw: Lengths
+    ends: Lengths
     minima: Lengths
     num_half: int
     num_double: int
@@ -281,6 +283,7 @@ def run_sampler(
     return SamplerRun(
         found=found,
         raw=_lengths(problem, found.raw, cost.value(found.raw)),
+        ends=_lengths(problem, modes.mean, modes.cost),
         minima=_lengths(problem, modes.mean[minima], modes.cost[minima]),
         num_half=half,
         num_double=double,
