@@ -1,0 +1,436 @@
+"""Every claim of the two papers' experiments, held against what our studies saw.
+
+    python scripts/claims.py --failures ARM.json CLUTTER.json DARK.json --table1 TABLE1.json \
+        --sequences ARM CLUTTER DARK --out docs/results/claims.json
+
+The reports are those of `scripts/failure_modes.py` and `scripts/table1.py`, the sequences are the
+folders that the former has tracked. A row is a claim, its section, what was seen, and whether it
+holds. The papers' sequences are lost and ours are others of the same kind: a claim is held against
+what becomes of a tracker and against the order in which trackers fail, not against a time.
+
+A run has *failed* once it has lost the body, or one limb in the mode nearest to the truth
+(`torchcss.studies.evaluation`); a tracker fails where most of its seeds do, and lasts longer than
+another where its median time does. A claim for which no report is given is not tested.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any, NamedTuple
+
+import numpy as np
+from common import Table, start, write_report
+
+from torchcss.errors import ConfigurationError
+from torchcss.io.tracks import read_summary
+from torchcss.studies.sequences import read_sequence
+
+ARM, CLUTTER, DARK = "arm", "body-clutter", "body-dark"
+FAILURES, TABLE1 = "failure_modes.py", "table1.py"
+MULTIMODAL = 0.1
+"""Weight of the other explanations above which a frame counts as multimodal."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """The reports to judge by."""
+
+    failures: tuple[Path, ...] = ()
+    """Reports of `scripts/failure_modes.py`, one a sequence."""
+    table1: Path | None = None
+    """Report of `scripts/table1.py`."""
+    sequences: tuple[Path, ...] = ()
+    """Folders of the sequences, for when they move in depth."""
+    out: Path | None = None
+    """JSON file to write."""
+
+
+class Seen(NamedTuple):
+    """What was seen of a claim, and whether it holds."""
+
+    words: str
+    holds: bool
+
+
+class Missing(Exception):
+    """What a claim would have to be judged by is not there."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What was measured.
+
+    Attributes:
+        runs: Runs by sequence and preset.
+        table1: Rows by method and scale.
+        ratio: Largest over smallest deviation of a mode, by body.
+        depth: Share of the joints' speed that is along the line of sight, by sequence and frame.
+    """
+
+    runs: Mapping[str, Mapping[str, list[dict[str, Any]]]]
+    table1: Mapping[tuple[str, float], Mapping[str, Any]]
+    ratio: Mapping[str, float]
+    depth: Mapping[str, np.ndarray]
+
+    def of(self, sequence: str, preset: str) -> list[dict[str, Any]]:
+        """The runs of a tracker on a sequence."""
+        runs = self.runs.get(sequence, {}).get(preset)
+        if not runs:
+            raise Missing(f"no report of {preset} on {sequence} is given")
+        return runs
+
+    def row(self, method: str, scale: float) -> Mapping[str, Any]:
+        """A row of Table 1."""
+        if (method, scale) not in self.table1:
+            raise Missing("no report with this scale is given")
+        return self.table1[method, scale]
+
+
+Judge = Callable[[Evidence], Seen]
+
+
+class Claim(NamedTuple):
+    """A claim.
+
+    Attributes:
+        words: What is claimed, in our words.
+        section: Where.
+        script: What tests it.
+        judge: What says whether it holds; a text: why it is not tested.
+    """
+
+    words: str
+    section: str
+    script: str
+    judge: Judge | str
+
+
+def failed_s(run: Mapping[str, Any]) -> float:
+    """When a run has failed; infinite if it never did."""
+    times = [run[key] for key in ("lost_s", "limb_lost_of_modes_s") if run[key] is not None]
+    return min(times, default=math.inf)
+
+
+def told(runs: list[dict[str, Any]]) -> str:
+    """How many runs failed and when."""
+    times = [failed_s(run) for run in runs]
+    failed = [time for time in times if math.isfinite(time)]
+    until = max(run["per_frame"]["time_s"][-1] for run in runs)
+    if not failed:
+        return f"none of {len(runs)} within {until:.1f} s"
+    middle = f"at {median(failed):.1f} s ({min(failed):.1f} to {max(failed):.1f})"
+    return f"{len(failed)} of {len(runs)} within {until:.1f} s, {middle}"
+
+
+def typical(runs: list[dict[str, Any]], key: str) -> float:
+    """Median over runs of one of their numbers."""
+    return median(run[key] for run in runs if run[key] is not None)
+
+
+def fails(sequence: str, preset: str) -> Judge:
+    """A tracker fails in most of its runs."""
+
+    def judge(evidence: Evidence) -> Seen:
+        runs = evidence.of(sequence, preset)
+        return Seen(told(runs), median(map(failed_s, runs)) < math.inf)
+
+    return judge
+
+
+def tracks(sequence: str, preset: str) -> Judge:
+    """A tracker fails in none of its runs."""
+
+    def judge(evidence: Evidence) -> Seen:
+        runs = evidence.of(sequence, preset)
+        error = typical(runs, "root_aligned_best_of_modes_mm")
+        return Seen(
+            f"failed: {told(runs)}; until then {error:.0f} mm in the nearest mode",
+            all(math.isinf(failed_s(run)) for run in runs),
+        )
+
+    return judge
+
+
+def outlasts(sequence: str, better: str, worse: str) -> Judge:
+    """A tracker fails later than another."""
+
+    def judge(evidence: Evidence) -> Seen:
+        one, two = evidence.of(sequence, better), evidence.of(sequence, worse)
+        return Seen(
+            f"{better}: {told(one)}; {worse}: {told(two)}",
+            median(map(failed_s, one)) > median(map(failed_s, two)),
+        )
+
+    return judge
+
+
+def in_depth(sequence: str, preset: str) -> Judge:
+    """Errors along the line of sight are more than twice those across it."""
+
+    def judge(evidence: Evidence) -> Seen:
+        runs = evidence.of(sequence, preset)
+        along, across = typical(runs, "along_mm"), typical(runs, "across_mm")
+        return Seen(f"{along:.0f} mm along, {across:.0f} mm across", along > 2 * across)
+
+    return judge
+
+
+def share(sequence: str, preset: str, key: str, words: str, least: float = 0.0) -> Judge:
+    """Something happens in more than a share of a tracker's frames."""
+
+    def judge(evidence: Evidence) -> Seen:
+        value = typical(evidence.of(sequence, preset), key)
+        return Seen(f"{words} in {100 * value:.1f} % of the frames", value > least)
+
+    return judge
+
+
+def hits_elbow(sequence: str, preset: str) -> Judge:
+    """The elbow is at its bound when the track fails."""
+
+    def judge(evidence: Evidence) -> Seen:
+        runs = evidence.of(sequence, preset)
+        hits = [_elbow_hit(run) for run in runs]
+        least = median(hits)
+        words = "never" if math.isinf(least) else f"first at {least:.1f} s"
+        return Seen(
+            f"elbow at its bound: {words} (median); failed: {told(runs)}",
+            median(map(failed_s, runs)) < math.inf and least <= median(map(failed_s, runs)),
+        )
+
+    return judge
+
+
+def _elbow_hit(run: Mapping[str, Any]) -> float:
+    frames = zip(run["per_frame"]["time_s"], run["per_frame"]["at_bound"], strict=True)
+    return min(
+        (time for time, names in frames if any("elbow" in n for n in names)), default=math.inf
+    )
+
+
+def multimodal(sequence: str, preset: str) -> Judge:
+    """The posterior has other explanations above all while the body moves in depth."""
+
+    def judge(evidence: Evidence) -> Seen:
+        runs = evidence.of(sequence, preset)
+        if sequence not in evidence.depth:
+            raise Missing("the sequence is not given")
+        deep, flat, several = [], [], []
+        for run in runs:
+            weight = np.array(run["per_frame"]["apart_weight"], np.float64)[1:]
+            depth = evidence.depth[sequence][: len(weight)]
+            much = depth > np.median(depth)
+            deep.append(float(weight[much].mean()))
+            flat.append(float(weight[~much].mean()))
+            several.append(float((weight > MULTIMODAL).mean()))
+        return Seen(
+            f"weight of other explanations: {median(deep):.2f} in the half of the frames that "
+            f"moves most in depth, {median(flat):.2f} in the other; above {MULTIMODAL:g} in "
+            f"{100 * median(several):.0f} % of the frames",
+            all(one > two for one, two in zip(deep, flat, strict=True)),
+        )
+
+    return judge
+
+
+def at_all_scales(words: str, better: Callable[[Mapping, Mapping], tuple[str, bool]]) -> Judge:
+    """CSS against SS at scales 1, 4 and 8."""
+
+    def judge(evidence: Evidence) -> Seen:
+        told_by_scale, holds = [], True
+        for scale in (1.0, 4.0, 8.0):
+            seen, so = better(evidence.row("CSS", scale), evidence.row("SS", scale))
+            told_by_scale.append(f"{seen} at {scale:g}")
+            holds &= so
+        return Seen(f"{words}: {', '.join(told_by_scale)}", holds)
+
+    return judge
+
+
+def _minima(css: Mapping[str, Any], ss: Mapping[str, Any]) -> tuple[str, bool]:
+    return f"{css['minima']:g} to {ss['minima']:g}", css["minima"] > ss["minima"]
+
+
+def _raw_costs(css: Mapping[str, Any], ss: Mapping[str, Any]) -> tuple[str, bool]:
+    return f"{css['cost_raw']:.3g} to {ss['cost_raw']:.3g}", css["cost_raw"] < ss["cost_raw"]
+
+
+def _shared(css: Mapping[str, Any], ss: Mapping[str, Any]) -> tuple[str, bool]:
+    del css
+    return f"{ss['shared']:g} of {ss['minima']:g}", ss["shared"] >= 0.9 * ss["minima"]
+
+
+def _descent(css: Mapping[str, Any], ss: Mapping[str, Any]) -> tuple[str, bool]:
+    raw, end = css["cost_raw"], css["cost"]
+    del ss
+    return f"{raw:.3g} to {end:.3g}", end is not None and raw > 10 * end
+
+
+def median_costs(evidence: Evidence) -> Seen:
+    """SS's minima cost slightly less than CSS's."""
+    css, ss = (evidence.row(method, 8.0)["cost"] for method in ("CSS", "SS"))
+    return Seen(f"CSS {css:.3g}, SS {ss:.3g} nats above the start at scale 8", ss < css)
+
+
+def falls_back(evidence: Evidence) -> Seen:
+    """Nearly all samples of the covariance itself descend to where they came from."""
+    back = evidence.row("CSS", 1.0)["back"], evidence.row("CSS", 8.0)["back"]
+    return Seen(
+        f"{100 * back[0]:.1f} % of the samples fall back at scale 1, {100 * back[1]:.1f} % at 8",
+        back[0] > 0.9 > back[1],
+    )
+
+
+def spectrum_of(body: str, printed: float) -> Judge:
+    """Largest over smallest deviation, within a factor of three of the paper's."""
+
+    def judge(evidence: Evidence) -> Seen:
+        if body not in evidence.ratio:
+            raise Missing("no report of Table 1 is given")
+        value = evidence.ratio[body]
+        return Seen(f"{value:.0f}, of joints in one image", printed / 3 < value < 3 * printed)
+
+    return judge
+
+
+LONG = "the study would take days, and a run of this length has not been made"
+
+CLAIMS: tuple[Claim, ...] = (
+    Claim("Gaussian single mode slips off at the pillar (0.5 s and 2.2 s, arm)", "[IJRR] 6.1",
+          FAILURES, fails(ARM, "ijrr_gaussian_single")),
+    Claim("Gaussian single mode slips off at the pillar (0.3 s, body)", "[IJRR] 6.1",
+          FAILURES, fails(CLUTTER, "ijrr_gaussian_single")),
+    Claim("a robust single mode takes motion in depth for motion in the image (arm)", "[IJRR] 6.1",
+          FAILURES, in_depth(ARM, "ijrr_robust_single")),
+    Claim("a robust single mode takes motion in depth for motion in the image (body)", "[IJRR] 6.1",
+          FAILURES, in_depth(CLUTTER, "ijrr_robust_single")),
+    Claim("a single mode runs into the elbow's bound and fails (2.6 s)", "[IJRR] 6.1",
+          FAILURES, hits_elbow(ARM, "ijrr_single_limits")),
+    Claim("with limits alone the fist ends up in the body", "[IJRR] 6.1", FAILURES,
+          share(CLUTTER, "ijrr_single_limits", "deep_share", "a part more than 2 cm in another")),
+    Claim("CSS with three modes tracks the arm without failure", "[IJRR] 6.1",
+          FAILURES, tracks(ARM, "ijrr_css")),
+    Claim("CSS with seven modes tracks the body without failure", "[IJRR] 6.1",
+          FAILURES, tracks(CLUTTER, "ijrr_css")),
+    Claim("several modes appear mainly while the arm moves in depth", "[IJRR] 6.1",
+          FAILURES, multimodal(ARM, "ijrr_css")),
+    Claim("several modes appear over nearly the whole motion of the body", "[IJRR] 6.1, [RR] 6",
+          FAILURES, multimodal(CLUTTER, "ijrr_css")),
+    Claim("least squares often converge to poses that no body can take", "[IJRR] 6.1", FAILURES,
+          share(CLUTTER, "ijrr_cham_rehg_ssd", "outside_share", "a joint beyond its limit")),
+    Claim("noise of the dynamics with least squares loses the body (0.5 s)", "[IJRR] 6.1",
+          FAILURES, fails(CLUTTER, "ijrr_cham_rehg_ssd")),
+    Claim("with robust costs it lasts longer", "[IJRR] 6.1",
+          FAILURES, outlasts(CLUTTER, "ijrr_cham_rehg", "ijrr_cham_rehg_ssd")),
+    Claim("and is lost, too (0.7 s)", "[IJRR] 6.1", FAILURES, fails(CLUTTER, "ijrr_cham_rehg")),
+    Claim("CONDENSATION has the same fault", "[IJRR] 6.1",
+          FAILURES, fails(CLUTTER, "ijrr_condensation")),
+    Claim("noise wide enough in depth puts most samples where the cost is high", "[IJRR] 6.1, 9",
+          TABLE1, at_all_scales("median cost of raw samples, CSS to a ball", _raw_costs)),
+    Claim("Gaussian single mode loses the body in the dark (0.5 s)", "[IJRR] 6.2",
+          FAILURES, fails(DARK, "ijrr_gaussian_single")),
+    Claim("a robust single mode follows longer (1 s)", "[IJRR] 6.2",
+          FAILURES, outlasts(DARK, "ijrr_robust_single", "ijrr_gaussian_single")),
+    Claim("and misjudges the depth", "[IJRR] 6.2", FAILURES, in_depth(DARK, "ijrr_robust_single")),
+    Claim("and is lost in the turn", "[IJRR] 6.2", FAILURES, fails(DARK, "ijrr_robust_single")),
+    Claim("several modes with limits alone converge to impossible poses at times", "[IJRR] 6.2",
+          FAILURES,
+          share(DARK, "ijrr_css_limits", "deep_modes_share", "parts in parts, of all modes")),
+    Claim("with terminal consequences", "[IJRR] 6.2", FAILURES, fails(DARK, "ijrr_css_limits")),
+    Claim("CSS with all constraints tracks the whole sequence", "[IJRR] 6.2",
+          FAILURES, tracks(DARK, "ijrr_css")),
+    Claim("clavicles are essential for many motions of the arms", "[IJRR] 6.2", FAILURES,
+          "the rendered body has them, and a body without has other joints to compare"),
+    Claim("CSS finds more minima than a ball of the same volume", "[IJRR] 4.2, 7",
+          TABLE1, at_all_scales("CSS to SS", _minima)),
+    Claim("CSS finds the few minima that SS finds", "[IJRR] 7",
+          TABLE1, at_all_scales("found by both", _shared)),
+    Claim("SS's minima cost slightly less at the median", "[IJRR] 7", TABLE1, median_costs),
+    Claim("descent lowers the cost of samples by far", "[IJRR] 7",
+          TABLE1, at_all_scales("medians of raw samples to minima, CSS", _descent)),
+    Claim("samples at the scale of the covariance fall back into the same minimum", "[IJRR] 4.2",
+          TABLE1, falls_back),
+    Claim("largest over smallest deviation is 350 for an arm", "[IJRR] Fig. 5",
+          TABLE1, spectrum_of("arm8", 350)),
+    Claim("largest over smallest deviation is 2000 for a body", "[IJRR] Fig. 5",
+          TABLE1, spectrum_of("body34", 2000)),
+    Claim("CSS is far better than noise of the dynamics (body before clutter)", "[IJRR] 9",
+          FAILURES, outlasts(CLUTTER, "ijrr_css", "ijrr_cham_rehg")),
+    Claim("CSS is far better than noise of the dynamics (body in the dark)", "[IJRR] 9",
+          FAILURES, outlasts(DARK, "ijrr_css", "ijrr_cham_rehg")),
+    Claim("weighing contours by foreground and motion boundaries improves much", "[IJRR] 8",
+          FAILURES, LONG),
+    Claim("more modes and samples follow what was lost", "[IJRR] 8", FAILURES, LONG),
+    Claim("three hypotheses track the arm over the whole sequence", "[RR] 6",
+          FAILURES, tracks(ARM, "rr_multiple_hypothesis")),
+    Claim("seven hypotheses track the body over the whole sequence", "[RR] 6",
+          FAILURES, tracks(CLUTTER, "rr_multiple_hypothesis")),
+    Claim("edges alone are enough to score hypotheses", "[RR] 4.2", FAILURES, LONG),
+)  # fmt: skip
+"""All of them, in the papers' order."""
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Judge, print, write; return what is written."""
+    evidence = read_evidence(config)
+    cells = []
+    for claim in CLAIMS:
+        seen, verdict = judged(claim, evidence)
+        cells.append([claim.words, claim.section, f"scripts/{claim.script}", seen, verdict])
+    table = Table("The papers' claims", ("claim", "section", "script", "seen", "it"), cells)
+    table.print()
+    counts = {verdict: sum(row[-1] == verdict for row in cells) for *_, verdict in cells}
+    report = {"counts": counts, "reports": [str(path.name) for path in config.failures]}
+    write_report(config.out, report, table)
+    return report | {"rows": cells}
+
+
+def judged(claim: Claim, evidence: Evidence) -> tuple[str, str]:
+    """What was seen of a claim, and the verdict."""
+    if isinstance(claim.judge, str):
+        return f"because {claim.judge}", "not tested"
+    try:
+        seen = claim.judge(evidence)
+    except Missing as why:
+        return f"because {why}", "not tested"
+    return seen.words, "holds" if seen.holds else "does not hold"
+
+
+def read_evidence(config: Config) -> Evidence:
+    """What the reports and sequences say."""
+    runs: dict[str, dict[str, list[dict[str, Any]]]] = {}
+    for path in config.failures:
+        report = read_summary(path)
+        if "study" not in report:
+            raise ConfigurationError(f"{path}: expected a report of {FAILURES}")
+        own = runs.setdefault(report["study"]["sequence"], {})
+        for run in report["runs"]:
+            if "num_frames" in run:
+                own.setdefault(run["preset"], []).append(run)
+    rows, ratio = {}, {}
+    if config.table1 is not None:
+        report = read_summary(config.table1)
+        if "median" not in report:
+            raise ConfigurationError(f"{config.table1}: expected a report of {TABLE1}")
+        rows = {(row["method"], row["scale"]): row for row in report["median"]}
+        spectra = [run["spectrum_ratio"] for run in report["runs"]]
+        ratio = {body: median(each[body] for each in spectra) for body in spectra[0]}
+    depth = dict(map(depth_share, config.sequences))
+    return Evidence(runs, rows, ratio, depth)
+
+
+def depth_share(folder: Path) -> tuple[str, np.ndarray]:
+    """A sequence's name, and how much of its motion is in depth, frame by frame from the second."""
+    sequence = read_sequence(folder)
+    step = np.diff(sequence.joints_world, axis=0)
+    axis = sequence.camera.R_camera_world[2].numpy(force=True)
+    along, whole = np.abs(step @ axis), np.linalg.norm(step, axis=-1)
+    return sequence.name, along.sum(-1) / np.maximum(whole.sum(-1), 1e-9)
+
+
+if __name__ == "__main__":
+    start(main, Config, __doc__)
