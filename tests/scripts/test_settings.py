@@ -38,6 +38,7 @@ VARIED = {
     "benchmark_engines": set(),
     "evaluate_posterior": set(),
     "failure_modes": {"body", "preset"},
+    "hypothesis_scores": {"body"},
     "learn_weights": {"body", "weights"},
     "several_views": set(),
     "track_quadruped": {"body"},
@@ -58,6 +59,9 @@ def arguments(folder: Path, script: str) -> list[str]:
     if script == "failure_modes":
         write_arm(folder / "arm", 3)
         return ["--sequence", str(folder / "arm"), "--presets", "css"]
+    if script == "hypothesis_scores":
+        write_arm(folder / "arm", 3)
+        return ["--sequences", str(folder / "arm")]
     if script == "evaluate_posterior":
         for name in ("video.mp4", "cameras.json", "keypoints2d.npz", "reference3d.npz"):
             (folder / name).touch()
