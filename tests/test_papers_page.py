@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from torchcss.tracking.presets import PRESETS
+
 REPOSITORY = Path(__file__).resolve().parents[1]
 PAGES = ("from_the_papers_to_the_code.md", "mathematics.md", "decisions.md")
 PAPERS = (REPOSITORY / "docs" / PAGES[0]).read_text(encoding="utf-8")
@@ -72,12 +74,38 @@ def test_every_file_exists(page: str) -> None:
 def test_every_number_is_there_once(paper: str, kind: str) -> None:
     sections = re.split(r"^## ", PAPERS, flags=re.MULTILINE)[1:]
     own = "\n".join(section for section in sections if section.startswith(paper))
-    rows = re.findall(rf"^\| {re.escape(kind)} (\d+) \|(.*)\|(.*)\|$", own, flags=re.MULTILINE)
+    cells = rf"^\| {re.escape(kind)} (\d+) \|(.*)\|(.*)\|(.*)\|(.*)\|$"
+    rows = re.findall(cells, own, flags=re.MULTILINE)
     assert [int(number) for number, *_ in rows] == list(range(1, NUMBERS[paper, kind] + 1))
-    for number, what, where in rows:
+    for number, what, where, used, held in rows:
         assert what.strip(), number
+        assert used.strip(), number
+        assert "::test_" in held, number
         honest = "not reproduced" in where or "the same" in where or "as " in where
         assert honest or "`" in where or "](" in where, number
+
+
+def test_every_test_preset_and_decision_of_the_page_is_there() -> None:
+    tests = set(re.findall(r"`(tests/[\w/]+\.py)::(test_\w+)`", PAPERS))
+    assert len(tests) > 60
+    for path, name in sorted(tests):
+        text = (REPOSITORY / path).read_text(encoding="utf-8")
+        assert re.search(rf"^def {name}\(", text, flags=re.MULTILINE), (path, name)
+    told = (REPOSITORY / "docs" / "decisions.md").read_text(encoding="utf-8")
+    for decision in re.findall(r'decision "([^"]+)"', PAPERS):
+        assert f"| **{decision}** |" in told, decision
+    presets = set(re.findall(r"`((?:ijrr|rr|heap|condensation)_\w+)`", PAPERS))
+    assert presets <= set(PRESETS)
+    assert {name for name in PRESETS if name.startswith("rr_")} <= presets
+
+
+def test_every_step_of_both_algorithms_has_a_line() -> None:
+    steps = ("1", "2.1", "2.2", "2.3", "3", "4", "5", "6")
+    for step in [f"Fig. 6, {step}" for step in steps] + [
+        "[RR] Fig. 4, descent", "[RR] Fig. 4, pattern", "[RR] Fig. 4, scores",
+        "[RR] Fig. 4, pruning",
+    ]:  # fmt: skip
+        assert f"{step} |" in PAPERS, step
 
 
 def test_every_decision_that_is_cited_is_told() -> None:
