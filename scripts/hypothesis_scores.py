@@ -15,7 +15,6 @@ hypotheses of a frame, and how many of the best k are the same.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from statistics import median
@@ -33,10 +32,9 @@ from torchcss.errors import ConfigurationError
 from torchcss.inference.grid_tracker import GridTracker
 from torchcss.inference.proposals import CovarianceScaled
 from torchcss.io.video import VideoReader
-from torchcss.studies.comparison import find_start, session_of
+from torchcss.studies.comparison import find_start, plan_of, session_of
 from torchcss.studies.evaluation import Evaluator, Thresholds, over_seeds, summarise
 from torchcss.studies.sequences import RecordedSequence, read_sequence
-from torchcss.tracking.session import TrackingSession
 from torchcss.tracking.settings import Settings
 from torchcss.types import CostFunction, LocalModel
 
@@ -117,20 +115,6 @@ def same_best(first: Float[Tensor, " m"], second: Float[Tensor, " m"], k: int) -
     return len(best[0] & best[1]) / max(1, min(k, len(first)))
 
 
-def session_for(
-    way: str, make: Callable[[], TrackingSession]
-) -> tuple[TrackingSession, GridTracker]:
-    """A session that lays out hypotheses in one of the ways."""
-    session = make()
-    tracker = session.plan.tracker
-    if not isinstance(tracker, GridTracker):
-        raise ConfigurationError(f"--preset: expected one of [RR], got {session.settings.preset!r}")
-    if way == "random":
-        tracker = replace(tracker, pattern=CovarianceScaled(covariance_scale=1.0))
-        session.plan = session.plan._replace(tracker=tracker)
-    return session, tracker
-
-
 def follow(
     config: Config, sequence: RecordedSequence, way: str, seed: int
 ) -> tuple[dict[str, Any], list[tuple[float, float]]]:
@@ -138,7 +122,13 @@ def follow(
     body = config.tracking.body if sequence.truth is None else sequence.truth.body.name
     settings = replace(config.tracking, body=body, seed=seed)
     begin, thresholds = find_start(sequence, settings), Thresholds.of(sequence)
-    session, tracker = session_for(way, lambda: session_of(sequence, settings, begin))
+    plan = plan_of(sequence, settings, begin)
+    if way == "random" and isinstance(plan.tracker, GridTracker):
+        drawn = replace(plan.tracker, pattern=CovarianceScaled(covariance_scale=1.0))
+        plan = plan._replace(tracker=drawn)
+    session = session_of(sequence, settings, begin, plan)
+    if not isinstance(plan.tracker, GridTracker):
+        raise ConfigurationError(f"--preset: expected one of [RR], got {settings.preset!r}")
     evaluator = Evaluator(sequence, begin.first.body, thresholds)
     measures, compared, first = [], [], None
     reader = VideoReader(sequence.video, stop=min(config.frames, sequence.num_frames))
@@ -150,7 +140,7 @@ def follow(
         )
         measures.append(evaluator(posterior, first, observation.seconds))
         for edges, full in noted if way == "edges" else ():
-            common = same_best(edges, full, tracker.num_modes)
+            common = same_best(edges, full, plan.tracker.num_modes)
             compared.append((rank_correlation(edges, full), common))
     row = summarise(measures, thresholds, 1 / sequence.frame_rate)
     return row, [pair for pair in compared if not math.isnan(pair[0])]

@@ -31,7 +31,7 @@ def test_small_mode(script: ModuleType, tmp_path: Path) -> None:
     assert all(row["root_aligned_mm"][0] < 150 for row in rows.values())
     assert len(json.loads(out.read_text())["table"]["rows"]) == 3
     other = replace(config, tracking=replace(small, preset="css"))
-    with pytest.raises(ConfigurationError, match="expected one of \\[RR\\], got 'css'"):
+    with pytest.raises(ConfigurationError, match=r"expected one of \[RR\], got 'css'"):
         script.main(other)
 
 

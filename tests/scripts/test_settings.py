@@ -40,6 +40,7 @@ VARIED = {
     "failure_modes": {"body", "preset"},
     "hypothesis_scores": {"body"},
     "learn_weights": {"body", "weights"},
+    "printed_and_ours": {"body", "preset"},
     "several_views": set(),
     "track_quadruped": {"body"},
     "track_robot": {"body", "seed"},
@@ -59,7 +60,7 @@ def arguments(folder: Path, script: str) -> list[str]:
     if script == "failure_modes":
         write_arm(folder / "arm", 3)
         return ["--sequence", str(folder / "arm"), "--presets", "css"]
-    if script == "hypothesis_scores":
+    if script in ("hypothesis_scores", "printed_and_ours"):
         write_arm(folder / "arm", 3)
         return ["--sequences", str(folder / "arm")]
     if script == "evaluate_posterior":
@@ -140,7 +141,10 @@ def test_a_setting_reaches_the_session(
 
 
 def test_every_script_that_tracks_is_among_them() -> None:
-    tracking = ("TrackingSession", "track_video", "track_sequence", "track_together", "run_demo")
+    tracking = (
+        *("TrackingSession", "track_video", "track_sequence", "track_together", "run_demo"),
+        "session_of",
+    )
     found = {
         path.stem
         for path in SCRIPTS.glob("*.py")

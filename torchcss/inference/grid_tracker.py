@@ -33,7 +33,7 @@ from torchcss.errors import ConfigurationError
 from torchcss.inference.importance import survival
 from torchcss.inference.mixture import GaussianMixture, Prior
 from torchcss.inference.problem import SearchProblem
-from torchcss.inference.proposals import EigenDirectionGrid
+from torchcss.inference.proposals import Proposal
 from torchcss.inference.tracker import (
     Particles,
     TrackerInfo,
@@ -53,13 +53,14 @@ class GridTracker:
     Attributes:
         num_samples: Most hypotheses that are scored in a frame, the best minima's first.
         num_modes: k, the hypotheses that descend: 3 for an arm and 7 for a body in section 6 [RR].
-        pattern: What is laid about each minimum, itself included.
+        pattern: What is laid about each minimum, itself included: an `EigenDirectionGrid`, or for
+            studies a random proposal, which then draws the same numbers in every frame.
         optimiser: How hypotheses descend.
     """
 
     num_samples: int
     num_modes: int
-    pattern: EigenDirectionGrid
+    pattern: Proposal
     optimiser: TrustRegionNewton = field(default_factory=TrustRegionNewton)
 
     def __post_init__(self) -> None:
@@ -153,7 +154,6 @@ class GridTracker:
             problem: That of the minima, in their order.
             bounds: Box limits on the state.
         """
-        # Nothing is drawn.
         pool = self.pattern.sample(minima, self.num_samples, bounds, generator=torch.Generator())
         problem = problem.take(pool.parent)
         score = (problem.screening or problem.cost).value(pool.x).nan_to_num(torch.inf)

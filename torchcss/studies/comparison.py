@@ -25,7 +25,7 @@ from torchcss.io.video import VideoReader
 from torchcss.studies.evaluation import Evaluator, FrameMeasures, Thresholds, loss
 from torchcss.studies.sequences import RecordedSequence
 from torchcss.tracking.session import TrackingSession
-from torchcss.tracking.settings import Settings
+from torchcss.tracking.settings import Plan, Settings, make_plan
 from torchcss.tracking.view import CameraView
 from torchcss.types import Frame
 
@@ -86,11 +86,13 @@ class Run(NamedTuple):
     """One tracker from the first frame to its end.
 
     Attributes:
+        number: Its place among the trackers.
         settings: What was run.
         measures: What was measured, frame by frame.
         ended: "complete", "lost" if it was stopped for that, or the error that ended it.
     """
 
+    number: int
     settings: Settings
     measures: list[FrameMeasures]
     ended: str
@@ -98,7 +100,7 @@ class Run(NamedTuple):
 
 def track_together(
     sequence: RecordedSequence,
-    runs: Sequence[tuple[Settings, Start]],
+    runs: Sequence[tuple[Settings, Start] | tuple[Settings, Start, Plan]],
     thresholds: Thresholds,
     *,
     start: int = 0,
@@ -110,7 +112,8 @@ def track_together(
 
     Args:
         sequence: What is tracked.
-        runs: The trackers, which agree in terms, working size, type and device, and their starts.
+        runs: The trackers and their starts; plans where other parts are wanted than those that the
+            settings ask for.
         thresholds: What counts as failed.
         start: First frame.
         stop: Frame before which to end.
@@ -123,11 +126,11 @@ def track_together(
     reader = VideoReader(sequence.video, start=start, stop=stop)
     going = [
         (
-            Run(settings, [], "complete"),
-            session_of(sequence, settings, begin),
+            Run(number, settings, [], "complete"),
+            session_of(sequence, settings, begin, *plan),
             Evaluator(sequence, begin.first.body, thresholds),
         )
-        for settings, begin in runs
+        for number, (settings, begin, *plan) in enumerate(runs)
     ]
     # Sight and one session that sees for all who share it; that session's own run may end.
     eyes = {key: session for _, session, _ in going if (key := sight(session)) is not None}
@@ -176,19 +179,34 @@ def sight(session: TrackingSession) -> Hashable | None:
     return *choices, extractor.luma.dtype, extractor.luma.device, plan.surface_prediction
 
 
-def session_of(sequence: RecordedSequence, settings: Settings, begin: Start) -> TrackingSession:
+def session_of(
+    sequence: RecordedSequence, settings: Settings, begin: Start, plan: Plan | None = None
+) -> TrackingSession:
     """A session that tracks a sequence.
 
     Args:
         sequence: What is tracked.
         settings: How.
         begin: Where it starts.
+        plan: See `TrackingSession`.
     """
-    camera = sequence.camera.to(dtype=settings.torch_dtype, device=settings.device)
     return TrackingSession(
         settings,
         begin.first,
-        [CameraView(camera, sequence.keypoints, begin.sigma)],
+        [view_of(sequence, settings, begin)],
         frame_interval=1 / sequence.frame_rate,
         generator=begin.generator,
+        plan=plan,
     )
+
+
+def plan_of(sequence: RecordedSequence, settings: Settings, begin: Start) -> Plan:
+    """What settings mean for a sequence; the arguments are those of `session_of`."""
+    view = view_of(sequence, settings, begin)
+    return make_plan(settings, begin.first.body, view, 1 / sequence.frame_rate)
+
+
+def view_of(sequence: RecordedSequence, settings: Settings, begin: Start) -> CameraView:
+    """The camera of a sequence, with its keypoints; the arguments are those of `session_of`."""
+    camera = sequence.camera.to(dtype=settings.torch_dtype, device=settings.device)
+    return CameraView(camera, sequence.keypoints, begin.sigma)

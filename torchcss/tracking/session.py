@@ -167,6 +167,8 @@ class TrackingSession:
             the first one's video is the one that counts the frames.
         frame_interval: Seconds between frames, which scales the expected motion.
         generator: Source of the samples; None: one seeded with `settings.seed`.
+        plan: The parts of the session, for studies that exchange some; None: what `make_plan` makes
+            of the settings.
 
     Raises:
         ConfigurationError: If there is no view, or what the settings ask for does not fit them.
@@ -180,9 +182,10 @@ class TrackingSession:
         *,
         frame_interval: float = 1 / 25,
         generator: torch.Generator | None = None,
+        plan: Plan | None = None,
     ) -> None:
         generator = generator or torch.Generator().manual_seed(settings.seed)
-        self._begin(settings, first.body, views, frame_interval)
+        self._begin(settings, first.body, views, frame_interval, plan)
         nothing = len(self._observers)
         mixture = first.mixture
         if self.plan.one_fit:
@@ -240,12 +243,13 @@ class TrackingSession:
         body: BodyModel,
         views: Sequence[CameraView | Camera],
         frame_interval: float,
+        plan: Plan | None = None,
     ) -> None:
         if not views:
             raise ConfigurationError("views: expected at least one camera that looks on, got none")
         views = [CameraView(view) if isinstance(view, Camera) else view for view in views]
         self.settings = settings
-        self.plan: Plan = make_plan(settings, body, views[0], frame_interval)
+        self.plan = plan or make_plan(settings, body, views[0], frame_interval)
         self._observers = [self.plan.observer(body, view) for view in views]
         self._bounds = self.plan.bounds
         self._prior_variance = default_prior_variance(self._bounds)

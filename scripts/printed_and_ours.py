@@ -1,0 +1,159 @@
+"""The tracker of [IJRR] as printed against ours, with cost, search and dynamics exchanged.
+
+    python scripts/printed_and_ours.py --sequences ARM DARK --out docs/results/exchange.json
+
+`ijrr_css` and `css` differ in their cost (terms, weights, edges, where keypoints count), in their
+search (samples, descents, what is kept, recovery, flips, limits, where they start from) and in
+their dynamics. From either end one of the three is taken from the other tracker, so that one sees
+which of our deviations from the paper earn their place. All start from the same first pose and see
+keypoints in the first frame alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from common import Table, start, write_report
+from tqdm import tqdm
+
+from torchcss.cli.options import SettingsOptions
+from torchcss.inference.tracker import Tracker
+from torchcss.studies.comparison import Start, find_start, plan_of, track_together
+from torchcss.studies.evaluation import Thresholds, over_seeds, summarise
+from torchcss.studies.sequences import RecordedSequence, read_sequence
+from torchcss.tracking.settings import Plan, Settings
+
+TRACKING = Settings(keypoints_use="first", overlay=False)
+"""How this script tracks, where nothing else is said."""
+ENDS = {"ours": ("css", "ijrr_css"), "printed": ("ijrr_css", "css")}
+"""The two ends, and what each of them takes parts from."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """What is tracked, and how long."""
+
+    sequences: tuple[Path, ...]
+    """Sequence folders."""
+    seeds: int = 3
+    """Runs of each tracker."""
+    frames: int = 60
+    """Frames of each run."""
+    tracking: SettingsOptions = TRACKING
+    """How to track. The seed is the first of the seeds; the body counts where the sequence does not
+    say which one moved; the presets are those of the two ends."""
+    out: Path | None = None
+    """JSON file to write."""
+
+
+def with_cost(plan: Plan, other: Plan) -> Plan:
+    """A plan with another one's cost, and what that needs of the pictures."""
+    return plan._replace(
+        extractor=other.extractor,
+        choice=other.choice,
+        keypoints_first_only=other.keypoints_first_only,
+        boundary_emphasis=other.boundary_emphasis,
+        noise=other.noise,
+        engine=other.engine,
+    )
+
+
+def with_search(plan: Plan, other: Plan) -> Plan:
+    """A plan with another one's search, which keeps its own dynamics."""
+    return with_dynamics(
+        plan._replace(
+            tracker=other.tracker,
+            bounds=other.bounds,
+            one_fit=other.one_fit,
+            recovery=other.recovery,
+            jumps_every=other.jumps_every,
+            limb_jumps=other.limb_jumps,
+        ),
+        plan,
+    )
+
+
+def with_dynamics(plan: Plan, other: Plan) -> Plan:
+    """A plan with another one's dynamics."""
+    mine, theirs = plan.tracker, other.tracker
+    assert isinstance(mine, Tracker)
+    assert isinstance(theirs, Tracker)
+    return plan._replace(tracker=replace(mine, dynamics=theirs.dynamics))
+
+
+EXCHANGES: dict[str, Callable[[Plan, Plan], Plan]] = {
+    "cost": with_cost, "search": with_search, "dynamics": with_dynamics,
+}  # fmt: skip
+
+
+def entrants(
+    config: Config, sequence: RecordedSequence, seed: int
+) -> dict[str, tuple[Settings, Start, Plan]]:
+    """All trackers of a seed by name."""
+    body = config.tracking.body if sequence.truth is None else sequence.truth.body.name
+    found: dict[str, tuple[Settings, Start, Plan]] = {}
+    begin = None
+    for end, presets in ENDS.items():
+        mine, theirs = (
+            replace(config.tracking, body=body, seed=seed, preset=preset) for preset in presets
+        )
+        begin = begin or find_start(sequence, mine)
+        plan, other = (plan_of(sequence, each, begin) for each in (mine, theirs))
+        found[end] = mine, begin, plan
+        for what, exchange in EXCHANGES.items():
+            whose = "printed" if end == "ours" else "our"
+            found[f"{end}, {whose} {what}"] = mine, begin, exchange(plan, other)
+    return found
+
+
+def advance(bar: tqdm, *_: int) -> None:
+    """A frame is done."""
+    bar.update()
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Run, print, write; return what is written."""
+    rows, cells = {}, []
+    for folder in config.sequences:
+        sequence = read_sequence(folder)
+        thresholds, runs, names = Thresholds.of(sequence), {}, []
+        stop = min(config.frames, sequence.num_frames)
+        for seed in range(config.tracking.seed, config.tracking.seed + config.seeds):
+            named = entrants(config, sequence, seed)
+            names = list(named)
+            with tqdm(total=stop, desc=f"{sequence.name}, seed {seed}", dynamic_ncols=True) as bar:
+                for run in track_together(
+                    sequence, list(named.values()), thresholds, stop=stop,
+                    progress=partial(advance, bar),
+                ):  # fmt: skip
+                    row = {"ended": run.ended}
+                    if run.measures:
+                        row |= summarise(run.measures, thresholds, 1 / sequence.frame_rate)
+                        runs.setdefault(names[run.number], []).append(row)
+        rows[sequence.name] = {name: over_seeds(each) for name, each in runs.items()}
+        for name in names:
+            if (row := rows[sequence.name].get(name)) is None:
+                continue
+            spread = (
+                f"{middle:.0f} ({least:.0f} to {most:.0f})"
+                for middle, least, most in (
+                    row["root_aligned_mm"], row["root_aligned_best_of_modes_mm"], row["pa_mpjpe_mm"]
+                )
+            )  # fmt: skip
+            time_s = row["search_s_per_frame"][0]
+            lost = f"{row['lost']} of {row['seeds']}"
+            cells.append([f"{sequence.name}: {name}", lost, *spread, time_s])
+    columns = ("sequence: tracker", "lost", "best mode", "best of modes", "PA", "search, s/frame")
+    table = Table("As printed against ours, part by part", columns, cells)
+    table.print()
+    report = {"frames": config.frames, "seeds": config.seeds, "by_sequence": rows}
+    write_report(config.out, report, table)
+    return report
+
+
+if __name__ == "__main__":
+    start(main, Config, __doc__)
