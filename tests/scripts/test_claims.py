@@ -107,10 +107,35 @@ def test_several_modes_while_the_body_moves_in_depth(script: ModuleType, tmp_pat
     evidence = script.read_evidence(script.Config(failures=(path,), sequences=(folder,)))
     assert name in evidence.depth
     seen = script.multimodal("arm", "ijrr_css")(
-        script.Evidence(evidence.runs, {}, {}, {"arm": depth})
+        script.Evidence(evidence.runs, {}, {}, {}, {}, {"arm": depth})
     )
     assert seen.holds
     assert "0.90 in the half" in seen.words
+
+
+def test_weights_help_where_the_error_is_less(script: ModuleType, tmp_path: Path) -> None:
+    claim = "weighing contours by foreground and motion boundaries improves much"
+    few, many = (
+        report_of("arm", [run_of("ijrr_css", 0, root_aligned_mm=mm)], tmp_path / f"{mm}.json")
+        for mm in (40.0, 60.0)
+    )
+    seen = verdicts(script.main(script.Config(failures=(few,), unweighted=(many,))))[claim]
+    assert seen == ("ijrr_css, arm: 40 mm, without 60", "holds")
+    seen = verdicts(script.main(script.Config(failures=(many,), unweighted=(few,))))[claim]
+    assert seen[1] == "does not hold"
+
+
+def test_edges_are_enough_if_they_do_as_well(script: ModuleType, tmp_path: Path) -> None:
+    claim, path = "edges alone are enough to score hypotheses", tmp_path / "scores.json"
+    for edges, verdict in ((50.0, "holds"), (70.0, "does not hold")):
+        rows = {
+            "edges": {"root_aligned_mm": [edges, 40, 80], "rank_correlation": 0.8},
+            "full": {"root_aligned_mm": [45.0, 40, 60], "rank_correlation": None},
+        }
+        path.write_text(json.dumps({"by_sequence": {"arm": rows}}))
+        seen = verdicts(script.main(script.Config(scores=path)))[claim]
+        assert seen[1] == verdict
+        assert "arm: rank correlation 0.80" in seen[0]
 
 
 def test_other_reports_are_refused(script: ModuleType, tmp_path: Path) -> None:
@@ -120,3 +145,5 @@ def test_other_reports_are_refused(script: ModuleType, tmp_path: Path) -> None:
         script.main(script.Config(failures=(other,)))
     with pytest.raises(ConfigurationError, match=r"expected a report of table1\.py"):
         script.main(script.Config(table1=other))
+    with pytest.raises(ConfigurationError, match=r"expected a report of hypothesis_scores\.py"):
+        script.main(script.Config(scores=other))
