@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import torchcss
-from torchcss.app.detect import detect_video, masks_of
-from torchcss.app.view_files import open_view
+from torchcss.app.detect import detect_video, frames_seen, masks_of
+from torchcss.app.view_files import Selection, open_view
 from torchcss.errors import KeypointError
 from torchcss.io.detect import Detected
 from torchcss.io.keypoints.frames import Film
@@ -29,9 +30,10 @@ class Crowd:
     relative_noise = 1.5
 
     def __init__(self, places: list[list[tuple[float, float, float]]]) -> None:
-        self.places, self.closed = places, False
+        self.places, self.closed, self.looked_at = places, False, []
 
     def detect(self, frame: Frame) -> Detected:
+        self.looked_at.append(frame.index)
         spread = np.random.default_rng(0).uniform(-1, 1, (17, 2))
         people = [
             np.column_stack([(x, y) + size * spread, np.full(17, 0.9)])
@@ -134,3 +136,36 @@ def test_a_video_alone_is_tracked(
     notes = "\n".join(run.summary["notes"])
     assert "followed the leftmost one of frame 0" in notes
     assert "as given" in notes
+
+
+def test_frames_that_nobody_asks_for_are_not_looked_at(files: Path, crowd: Crowd) -> None:
+    path = detect_video(files / "video.mp4", files / "found.npz", detector=crowd, start=1, stop=2)
+    assert crowd.looked_at == [1]
+    assert frames_seen(path) == (1, 2)
+    seen = read(path, "largest", frame=1).confidence.amax(-1) > 0
+    assert seen.tolist() == [False, True, False]
+    given = ViewFiles(video=files / "video.mp4", keypoints=path, masks=masks_of(path))
+    view = open_view(given, Camera.pinhole(*SIZE, focal_px=60.0), Selection(start=1, stop=2))
+    (mask,) = [frame.mask for frame in view.images()]
+    assert mask is not None
+    assert mask[24].mean() > 200 > mask[40].mean()
+    assert frames_seen(files / "nowhere.npz") is None
+
+
+def test_who_goes_on_further_looks_further(
+    files: Path, crowd: Crowd, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torchcss.app.detect.open_detector", lambda *_: crowd)
+    settings = torchcss.Settings(body="arm7", samples=3, modes=2, overlay=False)
+    options = torchcss.TrackOptions(person="leftmost", fov=60.0)
+    video, out = files / "video.mp4", files / "out"
+    run = torchcss.track_video(video, out=out, settings=settings, options=options, stop=2)
+    assert crowd.looked_at == [0, 1]
+    assert len(run.track.frames) == 2
+    crowd.looked_at.clear()
+    again = replace(options, resume=True)
+    run = torchcss.track_video(video, out=out, settings=settings, options=again, stop=2)
+    assert crowd.looked_at == []
+    run = torchcss.track_video(video, out=out, settings=settings, options=again)
+    assert crowd.looked_at == [0, 1, 2]
+    assert len(run.track.frames) == 3

@@ -1,9 +1,9 @@
-"""From a video to its 2D keypoints: everybody in every frame, as one file.
+"""From a video to its 2D keypoints: everybody in every frame wanted, as one file.
 
 `detect_video` is what `torchcss detect` calls, and `torchcss track` where no keypoints are given.
 It writes `keypoints [T P J 2]`, `confidence [T P J]`, `joint_names [J]`, `person_ids [P]`,
-`image_size_wh` and `relative_noise`, which `torchcss.io.keypoints` reads; of a detector that says
-them `points [T P J 3]`, and beside the file the masks, a film (`masks_of`).
+`image_size_wh`, `relative_noise` and `frames_seen`, which `torchcss.io.keypoints` reads; of a
+detector that says them `points [T P J 3]`, and beside the file the masks, a film (`masks_of`).
 """
 
 from __future__ import annotations
@@ -45,8 +45,10 @@ def detect_video(
     *,
     frame_rate: float | None = None,
     detector: Detector | None = None,
+    start: int = 0,
+    stop: int | None = None,
 ) -> Path:
-    """Find everybody in every frame of a video, and write their keypoints.
+    """Find everybody in the frames of a video, and write their keypoints.
 
     Args:
         video: A video, or a folder of images.
@@ -54,6 +56,8 @@ def detect_video(
         options: What finds them.
         frame_rate: Frames per second of a folder of images; None: 30.
         detector: A detector that is loaded already.
+        start: First frame to look at; nobody is known in those before.
+        stop: Frame before which to end; nobody is known in those from there on.
 
     Returns:
         The file.
@@ -62,24 +66,42 @@ def detect_video(
         TorchcssError: If the video or the detector cannot be read, or nobody is found.
     """
     options = options or DetectOptions()
-    reader = VideoReader(video, image_frame_rate=frame_rate)
+    reader = VideoReader(video, start=start, stop=stop, image_frame_rate=frame_rate)
     prepare_output_folder(out.parent)
     if detector is None:
         tqdm.write("loading the detector ...", file=sys.stderr)
         detector = open_detector(options.detector, options.detector_model)
     try:
-        frames = _detected(reader, detector, masks_of(out))
+        frames = _detected(reader, detector, masks_of(out), start)
     finally:
         detector.close()
     if not any(len(found.joints) for found in frames):
         raise KeypointError(
-            f"{video}: nobody found in {len(frames)} frames; the detector needs most of a person "
-            "in the picture: mark the joints of one frame (torchcss init --click), or give "
+            f"{video}: nobody found in {len(frames) - start} frames; the detector needs most of a "
+            "person in the picture: mark the joints of one frame (torchcss init --click), or give "
             "keypoints of another detector with --keypoints"
         )
     size = (reader.info.width, reader.info.height)
-    write_people(out, frames, detector, size)
+    seen = start, len(frames)
+    frames += [_nobody(frames[-1])] * ((reader.info.num_frames or 0) - len(frames))
+    write_people(out, frames, detector, size, seen)
     return out
+
+
+def frames_seen(keypoints: Path) -> tuple[int, int] | None:
+    """The first frame that was looked at for a file of keypoints, and the one after the last.
+
+    None for a file that `detect_video` has not written.
+
+    Args:
+        keypoints: The file.
+    """
+    try:
+        with np.load(keypoints, allow_pickle=False) as arrays:
+            first, end = arrays["frames_seen"].tolist()
+    except (OSError, ValueError, KeyError):
+        return None
+    return int(first), int(end)
 
 
 def masks_of(keypoints: Path) -> Path:
@@ -87,20 +109,35 @@ def masks_of(keypoints: Path) -> Path:
     return keypoints.with_name(f"{keypoints.stem}_masks.mp4")
 
 
-def _detected(reader: VideoReader, detector: Detector, masks: Path) -> list[Detected]:
-    """The people of every frame; their masks go into a film."""
-    found = []
+def _detected(reader: VideoReader, detector: Detector, masks: Path, start: int) -> list[Detected]:
+    """The people of every frame, nobody in those before the start; their masks go into a film."""
+    found: list[Detected] = []
     with VideoWriter(masks, reader.info.frame_rate) as film:
         for frame in tqdm(reader, "detecting", reader.num_selected, unit="frame"):
             seen = detector.detect(frame)
+            before = 0 if found else start
             if seen.mask is not None:
-                film.write(np.repeat(seen.mask[..., None], 3, axis=-1))
+                mask = np.repeat(seen.mask[..., None], 3, axis=-1)
+                for _ in range(before):
+                    film.write(np.full_like(mask, 255))
+                film.write(mask)
+            found += [_nobody(seen)] * before
             found.append(seen._replace(mask=None))
     return found
 
 
+def _nobody(like: Detected) -> Detected:
+    """A frame in which nobody is found."""
+    points = None if like.points is None else like.points[:0]
+    return Detected(like.joints[:0], points)
+
+
 def write_people(
-    out: Path, frames: Sequence[Detected], detector: Detector, image_size_wh: tuple[int, int]
+    out: Path,
+    frames: Sequence[Detected],
+    detector: Detector,
+    image_size_wh: tuple[int, int],
+    seen: tuple[int, int],
 ) -> None:
     """Write who is where in every frame, every person under one number; joints that bodies have.
 
@@ -109,6 +146,7 @@ def write_people(
         frames: The people of every frame.
         detector: What found them.
         image_size_wh: Size of the images.
+        seen: First frame that was looked at, and the one after the last.
     """
     ids = identified([found.joints for found in frames])
     count = 1 + max((number for people in ids for number in people), default=0)
@@ -127,6 +165,7 @@ def write_people(
         "person_ids": np.arange(count),
         "image_size_wh": image_size_wh,
         "relative_noise": detector.relative_noise,
+        "frames_seen": seen,
     }
     if np.isfinite(points).any():
         arrays["points"] = points

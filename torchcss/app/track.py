@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -20,7 +20,7 @@ import torch
 from tqdm import tqdm
 
 from torchcss.app.claims import Claim
-from torchcss.app.detect import DetectOptions, detect_video, masks_of
+from torchcss.app.detect import DetectOptions, detect_video, frames_seen, masks_of
 from torchcss.app.init import initialise_video
 from torchcss.app.lens import Lens, fitted
 from torchcss.app.lock import locked
@@ -35,6 +35,7 @@ from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body, write_fi
 from torchcss.io.keypoints.read import Scale
 from torchcss.io.run import Run
 from torchcss.io.tracks import TRACK_NAME, prepare_output_folder
+from torchcss.io.video import VideoReader
 from torchcss.io.view_files import ViewFiles
 from torchcss.show.track_pictures import write_overlays
 from torchcss.tracking.checkpoint import state_from_tensors
@@ -139,7 +140,7 @@ def track_video(
     with locked(out) as lock:
         if options.resume and (begun := _begun(out)) is not None:
             return _go_on(begun, settings, selection, options, lock)
-        files = _files_of(Path(video), keypoints, out, options)
+        files = _files_of(Path(video), keypoints, out, selection, options)
         views = _all_views(files, camera, selection, settings, options)
         return _begin(views, out, settings, selection, options, lock)
 
@@ -181,17 +182,22 @@ def _begin(
     return _record(recorder, views)
 
 
+_KEYPOINTS_NAME = "keypoints.npz"
+"""Where keypoints that are detected lie in the folder of a run."""
+
+
 def _files_of(
     video: Path,
     keypoints: str | os.PathLike[str] | None,
     out: Path,
+    selection: Selection,
     options: TrackOptions,
 ) -> ViewFiles:
     """The first camera's files; keypoints that are not given are detected."""
     masks = options.masks
     if keypoints is None:
-        keypoints = out / "keypoints.npz"
-        detect_video(video, keypoints, options.detect, frame_rate=options.frame_rate)
+        keypoints = out / _KEYPOINTS_NAME
+        _detect(video, keypoints, selection, options)
         if masks is None and masks_of(keypoints).is_file():
             masks = masks_of(keypoints)
     return ViewFiles(
@@ -205,6 +211,27 @@ def _files_of(
         person=options.person,
         sigma=options.sigma,
     )
+
+
+def _detect(video: Path, keypoints: Path, selection: Selection, options: TrackOptions) -> None:
+    """Find the keypoints of the frames that are tracked."""
+    detect_video(
+        video, keypoints, options.detect, frame_rate=options.frame_rate,
+        start=selection.start, stop=selection.stop,
+    )  # fmt: skip
+
+
+def _detect_further(run: Run, selection: Selection, options: TrackOptions) -> None:
+    """Find the keypoints anew where a run goes on beyond the frames that were looked at."""
+    own = run.cameras[0].files
+    found = (run.folder / _KEYPOINTS_NAME).resolve()
+    if own is None or own.keypoints is None or own.keypoints.resolve() != found:
+        return
+    seen = frames_seen(own.keypoints)
+    end = VideoReader(own.video, image_frame_rate=own.frame_rate).info.num_frames
+    last = min((each for each in (selection.stop, end) if each is not None), default=None)
+    if seen is not None and (last is None or seen[1] < last):
+        _detect(own.video, own.keypoints, selection, replace(options, frame_rate=own.frame_rate))
 
 
 def _all_views(
@@ -271,6 +298,7 @@ def _go_on(
     checkpoint, out = run.checkpoint, run.folder
     assert checkpoint is not None
     _check_same(run, settings, selection, checkpoint.notes["extra"]["frames_selected"])
+    _detect_further(run, selection, options)
     views = [open_view(each.files, each.camera, selection) for each in run.cameras if each.files]
     body = run.body.to(dtype=settings.torch_dtype, device=settings.device)
     state = state_from_tensors(checkpoint.tensors, body)

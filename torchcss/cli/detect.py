@@ -23,6 +23,10 @@ class Detect:
     """The file to write, which `torchcss track --keypoints` takes."""
     download_model: bool = False
     """Fetch MediaPipe's model into the cache folder, and nothing else where no video is given."""
+    start: int = 0
+    """First frame to look at."""
+    stop: int | None = None
+    """Frame before which to end."""
     frame_rate: float | None = None
     """Frames per second of a folder of images; by default 30."""
     options: Annotated[DetectOptions, tyro.conf.OmitArgPrefixes] = field(
@@ -34,7 +38,10 @@ class Detect:
         if self.download_model:
             download_model()
         if self.video is not None:
-            detect_video(self.video, self.out, self.options, frame_rate=self.frame_rate)
+            detect_video(
+                self.video, self.out, self.options, frame_rate=self.frame_rate,
+                start=self.start, stop=self.stop,
+            )  # fmt: skip
             print(f"keypoints are in {self.out}")
         elif not self.download_model:
             raise VideoError("give a video, or --download-model")
