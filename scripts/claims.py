@@ -438,7 +438,7 @@ def main(config: Config) -> dict[str, Any]:
     for claim in CLAIMS:
         seen, verdict = judged(claim, evidence)
         cells.append([claim.words, claim.section, f"scripts/{claim.script}", seen, verdict])
-    table = Table("The papers' claims", ("claim", "section", "script", "seen", "it"), cells)
+    table = Table("The papers' claims", ("claim", "section", "script", "seen", "verdict"), cells)
     table.print()
     counts = {verdict: sum(row[-1] == verdict for row in cells) for *_, verdict in cells}
     report = {"counts": counts, "reports": [str(path.name) for path in config.failures]}

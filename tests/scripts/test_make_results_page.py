@@ -41,12 +41,11 @@ def test_every_row_says_how_it_was_made(script: ModuleType) -> None:
     assert len(names) > 10
 
 
-@pytest.mark.parametrize("name", ["failure_modes", "limb_losses", "all_trackers"])
-def test_trackers_go_by_their_present_names(name: str) -> None:
-    table = json.loads((DOCS / "results" / f"{name}.json").read_text(encoding="utf-8"))["table"]
+def test_trackers_go_by_their_present_names() -> None:
+    table = json.loads((DOCS / "results" / "failure_modes.json").read_text("utf-8"))["table"]
     for row in table["rows"]:
         first = (row["cells"] if isinstance(row, dict) else row)[0]
-        assert re.sub(r"^[\w-]+: |, \d+ seeds?$", "", first) in PRESETS
+        assert re.sub(r"^[\w-]+: ", "", first) in PRESETS
 
 
 def test_tables_come_in_their_order_with_their_commands(script: ModuleType, tmp_path: Path) -> None:
