@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import torchcss
-from torchcss.app.detect import detect_video, frames_seen, masks_of
+from torchcss.app.detect import detect_video, looked_at, masks_of
 from torchcss.app.view_files import Selection, open_view
 from torchcss.errors import KeypointError
 from torchcss.io.detect import Detected
@@ -141,7 +141,9 @@ def test_a_video_alone_is_tracked(
 def test_frames_that_nobody_asks_for_are_not_looked_at(files: Path, crowd: Crowd) -> None:
     path = detect_video(files / "video.mp4", files / "found.npz", detector=crowd, start=1, stop=2)
     assert crowd.looked_at == [1]
-    assert frames_seen(path) == (1, 2)
+    assert looked_at(path, 2)
+    assert not looked_at(path, 3)
+    assert not looked_at(path, None)
     seen = read(path, "largest", frame=1).confidence.amax(-1) > 0
     assert seen.tolist() == [False, True, False]
     given = ViewFiles(video=files / "video.mp4", keypoints=path, masks=masks_of(path))
@@ -149,7 +151,10 @@ def test_frames_that_nobody_asks_for_are_not_looked_at(files: Path, crowd: Crowd
     (mask,) = [frame.mask for frame in view.images()]
     assert mask is not None
     assert mask[24].mean() > 200 > mask[40].mean()
-    assert frames_seen(files / "nowhere.npz") is None
+    assert looked_at(files / "nowhere.npz", 9)
+    for stop in (None, 9):  # beyond the end
+        path = detect_video(files / "video.mp4", files / "all.npz", detector=crowd, stop=stop)
+        assert looked_at(path, None)
 
 
 def test_who_goes_on_further_looks_further(

@@ -82,26 +82,34 @@ def detect_video(
             "keypoints of another detector with --keypoints"
         )
     size = (reader.info.width, reader.info.height)
-    seen = start, len(frames)
-    frames += [_nobody(frames[-1])] * ((reader.info.num_frames or 0) - len(frames))
-    write_people(out, frames, detector, size, seen)
+    end = _TO_THE_END
+    if stop is not None and len(frames) >= stop:
+        end = stop
+        # As many rows as the video has frames: whoever reads the file compares the two.
+        frames += [_nobody(frames[-1])] * ((reader.info.num_frames or 0) - stop)
+    write_people(out, frames, detector, size, (start, end))
     return out
 
 
-def frames_seen(keypoints: Path) -> tuple[int, int] | None:
-    """The first frame that was looked at for a file of keypoints, and the one after the last.
+_TO_THE_END = -1
+"""End of the frames that were looked at where they are all up to the video's end."""
 
-    None for a file that `detect_video` has not written.
+
+def looked_at(keypoints: Path, stop: int | None) -> bool:
+    """Whether all frames before one were looked at for a file of keypoints.
+
+    True for a file that `detect_video` has not written: there are no others to be had.
 
     Args:
         keypoints: The file.
+        stop: The frame; None: the video's end.
     """
     try:
         with np.load(keypoints, allow_pickle=False) as arrays:
-            first, end = arrays["frames_seen"].tolist()
+            _, end = arrays["frames_seen"].tolist()
     except (OSError, ValueError, KeyError):
-        return None
-    return int(first), int(end)
+        return True
+    return end == _TO_THE_END or (stop is not None and stop <= end)
 
 
 def masks_of(keypoints: Path) -> Path:
@@ -146,7 +154,7 @@ def write_people(
         frames: The people of every frame.
         detector: What found them.
         image_size_wh: Size of the images.
-        seen: First frame that was looked at, and the one after the last.
+        seen: First frame that was looked at, and the one after the last or `_TO_THE_END`.
     """
     ids = identified([found.joints for found in frames])
     count = 1 + max((number for people in ids for number in people), default=0)

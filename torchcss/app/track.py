@@ -20,7 +20,7 @@ import torch
 from tqdm import tqdm
 
 from torchcss.app.claims import Claim
-from torchcss.app.detect import DetectOptions, detect_video, frames_seen, masks_of
+from torchcss.app.detect import DetectOptions, detect_video, looked_at, masks_of
 from torchcss.app.init import initialise_video
 from torchcss.app.lens import Lens, fitted
 from torchcss.app.lock import locked
@@ -35,7 +35,6 @@ from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body, write_fi
 from torchcss.io.keypoints.read import Scale
 from torchcss.io.run import Run
 from torchcss.io.tracks import TRACK_NAME, prepare_output_folder
-from torchcss.io.video import VideoReader
 from torchcss.io.view_files import ViewFiles
 from torchcss.show.track_pictures import write_overlays
 from torchcss.tracking.checkpoint import state_from_tensors
@@ -227,10 +226,7 @@ def _detect_further(run: Run, selection: Selection, options: TrackOptions) -> No
     found = (run.folder / _KEYPOINTS_NAME).resolve()
     if own is None or own.keypoints is None or own.keypoints.resolve() != found:
         return
-    seen = frames_seen(own.keypoints)
-    end = VideoReader(own.video, image_frame_rate=own.frame_rate).info.num_frames
-    last = min((each for each in (selection.stop, end) if each is not None), default=None)
-    if seen is not None and (last is None or seen[1] < last):
+    if not looked_at(own.keypoints, selection.stop):
         _detect(own.video, own.keypoints, selection, replace(options, frame_rate=own.frame_rate))
 
 
