@@ -15,28 +15,30 @@ hypotheses of a frame, and how many of the best k are the same.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import torch
 from common import Table, start, write_report
+from common.side_by_side import Entrants, side_by_side
 from jaxtyping import Float, Int
 from torch import Tensor
-from tqdm import tqdm
 
 from torchcss.cli.options import SettingsOptions
-from torchcss.cost.total import TrackingCost
 from torchcss.errors import ConfigurationError
 from torchcss.inference.grid_tracker import GridTracker
+from torchcss.inference.mixture import GaussianMixture
+from torchcss.inference.problem import SearchProblem
 from torchcss.inference.proposals import CovarianceScaled
-from torchcss.io.video import VideoReader
-from torchcss.studies.comparison import find_start, plan_of, session_of
-from torchcss.studies.evaluation import Evaluator, Thresholds, over_seeds, summarise
+from torchcss.inference.tracker import SequenceTracker, TrackerInfo, TrackerState
+from torchcss.studies.comparison import find_start, plan_of
+from torchcss.studies.evaluation import over_seeds
 from torchcss.studies.sequences import RecordedSequence, read_sequence
 from torchcss.tracking.settings import Settings
-from torchcss.types import CostFunction, LocalModel
+from torchcss.types import Bounds, CostFunction, LocalModel
 
 WAYS = ("edges", "full", "random")
 TRACKING = Settings(preset="rr_multiple_hypothesis", overlay=False)
@@ -62,43 +64,88 @@ class Config:
 
 @dataclass(frozen=True)
 class Scores:
-    """A cost that scores as another one does, and notes both.
+    """The edges' cost, which notes what the whole cost says beside it.
 
     Attributes:
-        edges: What the edges say.
-        full: What the whole cost says.
-        by_edges: Which of the two scores.
-        noted: Where both are kept, call by call.
+        edges: What scores.
+        full: The whole cost.
+        noted: Where the scores of both are kept, call by call.
     """
 
-    edges: TrackingCost
-    full: TrackingCost
-    by_edges: bool
+    edges: CostFunction
+    full: CostFunction
     noted: list[tuple[Tensor, Tensor]]
 
     def value(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
         """The score, nats."""
         both = self.edges.value(x), self.full.value(x)
         self.noted.append(both)
-        return both[0] if self.by_edges else both[1]
+        return both[0]
 
     def local_model(self, x: Float[Tensor, "*batch n"]) -> LocalModel:
         """That of the cost which scores."""
-        return (self.edges if self.by_edges else self.full).local_model(x)
+        return self.edges.local_model(x)
 
     def take(self, items: Int[Tensor, " m"]) -> CostFunction:
         """The same of some items."""
         return replace(self, edges=self.edges.take(items), full=self.full.take(items))
 
 
-def noting(cost: TrackingCost, by_edges: bool, noted: list[tuple[Tensor, Tensor]]) -> TrackingCost:
-    """A frame's cost whose hypotheses are scored by `Scores`."""
+@dataclass(frozen=True)
+class Scoring:
+    """A tracker of Fig. 4 [RR] whose hypotheses are scored in another way.
 
-    class Noting(TrackingCost):
-        def screening(self) -> Any:
-            return Scores(super().screening(), self, by_edges, noted)
+    Attributes:
+        tracker: The tracker.
+        noted: Where the scores by edges and by the whole cost are kept; None: the latter scores.
+    """
 
-    return Noting(**{each.name: getattr(cost, each.name) for each in fields(cost) if each.init})
+    tracker: GridTracker
+    noted: list[tuple[Tensor, Tensor]] | None
+
+    @property
+    def num_samples(self) -> int:
+        """Those of the tracker."""
+        return self.tracker.num_samples
+
+    @property
+    def num_modes(self) -> int:
+        """Those of the tracker."""
+        return self.tracker.num_modes
+
+    @property
+    def stated_power(self) -> float:
+        """That of the tracker."""
+        return self.tracker.stated_power
+
+    def init(self, mixture: GaussianMixture, *, generator: torch.Generator) -> TrackerState:
+        """Start as the tracker does."""
+        return self.tracker.init(mixture, generator=generator)
+
+    def step(
+        self, state: TrackerState, problem: SearchProblem, bounds: Bounds, **rest: Any
+    ) -> tuple[TrackerState, TrackerInfo]:
+        """Step as the tracker does."""
+        return self.tracker.step(state, self._scored(problem), bounds, **rest)
+
+    def track(
+        self, state: TrackerState, problems: Iterable[SearchProblem], bounds: Bounds, **rest: Any
+    ) -> Iterator[tuple[TrackerState, TrackerInfo]]:
+        """Track as the tracker does."""
+        return self.tracker.track(state, map(self._scored, problems), bounds, **rest)
+
+    def _scored(self, problem: SearchProblem) -> SearchProblem:
+        """The problem, and those of its samples, with the other score."""
+        restrict, of_children, screening = problem.restrict, problem.of_children, None
+        if self.noted is not None and problem.screening is not None:
+            screening = Scores(problem.screening, problem.cost, self.noted)
+        return problem._replace(
+            screening=screening,
+            restrict=None if restrict is None else lambda items: self._scored(restrict(items)),
+            of_children=None
+            if of_children is None
+            else lambda *given: self._scored(of_children(*given)),
+        )
 
 
 def rank_correlation(first: Float[Tensor, " m"], second: Float[Tensor, " m"]) -> float:
@@ -115,35 +162,32 @@ def same_best(first: Float[Tensor, " m"], second: Float[Tensor, " m"], k: int) -
     return len(best[0] & best[1]) / max(1, min(k, len(first)))
 
 
-def follow(
-    config: Config, sequence: RecordedSequence, way: str, seed: int
-) -> tuple[dict[str, Any], list[tuple[float, float]]]:
-    """One run: its row, and rank correlation and common best of every frame."""
+def entrants(config: Config, sequence: RecordedSequence, seed: int) -> Entrants:
+    """The trackers of a seed by how their hypotheses are scored and laid out."""
     body = config.tracking.body if sequence.truth is None else sequence.truth.body.name
     settings = replace(config.tracking, body=body, seed=seed)
-    begin, thresholds = find_start(sequence, settings), Thresholds.of(sequence)
+    begin = find_start(sequence, settings)
     plan = plan_of(sequence, settings, begin)
-    if way == "random" and isinstance(plan.tracker, GridTracker):
-        drawn = replace(plan.tracker, pattern=CovarianceScaled(covariance_scale=1.0))
-        plan = plan._replace(tracker=drawn)
-    session = session_of(sequence, settings, begin, plan)
-    if not isinstance(plan.tracker, GridTracker):
+    tracker = plan.tracker
+    if not isinstance(tracker, GridTracker):
         raise ConfigurationError(f"--preset: expected one of [RR], got {settings.preset!r}")
-    evaluator = Evaluator(sequence, begin.first.body, thresholds)
-    measures, compared, first = [], [], None
-    reader = VideoReader(sequence.video, stop=min(config.frames, sequence.num_frames))
-    for frame in tqdm(reader, desc=f"{sequence.name}, {way}, {seed}", dynamic_ncols=True):
-        first, noted = first or frame, []
-        observation = session.observe(frame)
-        posterior = session.step(
-            observation, lambda cost, noted=noted: noting(cost, way != "full", noted)
-        )
-        measures.append(evaluator(posterior, first, observation.seconds))
-        for edges, full in noted if way == "edges" else ():
-            common = same_best(edges, full, plan.tracker.num_modes)
-            compared.append((rank_correlation(edges, full), common))
-    row = summarise(measures, thresholds, 1 / sequence.frame_rate)
-    return row, [pair for pair in compared if not math.isnan(pair[0])]
+    ways: dict[str, SequenceTracker] = {
+        "edges": Scoring(tracker, []),
+        "full": Scoring(tracker, None),
+        "random": replace(tracker, pattern=CovarianceScaled(covariance_scale=1.0)),
+    }
+    return {way: (settings, begin, plan._replace(tracker=each)) for way, each in ways.items()}
+
+
+def compared(scoring: SequenceTracker) -> list[tuple[float, float]]:
+    """Rank correlation of the two scores that were noted, and the share of the best in common."""
+    assert isinstance(scoring, Scoring)
+    assert scoring.noted is not None
+    pairs = [
+        (rank_correlation(edges, full), same_best(edges, full, scoring.num_modes))
+        for edges, full in scoring.noted
+    ]
+    return [pair for pair in pairs if not math.isnan(pair[0])]
 
 
 def main(config: Config) -> dict[str, Any]:
@@ -151,26 +195,31 @@ def main(config: Config) -> dict[str, Any]:
     rows, cells = {}, []
     for folder in config.sequences:
         sequence = read_sequence(folder)
-        for way in WAYS:
-            runs, compared = [], []
-            for seed in range(config.tracking.seed, config.tracking.seed + config.seeds):
-                run, pairs = follow(config, sequence, way, seed)
-                runs.append(run)
-                compared += pairs
-            row = over_seeds(runs)
-            row["rank_correlation"] = median(pair[0] for pair in compared) if compared else math.nan
-            row["same_best"] = median(pair[1] for pair in compared) if compared else math.nan
+        runs: dict[str, list[dict[str, Any]]] = {way: [] for way in WAYS}
+        pairs: list[tuple[float, float]] = []
+        for seed in range(config.tracking.seed, config.tracking.seed + config.seeds):
+            named = entrants(config, sequence, seed)
+            for way, row in side_by_side(sequence, named, config.frames):
+                runs[way].append(row)
+            pairs += compared(named["edges"][2].tracker)
+        for way, each in runs.items():
+            if not each:
+                continue
+            row = over_seeds(each)
+            if way == "edges" and pairs:
+                row["rank_correlation"] = median(pair[0] for pair in pairs)
+                row["same_best"] = median(pair[1] for pair in pairs)
             rows.setdefault(sequence.name, {})[way] = row
             error, nearest = row["root_aligned_mm"], row["root_aligned_best_of_modes_mm"]
             cells.append([
                 f"{sequence.name}: {way}", f"{row['lost']} of {row['seeds']}",
                 *(f"{middle:.0f} ({least:.0f} to {most:.0f})"
                   for middle, least, most in (error, nearest)),
-                row["rank_correlation"], row["same_best"], row["search_s_per_frame"][0],
+                row.get("rank_correlation"), row.get("same_best"),
             ])  # fmt: skip
     columns = (
         *("sequence: hypotheses", "lost", "best mode, mm", "best of modes, mm"),
-        *("rank correlation", "same best", "search, s/frame"),
+        *("rank correlation", "same best"),
     )
     table = Table("How hypotheses are scored and laid out", columns, cells)
     table.print()

@@ -13,17 +13,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from common import Table, start, write_report
-from tqdm import tqdm
+from common.side_by_side import Entrants, side_by_side
 
 from torchcss.cli.options import SettingsOptions
 from torchcss.inference.tracker import Tracker
-from torchcss.studies.comparison import Start, find_start, plan_of, track_together
-from torchcss.studies.evaluation import Thresholds, over_seeds, summarise
+from torchcss.studies.comparison import Start, find_start, plan_of
+from torchcss.studies.evaluation import over_seeds
 from torchcss.studies.sequences import RecordedSequence, read_sequence
 from torchcss.tracking.settings import Plan, Settings
 
@@ -90,9 +89,7 @@ EXCHANGES: dict[str, Callable[[Plan, Plan], Plan]] = {
 }  # fmt: skip
 
 
-def entrants(
-    config: Config, sequence: RecordedSequence, seed: int
-) -> dict[str, tuple[Settings, Start, Plan]]:
+def entrants(config: Config, sequence: RecordedSequence, seed: int) -> Entrants:
     """All trackers of a seed by name."""
     body = config.tracking.body if sequence.truth is None else sequence.truth.body.name
     found: dict[str, tuple[Settings, Start, Plan]] = {}
@@ -110,34 +107,19 @@ def entrants(
     return found
 
 
-def advance(bar: tqdm, *_: int) -> None:
-    """A frame is done."""
-    bar.update()
-
-
 def main(config: Config) -> dict[str, Any]:
     """Run, print, write; return what is written."""
     rows, cells = {}, []
     for folder in config.sequences:
         sequence = read_sequence(folder)
-        thresholds, runs, names = Thresholds.of(sequence), {}, []
-        stop = min(config.frames, sequence.num_frames)
+        runs: dict[str, list[dict[str, Any]]] = {}
         for seed in range(config.tracking.seed, config.tracking.seed + config.seeds):
             named = entrants(config, sequence, seed)
-            names = list(named)
-            with tqdm(total=stop, desc=f"{sequence.name}, seed {seed}", dynamic_ncols=True) as bar:
-                for run in track_together(
-                    sequence, list(named.values()), thresholds, stop=stop,
-                    progress=partial(advance, bar),
-                ):  # fmt: skip
-                    row = {"ended": run.ended}
-                    if run.measures:
-                        row |= summarise(run.measures, thresholds, 1 / sequence.frame_rate)
-                        runs.setdefault(names[run.number], []).append(row)
-        rows[sequence.name] = {name: over_seeds(each) for name, each in runs.items()}
-        for name in names:
-            if (row := rows[sequence.name].get(name)) is None:
-                continue
+            runs |= {name: runs.get(name, []) for name in named}
+            for name, row in side_by_side(sequence, named, config.frames):
+                runs[name].append(row)
+        rows[sequence.name] = {name: over_seeds(each) for name, each in runs.items() if each}
+        for name, row in rows[sequence.name].items():
             spread = (
                 f"{middle:.0f} ({least:.0f} to {most:.0f})"
                 for middle, least, most in (

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import torchcss
-from torchcss.app.detect import detect_video, looked_at, masks_of
+from torchcss.app.detect import detect_video, is_detected, masks_of
 from torchcss.app.view_files import Selection, open_view
 from torchcss.errors import KeypointError
 from torchcss.io.detect import Detected
@@ -30,10 +30,10 @@ class Crowd:
     relative_noise = 1.5
 
     def __init__(self, places: list[list[tuple[float, float, float]]]) -> None:
-        self.places, self.closed, self.looked_at = places, False, []
+        self.places, self.closed, self.asked = places, False, []
 
     def detect(self, frame: Frame) -> Detected:
-        self.looked_at.append(frame.index)
+        self.asked.append(frame.index)
         spread = np.random.default_rng(0).uniform(-1, 1, (17, 2))
         people = [
             np.column_stack([(x, y) + size * spread, np.full(17, 0.9)])
@@ -138,12 +138,12 @@ def test_a_video_alone_is_tracked(
     assert "as given" in notes
 
 
-def test_frames_that_nobody_asks_for_are_not_looked_at(files: Path, crowd: Crowd) -> None:
+def test_frames_that_nobody_asks_for_are_not_detected(files: Path, crowd: Crowd) -> None:
     path = detect_video(files / "video.mp4", files / "found.npz", detector=crowd, start=1, stop=2)
-    assert crowd.looked_at == [1]
-    assert looked_at(path, 2)
-    assert not looked_at(path, 3)
-    assert not looked_at(path, None)
+    assert crowd.asked == [1]
+    assert is_detected(path, 2)
+    assert not is_detected(path, 3)
+    assert not is_detected(path, None)
     seen = read(path, "largest", frame=1).confidence.amax(-1) > 0
     assert seen.tolist() == [False, True, False]
     given = ViewFiles(video=files / "video.mp4", keypoints=path, masks=masks_of(path))
@@ -151,10 +151,10 @@ def test_frames_that_nobody_asks_for_are_not_looked_at(files: Path, crowd: Crowd
     (mask,) = [frame.mask for frame in view.images()]
     assert mask is not None
     assert mask[24].mean() > 200 > mask[40].mean()
-    assert looked_at(files / "nowhere.npz", 9)
+    assert is_detected(files / "nowhere.npz", 9)
     for stop in (None, 9):  # beyond the end
         path = detect_video(files / "video.mp4", files / "all.npz", detector=crowd, stop=stop)
-        assert looked_at(path, None)
+        assert is_detected(path, None)
 
 
 def test_who_goes_on_further_looks_further(
@@ -165,12 +165,12 @@ def test_who_goes_on_further_looks_further(
     options = torchcss.TrackOptions(person="leftmost", fov=60.0)
     video, out = files / "video.mp4", files / "out"
     run = torchcss.track_video(video, out=out, settings=settings, options=options, stop=2)
-    assert crowd.looked_at == [0, 1]
+    assert crowd.asked == [0, 1]
     assert len(run.track.frames) == 2
-    crowd.looked_at.clear()
+    crowd.asked.clear()
     again = replace(options, resume=True)
     run = torchcss.track_video(video, out=out, settings=settings, options=again, stop=2)
-    assert crowd.looked_at == []
+    assert crowd.asked == []
     run = torchcss.track_video(video, out=out, settings=settings, options=again)
-    assert crowd.looked_at == [0, 1, 2]
+    assert crowd.asked == [0, 1, 2]
     assert len(run.track.frames) == 3

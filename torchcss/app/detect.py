@@ -56,7 +56,7 @@ def detect_video(
         options: What finds them.
         frame_rate: Frames per second of a folder of images; None: 30.
         detector: A detector that is loaded already.
-        start: First frame to look at; nobody is known in those before.
+        start: First frame given to the detector; nobody is known in those before.
         stop: Frame before which to end; nobody is known in those from there on.
 
     Returns:
@@ -92,11 +92,11 @@ def detect_video(
 
 
 _TO_THE_END = -1
-"""End of the frames that were looked at where they are all up to the video's end."""
+"""End of the detector's frames where they are all up to the video's end."""
 
 
-def looked_at(keypoints: Path, stop: int | None) -> bool:
-    """Whether all frames before one were looked at for a file of keypoints.
+def is_detected(keypoints: Path, stop: int | None) -> bool:
+    """Whether a file of keypoints was made from all frames before one.
 
     True for a file that `detect_video` has not written: there are no others to be had.
 
@@ -154,7 +154,7 @@ def write_people(
         frames: The people of every frame.
         detector: What found them.
         image_size_wh: Size of the images.
-        seen: First frame that was looked at, and the one after the last or `_TO_THE_END`.
+        seen: First frame given to the detector, and the one after the last or `_TO_THE_END`.
     """
     ids = identified([found.joints for found in frames])
     count = 1 + max((number for people in ids for number in people), default=0)

@@ -20,7 +20,7 @@ import torch
 from tqdm import tqdm
 
 from torchcss.app.claims import Claim
-from torchcss.app.detect import DetectOptions, detect_video, looked_at, masks_of
+from torchcss.app.detect import DetectOptions, detect_video, is_detected, masks_of
 from torchcss.app.init import initialise_video
 from torchcss.app.lens import Lens, fitted
 from torchcss.app.lock import locked
@@ -226,7 +226,7 @@ def _detect_further(run: Run, selection: Selection, options: TrackOptions) -> No
     found = (run.folder / _KEYPOINTS_NAME).resolve()
     if own is None or own.keypoints is None or own.keypoints.resolve() != found:
         return
-    if not looked_at(own.keypoints, selection.stop):
+    if not is_detected(own.keypoints, selection.stop):
         _detect(own.video, own.keypoints, selection, replace(options, frame_rate=own.frame_rate))
 
 

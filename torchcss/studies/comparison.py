@@ -132,18 +132,20 @@ def track_together(
         )
         for number, (settings, begin, *plan) in enumerate(runs)
     ]
-    # Sight and one session that sees for all who share it; that session's own run may end.
-    eyes = {key: session for _, session, _ in going if (key := sight(session)) is not None}
+    # Of sessions that see the same, one observes for all, even after its own run has ended.
+    observers = {
+        key: session for _, session, _ in going if (key := observation_key(session)) is not None
+    }
     first: Frame | None = None
     for frame in reader:
         first = first or frame
-        used = {sight(session) for _, session, _ in going}
-        seen = {key: each.observe(frame) for key, each in eyes.items() if key in used}
+        used = {observation_key(session) for _, session, _ in going}
+        seen = {key: each.observe(frame) for key, each in observers.items() if key in used}
         left = []
         for run, session, evaluator in going:
             ended = None
             try:
-                observation = seen.get(sight(session)) or session.observe(frame)
+                observation = seen.get(observation_key(session)) or session.observe(frame)
                 posterior = session.step(observation)
                 run.measures.append(evaluator(posterior, first, observation.seconds))
             except (TorchcssError, RuntimeError, ArithmeticError) as error:
@@ -164,7 +166,7 @@ def track_together(
         yield run
 
 
-def sight(session: TrackingSession) -> Hashable | None:
+def observation_key(session: TrackingSession) -> Hashable | None:
     """What the features of a picture depend on, the same where two sessions see the same.
 
     None where a session looks only where its own body can be: nobody else sees what it sees.
