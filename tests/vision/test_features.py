@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from torchcss.errors import ConfigurationError, ShapeError
+from torchcss.kernels import compiler
 from torchcss.vision.boundaries import motion_boundaries
 from torchcss.vision.camera import Camera
 from torchcss.vision.edges import EdgeConfiguration, edge_features, foreground_weight
@@ -314,3 +315,18 @@ def test_in_a_window_features_are_those_of_the_whole_but_for_its_border() -> Non
     for unknown in (part.flow_outlier, part.motion_boundary):
         assert unknown is not None
         assert bool((unknown[outside] == 1).all())
+
+
+@pytest.mark.skipif(not compiler.COMPILED, reason="numba is not installed")
+@pytest.mark.parametrize("working_size", [20, 47, 63])
+def test_whole_numbers_shrink_as_their_twin_in_torch(
+    picture: torch.Tensor, working_size: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    extractor = FeatureExtractor(working_size=working_size, colour=True)
+    opaque = torch.cat([picture, picture[..., :1]], dim=-1)
+    kinds = [picture, picture[..., 0], opaque, picture.numpy().astype(np.uint16) * 257]
+    compiled = [extractor(kind).colour for kind in kinds]
+    monkeypatch.setattr(compiler, "COMPILED", False)
+    for got, kind in zip(compiled, kinds, strict=True):
+        assert got is not None
+        torch.testing.assert_close(got, extractor(kind).colour, rtol=0, atol=1e-6)

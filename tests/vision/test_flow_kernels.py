@@ -68,3 +68,18 @@ def test_nothing_to_go_by_is_no_motion(generator):
     constancy = flow._Constancy(torch.zeros(1, 2, 4, 5), zero, zero)
     got = flow._solve(start, constancy, zero, zero[..., 1:], zero[..., 1:, :], 20)
     assert torch.equal(got, start)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_linearised_brightness(size, monkeypatch, generator):
+    """Also where pixels leave the image, far and near, and where there is no gradient."""
+    first, second = torch.rand(2, 2, 3, *size, generator=generator)
+    first[0, 1:], second[0, 1:] = 0.0, 0.0
+    moves = 3 * torch.randn(2, 2, *size, generator=generator)
+    moves[1, 0, 0, 0] = -100.0
+    got, expected = both(monkeypatch, lambda: flow._linearise(moves, first, second))
+    assert torch.equal(got.visible, expected.visible)
+    assert not got.gradient[0].any()
+    torch.testing.assert_close(got.gradient, expected.gradient, rtol=0, atol=2e-5)
+    expected_residual = flow._residual(expected, moves)
+    torch.testing.assert_close(flow._residual(got, moves), expected_residual, rtol=1e-5, atol=1e-4)

@@ -60,10 +60,13 @@ def part_map(
     batch = vertices.shape[:-3]
     vertices = vertices.flatten(-3, -2).reshape(-1, vertices.shape[-3] * vertices.shape[-2], 3)
     seen = every.new_empty(len(vertices), height, width)
+    # A last entry for pixels that see no face, whose index is -1.
+    part_of_face = torch.arange(-1, body.num_parts, device=faces.device).roll(-1)
+    part_of_face = part_of_face.repeat_interleave(len(faces))
     for first in range(0, len(vertices), _POSES_AT_ONCE):
         uv, depth, valid = camera.project(some := vertices[first : first + _POSES_AT_ONCE])
         face = nearest_faces(uv, depth, every, height, width, valid=valid)
-        seen[first : first + len(some)] = torch.where(face >= 0, face // len(faces), face)
+        seen[first : first + len(some)] = part_of_face[face]
     return seen.reshape(*batch, height, width)
 
 

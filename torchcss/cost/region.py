@@ -128,17 +128,17 @@ def region_masks(
     # A last entry for pixels that see no part, whose index is -1.
     layer_of_part = torch.tensor((*layer_of, -1), device=body.tie.device)
 
-    def pixels(girth: float) -> Tensor:
-        seen = layer_of_part[part_map(body, state, camera, girth=girth)]
-        return torch.stack([seen == layer for layer in range(len(names))])
+    def seen(girth: float) -> Int[Tensor, "h w"]:
+        return layer_of_part[part_map(body, state, camera, girth=girth)]
 
-    whole = pixels(1.0)
-    core, around = torch.zeros_like(whole), torch.zeros_like(whole)
-    window = _window(whole.any(0), reach + _COARSE)
+    whole, layers = seen(1.0), torch.arange(len(names), device=body.tie.device)[:, None, None]
+    core = torch.zeros(len(names), *whole.shape, dtype=torch.bool, device=whole.device)
+    around = core.clone()
+    window = _window(whole >= 0, reach + _COARSE)
     if window is None:
         return core, around
-    own = whole[window]
-    inner = own & pixels(_CORE)[window]
+    own = whole[window] == layers
+    inner = own & (seen(_CORE)[window] == layers)
     if fitted:
         inner |= ~grow(~own, _BODY_MARGIN if has_root(body) else _ARM_MARGIN)
     small = inner.flatten(1).sum(1) < _CORE_PIXELS

@@ -25,11 +25,12 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 from torch.nn import functional
 
 from torchcss.errors import ConfigurationError, ShapeError
+from torchcss.kernels import compiler
 from torchcss.vision.boundaries import motion_boundaries
 from torchcss.vision.camera import Camera
 from torchcss.vision.edges import EdgeConfiguration, edge_features, foreground_weight
@@ -310,7 +311,7 @@ class FeatureExtractor(nn.Module):
         planes = picture[None] if grey else picture[..., :3].permute(2, 0, 1)
         planes = planes.to(self.luma.device)
         if picture.dtype in _WHITE:
-            small = self._resized(planes.to(torch.float32, memory_format=torch.contiguous_format))
+            small = self._resized_whole(planes)
             return (small.to(self.luma) / _WHITE[picture.dtype]).clamp(0.0, 1.0)
         planes = planes.to(self.luma).contiguous()
         least, greatest = (float(bound) for bound in planes.aminmax())
@@ -320,6 +321,26 @@ class FeatureExtractor(nn.Module):
                 "divide by the value of white"
             )
         return self._resized(planes.clamp(0.0, 1.0)).clamp(0.0, 1.0)
+
+    def _resized_whole(self, planes: Int[Tensor, "c h w"]) -> Float[Tensor, "c y x"]:
+        """Planes of whole numbers at the working size, in single precision."""
+        height, width = planes.shape[-2:]
+        new_width, new_height = self.working_shape(width, height)
+        compiled = compiler.COMPILED and not torch.compiler.is_compiling()
+        if (
+            not compiled
+            or planes.device.type != "cpu"
+            or (new_width, new_height) == (width, height)
+        ):
+            return self._resized(planes.to(torch.float32, memory_format=torch.contiguous_format))
+        from torchcss.vision.shrink_kernels import shrink, triangles
+
+        small = torch.empty(len(planes), new_height, new_width, dtype=torch.float32)
+        pixels = planes.permute(1, 2, 0).contiguous().flatten(1).numpy()
+        row = np.empty(pixels.shape[1], np.float32)
+        rows, columns = triangles(height, new_height), triangles(width, new_width)
+        shrink(pixels, *rows, *columns, row, small.numpy())
+        return small
 
     def _resized(self, planes: Float[Tensor, "c h w"]) -> Float[Tensor, "c y x"]:
         height, width = planes.shape[-2:]

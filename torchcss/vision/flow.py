@@ -316,16 +316,14 @@ def _refine(
     configuration: FlowConfiguration,
 ) -> Float[Tensor, "b 2 h w"]:
     """Minimise on one level."""
-    first, second = frames[:, :1], frames[:, 1:]
-    first_gradient = _gradient(first)
-    second_and_gradient = torch.cat([second, _gradient(second)], dim=1)
+    first, second = (torch.cat([f, _gradient(f)], dim=1) for f in frames.split(1, dim=1))
     factors = configuration.sigma_factors
     for warp in range(configuration.num_warps):
         factor = factors[warp * len(factors) // configuration.num_warps]
         data = _of_scale(configuration.data, factor * configuration.data.sigma)
         smoothness = _of_scale(configuration.smoothness, factor * configuration.smoothness.sigma)
         weakest = _WEAKEST_LINK * smoothness.nu / smoothness.sigma**2
-        constancy = _linearise(flow, first, first_gradient, second_and_gradient)
+        constancy = _linearise(flow, first, second)
         for _ in range(configuration.num_reweightings):
             weight = data(_residual(constancy, flow).square()).first * constancy.visible
             right, down = (
@@ -351,16 +349,11 @@ def _of_scale(potential: Potential, sigma: float) -> Potential:
 
 def _gradient(image: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 2 h w"]:
     """Derivatives along u and v, exact for polynomials of degree four."""
-    kernel = image.new_tensor([1.0, -8.0, 0.0, 8.0, -1.0]) / 12.0
-    along_u = functional.pad(image, (2, 2, 0, 0), mode="replicate")
-    along_v = functional.pad(image, (0, 0, 2, 2), mode="replicate")
-    return torch.cat(
-        [
-            functional.conv2d(along_u, kernel.view(1, 1, 1, 5)),
-            functional.conv2d(along_v, kernel.view(1, 1, 5, 1)),
-        ],
-        dim=1,
-    )
+    u = functional.pad(image, (2, 2, 0, 0), mode="replicate")
+    v = functional.pad(image, (0, 0, 2, 2), mode="replicate")
+    along_u = 8 * (u[..., 3:-1] - u[..., 1:-3]) + u[..., :-4] - u[..., 4:]
+    along_v = 8 * (v[..., 3:-1, :] - v[..., 1:-3, :]) + v[..., :-4, :] - v[..., 4:, :]
+    return torch.cat([along_u, along_v], dim=1) / 12
 
 
 def _sample(
@@ -380,16 +373,31 @@ def _sample(
 
 def _linearise(
     flow: Float[Tensor, "b 2 h w"],
-    first: Float[Tensor, "b 1 h w"],
-    first_gradient: Float[Tensor, "b 2 h w"],
-    second_and_gradient: Float[Tensor, "b 3 h w"],
+    first: Float[Tensor, "b 3 h w"],
+    second: Float[Tensor, "b 3 h w"],
 ) -> _Constancy:
-    """Warp the second frame; the gradient is the mean of both frames', zero where it is noise."""
-    warped, visible = _sample(second_and_gradient, flow)
-    gradient = 0.5 * (first_gradient + warped[:, 1:])
+    """Warp the second frame; the gradient is the mean of both frames', zero where it is noise.
+
+    Args:
+        flow: Where pixels go.
+        first: Grey levels of the first frame, and their gradient.
+        second: The same of the other.
+    """
+    if has_kernels(flow):
+        from torchcss.vision import flow_kernels
+
+        gradient = torch.empty_like(flow, memory_format=torch.contiguous_format)
+        offset = torch.empty_like(gradient[:, :1])
+        found = _Constancy(gradient, offset, torch.empty_like(offset))
+        for x, one, two, to, (rest,), (seen,) in zip(flow, first, second, *found, strict=True):
+            x, one, two, to, rest, seen = (a.numpy() for a in (x, one, two, to, rest, seen))
+            flow_kernels.linearise(x, one, two, _ROUNDING**2, to, rest, seen)
+        return found
+    warped, visible = _sample(second, flow)
+    gradient = 0.5 * (first[:, 1:] + warped[:, 1:])
     seen = gradient.square().sum(dim=1, keepdim=True) > _ROUNDING**2
     gradient = torch.where(seen, gradient, 0.0)
-    offset = warped[:, :1] - first - (gradient * flow).sum(dim=1, keepdim=True)
+    offset = warped[:, :1] - first[:, :1] - (gradient * flow).sum(dim=1, keepdim=True)
     return _Constancy(gradient, offset, visible)
 
 

@@ -41,6 +41,69 @@ def make_memory(height: int, width: int) -> Memory:
     return Memory(np.empty((height, width), np.float32), inside[0], border, *inside[1:])
 
 
+@inlined
+def _near(t):  # type: ignore[no-untyped-def]
+    """Cubic convolution with the slope -3/4 at one, at a distance up to one."""
+    return (1.25 * t - 2.25) * t * t + 1.0
+
+
+@inlined
+def _far(t):  # type: ignore[no-untyped-def]
+    """The same at a distance from one to two."""
+    return ((-0.75 * t + 3.75) * t - 6.0) * t + 3.0
+
+
+@entry
+def linearise(flow, first, second, least, gradient, offset, visible):  # type: ignore[no-untyped-def]
+    """Warp the second frame and linearise constant brightness, see `torchcss.vision.flow`.
+
+    Args:
+        flow: `[2 h w]`, single precision, finite.
+        first: Grey levels of the first frame and their gradient, `[3 h w]`.
+        second: The same of the second frame.
+        least: Square of the least gradient that is not rounding.
+        gradient: Becomes the mean of both frames' gradients, `[2 h w]`.
+        offset: Becomes the residual less gradient times flow, `[h w]`.
+        visible: Becomes 1 where the pixel goes to a place in the image, else 0.
+    """
+    height, width = offset.shape
+    # Beyond these ends of the image, in its own precision, all that is sampled is its border.
+    right, bottom = np.float32(width - 0.5), np.float32(height - 0.5)
+    for row in range(height):
+        for c in range(width):
+            u, v = flow[0, row, c] + np.float32(c), flow[1, row, c] + np.float32(row)
+            inside = u >= -0.5 and u <= right and v >= -0.5 and v <= bottom
+            visible[row, c] = np.float32(1 if inside else 0)
+            u, v = min(max(u, -3.0), right + 3.0), min(max(v, -3.0), bottom + 3.0)
+            left, top = floor(u), floor(v)  # type: ignore[arg-type]
+            s, t = u - left, v - top
+            x, y = int(left), int(top)
+            x0, x1 = min(max(x - 1, 0), width - 1), min(max(x, 0), width - 1)
+            x2, x3 = min(max(x + 1, 0), width - 1), min(max(x + 2, 0), width - 1)
+            a0, a1, a2, a3 = _far(s + 1.0), _near(s), _near(1.0 - s), _far(2.0 - s)
+            level, to_u, to_v = np.float32(0), np.float32(0), np.float32(0)
+            for tap in range(4):
+                k = min(max(y - 1 + tap, 0), height - 1)
+                if tap == 0:
+                    share = _far(t + 1.0)
+                elif tap == 1:
+                    share = _near(t)
+                elif tap == 2:
+                    share = _near(1.0 - t)
+                else:
+                    share = _far(2.0 - t)
+                a, b, d = second[0, k], second[1, k], second[2, k]
+                level += share * (a0 * a[x0] + a1 * a[x1] + a2 * a[x2] + a3 * a[x3])
+                to_u += share * (a0 * b[x0] + a1 * b[x1] + a2 * b[x2] + a3 * b[x3])
+                to_v += share * (a0 * d[x0] + a1 * d[x1] + a2 * d[x2] + a3 * d[x3])
+            to_u, to_v = 0.5 * (first[1, row, c] + to_u), 0.5 * (first[2, row, c] + to_v)
+            if not to_u * to_u + to_v * to_v > least:
+                to_u, to_v = np.float32(0), np.float32(0)
+            gradient[0, row, c], gradient[1, row, c] = to_u, to_v
+            along = to_u * flow[0, row, c] + to_v * flow[1, row, c]
+            offset[row, c] = level - first[0, row, c] - along
+
+
 @kernel
 def _apply(x, q, degree, right, down, product):  # type: ignore[no-untyped-def]
     """Matrix times vector, inside a border of zeros; returns their inner product."""

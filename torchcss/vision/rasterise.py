@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchcss.errors import ShapeError, check_shape
+from torchcss.kernels import compiler
 
 _NEAREST_DEPTH = 1e-6
 """Metres; a vertex at or behind this depth is behind the camera."""
@@ -160,7 +161,7 @@ def nearest_faces(
     drawn, _ = _drawn(place, distance, every, valid.flatten())
     nearest = _nearest_faces(place, distance, every, drawn, height, width, pictures=pictures)
     nearest = nearest.view(pictures, height, width)
-    return torch.where(nearest >= 0, nearest % len(faces), nearest)
+    return nearest if pictures == 1 else nearest.where(nearest < 0, nearest % len(faces))
 
 
 def _drawn(
@@ -202,6 +203,29 @@ def _nearest_faces(
 
     Of several pictures each has as many of the `faces`, one after the other.
     """
+    if compiler.COMPILED and place.device.type == "cpu" and not torch.compiler.is_compiling():
+        from torchcss.vision.rasterise_kernels import draw  # compiled: only where it is used
+
+        near = torch.full((pictures, height, width), -1, dtype=torch.float32)
+        seen = torch.full_like(near, -1, dtype=torch.long)
+        corners, depths = place.contiguous().numpy(), distance.contiguous().numpy()
+        triangles, per_picture = faces.contiguous().numpy(), faces.shape[0] // pictures
+        draw(corners, depths, triangles, drawn.numpy(), per_picture, near.numpy(), seen.numpy())
+        return seen.flatten()
+    return _by_spans(place, distance, faces, drawn, height, width, pictures=pictures)
+
+
+def _by_spans(
+    place: Float[Tensor, "v 2"],
+    distance: Float[Tensor, " v"],
+    faces: Int[Tensor, "f 3"],
+    drawn: Int[Tensor, " d"],
+    height: int,
+    width: int,
+    *,
+    pictures: int = 1,
+) -> Int[Tensor, " bhw"]:
+    """The same in torch: spans of all triangles, and the nearest of them on every pixel."""
     corner, inverse = place[faces[drawn]], 1 / distance[faces[drawn]]
     order = corner[..., 1].argsort(-1)
     inverse = inverse.gather(-1, order)

@@ -22,42 +22,47 @@ from torch.nn import functional
 
 from torchcss.errors import ShapeError, check_shape
 
-_WIDE = 4.0
-"""Standard deviation, pixels, from which a product of matrices is quicker than a convolution."""
+_BLOCK = 64
+"""Pixels of a row that are blurred by one product of matrices."""
 
 
 def gaussian_blur(image: Float[Tensor, "*batch h w"], sigma: float) -> Float[Tensor, "*batch h w"]:
     """Blur with a Gaussian cut at three standard deviations, the border replicated.
+
+    Rows, then columns, are blurred in blocks, each by a product with one band matrix: that takes a
+    fifth of the time of a convolution.
 
     Args:
         image: Any number of images.
         sigma: Standard deviation, pixels.
     """
     height, width = image.shape[-2:]
-    if sigma < _WIDE:
-        from kornia.filters import gaussian_blur2d
-
-        size = 2 * math.ceil(3.0 * sigma) + 1
-        flat = image.reshape(-1, 1, height, width)
-        sigmas = flat.new_tensor([[sigma, sigma]])
-        blurred = gaussian_blur2d(flat, (size, size), sigmas, border_type="replicate")
-        return blurred.reshape(image.shape)
-    down, along = _blur_matrix(height, sigma).to(image), _blur_matrix(width, sigma).to(image)
-    return down @ image @ along.T
+    band = _band(sigma).to(image)
+    size, radius = len(band), (len(band) - _BLOCK) // 2
+    missing = [-length % _BLOCK for length in (width, height)]
+    sides = (radius, radius + missing[0], radius, radius + missing[1])
+    padded = functional.pad(image.reshape(-1, 1, height, width), sides, mode="replicate")[:, 0]
+    # Contiguous: of blocks that overlap the products would be made one by one.
+    rows = (padded.unfold(-1, size, _BLOCK).contiguous() @ band).flatten(-2)
+    columns = rows.unfold(-2, size, _BLOCK).mT.contiguous()
+    blurred = (band.T.contiguous() @ columns).flatten(-3, -2)
+    return blurred[:, :height, :width].reshape(image.shape)
 
 
 @lru_cache(maxsize=32)
-def _blur_matrix(length: int, sigma: float) -> Float[Tensor, "n n"]:
-    """What `gaussian_blur` does to a row of pixels.
+def _band(sigma: float) -> Float[Tensor, "n m"]:
+    """What makes `_BLOCK` blurred pixels of these and as many beside them as the Gaussian reaches.
 
-    A product of matrices takes a fraction of the time of a convolution with a wide kernel.
+    Args:
+        sigma: Standard deviation, pixels.
     """
     radius = math.ceil(3.0 * sigma)
-    offset = torch.arange(-radius, radius + 1)
-    weight = (-0.5 * (offset.double() / sigma).square()).exp()
-    source = (torch.arange(length)[:, None] + offset).clamp(0, length - 1)
-    matrix = torch.zeros(length, length, dtype=torch.float64)
-    return matrix.scatter_add_(1, source, (weight / weight.sum()).expand(length, -1))
+    weight = (-0.5 * (torch.arange(-radius, radius + 1).double() / sigma).square()).exp()
+    pixel = torch.arange(_BLOCK)
+    band = torch.zeros(_BLOCK + 2 * radius, _BLOCK, dtype=torch.float64)
+    for place, share in enumerate(weight / weight.sum()):
+        band[pixel + place, pixel] = share
+    return band
 
 
 def sample_bilinear(

@@ -88,12 +88,13 @@ class SplineField(NamedTuple):
         column, u = _cell(uv[..., 0].flatten(), width)
         row, v = _cell(uv[..., 1].flatten(), height)
         along_u, along_v = _basis(u, num_derivatives), _basis(v, num_derivatives)
-        flat, first = self.coefficients.to(uv).flatten(), row * width + column
+        flat, first = self.coefficients.flatten(), row * width + column
         if layer is not None:
             first = first + (height * width * layer).expand(uv.shape[:-1]).flatten().int()
         sums: list[list[Tensor]] = [[] for _ in along_u]
         for down in range(4):
-            taps = [flat.index_select(0, first + (down * width + right)) for right in range(4)]
+            rows = [flat.index_select(0, first + (down * width + right)) for right in range(4)]
+            taps = [tap.to(uv) for tap in rows]  # converted are the few that are looked at
             for into, weights in zip(sums, along_u, strict=True):
                 into.append(_dot(weights, taps))
         return sums, along_v

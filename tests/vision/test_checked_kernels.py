@@ -1,0 +1,47 @@
+"""No kernel of vision reaches beyond an array, in a process that checks every index."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from torchcss.kernels import compiler
+
+CHECK = """
+import numpy as np
+from torchcss.kernels import compiler
+from torchcss.kernels.checked import run
+from torchcss.vision import flow_kernels, rasterise_kernels, shrink_kernels
+
+assert compiler.CHECKED
+rng, single = np.random.default_rng(0), np.float32
+
+for size in ((1, 1), (3, 4), (9, 1)):
+    moves = (20 * rng.standard_normal((2, *size))).astype(single)
+    first, second = rng.random((2, 3, *size)).astype(single)
+    found = np.zeros((2, *size), single), *np.zeros((2, *size), single)
+    run(flow_kernels.linearise, moves, first, second, 1e-10, *found)
+
+for height, width, y, x in ((7, 5, 3, 2), (9, 9, 8, 8), (50, 3, 7, 1), (33, 64, 32, 63)):
+    pixels = rng.integers(0, 255, (height, 3 * width)).astype(np.uint8)
+    weights = *shrink_kernels.triangles(height, y), *shrink_kernels.triangles(width, x)
+    row, small = np.zeros(3 * width, single), np.zeros((3, y, x), single)
+    run(shrink_kernels.shrink, pixels, *weights, row, small)
+
+place, distance = 40 * rng.random((30, 2)) - 10, rng.random(30) + 0.5
+near, seen = np.full((1, 17, 19), -1, single), np.full((1, 17, 19), -1)
+faces = np.arange(30).reshape(-1, 3)
+run(rasterise_kernels.draw, place, distance, faces, np.arange(10), 10, near, seen)
+print("checked")
+"""
+
+
+@pytest.mark.skipif(not compiler.AVAILABLE, reason="numba is not installed")
+def test_no_index_is_out_of_range() -> None:
+    environment = {**os.environ, "TORCHCSS_CHECK_KERNELS": "1"}
+    run = [sys.executable, "-c", CHECK]
+    done = subprocess.run(run, env=environment, capture_output=True, text=True, check=False)
+    assert done.stdout == "checked\n", done.stderr
