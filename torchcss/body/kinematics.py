@@ -264,7 +264,7 @@ class KinematicTree(nn.Module):
         for level, place, constant, c, s, d in zip(
             self._levels, *(part.split(sizes) for part in parts), strict=True
         ):
-            x, y, z, t = _followed_by(frames[place], constant).split(1, dim=2)
+            x, y, z, t = _followed_by(frames[place], constant).chunk(4, dim=2)
             if level.turns:
                 x, y = torch.addcmul(c * x, s, y), torch.addcmul(c * y, s, x, value=-1)
             if level.slides:
@@ -318,8 +318,8 @@ def _followed_by(
 
     A matrix product would take as long, and round the same item differently in other batches.
     """
-    rows = constant[:, None, :, :, None].unbind(2)
-    product = frames[:, :, :1] * rows[0]
-    for column, row in zip(frames[:, :, 1:].split(1, dim=2), rows[1:], strict=True):
+    rows, (first, *columns) = constant[:, None, :, :, None].unbind(2), frames.chunk(4, dim=2)
+    product = first * rows[0]
+    for column, row in zip(columns, rows[1:], strict=True):
         product = torch.addcmul(product, column, row)
     return product

@@ -317,28 +317,29 @@ def _best_combinations(
         x: Poses: `t` trunks, each with its limbs in `w` ways.
         num: How many combinations to keep.
     """
-    num_trunks, num_ways, _ = x.shape
-    base = cost.value(x[:, 0])
-    extra = x.new_zeros(num_trunks, len(segments.limbs), num_ways)
-    for number, limb in enumerate(segments.limbs):
+    num_ways, limbs = x.shape[1], segments.limbs
+    # Each limb in each of its ways on the trunk with all other limbs in their first.
+    mixed = x[:, None, :1].repeat(1, len(limbs), num_ways, 1)
+    again = torch.zeros(mixed.shape[:-1], dtype=torch.bool, device=x.device)
+    for number, limb in enumerate(limbs):
         angles = x[:, :, limb.columns]
-        for way in range(1, num_ways):
-            mixed = x[:, 0].clone()
-            mixed[:, limb.columns] = angles[:, way]
-            apart = (angles[:, :way] - angles[:, way, None]).abs().amax(-1)
-            again = (apart < _SAME_ANGLE).any(-1)
-            extra[:, number, way] = torch.where(again, math.inf, cost.value(mixed) - base)
+        mixed[:, number, :, limb.columns] = angles
+        apart = (angles[:, :, None] - angles[:, None]).abs().amax(-1) < _SAME_ANGLE
+        again[:, number] = apart.tril(-1).any(-1)
+    value = cost.value(mixed)
+    base = value[:, 0, 0]
+    extra = torch.where(again, math.inf, value - base[:, None, None])
     combinations = torch.tensor(
-        list(itertools.product(range(num_ways), repeat=len(segments.limbs))), device=x.device
+        list(itertools.product(range(num_ways), repeat=len(limbs))), device=x.device
     )
     total = base[:, None].expand(-1, len(combinations))
-    for number in range(len(segments.limbs)):
+    for number in range(len(limbs)):
         total = total + extra[:, number, combinations[:, number]]
     flat = total.flatten().nan_to_num(math.inf)
     best = flat.argsort(stable=True)[:num]
     best = best[flat[best].isfinite()]
     trunk, chosen = best // len(combinations), combinations[best % len(combinations)]
     poses = x[trunk, 0].clone()
-    for number, limb in enumerate(segments.limbs):
+    for number, limb in enumerate(limbs):
         poses[:, limb.columns] = x[trunk, chosen[:, number]][:, limb.columns]
     return poses
