@@ -107,7 +107,7 @@ def test_several_modes_while_the_body_moves_in_depth(script: ModuleType, tmp_pat
     evidence = script.read_evidence(script.Config(failures=(path,), sequences=(folder,)))
     assert name in evidence.depth
     seen = script.multimodal("arm", "ijrr_css")(
-        script.Evidence(evidence.runs, {}, {}, {}, {}, {"arm": depth})
+        script.Evidence(evidence.runs, {}, {}, {}, {}, {}, {"arm": depth})
     )
     assert seen.holds
     assert "0.90 in the half" in seen.words
@@ -151,3 +151,38 @@ def test_other_reports_are_refused(script: ModuleType, tmp_path: Path) -> None:
         script.main(script.Config(table1=other))
     with pytest.raises(ConfigurationError, match=r"expected a report of hypothesis_scores\.py"):
         script.main(script.Config(scores=other))
+
+
+def test_a_variation_matters_beyond_the_spread_of_seeds(script: ModuleType, tmp_path: Path) -> None:
+    essential, more = (
+        "clavicles are essential for many motions of the arms",
+        "more modes and samples follow what was lost",
+    )
+    path = tmp_path / "variations.json"
+
+    def seen(held: float, many: float) -> dict[str, tuple[str, str]]:
+        def row(middle: float) -> dict[str, Any]:
+            return {"root_aligned_best_of_modes_mm": [middle, middle - 5, middle + 5]}
+
+        rows = {
+            "css: as it is": row(40.0), "css: clavicles at rest": row(held),
+            "ijrr_css: as it is": row(40.0), "ijrr_css: three times": row(many),
+        }  # fmt: skip
+        path.write_text(json.dumps({"by_sequence": {"arm": rows}}))
+        return verdicts(script.main(script.Config(variations=path)))
+
+    both = seen(46.0, 34.0)
+    assert both[essential] == (
+        "css, arm: 40 mm (35 to 45), clavicles at rest 46 (41 to 51)", "holds",
+    )  # fmt: skip
+    assert both[more][1] == "holds"
+    neither = seen(44.0, 36.0)
+    assert neither[essential][1] == neither[more][1] == "does not hold"
+    path.write_text(json.dumps({"by_sequence": {"arm": {"css: as it is": {}}}}))
+    found = verdicts(script.main(script.Config(variations=path)))
+    assert found[more] == (
+        "because no run of ijrr_css, three times, on arm is given", "not tested",
+    )  # fmt: skip
+    path.write_text("{}")
+    with pytest.raises(ConfigurationError, match="expected a report of model_variations"):
+        script.main(script.Config(variations=path))
