@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from weakref import ref
 
 import numpy as np
 import pytest
@@ -151,3 +153,21 @@ def test_an_index_out_of_range_is_refused() -> None:
     for index in ((2, 0), (0, -1), 2, -1):
         with pytest.raises(IndexError, match="of an axis of"):
             array[index]
+
+
+def test_what_is_packed_goes_with_its_frame(generator: torch.Generator) -> None:
+    """Else a run would keep the pictures of many frames."""
+    cost = colours_of(make_full_cost("arm8"))
+    x, frame = random_states(cost.body, 2, generator=generator), ref(cost.views[0])
+    engine = FusedEngine("float32")
+    packed = engine._view(cost, cost.past[0], cost.views[0])
+    engine.value(cost, x)
+    assert engine._view(cost, cost.past[0], cost.views[0]) is packed
+    for weight in range(20):
+        engine.value(cost.with_weights({"contour": float(weight)}), x)
+    assert len(engine._views._of[cost.views[0]]) < 20
+    del cost
+    gc.collect()
+    assert frame() is None
+    assert not len(engine._views._of)
+    assert not len(engine._priors._of)

@@ -15,6 +15,7 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -68,8 +69,8 @@ _IMAGES: dict[type[Any], tuple[str, Callable[..., Any]]] = {
 """Image terms that have a compiled twin: their field in `View`, and what packs them."""
 
 _PRIORS = (Stabiliser, Anthropometric, TemporalPrior, MixturePrior)
-_KEPT = 16
-"""Packed costs that are kept: those of a frame or two."""
+_KEPT = 8
+"""Packed costs that are kept of a frame, as long as that lives: with other terms and weights."""
 
 
 class _PackedView(NamedTuple):
@@ -90,6 +91,26 @@ class _Samples(NamedTuple):
     x: Array
     parent: Array | None
     component: Array | None
+
+
+class _Packs:
+    """What has been packed of frames that are still there, the latest few of each."""
+
+    def __init__(self) -> None:
+        self._of: WeakKeyDictionary[FrameContext, OrderedDict[Any, tuple[Any, Any]]] = (
+            WeakKeyDictionary()
+        )
+
+    def of(self, context: FrameContext, what: tuple[object, ...], make: Callable[[], Any]) -> Any:
+        """What is packed of a frame and of some other objects, packed now if it is not known."""
+        known = self._of.setdefault(context, OrderedDict())
+        # The objects are kept, so that no other one gets their numbers.
+        key = tuple(map(id, what))
+        if key not in known:
+            known[key] = (what, make())
+            if len(known) > _KEPT:
+                known.popitem(last=False)
+        return known[key][1]
 
 
 class Workspaces:
@@ -135,10 +156,7 @@ class FusedEngine:
 
     def __init__(self, dtype: Literal["float32", "float64"] = "float32") -> None:
         self.real: Any = np.float32 if dtype == "float32" else np.float64
-        self._views: OrderedDict[Any, tuple[Any, _PackedView | None, frozenset[str]]] = (
-            OrderedDict()
-        )
-        self._priors: OrderedDict[Any, tuple[Any, _PackedPrior, frozenset[str]]] = OrderedDict()
+        self._views, self._priors = _Packs(), _Packs()
 
     def value(self, cost: TrackingCost, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
         """Cost in nats; see `TrackingCost.value`."""
@@ -229,12 +247,7 @@ class FusedEngine:
         return left_out
 
     def _prior(self, cost: TrackingCost, past: FrameContext) -> tuple[_PackedPrior, frozenset[str]]:
-        key = (id(cost.choice), id(past))
-        if key not in self._priors:
-            self._priors[key] = ((cost.choice, past), *self._pack_prior(cost, past))
-            if len(self._priors) > _KEPT:
-                self._priors.popitem(last=False)
-        return self._priors[key][1:]
+        return self._priors.of(past, (cost.choice,), lambda: self._pack_prior(cost, past))
 
     def _pack_prior(
         self, cost: TrackingCost, past: FrameContext
@@ -284,13 +297,9 @@ class FusedEngine:
     def _view(
         self, cost: TrackingCost, past: FrameContext, context: FrameContext
     ) -> tuple[_PackedView | None, frozenset[str]]:
-        key = (id(cost.choice), id(past.body), id(context))
-        if key not in self._views:
-            keep = (cost.choice, past.body, context)
-            self._views[key] = (keep, *self._pack_view(cost, past, context))
-            if len(self._views) > _KEPT:
-                self._views.popitem(last=False)
-        return self._views[key][1:]
+        return self._views.of(
+            context, (cost.choice, past.body), lambda: self._pack_view(cost, past, context)
+        )
 
     def _pack_view(
         self, cost: TrackingCost, past: FrameContext, context: FrameContext
