@@ -15,7 +15,6 @@ hypotheses of a frame, and how many of the best k are the same.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
@@ -29,16 +28,14 @@ from torch import Tensor
 
 from torchcss.cli.options import SettingsOptions
 from torchcss.errors import ConfigurationError
-from torchcss.inference.grid_tracker import GridTracker
-from torchcss.inference.mixture import GaussianMixture
+from torchcss.inference.grid_tracker import GridTracker, by_edges
 from torchcss.inference.problem import SearchProblem
 from torchcss.inference.proposals import CovarianceScaled
-from torchcss.inference.tracker import SequenceTracker, TrackerInfo, TrackerState
 from torchcss.studies.comparison import find_start, plan_of
 from torchcss.studies.evaluation import over_seeds
 from torchcss.studies.sequences import RecordedSequence, read_sequence
 from torchcss.tracking.settings import Settings
-from torchcss.types import Bounds, CostFunction, LocalModel
+from torchcss.types import CostFunction, LocalModel
 
 WAYS = ("edges", "full", "random")
 TRACKING = Settings(preset="rr_multiple_hypothesis", overlay=False)
@@ -69,7 +66,7 @@ class Scores:
     Attributes:
         edges: What scores.
         full: The whole cost.
-        noted: Where the scores of both are kept, call by call.
+        noted: Where the scores of both are kept, frame by frame.
     """
 
     edges: CostFunction
@@ -78,9 +75,8 @@ class Scores:
 
     def value(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
         """The score, nats."""
-        both = self.edges.value(x), self.full.value(x)
-        self.noted.append(both)
-        return both[0]
+        self.noted.append((self.edges.value(x), self.full.value(x)))
+        return self.noted[-1][0]
 
     def local_model(self, x: Float[Tensor, "*batch n"]) -> LocalModel:
         """That of the cost which scores."""
@@ -92,60 +88,23 @@ class Scores:
 
 
 @dataclass(frozen=True)
-class Scoring:
-    """A tracker of Fig. 4 [RR] whose hypotheses are scored in another way.
+class Noting:
+    """Scores hypotheses as the paper does, and notes what the whole cost says of them.
 
     Attributes:
-        tracker: The tracker.
-        noted: Where the scores by edges and by the whole cost are kept; None: the latter scores.
+        noted: Where the scores of both are kept, frame by frame.
     """
 
-    tracker: GridTracker
-    noted: list[tuple[Tensor, Tensor]] | None
+    noted: list[tuple[Tensor, Tensor]]
 
-    @property
-    def num_samples(self) -> int:
-        """Those of the tracker."""
-        return self.tracker.num_samples
+    def __call__(self, problem: SearchProblem) -> CostFunction:
+        """What scores the hypotheses of a frame."""
+        return Scores(by_edges(problem), problem.cost, self.noted)
 
-    @property
-    def num_modes(self) -> int:
-        """Those of the tracker."""
-        return self.tracker.num_modes
 
-    @property
-    def stated_power(self) -> float:
-        """That of the tracker."""
-        return self.tracker.stated_power
-
-    def init(self, mixture: GaussianMixture, *, generator: torch.Generator) -> TrackerState:
-        """Start as the tracker does."""
-        return self.tracker.init(mixture, generator=generator)
-
-    def step(
-        self, state: TrackerState, problem: SearchProblem, bounds: Bounds, **rest: Any
-    ) -> tuple[TrackerState, TrackerInfo]:
-        """Step as the tracker does."""
-        return self.tracker.step(state, self._scored(problem), bounds, **rest)
-
-    def track(
-        self, state: TrackerState, problems: Iterable[SearchProblem], bounds: Bounds, **rest: Any
-    ) -> Iterator[tuple[TrackerState, TrackerInfo]]:
-        """Track as the tracker does."""
-        return self.tracker.track(state, map(self._scored, problems), bounds, **rest)
-
-    def _scored(self, problem: SearchProblem) -> SearchProblem:
-        """The problem, and those of its samples, with the other score."""
-        restrict, of_children, screening = problem.restrict, problem.of_children, None
-        if self.noted is not None and problem.screening is not None:
-            screening = Scores(problem.screening, problem.cost, self.noted)
-        return problem._replace(
-            screening=screening,
-            restrict=None if restrict is None else lambda items: self._scored(restrict(items)),
-            of_children=None
-            if of_children is None
-            else lambda *given: self._scored(of_children(*given)),
-        )
+def by_the_whole_cost(problem: SearchProblem) -> CostFunction:
+    """The frame's whole cost."""
+    return problem.cost
 
 
 def rank_correlation(first: Float[Tensor, " m"], second: Float[Tensor, " m"]) -> float:
@@ -162,8 +121,17 @@ def same_best(first: Float[Tensor, " m"], second: Float[Tensor, " m"], k: int) -
     return len(best[0] & best[1]) / max(1, min(k, len(first)))
 
 
-def entrants(config: Config, sequence: RecordedSequence, seed: int) -> Entrants:
-    """The trackers of a seed by how their hypotheses are scored and laid out."""
+def entrants(
+    config: Config, sequence: RecordedSequence, seed: int, noted: list[tuple[Tensor, Tensor]]
+) -> Entrants:
+    """The trackers of a seed by how their hypotheses are scored and laid out.
+
+    Args:
+        config: How to track.
+        sequence: What.
+        seed: The seed.
+        noted: Where the scores by edges and by the whole cost are kept.
+    """
     body = config.tracking.body if sequence.truth is None else sequence.truth.body.name
     settings = replace(config.tracking, body=body, seed=seed)
     begin = find_start(sequence, settings)
@@ -171,22 +139,17 @@ def entrants(config: Config, sequence: RecordedSequence, seed: int) -> Entrants:
     tracker = plan.tracker
     if not isinstance(tracker, GridTracker):
         raise ConfigurationError(f"--preset: expected one of [RR], got {settings.preset!r}")
-    ways: dict[str, SequenceTracker] = {
-        "edges": Scoring(tracker, []),
-        "full": Scoring(tracker, None),
+    ways = {
+        "edges": replace(tracker, scoring=Noting(noted)),
+        "full": replace(tracker, scoring=by_the_whole_cost),
         "random": replace(tracker, pattern=CovarianceScaled(covariance_scale=1.0)),
     }
     return {way: (settings, begin, plan._replace(tracker=each)) for way, each in ways.items()}
 
 
-def compared(scoring: SequenceTracker) -> list[tuple[float, float]]:
-    """Rank correlation of the two scores that were noted, and the share of the best in common."""
-    assert isinstance(scoring, Scoring)
-    assert scoring.noted is not None
-    pairs = [
-        (rank_correlation(edges, full), same_best(edges, full, scoring.num_modes))
-        for edges, full in scoring.noted
-    ]
+def compared(noted: list[tuple[Tensor, Tensor]], k: int) -> list[tuple[float, float]]:
+    """Rank correlation of two scores of the same, and the share of the best k in common."""
+    pairs = [(rank_correlation(*scores), same_best(*scores, k)) for scores in noted]
     return [pair for pair in pairs if not math.isnan(pair[0])]
 
 
@@ -198,10 +161,11 @@ def main(config: Config) -> dict[str, Any]:
         runs: dict[str, list[dict[str, Any]]] = {way: [] for way in WAYS}
         pairs: list[tuple[float, float]] = []
         for seed in range(config.tracking.seed, config.tracking.seed + config.seeds):
-            named = entrants(config, sequence, seed)
+            noted: list[tuple[Tensor, Tensor]] = []
+            named = entrants(config, sequence, seed, noted)
             for way, row in side_by_side(sequence, named, config.frames):
                 runs[way].append(row)
-            pairs += compared(named["edges"][2].tracker)
+            pairs += compared(noted, named["edges"][2].tracker.num_modes)
         for way, each in runs.items():
             if not each:
                 continue

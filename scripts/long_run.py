@@ -49,7 +49,7 @@ class Config:
     every: int = 100
     """Frames of a row."""
     tracking: SettingsOptions = TRACKING
-    """How to track; the body is the clip's, arm8."""
+    """How to track; the body is the clip's arm."""
     out: Path | None = None
     """JSON file to write."""
 
@@ -121,7 +121,7 @@ def main(config: Config) -> dict[str, Any]:
         track_video(
             films[config.frames], camera=CLIP / "cameras.json",
             keypoints=_keypoints_for(config.frames, work), out=work / "out",
-            settings=config.tracking,
+            settings=replace(config.tracking, body=DEMO_SETTINGS.body),
             options=TrackOptions(init=CLIP / "body.npz", layout=OWN_NAMES, live=watch),
         )  # fmt: skip
         size = (work / "out" / TRACK_NAME).stat().st_size / 1e6

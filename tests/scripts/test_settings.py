@@ -40,6 +40,8 @@ VARIED = {
     "failure_modes": {"body", "preset"},
     "hypothesis_scores": {"body"},
     "learn_weights": {"body", "weights"},
+    "long_run": {"body"},
+    "model_variations": {"body", "preset"},
     "printed_and_ours": {"body", "preset"},
     "several_views": set(),
     "track_quadruped": {"body"},
@@ -60,7 +62,7 @@ def arguments(folder: Path, script: str) -> list[str]:
     if script == "failure_modes":
         write_arm(folder / "arm", 3)
         return ["--sequence", str(folder / "arm"), "--presets", "css"]
-    if script in ("hypothesis_scores", "printed_and_ours"):
+    if script in ("hypothesis_scores", "model_variations", "printed_and_ours"):
         write_arm(folder / "arm", 3)
         return ["--sequences", str(folder / "arm")]
     if script == "evaluate_posterior":
@@ -76,6 +78,7 @@ def arguments(folder: Path, script: str) -> list[str]:
     return {
         "benchmark_batch": ["--sequences", "1", "--frames", "1"],
         "ablation": ["--rows", "+ region", "--frames", "2", "--seeds", "1"],
+        "long_run": ["--frames", "2", "--opened", "2"],
         "learn_weights": ["--frames", "2", "--epochs", "1", "--starts", "1",
                           "--learnt", "contour", "region"],
         "several_views": ["--data", str(folder), "--what", "balance_beam_4cam"],
@@ -109,6 +112,9 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Settings]:
     def catch_video(*rest: object, settings: Settings, **more: object) -> None:
         raise Caught(settings)
 
+    def catch_plan(sequence: object, settings: Settings, begin: object) -> None:
+        raise Caught(settings)
+
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(SCRIPTS)
         patch.setattr(TrackingSession, "__init__", catch)
@@ -116,6 +122,8 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Settings]:
             script = importlib.import_module(name)
             if name in ("several_views", "evaluate_posterior"):  # whose films are none here
                 patch.setattr(script, "track_video", catch_video)
+            if name == "hypothesis_scores":  # which refuses this preset, later
+                patch.setattr(script, "plan_of", catch_plan)
             words = [*arguments(tmp_path_factory.mktemp(name), name), *options(CHANGED)]
             with pytest.raises(Caught) as caught:
                 script.main(tyro.cli(script.Config, args=words))
@@ -144,6 +152,7 @@ def test_every_script_that_tracks_is_among_them() -> None:
     tracking = (
         *("TrackingSession", "track_video", "track_sequence", "track_together", "run_demo"),
         "session_of",
+        "side_by_side",
     )
     found = {
         path.stem

@@ -25,6 +25,7 @@ from torchcss.cost.joints import JointTerm
 from torchcss.cost.segmentation import SegmentationTerm
 from torchcss.cost.silhouette import SilhouetteTerm
 from torchcss.cost.temporal import MixturePrior, TemporalPrior
+from torchcss.cost.total import TrackingCost
 from torchcss.errors import ConfigurationError, OutputError, TorchcssError, VideoError
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.tracker import Tracker, TrackerState
@@ -522,6 +523,32 @@ def test_two_threads_give_the_same_bits(num_frames: int):
     for one, two in zip(*tracks, strict=True):
         for part, same in zip(one.state.mixture, two.state.mixture, strict=True):
             assert torch.equal(part, same)
+
+
+def test_torch_works_in_one_thread_beside_the_kernels():
+    """Else what is found would depend on how many cores there are."""
+    sequence = rendered_arm(0, 3)
+    settings = Settings(body="arm8", working_size=160, samples=4, modes=2)
+    session = session_at(settings, sequence.body, sequence.states[0], seen_by(sequence.camera))
+    numbers, before = [], torch.get_num_threads()
+
+    def frames():
+        for image in sequence.frames:
+            numbers.append(torch.get_num_threads())
+            yield image
+
+    def noted(cost: TrackingCost) -> TrackingCost:
+        numbers.append(torch.get_num_threads())
+        return cost
+
+    try:
+        torch.set_num_threads(2)
+        for image in frames():
+            session.step(session.observe(image), noted)
+            assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+    assert numbers == [2, 1 if session.plan.engine is not None else 2] * 3
 
 
 def test_what_is_wrong_with_an_image_is_told_by_two_threads_too():

@@ -13,7 +13,7 @@ that meet in one minimum count as often as they are.
 | `InitializeModel` | the pattern about the first fit, scored on the first frame |
 | `RobustContinuousOptimize` | `TrustRegionNewton`; in the preset by `Curvature.GAUSS_NEWTON` |
 | `GeneralizedEigenDecomposition` | eigenvectors of `constrained_inverse`, the widest first |
-| `EvaluateCost` | `SearchProblem.screening` |
+| `EvaluateCost` | `by_edges`: `SearchProblem.screening` |
 | `Prune` | the k of least score, of one pool (decision "regular sampling") |
 
 What is not printed: a hypothesis has the optical flow of the minimum that it was laid about; what
@@ -22,7 +22,7 @@ has not converged is left out; weights are exp(-cost).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
 import torch
@@ -43,7 +43,12 @@ from torchcss.inference.tracker import (
     initial_state,
 )
 from torchcss.inference.trust_region import TrustRegionNewton, check_bounds
-from torchcss.types import Bounds, Status
+from torchcss.types import Bounds, CostFunction, Status
+
+
+def by_edges(problem: SearchProblem) -> CostFunction:
+    """What scores the hypotheses of a frame (section 4.2 [RR]): the edges alone, if it has some."""
+    return problem.screening or problem.cost
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,12 +61,14 @@ class GridTracker:
         pattern: What is laid about each minimum, itself included: an `EigenDirectionGrid`, or for
             studies a random proposal, which then draws the same numbers in every frame.
         optimiser: How hypotheses descend.
+        scoring: What scores the hypotheses of a frame; the paper's way, or for studies another.
     """
 
     num_samples: int
     num_modes: int
     pattern: Proposal
     optimiser: TrustRegionNewton = field(default_factory=TrustRegionNewton)
+    scoring: Callable[[SearchProblem], CostFunction] = by_edges
 
     def __post_init__(self) -> None:
         for name in ("num_samples", "num_modes"):
@@ -156,7 +163,7 @@ class GridTracker:
         """
         pool = self.pattern.sample(minima, self.num_samples, bounds, generator=torch.Generator())
         problem = problem.take(pool.parent)
-        score = (problem.screening or problem.cost).value(pool.x).nan_to_num(torch.inf)
+        score = self.scoring(problem).value(pool.x).nan_to_num(torch.inf)
         best = score.argsort(stable=True)[: self.num_modes]
         x = pool.x[best]
         return Particles(x, torch.zeros_like(x), -score[best], pool.parent[best])

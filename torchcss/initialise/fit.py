@@ -28,6 +28,7 @@ from torchcss.body.shape import WHOLE_SHAPE, ShapeParameters, with_shape
 from torchcss.cost.context import FrameContext
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.frame import FrameCosts
+from torchcss.cost.fused import threads_for
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.outline import OutlineTerm
 from torchcss.cost.region import RegionTerm
@@ -108,12 +109,25 @@ def initialise(
     if not isinstance(keypoints, Keypoints):
         keypoints = keypoints_by_name(keypoints)
     camera, notes = _camera_of(image, camera)
-    camera = camera.to(dtype=options.dtype, device=options.device)
+    view = View(camera=camera.to(dtype=options.dtype, device=options.device), keypoints=keypoints)
+    with threads_for(options.evaluator):
+        found = _all_stages(image, view, body, generator, options, tuple(others))
+    return found._replace(report=(*notes, *found.report))
+
+
+def _all_stages(
+    image: UInt8[np.ndarray, "h w 3"] | Tensor | None,
+    view: View,
+    body: str | BodyModel,
+    generator: torch.Generator,
+    options: InitialiseOptions,
+    others: tuple[View, ...],
+) -> Initialisation:
+    assert view.keypoints is not None
     learns = options.sigma is None if options.learn_noise is None else options.learn_noise
-    sigma = options.sigma or default_sigma(keypoints)
+    sigma = options.sigma or default_sigma(view.keypoints)
     options = replace(options, sigma=sigma)
-    view, others = View(camera=camera, keypoints=keypoints), tuple(others)
-    noise = 1.0
+    noise, notes = 1.0, []
     if learns:
         brief = replace(options, search=briefly(options.search))
         rough = fit_joints(body, view, generator=generator, options=brief, others=others)
@@ -122,10 +136,10 @@ def initialise(
         notes.append(f"keypoints: noise of a wrist {noise * sigma:.1f} px, from the best fit")
     first = fit_joints(body, view, generator=generator, options=options, others=others)
     first = first._replace(noise=noise)
-    given = keypoints.only(first.body.joint_names).to(first.body.tie)
+    given = view.keypoints.only(first.body.joint_names).to(first.body.tie)
     alone = TrackingCost(
         choice=options.joint_choice,
-        views=(FrameContext(body=first.body, camera=camera, keypoints=given),),
+        views=(FrameContext(body=first.body, camera=view.camera, keypoints=given),),
         engine=options.evaluator,
     )
     notes += swapped_sides(alone, first.mixture.mean[0], generator)

@@ -35,6 +35,7 @@ from torch import Tensor
 
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, has_root, move_base, root_pose
+from torchcss.cost.fused import threads_for
 from torchcss.cost.total import TrackingCost, beside
 from torchcss.errors import ConfigurationError
 from torchcss.inference.loss_monitor import MonitorState
@@ -268,7 +269,7 @@ class TrackingSession:
         Yields:
             What is known after each of them.
         """
-        if self.settings.threads < 2:
+        if (self.settings.threads or 1) < 2:
             for each in images:
                 yield self.step(self.observe(each))
             return
@@ -294,6 +295,10 @@ class TrackingSession:
         Args:
             images: One of each view, or that of the only one.
         """
+        with threads_for(self.plan.engine):
+            return self._observed(images)
+
+    def _observed(self, images: Images) -> Observation:
         began = time.perf_counter()
         given = (images,) if isinstance(images, Image) else tuple(images)
         frames = [
@@ -329,6 +334,12 @@ class TrackingSession:
             searched: What the search sees of the frame's cost: by default the cost itself, else
                 the same with another engine, say (`torchcss.tracking.batch`).
         """
+        with threads_for(self.plan.engine):
+            return self._stepped(observation, searched)
+
+    def _stepped(
+        self, observation: Observation, searched: Callable[[TrackingCost], TrackingCost]
+    ) -> Posterior:
         before, plan, stopwatch = self.state, self.plan, Stopwatch()
         body, clock = before.body, [time.perf_counter()]
         memory = tuple(

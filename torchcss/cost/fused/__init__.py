@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Literal
 
 import torch
@@ -28,3 +30,24 @@ def engine_for(
     from torchcss.cost.fused.engine import fused_engine
 
     return fused_engine(dtype)
+
+
+@contextmanager
+def threads_for(engine: Engine | None) -> Iterator[None]:
+    """Leave torch a single thread of the calling one's, where kernels evaluate the cost.
+
+    What torch then does beside them is small: threads cost more than they gain, and with another
+    number of them sums round otherwise.
+
+    Args:
+        engine: What evaluates the cost; None: torch keeps the threads that it has.
+    """
+    before = torch.get_num_threads()
+    if engine is None or before == 1:
+        yield
+        return
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
