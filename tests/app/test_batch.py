@@ -40,7 +40,6 @@ def test_a_bad_clip_fails_alone_and_is_tried_again_when_it_has_changed(tmp_path:
     assert (told["done"], told["failed"]) == (1, 1)
     assert "bad.mp4" in told["clips"]["bad"]["about"]
     assert Run.open(tmp_path / "out" / "good").settings["seed"] == 3
-    assert Run.open(tmp_path / "out" / "good").settings["threads"] == 1
     failed = tmp_path / "out" / ".batch" / "failed" / "bad.json"
     before = failed.stat().st_mtime_ns
     batch.run()

@@ -26,7 +26,7 @@ import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout, suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -412,13 +412,12 @@ def _track_into(place: Path, job: Job, clip: Clip, watch: _Watch) -> None:
     watch.total = VideoReader(row["video"], start=begin, stop=end).num_selected
     own = {name: row[name] for name in SETTINGS if name in row}
     options = {name: row[name] for name in OPTIONS if name in row}
-    settings = settings_from_plain({**asdict(job.settings), **own})
     track_video(
         row["video"],
         camera=clip.path("camera"),
         keypoints=clip.path("keypoints"),
         out=place,
-        settings=replace(settings, threads=settings.threads or 1),
+        settings=settings_from_plain({**asdict(job.settings), **own}),
         start=begin,
         stop=end,
         options=TrackOptions(

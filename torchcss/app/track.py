@@ -134,7 +134,6 @@ def track_video(
             process writes into the folder.
     """
     settings, options = settings or Settings(), options or TrackOptions()
-    settings = replace(settings, threads=settings.threads or 2)
     out = prepare_output_folder(Path(out))
     selection = Selection(start=start, stop=stop, stride=options.stride)
     with locked(out) as lock:

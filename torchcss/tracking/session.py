@@ -269,7 +269,7 @@ class TrackingSession:
         Yields:
             What is known after each of them.
         """
-        if (self.settings.threads or 1) < 2:
+        if self.settings.threads < 2:
             for each in images:
                 yield self.step(self.observe(each))
             return

@@ -139,8 +139,7 @@ class Settings:
             "eager": the terms as they are written, as everywhere else.
         engine_dtype: Precision of the kernels; sums are in double precision.
         threads: With two or more, the next frame's features are found while this one is searched.
-            Nothing else changes. None: two where a video is tracked by itself (`track_video`),
-            else one.
+            Nothing else changes.
         overlay: Write `overlay.mp4` and `report.html`.
         recovery: Tell from the costs when the track is lost, and search more widely then; as the
             preset does by default.
@@ -168,7 +167,7 @@ class Settings:
     dtype: Literal["float64", "float32"] = "float64"
     engine: Literal["fused", "eager"] = "fused"
     engine_dtype: Literal["float32", "float64"] = "float64"
-    threads: int | None = None
+    threads: int = 1
     overlay: bool = True
     recovery: bool | None = None
 
