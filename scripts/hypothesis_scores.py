@@ -16,13 +16,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import torch
 from common import Table, start, write_report
-from common.side_by_side import Entrants, side_by_side
+from common.side_by_side import Entrants, by_name, cells_of
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -32,12 +33,12 @@ from torchcss.inference.grid_tracker import GridTracker, by_edges
 from torchcss.inference.problem import SearchProblem
 from torchcss.inference.proposals import CovarianceScaled
 from torchcss.studies.comparison import find_start, plan_of
-from torchcss.studies.evaluation import over_seeds
 from torchcss.studies.sequences import RecordedSequence, read_sequence
 from torchcss.tracking.settings import Settings
 from torchcss.types import CostFunction, LocalModel
 
-WAYS = ("edges", "full", "random")
+ERRORS = "root_aligned_mm", "root_aligned_best_of_modes_mm"
+"""What the table shows of each tracker."""
 TRACKING = Settings(preset="rr_multiple_hypothesis", overlay=False)
 """How this script tracks, where nothing else is said."""
 
@@ -61,22 +62,26 @@ class Config:
 
 @dataclass(frozen=True)
 class Scores:
-    """The edges' cost, which notes what the whole cost says beside it.
+    """The edges' cost, which is compared with the whole cost whenever it scores.
 
     Attributes:
         edges: What scores.
         full: The whole cost.
-        noted: Where the scores of both are kept, frame by frame.
+        num_kept: How many of the best are kept.
+        noted: Where is kept what comes out: rank correlation, and share of the best in common.
     """
 
     edges: CostFunction
     full: CostFunction
-    noted: list[tuple[Tensor, Tensor]]
+    num_kept: int
+    noted: list[tuple[float, float]]
 
     def value(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
         """The score, nats."""
-        self.noted.append((self.edges.value(x), self.full.value(x)))
-        return self.noted[-1][0]
+        scores = self.edges.value(x), self.full.value(x)
+        if not math.isnan(correlation := rank_correlation(*scores)):
+            self.noted.append((correlation, same_best(*scores, self.num_kept)))
+        return scores[0]
 
     def local_model(self, x: Float[Tensor, "*batch n"]) -> LocalModel:
         """That of the cost which scores."""
@@ -88,18 +93,20 @@ class Scores:
 
 
 @dataclass(frozen=True)
-class Noting:
+class Compared:
     """Scores hypotheses as the paper does, and notes what the whole cost says of them.
 
     Attributes:
-        noted: Where the scores of both are kept, frame by frame.
+        num_kept: How many of the best are kept.
+        noted: See `Scores`.
     """
 
-    noted: list[tuple[Tensor, Tensor]]
+    num_kept: int
+    noted: list[tuple[float, float]]
 
     def __call__(self, problem: SearchProblem) -> CostFunction:
         """What scores the hypotheses of a frame."""
-        return Scores(by_edges(problem), problem.cost, self.noted)
+        return Scores(by_edges(problem), problem.cost, self.num_kept, self.noted)
 
 
 def by_the_whole_cost(problem: SearchProblem) -> CostFunction:
@@ -122,15 +129,15 @@ def same_best(first: Float[Tensor, " m"], second: Float[Tensor, " m"], k: int) -
 
 
 def entrants(
-    config: Config, sequence: RecordedSequence, seed: int, noted: list[tuple[Tensor, Tensor]]
+    config: Config, sequence: RecordedSequence, noted: list[tuple[float, float]], seed: int
 ) -> Entrants:
     """The trackers of a seed by how their hypotheses are scored and laid out.
 
     Args:
         config: How to track.
         sequence: What.
+        noted: Where is kept what comes out where both scores are known, see `Scores`.
         seed: The seed.
-        noted: Where the scores by edges and by the whole cost are kept.
     """
     body = config.tracking.body if sequence.truth is None else sequence.truth.body.name
     settings = replace(config.tracking, body=body, seed=seed)
@@ -140,45 +147,29 @@ def entrants(
     if not isinstance(tracker, GridTracker):
         raise ConfigurationError(f"--preset: expected one of [RR], got {settings.preset!r}")
     ways = {
-        "edges": replace(tracker, scoring=Noting(noted)),
+        "edges": replace(tracker, scoring=Compared(tracker.num_modes, noted)),
         "full": replace(tracker, scoring=by_the_whole_cost),
         "random": replace(tracker, pattern=CovarianceScaled(covariance_scale=1.0)),
     }
     return {way: (settings, begin, plan._replace(tracker=each)) for way, each in ways.items()}
 
 
-def compared(noted: list[tuple[Tensor, Tensor]], k: int) -> list[tuple[float, float]]:
-    """Rank correlation of two scores of the same, and the share of the best k in common."""
-    pairs = [(rank_correlation(*scores), same_best(*scores, k)) for scores in noted]
-    return [pair for pair in pairs if not math.isnan(pair[0])]
-
-
 def main(config: Config) -> dict[str, Any]:
     """Run, print, write; return what is written."""
-    rows, cells = {}, []
+    rows: dict[str, dict[str, Any]] = {}
+    cells = []
+    seeds = range(config.tracking.seed, config.tracking.seed + config.seeds)
     for folder in config.sequences:
         sequence = read_sequence(folder)
-        runs: dict[str, list[dict[str, Any]]] = {way: [] for way in WAYS}
-        pairs: list[tuple[float, float]] = []
-        for seed in range(config.tracking.seed, config.tracking.seed + config.seeds):
-            noted: list[tuple[Tensor, Tensor]] = []
-            named = entrants(config, sequence, seed, noted)
-            for way, row in side_by_side(sequence, named, config.frames):
-                runs[way].append(row)
-            pairs += compared(noted, named["edges"][2].tracker.num_modes)
-        for way, each in runs.items():
-            if not each:
-                continue
-            row = over_seeds(each)
-            if way == "edges" and pairs:
-                row["rank_correlation"] = median(pair[0] for pair in pairs)
-                row["same_best"] = median(pair[1] for pair in pairs)
-            rows.setdefault(sequence.name, {})[way] = row
-            error, nearest = row["root_aligned_mm"], row["root_aligned_best_of_modes_mm"]
+        noted: list[tuple[float, float]] = []
+        begin = partial(entrants, config, sequence, noted)
+        rows[sequence.name] = found = by_name(sequence, begin, seeds, config.frames)
+        if noted and "edges" in found:
+            ranks, shares = zip(*noted, strict=True)
+            found["edges"] |= {"rank_correlation": median(ranks), "same_best": median(shares)}
+        for way, row in found.items():
             cells.append([
-                f"{sequence.name}: {way}", f"{row['lost']} of {row['seeds']}",
-                *(f"{middle:.0f} ({least:.0f} to {most:.0f})"
-                  for middle, least, most in (error, nearest)),
+                f"{sequence.name}: {way}", *cells_of(row, *ERRORS),
                 row.get("rank_correlation"), row.get("same_best"),
             ])  # fmt: skip
     columns = (

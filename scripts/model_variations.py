@@ -17,12 +17,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 from common import Table, start, write_report
-from common.side_by_side import Entrants, side_by_side
+from common.side_by_side import Entrants, by_name, cells_of
 
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
@@ -30,11 +31,12 @@ from torchcss.body.root import has_root
 from torchcss.body.shape import SHAPE_NAMES, with_shape
 from torchcss.cli.options import SettingsOptions
 from torchcss.studies.comparison import Start, find_start, plan_of
-from torchcss.studies.evaluation import over_seeds
 from torchcss.studies.sequences import RecordedSequence, read_sequence
 from torchcss.tracking.settings import Plan, Settings
 from torchcss.types import Bounds
 
+ERRORS = "root_aligned_mm", "root_aligned_best_of_modes_mm", "pa_mpjpe_mm"
+"""What the table shows of each tracker."""
 TRACKING = Settings(keypoints_use="first", overlay=False)
 """How this script tracks, where nothing else is said."""
 AS_IT_IS = "as it is"
@@ -124,23 +126,14 @@ def main(config: Config) -> dict[str, Any]:
     """Run, print, write; return what is written."""
     rows: dict[str, dict[str, Any]] = {}
     cells = []
+    seeds = range(config.tracking.seed, config.tracking.seed + config.seeds)
     for folder in config.sequences:
         sequence = read_sequence(folder)
-        runs: dict[str, list[dict[str, Any]]] = {}
-        for seed in range(config.tracking.seed, config.tracking.seed + config.seeds):
-            named = entrants(config, sequence, seed)
-            runs |= {name: runs.get(name, []) for name in named}
-            for name, row in side_by_side(sequence, named, config.frames):
-                runs[name].append(row)
-        rows[sequence.name] = {name: over_seeds(each) for name, each in runs.items() if each}
-        for name, row in rows[sequence.name].items():
-            spread = (
-                f"{middle:.0f} ({least:.0f} to {most:.0f})"
-                for middle, least, most in (
-                    row["root_aligned_mm"], row["root_aligned_best_of_modes_mm"], row["pa_mpjpe_mm"]
-                )
-            )  # fmt: skip
-            cells.append([f"{sequence.name}, {name}", f"{row['lost']} of {row['seeds']}", *spread])
+        found = by_name(sequence, partial(entrants, config, sequence), seeds, config.frames)
+        rows[sequence.name] = found
+        for name, row in found.items():
+            errors = cells_of(row, *ERRORS)
+            cells.append([f"{sequence.name}, {name}", *errors])
     columns = ("sequence, tracker: variation", "lost", "best mode", "best of modes", "PA")
     table = Table("Parts of the model, changed one at a time", columns, cells)
     table.print()

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 from tqdm import tqdm
 
 from torchcss.studies.comparison import Start, track_together
-from torchcss.studies.evaluation import Thresholds, summarise
+from torchcss.studies.evaluation import Thresholds, over_seeds, summarise
 from torchcss.studies.sequences import RecordedSequence
 from torchcss.tracking.settings import Plan, Settings
 
@@ -42,3 +42,38 @@ def side_by_side(
             if run.measures:
                 summary = summarise(run.measures, thresholds, 1 / sequence.frame_rate)
                 yield names[run.number], {"ended": run.ended, **summary}
+
+
+def by_name(
+    sequence: RecordedSequence,
+    entrants: Callable[[int], Entrants],
+    seeds: Iterable[int],
+    frames: int,
+) -> dict[str, dict[str, Any]]:
+    """Run the trackers of several seeds.
+
+    Args:
+        sequence: What is tracked.
+        entrants: The trackers of a seed.
+        seeds: The seeds.
+        frames: How many frames, where the sequence has as many.
+
+    Returns:
+        Of each tracker that was measured median, least and greatest of its numbers (`over_seeds`).
+    """
+    runs: dict[str, list[dict[str, Any]]] = {}
+    for seed in seeds:
+        named = entrants(seed)
+        runs |= {name: runs.get(name, []) for name in named}
+        for name, summary in side_by_side(sequence, named, frames):
+            runs[name].append(summary)
+    return {name: over_seeds(each) for name, each in runs.items() if each}
+
+
+def cells_of(row: Mapping[str, Any], *keys: str) -> list[str]:
+    """How many seeds were lost, then median, least and greatest of some numbers."""
+    spreads = (row[key] for key in keys)
+    return [
+        f"{row['lost']} of {row['seeds']}",
+        *(f"{middle:.0f} ({least:.0f} to {most:.0f})" for middle, least, most in spreads),
+    ]
