@@ -111,8 +111,7 @@ def initialise(
     camera, notes = _camera_of(image, camera)
     view = View(camera=camera.to(dtype=options.dtype, device=options.device), keypoints=keypoints)
     with threads_for(options.evaluator):
-        found = _all_stages(image, view, body, generator, options, tuple(others))
-    return found._replace(report=(*notes, *found.report))
+        return _all_stages(image, view, body, generator, options, tuple(others), notes)
 
 
 def _all_stages(
@@ -122,12 +121,13 @@ def _all_stages(
     generator: torch.Generator,
     options: InitialiseOptions,
     others: tuple[View, ...],
+    notes: list[str],
 ) -> Initialisation:
     assert view.keypoints is not None
     learns = options.sigma is None if options.learn_noise is None else options.learn_noise
     sigma = options.sigma or default_sigma(view.keypoints)
     options = replace(options, sigma=sigma)
-    noise, notes = 1.0, []
+    noise = 1.0
     if learns:
         brief = replace(options, search=briefly(options.search))
         rough = fit_joints(body, view, generator=generator, options=brief, others=others)

@@ -153,7 +153,7 @@ def nearest_faces(
     check_shape("uv", uv, *depth.shape, 2)
     check_shape("valid", valid, *depth.shape)
     pictures, vertices = depth.shape
-    if not len(faces):
+    if not pictures or not len(faces):
         return faces.new_full((pictures, height, width), -1)
     place, distance = uv.detach().double().flatten(0, 1), depth.detach().double().flatten()
     first = vertices * torch.arange(pictures, device=uv.device)
