@@ -62,7 +62,7 @@ def test_the_skin_is_closed_and_turned_outwards(person: tuple[BodyModel, Charact
     # Every edge belongs to two triangles, which run along it in opposite directions.
     assert torch.equal(forward.sort().values, backward.sort().values)
     skin = character.pose(body.rest)
-    assert 0.04 < volume(skin.vertices, faces) < 0.09  # cubic metres: 40 to 90 litres
+    assert 0.04 < volume(skin.vertices_world, faces) < 0.09  # cubic metres: 40 to 90 litres
     assert set(character.part.tolist()) == set(range(body.num_parts))
     assert bool(((character.colour >= 0) & (character.colour <= 1)).all())
 
@@ -70,8 +70,8 @@ def test_the_skin_is_closed_and_turned_outwards(person: tuple[BodyModel, Charact
 def test_limbs_keep_their_volume_when_they_bend(person: tuple[BodyModel, Character]) -> None:
     """Linear blending would lose it at twisted and bent joints."""
     body, character = person
-    still = volume(character.pose(body.rest).vertices, character.faces)
-    bent = volume(character.pose(reaching(body)).vertices, character.faces)
+    still = volume(character.pose(body.rest).vertices_world, character.faces)
+    bent = volume(character.pose(reaching(body)).vertices_world, character.faces)
     assert abs(bent / still - 1) < 0.05
 
 
@@ -81,7 +81,7 @@ def test_the_skin_lies_on_the_parts(person: tuple[BodyModel, Character]) -> None
     state = reaching(body)
     skin = character.pose(state)
     rotation, centre = body.part_poses(body.pose(state))
-    local = (skin.vertices - centre[:, None]) @ rotation
+    local = (skin.vertices_world - centre[:, None]) @ rotation
     apart = torch.stack(
         [distance_to_part(s, p) for s, p in zip(body.part_shape, local, strict=True)]
     ).amin(0)
@@ -98,9 +98,12 @@ def test_a_skin_moves_with_its_base_and_root(person: tuple[BodyModel, Character]
     shifted[body.state_index("root_x")] += 0.4
     moved = character.pose(shifted)
     torch.testing.assert_close(
-        moved.vertices, skin.vertices + skin.vertices.new_tensor([0.4, 0, 0]), rtol=0, atol=1e-9
+        moved.vertices_world,
+        skin.vertices_world + skin.vertices_world.new_tensor([0.4, 0, 0]),
+        rtol=0,
+        atol=1e-9,
     )
-    torch.testing.assert_close(moved.normals, skin.normals, rtol=0, atol=1e-9)
+    torch.testing.assert_close(moved.normals_world, skin.normals_world, rtol=0, atol=1e-9)
 
 
 def test_cloth_moves_with_the_pose_and_muscles_swell() -> None:
@@ -112,7 +115,9 @@ def test_cloth_moves_with_the_pose_and_muscles_swell() -> None:
     bent[body.state_index("r_elbow_flexion")] = math.radians(110)
 
     def swelling(state: Tensor) -> Tensor:
-        return (character.pose(state).vertices - plain.pose(state).vertices).norm(dim=-1)
+        return (character.pose(state).vertices_world - plain.pose(state).vertices_world).norm(
+            dim=-1
+        )
 
     assert float(swelling(straight).max()) < 1e-3
     swollen = swelling(bent)
@@ -123,7 +128,7 @@ def test_cloth_moves_with_the_pose_and_muscles_swell() -> None:
     shoulder, elbow, wrist = (
         pose.joints[body.joint_index(f"r_{name}")] for name in ("shoulder", "elbow", "wrist")
     )
-    place = character.pose(bent).vertices[most]
+    place = character.pose(bent).vertices_world[most]
     axis = (elbow - shoulder) / (elbow - shoulder).norm()
     along = float((place - shoulder) @ axis) / float((elbow - shoulder).norm())
     assert 0.2 < along < 0.8

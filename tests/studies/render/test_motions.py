@@ -32,7 +32,7 @@ HARDEST = 30.0
 @pytest.fixture(scope="module", params=list(MOTIONS))
 def moved(request: pytest.FixtureRequest) -> tuple[str, BodyModel, Tensor]:
     """A built-in motion, of a person of other lengths where the sequence has one."""
-    poses, _ = MOTIONS[request.param]
+    poses = MOTIONS[request.param]
     lengths = None
     if not poses.body.startswith("arm"):
         lengths = random_lengths(generator=torch.Generator().manual_seed(0))
@@ -55,10 +55,10 @@ def test_the_spline_is_scipys_clamped_one() -> None:
 
 def test_motions_have_the_papers_length() -> None:
     frames = {
-        name: len(sample_times(poses.duration, RATE, None)) for name, (poses, _) in MOTIONS.items()
+        name: len(sample_times(poses.duration, RATE, None)) for name, poses in MOTIONS.items()
     }
     assert frames == {"arm": 400, "body-clutter": 175, "body-dark": 200}
-    assert [poses.body for poses, _ in MOTIONS.values()] == ["arm8", "body30", "body34"]
+    assert [poses.body for poses in MOTIONS.values()] == ["arm8", "body30", "body34"]
 
 
 def test_joints_stay_within_their_limits(moved: tuple[str, BodyModel, Tensor]) -> None:
@@ -96,7 +96,7 @@ def test_no_part_enters_another(moved: tuple[str, BodyModel, Tensor]) -> None:
 
 @pytest.mark.parametrize("name", ["body-clutter", "body-dark"])
 def test_feet_stay_on_the_ground(name: str) -> None:
-    poses, _ = MOTIONS[name]
+    poses = MOTIONS[name]
     body = load_body(poses.body)
     states = poses.states(body, sample_times(poses.duration, 25.0, None))
     marks = [
@@ -124,7 +124,7 @@ def test_planting_leaves_all_but_the_legs_alone() -> None:
 
 
 def test_the_dark_sequence_needs_the_clavicles() -> None:
-    poses, _ = MOTIONS["body-dark"]
+    poses = MOTIONS["body-dark"]
     for side in "lr":
         for angle in ("elevation", "protraction"):
             assert max(poses.degrees[f"{side}_clavicle_{angle}"]) > 20

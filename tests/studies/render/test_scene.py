@@ -11,7 +11,6 @@ from torch import Tensor
 from torchcss.body.load import load_body
 from torchcss.errors import CameraError, ConfigurationError
 from torchcss.studies.render.character import Character, Clothing
-from torchcss.studies.render.renderer import Mesh
 from torchcss.studies.render.scene import Place, SceneRenderer, Style, look_at
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import rasterise
@@ -44,11 +43,11 @@ def test_the_silhouette_is_the_rasterisers(character: Character) -> None:
     white = torch.ones_like(character.colour)
     renderer = SceneRenderer(camera, PLACE, PLAIN, generator=torch.Generator().manual_seed(0))
     empty = renderer.picture([]).double().mean(-1)
-    full = renderer.picture([Mesh(*skin, character.faces, white)]).double().mean(-1)
+    full = renderer.picture([skin._replace(colour=white)]).double().mean(-1)
     seen = ((full - empty) / (255 - empty)).clamp(0, 1)
     # The same coverage by our own rasteriser, at eight times the size.
     fine, (width, height) = 8, camera.image_size_wh
-    uv, depth, valid = camera.project(skin.vertices)
+    uv, depth, valid = camera.project(skin.vertices_world)
     faces = rasterise(
         (uv + 0.5) * fine - 0.5, depth, character.faces, fine * height, fine * width, valid=valid
     ).face
@@ -82,9 +81,8 @@ def test_a_character_casts_a_shadow_on_scene_and_self(character: Character) -> N
         renderer = SceneRenderer(camera, PLACE, style, generator=torch.Generator().manual_seed(2))
         empty = renderer.picture([]).double().mean(-1)
         skin = character.pose(character.body.rest)
-        mesh = Mesh(*skin, character.faces, character.colour)
-        pictures[shadows] = (empty, renderer.picture([mesh]).double().mean(-1))
-    uv, depth, valid = camera.project(character.pose(character.body.rest).vertices)
+        pictures[shadows] = (empty, renderer.picture([skin]).double().mean(-1))
+    uv, depth, valid = camera.project(skin.vertices_world)
     person = rasterise(uv, depth, character.faces, 120, 160, valid=valid).face >= 0
     grown = torch.nn.functional.max_pool2d(person[None].double(), 3, 1, 1)[0] > 0
     empty, full = pictures[True]

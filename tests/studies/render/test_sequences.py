@@ -256,7 +256,7 @@ def test_the_person_is_not_the_trackers_model() -> None:
         chosen.body.base_rotation, chosen.body.base_translation
     )
     rotation, centre = body.part_poses(body.pose(chosen.states[0]))
-    local = (skin.vertices - centre[:, None]) @ rotation
+    local = (skin.vertices_world - centre[:, None]) @ rotation
     apart = torch.stack(
         [distance_to_part(s, p) for s, p in zip(body.part_shape, local, strict=True)]
     ).amin(0)

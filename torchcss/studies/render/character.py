@@ -24,13 +24,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
 from torchcss.body.model import BodyModel
 from torchcss.body.surface import straighten
-from torchcss.studies.render.renderer import Colour
+from torchcss.studies.render.renderer import Colour, Mesh, random_waves
 from torchcss.vision.rasterise import vertex_normals
 
 _BLEND = 0.008
@@ -121,16 +121,30 @@ class Clothing:
     muscle: float = 0.008
 
 
-class Skin(NamedTuple):
-    """A posed character, world frame, metres.
+class _OnBody(NamedTuple):
+    """Where the vertices of a skin are on a body.
 
     Attributes:
-        vertices: Corner positions.
-        normals: Unit outward normals.
+        body: The body.
+        shape: Shapes of its parts, with the character's girths.
+        nearest: The part that moves a vertex most.
+        local: Place in that part's frame, metres.
     """
 
-    vertices: Float[Tensor, "v 3"]
-    normals: Float[Tensor, "v 3"]
+    body: BodyModel
+    shape: Float[Tensor, "parts 9"]
+    nearest: Int[Tensor, " v"]
+    local: Float[Tensor, "v 3"]
+
+    @property
+    def in_semi_axes(self) -> Float[Tensor, "v 3"]:
+        """Place in the part's frame, in units of its semi-axes."""
+        return self.local / self.shape[self.nearest, :3]
+
+    def on(self, *endings: str) -> Bool[Tensor, " v"]:
+        """Which vertices are on parts whose names end in one of these."""
+        names = self.body.part_names
+        return torch.tensor([name.endswith(endings) for name in names])[self.nearest]
 
 
 class Character:
@@ -185,48 +199,36 @@ class Character:
         agree = corner[:, 1] == corner[:, 2]
         self.part: Int[Tensor, " f"] = torch.where(agree, corner[:, 1], corner[:, 0])
         at = torch.arange(len(vertices))
-        self._dress(local[nearest, at], nearest, vertices, generator)
+        self._dress(_OnBody(body, self.shape, nearest, local[nearest, at]), generator)
 
-    def _dress(
-        self, local: Tensor, nearest: Tensor, vertices: Tensor, generator: torch.Generator
-    ) -> None:
+    def _dress(self, place: _OnBody, generator: torch.Generator) -> None:
         """Fix colours, looseness and the random fields of all vertices."""
-        clothing, body = self.clothing, self.body
-        along = _along_limb(body, self.shape, local, nearest)
-        colour, cloth = _colours(
-            body, clothing, self.shape, local, nearest, along, vertices, generator
-        )
+        clothing, vertices = self.clothing, self._vertices
+        colour, cloth = _colours(place, clothing, vertices, generator)
         # Borders of patterns and clothes run through the middle of triangles.
         self.colour: Float[Tensor, "v 3"] = _smooth(colour, self.faces, 1)
         radius = (self.shape[:, 0] * self.shape[:, 1]).sqrt()
         radius = (self._weight * radius[self._owner]).sum(-1)
-        still = torch.tensor(
-            [name == "head" or name.endswith(("hand", "foot", "neck")) for name in body.part_names]
-        )
-        loose = torch.where(cloth, 1.0, 1 / 3) * torch.where(still[nearest], 0.3, 1.0)
+        still = place.on("head", "hand", "foot", "neck")
+        loose = torch.where(cloth, 1.0, 1 / 3) * torch.where(still, 0.3, 1.0)
         loose = _smooth(loose[:, None].to(vertices), self.faces, 2)[:, 0]
         self._amplitude = clothing.looseness * radius * loose
         # Cloth stands off the body a little.
         self._offset = 0.03 * radius * _smooth(cloth[:, None].to(vertices), self.faces, 1)[:, 0]
-        waves = 10
-        direction = functional.normalize(
-            torch.randn(waves, 3, generator=generator, dtype=vertices.dtype), dim=-1
-        )
-        wavelength = 0.07 * (0.28 / 0.07) ** torch.linspace(0, 1, waves, dtype=vertices.dtype)
-        phase = 2 * math.pi * torch.rand(waves, generator=generator, dtype=vertices.dtype)
-        self._phase = vertices @ (2 * math.pi / wavelength[:, None] * direction).T + phase
+        waves = random_waves(10, 0.07, 0.28, generator=generator, dtype=vertices.dtype)
+        self._phase = waves.angles(vertices)
         # Folds run across the limb, and are not quite regular.
-        self._fold = 2 * math.pi * local[:, 2] / 0.035 + 1.5 * self._phase[:, -1].sin()
+        self._fold = 2 * math.pi * place.local[:, 2] / 0.035 + 1.5 * self._phase[:, -1].sin()
         self._crease = clothing.creases * loose
-        self._muscle = clothing.muscle * _muscle(body, self.shape, local, nearest)
+        self._muscle = clothing.muscle * _muscle(place)
 
     @property
     def num_vertices(self) -> int:
         """Number of vertices."""
         return len(self._vertices)
 
-    def pose(self, state: Float[Tensor, " n"]) -> Skin:
-        """The skin in a pose.
+    def pose(self, state: Float[Tensor, " n"]) -> Mesh:
+        """The skin in a pose, with unit normals.
 
         Args:
             state: A state of the body.
@@ -257,7 +259,8 @@ class Character:
         spin = torch.linalg.cross(axis, vertices) + scalar * vertices
         turned = vertices + 2 * torch.linalg.cross(axis, spin)
         vertices = turned + moved
-        return Skin(vertices, vertex_normals(vertices, self.faces))
+        normals = vertex_normals(vertices, self.faces)
+        return Mesh(vertices, normals, self.faces, self.colour)
 
     def _elbow_swell(self, state: Tensor) -> Tensor:
         """How much the muscle of every vertex's arm is swollen, 0 to 1."""
@@ -296,7 +299,7 @@ def _other_girths(body: BodyModel, deviation: float, generator: torch.Generator)
     """The body's shapes with girths of their own, left and right alike."""
     shape, factors = body.part_shape.clone(), {}
     for index, name in enumerate(body.part_names):
-        bare = name.removeprefix("l_").removeprefix("r_")
+        bare = _without_side(name)
         if bare not in factors:
             drawn = torch.randn(2, generator=generator, dtype=shape.dtype)
             factors[bare] = 1 + deviation * drawn.clamp(-2, 2)
@@ -304,10 +307,14 @@ def _other_girths(body: BodyModel, deviation: float, generator: torch.Generator)
     return shape
 
 
+def _without_side(name: str) -> str:
+    return name.removeprefix("l_").removeprefix("r_")
+
+
 def _spread_state(body: BodyModel) -> Tensor:
     state = body.rest.clone()
     for column, name in enumerate(body.state_names):
-        degrees = _SPREAD_POSE.get(name.removeprefix("l_").removeprefix("r_"), 0.0)
+        degrees = _SPREAD_POSE.get(_without_side(name), 0.0)
         state[column] += math.radians(degrees)
     return body.bounds.project(state)
 
@@ -325,12 +332,13 @@ def _padding(
         centres.append(place)
 
     for index, name in enumerate(body.joint_names):
-        side = name[:2] if name[:2] in ("l_", "r_") else ""
-        owner, axes = _PADDING.get(name.removeprefix(side), ("", ()))
+        bare = _without_side(name)
+        side = name.removesuffix(bare)
+        owner, axes = _PADDING.get(bare, ("", ()))
         if side + owner in body.part_names and side + owner not in without:
             add(axes, body.base_rotation, joints[index])
     for index, name in enumerate(body.part_names):
-        bare = name.removeprefix("l_").removeprefix("r_")
+        bare = _without_side(name)
         for place, axes in _FEATURES.get(bare, ()) if name not in without else ():
             turn = rotation[index]
             if bare == "hand":
@@ -357,25 +365,16 @@ def _smooth_union(
     half = (rotation.abs() * reach[:, None]).sum(-1) + margin
     low = ((centre - half) / spacing).floor().long()
     high = ((centre + half) / spacing).ceil().long() + 1
-    origin, size = low.amin(0), (high.amax(0) - low.amin(0)).tolist()
-    total = torch.zeros(size, dtype=torch.float64)
-    for index in range(len(shape)):
-        ranges = [
-            torch.arange(a, b)
-            for a, b in zip(low[index].tolist(), high[index].tolist(), strict=True)
-        ]
-        grid = torch.stack(torch.meshgrid(*ranges, indexing="ij"), -1)
-        points = (grid.reshape(-1, 3) * spacing - centre[index]) @ rotation[index]
-        near = torch.exp(
-            -distance_to_part(shape[index], points).clamp(-margin, 2 * margin) / _BLEND
-        )
-        box = tuple(
-            slice(a, b)
-            for a, b in zip(
-                (low[index] - origin).tolist(), (high[index] - origin).tolist(), strict=True
-            )
-        )
-        total[box] += near.reshape(grid.shape[:3])
+    origin = low.amin(0)
+    total = torch.zeros((high.amax(0) - origin).tolist(), dtype=torch.float64)
+    for part, start, stop in zip(
+        range(len(shape)), (low - origin).tolist(), (high - origin).tolist(), strict=True
+    ):
+        box = tuple(map(slice, start, stop))
+        cells = torch.cartesian_prod(*map(torch.arange, start, stop)) + origin
+        points = (cells * spacing - centre[part]) @ rotation[part]
+        distance = distance_to_part(shape[part], points).clamp(-margin, 2 * margin)
+        total[box] += torch.exp(-distance / _BLEND).reshape(total[box].shape)
     field = -_BLEND * (total + math.exp(-12)).log()
     vertices, faces = _level_set(field)
     vertices = (vertices + origin) * spacing
@@ -441,112 +440,79 @@ def _smooth(values: Float[Tensor, "v c"], faces: Tensor, times: int) -> Float[Te
     return values
 
 
-def _along_limb(
-    body: BodyModel, shape: Tensor, local: Tensor, nearest: Tensor
-) -> Float[Tensor, " v"]:
+def _along_limb(place: _OnBody) -> Float[Tensor, " v"]:
     """Place along arm or leg in limbs: 0 at shoulder or hip, 1 at elbow or knee, 2 at the end.
 
     On other parts it is the place along the part's axis from -1 to 1.
     """
-    height = local[:, 2] / shape[nearest, 2]
-    first = {"upper_arm": 0.0, "thigh": 0.0, "forearm": 1.0, "shank": 1.0, "hand": 2.0, "foot": 2.0}
-    start = [
-        next((v for k, v in first.items() if name.endswith(k)), math.nan)
-        for name in body.part_names
-    ]
-    start = height.new_tensor(start)[nearest]
-    # A part is about 1.1 limbs long, centred on the limb.
-    return torch.where(start.isnan(), height, start + 0.5 + 0.55 * height)
+    along = place.in_semi_axes[:, 2]
+    for start, limbs in enumerate((("upper_arm", "thigh"), ("forearm", "shank"), ("hand", "foot"))):
+        # A part is about 1.1 limbs long, centred on the limb.
+        along = torch.where(place.on(*limbs), start + 0.5 + 0.55 * along, along)
+    return along
 
 
-def _muscle(body: BodyModel, shape: Tensor, local: Tensor, nearest: Tensor) -> Float[Tensor, " v"]:
+def _muscle(place: _OnBody) -> Float[Tensor, " v"]:
     """Shape of the biceps on the upper arms, 0 to 1: on the flexing side, above the elbow."""
-    arm = torch.tensor([name.endswith("upper_arm") for name in body.part_names])[nearest]
-    x, y, z = (local / shape[nearest, :3]).unbind(-1)
+    x, y, z = place.in_semi_axes.unbind(-1)
     # The elbow bends forwards, and a part that hangs has its y axis along the link's z.
     side = torch.atan2(x, y)
     bump = torch.exp(-((side / 0.9) ** 2) - ((z - 0.1) / 0.35) ** 2)
-    return torch.where(arm, bump, 0.0)
+    return torch.where(place.on("upper_arm"), bump, 0.0)
 
 
 def _colours(
-    body: BodyModel,
-    clothing: Clothing,
-    shape: Tensor,
-    local: Tensor,
-    nearest: Tensor,
-    along: Tensor,
-    vertices: Tensor,
-    generator: torch.Generator,
+    place: _OnBody, clothing: Clothing, vertices: Tensor, generator: torch.Generator
 ) -> tuple[Float[Tensor, "v 3"], Tensor]:
     """Display colours of all vertices, and which of them are covered by loose cloth."""
-
-    def where(*endings: str) -> Tensor:
-        return torch.tensor([name.endswith(endings) for name in body.part_names])[nearest]
-
-    shirt = where("chest", "clavicle") | (where("upper_arm", "forearm") & (along < clothing.sleeve))
-    shirt |= where("pelvis") & (along > clothing.hem)
-    shirt |= where("neck") & (along < -0.35)
-    trousers = (where("pelvis") & ~shirt) | (
-        where("thigh", "shank") & (along < clothing.trouser_leg)
-    )
-    shoes = where("foot") | (where("shank") & (along > 2.1))
-    colour = vertices.new_tensor(clothing.skin).expand(len(vertices), 3).clone()
-    x, _, z = local.unbind(-1)
+    on, along = place.on, _along_limb(place)
+    shirt = on("chest", "clavicle") | (on("upper_arm", "forearm") & (along < clothing.sleeve))
+    shirt |= on("pelvis") & (along > clothing.hem)
+    shirt |= on("neck") & (along < -0.35)
+    trousers = (on("pelvis") & ~shirt) | (on("thigh", "shank") & (along < clothing.trouser_leg))
+    shoes = on("foot") | (on("shank") & (along > 2.1))
+    x, _, z = place.local.unbind(-1)
+    mix = torch.zeros_like(x)
     if clothing.pattern == "plaid":
         # Bands along and around the part, which the eye takes for threads.
         bands = [(t / 0.055).remainder(1.0) for t in (x, z)]
-        mix = 0.5 * sum(((b < 0.38).to(x) for b in bands), torch.zeros_like(x))
-        mix = mix + 0.5 * sum((((b > 0.62) & (b < 0.70)).to(x) for b in bands), torch.zeros_like(x))
+        mix = 0.5 * sum(((b < 0.38).to(x) for b in bands), mix)
+        mix = mix + 0.5 * sum((((b > 0.62) & (b < 0.70)).to(x) for b in bands), 0 * mix)
     elif clothing.pattern == "stripes":
         mix = ((z / 0.06).remainder(1.0) < 0.4).to(x)
-    else:
-        mix = torch.zeros_like(x)
     base, accent = vertices.new_tensor(clothing.shirt), vertices.new_tensor(clothing.accent)
     mix = mix.clamp(0, 1)[:, None]
-    cloth_colour = base * (1 - mix) + accent * mix
-    colour = torch.where(shirt[:, None], cloth_colour, colour)
-    colour = torch.where(trousers[:, None], vertices.new_tensor(clothing.trousers), colour)
-    colour = torch.where(shoes[:, None], vertices.new_tensor(clothing.shoes), colour)
+    colour = vertices.new_tensor(clothing.skin).expand(len(vertices), 3)
+    colour = torch.where(shirt[:, None], base * (1 - mix) + accent * mix, colour)
+    colour = _painted(colour, trousers, clothing.trousers)
+    colour = _painted(colour, shoes, clothing.shoes)
     cloth = shirt | trousers
-    waves = 12
-    direction = functional.normalize(
-        torch.randn(waves, 3, generator=generator, dtype=x.dtype), dim=-1
-    )
-    wavelength = 0.02 * (0.15 / 0.02) ** torch.linspace(0, 1, waves, dtype=x.dtype)
-    phase = 2 * math.pi * torch.rand(waves, generator=generator, dtype=x.dtype)
-    weave = (vertices @ (2 * math.pi / wavelength[:, None] * direction).T + phase).sin().mean(-1)
+    waves = random_waves(12, 0.02, 0.15, generator=generator, dtype=x.dtype)
+    weave = waves.angles(vertices).sin().mean(-1)
     strength = torch.where(cloth, clothing.texture, 0.3 * clothing.texture)
-    colour = colour * (1 + strength * math.sqrt(2 * waves) * weave)[:, None]
-    colour = _head(body, clothing, shape, local, nearest, colour)
-    return colour.clamp(0, 1), cloth
+    colour = colour * (1 + strength * math.sqrt(2 * len(waves.phases)) * weave)[:, None]
+    return _head(place, clothing, colour).clamp(0, 1), cloth
 
 
-def _head(
-    body: BodyModel,
-    clothing: Clothing,
-    shape: Tensor,
-    local: Tensor,
-    nearest: Tensor,
-    colour: Tensor,
-) -> Tensor:
+def _painted(colour: Float[Tensor, "v 3"], where: Bool[Tensor, " v"], paint: Colour) -> Tensor:
+    return torch.where(where[:, None], colour.new_tensor(paint), colour)
+
+
+def _head(place: _OnBody, clothing: Clothing, colour: Float[Tensor, "v 3"]) -> Tensor:
     """Hair, eyes and mouth."""
-    if "head" not in body.part_names:
-        return colour
-    index = body.part_names.index("head")
     # The head's z axis points up, its y axis backwards.
-    x, y, z = (local / shape[index, :3]).unbind(-1)
-    on_head = nearest == index
+    x, y, z = place.in_semi_axes.unbind(-1)
+    head = place.on("head")
     hair = (z > 0.5 + 0.1 * (6 * x).sin()) | ((y > -0.15) & (z > -0.5 + 0.3 * (y < 0.2)))
-    colour = torch.where((on_head & hair)[:, None], colour.new_tensor(clothing.hair), colour)
-    front = on_head & (y < 0)
+    colour = _painted(colour, head & hair, clothing.hair)
+    front = head & (y < 0)
     for side in (-1, 1):
         eye = ((x - 0.42 * side) / 0.17) ** 2 + ((z - 0.12) / 0.06) ** 2 < 1
         brow = ((x - 0.42 * side) / 0.24) ** 2 + ((z - 0.29) / 0.05) ** 2 < 1
-        colour = torch.where((front & eye)[:, None], colour.new_tensor((0.12, 0.1, 0.1)), colour)
-        colour = torch.where((front & brow)[:, None], colour.new_tensor(clothing.hair), colour)
+        colour = _painted(colour, front & eye, (0.12, 0.1, 0.1))
+        colour = _painted(colour, front & brow, clothing.hair)
     mouth = (x / 0.3) ** 2 + ((z + 0.45) / 0.05) ** 2 < 1
-    return torch.where((front & mouth)[:, None], colour.new_tensor((0.62, 0.30, 0.28)), colour)
+    return _painted(colour, front & mouth, (0.62, 0.30, 0.28))
 
 
 def _quaternion(rotation: Float[Tensor, "p 3 3"]) -> Float[Tensor, "p 4"]:

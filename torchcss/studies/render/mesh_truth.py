@@ -109,7 +109,7 @@ class MeshTruth:
         uv, depth, valid = self.camera.project(points)
         here = torch.stack([column, row], -1).to(uv)
         flow[row, column] = uv - here
-        outside = ~valid | ~self._inside(uv)
+        outside = ~valid | ~self.camera.inside_image(uv)
         hidden = (
             outside | ~after.facing[face] | (depth > self._depth_around(after, uv) + _SKIN_DEEP)
         )
@@ -128,7 +128,7 @@ class MeshTruth:
             joints: Joint centres, world frame, metres.
         """
         uv, depth, valid = self.camera.project(joints)
-        inside = valid & self._inside(uv)
+        inside = valid & self.camera.inside_image(uv)
         visible = torch.zeros_like(inside)
         for index in inside.nonzero()[:, 0].tolist():
             u, v = (int(x) for x in uv[index].round().tolist())
@@ -138,10 +138,6 @@ class MeshTruth:
             own = (part >= 0) & self.own[index][part.clamp(min=0)]
             visible[index] = bool((own & (surface > depth[index] - _JOINT_DEEP)).any())
         return uv, visible, inside
-
-    def _inside(self, uv: Tensor) -> Tensor:
-        u, v = uv.unbind(-1)
-        return (u >= -0.5) & (v >= -0.5) & (u < self.width - 0.5) & (v < self.height - 0.5)
 
     def _depth_around(self, labels: Labels, uv: Tensor) -> Tensor:
         """The farthest of the four surfaces around a point of the picture, half a pixel apart."""

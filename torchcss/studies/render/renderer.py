@@ -136,23 +136,46 @@ class Light(Protocol):
         ...
 
 
-class SineTexture(NamedTuple):
-    """A sum of sine waves through space, the weave and the creases of a cloth.
+class Waves(NamedTuple):
+    """Sine waves through space: the weave and the creases of a cloth.
 
     Attributes:
-        wave_vectors: Direction and angular frequency of every wave, radians per metre.
+        vectors: Direction and angular frequency of every wave, radians per metre.
         phases: Phase of every wave, radians.
-        amplitudes: Amplitude of every wave; they are summed, so keep the total below 1.
     """
 
-    wave_vectors: Float[Tensor, "m 3"]
+    vectors: Float[Tensor, "m 3"]
     phases: Float[Tensor, " m"]
-    amplitudes: Float[Tensor, " m"]
 
-    def __call__(self, points_part: Float[Tensor, "i 3"]) -> Float[Tensor, "i 1"]:
-        """Return the factor on the colour at points of the part, around 1."""
-        angle = points_part @ self.wave_vectors.to(points_part).T + self.phases.to(points_part)
-        return (1 + angle.sin() @ self.amplitudes.to(points_part)[:, None]).clamp_min(0.1)
+    def angles(self, points: Float[Tensor, "i 3"]) -> Float[Tensor, "i m"]:
+        """Where in its period every wave is at some points, radians."""
+        return points @ self.vectors.to(points).T + self.phases.to(points)
+
+
+def random_waves(
+    count: int,
+    shortest: float,
+    longest: float,
+    *,
+    generator: torch.Generator,
+    dtype: torch.dtype = torch.float32,
+) -> Waves:
+    """Draw waves in random directions.
+
+    Args:
+        count: How many.
+        shortest: Shortest wavelength, metres.
+        longest: Longest wavelength, metres; wavelengths are spread evenly in logarithm.
+        generator: Source of randomness.
+        dtype: Floating type.
+    """
+    device = generator.device
+    direction = torch.randn(count, 3, generator=generator, dtype=dtype, device=device)
+    share = torch.linspace(0, 1, count, dtype=dtype, device=device)
+    wavelength = shortest * (longest / shortest) ** share
+    phases = 2 * math.pi * torch.rand(count, generator=generator, dtype=dtype, device=device)
+    direction = functional.normalize(direction, dim=-1)
+    return Waves(2 * math.pi / wavelength[:, None] * direction, phases)
 
 
 def random_texture(
@@ -161,39 +184,32 @@ def random_texture(
     contrast: float = 0.25,
     shortest: float = 0.02,
     longest: float = 0.15,
-    num_waves: int = 7,
-) -> SineTexture:
+) -> Texture:
     """Draw a cloth texture with detail at every scale that a tracker of a limb can see.
 
     Args:
         generator: Source of randomness.
-        contrast: Standard deviation of the factor on the colour.
+        contrast: Standard deviation of the factor on the colour, which is about 1.
         shortest: Shortest wavelength, metres.
-        longest: Longest wavelength, metres; wavelengths are spread evenly in logarithm.
-        num_waves: Number of waves.
+        longest: Longest wavelength, metres.
 
     Raises:
-        ConfigurationError: If the wavelengths are not positive and ordered, or there are no waves.
+        ConfigurationError: If the wavelengths are not positive and ordered.
     """
-    if not 0 < shortest <= longest or num_waves < 1:
+    if not 0 < shortest <= longest:
         raise ConfigurationError(
-            "random_texture: expected 0 < shortest <= longest and num_waves >= 1, got "
-            f"{shortest}, {longest} and {num_waves}; wavelengths are in metres"
+            f"random_texture: expected 0 < shortest <= longest, got {shortest} and {longest}; "
+            "wavelengths are in metres"
         )
-    device = generator.device
-    direction = functional.normalize(
-        torch.randn(num_waves, 3, generator=generator, device=device), dim=-1
-    )
-    share = torch.linspace(0, 1, num_waves, device=device)
-    wavelength = shortest * (longest / shortest) ** share
-    phases = 2 * torch.pi * torch.rand(num_waves, generator=generator, device=device)
+    waves = random_waves(7, shortest, longest, generator=generator)
     # A sine of amplitude a has the variance a^2 / 2.
-    amplitude = contrast * (2 / num_waves) ** 0.5
-    return SineTexture(
-        wave_vectors=direction * (2 * torch.pi / wavelength)[:, None],
-        phases=phases,
-        amplitudes=torch.full_like(phases, amplitude),
-    )
+    amplitudes = torch.full_like(waves.phases, contrast * (2 / len(waves.phases)) ** 0.5)
+
+    def texture(points: Float[Tensor, "i 3"]) -> Float[Tensor, "i 1"]:
+        shade = waves.angles(points).sin() @ amplitudes.to(points)[:, None]
+        return (1 + shade).clamp_min(0.1)
+
+    return texture
 
 
 def render_meshes(

@@ -5,7 +5,7 @@ motion towards the camera, before a cluttered, unevenly lit room with a bright p
 experiment of section 6 [IJRR] in small). The rendered surface is finer than the tracker's mesh and
 carries a cloth texture.
 
-`render_sequence` renders any motion of any body as a dressed character in a scene
+A `Shot` renders any motion of any body as a dressed character in a scene
 (`torchcss.studies.render.character`, `torchcss.studies.render.scene`).
 `shot("arm")`, `"body-clutter"` and `"body-dark"` are the three sequences of section 6 [IJRR];
 `shot_of_motion` films a motion of the user's.
@@ -35,9 +35,9 @@ from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.errors import ConfigurationError
 from torchcss.studies.random_person import random_lengths
-from torchcss.studies.render.character import Character, Clothing, Skin
+from torchcss.studies.render.character import Character, Clothing
 from torchcss.studies.render.clutter import clutter_background
-from torchcss.studies.render.mesh_truth import MeshTruth, joints_own_parts
+from torchcss.studies.render.mesh_truth import Labels, MeshTruth, joints_own_parts
 from torchcss.studies.render.motions import MOTIONS, Motion, sample_times
 from torchcss.studies.render.renderer import (
     Colour,
@@ -55,6 +55,8 @@ from torchcss.vision.rasterise import grid_faces, join_faces
 _SKIN = (0.86, 0.63, 0.52)
 _SLEEVE = (0.35, 0.42, 0.62)
 _UP = (0.0, 1.0, 0.0)
+_MARGIN = 0.06
+"""Share of a picture's width and height that `camera_in_front` leaves free on every side."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -245,7 +247,7 @@ class Shot:
         camera: Who looks.
         style: Scene and light.
         clothing: Clothes and deformations.
-        floor: Height of the floor in the world, metres.
+        floor: Height of the floor in the world, metres (Y up).
         seed: Seed of everything that is drawn.
         description: A line about it.
         bystander: For an arm: whether the still rest of the person stands beside it.
@@ -273,12 +275,44 @@ class Shot:
         return matrix
 
     def frames(self) -> Iterator[SequenceFrame]:
-        """Render; the same frames whenever it is called."""
+        """Render; the same frames whenever it is called.
+
+        Raises:
+            CameraError: If the camera has a distortion.
+        """
         characters, generator = self.characters()
-        return render_sequence(
-            self.body, self.states, camera=self.camera, style=self.style, characters=characters,
-            floor=self.floor, generator=generator,
-        )  # fmt: skip
+        character, *others = characters
+        still = [other.pose(other.body.rest) for other in others]
+        faces, owner = join_faces(
+            [each.faces for each in characters], [each.num_vertices for each in characters]
+        )
+        part = torch.full_like(owner, -1)
+        part[owner == 0] = character.part
+        truth = MeshTruth(self.camera, faces, part, joints_own_parts(self.body))
+        joints = self.body.pose(self.states).joints
+        place = _place(joints, self.camera, self.floor)
+        renderer = SceneRenderer(self.camera, place, self.style, generator=generator)
+
+        def posed(state: Float[Tensor, " n"]) -> tuple[list[Mesh], Labels]:
+            meshes = [character.pose(state), *still]
+            return meshes, truth.labels(torch.cat([mesh.vertices_world for mesh in meshes]))
+
+        upcoming = posed(self.states[0])
+        for index in range(len(self.states)):
+            meshes, labels = upcoming
+            picture = add_sensor_noise(
+                renderer.picture(meshes), generator=generator, read=self.style.read_noise,
+                shot=self.style.shot_noise,
+            )  # fmt: skip
+            flow, occluded = None, None
+            if index + 1 < len(self.states):
+                upcoming = posed(self.states[index + 1])
+                flow, occluded = truth.flow(labels, upcoming[1])
+            uv, visible, in_image = truth.joints(labels, joints[index])
+            yield SequenceFrame(
+                picture, labels.part >= 0, labels.part, labels.depth, joints[index], uv, visible,
+                in_image, flow, occluded,
+            )  # fmt: skip
 
     def characters(self) -> tuple[list[Character], torch.Generator]:
         """The body's character, whoever stands beside it, and the generator as they leave it."""
@@ -293,74 +327,7 @@ class Shot:
         return characters, generator
 
 
-def render_sequence(
-    body: BodyModel,
-    states: Float[Tensor, "t n"],
-    *,
-    camera: Camera,
-    generator: torch.Generator,
-    style: Style | None = None,
-    clothing: Clothing | None = None,
-    characters: Sequence[Character] | None = None,
-    floor: float | None = None,
-) -> Iterator[SequenceFrame]:
-    """Render any motion of any body, frame by frame.
-
-    Args:
-        body: The body on its base; arms, people, or anything with parts.
-        states: Its states.
-        camera: Who looks, in the body's world (Y up); without distortion.
-        generator: Source of the character, the scene and the sensor's noise.
-        style: Scene and light.
-        clothing: Clothes and deformations of the character that is made where none is given.
-        characters: The character of the body; further ones stand still, hide and are no truth.
-        floor: Height of the floor; by default that of the lowest point of the first state.
-
-    Raises:
-        CameraError: If the camera has a distortion.
-    """
-    style = style or Style()
-    character, *others = characters or [Character(body, clothing, generator=generator)]
-    still = [other.pose(other.body.rest) for other in others]
-    faces, owner = join_faces(
-        [character.faces, *(other.faces for other in others)],
-        [character.num_vertices, *(other.num_vertices for other in others)],
-    )
-    part = torch.full_like(owner, -1)
-    part[owner == 0] = character.part
-    truth = MeshTruth(camera, faces, part, joints_own_parts(body))
-    joints = body.pose(states).joints
-    place = _place(joints, camera, floor)
-    renderer = SceneRenderer(camera, place, style, generator=generator)
-    bystanders = [
-        Mesh(skin.vertices, skin.normals, other.faces, other.colour)
-        for other, skin in zip(others, still, strict=True)
-    ]
-    skins = (character.pose(state) for state in states)
-    upcoming: Skin | None = next(skins, None)
-    labels = None
-    for index in range(len(states)):
-        skin, upcoming = upcoming, next(skins, None)
-        assert skin is not None
-        mesh = Mesh(skin.vertices, skin.normals, character.faces, character.colour)
-        picture = add_sensor_noise(
-            renderer.picture([mesh, *bystanders]), generator=generator, read=style.read_noise,
-            shot=style.shot_noise,
-        )  # fmt: skip
-        labels = labels or truth.labels(torch.cat([skin.vertices, *(s.vertices for s in still)]))
-        after, flow, occluded = None, None, None
-        if upcoming is not None:
-            after = truth.labels(torch.cat([upcoming.vertices, *(s.vertices for s in still)]))
-            flow, occluded = truth.flow(labels, after)
-        uv, visible, in_image = truth.joints(labels, joints[index])
-        yield SequenceFrame(
-            picture, labels.part >= 0, labels.part, labels.depth, joints[index], uv, visible,
-            in_image, flow, occluded,
-        )  # fmt: skip
-        labels = after
-
-
-def _place(joints: Float[Tensor, "t j 3"], camera: Camera, floor: float | None) -> Place:
+def _place(joints: Float[Tensor, "t j 3"], camera: Camera, floor: float) -> Place:
     """Where the motion is, seen from the camera."""
     lowest, highest = joints.amin((0, 1)), joints.amax((0, 1))
     middle = 0.5 * (lowest + highest)
@@ -368,8 +335,7 @@ def _place(joints: Float[Tensor, "t j 3"], camera: Camera, floor: float | None) 
     away[1] = 0
     away = functional.normalize(away, dim=-1)
     behind = float(((joints - middle) @ away).max())
-    ground = float(lowest[1]) - 0.05 if floor is None else floor
-    return Place(middle, ground, behind + 0.15)
+    return Place(middle, floor, behind + 0.15)
 
 
 def _rest_of_person(
@@ -413,7 +379,6 @@ def shot(
     *,
     seed: int = 0,
     num_frames: int | None = None,
-    frame_rate: float = 50.0,
     small: bool = False,
 ) -> Shot:
     """One of the sequences of section 6 [IJRR], ready to be rendered.
@@ -422,7 +387,6 @@ def shot(
         name: "arm", "body-clutter" or "body-dark".
         seed: Seed of the person, the scene and the noise; the motion is always the same.
         num_frames: Number of frames; all of the motion by default.
-        frame_rate: Frames per second.
         small: A quarter of the picture's width and height, for tests.
 
     Raises:
@@ -430,18 +394,17 @@ def shot(
     """
     if name not in MOTIONS:
         raise ConfigurationError(f"no sequence {name!r}; expected one of {', '.join(MOTIONS)}")
-    poses, description = MOTIONS[name]
+    poses, frame_rate = MOTIONS[name], 50.0
     times = sample_times(poses.duration, frame_rate, num_frames)
     is_arm = poses.body.startswith("arm")
     lengths = None if is_arm else random_lengths(generator=torch.Generator().manual_seed(seed))
     body = load_body(poses.body, lengths=lengths)
+    states = poses.states(body, times)
     if is_arm:
         body = body.with_base(torch.eye(3), torch.tensor([0.42, 1.40, 0.0]))
-        states = poses.states(body, times)
         camera = look_at((0.0, 1.30, 1.85), (0.0, 1.30, 0.0), focal_px=640.0)
         style, clothing, spacing = ARM_STYLE, ARM_CLOTHING, 0.006
     else:
-        states = poses.states(body, times)
         body = _stand(body, states[0])
         # Room above the head for arms that reach up.
         camera = look_at((0.3, 1.35, 3.7), (0.0, 1.0, 0.0), focal_px=720.0)
@@ -453,7 +416,8 @@ def shot(
         camera, spacing = camera.resized(160, 120), 2 * spacing
     return Shot(
         name=name, body=body, states=states, frame_rate=frame_rate, camera=camera, style=style,
-        clothing=clothing, seed=seed, description=description, bystander=is_arm, spacing=spacing,
+        clothing=clothing, seed=seed, description=poses.description, bystander=is_arm,
+        spacing=spacing,
     )  # fmt: skip
 
 
@@ -534,8 +498,6 @@ def camera_in_front(
     states: Float[Tensor, "t n"],
     *,
     focal_px: float = 720.0,
-    image_size_wh: tuple[int, int] = (640, 480),
-    margin: float = 0.06,
     azimuth: float = 0.0,
     height: float = 0.12,
 ) -> Camera:
@@ -544,9 +506,7 @@ def camera_in_front(
     Args:
         body: The body.
         states: Its motion.
-        focal_px: Focal length.
-        image_size_wh: Width and height of the picture.
-        margin: Share of the picture's width and height to leave free on every side.
+        focal_px: Focal length, of a picture of 640 x 480 pixels.
         azimuth: Angle about the vertical from there, radians.
         height: Height of its centre above the middle of the motion, in distances from it.
     """
@@ -559,16 +519,13 @@ def camera_in_front(
     front = functional.normalize(front, dim=-1)
     aside = torch.stack([front[2], front[1], -front[0]])
     away = math.cos(azimuth) * front + math.sin(azimuth) * aside + height * front.new_tensor(_UP)
-    width_px, height_px = image_size_wh
-    border = margin * points.new_tensor(image_size_wh)
     distance = 1.0
     while True:
         eye = middle + distance * away
-        camera = look_at(
-            eye.tolist(), middle.tolist(), focal_px=focal_px, image_size_wh=image_size_wh
-        )
+        camera = look_at(eye.tolist(), middle.tolist(), focal_px=focal_px)
+        size = points.new_tensor(camera.image_size_wh)
         uv, _, valid = camera.project(points)
-        inside = (uv > border).all() & (uv < uv.new_tensor([width_px, height_px]) - border).all()
+        inside = (uv > _MARGIN * size).all() & (uv < size - _MARGIN * size).all()
         if bool(valid.all() & inside) or distance > 50:
             return camera
         distance *= 1.05
