@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -26,7 +25,13 @@ from torchcss.body.root import move_base
 from torchcss.cost.anthropometric import Anthropometric, proportion_columns
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.studies.metrics import LIMB_JOINTS
-from torchcss.studies.reprojection import DISTANCE, FOCAL_PX, HEIGHT, WIDTH, plausible_pose
+from torchcss.studies.reprojection import (
+    DISTANCE,
+    HEIGHT,
+    WIDTH,
+    camera_in_front,
+    plausible_pose,
+)
 from torchcss.vision.camera import Camera
 
 MARKED = (*LIMB_JOINTS, "vc7", "skull_tip")
@@ -85,8 +90,7 @@ def random_person(
     state = plausible_pose(body, generator=generator)
     turn = torch.rand((), generator=generator, dtype=torch.float64)
     state[body.state_index("root_yaw")] = math.pi * (2 * turn - 1)
-    K = [[FOCAL_PX, 0, (WIDTH - 1) / 2], [0, FOCAL_PX, (HEIGHT - 1) / 2], [0, 0, 1]]
-    camera = Camera(K, (WIDTH, HEIGHT), R_camera_world=np.diag([1.0, -1.0, -1.0]), name="random")
+    camera = camera_in_front("random")
     index = [body.joint_index(name) for name in joint_names]
     uv = camera.project(body.pose(state).joints[index]).uv
     noise = torch.randn(uv.shape, generator=generator, dtype=uv.dtype)

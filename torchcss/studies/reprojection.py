@@ -88,7 +88,7 @@ class ReprojectionCost:
     focal: tuple[float, float] = field(init=False)
 
     def __post_init__(self) -> None:
-        if bool(self.camera.distortion.any()):
+        if self.camera.has_distortion:
             raise CameraError(
                 f"{self.camera.name}: expected a camera without lens distortion, got "
                 f"{self.camera.distortion.tolist()}; undistort the observations first"
@@ -278,9 +278,7 @@ def reprojection_problem(
     body = load_body(body_name)
     place = torch.tensor([0.0, 0.0, -DISTANCE], dtype=torch.float64)
     body = body.with_base(torch.eye(3, dtype=torch.float64), place)
-    middle = [[FOCAL_PX, 0.0, (WIDTH - 1) / 2], [0.0, FOCAL_PX, (HEIGHT - 1) / 2], [0.0, 0.0, 1.0]]
-    upright = [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]
-    camera = Camera(middle, (WIDTH, HEIGHT), R_camera_world=upright, name="reprojection")
+    camera = camera_in_front("reprojection")
     truth = plausible_pose(body, generator=generator)
     names = joint_names or tuple(n for n in body.joint_names if n not in (*_FACE, *_FOOT))
     index = torch.tensor([body.joint_index(name) for name in names])
@@ -298,6 +296,13 @@ def reprojection_problem(
     )
     start = TrustRegionNewton(max_steps=1000).minimise(cost, truth, body.bounds)
     return ReprojectionProblem(body, camera, truth, names, observed, cost, body.bounds, start)
+
+
+def camera_in_front(name: str) -> Camera:
+    """The camera of the study, at the world's origin: Y is up, and the body is along -Z."""
+    K = Camera.pinhole(WIDTH, HEIGHT, focal_px=FOCAL_PX).K
+    upright = torch.tensor([1.0, -1.0, -1.0]).diag()
+    return Camera(K, (WIDTH, HEIGHT), R_camera_world=upright, name=name)
 
 
 def plausible_pose(body: BodyModel, *, generator: torch.Generator) -> Float[Tensor, " n"]:

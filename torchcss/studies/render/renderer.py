@@ -59,6 +59,14 @@ class Mesh(NamedTuple):
     points_part: Float[Tensor, "v 3"] | None = None
     texture: Texture | None = None
 
+    def moved(self, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]) -> Mesh:
+        """The mesh of a part that was at the world's origin where the part is now."""
+        return self._replace(
+            vertices_world=self.vertices_world @ rotation.T + translation,
+            normals_world=self.normals_world @ rotation.T,
+            points_part=self.vertices_world,
+        )
+
 
 @dataclass(frozen=True, kw_only=True)
 class Lighting:
@@ -304,16 +312,15 @@ def _join(meshes: Sequence[Mesh]) -> _Joined:
 
 
 def capsule(
-    radius: float, half_length: float, *, rings: int = 24, meridians: int = 24
+    radius: float, half_length: float
 ) -> tuple[Float[Tensor, "rings meridians 3"], Float[Tensor, "rings meridians 3"]]:
     """Nodes and unit normals of a cylinder with round ends, along z about the origin.
 
     Args:
         radius: Metres.
         half_length: Half the length of the cylinder, metres.
-        rings: Latitudes, an even number: half of them on either end.
-        meridians: Longitudes.
     """
+    rings = meridians = 24  # of the rings, half on either end
     # The poles themselves are left out, as in the meshes of the parts.
     latitude = (torch.arange(rings, dtype=torch.float64) + 0.5) / rings * math.pi - math.pi / 2
     longitude = torch.arange(meridians, dtype=torch.float64) * (2 * math.pi / meridians)

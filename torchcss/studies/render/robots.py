@@ -23,18 +23,17 @@ from torchcss.body.load import FileOptions, load_body
 from torchcss.body.model import BodyModel
 from torchcss.errors import BodyError
 from torchcss.studies.render.clutter import clutter_background
-from torchcss.studies.render.renderer import Lighting, capsule, random_texture
+from torchcss.studies.render.renderer import Lighting, Mesh, capsule, random_texture
 from torchcss.studies.render.scene import look_at
-from torchcss.studies.render.sequences import (
-    PaintedPart,
-    SyntheticSequence,
-    film_parts,
-)
+from torchcss.studies.render.sequences import SyntheticSequence, film_parts
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import grid_faces
 
 _COLOURS = ((0.85, 0.86, 0.88), (0.95, 0.55, 0.15), (0.80, 0.82, 0.86))
 """Painted metal, and a joint cover in a signal colour."""
+
+_GIRTH = 0.055
+"""Radius of the links of an arm, metres."""
 
 _ENDLESS = math.pi
 """Range of a joint without limits, to either side."""
@@ -44,9 +43,6 @@ def robot_arm(
     path: str | Path,
     *,
     usual: Float[Tensor, " n"] | None = None,
-    deviation: float = 1.0,
-    girth: float = 0.055,
-    dtype: torch.dtype = torch.float64,
 ) -> BodyModel:
     """Load an arm, standing on the world's origin, Y up.
 
@@ -56,29 +52,25 @@ def robot_arm(
 
     Args:
         path: A URDF or MJCF file.
-        usual: Pose about which the arm works, if it is known.
-        deviation: By how much it departs from that, radians.
-        girth: Radius of the links, metres.
-        dtype: Floating type.
+        usual: Pose about which the arm works, if it is known: it departs from that by a radian.
 
     Raises:
         BodyError: If the file cannot be used or describes no links of any length.
     """
-    body = load_body(path, file=FileOptions(shape="bones"), dtype=dtype)
+    body = load_body(path, file=FileOptions(shape="bones"), dtype=torch.float64)
     if not body.num_parts:
         raise BodyError(f"{path}: no link has a length; expected an arm")
     upright = body.tie.new_tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
     body = body.with_base(upright, upright.new_zeros(3))
     shape = body.part_shape.clone()
     # What was along the bone stays; across it the link is as thick as all others.
-    shape[:, 2] = shape[:, 2] - shape[:, :2].mean(1) + girth
-    shape[:, 2] = torch.maximum(shape[:, 2], shape.new_tensor(1.1 * girth))
-    shape[:, :2] = girth
+    shape[:, 2] = (shape[:, 2] - shape[:, :2].mean(1) + _GIRTH).clamp(min=1.1 * _GIRTH)
+    shape[:, :2] = _GIRTH
     body.part_shape = shape
     body.neighbours = _near_pairs(body)
     if usual is not None:
         body.sticky_mean = usual.to(body.tie)
-        body.sticky_deviation = torch.full_like(body.sticky_mean, deviation)
+        body.sticky_deviation = torch.ones_like(body.sticky_mean)
     return body
 
 
@@ -189,8 +181,11 @@ def film_robot(
         points, normals = capsule(float(shape[0]) * float(factor), float(shape[2] - shape[0]))
         colour, faces = _COLOURS[part % len(_COLOURS)], grid_faces(*points.shape[:2])
         painted.append(
-            PaintedPart(points.flatten(0, 1), normals.flatten(0, 1), faces, colour, textures[part])
-        )
+            Mesh(
+                points.flatten(0, 1), normals.flatten(0, 1), faces, points.new_tensor(colour),
+                texture=textures[part],
+            )
+        )  # fmt: skip
     return [
         film_parts(
             body, states, painted, camera=camera, background=room, lighting=lighting,

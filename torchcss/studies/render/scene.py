@@ -302,7 +302,6 @@ def look_at(
         image_size_wh: Width and height of the picture.
         name: Its name.
     """
-    width, height = image_size_wh
     centre = torch.as_tensor(eye, dtype=torch.float64)
     forward = functional.normalize(torch.as_tensor(target, dtype=torch.float64) - centre, dim=-1)
     # Straight up or down no row is level; any will do.
@@ -310,7 +309,7 @@ def look_at(
     up = forward.new_tensor([0.0, 0.0, 1.0] if steep else [0.0, 1.0, 0.0])
     right = functional.normalize(torch.linalg.cross(forward, up), dim=-1)
     rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
-    K = [[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]]
+    K = Camera.pinhole(*image_size_wh, focal_px=focal_px).K
     return Camera(
         K, image_size_wh, R_camera_world=rotation, t_camera_world=-rotation @ centre, name=name
     )

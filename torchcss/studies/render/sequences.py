@@ -40,10 +40,8 @@ from torchcss.studies.render.clutter import clutter_background
 from torchcss.studies.render.mesh_truth import Labels, MeshTruth, joints_own_parts
 from torchcss.studies.render.motions import MOTIONS, Motion, sample_times
 from torchcss.studies.render.renderer import (
-    Colour,
     Lighting,
     Mesh,
-    Texture,
     add_sensor_noise,
     random_texture,
     render_meshes,
@@ -110,20 +108,10 @@ def arm_motion(body: BodyModel, times: Float[Tensor, " t"]) -> Float[Tensor, "t 
     return body.bounds.project(states)
 
 
-class PaintedPart(NamedTuple):
-    """The surface of a part that is filmed, in the part's frame, metres."""
-
-    points: Float[Tensor, "v 3"]
-    normals: Float[Tensor, "v 3"]
-    faces: Int[Tensor, "f 3"]
-    colour: Colour
-    texture: Texture
-
-
 def film_parts(
     body: BodyModel,
     states: Float[Tensor, "t n"],
-    painted: Sequence[PaintedPart],
+    painted: Sequence[Mesh],
     *,
     camera: Camera,
     background: UInt8[Tensor, "h w 3"],
@@ -136,7 +124,7 @@ def film_parts(
     Args:
         body: The body, on its base.
         states: Its states.
-        painted: What every part looks like.
+        painted: The surface of every part as it is where the part is at the world's origin.
         camera: Who looks.
         background: What is behind.
         lighting: The light on the parts.
@@ -147,15 +135,8 @@ def film_parts(
     for state in states:
         rotation, centre = body.part_poses(body.pose(state))
         meshes = [
-            Mesh(
-                part.points @ turn.T + place,
-                part.normals @ turn.T,
-                part.faces,
-                torch.tensor(part.colour, dtype=torch.float64),
-                points_part=part.points,
-                texture=part.texture,
-            )
-            for part, turn, place in zip(painted, rotation, centre, strict=True)
+            mesh.moved(turn, place)
+            for mesh, turn, place in zip(painted, rotation, centre, strict=True)
         ]
         picture = render_meshes(meshes, camera, background=background, lighting=lighting)
         frames.append(add_sensor_noise(picture, generator=generator).numpy())
@@ -188,12 +169,12 @@ def arm_sequence(
     textures = [random_texture(generator=generator) for _ in body.part_names]
     fine, faces = body.mesh(40, 48), grid_faces(40, 48)
     painted = [
-        PaintedPart(
+        Mesh(
             fine.points[part].flatten(0, 1),
             fine.normals[part].flatten(0, 1),
             faces,
-            _SLEEVE if name.endswith(("upper_arm", "clavicle")) else _SKIN,
-            textures[part],
+            fine.points.new_tensor(_SLEEVE if name.endswith(("upper_arm", "clavicle")) else _SKIN),
+            texture=textures[part],
         )
         for part, name in enumerate(body.part_names)
     ]
