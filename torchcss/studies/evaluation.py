@@ -68,6 +68,7 @@ from torchcss.studies.metrics import (
     probability_within,
     procrustes_errors_mm,
     root_aligned_errors_mm,
+    spread,
     track_errors,
 )
 from torchcss.studies.sequences import RecordedSequence, common_name, read_reference
@@ -211,19 +212,15 @@ def penetration_depth(
     return deepest.scatter_reduce(0, near.item[near.owner], depth, "amax").reshape(batch)
 
 
-def silhouette(
-    body: BodyModel, x: Float[Tensor, " n"], camera: Camera, *, rings: int = 16, meridians: int = 20
-) -> Bool[np.ndarray, "h w"]:
+def silhouette(body: BodyModel, x: Float[Tensor, " n"], camera: Camera) -> Bool[np.ndarray, "h w"]:
     """Pixels whose centres see the posed body.
 
     Args:
         body: The body.
         x: Its state.
         camera: The camera.
-        rings: Latitudes of the drawn mesh.
-        meridians: Longitudes of the drawn mesh.
     """
-    return (part_map(body, x, camera, rings=rings, meridians=meridians) >= 0).cpu().numpy()
+    return (part_map(body, x, camera, rings=16, meridians=20) >= 0).cpu().numpy()
 
 
 def region_probability(
@@ -354,12 +351,14 @@ class Evaluator:
             drawn = silhouette(body, mixture.mean[0], sequence.camera)
             overlap = float(mask_overlap(drawn, sequence.mask[number]))
         poses, error = body.pose(mixture.mean), _mean(aligned[0])
+        weight = mixture.weight.double().cpu().numpy()
+        along, across = self._directions(joints[0], reference)
         failed = error > limits.lost_mm or overlap < limits.least_overlap
         return FrameMeasures(
             frame=number,
             time_s=tracked.frame.time_s - start.time_s,
             failed=None if math.isnan(error) and math.isnan(overlap) else failed,
-            weight=mixture.weight.double().cpu().numpy(),
+            weight=weight,
             absolute_mm=absolute,
             root_aligned_mm=aligned,
             procrustes_mm=procrustes_errors_mm(joints[:, :count], reference[:count]),
@@ -377,8 +376,9 @@ class Evaluator:
             overlap=overlap,
             outside_degrees=_outside(body, mixture.mean[0]),
             penetration_m=penetration_depth(body, poses, self._pairs, self._surface).cpu().numpy(),
-            **self._directions(joints[0], reference),
-            apart_weight=_apart_weight(joints, mixture.weight.double().cpu().numpy()),
+            along_mm=along,
+            across_mm=across,
+            apart_weight=_apart_weight(joints, weight),
             at_bound=_at_bound(body, mixture.mean[0]),
             samples=int(tracked.info.num_samples),
             evaluations=num_evaluations(tracked.info),
@@ -391,23 +391,20 @@ class Evaluator:
 
     def _directions(
         self, joints: Float[np.ndarray, "j 3"], reference: Float[np.ndarray, "j 3"]
-    ) -> dict[str, float]:
-        """Errors of the compared joints along the line of sight and across it."""
+    ) -> tuple[float, float]:
+        """Errors of the compared joints along the line of sight and across it, millimetres."""
         away, count = joints - reference, len(self.compared)
         if self._rooted:
             hips = [self._common.index(name) for name in ("l_hip", "r_hip")]
             away = away - away[hips].mean(0)
         away, known = away[:count], np.isfinite(reference[:count]).all(-1)
         if not known.any() or not np.isfinite(away[known]).all():
-            return {"along_mm": math.nan, "across_mm": math.nan}
+            return math.nan, math.nan
         centre = self.sequence.camera.centre_world.double().cpu().numpy()
         sight = reference[:count][known].mean(0) - centre
         along = away[known] @ (sight / np.linalg.norm(sight))
         squared = (away[known] ** 2).sum(-1) - along**2
-        return {
-            "along_mm": 1000 * float(np.sqrt((along**2).mean())),
-            "across_mm": 1000 * float(np.sqrt(squared.mean())),
-        }
+        return 1000 * float(np.sqrt((along**2).mean())), 1000 * float(np.sqrt(squared.mean()))
 
     def _angle_deviations(self, tracked: Posterior) -> np.ndarray:
         """Standard deviations per angle between each mode and the truth."""
@@ -472,7 +469,11 @@ def summarise(
         thresholds: What counted as failed.
         interval_s: Seconds between the frames.
     """
-    times = [m.time_s for m in measures]
+
+    def every(name: str, frames: Sequence[FrameMeasures] = measures) -> list[Any]:
+        return [getattr(frame, name) for frame in frames]
+
+    times = every("time_s")
     nearest = [m.root_aligned_mm[_nearest(m)] for m in measures]
     lost = loss(measures, thresholds)
     held = measures if lost is None else measures[: max(lost, 1)]
@@ -480,39 +481,31 @@ def summarise(
         "num_frames": len(measures),
         "lost": lost is not None,
         "lost_s": math.nan if lost is None else times[lost],
-        "failed_share": _mean([m.failed for m in measures if m.failed is not None]),
+        "failed_share": _mean(every("failed")),
         "limb_lost_s": limb_loss([m.root_aligned_mm[0] for m in measures], times, thresholds),
         "limb_lost_of_modes_s": limb_loss(nearest, times, thresholds),
         "num_frames_held": len(held) if lost is None else lost,
         **_errors(held),
         **_modes(held, thresholds),
-        "overlap": _mean([m.overlap for m in held]),
+        "overlap": _mean(every("overlap", held)),
         "acceleration_error": acceleration_error(
-            np.stack([m.joints_m for m in held]),
-            np.stack([m.reference_m for m in held]),
-            interval_s,
+            every("joints_m", held), every("reference_m", held), interval_s
         ),
         **_impossible(held, thresholds),
-        "along_mm": _mean([m.along_mm for m in held]),
-        "across_mm": _mean([m.across_mm for m in held]),
-        "apart_weight": _mean([m.apart_weight for m in held]),
-        "samples_per_frame": _mean([m.samples for m in measures]),
-        "evaluations_per_frame": _mean([m.evaluations for m in measures]),
+        **{name: _mean(every(name, held)) for name in ("along_mm", "across_mm", "apart_weight")},
+        **{f"{name}_per_frame": _mean(every(name)) for name in ("samples", "evaluations")},
         **{
             f"{stage}_s_per_frame": _mean([m.seconds[stage] for m in measures])
             for stage in measures[0].seconds
         },
         "per_frame": {
             "time_s": times,
-            "failed": [m.failed for m in measures],
+            "failed": every("failed"),
             "root_aligned_mm": [_mean(m.root_aligned_mm[0]) for m in measures],
             "root_aligned_best_of_modes_mm": [_mean(errors) for errors in nearest],
-            "overlap": [m.overlap for m in measures],
-            "along_mm": [m.along_mm for m in measures],
-            "across_mm": [m.across_mm for m in measures],
-            "apart_weight": [m.apart_weight for m in measures],
+            **{name: every(name) for name in ("overlap", "along_mm", "across_mm", "apart_weight")},
             "penetration_mm": [1000 * float(m.penetration_m[0]) for m in measures],
-            "at_bound": [m.at_bound for m in measures],
+            "at_bound": every("at_bound"),
         },
     }
 
@@ -619,10 +612,7 @@ def over_seeds(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         missing = math.inf if key in LOSSES else math.nan
         # A file may begin with runs of an earlier version, which did not measure everything.
         values = [number(row[key], missing) for row in rows if key in row]
-        known = sorted(value for value in values if not math.isnan(value)) or [math.nan]
-        # The middle by hand: the mean of two middle ones may be that of infinities.
-        middle = (known[(len(known) - 1) // 2] + known[len(known) // 2]) / 2
-        table[key] = (middle, known[0], known[-1])
+        table[key] = spread(values)
     return table
 
 

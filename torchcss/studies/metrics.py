@@ -130,8 +130,7 @@ def absolute_errors_mm(
     Raises:
         ShapeError: If the shapes do not fit, or a tracked position is not finite.
     """
-    tracked, reference = _pair(tracked_m, reference_m)
-    return _distances_mm(tracked, reference)
+    return _distances_mm(*_pair(tracked_m, reference_m))
 
 
 def root_aligned_errors_mm(
@@ -186,8 +185,7 @@ def procrustes_errors_mm(
     Raises:
         ShapeError: If the shapes do not fit, or a tracked position is not finite.
     """
-    tracked, reference = _pair(tracked_m, reference_m)
-    return _distances_mm(procrustes_align(tracked, reference), reference)
+    return _distances_mm(procrustes_align(tracked_m, reference_m), np.asarray(reference_m))
 
 
 def procrustes_align(
@@ -412,6 +410,15 @@ def coverage(
     known = np.asarray(probability, np.float64)
     known = known[np.isfinite(known)]
     return {level: float((known <= level).mean()) if known.size else np.nan for level in levels}
+
+
+def spread(values: Float[ArrayLike, " n"]) -> tuple[float, float, float]:
+    """Median, least and greatest of the numbers among some values; NaN if there is none."""
+    known = np.sort(np.asarray(values, np.float64))
+    known = known[~np.isnan(known)].tolist() or [np.nan]
+    # The middle by hand: the mean of two middle ones may be that of infinities.
+    middle = (known[(len(known) - 1) // 2] + known[len(known) // 2]) / 2
+    return middle, known[0], known[-1]
 
 
 def acceleration_error(

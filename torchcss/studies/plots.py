@@ -21,6 +21,8 @@ from matplotlib.figure import Figure
 
 from torchcss.body.root import ROOT_NAMES
 from torchcss.show.style import OKABE_ITO
+from torchcss.show.track_plots import tidy
+from torchcss.studies.metrics import spread
 from torchcss.studies.slices import PROMINENCE, Line, Slice
 
 _TERM_COLOURS = {
@@ -117,11 +119,7 @@ def decorate(axes: Axes, unit: Unit | None = None) -> None:
     if unit is not None:
         axes.axvline(0.0, color=GREY, lw=0.8, ls=":", zorder=1)
         axes.set_xlabel(unit.label, labelpad=1)
-    axes.grid(visible=True, color="0.92", lw=0.6)
-    axes.set_axisbelow(True)
-    axes.tick_params(labelsize=8)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    tidy(axes)
 
 
 class ErrorCurves(NamedTuple):
@@ -225,14 +223,14 @@ def failure_figure(
 
 def _draw(axes: Axes, times: np.ndarray, tracker: ErrorCurves, failed_mm: float) -> None:
     top = _ABOVE * failed_mm
-    low, middle, high = _quantiles(tracker.best_mm)
+    middle, low, high = _spreads(tracker.best_mm)
     # The band of a seed that is lost goes up to the border.
     axes.fill_between(
         times, low.clip(max=2 * top), high.clip(max=2 * top), color=OKABE_ITO["blue"], alpha=0.2,
         lw=0, label="range over the seeds",
     )  # fmt: skip
     axes.plot(times, middle, color=OKABE_ITO["blue"], lw=1.6, label="best mode, median")
-    nearest = _quantiles(tracker.best_of_modes_mm)[1]
+    nearest, _, _ = _spreads(tracker.best_of_modes_mm)
     axes.plot(
         times, nearest, color=OKABE_ITO["orange"], lw=1.3, ls="--", label="nearest mode, median"
     )
@@ -254,14 +252,7 @@ def _draw(axes: Axes, times: np.ndarray, tracker: ErrorCurves, failed_mm: float)
     decorate(axes)
 
 
-def _quantiles(errors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Least, median and greatest over the known seeds of every time; NaN where there is none."""
-    result = np.full((3, errors.shape[1]), np.nan)
-    for index, column in enumerate(errors.T):
-        known = np.sort(column[~np.isnan(column)])
-        if known.size:
-            # The middle by hand: the mean of two middle ones may be that of infinities.
-            middle = (known[(known.size - 1) // 2] + known[known.size // 2]) / 2
-            result[:, index] = known[0], middle, known[-1]
-    result[np.isinf(result[1]) & (np.arange(3) == 1)[:, None]] = np.nan
-    return result[0], result[1], result[2]
+def _spreads(errors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Median, least and greatest over the known seeds of every time; NaN where there is none."""
+    middle, low, high = np.array([spread(column) for column in errors.T]).T
+    return np.where(np.isinf(middle), np.nan, middle), low, high
