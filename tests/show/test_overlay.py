@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from torchcss.errors import ConfigurationError, ShapeError
-from torchcss.show.overlay import PALETTE, OverlayStyle, ProjectedPart, draw_overlay
+from torchcss.show.overlay import PALETTE, OverlayStyle, ProjectedBody, draw_overlay
+from torchcss.vision.rasterise import join_faces
 
 
 def disc(u, v, radius, *, depth=2.0, part=0, dtype=torch.float32):
@@ -19,7 +20,14 @@ def disc(u, v, radius, *, depth=2.0, part=0, dtype=torch.float32):
     index = torch.arange(48)
     faces = torch.stack((index, (index + 1) % 48, torch.full_like(index, 48)), -1)
     far = torch.full((49,), depth, dtype=dtype)
-    return ProjectedPart(uv, far, far > 0, faces, part)
+    return ProjectedBody(uv, far, far > 0, faces, torch.full_like(index, part))
+
+
+def together(*bodies):
+    """Several meshes as one body."""
+    uv, depth, valid, faces, part = zip(*bodies, strict=True)
+    faces, _ = join_faces(faces, [len(points) for points in uv])
+    return ProjectedBody(*map(torch.cat, (uv, depth, valid)), faces, torch.cat(part))
 
 
 def grey(height=120, width=160, level=90):
@@ -38,7 +46,7 @@ def rings(height, width, u, v):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_only_the_body_and_its_outline_change(dtype):
     image = grey()
-    drawn = draw_overlay(image, [[disc(70, 60, 30, dtype=dtype)]])
+    drawn = draw_overlay(image, [disc(70, 60, 30, dtype=dtype)])
     assert (image == 90).all()  # the input is not touched
     touched, distance = changed(image, drawn), rings(120, 160, 70, 60)
     assert touched[distance < 29].all()
@@ -53,7 +61,7 @@ def test_lines_have_the_same_width_in_every_direction():
     for resolution in (10**6, 6000):  # at full size, and rasterised at about a third
         image = grey(220, 220, 0)
         style = OverlayStyle(line=3.0, fill=0.0, resolution=resolution)
-        bright = draw_overlay(image, [[disc(110, 110, 80)]], style=style).float().mean(-1)
+        bright = draw_overlay(image, [disc(110, 110, 80)], style=style).float().mean(-1)
         y, x = torch.meshgrid(torch.arange(220), torch.arange(220), indexing="ij")
         sector = (torch.atan2(y - 110.0, x - 110.0) / (2 * math.pi) * 24).floor().long() % 24
         ink = torch.zeros(24).index_add(0, sector.view(-1), bright.view(-1)) / bright.max()
@@ -66,10 +74,10 @@ def test_lines_have_the_same_width_in_every_direction():
 
 def test_other_modes_are_outlines_and_their_weight_shows():
     image = grey()
-    best = [disc(-500, -500, 5)]
+    best = disc(-500, -500, 5)
 
     def ink(share):
-        other = [disc(70, 60, 30)]
+        other = disc(70, 60, 30)
         drawn = draw_overlay(image, [best, other], weights=[1.0, share])
         distance = rings(120, 160, 70, 60)
         assert not changed(image, drawn)[(distance - 30).abs() > 4].any()
@@ -85,23 +93,23 @@ def test_other_modes_are_outlines_and_their_weight_shows():
 def test_hidden_parts_are_dashed():
     image = grey()
     front, back = disc(70, 60, 40, depth=1.0, part=0), disc(70, 60, 20, depth=2.0, part=1)
-    with_back = draw_overlay(image, [[front, back]])
-    alone = draw_overlay(image, [[front]])
+    with_back = draw_overlay(image, [together(front, back)])
+    alone = draw_overlay(image, [front])
     ring = (rings(120, 160, 70, 60) - 20).abs() < 0.6
     lit = (with_back.float() - alone.float()).mean(-1)[ring] > 10
     assert 0.15 < lit.float().mean() < 0.85
     # The same with the parts' depths exchanged is a solid line.
-    solid = draw_overlay(image, [[front._replace(depth=3 * front.depth), back]])
+    solid = draw_overlay(image, [together(front._replace(depth=3 * front.depth), back)])
     assert (solid[ring].float().mean(-1) > 180).all()
-    quiet = draw_overlay(image, [[front, back]], style=OverlayStyle(hidden=0.0))
+    quiet = draw_overlay(image, [together(front, back)], style=OverlayStyle(hidden=0.0))
     assert torch.equal(quiet, alone)
 
 
 def test_meshes_of_one_part_share_an_outline():
     image = grey()
     style = OverlayStyle(fill=0.0)
-    one = draw_overlay(image, [[disc(60, 60, 20), disc(80, 60, 20)]], style=style)
-    two = draw_overlay(image, [[disc(60, 60, 20), disc(80, 60, 20, part=1)]], style=style)
+    one = draw_overlay(image, [together(disc(60, 60, 20), disc(80, 60, 20))], style=style)
+    two = draw_overlay(image, [together(disc(60, 60, 20), disc(80, 60, 20, part=1))], style=style)
     lens = rings(120, 160, 60, 60).maximum(rings(120, 160, 80, 60)) < 15
     assert not changed(image, one)[lens].any()
     assert changed(image, one).any()
@@ -112,10 +120,9 @@ def test_meshes_of_one_part_share_an_outline():
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (2, 7), (33, 17), (121, 163)])
 def test_odd_sizes(height, width):
     image = grey(height, width)
-    mode = [disc(width / 2, height / 2, 6), disc(width / 3, 0, 9, depth=1.0, part=1)]
-    drawn = draw_overlay(
-        image, [mode, mode[:1]], keypoints=torch.tensor([[0.0, 0.0]]), text="frame 1"
-    )
+    one = disc(width / 2, height / 2, 6)
+    two = together(one, disc(width / 3, 0, 9, depth=1.0, part=1))
+    drawn = draw_overlay(image, [two, one], keypoints=torch.tensor([[0.0, 0.0]]), text="frame 1")
     assert drawn.shape == image.shape
     assert drawn.dtype == torch.uint8
     assert changed(image, drawn).any()
@@ -124,7 +131,8 @@ def test_odd_sizes(height, width):
 def test_no_modes_and_empty_modes_change_nothing():
     image = grey()
     assert torch.equal(draw_overlay(image, []), image)
-    assert torch.equal(draw_overlay(image, [[], []]), image)
+    nothing = ProjectedBody(*(values[:0] for values in disc(70, 60, 30)))
+    assert torch.equal(draw_overlay(image, [nothing, nothing]), image)
 
 
 def test_bodies_out_of_sight_change_nothing():
@@ -142,19 +150,19 @@ def test_bodies_out_of_sight_change_nothing():
         disc(1e30, -1e30, 30),
     ]
     for part in away:
-        assert torch.equal(draw_overlay(image, [[part], [part]]), image)
+        assert torch.equal(draw_overlay(image, [part, part]), image)
 
 
 def test_bodies_far_larger_than_the_frame_fill_it():
     image = grey()
     for radius in (1e3, 1e6):
-        drawn = draw_overlay(image, [[disc(80, 60, radius)], [disc(70, 60, radius)]])
+        drawn = draw_overlay(image, [disc(80, 60, radius), disc(70, 60, radius)])
         assert changed(image, drawn).all()
 
 
 def test_a_body_cut_by_the_frame_has_no_line_along_the_cut():
     image = grey()
-    drawn = draw_overlay(image, [[disc(0, 60, 30)]], style=OverlayStyle(fill=0.0))
+    drawn = draw_overlay(image, [disc(0, 60, 30)], style=OverlayStyle(fill=0.0))
     touched = changed(image, drawn)
     assert touched[60, 28:32].any()
     assert not touched[50:70, :10].any()
@@ -184,7 +192,7 @@ def test_text_stays_in_its_corner():
 
 
 def test_bad_input_is_named():
-    mode = [disc(70, 60, 30)]
+    mode = disc(70, 60, 30)
     with pytest.raises(ShapeError, match="uint8"):
         draw_overlay(grey().float(), [mode])
     with pytest.raises(ShapeError, match="image"):

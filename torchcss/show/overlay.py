@@ -30,54 +30,58 @@ from torch.nn import functional
 
 from torchcss.body.model import BodyModel
 from torchcss.errors import ConfigurationError, ShapeError, check_shape
+from torchcss.show.style import OKABE_ITO
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import (
     Fragments,
     grid_faces,
     interpolate,
-    join_faces,
     nearest_faces,
     rasterise,
     vertex_normals,
 )
 
-PALETTE: tuple[tuple[int, int, int], ...] = (
-    (86, 180, 233),
-    (230, 159, 0),
-    (204, 121, 167),
-    (0, 158, 115),
-    (213, 94, 0),
-    (240, 228, 66),
-    (0, 114, 178),
-)
+_ORDER = ("sky", "orange", "purple", "green", "vermilion", "yellow", "blue")
+PALETTE = tuple(tuple(bytes.fromhex(OKABE_ITO[name].removeprefix("#"))) for name in _ORDER)
 """Colours of the modes, RGB, best mode first: Okabe and Ito's set without black."""
 
+_RINGS, _MERIDIANS = 16, 20
+"""Latitudes and longitudes of the mesh of a part."""
 
 _STEPS = 0.25
 """Square coarse pixels: how far the cracks of a raster, enlarged, scatter about the true line:
 1/12 for rounding to pixels and 1/6 for interpolating between them."""
 
 
-class ProjectedPart(NamedTuple):
-    """The mesh of one body part as a camera sees it.
+class ProjectedBody(NamedTuple):
+    """The mesh of a body in one pose as a camera sees it: one explanation of the picture.
 
     Attributes:
         uv: Projected vertices, pixels.
         depth: Their depth along the optical axis, metres.
         valid: Which of them may be used (in front of the camera).
         faces: Corner indices of the triangles.
-        part: Which part of the body it is; meshes with one number share one outline.
+        part: Which part of the body every triangle is of; every part has one outline.
     """
 
     uv: Float[Tensor, "v 2"]
     depth: Float[Tensor, " v"]
     valid: Bool[Tensor, " v"]
     faces: Int[Tensor, "f 3"]
-    part: int
+    part: Int[Tensor, " f"]
 
+    def alone(self, part: int) -> ProjectedBody:
+        """One part of it."""
+        chosen = self.part == part
+        faces = self.faces[chosen]
+        own = torch.zeros_like(self.valid).index_fill(0, faces.flatten(), True)
+        return self._replace(valid=self.valid & own, faces=faces, part=self.part[chosen])
 
-ProjectedMode = Sequence[ProjectedPart]
-"""One explanation of the picture: all the parts of the body in one pose."""
+    def parts_seen(self, face: Int[Tensor, "r s"]) -> Int[Tensor, "r s"]:
+        """The part of every pixel's triangle, -1 where there is none."""
+        if not len(self.part):
+            return face
+        return torch.where(face >= 0, self.part[face.clamp_min(0)], -1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,28 +146,22 @@ def project_body(
     body: BodyModel,
     x: Float[Tensor, "k n"],
     camera: Camera,
-    *,
-    rings: int = 16,
-    meridians: int = 20,
-) -> list[list[ProjectedPart]]:
+) -> list[ProjectedBody]:
     """Project the surface of a body in several poses, as `draw_overlay` takes it.
 
     Args:
         body: The body on its base.
         x: Its poses, the best first.
         camera: Camera of the picture.
-        rings: Latitudes of the mesh of each part.
-        meridians: Longitudes of the mesh of each part.
     """
-    local, faces = body.mesh(rings, meridians).points.flatten(1, 2), grid_faces(rings, meridians)
+    local, faces = body.mesh(_RINGS, _MERIDIANS).points, grid_faces(_RINGS, _MERIDIANS)
     rotation, centre = body.part_poses(body.pose(x))
-    seen = camera.project(local @ rotation.mT + centre[..., None, :])
+    seen = camera.project(local.flatten(1, 2) @ rotation.mT + centre[..., None, :])
+    part = torch.arange(body.num_parts).repeat_interleave(len(faces))
+    faces = faces.repeat(body.num_parts, 1) + _RINGS * _MERIDIANS * part[:, None]
     return [
-        [
-            ProjectedPart(uv, depth, valid, faces, part)
-            for part, (uv, depth, valid) in enumerate(zip(*pose, strict=True))
-        ]
-        for pose in zip(*(tensor.cpu() for tensor in seen), strict=True)
+        ProjectedBody(uv, depth, valid, faces, part)
+        for uv, depth, valid in zip(*(t.flatten(1, 2).cpu() for t in seen), strict=True)
     ]
 
 
@@ -195,7 +193,7 @@ def draw_poses(
 
 def draw_overlay(
     image: UInt8[Tensor, "h w 3"],
-    modes: Sequence[ProjectedMode],
+    modes: Sequence[ProjectedBody],
     *,
     weights: Float[Tensor, " k"] | Sequence[float] | None = None,
     keypoints: Float[Tensor, "j 2"] | None = None,
@@ -206,7 +204,7 @@ def draw_overlay(
 
     Args:
         image: The frame; it is not changed.
-        modes: Projected bodies, the best first. There may be none, and parts may be behind the
+        modes: Projected bodies, the best first. There may be none, and they may be behind the
             camera or out of the picture.
         weights: Weight of every mode, in any unit; equal when absent.
         keypoints: Measured image points, drawn as small rings; those not finite are missing.
@@ -256,12 +254,10 @@ def draw_overlay(
 
 
 def _window(
-    mode: ProjectedMode, height: int, width: int, margin: float, resolution: int
+    mode: ProjectedBody, height: int, width: int, margin: float, resolution: int
 ) -> _Window | None:
     """Bounding box of a body's usable vertices and `margin` in the frame; `None` if it is empty."""
-    corners = [part.uv[part.valid & (part.depth > 0)] for part in mode]
-    uv = torch.cat(corners) if corners else torch.zeros(0, 2)
-    uv = uv[torch.isfinite(uv).all(-1)]
+    uv = mode.uv[mode.valid & (mode.depth > 0) & torch.isfinite(mode.uv).all(-1)]
     if not uv.numel():
         return None
     bound = uv.new_tensor([width, height])
@@ -274,37 +270,10 @@ def _window(
     return _Window(top, left, rows, columns, min(1.0, (resolution / (rows * columns)) ** 0.5))
 
 
-class _Joined(NamedTuple):
-    """The meshes of all parts as one, and the part number of every face."""
-
-    uv: Float[Tensor, "v 2"]
-    depth: Float[Tensor, " v"]
-    valid: Bool[Tensor, " v"]
-    faces: Int[Tensor, "f 3"]
-    number: Int[Tensor, " f"]
-
-    @classmethod
-    def of(cls, mode: ProjectedMode) -> _Joined:
-        """The parts of a body."""
-        faces, owner = join_faces([p.faces for p in mode], [p.uv.shape[0] for p in mode])
-        return cls(
-            torch.cat([part.uv for part in mode]),
-            torch.cat([part.depth for part in mode]),
-            torch.cat([part.valid for part in mode]),
-            faces,
-            owner.new_tensor([part.part for part in mode])[owner],
-        )
-
-    def labels(self, face: Int[Tensor, "r s"]) -> Int[Tensor, "r s"]:
-        """The part number of every pixel, -1 where there is none."""
-        return torch.where(face >= 0, self.number[face.clamp_min(0)], -1)
-
-
-def _labels(mode: ProjectedMode, window: _Window) -> Int[Tensor, "r s"]:
+def _labels(mode: ProjectedBody, window: _Window) -> Int[Tensor, "r s"]:
     """Part labels of a body in its window."""
-    mesh = _Joined.of(mode)
-    place, depth, valid = window.place(mesh.uv)[None], mesh.depth[None], mesh.valid[None]
-    return mesh.labels(nearest_faces(place, depth, mesh.faces, *window.coarse, valid=valid)[0])
+    place, depth, valid = window.place(mode.uv)[None], mode.depth[None], mode.valid[None]
+    return mode.parts_seen(nearest_faces(place, depth, mode.faces, *window.coarse, valid=valid)[0])
 
 
 def _borders(part: Int[Tensor, "r s"]) -> Float[Tensor, "R S"]:
@@ -366,7 +335,7 @@ def _blend(
 
 def _draw_outline(
     target: UInt8[Tensor, "h w 3"],
-    mode: ProjectedMode,
+    mode: ProjectedBody,
     colour: Float[Tensor, "3"],
     line: float,
     opacity: float,
@@ -383,7 +352,7 @@ def _draw_outline(
 
 def _draw_body(
     target: UInt8[Tensor, "h w 3"],
-    mode: ProjectedMode,
+    mode: ProjectedBody,
     colour: Float[Tensor, "3"],
     line: float,
     style: OverlayStyle,
@@ -392,11 +361,10 @@ def _draw_body(
     window = _window(mode, target.shape[0], target.shape[1], 2 * line + 2, style.resolution)
     if window is None:
         return
-    mesh = _Joined.of(mode)
-    place = window.place(mesh.uv)
-    fragments = rasterise(place, mesh.depth, mesh.faces, *window.coarse, valid=mesh.valid)
-    part = mesh.labels(fragments.face)
-    light, seen = _shading(mesh, fragments, target.shape[0], target.shape[1])
+    place = window.place(mode.uv)
+    fragments = rasterise(place, mode.depth, mode.faces, *window.coarse, valid=mode.valid)
+    part = mode.parts_seen(fragments.face)
+    light, seen = _shading(mode, fragments, target.shape[0], target.shape[1])
     sigma = _line_spread(line, window.scale)
     visible = _profile(_borders(part), sigma)
     hidden = _profile(_hidden_borders(mode, part, window, line), sigma)
@@ -414,7 +382,7 @@ def _draw_body(
 
 
 def _shading(
-    mesh: _Joined, fragments: Fragments, height: int, width: int
+    mesh: ProjectedBody, fragments: Fragments, height: int, width: int
 ) -> tuple[Float[Tensor, "r s"], Float[Tensor, "r s"]]:
     """Lambert's shading per pixel, and where there is a surface.
 
@@ -438,19 +406,19 @@ def _shading(
 
 
 def _hidden_borders(
-    mode: ProjectedMode, visible: Int[Tensor, "r s"], window: _Window, line: float
+    mode: ProjectedBody, visible: Int[Tensor, "r s"], window: _Window, line: float
 ) -> Float[Tensor, "R S"]:
     """Dashed lattice of part silhouettes that lie behind other parts of the same body."""
     rows, columns = visible.shape
     dashes = visible.new_zeros(rows + 1, columns + 1, dtype=torch.float32)
     dash = max(round(4 * line * window.scale), 2)
-    for number in sorted({part.part for part in mode}):
-        members = [part for part in mode if part.part == number]
-        placed = [part._replace(uv=window.place(part.uv)) for part in members]
-        box = _window(placed, rows, columns, 2, rows * columns)
+    placed = mode._replace(uv=window.place(mode.uv))
+    for number in mode.part.unique().tolist():
+        alone = placed.alone(number)
+        box = _window(alone, rows, columns, 2, rows * columns)
         if box is None:
             continue
-        own = _labels(placed, box) == number
+        own = _labels(alone, box) == number
         here = (slice(box.top, box.top + box.height), slice(box.left, box.left + box.width))
         border = _borders(own.long())
         # A lattice point counts as hidden where none of its four pixels shows this part.

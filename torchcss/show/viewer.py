@@ -419,7 +419,7 @@ def _opacity(share: float) -> float:
     return _FAINTEST + (1 - _FAINTEST) * min(share, 1.0)
 
 
-def _colour(mode: int, opacity: float) -> tuple[int, int, int, int]:
+def _colour(mode: int, opacity: float) -> tuple[int, ...]:
     return (*PALETTE[mode % len(PALETTE)], round(255 * opacity))
 
 
