@@ -275,9 +275,6 @@ def test_bad_shapes_are_named():
         rasterise(uv, depth, faces, 0, 5)
     with pytest.raises(ShapeError, match="background"):
         render_meshes([], camera(5, 5, 5), background=torch.zeros(4, 5, 3))
-    black = torch.zeros(5, 5, 3, dtype=torch.uint8)
-    with pytest.raises(ConfigurationError, match="supersample"):
-        render_meshes([], camera(5, 5, 5), background=black, supersample=0)
 
 
 def test_joined_faces_name_their_mesh():

@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from torchcss.body.model import BodyModel
+from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.surface import straighten
 from torchcss.studies.render.renderer import Colour, Mesh, random_waves
 from torchcss.vision.rasterise import vertex_normals
@@ -175,19 +175,17 @@ class Character:
     ) -> None:
         self.body, self.clothing = body, clothing or Clothing()
         self.shape = _other_girths(body, self.clothing.girth, generator)
-        kept = [i for i, name in enumerate(body.part_names) if name not in without]
-        bind_rotation, bind_centre = body.part_poses(body.pose(_spread_state(body)))
-        blobs = [(self.shape[kept], bind_rotation[kept], bind_centre[kept])]
-        blobs.append(_padding(body, bind_rotation, bind_centre, without))
-        shapes, rotations, centres = (torch.cat(group) for group in zip(*blobs, strict=True))
-        vertices, self.faces = _smooth_union(shapes, rotations, centres, spacing)
+        bare = torch.tensor([name in without for name in body.part_names])
+        spread = body.pose(_spread_state(body))
+        bind_rotation, bind_centre = body.part_poses(spread)
+        kept = [part[~bare] for part in (self.shape, bind_rotation, bind_centre)]
+        padding = _padding(body, spread, without)
+        vertices, self.faces = _smooth_union(
+            *(torch.cat(pair) for pair in zip(kept, padding, strict=True)), spacing
+        )
         # Where every vertex is for every part, and how near.
         local = (vertices[None] - bind_centre[:, None]) @ bind_rotation
-        distance = torch.stack(
-            [distance_to_part(s, p) for s, p in zip(self.shape, local, strict=True)]
-        )
-        bare = torch.ones(body.num_parts, dtype=torch.bool)
-        bare[kept] = False
+        distance = distance_to_parts(self.shape, local)
         distance[bare] = math.inf
         shares = _shares(body, distance.T, self.faces)
         weight, owner = shares.topk(min(_INFLUENCES, body.num_parts), dim=-1)
@@ -295,6 +293,13 @@ def distance_to_part(
     return (radial.detach() - 1) / slope.norm(dim=-1).clamp(min=least)
 
 
+def distance_to_parts(
+    shape: Float[Tensor, "parts 9"], points: Float[Tensor, "parts p 3"]
+) -> Float[Tensor, "parts p"]:
+    """Distance of points to several parts, in whose frames they are given."""
+    return torch.stack([distance_to_part(s, p) for s, p in zip(shape, points, strict=True)])
+
+
 def _other_girths(body: BodyModel, deviation: float, generator: torch.Generator) -> Tensor:
     """The body's shapes with girths of their own, left and right alike."""
     shape, factors = body.part_shape.clone(), {}
@@ -320,23 +325,24 @@ def _spread_state(body: BodyModel) -> Tensor:
 
 
 def _padding(
-    body: BodyModel, rotation: Tensor, centre: Tensor, without: Sequence[str]
+    body: BodyModel, pose: BodyPose, without: Sequence[str]
 ) -> tuple[Float[Tensor, "k 9"], Float[Tensor, "k 3 3"], Float[Tensor, "k 3"]]:
-    """What is there besides the parts in the spread pose: fillings about joints, features."""
-    joints = body.pose(_spread_state(body)).joints
-    shapes, rotations, centres = [], [], []
+    """What is there besides the parts in a pose: fillings about joints, features."""
+    rotation, centre = body.part_poses(pose)
+    # Without any they are empty.
+    shapes, rotations, centres = [rotation.new_zeros(0, 9)], [rotation[:0]], [centre[:0]]
 
     def add(axes: Sequence[float], turn: Tensor, place: Tensor) -> None:
-        shapes.append([*axes, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
-        rotations.append(turn)
-        centres.append(place)
+        shapes.append(place.new_tensor([[*axes, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0]]))
+        rotations.append(turn[None])
+        centres.append(place[None])
 
     for index, name in enumerate(body.joint_names):
         bare = _without_side(name)
         side = name.removesuffix(bare)
         owner, axes = _PADDING.get(bare, ("", ()))
         if side + owner in body.part_names and side + owner not in without:
-            add(axes, body.base_rotation, joints[index])
+            add(axes, body.base_rotation, pose.joints[index])
     for index, name in enumerate(body.part_names):
         bare = _without_side(name)
         for place, axes in _FEATURES.get(bare, ()) if name not in without else ():
@@ -345,9 +351,7 @@ def _padding(
                 c, s = math.cos(_THUMB_TILT), math.sin(_THUMB_TILT)
                 turn = turn @ turn.new_tensor([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]])
             add(axes, turn, centre[index] + rotation[index] @ rotation.new_tensor(place))
-    if not shapes:
-        return rotation.new_zeros(0, 9), rotation[:0], centre[:0]
-    return rotation.new_tensor(shapes), torch.stack(rotations), torch.stack(centres)
+    return torch.cat(shapes), torch.cat(rotations), torch.cat(centres)
 
 
 def _smooth_union(
@@ -517,22 +521,15 @@ def _head(place: _OnBody, clothing: Clothing, colour: Float[Tensor, "v 3"]) -> T
 
 def _quaternion(rotation: Float[Tensor, "p 3 3"]) -> Float[Tensor, "p 4"]:
     """Unit quaternions, scalar first: the largest of the four candidates, for accuracy."""
-    m = rotation
-    trace = m.diagonal(dim1=-2, dim2=-1)
-    t0, t1, t2 = trace.unbind(-1)
-    squares = torch.stack(
-        [1 + t0 + t1 + t2, 1 + t0 - t1 - t2, 1 - t0 + t1 - t2, 1 - t0 - t1 + t2], -1
-    )
-    a, b, c = m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]
-    d, e, f = m[:, 1, 0] + m[:, 0, 1], m[:, 0, 2] + m[:, 2, 0], m[:, 2, 1] + m[:, 1, 2]
-    s0, s1, s2, s3 = squares.unbind(-1)
-    rows = torch.stack([
-        torch.stack([s0, a, b, c], -1),
-        torch.stack([a, s1, d, e], -1),
-        torch.stack([b, d, s2, f], -1),
-        torch.stack([c, e, f, s3], -1),
-    ], 1)  # fmt: skip
-    best = rows[torch.arange(len(m)), squares.argmax(-1)]
+    skew = rotation - rotation.mT
+    axis = torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], -1)
+    x, y, z = rotation.diagonal(dim1=-2, dim2=-1).unbind(-1)
+    squares = torch.stack([1 + x + y + z, 1 + x - y - z, 1 - x + y - z, 1 - x - y + z], -1)
+    # Every row is the quaternion times four times one of its numbers.
+    rows = functional.pad(rotation + rotation.mT, (1, 0, 1, 0))
+    rows[:, 0, 1:] = rows[:, 1:, 0] = axis
+    rows.diagonal(dim1=-2, dim2=-1).copy_(squares)
+    best = rows[torch.arange(len(rows)), squares.argmax(-1)]
     return functional.normalize(best, dim=-1)
 
 

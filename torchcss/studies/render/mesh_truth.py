@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchcss.body.model import BodyModel
-from torchcss.studies.render.character import distance_to_part
+from torchcss.studies.render.character import distance_to_parts
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import interpolate, rasterise
 
@@ -160,5 +160,4 @@ def joints_own_parts(body: BodyModel) -> Bool[Tensor, "j parts"]:
     pose = body.pose(body.rest)
     rotation, centre = body.part_poses(pose)
     local = (pose.joints[None] - centre[:, None]) @ rotation
-    distance = [distance_to_part(s, p) for s, p in zip(body.part_shape, local, strict=True)]
-    return (torch.stack(distance) < 0.02).T
+    return (distance_to_parts(body.part_shape, local) < 0.02).T

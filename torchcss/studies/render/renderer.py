@@ -226,43 +226,38 @@ def render_meshes(
     *,
     background: UInt8[Tensor, "h w 3"],
     lighting: Light | None = None,
-    supersample: int = 2,
 ) -> UInt8[Tensor, "h w 3"]:
     """Draw meshes before a background.
 
-    The picture is rendered at `supersample` times the resolution and averaged.
+    The picture is rendered with two samples per pixel and axis, and averaged.
 
     Args:
         meshes: What to draw.
         camera: Who looks.
         background: What is behind the meshes, of the camera's image size.
         lighting: The light on the meshes; the default lamp when absent.
-        supersample: Samples per pixel and axis.
 
     Raises:
         ShapeError: If a mesh or the background has the wrong shape.
-        ConfigurationError: If `supersample` is less than 1.
     """
     width, height = camera.image_size_wh
     check_shape("background", background, height, width, 3)
-    if supersample < 1:
-        raise ConfigurationError(f"supersample: expected at least 1, got {supersample}; 2 is usual")
     if not meshes:
         return background.clone()
-    joined = _join(meshes)
-    uv, depth, valid = camera.project(joined.vertices)
-    rows, columns = height * supersample, width * supersample
-    uv = (uv + 0.5) * supersample - 0.5
-    fine = rasterise(uv, depth, joined.faces, rows, columns, valid=valid)
+    values = _at_vertices(meshes)
+    faces, owner = join_faces(
+        [mesh.faces for mesh in meshes], [len(mesh.vertices_world) for mesh in meshes]
+    )
+    uv, depth, valid = camera.project(values[:, :3])
+    rows, columns = 2 * height, 2 * width
+    fine = rasterise((uv + 0.5) * 2 - 0.5, depth, faces, rows, columns, valid=valid)
     sample = torch.nonzero(fine.face.view(-1) >= 0)[:, 0]
     face, weights = fine.face.view(-1)[sample], fine.barycentric.view(-1, 3)[sample]
-    values = (joined.vertices, joined.normals, to_light(joined.colours), joined.points_part)
-    at_sample = interpolate(torch.cat(values, -1), joined.faces, face, weights)
-    points, normals, albedo, local = at_sample.split(3, -1)
+    points, normals, albedo, local = interpolate(values, faces, face, weights).split(3, -1)
     factor = torch.ones_like(albedo[:, :1])
     for index, mesh in enumerate(meshes):
         if mesh.texture is not None:
-            here = torch.nonzero(joined.owner[face] == index)[:, 0]
+            here = torch.nonzero(owner[face] == index)[:, 0]
             factor[here] = mesh.texture(local[here]).to(factor)
     albedo = (albedo * factor).clamp(0, 1)
     light = (lighting or Lighting()).shade(points, normals, albedo, camera.centre_world)
@@ -270,7 +265,7 @@ def render_meshes(
     canvas = light.new_zeros(rows * columns, 4)
     canvas[sample] = torch.cat((to_display(light), torch.ones_like(light[:, :1])), -1)
     canvas = canvas.view(1, rows, columns, 4).permute(0, 3, 1, 2)
-    pooled = functional.avg_pool2d(canvas, supersample)[0].permute(1, 2, 0)
+    pooled = functional.avg_pool2d(canvas, 2)[0].permute(1, 2, 0)
     return to_bytes(pooled[..., :3] * 255 + (1 - pooled[..., 3:]) * background.to(pooled))
 
 
@@ -284,31 +279,18 @@ def to_light(display: Float[Tensor, "i 3"]) -> Float[Tensor, "i 3"]:
     return display**_GAMMA
 
 
-class _Joined(NamedTuple):
-    """Meshes as one: arrays over all vertices, triangles, and whose they are."""
-
-    vertices: Float[Tensor, "v 3"]
-    normals: Float[Tensor, "v 3"]
-    colours: Float[Tensor, "v 3"]
-    points_part: Float[Tensor, "v 3"]
-    faces: Int[Tensor, "f 3"]
-    owner: Int[Tensor, " f"]
-
-
-def _join(meshes: Sequence[Mesh]) -> _Joined:
-    sizes = [mesh.vertices_world.shape[0] for mesh in meshes]
-    for index, (mesh, size) in enumerate(zip(meshes, sizes, strict=True)):
-        check_shape(f"vertices_world of mesh {index}", mesh.vertices_world, size, 3)
+def _at_vertices(meshes: Sequence[Mesh]) -> Float[Tensor, "v 12"]:
+    """Position, normal, light of the colour and place in the part of all vertices of all meshes."""
+    values = []
+    for index, mesh in enumerate(meshes):
+        vertices, size = mesh.vertices_world, len(mesh.vertices_world)
+        check_shape(f"vertices_world of mesh {index}", vertices, size, 3)
         check_shape(f"normals_world of mesh {index}", mesh.normals_world, size, 3)
         check_shape(f"colour of mesh {index}", mesh.colour, 3)
-    vertices = torch.cat([mesh.vertices_world for mesh in meshes])
-    return _Joined(
-        vertices,
-        torch.cat([mesh.normals_world for mesh in meshes]),
-        torch.cat([m.colour.to(vertices).expand(n, 3) for m, n in zip(meshes, sizes, strict=True)]),
-        torch.cat([m.vertices_world if m.points_part is None else m.points_part for m in meshes]),
-        *join_faces([mesh.faces for mesh in meshes], sizes),
-    )
+        albedo = to_light(mesh.colour.to(vertices)).expand(size, 3)
+        local = vertices if mesh.points_part is None else mesh.points_part
+        values.append(torch.cat([vertices, mesh.normals_world, albedo, local], -1))
+    return torch.cat(values)
 
 
 def capsule(
