@@ -180,9 +180,8 @@ class Character:
         bind_rotation, bind_centre = body.part_poses(spread)
         kept = [part[~bare] for part in (self.shape, bind_rotation, bind_centre)]
         padding = _padding(body, spread, without)
-        vertices, self.faces = _smooth_union(
-            *(torch.cat(pair) for pair in zip(kept, padding, strict=True)), spacing
-        )
+        shapes, rotations, centres = map(torch.cat, zip(kept, padding, strict=True))
+        vertices, self.faces = _smooth_union(shapes, rotations, centres, spacing)
         # Where every vertex is for every part, and how near.
         local = (vertices[None] - bind_centre[:, None]) @ bind_rotation
         distance = distance_to_parts(self.shape, local)
