@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING
 
 from torchcss.files import prepare_output_folder, replace_file
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 OKABE_ITO: dict[str, str] = {
     "blue": "#0072B2",

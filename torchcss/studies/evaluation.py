@@ -353,6 +353,10 @@ class Evaluator:
         poses, error = body.pose(mixture.mean), _mean(aligned[0])
         weight = mixture.weight.double().cpu().numpy()
         along, across = self._directions(joints[0], reference)
+        within = region_probability(
+            body, mixture, self._column[:count], reference[:count], limits.reference_m,
+            exact=sequence.truth is not None,
+        )  # fmt: skip
         failed = error > limits.lost_mm or overlap < limits.least_overlap
         return FrameMeasures(
             frame=number,
@@ -362,14 +366,7 @@ class Evaluator:
             absolute_mm=absolute,
             root_aligned_mm=aligned,
             procrustes_mm=procrustes_errors_mm(joints[:, :count], reference[:count]),
-            within=region_probability(
-                body,
-                mixture,
-                self._column[:count],
-                reference[:count],
-                limits.reference_m,
-                exact=sequence.truth is not None,
-            ),
+            within=within,
             angle_deviations=self._angle_deviations(tracked),
             joints_m=joints[0, :count],
             reference_m=reference[:count],
