@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Self
 
 import torch
 from torch import Tensor
 
+from torchcss.inference.problem import SearchProblem
+from torchcss.inference.tracker import SequenceTracker, TrackerInfo, TrackerState
 from torchcss.types import Bounds, LocalModel
 
 
@@ -20,6 +22,18 @@ def box(n: int, lower: float, upper: float, dtype: torch.dtype = torch.float64) 
 def unbounded(n: int, dtype: torch.dtype = torch.float64) -> Bounds:
     """No limits at all."""
     return box(n, -torch.inf, torch.inf, dtype)
+
+
+def follow(
+    tracker: SequenceTracker,
+    state: TrackerState,
+    problems: Iterable[SearchProblem],
+    bounds: Bounds,
+) -> Iterator[tuple[TrackerState, TrackerInfo]]:
+    """Step through a sequence, one problem a frame; yields what `step` returns."""
+    for problem in problems:
+        state, info = tracker.step(state, problem, bounds)
+        yield state, info
 
 
 class Alike:

@@ -68,6 +68,24 @@ class MissingExtraError(TorchcssError, ImportError):
     """An optional package is needed; the message says which extra installs it."""
 
 
+def check_positive(choice: object, *names: str, hint: str = "") -> None:
+    """Check that attributes of a choice are positive numbers, or None.
+
+    Args:
+        choice: A record of choices.
+        names: Its attributes.
+        hint: What to do, for the message.
+
+    Raises:
+        ConfigurationError: If one is not.
+    """
+    for name in names:
+        value = getattr(choice, name)
+        if value is not None and not value > 0:
+            where = f"{type(choice).__name__}.{name}"
+            raise ConfigurationError(f"{where}: expected a positive number, got {value}{hint}")
+
+
 def check_shape(name: str, tensor: Tensor, *trailing: int | None) -> None:
     """Check that `tensor` ends in the dimensions `trailing`; `None` stands for any size.
 

@@ -137,11 +137,11 @@ def test_what_has_not_converged_is_left_out_and_all_stay_if_none_has():
 def test_nothing_is_random_and_steps_are_pure():
     wells = [SearchProblem(problems.DoubleWell(tilt=0.1 * t)) for t in range(6)]
     start = ARM.init(at(), generator=START)
-    *_, (whole, _) = ARM.track(start, wells, BOUNDS)
-    *_, (half, _) = ARM.track(start, wells[:3], BOUNDS)
-    *_, (end, _) = ARM.track(half, wells[3:], BOUNDS)
+    *_, (whole, _) = problems.follow(ARM, start, wells, BOUNDS)
+    *_, (half, _) = problems.follow(ARM, start, wells[:3], BOUNDS)
+    *_, (end, _) = problems.follow(ARM, half, wells[3:], BOUNDS)
     other = ARM.init(at(), generator=torch.Generator().manual_seed(9))
-    *_, (same, _) = ARM.track(other, wells, BOUNDS)
+    *_, (same, _) = problems.follow(ARM, other, wells, BOUNDS)
     for one in (end, same):
         assert whole.particles is not None
         assert one.particles is not None
@@ -156,7 +156,7 @@ def test_floored_hessians_are_counted():
     """Of a parameter about which the cost says nothing, the deviation is the prior's."""
     problem = SearchProblem(bowl(4.0, 0.0))
     start = ARM.init(at(), generator=START)
-    state, info = ARM.step(start, problem, BOUNDS, prior_variance=torch.tensor([1.0, 9.0]))
+    state, info = ARM.step(start, problem, BOUNDS)
     assert int(info.num_floored) == 3
     expected = torch.tensor([0.25, 9.0]).double()
     torch.testing.assert_close(state.mixture.covariance[0].diagonal(), expected)

@@ -54,7 +54,7 @@ def test_it_is_the_kalman_filter_where_that_is_exact(options, generator):
     noise = torch.diag(torch.tensor(STEP).double().square())
     state = tracker.init(single(), generator=generator)
     for cost, (now, info) in zip(
-        costs, tracker.track(state, map(SearchProblem, costs), FREE), strict=True
+        costs, problems.follow(tracker, state, map(SearchProblem, costs), FREE), strict=True
     ):
         information = torch.linalg.inv(covariance + noise)
         covariance = torch.linalg.inv(information + cost.hessian)
@@ -123,7 +123,9 @@ def test_bounds_type_and_repeatability(tracker, dtype):
         state = tracker.init(mixture, generator=torch.Generator().manual_seed(4))
         states = [
             state
-            for state, _ in tracker.track(state, map(SearchProblem, [bowl(1.0, 1.0)] * 2), bounds)
+            for state, _ in problems.follow(
+                tracker, state, map(SearchProblem, [bowl(1.0, 1.0)] * 2), bounds
+            )
         ]
         runs.append(states[-1])
     a, b = runs
@@ -137,14 +139,14 @@ def test_bounds_type_and_repeatability(tracker, dtype):
 def test_saved_and_restored_runs_continue_exactly(tracker, generator):
     costs = [bowl(0.1 * t, 0.2) for t in range(6)]
     state = tracker.init(single(), generator=generator)
-    whole = [s for s, _ in tracker.track(state, map(SearchProblem, costs), FREE)][-1]
-    half = [s for s, _ in tracker.track(state, map(SearchProblem, costs[:3]), FREE)][-1]
+    *_, (whole, _) = problems.follow(tracker, state, map(SearchProblem, costs), FREE)
+    *_, (half, _) = problems.follow(tracker, state, map(SearchProblem, costs[:3]), FREE)
     file = io.BytesIO()
     torch.save([half.mixture._asdict(), *half[1:4], half.particles._asdict()], file)
     file.seek(0)
     mixture, *rest, particles = torch.load(file)
     resumed = type(half)(GaussianMixture(**mixture), *rest, Particles(**particles))
-    end = [s for s, _ in tracker.track(resumed, map(SearchProblem, costs[3:]), FREE)][-1]
+    *_, (end, _) = problems.follow(tracker, resumed, map(SearchProblem, costs[3:]), FREE)
     for a, b in zip(
         (*whole.mixture, *whole.particles), (*end.mixture, *end.particles), strict=True
     ):
@@ -183,7 +185,8 @@ def test_no_finite_cost(tracker, generator):
 @pytest.mark.parametrize("variance", [0.0, 1e-14, 1e14])
 def test_awkward_priors(tracker, variance, generator):
     state = tracker.init(single(variance=(variance, variance)), generator=generator)
-    for state, _ in tracker.track(state, map(SearchProblem, [bowl(0.0, 0.0)] * 2), BOUNDS):  # noqa: B020
+    twice = map(SearchProblem, [bowl(0.0, 0.0)] * 2)
+    for state, _ in problems.follow(tracker, state, twice, BOUNDS):  # noqa: B020
         assert all(bool(field.isfinite().all()) for field in state.mixture)
     still = make(type(tracker), num_samples=50, dynamics=Diffusion())
     state, _ = still.step(
@@ -202,7 +205,7 @@ def test_velocity_carries_particles_on(generator):
     for dynamics in (ConstantVelocity(deviation=0.05), Diffusion(deviation=0.05)):
         tracker = make(ParticleFilter, dynamics=dynamics)
         state = tracker.init(single(variance=(0.01, 0.01)), generator=generator)
-        *_, (state, _) = tracker.track(state, map(SearchProblem, path), FREE)
+        *_, (state, _) = problems.follow(tracker, state, map(SearchProblem, path), FREE)
         behind.append(float(path[-1].minimum[0] - state.mixture.moments()[0][0]))
     assert abs(behind[0]) < 0.05 < behind[1]
     assert float(state.velocity[0, 0]) == pytest.approx(0.2, abs=0.1)

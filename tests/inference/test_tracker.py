@@ -37,7 +37,7 @@ def test_both_wells_are_found_and_followed(generator):
     state = CSS.init(single(), generator=generator)
     wells = [problems.DoubleWell(slope=0.5 + 0.02 * t) for t in range(5)]
     for well, (now, info) in zip(
-        wells, CSS.track(state, map(SearchProblem, wells), BOUNDS), strict=True
+        wells, problems.follow(CSS, state, map(SearchProblem, wells), BOUNDS), strict=True
     ):
         state = now
         found = state.mixture.mean[state.mixture.mean[:, 0].argsort()]
@@ -81,14 +81,14 @@ def test_saved_and_restored_runs_continue_exactly(generator):
         dynamics=ConstantVelocity(deviation=0.01),
     )
     state = tracker.init(single(), generator=generator)
-    whole = [s for s, _ in tracker.track(state, map(SearchProblem, wells), BOUNDS)][-1]
-    half = [s for s, _ in tracker.track(state, map(SearchProblem, wells[:3]), BOUNDS)][-1]
+    *_, (whole, _) = problems.follow(tracker, state, map(SearchProblem, wells), BOUNDS)
+    *_, (half, _) = problems.follow(tracker, state, map(SearchProblem, wells[:3]), BOUNDS)
     file = io.BytesIO()
     torch.save([half.mixture._asdict(), half.velocity, half.generator_state, half.frame], file)
     file.seek(0)
     mixture, *rest = torch.load(file)
     resumed = type(half)(GaussianMixture(**mixture), *rest)
-    end = [s for s, _ in tracker.track(resumed, map(SearchProblem, wells[3:]), BOUNDS)][-1]
+    *_, (end, _) = problems.follow(tracker, resumed, map(SearchProblem, wells[3:]), BOUNDS)
     assert whole.particles is end.particles is None
     for a, b in zip((*whole.mixture, *whole[1:4]), (*end.mixture, *end[1:4]), strict=True):
         assert torch.equal(a, b)
@@ -187,7 +187,7 @@ def test_awkward_covariances(variance, num_modes, single_precision, seed):
     tracker = Tracker(proposal=CSS.proposal, num_samples=15, num_modes=num_modes)
     state = tracker.init(mixture, generator=torch.Generator().manual_seed(seed))
     frames = [SearchProblem(problems.DoubleWell(tilt=0.2))] * 3
-    for state, info in tracker.track(state, frames, BOUNDS):  # noqa: B020
+    for state, info in problems.follow(tracker, state, frames, BOUNDS):  # noqa: B020
         assert 1 <= len(state.mixture.mean) <= num_modes
         assert all(bool(x.isfinite().all()) for x in state.mixture)
         assert state.mixture.mean.dtype == dtype
@@ -232,7 +232,7 @@ def test_weights_do_not_underflow(generator):
         well.minima, 0.01 * torch.eye(2).double().expand(2, 2, 2), torch.zeros(2).double()
     )
     state = tracker.init(both, generator=generator)
-    *_, (state, _) = tracker.track(state, map(SearchProblem, [well] * 100), BOUNDS)
+    *_, (state, _) = problems.follow(tracker, state, map(SearchProblem, [well] * 100), BOUNDS)
     assert len(state.mixture.mean) == 2
     assert -5000 < float(state.mixture.log_weight[1]) < -3000
 
@@ -374,7 +374,7 @@ def test_evidence_is_the_power_of_the_likelihood(generator):
         proposal=EigenDirectionGrid(), num_samples=20, num_modes=2, likelihood_power=0.1
     )
     state = tracker.init(both, generator=generator)
-    *_, (state, info) = tracker.track(state, map(SearchProblem, [well] * 30), BOUNDS)
+    *_, (state, info) = problems.follow(tracker, state, map(SearchProblem, [well] * 30), BOUNDS)
     odds = state.mixture.log_weight[0] - state.mixture.log_weight[1]
     torch.testing.assert_close(odds, 3 * (info.cost[1] - info.cost[0]), rtol=1e-3, atol=1e-3)
 

@@ -20,7 +20,7 @@ from torchcss.cost.total import TrackingCost
 from torchcss.inference.dynamics import ConstantVelocity
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.proposals import CovarianceScaled, with_moves
-from torchcss.inference.tracker import Tracker, TrackerState, initial_state
+from torchcss.inference.tracker import Tracker, TrackerState
 from torchcss.tracking.limb_moves import LostLimbs, astray_limbs, other_poses
 
 DYNAMICS = ConstantVelocity(deviation=0.05, persistence=0.8)
@@ -57,7 +57,8 @@ def state_at(body: BodyModel, x: Tensor, *others: Tensor) -> TrackerState:
     mixture = GaussianMixture(
         mean, 1e-3 * torch.eye(n).to(x).expand(k, n, n), -torch.arange(k).to(x)
     )
-    state = initial_state(mixture.normalise(), generator=torch.Generator().manual_seed(0))
+    tracker = Tracker(proposal=CovarianceScaled(covariance_scale=1), num_samples=1, num_modes=1)
+    state = tracker.init(mixture.normalise(), generator=torch.Generator().manual_seed(0))
     return state._replace(velocity=torch.full_like(mean, 0.01))
 
 

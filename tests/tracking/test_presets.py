@@ -51,7 +51,7 @@ def test_every_tracker_follows_a_minimum(name, body, generator):
     bounds = PRESETS[name].bounds(problems.box(2, -6, 6))
     state = tracker.init(START, generator=generator)
     wells = [problems.DoubleWell(width=0.3, tilt=-0.02 * t) for t in range(4)]
-    for state, info in tracker.track(state, map(SearchProblem, wells), bounds):  # noqa: B020
+    for state, info in problems.follow(tracker, state, map(SearchProblem, wells), bounds):  # noqa: B020
         assert 1 <= len(state.mixture.mean) <= tracker.num_modes
         assert float(state.mixture.weight.sum()) == pytest.approx(1)
         assert state.mixture.log_weight.argmax() == 0

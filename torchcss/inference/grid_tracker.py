@@ -22,25 +22,22 @@ has not converged is left out; weights are exp(-cost).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from torchcss.errors import ConfigurationError
 from torchcss.inference.importance import survival
 from torchcss.inference.mixture import GaussianMixture, Prior
 from torchcss.inference.problem import SearchProblem
 from torchcss.inference.proposals import Proposal
 from torchcss.inference.tracker import (
     Particles,
+    SequenceTracker,
     TrackerInfo,
     TrackerState,
     as_printed,
     finite_cost,
-    initial_state,
 )
 from torchcss.inference.trust_region import TrustRegionNewton, check_bounds
 from torchcss.types import Bounds, CostFunction, Status
@@ -52,7 +49,7 @@ def by_edges(problem: SearchProblem) -> CostFunction:
 
 
 @dataclass(frozen=True, kw_only=True)
-class GridTracker:
+class GridTracker(SequenceTracker):
     """Fig. 4 [RR]; a `SequenceTracker` without randomness.
 
     Attributes:
@@ -64,36 +61,12 @@ class GridTracker:
         scoring: What scores the hypotheses of a frame; the paper's way, or for studies another.
     """
 
-    num_samples: int
-    num_modes: int
     pattern: Proposal
     optimiser: TrustRegionNewton = field(default_factory=TrustRegionNewton)
     scoring: Callable[[SearchProblem], CostFunction] = by_edges
 
-    def __post_init__(self) -> None:
-        for name in ("num_samples", "num_modes"):
-            if not getattr(self, name) > 0:
-                raise ConfigurationError(
-                    f"GridTracker.{name}: expected a positive number, got {getattr(self, name)}"
-                )
-
-    @property
-    def stated_power(self) -> float:
-        """Covariances are those of the likelihood as it is."""
-        return 1.0
-
-    def init(self, mixture: GaussianMixture, *, generator: torch.Generator) -> TrackerState:
-        """Start from a mixture, see `initial_state`."""
-        return initial_state(mixture, generator=generator)
-
     def step(
-        self,
-        state: TrackerState,
-        problem: SearchProblem,
-        bounds: Bounds,
-        *,
-        scale: Float[Tensor, " n"] | None = None,
-        prior_variance: Float[Tensor, " n"] | None = None,
+        self, state: TrackerState, problem: SearchProblem, bounds: Bounds
     ) -> tuple[TrackerState, TrackerInfo]:
         """Process one frame.
 
@@ -102,8 +75,6 @@ class GridTracker:
                 are laid about its mixture and scored on this frame.
             problem: The frame.
             bounds: Box limits on the state.
-            scale: See `TrustRegionNewton.init`.
-            prior_variance: See `TrustRegionNewton.minimise`.
 
         Returns:
             The next state and what was done. If no hypothesis has come to an end with a finite
@@ -114,9 +85,8 @@ class GridTracker:
         starts = state.particles or self._first(state.mixture, prior, problem, bounds)
         own, origin = problem.children(starts.component, prior), starts.component
         waiting = self.optimiser.start(bounds.project(starts.x))
-        descents = self.optimiser.descend(own.cost, waiting, bounds, scale=scale)
-        ends = self.optimiser.modes(descents, bounds)
-        ends, floored = as_printed(ends, descents, bounds, prior_variance)
+        descents = self.optimiser.descend(own.cost, waiting, bounds)
+        ends, floored = as_printed(self.optimiser.modes(descents, bounds), descents, bounds)
 
         cost = finite_cost(ends, converged_only=True)
         if own.weight_only is not None:
@@ -167,19 +137,3 @@ class GridTracker:
         best = score.argsort(stable=True)[: self.num_modes]
         x = pool.x[best]
         return Particles(x, torch.zeros_like(x), -score[best], pool.parent[best])
-
-    def track(
-        self,
-        state: TrackerState,
-        problems: Iterable[SearchProblem],
-        bounds: Bounds,
-        *,
-        scale: Float[Tensor, " n"] | None = None,
-        prior_variance: Float[Tensor, " n"] | None = None,
-    ) -> Iterator[tuple[TrackerState, TrackerInfo]]:
-        """Step through a sequence, one problem a frame; yields what `step` returns."""
-        for problem in problems:
-            state, info = self.step(
-                state, problem, bounds, scale=scale, prior_variance=prior_variance
-            )
-            yield state, info

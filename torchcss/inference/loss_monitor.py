@@ -24,8 +24,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from torchcss.errors import ConfigurationError
-from torchcss.inference.grid_tracker import GridTracker
+from torchcss.errors import check_positive
 from torchcss.inference.particle import AnnealedParticleFilter, ParticleFilter
 from torchcss.inference.proposals import CovarianceScaled, HeavyTailed
 from torchcss.inference.tracker import SequenceTracker, Tracker
@@ -68,11 +67,7 @@ class LossMonitor:
     floor: float = 0.05
 
     def __post_init__(self) -> None:
-        for name in ("slack", "threshold", "most", "burn_in", "window", "floor"):
-            if not getattr(self, name) > 0:
-                raise ConfigurationError(
-                    f"LossMonitor.{name}: expected a positive number, got {getattr(self, name)}"
-                )
+        check_positive(self, "slack", "threshold", "most", "burn_in", "window", "floor")
 
     def init(self) -> MonitorState:
         """Know nothing yet."""
@@ -129,25 +124,14 @@ def widened(
         modes: How many times as many modes are kept.
         scale: Factor on the covariance scale, for trackers that sample by it.
     """
+    tracker = replace(tracker, num_samples=samples * tracker.num_samples)
     if isinstance(tracker, (ParticleFilter, AnnealedParticleFilter)):
-        return replace(tracker, num_samples=samples * tracker.num_samples)
-    if isinstance(tracker, GridTracker):
-        return replace(
-            tracker,
-            num_samples=samples * tracker.num_samples,
-            num_modes=modes * tracker.num_modes,
-        )
+        return tracker
+    tracker = replace(tracker, num_modes=modes * tracker.num_modes)
     if not isinstance(tracker, Tracker):
         return tracker
     proposal = tracker.proposal
     if isinstance(proposal, (CovarianceScaled, HeavyTailed)):
         wider = None if proposal.covariance_scale is None else scale * proposal.covariance_scale
         proposal = replace(proposal, covariance_scale=wider)
-    return replace(
-        tracker,
-        proposal=proposal,
-        num_samples=samples * tracker.num_samples,
-        num_modes=modes * tracker.num_modes,
-        forgetting=0.0,
-        soft_matching=False,
-    )
+    return replace(tracker, proposal=proposal, forgetting=0.0, soft_matching=False)

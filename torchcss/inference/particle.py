@@ -26,8 +26,7 @@ until `num_modes` clusters are made; the rest join the nearest. Centres found so
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator
+from abc import abstractmethod
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -35,7 +34,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchcss.errors import ConfigurationError
+from torchcss.errors import ConfigurationError, check_positive
 from torchcss.inference.dynamics import Diffusion, Dynamics
 from torchcss.inference.importance import (
     normalised_log_weight,
@@ -48,9 +47,9 @@ from torchcss.inference.problem import SearchProblem
 from torchcss.inference.proposals import CovarianceScaled
 from torchcss.inference.tracker import (
     Particles,
+    SequenceTracker,
     TrackerInfo,
     TrackerState,
-    initial_state,
 )
 from torchcss.inference.trust_region import check_bounds
 from torchcss.linalg import covariance_factor, squared_mahalanobis
@@ -74,7 +73,7 @@ class _Weighed(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Filter(ABC):
+class _Filter(SequenceTracker):
     """What the particle filters share.
 
     Attributes:
@@ -85,23 +84,12 @@ class _Filter(ABC):
             `sqrt(2 n)` in the metric of the dynamics' noise, of two draws of that noise.
     """
 
-    num_samples: int
-    num_modes: int
     dynamics: Dynamics = field(default_factory=Diffusion)
     cluster_distance: float = 1.0
 
     def __post_init__(self) -> None:
-        for name in ("num_samples", "num_modes", "cluster_distance"):
-            if not getattr(self, name) > 0:
-                raise ConfigurationError(
-                    f"{type(self).__name__}.{name}: expected a positive number, "
-                    f"got {getattr(self, name)}"
-                )
-
-    @property
-    def stated_power(self) -> float:
-        """Particles state the covariances of the posterior as it is."""
-        return 1.0
+        super().__post_init__()
+        check_positive(self, "cluster_distance")
 
     @abstractmethod
     def _weigh(
@@ -115,18 +103,8 @@ class _Filter(ABC):
     ) -> _Weighed:
         """Draw this frame's particles from the moved ones of the last, and weigh them."""
 
-    def init(self, mixture: GaussianMixture, *, generator: torch.Generator) -> TrackerState:
-        """Start from a mixture, see `initial_state`; the first step draws the particles."""
-        return initial_state(mixture, generator=generator)
-
     def step(
-        self,
-        state: TrackerState,
-        problem: SearchProblem,
-        bounds: Bounds,
-        *,
-        scale: Float[Tensor, " n"] | None = None,
-        prior_variance: Float[Tensor, " n"] | None = None,
+        self, state: TrackerState, problem: SearchProblem, bounds: Bounds
     ) -> tuple[TrackerState, TrackerInfo]:
         """Process one frame.
 
@@ -134,8 +112,6 @@ class _Filter(ABC):
             state: Where the last frame left off.
             problem: The frame. A particle's parent is the mode that sums up its ancestor.
             bounds: Box limits on the state.
-            scale: Not used; nothing descends.
-            prior_variance: Not used.
 
         Returns:
             The next state and what was done. If no particle has a finite cost, they count as
@@ -189,22 +165,6 @@ class _Filter(ABC):
         drawn = fair.sample(state.mixture, self.num_samples, bounds, generator=generator)
         velocity = state.velocity[drawn.parent]
         return Particles(drawn.x, velocity, drawn.log_weight, drawn.parent)
-
-    def track(
-        self,
-        state: TrackerState,
-        problems: Iterable[SearchProblem],
-        bounds: Bounds,
-        *,
-        scale: Float[Tensor, " n"] | None = None,
-        prior_variance: Float[Tensor, " n"] | None = None,
-    ) -> Iterator[tuple[TrackerState, TrackerInfo]]:
-        """Step through a sequence, one problem a frame; yields what `step` returns."""
-        for problem in problems:
-            state, info = self.step(
-                state, problem, bounds, scale=scale, prior_variance=prior_variance
-            )
-            yield state, info
 
     def _sum_up(
         self,

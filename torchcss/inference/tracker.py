@@ -12,8 +12,8 @@ and could never recover.
         proposal=CovarianceScaled(covariance_scale=8), num_samples=100, num_modes=7
     )
     state = tracker.init(mixture, generator=generator)
-    for state, info in tracker.track(state, problems, bounds):
-        ...
+    for problem in problems:
+        state, info = tracker.step(state, problem, bounds)
 
 A frame is a `SearchProblem`: the cost, and what else is known of it. The state is a record of
 tensors: `step` is a pure function of it, so that a run that was saved and restored continues
@@ -22,15 +22,15 @@ exactly as one that was never interrupted.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from torchcss.errors import ConfigurationError, check_shape
+from torchcss.errors import ConfigurationError, check_positive, check_shape
 from torchcss.inference.dynamics import Diffusion, Dynamics
 from torchcss.inference.importance import Survival, survival
 from torchcss.inference.mixture import (
@@ -136,97 +136,73 @@ class TrackerInfo(NamedTuple):
     prior: Prior
 
 
-class SequenceTracker(Protocol):
+@dataclass(frozen=True, kw_only=True)
+class SequenceTracker(ABC):
     """Anything that follows a mixture through a sequence of frames.
 
-    `Tracker`, `GridTracker`, `ParticleFilter` and `AnnealedParticleFilter` are; see `Tracker` for
-    the arguments.
+    Attributes:
+        num_samples: Samples per frame.
+        num_modes: Modes kept.
     """
 
-    @property
-    def num_samples(self) -> int:
-        """Samples per frame."""
-        ...
+    num_samples: int
+    num_modes: int
 
-    @property
-    def num_modes(self) -> int:
-        """Modes kept."""
-        ...
+    def __post_init__(self) -> None:
+        check_positive(self, "num_samples", "num_modes")
 
     @property
     def stated_power(self) -> float:
         """Power of a frame's likelihood in the covariances that are stated, see `tempered`."""
-        ...
+        return 1.0
 
     def init(self, mixture: GaussianMixture, *, generator: torch.Generator) -> TrackerState:
-        """Start from a mixture."""
-        ...
+        """Start from a mixture.
 
-    def step(
-        self,
-        state: TrackerState,
-        problem: SearchProblem,
-        bounds: Bounds,
-        *,
-        scale: Float[Tensor, " n"] | None = None,
-        prior_variance: Float[Tensor, " n"] | None = None,
-    ) -> tuple[TrackerState, TrackerInfo]:
-        """Process one frame."""
-        ...
+        Args:
+            mixture: Prior of the first frame.
+            generator: On the CPU, so that every device sees the same samples. Its state is copied.
 
-    def track(
-        self,
-        state: TrackerState,
-        problems: Iterable[SearchProblem],
-        bounds: Bounds,
-        *,
-        scale: Float[Tensor, " n"] | None = None,
-        prior_variance: Float[Tensor, " n"] | None = None,
-    ) -> Iterator[tuple[TrackerState, TrackerInfo]]:
-        """Step through a sequence."""
-        ...
-
-
-def initial_state(mixture: GaussianMixture, *, generator: torch.Generator) -> TrackerState:
-    """Where every tracker starts.
-
-    Args:
-        mixture: Prior of the first frame.
-        generator: On the CPU, so that every device sees the same samples. Its state is copied.
-
-    Raises:
-        ConfigurationError: If the generator is on another device.
-        ShapeError: If the mixture's tensors do not agree.
-    """
-    if generator.device.type != "cpu":
-        raise ConfigurationError(
-            f"Tracker.init: expected a generator on the CPU, got one on {generator.device}; "
-            "use torch.Generator()"
+        Raises:
+            ConfigurationError: If the generator is on another device.
+            ShapeError: If the mixture's tensors do not agree.
+        """
+        if generator.device.type != "cpu":
+            raise ConfigurationError(
+                f"Tracker.init: expected a generator on the CPU, got one on {generator.device}; "
+                "use torch.Generator()"
+            )
+        check_shape("mixture.mean", mixture.mean, None, None)
+        k, n = mixture.mean.shape
+        check_shape("mixture.covariance", mixture.covariance, k, n, n)
+        check_shape("mixture.log_weight", mixture.log_weight, k)
+        return TrackerState(
+            mixture=mixture.prune(k),
+            velocity=torch.zeros_like(mixture.mean),
+            generator_state=generator.get_state(),
+            frame=torch.zeros((), dtype=torch.long),
         )
-    check_shape("mixture.mean", mixture.mean, None, None)
-    k, n = mixture.mean.shape
-    check_shape("mixture.covariance", mixture.covariance, k, n, n)
-    check_shape("mixture.log_weight", mixture.log_weight, k)
-    return TrackerState(
-        mixture=mixture.prune(k),
-        velocity=torch.zeros_like(mixture.mean),
-        generator_state=generator.get_state(),
-        frame=torch.zeros((), dtype=torch.long),
-    )
+
+    @abstractmethod
+    def step(
+        self, state: TrackerState, problem: SearchProblem, bounds: Bounds
+    ) -> tuple[TrackerState, TrackerInfo]:
+        """Process one frame.
+
+        Args:
+            state: Where the last frame left off.
+            problem: The frame.
+            bounds: Box limits on the state.
+
+        Returns:
+            The next state, and what was done.
+        """
 
 
 def _unperturbed(samples: Samples, prior: Prior, bounds: Bounds) -> Bool[Tensor, " s"]:
     """The samples that are a component's centre, and were not drawn at random."""
     centre = bounds.project(prior.mixture.mean)[samples.parent]
     return (samples.x == centre).all(-1) & (samples.log_weight == -torch.inf)
-
-
-class _Space(NamedTuple):
-    """The state's space: limits, and what `TrustRegionNewton` may be told of its parameters."""
-
-    bounds: Bounds
-    scale: Float[Tensor, " n"] | None
-    prior_variance: Float[Tensor, " n"] | None
 
 
 class _Search(NamedTuple):
@@ -270,7 +246,7 @@ class _Kept(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tracker:
+class Tracker(SequenceTracker):
     """The multiple-mode tracker of section 4.2 [IJRR].
 
     Attributes:
@@ -322,8 +298,6 @@ class Tracker:
     """
 
     proposal: Proposal
-    num_samples: int
-    num_modes: int
     optimiser: TrustRegionNewton = field(default_factory=TrustRegionNewton)
     dynamics: Dynamics = field(default_factory=Diffusion)
     duplicate_distance: float = 1.0
@@ -341,31 +315,18 @@ class Tracker:
     capped: bool = True
 
     def __post_init__(self) -> None:
-        for name in ("num_samples", "num_modes", "duplicate_distance", "oversampling"):
-            if not getattr(self, name) > 0:
-                raise ConfigurationError(
-                    f"Tracker.{name}: expected a positive number, got {getattr(self, name)}"
-                )
+        super().__post_init__()
+        check_positive(self, "duplicate_distance", "oversampling")
         if not 0 <= self.forgetting <= 1:
             raise ConfigurationError(f"Tracker.forgetting: expected 0 to 1, got {self.forgetting}")
 
     @property
     def stated_power(self) -> float:
-        """Power of a frame's likelihood in the covariances that are stated, see `tempered`."""
+        """The power that the weights have."""
         return self.likelihood_power
 
-    def init(self, mixture: GaussianMixture, *, generator: torch.Generator) -> TrackerState:
-        """Start from a mixture, see `initial_state`."""
-        return initial_state(mixture, generator=generator)
-
     def step(
-        self,
-        state: TrackerState,
-        problem: SearchProblem,
-        bounds: Bounds,
-        *,
-        scale: Float[Tensor, " n"] | None = None,
-        prior_variance: Float[Tensor, " n"] | None = None,
+        self, state: TrackerState, problem: SearchProblem, bounds: Bounds
     ) -> tuple[TrackerState, TrackerInfo]:
         """Process one frame.
 
@@ -373,15 +334,13 @@ class Tracker:
             state: Where the last frame left off.
             problem: The frame.
             bounds: Box limits on the state.
-            scale: See `TrustRegionNewton.init`.
-            prior_variance: See `TrustRegionNewton.minimise`.
 
         Returns:
             The next state and what was done. If no sample has a finite cost, the best of the prior
             are carried over, inside the bounds.
         """
         check_bounds(bounds, state.mixture.mean.shape[-1])
-        generator, space = torch.Generator(), _Space(bounds, scale, prior_variance)
+        generator = torch.Generator()
         generator.set_state(state.generator_state)
 
         # 1: the prior, one frame ahead; the proposal inflates it.
@@ -393,12 +352,12 @@ class Tracker:
         prior = Prior.of(ahead).joined(samples.jumps)
         spread = survival(samples.log_weight)
         samples = self._screen(problem, samples, prior, bounds)
-        samples = self._descend_coarsely(problem, samples, prior, space)
+        samples = self._descend_coarsely(problem, samples, prior, bounds)
         started = len(samples.x)
 
         # 2.3: descend from every sample, and discard minima found before.
-        search = self._halve(self._begin(problem, samples, prior, bounds), space)
-        modes, distinct, floored = self._minima(search, space)
+        search = self._halve(self._begin(problem, samples, prior, bounds), bounds)
+        modes, distinct, floored = self._minima(search, bounds)
         if len(distinct):
             # 3: weights by the likelihood at the modes. 4 to 6: the best K, with their pasts.
             found = search.problem.take(distinct), Modes(*(part[distinct] for part in modes))
@@ -434,15 +393,15 @@ class Tracker:
         return samples.take(score.argsort(stable=True)[: self.num_samples].sort().values)
 
     def _descend_coarsely(
-        self, problem: SearchProblem, samples: Samples, prior: Prior, space: _Space
+        self, problem: SearchProblem, samples: Samples, prior: Prior, bounds: Bounds
     ) -> Samples:
         """Let every so many samples descend on the coarse cost, if the frame has one."""
         if not self.coarse_every or problem.children(samples.parent, prior).coarse is None:
             return samples
-        samples, some = self._modes_among(samples, prior, space.bounds)
+        samples, some = self._modes_among(samples, prior, bounds)
         coarse = problem.children(samples.parent, prior).take(some).coarse
         assert coarse is not None
-        rough = self.optimiser.minimise(coarse, samples.x[some], space.bounds, scale=space.scale)
+        rough = self.optimiser.minimise(coarse, samples.x[some], bounds)
         return samples._replace(x=samples.x.index_copy(0, some, rough.mean))
 
     def _modes_among(
@@ -477,12 +436,12 @@ class Tracker:
             samples.parent[:0],
         )
 
-    def _halve(self, search: _Search, space: _Space) -> _Search:
+    def _halve(self, search: _Search, bounds: Bounds) -> _Search:
         """Successive halving: give up what falls behind in descending, round by round."""
-        optimiser, bounds, scale = self.optimiser, space.bounds, space.scale
         if not self.survivors or len(search.samples.x) <= self.survivors:
             return search
-        descents = optimiser.init(search.problem.cost, search.samples.x, bounds, scale=scale)
+        optimiser = self.optimiser
+        descents = optimiser.init(search.problem.cost, search.samples.x, bounds)
         search = search._replace(descents=descents)
         for max_steps, multiple in _ROUNDS:
             size = round(multiple * self.survivors)
@@ -490,8 +449,7 @@ class Tracker:
                 continue
             if max_steps:
                 short = replace(optimiser, max_steps=min(max_steps, optimiser.max_steps))
-                cost, descents = search.problem.cost, search.descents
-                descents = short.descend(cost, descents, bounds, scale=scale)
+                descents = short.descend(search.problem.cost, search.descents, bounds)
                 search = search._replace(descents=descents)
                 modes = optimiser.modes(descents, bounds)
             else:
@@ -522,17 +480,14 @@ class Tracker:
         return best[: max(size, len(own))].sort().values
 
     def _minima(
-        self, search: _Search, space: _Space
+        self, search: _Search, bounds: Bounds
     ) -> tuple[Modes, Int[Tensor, " m"], Int[Tensor, ""]]:
         """Descend to the end: all ends, which are distinct by ascending cost, `num_floored`."""
-        bounds = space.bounds
-        descents = self.optimiser.descend(
-            search.problem.cost, search.descents, bounds, scale=space.scale
-        )
-        modes = self.optimiser.modes(descents, bounds, prior_variance=space.prior_variance)
+        descents = self.optimiser.descend(search.problem.cost, search.descents, bounds)
+        modes = self.optimiser.modes(descents, bounds)
         floored = modes.status.new_zeros(())
         if not self.capped:
-            modes, floored = as_printed(modes, descents, bounds, space.prior_variance)
+            modes, floored = as_printed(modes, descents, bounds)
         energy = finite_cost(modes, converged_only=self.converged_only)
         distinct = distinct_modes(
             modes.mean, modes.covariance, energy, distance=self.duplicate_distance
@@ -612,30 +567,6 @@ class Tracker:
         cost = torch.full_like(mixture.log_weight, torch.inf)
         return _Kept(mixture, velocity, cost, best, best, torch.zeros_like(prior.log_weight[0]))
 
-    def track(
-        self,
-        state: TrackerState,
-        problems: Iterable[SearchProblem],
-        bounds: Bounds,
-        *,
-        scale: Float[Tensor, " n"] | None = None,
-        prior_variance: Float[Tensor, " n"] | None = None,
-    ) -> Iterator[tuple[TrackerState, TrackerInfo]]:
-        """Step through a sequence, one problem a frame; yields what `step` returns.
-
-        Args:
-            state: Where to begin.
-            problems: The frames.
-            bounds: Box limits on the state.
-            scale: See `TrustRegionNewton.init`.
-            prior_variance: See `TrustRegionNewton.minimise`.
-        """
-        for problem in problems:
-            state, info = self.step(
-                state, problem, bounds, scale=scale, prior_variance=prior_variance
-            )
-            yield state, info
-
 
 def _start(modes: GaussianMixture, prior: Prior) -> Float[Tensor, "k n"]:
     """Where each component of a prior was a frame ago: what a move put elsewhere was there."""
@@ -657,10 +588,7 @@ def finite_cost(modes: Modes, *, converged_only: bool = False) -> Float[Tensor, 
 
 
 def as_printed(
-    modes: Modes,
-    descents: TrustRegionState,
-    bounds: Bounds,
-    prior_variance: Float[Tensor, " n"] | None,
+    modes: Modes, descents: TrustRegionState, bounds: Bounds
 ) -> tuple[Modes, Int[Tensor, ""]]:
     """Modes with the covariances of `constrained_inverse`, and how many of these were floored.
 
@@ -668,11 +596,9 @@ def as_printed(
         modes: Ends of descents.
         descents: The descents, with the Hessians there.
         bounds: Box limits on the state.
-        prior_variance: See `TrustRegionNewton.minimise`.
     """
-    if prior_variance is None:
-        prior_variance = default_prior_variance(bounds)
     free = modes.active == 0
+    prior_variance = default_prior_variance(bounds)
     covariance, floored = constrained_inverse(descents.model.hessian, free, prior_variance)
     finite = modes.status != Status.NON_FINITE
     return modes._replace(covariance=covariance), (floored & finite).sum()

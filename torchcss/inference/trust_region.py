@@ -47,7 +47,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchcss.errors import ConfigurationError, ShapeError, check_shape
+from torchcss.errors import ConfigurationError, ShapeError, check_positive, check_shape
 from torchcss.kernels import compiler
 from torchcss.kernels.checked import run
 from torchcss.linalg import (
@@ -169,12 +169,11 @@ class TrustRegionNewton:
     pool_size: int | None = None
 
     def __post_init__(self) -> None:
-        for name in ("max_steps", "tolerance", "initial_radius", "factorisations", "pool_size"):
-            if getattr(self, name) is not None and not getattr(self, name) > 0:
-                raise ConfigurationError(
-                    f"TrustRegionNewton.{name}: expected a positive number, "
-                    f"got {getattr(self, name)}; leave it out for the default"
-                )
+        check_positive(
+            self,
+            *("max_steps", "tolerance", "initial_radius", "factorisations", "pool_size"),
+            hint="; leave it out for the default",
+        )
 
     def init(
         self,
@@ -403,18 +402,10 @@ class TrustRegionNewton:
             part = cost.take(items)
         return result
 
-    def modes(
-        self,
-        state: TrustRegionState,
-        bounds: Bounds,
-        *,
-        prior_variance: Float[Tensor, " n"] | None = None,
-    ) -> Modes:
+    def modes(self, state: TrustRegionState, bounds: Bounds) -> Modes:
         """Where the items of a state stand, with the covariances there; see `minimise`."""
         bounds = _like(bounds, state.x)
-        if prior_variance is None:
-            prior_variance = default_prior_variance(bounds)
-        return _modes(state, bounds, prior_variance, state.x.shape)
+        return _modes(state, bounds, default_prior_variance(bounds), state.x.shape)
 
     def promised(self, state: TrustRegionState, bounds: Bounds) -> Modes:
         """Where the next step from every item would lead, by the quadratic model.
