@@ -162,5 +162,5 @@ def residual_cost(
     stiffness = share * weight * first
     bend = (2 * share * weight.square() * second)[..., None, None]
     hessian = residual[..., :, None] * residual[..., None, :] * bend
-    hessian.diagonal(dim1=-2, dim2=-1).add_(stiffness[..., None])
+    torch.linalg.diagonal(hessian).add_(stiffness[..., None])
     return 0.5 * rho, stiffness[..., None] * residual, hessian

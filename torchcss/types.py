@@ -72,6 +72,16 @@ class Bounds(NamedTuple):
         """Return the nearest admissible state."""
         return x.clamp(self.lower.to(x), self.upper.to(x))
 
+    def to(self, like: Tensor) -> Bounds:
+        """The same in the type and on the device of a tensor."""
+        return Bounds(self.lower.to(like), self.upper.to(like))
+
+    def hold(
+        self, x: Float[Tensor, "*batch n"], gradient: Float[Tensor, "*batch n"]
+    ) -> Bool[Tensor, "*batch n"]:
+        """Variables at a bound that a cost of this gradient pushes against it."""
+        return ((x <= self.lower) & (gradient > 0)) | ((x >= self.upper) & (gradient < 0))
+
 
 class Curvature(Enum):
     """Which second derivative `BodyModel.lift` returns."""
@@ -124,6 +134,10 @@ class Modes(NamedTuple):
     active: Int[Tensor, "*batch n"]
     status: Int[Tensor, "*batch"]
     num_steps: Int[Tensor, "*batch"]
+
+    def take(self, items: Int[Tensor, " m"] | slice | int) -> Modes:
+        """Some of the items, of the first leading dimension."""
+        return Modes(*(field[items] for field in self))
 
 
 class Differentiable(Protocol):

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchcss.linalg import mask_free, symmetric_part
+from torchcss.linalg import mask_free, multiply, symmetric_part
 
 _ROUNDS = 200
 """Sets of pinned variables tried; ten are many."""
@@ -33,17 +33,17 @@ class Band(NamedTuple):
 
     def times(self, vector: Float[Tensor, "t n"]) -> Float[Tensor, "t n"]:
         """Matrix times vector."""
-        out = (self.block[:, 0] @ vector[..., None])[..., 0]
+        out = multiply(self.block[:, 0], vector)
         for d in range(1, min(self.block.shape[1], len(vector))):
             lower = self.block[d:, d]
-            out[d:] += (lower @ vector[:-d, :, None])[..., 0]
-            out[:-d] += (lower.mT @ vector[d:, :, None])[..., 0]
+            out[d:] += multiply(lower, vector[:-d])
+            out[:-d] += multiply(lower.mT, vector[d:])
         return out
 
     def plus_diagonal(self, diagonal: Float[Tensor, "*t n"]) -> Band:
         """With something added to the diagonal."""
         block = self.block.clone()
-        block[:, 0].diagonal(dim1=-2, dim2=-1).add_(diagonal)
+        torch.linalg.diagonal(block[:, 0]).add_(diagonal)
         return Band(block)
 
     def masked(self, free: Bool[Tensor, "t n"]) -> Band:
@@ -145,7 +145,7 @@ def least_in_box(
         The minimiser; None if a matrix on the way was not definite in the numbers' precision.
     """
     step, value = torch.zeros_like(gradient), 0.0
-    diagonal = torch.where(held, 1.0, band.block[:, 0].diagonal(dim1=-2, dim2=-1))
+    diagonal = torch.where(held, 1.0, torch.linalg.diagonal(band.block[:, 0]))
     size = float((torch.where(held, 0.0, gradient).square() / diagonal).sum())
     for _ in range(_ROUNDS):
         slope = gradient + band.times(step)

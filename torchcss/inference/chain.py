@@ -19,7 +19,7 @@ from torch import Tensor
 
 from torchcss.errors import ConfigurationError
 from torchcss.inference.band import Band, least_in_box
-from torchcss.linalg import mask_free, symmetric_part
+from torchcss.linalg import mask_free, multiply, symmetric_part
 from torchcss.types import Bounds, Differentiable, LocalModel, Status
 
 Changes = Mapping[int, Callable[[Tensor], Tensor]]
@@ -145,7 +145,7 @@ class Chain(NamedTuple):
 
     def curvature(self, weight: Float[Tensor, " n"]) -> float:
         """A typical curvature in the damping's units, never zero."""
-        diagonal = self.band.block[:, 0].diagonal(dim1=-2, dim2=-1) / weight
+        diagonal = torch.linalg.diagonal(self.band.block[:, 0]) / weight
         typical = float(diagonal.abs().median())
         return typical if typical > 0 else 1.0
 
@@ -246,16 +246,15 @@ def marginals(
     else:
         return torch.diag_embed(prior_variance.expand_as(chain.gradient))
     covariance = mask_free(factor.inverse_diagonal(), free)
-    covariance.diagonal(dim1=-2, dim2=-1).copy_(
-        torch.where(free, covariance.diagonal(dim1=-2, dim2=-1), prior_variance)
+    torch.linalg.diagonal(covariance).copy_(
+        torch.where(free, torch.linalg.diagonal(covariance), prior_variance)
     )
     return covariance
 
 
 def held_by(x: Tensor, gradient: Tensor, bounds: Bounds) -> Bool[Tensor, "t n"]:
     """Variables at a bound that the sum pushes against it, or without room between two."""
-    pushed = ((x <= bounds.lower) & (gradient > 0)) | ((x >= bounds.upper) & (gradient < 0))
-    return pushed | (bounds.lower == bounds.upper)
+    return bounds.hold(x, gradient) | (bounds.lower == bounds.upper)
 
 
 def motion_terms(
@@ -293,7 +292,7 @@ def motion_terms(
         value = value + 0.5 * residual.square().sum()
         for d, factor in enumerate(factors):
             rows = slice(first - d, t - d)
-            gradient[rows] += (factor.mT @ residual[..., None])[..., 0]
+            gradient[rows] += multiply(factor.mT, residual)
             for e in range(d, len(factors)):
                 band[rows, e - d] += factor.mT @ factors[e]
 

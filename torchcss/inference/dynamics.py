@@ -19,6 +19,15 @@ from torch import Tensor
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.linalg import symmetric_part
 
+Deviation = float | tuple[float, ...]
+"""Standard deviation of every parameter, or one number for all."""
+
+
+def noise_covariance(deviation: Deviation, like: Float[Tensor, "k n n"]) -> Float[Tensor, "n n"]:
+    """Covariance of independent dynamical noise, in the type of other covariances."""
+    noise = torch.as_tensor(deviation, dtype=like.dtype, device=like.device)
+    return torch.diag_embed(noise.square().expand(like.shape[-1]))
+
 
 class Dynamics(Protocol):
     """Anything that predicts a mixture one frame ahead."""
@@ -42,13 +51,11 @@ class Diffusion:
             Zero, the default, leaves the mixture as it is.
     """
 
-    deviation: float | tuple[float, ...] = 0.0
+    deviation: Deviation = 0.0
 
     def predict(self, mixture: GaussianMixture, velocity: Float[Tensor, "k n"]) -> GaussianMixture:
         """Add the variance of the motion; the velocity is not used."""
-        mean = mixture.mean
-        deviation = torch.as_tensor(self.deviation, dtype=mean.dtype, device=mean.device)
-        motion = torch.diag_embed(deviation.square().expand(mean.shape[-1]))
+        motion = noise_covariance(self.deviation, mixture.covariance)
         return mixture._replace(covariance=mixture.covariance + motion)
 
 
@@ -61,7 +68,7 @@ class ConstantVelocity:
         persistence: Share of the velocity that is kept, from 0 (diffusion) to 1.
     """
 
-    deviation: float | tuple[float, ...] = 0.0
+    deviation: Deviation = 0.0
     persistence: float = 1.0
 
     def predict(self, mixture: GaussianMixture, velocity: Float[Tensor, "k n"]) -> GaussianMixture:
@@ -89,7 +96,7 @@ class Learned:
     """
 
     transition: Transition
-    deviation: float | tuple[float, ...] = 0.0
+    deviation: Deviation = 0.0
 
     def predict(self, mixture: GaussianMixture, velocity: Float[Tensor, "k n"]) -> GaussianMixture:
         """Apply the transition to every mode."""

@@ -30,7 +30,7 @@ from torch import Tensor, nn
 
 from torchcss.errors import ConfigurationError, check_shape
 from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.linalg import symmetric_part
+from torchcss.linalg import multiply, symmetric_part
 from torchcss.types import Bounds, CostFunction
 
 OPTIMISER = TrustRegionNewton(max_steps=60, tolerance=1e-8)
@@ -169,8 +169,8 @@ class _Minimum(torch.autograd.Function):
         rounding = 8 * value.shape[-1] * torch.finfo(value.dtype).eps
         least = value.abs().amax(-1, keepdim=True) * max(_FLAT, rounding)
         inverse = torch.where(value > least, 1.0 / value.clamp(min=least), 0.0)
-        along = (direction.mT @ (free * outputs[0])[..., None])[..., 0]
-        moved = (direction @ (inverse * along)[..., None])[..., 0] * free
+        along = multiply(direction.mT, free * outputs[0])
+        moved = multiply(direction, inverse * along) * free
         per_term = -(gradients * moved[..., None, :]).sum(-1)
         return None, None, None, None, per_term.reshape(-1, len(weights)).sum(0).to(weights)
 

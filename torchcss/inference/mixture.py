@@ -9,8 +9,7 @@ Covariances may be singular, huge or tiny (see `torchcss.linalg`).
 
 What to call: `GaussianMixture.prune` to keep the best modes, `distinct_modes` to discard modes
 found before (step 2.3; `torchcss.studies.minima` counts them more strictly), `match_to_prior` or
-`prior_at` for step 5, `GaussianMixture.merge` where components overlap and their moments are to be
-kept.
+`prior_at` for step 5.
 """
 
 from __future__ import annotations
@@ -26,6 +25,7 @@ from torchcss.errors import ShapeError
 from torchcss.linalg import (
     covariance_factor,
     log_determinant,
+    multiply,
     squared_mahalanobis,
     symmetric_part,
     whitener,
@@ -89,12 +89,34 @@ class GaussianMixture(NamedTuple):
         """Log-density of the mixture, its weights normalised."""
         return (self.component_log_density(x) + self.normalise().log_weight).logsumexp(-1)
 
-    def sample(self, num: int, *, generator: torch.Generator) -> MixtureSamples:
-        """Draw independent samples."""
-        component = draw_components(self.log_weight, num, generator=generator)
-        noise = standard_normal((num, self.mean.shape[-1]), self.mean, generator=generator)
+    def sample(
+        self,
+        num: int,
+        *,
+        generator: torch.Generator,
+        stratified: bool = False,
+        degrees_of_freedom: int | None = None,
+    ) -> MixtureSamples:
+        """Draw samples.
+
+        Args:
+            num: How many.
+            generator: Source of randomness.
+            stratified: See `draw_components`.
+            degrees_of_freedom: Draw from Student t's of these shapes; None: from Gaussians.
+        """
+        component = draw_components(
+            self.log_weight, num, generator=generator, stratified=stratified
+        )
+        normal = standard_normal((num, self.mean.shape[-1]), self.mean, generator=generator)
+        if degrees_of_freedom is not None:
+            # A sum of squared normals is chi-squared; it is zero with probability zero only.
+            size = (num, degrees_of_freedom)
+            chi = standard_normal(size, self.mean, generator=generator)
+            least = torch.finfo(normal.dtype).eps
+            normal = normal / (chi.square().mean(-1, keepdim=True)).clamp(min=least).sqrt()
         factor = covariance_factor(self.covariance)[component]
-        return MixtureSamples(self.mean[component] + (factor @ noise[..., None])[..., 0], component)
+        return MixtureSamples(self.mean[component] + multiply(factor, normal), component)
 
     def moments(self) -> tuple[Float[Tensor, " n"], Float[Tensor, "n n"]]:
         """Mean and covariance of the whole mixture."""
@@ -103,29 +125,6 @@ class GaussianMixture(NamedTuple):
         apart = self.mean - mean
         spread = self.covariance + apart[:, :, None] * apart[:, None, :]
         return mean, symmetric_part((weight[:, None, None] * spread).sum(0))
-
-    def merge(self, distance: float = 1.0) -> GaussianMixture:
-        """Merge components that lie within each other, keeping the mixture's moments.
-
-        The heaviest component absorbs all whose means lie within `distance` standard deviations of
-        its own, and takes their weight, mean and covariance together; then the heaviest of the rest
-        does, and so on. The mean and covariance of the whole mixture stay as they are.
-
-        Args:
-            distance: Threshold in standard deviations of the absorbing component.
-
-        Returns:
-            The merged mixture, the heaviest component first, its weights normalised.
-        """
-        rest, merged = self.prune(len(self.mean)), []
-        while len(rest.mean):
-            near = rest.take(torch.arange(1, device=rest.mean.device)).squared_distance(rest.mean)
-            near = near[:, 0] <= distance**2
-            near[0] = True
-            absorbed, rest = rest.take(near.nonzero()[:, 0]), rest.take((~near).nonzero()[:, 0])
-            merged.append((*absorbed.moments(), absorbed.log_weight.logsumexp(0)))
-        fields = (torch.stack(field) for field in zip(*merged, strict=True))
-        return GaussianMixture(*fields).prune(len(merged))
 
 
 class MixtureSamples(NamedTuple):
@@ -165,24 +164,12 @@ class Prior(NamedTuple):
         return Prior(joined, torch.cat([self.parent, others.parent]))
 
 
-class Matches(NamedTuple):
-    """Posterior modes matched with prior ones, Fig. 6 step 5.
-
-    Attributes:
-        mixture: The posterior with the weights of its matches multiplied in, normalised.
-        parent: The prior component of each mode; -1 where none was left.
-    """
-
-    mixture: GaussianMixture
-    parent: Int[Tensor, " k"]
-
-
 class Past(NamedTuple):
-    """What modes inherit from the prior.
+    """What modes inherit from the prior, Fig. 6 step 5.
 
     Attributes:
-        log_weight: The prior's weight at the place of each mode.
-        parent: The prior component next to each mode; -1 for a mode that none is near.
+        log_weight: What the prior multiplies into the weight of each mode.
+        parent: The prior component of each mode; -1 for a mode that none is left for, or none near.
     """
 
     log_weight: Float[Tensor, " k"]
@@ -374,7 +361,7 @@ def bhattacharyya(
     one, other = with_least_width(first.covariance), with_least_width(second.covariance)
     between = 0.5 * (one[:, None] + other[None, :])
     apart = first.mean[:, None] - second.mean[None, :]
-    squared = (whitener(between) @ apart[..., None])[..., 0].square().sum(-1)
+    squared = multiply(whitener(between), apart).square().sum(-1)
     own = log_determinant(one)[:, None] + log_determinant(other)[None, :]
     overlap = 0.5 * (log_determinant(between) - 0.5 * own)
     if standard:
@@ -384,8 +371,8 @@ def bhattacharyya(
 
 def match_to_prior(
     posterior: GaussianMixture, prior: GaussianMixture, *, standard: bool = False
-) -> Matches:
-    """Multiply each mode's weight by that of the closest prior component, Fig. 6 step 5 and 6.
+) -> Past:
+    """The weight of the closest prior component for each mode, Fig. 6 step 5.
 
     The modes choose in their order, and a prior component is used once. A mode for which no
     component is left is new; it takes the least weight of the prior, so that it is not favoured
@@ -409,8 +396,7 @@ def match_to_prior(
         closest = choices[distance[mode, choices].argmin()]
         parent[mode], factor[mode] = present[closest], prior.log_weight[closest]
         unused[closest] = False
-    weighted = posterior._replace(log_weight=posterior.log_weight + factor)
-    return Matches(weighted.normalise(), parent)
+    return Past(factor, parent)
 
 
 def prior_at(posterior: GaussianMixture, prior: GaussianMixture) -> Past:

@@ -52,7 +52,7 @@ from torchcss.inference.tracker import (
     TrackerState,
 )
 from torchcss.inference.trust_region import check_bounds
-from torchcss.linalg import covariance_factor, squared_mahalanobis
+from torchcss.linalg import covariance_factor, multiply, squared_mahalanobis
 from torchcss.types import Bounds, Status
 
 
@@ -245,7 +245,7 @@ class ParticleFilter(_Filter):
         factor = covariance_factor(moved.covariance)[ancestor]
         # Directions without dynamical noise have no share in the weights.
         noise = torch.where(factor.any(-2), noise, 0.0)
-        step = (factor @ noise[..., None])[..., 0]
+        step = multiply(factor, noise)
         x = bounds.project(moved.mean[ancestor] + self.noise_scale**0.5 * step)
         energy = _energy(problem, particles.component[ancestor], prior, x)
         correction = (1 - self.dilution) * particles.log_weight[ancestor]
@@ -305,7 +305,7 @@ class AnnealedParticleFilter(_Filter):
                 x, ancestor = x[chosen], ancestor[chosen]
                 spread = spread * self.survival_rate**0.5
             noise = standard_normal(x.shape, x, generator=generator)
-            x = bounds.project(x + spread * (factor[ancestor] @ noise[..., None])[..., 0])
+            x = bounds.project(x + spread * multiply(factor[ancestor], noise))
             energy = _energy(problem, particles.component[ancestor], prior, x)
             log_weight, _ = tempered_log_weight(-energy, self.survival_rate)
         return _Weighed(x, log_weight, ancestor, num_weighed=self.num_layers * len(x))

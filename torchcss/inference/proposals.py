@@ -36,26 +36,19 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
-from typing import NamedTuple, Protocol
+from functools import partial
+from itertools import accumulate, pairwise
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchcss.errors import ConfigurationError
-from torchcss.inference.mixture import (
-    GaussianMixture,
-    MixtureSamples,
-    Prior,
-    draw_components,
-    standard_normal,
-)
-from torchcss.linalg import cholesky_apply, covariance_factor, log_determinant, mask_free
+from torchcss.inference.dynamics import Deviation, noise_covariance
+from torchcss.inference.mixture import GaussianMixture, MixtureSamples, Prior
+from torchcss.linalg import cholesky_apply, log_determinant, mask_free, multiply
 from torchcss.types import Bounds
-
-Deviation = float | tuple[float, ...]
-"""Standard deviation of every parameter, or one number for all."""
 
 
 class Samples(NamedTuple):
@@ -68,21 +61,26 @@ class Samples(NamedTuple):
             sample was drawn, before it was projected onto the bounds. `-inf` for what was not
             drawn at random from the mixture: the modes themselves, regular patterns, jumps.
         jumps: Components that moves add to the mixture, weighed as its own are; None: none.
+        drawn: Where they were before they were projected onto the bounds; None: where they are.
     """
 
     x: Float[Tensor, "s n"]
     parent: Int[Tensor, " s"]
     log_weight: Float[Tensor, " s"]
     jumps: Prior | None = None
+    drawn: Float[Tensor, "s n"] | None = None
 
     def take(self, items: Int[Tensor, " m"]) -> Samples:
         """Some of the samples."""
-        return Samples(self.x[items], self.parent[items], self.log_weight[items], self.jumps)
+        drawn = None if self.drawn is None else self.drawn[items]
+        parts = self.x[items], self.parent[items], self.log_weight[items]
+        return Samples(*parts, self.jumps, drawn)
 
 
-class Proposal(Protocol):
+class Proposal(ABC):
     """Anything that draws starts from a mixture."""
 
+    @abstractmethod
     def sample(
         self, mixture: GaussianMixture, num: int, bounds: Bounds, *, generator: torch.Generator
     ) -> Samples:
@@ -95,32 +93,18 @@ class Proposal(Protocol):
                 they were drawn.
             generator: Where randomness comes from.
         """
-        ...
 
     def log_density(
         self, mixture: GaussianMixture, x: Float[Tensor, "*batch n"]
     ) -> Float[Tensor, "*batch"]:
         """Log-density of what is drawn at random, before projection; `-inf` if nothing is."""
-        ...
+        return torch.full_like(x[..., 0], -math.inf)
 
 
 def unbounded(like: Float[Tensor, "*batch n"]) -> Bounds:
     """No limits on states like these."""
     limit = torch.full_like(like.reshape(-1, like.shape[-1])[0], math.inf)
     return Bounds(-limit, limit)
-
-
-def _deviation_factor(
-    covariance_scale: float | None, deviation_scale: float | None, name: str
-) -> float:
-    """Return the one factor on standard deviations that two named parameters stand for."""
-    given = [s for s in (covariance_scale, deviation_scale) if s is not None]
-    if len(given) != 1 or not (math.isfinite(given[0]) and given[0] > 0):
-        raise ConfigurationError(
-            f"{name}: expected exactly one positive scale, got covariance_scale="
-            f"{covariance_scale} and deviation_scale={deviation_scale}; give one of the two"
-        )
-    return given[0] if covariance_scale is None else math.sqrt(given[0])
 
 
 def _capped(
@@ -130,15 +114,9 @@ def _capped(
     if max_deviation is None:
         return covariance
     limit = torch.as_tensor(max_deviation, dtype=covariance.dtype, device=covariance.device)
-    deviation = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
+    deviation = torch.linalg.diagonal(covariance).clamp(min=0).sqrt()
     shrink = torch.where(deviation > limit, limit / deviation, 1.0)
     return covariance * shrink[..., :, None] * shrink[..., None, :]
-
-
-def _noise(deviation: Deviation, like: Float[Tensor, "k n n"]) -> Float[Tensor, "n n"]:
-    """Covariance of independent dynamical noise."""
-    noise = torch.as_tensor(deviation, dtype=like.dtype, device=like.device)
-    return torch.diag_embed(noise.square().expand(like.shape[-1]))
 
 
 def _check_deviation(deviation: Deviation, name: str) -> None:
@@ -179,7 +157,7 @@ def project_in_metric(
     # What is held is compared with its bound, so that the two must be rounded alike.
     bounds = Bounds(bounds.lower.to(x), bounds.upper.to(x))
     pinned = bounds.lower == bounds.upper
-    scale = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=torch.finfo(x.dtype).tiny).sqrt()
+    scale = torch.linalg.diagonal(covariance).clamp(min=torch.finfo(x.dtype).tiny).sqrt()
     correlation = covariance / scale[:, :, None] / scale[:, None, :]
     target, held, moved = bounds.project(x), torch.zeros_like(x, dtype=torch.bool), x.clone()
     change, items = bounds.project(x) != x, torch.arange(len(x), device=x.device)
@@ -202,7 +180,7 @@ def project_in_metric(
         gap = torch.where(some, target[items] - x[items], 0.0)
         factor, failed = torch.linalg.cholesky_ex(mask_free(part, some))
         pull = torch.where(some, cholesky_apply(factor, gap / scale[items]), 0.0)
-        shift = torch.where(some, gap, scale[items] * (part @ pull[..., None])[..., 0])
+        shift = torch.where(some, gap, scale[items] * multiply(part, pull))
         sound = (failed == 0)[:, None] & shift.isfinite()
         moved[items] = x[items] + torch.where(sound, shift, gap)
         # A bound may pull inwards only: downwards from an upper one, upwards from a lower one. One
@@ -235,11 +213,17 @@ class _Law(NamedTuple):
 
     def draw(self, num: int, *, stratified: bool, generator: torch.Generator) -> MixtureSamples:
         """Draw samples, not projected."""
+        sample = partial(
+            self.mixture.sample,
+            generator=generator,
+            stratified=stratified,
+            degrees_of_freedom=self.degrees_of_freedom,
+        )
         if not self.piecewise:
-            return self._draw(num, stratified, generator)
+            return sample(num)
         parts, found = [], 0
         for _ in range(_ROUNDS):
-            own = self._take_own(self._draw(num, stratified, generator))
+            own = self._take_own(sample(num))
             if stratified and found + len(own.x) > num:
                 # These are in the order of the components: a cut would take the first ones' alone.
                 order = torch.randperm(len(own.x), generator=generator, device=generator.device)
@@ -249,7 +233,7 @@ class _Law(NamedTuple):
             if found >= num:
                 break
         else:
-            parts.append(self._draw(num - found, stratified, generator))
+            parts.append(sample(num - found))
         x, component = (torch.cat(field)[:num] for field in zip(*parts, strict=True))
         return MixtureSamples(x, component)
 
@@ -262,25 +246,12 @@ class _Law(NamedTuple):
             return components[..., 0]
         # The share of the mixture's draws that are kept is the mass below the highest components.
         fixed = torch.Generator().manual_seed(0)
-        kept = len(self._take_own(self._draw(_NORMALISER_DRAWS, True, fixed)).x)
+        kept = len(
+            self._take_own(
+                self.mixture.sample(_NORMALISER_DRAWS, generator=fixed, stratified=True)
+            ).x
+        )
         return components.amax(-1) - math.log(max(kept, 1) / _NORMALISER_DRAWS)
-
-    def _draw(self, num: int, stratified: bool, generator: torch.Generator) -> MixtureSamples:
-        mixture, n = self.mixture, self.mixture.mean.shape[-1]
-        component = draw_components(
-            mixture.log_weight, num, generator=generator, stratified=stratified
-        )
-        normal = standard_normal((num, n), mixture.mean, generator=generator)
-        if self.degrees_of_freedom is not None:
-            # A sum of squared normals is chi-squared; it is zero with probability zero only.
-            size = (num, self.degrees_of_freedom)
-            chi = standard_normal(size, mixture.mean, generator=generator)
-            least = torch.finfo(normal.dtype).eps
-            normal = normal / (chi.square().mean(-1, keepdim=True)).clamp(min=least).sqrt()
-        factor = covariance_factor(mixture.covariance)[component]
-        return MixtureSamples(
-            mixture.mean[component] + (factor @ normal[..., None])[..., 0], component
-        )
 
     def _take_own(self, samples: MixtureSamples) -> MixtureSamples:
         """Keep the samples at which their own component is the highest."""
@@ -300,25 +271,8 @@ class _Law(NamedTuple):
         return peak - 0.5 * (degrees + n) * tail + log_weight
 
 
-class _Projecting(ABC):
-    """A proposal with a rule of its own by which samples are moved onto the bounds."""
-
-    @abstractmethod
-    def draw(
-        self, mixture: GaussianMixture, num: int, bounds: Bounds, *, generator: torch.Generator
-    ) -> tuple[Samples, Float[Tensor, "s n"]]:
-        """Draw samples: as they were drawn, and their admissible states."""
-
-    def sample(
-        self, mixture: GaussianMixture, num: int, bounds: Bounds, *, generator: torch.Generator
-    ) -> Samples:
-        """Draw samples, projected onto the bounds."""
-        samples, admissible = self.draw(mixture, num, bounds, generator=generator)
-        return samples._replace(x=admissible)
-
-
 @dataclass(frozen=True, kw_only=True)
-class _RandomProposal(_Projecting):
+class _RandomProposal(Proposal):
     """A proposal that draws independent samples from a law made of the mixture's modes.
 
     Attributes:
@@ -343,9 +297,9 @@ class _RandomProposal(_Projecting):
         """Log-density of what is drawn at random, before projection."""
         return self.law(mixture).log_density(x)
 
-    def draw(
+    def sample(
         self, mixture: GaussianMixture, num: int, bounds: Bounds, *, generator: torch.Generator
-    ) -> tuple[Samples, Float[Tensor, "s n"]]:
+    ) -> Samples:
         """Draw samples, the modes themselves first, the best of all; and project them."""
         law = self.law(mixture)
         own = mixture.log_weight[:0].long()
@@ -356,16 +310,17 @@ class _RandomProposal(_Projecting):
             log_weight = torch.zeros_like(x[:, 0])
         else:
             log_weight = mixture.log_density(x) - law.log_density(x)
-        samples = Samples(
-            torch.cat([mixture.mean[own], x]),
-            torch.cat([own, component]),
-            torch.cat([torch.full_like(mixture.mean[own, 0], -math.inf), log_weight]),
-        )
+        drawn = torch.cat([mixture.mean[own], x])
         if self.correlated_projection:
             parts = zip(x.split(_STATES_AT_ONCE), component.split(_STATES_AT_ONCE), strict=True)
             shapes = law.mixture.covariance
             x = torch.cat([project_in_metric(part, shapes[of], bounds) for part, of in parts])
-        return samples, bounds.project(torch.cat([mixture.mean[own], x]))
+        return Samples(
+            bounds.project(torch.cat([mixture.mean[own], x])),
+            torch.cat([own, component]),
+            torch.cat([torch.full_like(mixture.mean[own, 0], -math.inf), log_weight]),
+            drawn=drawn,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -385,7 +340,15 @@ class _ScaledProposal(_RandomProposal):
 
     @property
     def _factor(self) -> float:
-        return _deviation_factor(self.covariance_scale, self.deviation_scale, type(self).__name__)
+        """The one factor on standard deviations that the two parameters stand for."""
+        given = [s for s in (self.covariance_scale, self.deviation_scale) if s is not None]
+        if len(given) != 1 or not 0 < given[0] < math.inf:
+            raise ConfigurationError(
+                f"{type(self).__name__}: expected exactly one positive scale, got covariance_scale="
+                f"{self.covariance_scale} and deviation_scale={self.deviation_scale}; give one of "
+                "the two"
+            )
+        return given[0] if self.covariance_scale is None else math.sqrt(given[0])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -463,7 +426,7 @@ class Spherical(_ScaledProposal):
 
     def law(self, mixture: GaussianMixture) -> _Law:
         """Balls."""
-        free = mixture.covariance.diagonal(dim1=-2, dim2=-1) > 0
+        free = torch.linalg.diagonal(mixture.covariance) > 0
         volume = log_determinant(mask_free(mixture.covariance, free))
         variance = (volume / free.sum(-1).clamp(min=1)).exp()
         ball = torch.diag_embed(torch.where(free, variance[:, None], 0.0))
@@ -493,7 +456,7 @@ class Condensation(_RandomProposal):
 
     def law(self, mixture: GaussianMixture) -> _Law:
         """Noise about every mode."""
-        noise = _noise(self.deviation, mixture.covariance)
+        noise = noise_covariance(self.deviation, mixture.covariance)
         return _Law(mixture._replace(covariance=noise.expand_as(mixture.covariance)))
 
 
@@ -524,7 +487,7 @@ class ChamRehg(_RandomProposal):
 
     def law(self, mixture: GaussianMixture) -> _Law:
         """Gaussians widened by noise, each in its own piece of the state space."""
-        covariance = mixture.covariance + _noise(self.deviation, mixture.covariance)
+        covariance = mixture.covariance + noise_covariance(self.deviation, mixture.covariance)
         return _Law(mixture._replace(covariance=covariance), piecewise=self.piecewise)
 
 
@@ -555,12 +518,14 @@ class InflatedPosterior(_ScaledProposal):
     def law(self, mixture: GaussianMixture) -> _Law:
         """Inflated Gaussians with diluted weights."""
         scale = self._factor**2
-        covariance = scale * mixture.covariance + _noise(self.deviation, mixture.covariance)
+        covariance = scale * mixture.covariance + noise_covariance(
+            self.deviation, mixture.covariance
+        )
         return _Law(GaussianMixture(mixture.mean, covariance, mixture.log_weight / scale))
 
 
 @dataclass(frozen=True, kw_only=True)
-class EigenDirectionGrid:
+class EigenDirectionGrid(Proposal):
     """Step along each mode's most uncertain directions: the regular pattern of Fig. 4 [RR].
 
     Per mode: the mode, then `p deviation_scale sigma_j v_j` from it for `p = ±1, ..., ±num_steps`
@@ -577,12 +542,6 @@ class EigenDirectionGrid:
     num_directions: int = 3
     num_steps: int = 1
     deviation_scale: float = 1.0
-
-    def log_density(
-        self, mixture: GaussianMixture, x: Float[Tensor, "*batch n"]
-    ) -> Float[Tensor, "*batch"]:
-        """`-inf`: nothing is random."""
-        return torch.full_like(x[..., 0], -math.inf)
 
     def sample(
         self, mixture: GaussianMixture, num: int, bounds: Bounds, *, generator: torch.Generator
@@ -606,14 +565,13 @@ class EigenDirectionGrid:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MixtureOfProposals(_Projecting):
+class MixtureOfProposals(Proposal):
     """Several proposals in fixed shares: local and far samples, random and regular ones.
 
     Every random sample is weighed by the density of all members together, each by the number of
     samples that it drew, whichever of them drew this one: a member that is close to the prior then
-    bounds all the weights. Members of this module project their samples as they do alone
-    (`correlated_projection`); those of a `Proposal` from elsewhere are projected each parameter for
-    itself. Give `include_modes` to the first member only.
+    bounds all the weights. Members project their samples as they do alone, and say where these
+    were before (`Samples.drawn`). Give `include_modes` to the first member only.
 
     What a member leaves, such as a regular pattern of fewer states, the first one draws.
 
@@ -626,7 +584,7 @@ class MixtureOfProposals(_Projecting):
     shares: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        shares = (1.0,) * len(self.proposals) if self.shares is None else self.shares
+        shares = self._shares
         if not self.proposals or len(shares) != len(self.proposals):
             raise ConfigurationError(
                 f"MixtureOfProposals: expected one share for each of at least one proposal, got "
@@ -637,12 +595,13 @@ class MixtureOfProposals(_Projecting):
                 f"MixtureOfProposals.shares: expected positive numbers, got {shares}"
             )
 
+    @property
+    def _shares(self) -> tuple[float, ...]:
+        return (1.0,) * len(self.proposals) if self.shares is None else self.shares
+
     def _counts(self, num: int) -> list[int]:
         """Samples of each member, `num` in all: its share, the first members' rounded up."""
-        shares = self.shares or (1.0,) * len(self.proposals)
-        ends = [0.0]
-        for share in shares:
-            ends.append(ends[-1] + share)
+        ends = list(accumulate(self._shares, initial=0.0))
         # Less than a sample's millionth is rounding, not a share.
         whole = [math.ceil(num * end / ends[-1] - 1e-6) for end in ends]
         return [after - before for before, after in pairwise(whole)]
@@ -651,8 +610,7 @@ class MixtureOfProposals(_Projecting):
         self, mixture: GaussianMixture, x: Float[Tensor, "*batch n"]
     ) -> Float[Tensor, "*batch"]:
         """Log-density of the random members together, in their shares of each other."""
-        shares = self.shares or (1.0,) * len(self.proposals)
-        return self._joint_log_density(mixture, x, shares)
+        return self._joint_log_density(mixture, x, self._shares)
 
     def _joint_log_density(
         self, mixture: GaussianMixture, x: Tensor, shares: tuple[float, ...] | list[int]
@@ -668,51 +626,33 @@ class MixtureOfProposals(_Projecting):
         part = torch.tensor(random_shares, dtype=x.dtype, device=x.device)
         return (torch.stack(densities, -1) + (part / part.sum()).log()).logsumexp(-1)
 
-    def draw(
+    def sample(
         self, mixture: GaussianMixture, num: int, bounds: Bounds, *, generator: torch.Generator
-    ) -> tuple[Samples, Float[Tensor, "s n"]]:
-        """Draw from the members; each projects its own, and the first draws what others leave."""
+    ) -> Samples:
+        """Draw from the members; the first draws what others leave."""
         (first, *others), (count, *counts) = self.proposals, self._counts(num)
         parts = [
-            _drawn(member, mixture, wanted, bounds, generator)
+            member.sample(mixture, wanted, bounds, generator=generator)
             for member, wanted in zip(others, counts, strict=True)
         ]
-        left = sum(counts) - sum(len(samples.x) for samples, _ in parts)
-        parts.insert(0, _drawn(first, mixture, count + left, bounds, generator))
-        drawn, admissible = zip(*parts, strict=True)
-        x, log_weight = (torch.cat([part[field] for part in drawn]) for field in (0, 2))
+        left = sum(counts) - sum(len(part.x) for part in parts)
+        parts.insert(0, first.sample(mixture, count + left, bounds, generator=generator))
+        log_weight = torch.cat([part.log_weight for part in parts])
+        drawn = torch.cat([part.x if part.drawn is None else part.drawn for part in parts])
         jumps, parents, num_modes = None, [], len(mixture.mean)
-        for part in drawn:
+        for part in parts:
             before = 0 if jumps is None else len(jumps.parent)
             parents.append(part.parent + before * (part.parent >= num_modes))
             jumps = part.jumps if jumps is None else jumps.joined(part.jumps)
-        parent = torch.cat(parents)
-        random = log_weight > -math.inf
-        counts = [int((part.log_weight > -math.inf).sum()) for part in drawn]
-        joint = mixture.log_density(x) - self._joint_log_density(mixture, x, counts)
-        log_weight = torch.where(random, joint, -math.inf)
-        return Samples(x, parent, log_weight, jumps), torch.cat(admissible)
-
-
-def _drawn(
-    proposal: Proposal,
-    mixture: GaussianMixture,
-    num: int,
-    bounds: Bounds,
-    generator: torch.Generator,
-) -> tuple[Samples, Float[Tensor, "s n"]]:
-    """Samples of any proposal: as they were drawn, and their admissible states."""
-    if isinstance(proposal, _Projecting):
-        return proposal.draw(mixture, num, bounds, generator=generator)
-    if isinstance(proposal, Move):
-        samples = proposal.sample(mixture, num, bounds, generator=generator)
-        return samples, samples.x
-    samples = proposal.sample(mixture, num, unbounded(mixture.mean), generator=generator)
-    return samples, bounds.project(samples.x)
+        random = [int((part.log_weight > -math.inf).sum()) for part in parts]
+        joint = mixture.log_density(drawn) - self._joint_log_density(mixture, drawn, random)
+        log_weight = torch.where(log_weight > -math.inf, joint, -math.inf)
+        x = torch.cat([part.x for part in parts])
+        return Samples(x, torch.cat(parents), log_weight, jumps, drawn)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Move(ABC):
+class Move(Proposal):
     """A proposal that knows where else to look: it adds components to the prior.
 
     What is known of the body or of the picture leads from the heaviest component to other states,
@@ -755,12 +695,6 @@ class Move(ABC):
             torch.full_like(found.log_weight, -math.inf),
             Prior(jumps, parent),
         )
-
-    def log_density(
-        self, mixture: GaussianMixture, x: Float[Tensor, "*batch n"]
-    ) -> Float[Tensor, "*batch"]:
-        """`-inf`: of the mixture itself, nothing is drawn."""
-        return torch.full_like(x[..., 0], -math.inf)
 
 
 _MOST_OF_MOVES = 0.75

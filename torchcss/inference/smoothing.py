@@ -53,7 +53,7 @@ from torchcss.inference.chain import (
     with_slope,
 )
 from torchcss.inference.trust_region import default_prior_variance
-from torchcss.linalg import symmetric_part, whitener, with_least_width
+from torchcss.linalg import multiply, symmetric_part, whitener, with_least_width
 from torchcss.types import Bounds, Differentiable, LocalModel, Status
 
 __all__ = [
@@ -140,11 +140,11 @@ class GaussianEvidence(NamedTuple):
     def value(self, x: Float[Tensor, "t n"]) -> Float[Tensor, " t"]:
         """Cost of every frame, nats."""
         apart = x - self.mean
-        return 0.5 * (apart * (self.precision @ apart[..., None])[..., 0]).sum(-1)
+        return 0.5 * (apart * multiply(self.precision, apart)).sum(-1)
 
     def local_model(self, x: Float[Tensor, "t n"]) -> LocalModel:
         """Cost, gradient and Hessian of every frame."""
-        pull = (self.precision @ (x - self.mean)[..., None])[..., 0]
+        pull = multiply(self.precision, x - self.mean)
         return LocalModel(0.5 * ((x - self.mean) * pull).sum(-1), pull, self.precision)
 
 
@@ -429,10 +429,10 @@ def _gaussian_cost(
         return 0.5 * z.square().sum(-1)
     units = torch.outer(deviation[judged], deviation[judged])
     matrix = wide[..., judged, :][..., judged] / units
-    matrix.diagonal(dim1=-2, dim2=-1).add_(1.0)
+    torch.linalg.diagonal(matrix).add_(1.0)
     factor = torch.linalg.cholesky(symmetric_part(matrix))
     white = torch.linalg.solve_triangular(factor, z[..., None], upper=False)[..., 0]
-    return 0.5 * white.square().sum(-1) + factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    return 0.5 * white.square().sum(-1) + torch.linalg.diagonal(factor).log().sum(-1)
 
 
 def _viterbi(node: Float[Tensor, "t k"], edges: list[Tensor]) -> Path:

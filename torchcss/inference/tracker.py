@@ -360,7 +360,7 @@ class Tracker(SequenceTracker):
         modes, distinct, floored = self._minima(search, bounds)
         if len(distinct):
             # 3: weights by the likelihood at the modes. 4 to 6: the best K, with their pasts.
-            found = search.problem.take(distinct), Modes(*(part[distinct] for part in modes))
+            found = search.problem.take(distinct), modes.take(distinct)
             kept = self._posterior(state, prior, *found, search.samples.parent[distinct])
         else:
             kept = self._carry_over(state, ahead, bounds)
@@ -517,12 +517,12 @@ class Tracker(SequenceTracker):
         kept = self._explanations(problem, unpruned, volume - cost, past)
         pruned = unpruned.take(kept).normalise()
         if past is None:
-            mixture, match = match_to_prior(pruned, tempered, standard=self.standard_bhattacharyya)
+            past = match_to_prior(pruned, tempered, standard=self.standard_bhattacharyya)
         else:
-            weighted = pruned.log_weight + past.log_weight[kept]
-            mixture, match = pruned._replace(log_weight=weighted).normalise(), past.parent[kept]
+            past = Past(*(part[kept] for part in past))
+        mixture = pruned._replace(log_weight=pruned.log_weight + past.log_weight).normalise()
         best_first = mixture.log_weight.argsort(descending=True, stable=True)
-        mixture, match, kept = mixture.take(best_first), match[best_first], kept[best_first]
+        mixture, match, kept = mixture.take(best_first), past.parent[best_first], kept[best_first]
         moved = mixture.mean - _start(state.mixture, prior)[match.clamp(min=0)]
         velocity = torch.where((match >= 0)[:, None], moved, 0.0)
         parent = torch.where(match >= 0, prior.parent[match.clamp(min=0)], -1)

@@ -39,6 +39,7 @@ Call `TrustRegionNewton().minimise(cost, x0, bounds)`.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -99,10 +100,17 @@ class TrustRegionState(NamedTuple):
 
     def take(self, items: Int[Tensor, " m"]) -> TrustRegionState:
         """Some of the items, as a copy."""
-        x, model, *rest = self
-        return TrustRegionState(
-            x[items], LocalModel(*(part[items] for part in model)), *(part[items] for part in rest)
-        )
+        return TrustRegionState.of([field[items] for field in self.tensors])
+
+    @property
+    def tensors(self) -> tuple[Tensor, ...]:
+        """All tensors, those of the model in their place."""
+        return (self.x, *self.model, *self[2:])
+
+    @staticmethod
+    def of(tensors: Sequence[Tensor]) -> TrustRegionState:
+        """The state of such tensors."""
+        return TrustRegionState(tensors[0], LocalModel(*tensors[1:4]), *tensors[4:])
 
 
 class TrustRegionInfo(NamedTuple):
@@ -233,7 +241,7 @@ class TrustRegionNewton:
         Returns:
             The next state, and what became of the steps.
         """
-        bounds, weight = _like(bounds, state.x), _weight(state.x, scale)
+        bounds, weight = bounds.to(state.x), _weight(state.x, scale)
         candidate = bounds.project(state.x + state.step)
         greatest_radius = torch.inf
         if isinstance(cost, BlendedCost):
@@ -256,12 +264,11 @@ class TrustRegionNewton:
         """The same as `_advance` in one compiled call."""
         from torchcss.inference import planning  # compiled: only where it is used
 
-        x, model, *rest = state
-        fields = [f.clone(memory_format=torch.contiguous_format) for f in (x, *model, *rest)]
+        fields = [f.clone(memory_format=torch.contiguous_format) for f in state.tensors]
         info = TrustRegionInfo(
             torch.empty_like(state.status, dtype=torch.bool), torch.empty_like(state.radius)
         )
-        arrays, real = [_array(field) for field in fields], _real(x)
+        arrays, real = [_array(field) for field in fields], _real(state.x)
         run(
             planning.advance,
             planning.Items(planning.Points(*arrays[:5]), *arrays[5:]),
@@ -274,10 +281,10 @@ class TrustRegionNewton:
                 pinning_rounds=_PINNING_ROUNDS,
                 max_steps=self.max_steps,
             ),
-            planning.make_memory(x.shape[-1], real),
+            planning.make_memory(state.x.shape[-1], real),
             *map(_array, info),
         )
-        return TrustRegionState(fields[0], LocalModel(*fields[1:4]), *fields[4:]), info
+        return TrustRegionState.of(fields), info
 
     def _advance(
         self, state: TrustRegionState, trial: _Trial, bounds: Bounds, weight: Float[Tensor, " n"]
@@ -343,19 +350,11 @@ class TrustRegionNewton:
         check_shape("x0", x0, None)
         batch, n = x0.shape[:-1], x0.shape[-1]
         check_bounds(bounds, n)
-        for name, vector in (("scale", scale), ("prior_variance", prior_variance)):
-            if vector is not None and vector.shape != (n,):
-                raise ShapeError(
-                    f"{name}: expected one number per parameter, shape [{n}], "
-                    f"got {list(vector.shape)}"
-                )
-        bounds = _like(bounds, x0)
-        if prior_variance is None:
-            prior_variance = default_prior_variance(bounds)
-
+        _check_vectors(n, {"scale": scale, "prior_variance": prior_variance})
         starts = self.start(x0.reshape(batch.numel(), n))
         result = self.descend(cost, starts, bounds, scale=scale)
-        return _modes(result, bounds, prior_variance, x0.shape)
+        modes = self.modes(result, bounds, prior_variance=prior_variance)
+        return Modes(*(field.reshape(batch + field.shape[1:]) for field in modes))
 
     def descend(
         self,
@@ -374,7 +373,7 @@ class TrustRegionNewton:
             bounds: Box limits on the state.
             scale: See `init`.
         """
-        bounds = _like(bounds, state.x)
+        bounds = bounds.to(state.x)
         limited = (state.status == Status.STEP_LIMIT) & (state.num_steps < self.max_steps)
         status = torch.where(limited, int(Status.RUNNING), state.status)
         result = state._replace(status=status).take(torch.arange(len(status), device=status.device))
@@ -402,10 +401,22 @@ class TrustRegionNewton:
             part = cost.take(items)
         return result
 
-    def modes(self, state: TrustRegionState, bounds: Bounds) -> Modes:
+    def modes(
+        self,
+        state: TrustRegionState,
+        bounds: Bounds,
+        *,
+        prior_variance: Float[Tensor, " n"] | None = None,
+    ) -> Modes:
         """Where the items of a state stand, with the covariances there; see `minimise`."""
-        bounds = _like(bounds, state.x)
-        return _modes(state, bounds, default_prior_variance(bounds), state.x.shape)
+        bounds, model = bounds.to(state.x), state.model
+        if prior_variance is None:
+            prior_variance = default_prior_variance(bounds)
+        active = bounds.hold(state.x, model.gradient)
+        sound = state.status != Status.NON_FINITE
+        hessian = torch.where(sound[:, None, None], model.hessian, 0.0)
+        covariance = inverse_on_free(hessian, ~active, prior_variance, model.gradient)
+        return Modes(state.x, covariance, model.value, active, state.status, state.num_steps)
 
     def promised(self, state: TrustRegionState, bounds: Bounds) -> Modes:
         """Where the next step from every item would lead, by the quadratic model.
@@ -420,7 +431,7 @@ class TrustRegionNewton:
             The ends of the steps, with the costs that the model promises there (infinite for starts
             with `Status.NON_FINITE`) and the model's covariances; nothing was evaluated there.
         """
-        bounds = _like(bounds, state.x)
+        bounds = bounds.to(state.x)
         model = state.model._replace(value=state.model.value - state.predicted)
         ends = bounds.project(state.x + state.step)
         return self.modes(state._replace(x=ends, model=model), bounds)
@@ -438,7 +449,7 @@ class TrustRegionNewton:
         """
         x, model = state.x, state.model
         running = state.status == Status.RUNNING
-        free = running[:, None] & ~_held(x, model.gradient, bounds)
+        free = running[:, None] & ~bounds.hold(x, model.gradient)
         problem = _Quadratic.of(model, free, weight)
         # Curvature that could change the cost by `tolerance` over a unit length counts as none.
         floor = 2 * self.tolerance
@@ -464,25 +475,6 @@ class TrustRegionNewton:
         )
 
 
-def _modes(
-    state: TrustRegionState, bounds: Bounds, prior_variance: Tensor, shape: torch.Size
-) -> Modes:
-    """What a state found, in the leading shape of the starts."""
-    batch, n = shape[:-1], shape[-1]
-    active = _held(state.x, state.model.gradient, bounds)
-    sound = state.status != Status.NON_FINITE
-    hessian = torch.where(sound[:, None, None], state.model.hessian, 0.0)
-    covariance = inverse_on_free(hessian, ~active, prior_variance, state.model.gradient)
-    return Modes(
-        mean=state.x.reshape(shape),
-        covariance=covariance.reshape(*batch, n, n),
-        cost=state.model.value.reshape(batch),
-        active=active.reshape(shape),
-        status=state.status.reshape(batch),
-        num_steps=state.num_steps.reshape(batch),
-    )
-
-
 class _Quadratic(NamedTuple):
     """The quadratic model on the free variables: those that no bound holds.
 
@@ -505,7 +497,7 @@ class _Quadratic(NamedTuple):
     def of(model: LocalModel, free: Tensor, weight: Tensor) -> _Quadratic:
         """The model of a cost."""
         # A factorisation cannot tell a curvature within the rounding of the diagonal from zero.
-        diagonal = model.hessian.diagonal(dim1=-2, dim2=-1)
+        diagonal = torch.linalg.diagonal(model.hessian)
         rounding = 8 * torch.finfo(weight.dtype).eps * diagonal.abs()
         ridge = torch.where(free, rounding, wall(weight.dtype))
         return _Quadratic(
@@ -514,15 +506,9 @@ class _Quadratic(NamedTuple):
 
     def take(self, items: Int[Tensor, " m"]) -> _Quadratic:
         """Some of the items."""
-        hessian, gradient, ridge, free, weight = self
         # Several times faster than indexing, which gathers entry by entry.
-        return _Quadratic(
-            hessian.index_select(0, items),
-            gradient.index_select(0, items),
-            ridge.index_select(0, items),
-            free.index_select(0, items),
-            weight,
-        )
+        fields = (field.index_select(0, items) for field in self[:-1])
+        return _Quadratic(*fields, weight=self.weight)
 
     def times(self, vector: Float[Tensor, "b n"]) -> Float[Tensor, "b n"]:
         """Hessian times a vector."""
@@ -551,12 +537,7 @@ def check_bounds(bounds: Bounds, n: int) -> None:
         ShapeError: If a bound does not have one number per parameter.
         ConfigurationError: If a lower bound exceeds the upper one, or either is not a number.
     """
-    for name, vector in zip(("lower", "upper"), bounds, strict=True):
-        if vector.shape != (n,):
-            raise ShapeError(
-                f"bounds.{name}: expected one number per parameter, shape [{n}], "
-                f"got {list(vector.shape)}"
-            )
+    _check_vectors(n, {"bounds.lower": bounds.lower, "bounds.upper": bounds.upper})
     wrong = ~(bounds.lower <= bounds.upper)
     if bool(wrong.any()):
         first = int(torch.nonzero(wrong)[0, 0])
@@ -564,6 +545,14 @@ def check_bounds(bounds: Bounds, n: int) -> None:
             f"bounds: expected lower <= upper, got {float(bounds.lower[first])} and "
             f"{float(bounds.upper[first])} for parameter {first}; correct its limits"
         )
+
+
+def _check_vectors(n: int, vectors: Mapping[str, Tensor | None]) -> None:
+    for name, vector in vectors.items():
+        if vector is not None and vector.shape != (n,):
+            raise ShapeError(
+                f"{name}: expected one number per parameter, shape [{n}], got {list(vector.shape)}"
+            )
 
 
 def _next_radius(radius: Tensor, length: Tensor, ratio: Tensor, accepted: Tensor) -> Tensor:
@@ -617,7 +606,7 @@ def _damped_step(
     # Kept where no factor is found in time: steepest descent.
     step = -gradient / weight * (radius / torch.where(length > 0, length, 1.0))[:, None]
     # A first guess where the undamped matrix is not definite.
-    curvature = problem.hessian.diagonal(dim1=-2, dim2=-1) / weight
+    curvature = torch.linalg.diagonal(problem.hessian) / weight
     curvature = torch.where(problem.free, curvature, 0.0)
     guess = torch.maximum(-curvature.amin(-1), 1e-3 * curvature.abs().amax(-1))
     guess = torch.maximum(guess, 0.1 * length / radius)
@@ -730,7 +719,7 @@ def _step_in_box(
         moved = torch.where(loose & ok[:, None], -cholesky_apply(factor, force), pinned)
         moved = torch.where(ok[:, None], moved, 0.0)
         slope = part.gradient + part.times(moved) + ridge * moved
-        diagonal = part.hessian.diagonal(dim1=-2, dim2=-1) + ridge
+        diagonal = torch.linalg.diagonal(part.hessian) + ridge
         gain = slope.square() / (2 * torch.where(diagonal > 0, diagonal, 1.0))
         released = (side * slope > 0) & (gain > negligible)
         target = position + moved
@@ -752,10 +741,6 @@ def _weight(x: Float[Tensor, "b n"], scale: Tensor | None) -> Float[Tensor, " n"
     if scale is None:
         return x.new_ones(x.shape[-1])
     return scale.to(x).square().reciprocal()
-
-
-def _like(bounds: Bounds, x: Tensor) -> Bounds:
-    return Bounds(bounds.lower.to(x), bounds.upper.to(x))
 
 
 def _is_finite(model: LocalModel) -> Bool[Tensor, " b"]:
@@ -791,17 +776,7 @@ def _share_of_second_order(value: Float[Tensor, " b"], predicted: Float[Tensor, 
     return torch.where(value.isinf(), 0.0, exact.clamp(0, 1))
 
 
-def _held(
-    x: Float[Tensor, "b n"], gradient: Float[Tensor, "b n"], bounds: Bounds
-) -> Bool[Tensor, "b n"]:
-    """Variables at a bound that the cost pushes against it."""
-    return ((x <= bounds.lower) & (gradient > 0)) | ((x >= bounds.upper) & (gradient < 0))
-
-
 def _write(result: TrustRegionState, items: Int[Tensor, " m"], part: TrustRegionState) -> None:
     """Write items into a state that belongs to the caller alone."""
-    pairs = zip(
-        (result.x, *result.model, *result[2:]), (part.x, *part.model, *part[2:]), strict=True
-    )
-    for into, field in pairs:
+    for into, field in zip(result.tensors, part.tensors, strict=True):
         into[items] = field

@@ -127,7 +127,7 @@ def _with_lengths_fitted(
     report = [*result.report, scale_report(options.stature, lengths, num_views=len(cost.views))]
     if (line := undetermined_line(held, kept, joints=cost.with_body(held))) is not None:
         report.append(line)
-    fits = Modes(*(field[: options.num_modes] for field in fits))
+    fits = fits.take(slice(options.num_modes))
     return result._replace(
         report=tuple(report),
         lengths=lengths,

@@ -99,7 +99,7 @@ def find_outliers(cost: TrackingCost, fits: Modes, search: Search) -> Bool[Tenso
             return outliers
         if int(more[best].sum()) > _MOST * int((weight > 0).sum()):
             return torch.zeros_like(outliers)
-        outliers, fits = more[best], best_distinct(Modes(*(field[best] for field in ends)))
+        outliers, fits = more[best], best_distinct(ends.take(best))
 
 
 def _put_back(
@@ -159,5 +159,4 @@ def refine(cost: TrackingCost, x: Float[Tensor, "b n"], search: Search) -> Modes
 
 def best_distinct(fits: Modes, num: int | None = None) -> Modes:
     """The distinct fits, the best first."""
-    keep = distinct_modes(fits.mean, fits.covariance, fits.cost)[:num]
-    return Modes(*(field[keep] for field in fits))
+    return fits.take(distinct_modes(fits.mean, fits.covariance, fits.cost)[:num])

@@ -120,7 +120,7 @@ def hang_on_best(body: BodyModel, fits: Modes) -> tuple[BodyModel, Modes]:
     root = [body.state_index(name) for name in ROOT_NAMES]
     inside = (mean >= body.lower) & (mean <= body.upper)
     keep = torch.nonzero(inside[:, root].all(-1))[:, 0]
-    return body, Modes(*(field[keep] for field in fits._replace(mean=mean)))
+    return body, fits._replace(mean=mean).take(keep)
 
 
 def columns_of(
@@ -181,12 +181,13 @@ def with_unknown_lengths(cost: TrackingCost, body: BodyModel, fits: Modes, searc
     columns = [loose.state_index(name) for name in body.state_names]
     full = spread_to(body, loose, fits.mean)
     model, bounds = cost.local_model(full), search.bounds(loose)
-    held = (full <= bounds.lower) & (model.gradient > 0)
-    held = held | ((full >= bounds.upper) & (model.gradient < 0))
     lengths = bounds.upper > bounds.lower
     lengths[columns] = False
     covariance = inverse_on_free(
-        model.hessian, ~held | lengths, default_prior_variance(loose.bounds), model.gradient
+        model.hessian,
+        ~bounds.hold(full, model.gradient) | lengths,
+        default_prior_variance(loose.bounds),
+        model.gradient,
     )
     return fits._replace(covariance=covariance[:, columns][:, :, columns])
 

@@ -193,7 +193,7 @@ def _scene(
     cost = observer.cost(seen, memory, body, previous).of_mode(previous)
     mode = TrustRegionNewton().minimise(cost, truth[None], body.bounds)
     assert seen.features is not None
-    return Scene(name, now.image, seen.features, cost, truth, Modes(*(part[0] for part in mode)))
+    return Scene(name, now.image, seen.features, cost, truth, mode.take(0))
 
 
 def _nearest(body: BodyModel, fits: Float[Tensor, "k n"], reference: Path, frame: int) -> Tensor:
