@@ -26,7 +26,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -49,31 +49,12 @@ class RobustValue(NamedTuple):
     second: Float[Tensor, "*batch"]
 
 
-@runtime_checkable
-class RobustPotential(Protocol):
-    """An increasing function of the squared weighted error with its first two derivatives."""
-
-    @property
-    def nu(self) -> float:
-        """Spread of the outliers; the unit in which costs are normalised, eq. 5 [IJRR]."""
-        ...
-
-    @property
-    def sigma(self) -> float:
-        """Scale of the central peak, in the unit of the weighted residual."""
-        ...
-
-    def __call__(self, s: Float[Tensor, "*batch"]) -> RobustValue:
-        """Evaluate at squared weighted errors, none negative."""
-        ...
-
-
 @dataclass(frozen=True, kw_only=True)
-class _Scaled(ABC):
-    """The two parameters that most potentials have, checked.
+class RobustPotential(ABC):
+    """An increasing function of the squared weighted error with its first two derivatives.
 
     Attributes:
-        nu: Spread of the outliers, positive.
+        nu: Spread of the outliers, positive; the unit in which costs are normalised, eq. 5 [IJRR].
         sigma: Scale of the central peak in the unit of the weighted residual, positive.
     """
 
@@ -82,18 +63,18 @@ class _Scaled(ABC):
 
     def __post_init__(self) -> None:
         for name, value in (("nu", self.nu), ("sigma", self.sigma)):
-            if not (math.isfinite(value) and value > 0.0):
+            if not 0.0 < value < math.inf:
                 raise ConfigurationError(
                     f"{type(self).__name__}: {name} must be positive and finite, got {value}"
                 )
 
     @abstractmethod
     def __call__(self, s: Float[Tensor, "*batch"]) -> RobustValue:
-        """Evaluate at squared weighted errors."""
+        """Evaluate at squared weighted errors, none negative."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Quadratic(_Scaled):
+class Quadratic(RobustPotential):
     """The Gaussian error model, rho = nu s / sigma^2: no outliers expected.
 
     Attributes:
@@ -108,7 +89,7 @@ class Quadratic(_Scaled):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lorentzian(_Scaled):
+class Lorentzian(RobustPotential):
     """The Lorentzian potential of section 3.1.1 [IJRR], rho = nu log(1 + s / sigma^2).
 
     Attributes:
@@ -125,7 +106,7 @@ class Lorentzian(_Scaled):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Leclerc(_Scaled):
+class Leclerc(RobustPotential):
     """The Leclerc potential of section 3.1.1 [IJRR], rho = nu (1 - exp(-s / sigma^2)).
 
     Attributes:

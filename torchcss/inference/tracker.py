@@ -356,7 +356,14 @@ class Tracker(SequenceTracker):
         started = len(samples.x)
 
         # 2.3: descend from every sample, and discard minima found before.
-        search = self._halve(self._begin(problem, samples, prior, bounds), bounds)
+        search = _Search(
+            problem.children(samples.parent, prior),
+            samples,
+            self.optimiser.start(samples.x),
+            _unperturbed(samples, prior, bounds),
+            samples.parent[:0],
+        )
+        search = self._halve(search, bounds)
         modes, distinct, floored = self._minima(search, bounds)
         if len(distinct):
             # 3: weights by the likelihood at the modes. 4 to 6: the best K, with their pasts.
@@ -424,17 +431,6 @@ class Tracker(SequenceTracker):
             parent=samples.parent.index_copy(0, first, own),
             log_weight=samples.log_weight.index_fill(0, first, -torch.inf),
         ), some
-
-    def _begin(
-        self, problem: SearchProblem, samples: Samples, prior: Prior, bounds: Bounds
-    ) -> _Search:
-        return _Search(
-            problem.children(samples.parent, prior),
-            samples,
-            self.optimiser.start(samples.x),
-            _unperturbed(samples, prior, bounds),
-            samples.parent[:0],
-        )
 
     def _halve(self, search: _Search, bounds: Bounds) -> _Search:
         """Successive halving: give up what falls behind in descending, round by round."""

@@ -25,7 +25,6 @@ from torch import Tensor
 from torchcss.body.model import BodyModel
 from torchcss.body.root import has_root
 from torchcss.body.shape import WHOLE_SHAPE, ShapeParameters, with_shape
-from torchcss.cost.context import FrameContext
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.frame import FrameCosts
 from torchcss.cost.fused import threads_for
@@ -59,6 +58,9 @@ from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor
 
+Picture = UInt8[np.ndarray, "h w 3"] | Tensor
+"""Red, green, blue."""
+
 DEFAULT_VIEW_DEGREES = 54.0
 """Field of view along the longer side of a picture from an unknown camera: that of a 35 mm lens on
 35 mm film, in the middle of what telephones and cameras have."""
@@ -75,7 +77,7 @@ own: odds of twenty to one. A shape takes time, and changes what poses cost by l
 
 
 def initialise(
-    image: UInt8[np.ndarray, "h w 3"] | Tensor | None,
+    image: Picture | None,
     keypoints: Keypoints | Mapping[str, Sequence[float]],
     camera: Camera | None = None,
     body: str | BodyModel = "body34",
@@ -115,7 +117,7 @@ def initialise(
 
 
 def _all_stages(
-    image: UInt8[np.ndarray, "h w 3"] | Tensor | None,
+    image: Picture | None,
     view: View,
     body: str | BodyModel,
     generator: torch.Generator,
@@ -137,11 +139,7 @@ def _all_stages(
     first = fit_joints(body, view, generator=generator, options=options, others=others)
     first = first._replace(noise=noise)
     given = view.keypoints.only(first.body.joint_names).to(first.body.tie)
-    alone = TrackingCost(
-        choice=options.joint_choice,
-        views=(FrameContext(body=first.body, camera=view.camera, keypoints=given),),
-        engine=options.evaluator,
-    )
+    alone = options.joint_cost(first.body, [view._replace(keypoints=given)])
     notes += swapped_sides(alone, first.mixture.mean[0], generator)
     first = first._replace(report=(*notes, *first.report))
     if image is None or not options.contours or isinstance(body, BodyModel):
@@ -149,9 +147,7 @@ def _all_stages(
     return _to_the_picture(first, image, view._replace(keypoints=given), others, options)
 
 
-def _camera_of(
-    image: UInt8[np.ndarray, "h w 3"] | Tensor | None, camera: Camera | None
-) -> tuple[Camera, list[str]]:
+def _camera_of(image: Picture | None, camera: Camera | None) -> tuple[Camera, list[str]]:
     """The camera, checked or assumed, and what to say of it."""
     if camera is None:
         if image is None:
@@ -168,7 +164,7 @@ def _camera_of(
 
 def _to_the_picture(
     first: Initialisation,
-    image: UInt8[np.ndarray, "h w 3"] | Tensor,
+    image: Picture,
     view: View,
     others: tuple[View, ...],
     options: InitialiseOptions,
@@ -193,17 +189,13 @@ def _noise(
 ) -> float:
     """How many times as noisy as the options say keypoints are."""
     body, fits = first.free_body or first.body, first.free_mixture or first.mixture
-    views = tuple(
-        FrameContext(
-            body=body,
-            camera=each.camera,
-            keypoints=each.keypoints and each.keypoints.only(body.joint_names).to(body.tie),
-        )
+    names = body.joint_names
+    given = (
+        each._replace(keypoints=each.keypoints and each.keypoints.only(names).to(body.tie))
         for each in (view, *others)
     )
     # Else an unusual pose would pass for noise.
-    choice = options.joint_choice.without("pose_prior")
-    cost = TrackingCost(choice=choice, views=views, engine=options.evaluator)
+    cost = replace(options, pose_prior=False).joint_cost(body, given)
     return noise_factor(cost, fits.mean[0], options.search)
 
 
@@ -213,7 +205,7 @@ def _factor(camera: Camera, working: Camera) -> float:
 
 
 def _contour_cost(
-    image: UInt8[np.ndarray, "h w 3"] | Tensor,
+    image: Picture,
     first: Initialisation,
     view: View,
     options: InitialiseOptions,

@@ -21,9 +21,9 @@ from torch import Tensor
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES
-from torchcss.cost.context import FrameContext
 from torchcss.cost.joints import match_joints
 from torchcss.cost.total import TrackingCost
+from torchcss.cost.view import View
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.initialise.from_joints import hang_before_camera
 from torchcss.initialise.multi_start import descend, starts_about
@@ -110,11 +110,7 @@ def _costs(
     """What the best fits to all frames cost before each camera, nats."""
     num, middle = len(keypoints.confidence), len(cameras) // 2
     body, places = _hung(free, keypoints, cameras[middle])
-    cost = TrackingCost(
-        choice=options.joint_choice,
-        views=(FrameContext(body=body, camera=cameras[middle], keypoints=keypoints),),
-        engine=options.evaluator,
-    )
+    cost = options.joint_cost(body, [View(cameras[middle], keypoints)])
     bounds = options.search.bounds(body)
     frame = torch.arange(num).repeat_interleave(_NUM_STARTS)
     x = starts_about(body, _NUM_STARTS, generator).repeat(num, 1)

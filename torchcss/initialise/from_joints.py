@@ -23,7 +23,6 @@ import torch
 from torchcss.body.load import has_free_root, load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.root import has_root, move_base, root_pose
-from torchcss.cost.context import FrameContext
 from torchcss.cost.joints import JointTargets, match_joints
 from torchcss.cost.total import TrackingCost
 from torchcss.cost.view import View
@@ -88,14 +87,7 @@ def fit_joints(
     keypoints = view.keypoints.only(free.joint_names).to(free.tie)
     keypoints = keypoints.without(~keypoints.positions.isfinite().all(-1))
     notes = (*free.notes, *check_joints(free.name, keypoints, view.camera, options.least_joints))
-    cost = TrackingCost(
-        choice=options.joint_choice,
-        views=tuple(
-            FrameContext(body=free, camera=each.camera, keypoints=each.keypoints)
-            for each in (View(view.camera, keypoints), *others)
-        ),
-        engine=options.evaluator,
-    )
+    cost = options.joint_cost(free, (View(view.camera, keypoints), *others))
     if isinstance(body, BodyModel):
         _check_in_view(body, view.camera)
         fits = multi_start_fits(cost, search=options.search, generator=generator)

@@ -164,7 +164,7 @@ def multi_start_fits(cost: TrackingCost, *, search: Search, generator: torch.Gen
         trunks = _distinct_trunks(cost, segments, torch.cat(starts), search.num_trunks)
         starts.append(flips(cost, segments, trunks, bounds, search.num_flips))
     if search.num_samples or search.anneal:
-        modes = _optimise(_widened(cost, _MIDDLE), fits, bounds, 2)
+        modes = _optimise(widened(cost, _MIDDLE), fits, bounds, 2)
         keep = distinct_modes(modes.mean, modes.covariance, modes.cost)[:16]
         starts[0] = modes.mean[keep]
         if search.num_samples and len(keep):
@@ -195,11 +195,12 @@ def descend(
         schedule: Factors on the scale, and the most steps with each.
     """
     for factor, steps in schedule:
-        x = _optimise(_widened(cost, factor), x, bounds, steps).mean
+        x = _optimise(widened(cost, factor), x, bounds, steps).mean
     return x
 
 
-def _widened(cost: TrackingCost, factor: float) -> TrackingCost:
+def widened(cost: TrackingCost, factor: float) -> TrackingCost:
+    """A cost with the scale of its keypoints multiplied by a factor."""
     joints = cost.choice.find(JointTerm)
     assert joints is not None
     wide = replace(joints, sigma=factor * joints.sigma)
@@ -216,9 +217,14 @@ def starts_about(body: BodyModel, num: int, generator: torch.Generator) -> Float
     if has_root(body):
         columns = [body.state_index(name) for name in ROOT_NAMES]
         x[:, columns] = 0.1 * noise[:, columns]
-        turn = torch.arange(num, device=x.device).to(x) * (2 * math.pi / num)
-        x[:, body.state_index("root_yaw")] = torch.remainder(turn + math.pi, 2 * math.pi) - math.pi
+        x[:, body.state_index("root_yaw")] = _all_round(x)
     return body.bounds.project(x)
+
+
+def _all_round(x: Float[Tensor, "b n"]) -> Float[Tensor, " b"]:
+    """As many angles as there are states, evenly round the circle from zero."""
+    turn = torch.arange(len(x), device=x.device).to(x) * (2 * math.pi / len(x))
+    return torch.remainder(turn + math.pi, 2 * math.pi) - math.pi
 
 
 def _coarse_start(
@@ -230,9 +236,8 @@ def _coarse_start(
         x[:, body.state_index(name)] = value
     if search.turn and has_root(body) and "root_yaw" not in search.coarse_pose:
         x = x.repeat(_TURNS, 1)
-        turn = torch.arange(_TURNS).to(x) * (2 * math.pi / _TURNS)
-        x[:, body.state_index("root_yaw")] = torch.remainder(turn + math.pi, 2 * math.pi) - math.pi
-        x = x[_widened(cost, _WIDE).value(x).argmin()][None]
+        x[:, body.state_index("root_yaw")] = _all_round(x)
+        x = x[widened(cost, _WIDE).value(x).argmin()][None]
     return body.bounds.project(x)
 
 
@@ -240,7 +245,7 @@ def _distinct_trunks(
     cost: TrackingCost, segments: Segments, x: Float[Tensor, "b n"], num: int
 ) -> Float[Tensor, "m n"]:
     """The best fits whose trunks differ."""
-    value = _widened(cost, _MIDDLE).value(x).nan_to_num(math.inf)
+    value = widened(cost, _MIDDLE).value(x).nan_to_num(math.inf)
     order = value.argsort(stable=True)
     limb = {group for each in segments.limbs for group in each.groups}
     trunk = [j for j, name in enumerate(cost.body.joint_names) if name not in limb]
@@ -297,7 +302,7 @@ def flips(
     start = x[:, None, None].expand(*shape, -1).flatten(0, 2)
     solved = TrustRegionNewton(max_steps=15, tolerance=0.1).minimise(reach, start, bounds)
     return _best_combinations(
-        _widened(cost, 1.5 * _MIDDLE), segments, solved.mean.unflatten(0, (-1, len(ways[1]))), num
+        widened(cost, 1.5 * _MIDDLE), segments, solved.mean.unflatten(0, (-1, len(ways[1]))), num
     )
 
 

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from torchcss.cost.joints import JointTerm, match_joints
 from torchcss.cost.total import TrackingCost
-from torchcss.initialise.multi_start import Search
+from torchcss.initialise.multi_start import Search, widened
 from torchcss.initialise.outliers import refine
 from torchcss.linalg import symmetric_part
 from torchcss.types import Curvature
@@ -66,18 +66,12 @@ def noise_factor(cost: TrackingCost, x: Float[Tensor, " n"], search: Search) -> 
         search: Whether limits hold.
     """
     factor, state = 1.0, x[None]
+    cost = replace(cost, choice=replace(cost.choice, curvature=Curvature.GAUSS_NEWTON))
     for _ in range(_TURNS):
-        widened = _widened(cost, factor)
-        state = refine(widened, state, search).mean
-        factor *= _left_over(widened, state, search)
+        wide = widened(cost, factor)
+        state = refine(wide, state, search).mean
+        factor *= _left_over(wide, state, search)
     return factor
-
-
-def _widened(cost: TrackingCost, factor: float) -> TrackingCost:
-    joints = cost.choice.find(JointTerm)
-    assert joints is not None
-    choice = cost.choice.having(replace(joints, sigma=factor * joints.sigma))
-    return replace(cost, choice=replace(choice, curvature=Curvature.GAUSS_NEWTON))
 
 
 def _left_over(cost: TrackingCost, x: Float[Tensor, "1 n"], search: Search) -> float:

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
 
+from torchcss.body.model import BodyModel
 from torchcss.cost.anthropometric import Anthropometric
 from torchcss.cost.choice import CostChoice
+from torchcss.cost.context import FrameContext
 from torchcss.cost.fused import engine_for
 from torchcss.cost.interpenetration import Interpenetration
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.pose_prior import PosePrior
 from torchcss.cost.stabiliser import Stabiliser
-from torchcss.cost.total import Engine
+from torchcss.cost.total import Engine, TrackingCost
+from torchcss.cost.view import View
 from torchcss.errors import ConfigurationError
 from torchcss.initialise.multi_start import PAPERS, Search
 from torchcss.robust import Lorentzian
@@ -104,3 +108,15 @@ class InitialiseOptions:
                 *((Interpenetration(),) if self.printed else ()),
             )
         )
+
+    def joint_cost(self, body: BodyModel, views: Iterable[View]) -> TrackingCost:
+        """Cost of the first stage.
+
+        Args:
+            body: The body.
+            views: The cameras and the keypoints in their pixels, of joints that it has.
+        """
+        contexts = (
+            FrameContext(body=body, camera=view.camera, keypoints=view.keypoints) for view in views
+        )
+        return TrackingCost(choice=self.joint_choice, views=tuple(contexts), engine=self.evaluator)

@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.body.flips import Segments
@@ -22,7 +22,7 @@ from torchcss.cost.choice import CostChoice
 from torchcss.cost.context import FrameContext
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.total import TrackingCost
-from torchcss.inference.mixture import GaussianMixture
+from torchcss.inference.mixture import GaussianMixture, separated
 from torchcss.inference.proposals import Move
 from torchcss.initialise.multi_start import flips
 from torchcss.types import Bounds, Keypoints
@@ -39,7 +39,7 @@ limits leave nearly no flip, what they leave looks different, and a descent from
 _ALL = 1_000_000
 """More combinations than any body has."""
 
-_APART = 0.15
+APART = 0.15
 """Least distance of some joint, metres, at which two poses are two. A body has a thousand flips
 that differ by the tilt of a foot or of the trunk, and they are the most plausible."""
 
@@ -77,7 +77,7 @@ def flipped_poses(
         num: Most poses wanted.
 
     Returns:
-        The poses, each with a joint `_APART` from where it is in the given one and in the others;
+        The poses, each with a joint `APART` from where it is in the given one and in the others;
         none for a body without limbs that can flip, or wholly out of the camera's sight.
     """
     segments = Segments(body)
@@ -98,14 +98,6 @@ def flipped_poses(
     poses = flips(cost, segments, x[None], body.bounds, _ALL)
     places = body.pose(poses).joints
     missed = torch.where(valid, (camera.project(places).uv - uv).norm(dim=-1), 0.0).amax(-1)
-    left = torch.nonzero((missed <= _MOST_NOISE * sigma) & _differ(places, joints))[:, 0]
-    chosen = []
-    while len(left) and len(chosen) < num:
-        chosen.append(left[0])
-        left = left[_differ(places[left], places[left[0]])]
-    return poses[torch.stack(chosen)] if chosen else nothing
-
-
-def _differ(places: Float[Tensor, "s j 3"], others: Float[Tensor, "j 3"]) -> Bool[Tensor, " s"]:
-    """Whether some joint is `_APART` from where it is in another pose."""
-    return (places - others).norm(dim=-1).amax(-1) >= _APART
+    differs = (places - joints).norm(dim=-1).amax(-1) >= APART
+    left = torch.nonzero((missed <= _MOST_NOISE * sigma) & differs)[:, 0]
+    return poses[left[separated(places[left], APART, num, fill=False)]]

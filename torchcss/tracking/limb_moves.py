@@ -27,8 +27,9 @@ from torchcss.body.flips import Limb, Segments
 from torchcss.body.model import BodyModel
 from torchcss.body.shape import with_shape
 from torchcss.cost.total import TrackingCost
-from torchcss.inference.mixture import GaussianMixture, Prior
+from torchcss.inference.mixture import GaussianMixture, Prior, separated
 from torchcss.inference.proposals import Move
+from torchcss.tracking.flip_moves import APART
 from torchcss.types import Bounds
 
 REACH = 0.2
@@ -43,9 +44,6 @@ less a pose has to cost to join the search; nats."""
 
 _SWINGING = ("arm",)
 """Which limbs are looked for."""
-
-_APART = 0.15
-"""Least distance of some joint, metres, at which two poses are two."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,12 +135,9 @@ def other_poses(
     speak = colours < _without(cost, body, limb, x) - GAIN
     better = (value < value[0] - GAIN) & speak
     order = value.argsort(stable=True)
-    joints, chosen = body.pose(every).joints, []
-    for item in order[better[order]].tolist():
-        distances = (joints[item] - joints[chosen]).norm(dim=-1).amax(-1)
-        if len(chosen) < num and bool((distances > _APART).all()):
-            chosen.append(item)
-    return every[chosen]
+    order = order[better[order]]
+    joints = body.pose(every).joints[order]
+    return every[order[separated(joints, APART, num, fill=False)]]
 
 
 def _without(cost: TrackingCost, body: BodyModel, limb: Limb, x: Float[Tensor, " n"]) -> float:

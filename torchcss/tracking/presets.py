@@ -42,8 +42,6 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Literal
 
-import torch
-
 from torchcss.body.load import has_free_root
 from torchcss.errors import ConfigurationError
 from torchcss.inference.dynamics import ConstantVelocity
@@ -57,6 +55,7 @@ from torchcss.inference.proposals import (
     HeavyTailed,
     Proposal,
     Spherical,
+    unbounded,
 )
 from torchcss.inference.tracker import SequenceTracker, Tracker
 from torchcss.inference.trust_region import TrustRegionNewton
@@ -175,9 +174,7 @@ class Preset:
         """
         if self.limits:
             return limits
-        return Bounds(
-            torch.full_like(limits.lower, -torch.inf), torch.full_like(limits.upper, torch.inf)
-        )
+        return unbounded(limits.lower)
 
 
 _OURS = TrustRegionNewton(max_steps=60, tolerance=1e-2, initial_radius=1 / 16)
@@ -247,18 +244,6 @@ _SINGLE = _printed(
         interpenetration=False,
     )
 )
-_CHAM_REHG = _printed(
-    Preset(
-        what="Cham and Rehg's multiple-hypothesis tracker in 3D, robust ([IJRR] section 6.1)",
-        proposal=ChamRehg(deviation=0.0, piecewise=False),
-        samples_arm=40,
-        samples_body=60,
-        modes_arm=10,
-        modes_body=10,
-        persistence=1.0,
-        noise=3.0,
-    )
-)
 _HEAP_HOGG = Preset(
     what="Heap and Hogg's multiple-hypothesis tracker in 3D, robust",
     proposal=Condensation(deviation=0.0),
@@ -267,6 +252,12 @@ _HEAP_HOGG = Preset(
     modes_arm=10,
     modes_body=10,
     noise=3.0,
+)
+_CHAM_REHG = replace(
+    _printed(_HEAP_HOGG),
+    what="Cham and Rehg's multiple-hypothesis tracker in 3D, robust ([IJRR] section 6.1)",
+    proposal=ChamRehg(deviation=0.0, piecewise=False),
+    persistence=1.0,
 )
 _CONDENSATION = Preset(
     what="CONDENSATION: particles weighed by the likelihood ([IJRR] section 1.1)",

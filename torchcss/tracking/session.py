@@ -438,14 +438,11 @@ class TrackingSession:
             return tracker
         search, dynamics, num = tracker.proposal, tracker.dynamics, tracker.num_samples
         camera, moves = self._observers[0].view.camera, []
-        if recovery is not None and lost:
-            flips = Flips(
-                search=search, body=state.body, camera=camera, num=recovery.num_flips, log_odds=0.0
-            )
-            moves.append((flips, num))
-        elif self._flips_now():
+        if lost or self._flips_now():
             flips = Flips(search=search, body=state.body, camera=camera, num=_NUM_FLIPS)
-            moves.append((flips, _NUM_FLIPS))
+            if recovery is not None and lost:
+                flips = replace(flips, num=recovery.num_flips, log_odds=0.0)
+            moves.append((flips, num if lost else _NUM_FLIPS))
         if plan.limb_jumps:
             limbs = LostLimbs(search=search, body=state.body, cost=cost, num=plan.limb_jumps)
             moves.append((limbs, 2 * plan.limb_jumps))

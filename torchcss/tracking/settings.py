@@ -89,13 +89,8 @@ def named_terms(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(term for name in names for term in _SETS.get(name, (name,))))
 
 
-_OF_SAMPLES = {
-    "oversampling": 1,
-    "prediction": "velocity",
-    "likelihood_power": None,
-    "limb_jumps": 0,
-}
-"""Settings of trackers that descend from samples, and their defaults."""
+_OF_SAMPLES = ("prediction", "oversampling", "likelihood_power", "limb_jumps")
+"""Settings of trackers that descend from samples."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,8 +174,8 @@ class Settings:
         self._check_names()
         self._check_numbers()
         if not PRESETS[self.preset].descends_from_samples:
-            for name, default in _OF_SAMPLES.items():
-                if getattr(self, name) != default:
+            for name in _OF_SAMPLES:
+                if self._is_given(name):
                     raise ConfigurationError(
                         f"{name}: {self.preset} does not descend from samples; leave it out"
                     )
@@ -242,14 +237,9 @@ class Settings:
 
     def changed(self) -> tuple[str, ...]:
         """Names of the options in which the run differs from its preset."""
-        row, power = PRESETS[self.preset], self.likelihood_power
+        row = PRESETS[self.preset]
         differs = {
-            "samples": self.samples is not None,
-            "modes": self.modes is not None,
-            "prediction": self.prediction != "velocity",
-            "oversampling": self.oversampling != 1,
-            "likelihood_power": power is not None,
-            "limb_jumps": self.limb_jumps > 0,
+            **{name: self._is_given(name) for name in ("samples", "modes", *_OF_SAMPLES)},
             "keypoints_use": self.keypoints_first_only != (row.keypoints_use == "first"),
             "terms": set(self.used_terms) != set(_preset_terms(row)),
             "curvature": self.curvature not in (None, row.curvature.value),
@@ -257,6 +247,9 @@ class Settings:
             "recovery": self.recovers != row.recovery,
         }
         return tuple(name for name, does in differs.items() if does)
+
+    def _is_given(self, name: str) -> bool:
+        return getattr(self, name) != getattr(Settings, name)
 
     @property
     def torch_dtype(self) -> torch.dtype:
