@@ -96,18 +96,12 @@ def solve_lower(
     return torch.linalg.solve_triangular(factor, vector[..., None], upper=False)[..., 0]
 
 
-def solve_upper(
-    factor: Float[Tensor, "*batch n n"], vector: Float[Tensor, "*batch n"]
-) -> Float[Tensor, "*batch n"]:
-    """Multiply a vector by the inverse of the transpose of a lower factor."""
-    return torch.linalg.solve_triangular(factor.mT, vector[..., None], upper=True)[..., 0]
-
-
 def cholesky_apply(
     factor: Float[Tensor, "*batch n n"], vector: Float[Tensor, "*batch n"]
 ) -> Float[Tensor, "*batch n"]:
     """Multiply a vector by the inverse of `factor factor^T`."""
-    return solve_upper(factor, solve_lower(factor, vector))
+    lower = solve_lower(factor, vector)[..., None]
+    return torch.linalg.solve_triangular(factor.mT, lower, upper=True)[..., 0]
 
 
 def inverse_on_free(

@@ -143,10 +143,6 @@ class Modes(NamedTuple):
 class Differentiable(Protocol):
     """Anything that gives a cost and its derivatives, item by item."""
 
-    def value(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
-        """Cost in nats; a pure function of `x`."""
-        ...
-
     def local_model(self, x: Float[Tensor, "*batch n"]) -> LocalModel:
         """Cost, gradient and Hessian at `x`, image matches held fixed."""
         ...
@@ -155,6 +151,10 @@ class Differentiable(Protocol):
 @runtime_checkable
 class CostFunction(Differentiable, Protocol):
     """Anything that the optimiser can search: the negative log posterior, eq. 3."""
+
+    def value(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+        """Cost in nats; a pure function of `x`."""
+        ...
 
     def take(self, items: Int[Tensor, " m"]) -> CostFunction:
         """The cost of some items of the batch; itself, where all items have the same cost."""

@@ -9,10 +9,10 @@ import torch
 
 from torchcss.errors import ConfigurationError
 from torchcss.inference.grid_tracker import GridTracker
-from torchcss.inference.loss_monitor import widened
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.problem import SearchProblem
 from torchcss.inference.proposals import EigenDirectionGrid
+from torchcss.tracking.recovery import Recovery
 from torchcss.types import LocalModel, Status
 
 BOUNDS = problems.box(2, -6, 6)
@@ -165,6 +165,6 @@ def test_floored_hessians_are_counted():
 def test_bad_numbers_and_widening():
     with pytest.raises(ConfigurationError, match=r"GridTracker.num_modes"):
         replace(ARM, num_modes=0)
-    wide = widened(ARM, samples=3, modes=2)
+    wide = Recovery(samples=3, modes=2).widened(ARM)
     assert isinstance(wide, GridTracker)
     assert (wide.num_modes, wide.num_samples) == (6, 27)

@@ -12,12 +12,13 @@ import torch
 
 from torchcss.errors import ConfigurationError
 from torchcss.inference.grid_tracker import GridTracker
-from torchcss.inference.loss_monitor import LossMonitor, MonitorState, widened
+from torchcss.inference.loss_monitor import LossMonitor, MonitorState
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.particle import AnnealedParticleFilter, ParticleFilter
 from torchcss.inference.proposals import CovarianceScaled, HeavyTailed
 from torchcss.inference.tracker import Tracker
 from torchcss.tracking.presets import PRESETS, make_tracker
+from torchcss.tracking.recovery import Recovery
 
 MONITOR = LossMonitor()
 
@@ -152,7 +153,7 @@ def test_bad_configuration(name: str, value: Any):
 @pytest.mark.parametrize("preset", PRESETS)
 def test_every_tracker_of_the_table_searches_more_widely(preset: str, generator: torch.Generator):
     narrow = make_tracker(preset, "arm8", num_samples=10, num_modes=2, motion=0.1)
-    wide = widened(narrow, samples=3, modes=2, scale=2.0)
+    wide = Recovery(samples=3, modes=2, scale=2.0).widened(narrow)
     assert type(wide) is type(narrow)
     assert wide.num_samples == 30
     assert narrow.num_samples == 10

@@ -379,7 +379,7 @@ def test_refinement_across_a_change_of_coordinates(acceleration: float):
     def total(x: torch.Tensor) -> torch.Tensor:
         # The states before the change, seen from after it.
         seen = [torch.cat([to_polar(x[:4]), x[4:]]) if i > 3 else x for i in range(t)]
-        sum_ = evidence.value(x).sum()
+        sum_ = evidence.local_model(x).value.sum()
         for i in range(1, t):
             step, y = times[i] - times[i - 1], seen[i]
             sum_ = sum_ + 0.5 * ((y[i] - y[i - 1]) / (3.0 * step)).square().sum()
@@ -433,7 +433,7 @@ def test_windows_come_near_what_all_frames_find_together(window: tuple[int, int]
     if window[0] > t:
         assert parts.mean.numpy() == pytest.approx(whole.mean.numpy(), abs=1e-9)
     assert (0.97 if window[1] else 0.9) < gained <= 1 + 1e-12
-    assert parts.cost.numpy() == pytest.approx(evidence.value(parts.mean).numpy())
+    assert parts.cost.numpy() == pytest.approx(evidence.local_model(parts.mean).value.numpy())
     # Where the same variables are free, the covariances are those of all frames.
     same = (parts.active == whole.active).all()
     if bool(same):
@@ -467,9 +467,6 @@ def test_windows_let_costs_go():
     class Cost:
         def __init__(self, evidence: GaussianEvidence) -> None:
             self.evidence = evidence
-
-        def value(self, x: torch.Tensor) -> torch.Tensor:
-            return self.evidence.value(x)
 
         def local_model(self, x: torch.Tensor) -> LocalModel:
             return self.evidence.local_model(x)

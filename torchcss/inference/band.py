@@ -40,7 +40,7 @@ class Band(NamedTuple):
             out[:-d] += multiply(lower.mT, vector[d:])
         return out
 
-    def plus_diagonal(self, diagonal: Float[Tensor, "*t n"]) -> Band:
+    def plus_diagonal(self, diagonal: Float[Tensor, "*t n"] | float) -> Band:
         """With something added to the diagonal."""
         block = self.block.clone()
         torch.linalg.diagonal(block[:, 0]).add_(diagonal)

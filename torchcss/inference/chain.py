@@ -134,19 +134,14 @@ class Chain(NamedTuple):
         block[:, 0] += self.hessian
         return Band(block)
 
-    def times(self, vector: Float[Tensor, "t n"]) -> Float[Tensor, "t n"]:
-        """Second derivative times a vector."""
-        return self.band.times(vector)
-
     def convex(self) -> Chain:
         """With the frames' negative curvatures turned round."""
         values, vectors = torch.linalg.eigh(self.hessian)
         return self._replace(hessian=(vectors * values.abs()[:, None, :]) @ vectors.mT)
 
-    def curvature(self, weight: Float[Tensor, " n"]) -> float:
-        """A typical curvature in the damping's units, never zero."""
-        diagonal = torch.linalg.diagonal(self.band.block[:, 0]) / weight
-        typical = float(diagonal.abs().median())
+    def curvature(self) -> float:
+        """A typical curvature, never zero."""
+        typical = float(torch.linalg.diagonal(self.band.block[:, 0]).abs().median())
         return typical if typical > 0 else 1.0
 
 
@@ -177,7 +172,7 @@ class ChainSum(NamedTuple):
 
 
 def descend(
-    sum_: ChainSum, x: Tensor, limits: Bounds, weight: Tensor, max_steps: int, tolerance: float
+    sum_: ChainSum, x: Tensor, limits: Bounds, max_steps: int, tolerance: float
 ) -> tuple[Float[Tensor, "t n"], Chain, Status, int]:
     """Newton's method on all frames at once.
 
@@ -185,8 +180,6 @@ def descend(
         sum_: The sum that is minimised.
         x: States to start from.
         limits: Box limits on the state of every frame.
-        weight: Metric of the damping, as in `TrustRegionNewton`: one over the squared scale of each
-            parameter.
         max_steps: Most evaluations after the first.
         tolerance: Promised decrease, nats, below which the descent has converged.
 
@@ -198,8 +191,8 @@ def descend(
     if not chain.is_finite:
         return x, chain, Status.NON_FINITE, 0
     while True:
-        step, used = _chain_step(chain, x, limits, weight, damping)
-        predicted = -float((step * (chain.gradient + 0.5 * chain.times(step))).sum())
+        step, used = _chain_step(chain, x, limits, damping)
+        predicted = -float((step * (chain.gradient + 0.5 * chain.band.times(step))).sum())
         resolution = 4 * torch.finfo(sum_.dtype).eps * abs(float(chain.value))
         if predicted < tolerance and used == damping == 0.0:
             return x, chain, Status.CONVERGED, steps
@@ -213,7 +206,7 @@ def descend(
         candidate = torch.where(step >= limits.upper - x, limits.upper, candidate)
         other = sum_.at(limits.project(candidate))
         decrease = float(chain.value - other.value) if other.is_finite else -math.inf
-        typical = chain.curvature(weight)
+        typical = chain.curvature()
         if decrease >= 0 and decrease > 1e-4 * predicted:
             x, chain = limits.project(candidate), other
             damping = 0.0 if damping < 1e-3 * typical else 0.2 * damping
@@ -330,14 +323,14 @@ def with_slope(
 
 
 def _chain_step(
-    chain: Chain, x: Tensor, limits: Bounds, weight: Tensor, damping: float
+    chain: Chain, x: Tensor, limits: Bounds, damping: float
 ) -> tuple[Float[Tensor, "t n"], float]:
     """The step to the least of the damped model in the box, and the damping that it took."""
     fixed, held = limits.lower == limits.upper, held_by(x, chain.gradient, limits)
     lower, upper = limits.lower - x, limits.upper - x
     trial, model = damping, chain
     for attempt in range(_ATTEMPTS):
-        band = model.band.plus_diagonal(trial * weight)
+        band = model.band.plus_diagonal(trial)
         # A definite model may take variables off their bounds; else those stay that are held.
         for kept in (fixed, held):
             if band.masked(~kept).factor() is not None:
@@ -347,6 +340,6 @@ def _chain_step(
         if attempt == 0:
             model = chain.convex()
         else:
-            trial = max(10 * trial, 1e-12 * chain.curvature(weight))
+            trial = max(10 * trial, 1e-12 * chain.curvature())
     # Every entry of the model would have to be beyond all bounds; there is no step to take.
     return torch.zeros_like(x), trial

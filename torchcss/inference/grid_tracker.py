@@ -82,7 +82,9 @@ class GridTracker(SequenceTracker):
         """
         check_bounds(bounds, state.mixture.mean.shape[-1])
         prior = Prior.of(state.mixture)
-        starts = state.particles or self._first(state.mixture, prior, problem, bounds)
+        starts = state.particles
+        if starts is None:
+            starts = self._prune(state.mixture, problem.children(prior.parent, prior), bounds)
         own, origin = problem.children(starts.component, prior), starts.component
         waiting = self.optimiser.start(bounds.project(starts.x))
         descents = self.optimiser.descend(own.cost, waiting, bounds)
@@ -116,12 +118,6 @@ class GridTracker(SequenceTracker):
         )
         velocity, frame = mixture.mean - state.mixture.mean[origin], state.frame + 1
         return TrackerState(mixture, velocity, state.generator_state, frame, starts), info
-
-    def _first(
-        self, fits: GaussianMixture, prior: Prior, problem: SearchProblem, bounds: Bounds
-    ) -> Particles:
-        """Hypotheses about the fits of the first frame."""
-        return self._prune(fits, problem.children(prior.parent, prior), bounds)
 
     def _prune(self, minima: GaussianMixture, problem: SearchProblem, bounds: Bounds) -> Particles:
         """The best k of the patterns about the minima, by edges alone.

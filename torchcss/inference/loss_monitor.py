@@ -1,4 +1,4 @@
-"""Tells from a tracker's own costs when it has lost what it follows, and widens the search then.
+"""Tells from a tracker's own costs when it has lost what it follows.
 
 A tracker that has lost its target goes on with modes that explain the image worse than before.
 `LossMonitor` compares what each observation term costs with its median over the frames that were
@@ -10,10 +10,7 @@ Biometrika 41, 1954):
 so that one bad frame is no loss, and several are. Only terms that the frame has are compared, each
 with its own past. While the sum is above half the threshold nothing is learnt.
 
-`widened` gives the tracker that searches for it: "when tracking fails, the number of modes and of
-samples can be increased" is what section 8 [IJRR] offers; here the scale of the search grows too.
-Jumps to other poses that project alike are for whoever knows the body
-(`torchcss.tracking.session`).
+What is done then is `torchcss.tracking.recovery`.
 """
 
 from __future__ import annotations
@@ -21,13 +18,10 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from torchcss.errors import check_positive
-from torchcss.inference.particle import AnnealedParticleFilter, ParticleFilter
-from torchcss.inference.proposals import CovarianceScaled, HeavyTailed
-from torchcss.inference.tracker import SequenceTracker, Tracker
 
 
 class MonitorState(NamedTuple):
@@ -111,27 +105,3 @@ class LossMonitor:
             history[name] = (*history.get(name, ()), cost)[-self.window :]
         past = state.excess if excess is None else (*state.excess, excess)[-self.window :]
         return MonitorState(history, past, total, score), False
-
-
-def widened(
-    tracker: SequenceTracker, *, samples: int = 4, modes: int = 2, scale: float = 2.0
-) -> SequenceTracker:
-    """The same tracker with a wider search, that forgets: no pose is too far from the lost ones.
-
-    Args:
-        tracker: Any of the package.
-        samples: How many times as many samples.
-        modes: How many times as many modes are kept.
-        scale: Factor on the covariance scale, for trackers that sample by it.
-    """
-    tracker = replace(tracker, num_samples=samples * tracker.num_samples)
-    if isinstance(tracker, (ParticleFilter, AnnealedParticleFilter)):
-        return tracker
-    tracker = replace(tracker, num_modes=modes * tracker.num_modes)
-    if not isinstance(tracker, Tracker):
-        return tracker
-    proposal = tracker.proposal
-    if isinstance(proposal, (CovarianceScaled, HeavyTailed)):
-        wider = None if proposal.covariance_scale is None else scale * proposal.covariance_scale
-        proposal = replace(proposal, covariance_scale=wider)
-    return replace(tracker, proposal=proposal, forgetting=0.0, soft_matching=False)

@@ -27,6 +27,7 @@ until `num_modes` clusters are made; the rest join the nearest. Centres found so
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -54,6 +55,9 @@ from torchcss.inference.tracker import (
 from torchcss.inference.trust_region import check_bounds
 from torchcss.linalg import covariance_factor, multiply, squared_mahalanobis
 from torchcss.types import Bounds, Status
+
+Energy = Callable[[Float[Tensor, "s n"], Int[Tensor, " s"]], Float[Tensor, " s"]]
+"""Cost of states whose ancestors these modes sum up; infinite where it is not finite."""
 
 
 class _Weighed(NamedTuple):
@@ -96,8 +100,7 @@ class _Filter(SequenceTracker):
         self,
         particles: Particles,
         moved: GaussianMixture,
-        prior: Prior,
-        problem: SearchProblem,
+        energy: Energy,
         bounds: Bounds,
         generator: torch.Generator,
     ) -> _Weighed:
@@ -128,14 +131,17 @@ class _Filter(SequenceTracker):
         )
         prior = Prior.of(self.dynamics.predict(mixture, state.velocity))
 
-        weighed = self._weigh(particles, moved, prior, problem, bounds, generator)
+        def energy(x: Tensor, component: Tensor) -> Tensor:
+            value = problem.children(component, prior).cost.value(x).detach()
+            return torch.where(value.isfinite(), value, torch.inf)
+
+        weighed = self._weigh(particles, moved, energy, bounds, generator)
         some = bool((weighed.log_weight > -torch.inf).any())
         log_weight = normalised_log_weight(weighed.log_weight)
         parent = particles.component[weighed.ancestor]
         component, summary, best = self._sum_up(weighed.x, log_weight, moved.covariance[0])
         # Every mode's parent is that of its heaviest particle.
         origin = parent[best]
-        energy = _energy(problem, origin, prior, summary.mean)
         status_counts = torch.zeros(len(Status), dtype=torch.long, device=weighed.x.device)
         status_counts[Status.NON_FINITE] = (~(weighed.log_weight > -torch.inf)).sum()
         state = TrackerState(
@@ -146,7 +152,7 @@ class _Filter(SequenceTracker):
             Particles(weighed.x, weighed.x - particles.x[weighed.ancestor], log_weight, component),
         )
         return state, TrackerInfo(
-            cost=energy,
+            cost=energy(summary.mean, origin),
             parent=origin,
             origin=origin,
             status_counts=status_counts,
@@ -232,8 +238,7 @@ class ParticleFilter(_Filter):
         self,
         particles: Particles,
         moved: GaussianMixture,
-        prior: Prior,
-        problem: SearchProblem,
+        energy: Energy,
         bounds: Bounds,
         generator: torch.Generator,
     ) -> _Weighed:
@@ -247,11 +252,11 @@ class ParticleFilter(_Filter):
         noise = torch.where(factor.any(-2), noise, 0.0)
         step = multiply(factor, noise)
         x = bounds.project(moved.mean[ancestor] + self.noise_scale**0.5 * step)
-        energy = _energy(problem, particles.component[ancestor], prior, x)
+        cost = energy(x, particles.component[ancestor])
         correction = (1 - self.dilution) * particles.log_weight[ancestor]
         # The ratio of the two Gaussians where it was drawn, up to a constant.
         correction = correction - 0.5 * (self.noise_scale - 1) * noise.square().sum(-1)
-        return _Weighed(x, correction - energy, ancestor, num_weighed=len(x))
+        return _Weighed(x, correction - cost, ancestor, num_weighed=len(x))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -291,8 +296,7 @@ class AnnealedParticleFilter(_Filter):
         self,
         particles: Particles,
         moved: GaussianMixture,
-        prior: Prior,
-        problem: SearchProblem,
+        energy: Energy,
         bounds: Bounds,
         generator: torch.Generator,
     ) -> _Weighed:
@@ -306,17 +310,6 @@ class AnnealedParticleFilter(_Filter):
                 spread = spread * self.survival_rate**0.5
             noise = standard_normal(x.shape, x, generator=generator)
             x = bounds.project(x + spread * multiply(factor[ancestor], noise))
-            energy = _energy(problem, particles.component[ancestor], prior, x)
-            log_weight, _ = tempered_log_weight(-energy, self.survival_rate)
+            cost = energy(x, particles.component[ancestor])
+            log_weight, _ = tempered_log_weight(-cost, self.survival_rate)
         return _Weighed(x, log_weight, ancestor, num_weighed=self.num_layers * len(x))
-
-
-def _energy(
-    problem: SearchProblem,
-    parent: Int[Tensor, " s"],
-    prior: Prior,
-    x: Float[Tensor, "s n"],
-) -> Float[Tensor, " s"]:
-    """The frame's cost of states with these parents; infinite where it is not finite."""
-    value = problem.children(parent, prior).cost.value(x).detach()
-    return torch.where(value.isfinite(), value, torch.inf)

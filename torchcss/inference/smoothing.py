@@ -56,17 +56,6 @@ from torchcss.inference.trust_region import default_prior_variance
 from torchcss.linalg import multiply, symmetric_part, whitener, with_least_width
 from torchcss.types import Bounds, Differentiable, LocalModel, Status
 
-__all__ = [
-    "Changes",
-    "GaussianEvidence",
-    "Path",
-    "Refined",
-    "Transition",
-    "best_path",
-    "refine",
-    "refine_in_windows",
-]
-
 
 class Path(NamedTuple):
     """What `best_path` chose.
@@ -137,15 +126,11 @@ class GaussianEvidence(NamedTuple):
             precision = torch.where(seen[:, None, None], precision, 0.0)
         return GaussianEvidence(mean.double(), precision)
 
-    def value(self, x: Float[Tensor, "t n"]) -> Float[Tensor, " t"]:
-        """Cost of every frame, nats."""
-        apart = x - self.mean
-        return 0.5 * (apart * multiply(self.precision, apart)).sum(-1)
-
     def local_model(self, x: Float[Tensor, "t n"]) -> LocalModel:
         """Cost, gradient and Hessian of every frame."""
-        pull = multiply(self.precision, x - self.mean)
-        return LocalModel(0.5 * ((x - self.mean) * pull).sum(-1), pull, self.precision)
+        apart = x - self.mean
+        pull = multiply(self.precision, apart)
+        return LocalModel(0.5 * (apart * pull).sum(-1), pull, self.precision)
 
 
 def best_path(
@@ -223,7 +208,6 @@ class Refinement:
 
     Attributes:
         likelihood_power: Factor on the costs.
-        scale: Length of each parameter that damping counts as one; ones by default.
         prior_variance: Variance of each parameter before any image is seen: of variables that a
             bound holds (decision: active bounds), and a weak prior on the others in the
             covariances, not in the means. By default `default_prior_variance` of the least box that
@@ -233,7 +217,6 @@ class Refinement:
     """
 
     likelihood_power: float = 1.0
-    scale: Float[Tensor, " n"] | None = None
     prior_variance: Float[Tensor, " n"] | None = None
     max_steps: int = 50
     tolerance: float = 1e-6
@@ -300,8 +283,7 @@ def refine(
     x, times, limits = _checked(start, times, bounds)
     power = choice.likelihood_power
     sum_ = ChainSum(cost, power, times, transition, changes or {}, start.dtype)
-    weight = _damping_weight(x, choice.scale)
-    ended = descend(sum_, x, limits, weight, choice.max_steps, choice.tolerance)
+    ended = descend(sum_, x, limits, choice.max_steps, choice.tolerance)
     return _refined(*ended, limits, choice, start)
 
 
@@ -342,7 +324,7 @@ def refine_in_windows(
         ConfigurationError: As `refine`, or if there are fewer costs than frames.
     """
     x, times, limits = _checked(start, times, bounds)
-    t, weight, changes = len(x), _damping_weight(x, choice.scale), changes or {}
+    t, changes = len(x), changes or {}
     queue = iter(costs)
     held: dict[int, Differentiable] = {}
     models: list[LocalModel] = []
@@ -366,7 +348,7 @@ def refine_in_windows(
                 costs_here, choice.likelihood_power, times[before:after], transition, here,
                 start.dtype,
             ),
-            part, box, weight, choice.max_steps, choice.tolerance,
+            part, box, choice.max_steps, choice.tolerance,
         )  # fmt: skip
         del costs_here  # Nothing keeps the costs of a window but `held`.
         x[before:after] = part
@@ -456,10 +438,6 @@ class _FrameByFrame(NamedTuple):
 
     costs: list[Differentiable | None]
 
-    def value(self, x: Float[Tensor, "t n"]) -> Float[Tensor, " t"]:
-        """Cost of every frame, nats."""
-        return self.local_model(x).value
-
     def local_model(self, x: Float[Tensor, "t n"]) -> LocalModel:
         """Cost, gradient and Hessian of every frame."""
         models = [
@@ -527,7 +505,3 @@ def _checked(
         raise ShapeError("refine: expected a finite start")
     limits = Bounds(bounds.lower.double().expand(t, n), bounds.upper.double().expand(t, n))
     return limits.project(start.detach().double()), times, limits
-
-
-def _damping_weight(x: Tensor, scale: Tensor | None) -> Float[Tensor, " n"]:
-    return x.new_ones(x.shape[-1]) if scale is None else scale.double().square().reciprocal()

@@ -1,7 +1,8 @@
 """What a tracker does when it has lost its target: search more widely, and jump.
 
 `torchcss.inference.loss_monitor` tells from the costs that the track is lost. Until it is found
-again, each frame is searched with more samples, at a larger scale, for more modes, and most samples
+again, each frame is searched with more samples, at a larger scale, for more modes ("when tracking
+fails, the number of modes and of samples can be increased", section 8 [IJRR]), and most samples
 are of the poses that project to the same places as the best mode: the forward-backward flips of
 initialisation (`torchcss.body.flips`), which lie far apart in space and next to each other in the
 image. A track that was lost for that reason is found in one frame.
@@ -10,11 +11,13 @@ image. A track that was lost for that reason is found in one frame.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from torchcss.cost.choice import TERM_TABLE
-from torchcss.inference.loss_monitor import LossMonitor, MonitorState, widened
-from torchcss.inference.tracker import SequenceTracker
+from torchcss.inference.loss_monitor import LossMonitor, MonitorState
+from torchcss.inference.particle import AnnealedParticleFilter, ParticleFilter
+from torchcss.inference.proposals import CovarianceScaled, HeavyTailed
+from torchcss.inference.tracker import SequenceTracker, Tracker
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,5 +48,18 @@ class Recovery:
         return self.monitor.update(state, observed)
 
     def widened(self, tracker: SequenceTracker) -> SequenceTracker:
-        """The tracker that searches for what was lost; the flips are for whoever knows the body."""
-        return widened(tracker, samples=self.samples, modes=self.modes, scale=self.scale)
+        """The same tracker with a wider search, which forgets: no pose is too far from those lost.
+
+        The flips are for whoever knows the body.
+        """
+        tracker = replace(tracker, num_samples=self.samples * tracker.num_samples)
+        if isinstance(tracker, (ParticleFilter, AnnealedParticleFilter)):
+            return tracker
+        tracker = replace(tracker, num_modes=self.modes * tracker.num_modes)
+        if not isinstance(tracker, Tracker):
+            return tracker
+        proposal = tracker.proposal
+        scaled = isinstance(proposal, (CovarianceScaled, HeavyTailed))
+        if scaled and proposal.covariance_scale is not None:
+            proposal = replace(proposal, covariance_scale=self.scale * proposal.covariance_scale)
+        return replace(tracker, proposal=proposal, forgetting=0.0, soft_matching=False)
