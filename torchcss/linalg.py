@@ -19,6 +19,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchcss.types import Matrices, Numbers, Vector, Vectors
+
 CHUNK = 256
 """Matrices inverted at a time: a few copies of them stay in the caches."""
 
@@ -32,7 +34,7 @@ LEAST_DEVIATION = 1e-2
 `constrained_inverse` are compared. Ours."""
 
 
-def symmetric_part(matrix: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n n"]:
+def symmetric_part(matrix: Matrices) -> Matrices:
     """Return the mean of a matrix and its transpose."""
     return 0.5 * (matrix + matrix.mT)
 
@@ -44,9 +46,7 @@ def multiply(
     return (matrix @ vector[..., None])[..., 0]
 
 
-def mask_free(
-    matrix: Float[Tensor, "*batch n n"], free: Bool[Tensor, "*batch n"]
-) -> Float[Tensor, "*batch n n"]:
+def mask_free(matrix: Matrices, free: Bool[Tensor, "*batch n"]) -> Matrices:
     """Replace the rows and columns of variables that are not free by those of the identity.
 
     A system with this matrix and a right-hand side that is zero on the fixed variables leaves them
@@ -58,11 +58,8 @@ def mask_free(
 
 
 def damped_cholesky(
-    matrix: Float[Tensor, "*batch n n"],
-    damping: Float[Tensor, "*batch n"],
-    *,
-    overwrite: bool = False,
-) -> tuple[Float[Tensor, "*batch n n"], Bool[Tensor, "*batch"]]:
+    matrix: Matrices, damping: Vectors, *, overwrite: bool = False
+) -> tuple[Matrices, Bool[Tensor, "*batch"]]:
     """Factor `matrix + diag(damping)` item by item.
 
     Args:
@@ -89,27 +86,23 @@ def wall(dtype: torch.dtype) -> float:
     return torch.finfo(dtype).max ** 0.75
 
 
-def solve_lower(
-    factor: Float[Tensor, "*batch n n"], vector: Float[Tensor, "*batch n"]
-) -> Float[Tensor, "*batch n"]:
+def solve_lower(factor: Matrices, vector: Vectors) -> Vectors:
     """Multiply a vector by the inverse of a lower factor."""
     return torch.linalg.solve_triangular(factor, vector[..., None], upper=False)[..., 0]
 
 
-def cholesky_apply(
-    factor: Float[Tensor, "*batch n n"], vector: Float[Tensor, "*batch n"]
-) -> Float[Tensor, "*batch n"]:
+def cholesky_apply(factor: Matrices, vector: Vectors) -> Vectors:
     """Multiply a vector by the inverse of `factor factor^T`."""
     lower = solve_lower(factor, vector)[..., None]
     return torch.linalg.solve_triangular(factor.mT, lower, upper=True)[..., 0]
 
 
 def inverse_on_free(
-    hessian: Float[Tensor, "*batch n n"],
+    hessian: Matrices,
     free: Bool[Tensor, "*batch n"],
-    prior_variance: Float[Tensor, " n"],
-    gradient: Float[Tensor, "*batch n"] | None = None,
-) -> Float[Tensor, "*batch n n"]:
+    prior_variance: Vector,
+    gradient: Vectors | None = None,
+) -> Matrices:
     """Covariance of a mode: the inverse Hessian on the free variables, never wider than the prior.
 
     In units of the prior's standard deviations, an eigen-direction of curvature `e > 1` gets the
@@ -149,9 +142,7 @@ def inverse_on_free(
     return covariance.to(hessian.dtype)
 
 
-def _inverse_at_least_one(
-    matrix: Float[Tensor, "b n n"], free: Bool[Tensor, "b n"]
-) -> Float[Tensor, "b n n"]:
+def _inverse_at_least_one(matrix: Matrices, free: Bool[Tensor, "b n"]) -> Matrices:
     """Inverse on the free variables with every eigenvalue below one raised to one."""
     scaled = mask_free(symmetric_part(matrix), free)
     above_one = scaled.clone()
@@ -167,10 +158,8 @@ def _inverse_at_least_one(
 
 
 def constrained_inverse(
-    hessian: Float[Tensor, "*batch n n"],
-    free: Bool[Tensor, "*batch n"],
-    prior_variance: Float[Tensor, " n"],
-) -> tuple[Float[Tensor, "*batch n n"], Bool[Tensor, "*batch"]]:
+    hessian: Matrices, free: Bool[Tensor, "*batch n"], prior_variance: Vector
+) -> tuple[Matrices, Bool[Tensor, "*batch"]]:
     """Covariance of a mode as the papers print it: `H^-1` on the free variables, zero elsewhere.
 
     Note 8 and Fig. 6 step 2.3 [IJRR], section 4.2 [RR]; nothing is capped. Where the Hessian is not
@@ -197,17 +186,13 @@ def constrained_inverse(
     return torch.where(both, inverse, 0.0).to(hessian.dtype), floored
 
 
-def with_least_width(
-    covariance: Float[Tensor, "*batch n n"], deviation: float = LEAST_DEVIATION
-) -> Float[Tensor, "*batch n n"]:
+def with_least_width(covariance: Matrices, deviation: float = LEAST_DEVIATION) -> Matrices:
     """Give parameters without any width a little, so that the covariance has an inverse."""
     without = torch.linalg.diagonal(covariance) <= 0
     return covariance + deviation**2 * torch.diag_embed(without).to(covariance)
 
 
-def _standardised(
-    covariance: Float[Tensor, "*batch n n"],
-) -> tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n n"]]:
+def _standardised(covariance: Matrices) -> tuple[Vectors, Matrices]:
     """Split a covariance into standard deviations and correlations; never a zero deviation."""
     variance = torch.linalg.diagonal(covariance)
     smallest = torch.finfo(covariance.dtype).tiny
@@ -216,7 +201,7 @@ def _standardised(
     return deviation, symmetric_part(correlation)
 
 
-def covariance_factor(covariance: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n n"]:
+def covariance_factor(covariance: Matrices) -> Matrices:
     """Return `A` with `A A^T = covariance`, also where the covariance is singular.
 
     Negative eigenvalues, which only rounding can cause, count as zero.
@@ -226,9 +211,7 @@ def covariance_factor(covariance: Float[Tensor, "*batch n n"]) -> Float[Tensor, 
     return deviation[..., :, None] * vectors * values.clamp(min=0).sqrt()[..., None, :]
 
 
-def _resolved_eigen(
-    covariance: Float[Tensor, "*batch n n"],
-) -> tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"], Float[Tensor, "*batch n n"]]:
+def _resolved_eigen(covariance: Matrices) -> tuple[Vectors, Vectors, Matrices]:
     """Deviations, then eigenvalues (no smaller than the resolution) and vectors of correlations."""
     deviation, correlation = _standardised(covariance)
     values, vectors = torch.linalg.eigh(correlation)
@@ -236,15 +219,13 @@ def _resolved_eigen(
     return deviation, values.clamp(min=resolution), vectors
 
 
-def log_determinant(covariance: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch"]:
+def log_determinant(covariance: Matrices) -> Numbers:
     """Log-determinant of a covariance; finite where it is singular, as the module page says."""
     deviation, values, _ = _resolved_eigen(covariance)
     return 2 * deviation.log().sum(-1) + values.log().sum(-1)
 
 
-def squared_mahalanobis(
-    difference: Float[Tensor, "*batch n"], covariance: Float[Tensor, "*batch n n"]
-) -> Float[Tensor, "*batch"]:
+def squared_mahalanobis(difference: Vectors, covariance: Matrices) -> Numbers:
     """Squared distance in the metric of a covariance.
 
     Args:
@@ -260,7 +241,7 @@ def squared_mahalanobis(
     return multiply(whitener(covariance), difference).square().sum(-1)
 
 
-def whitener(covariance: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n n"]:
+def whitener(covariance: Matrices) -> Matrices:
     """Return `A` such that `|A d|^2` is the squared Mahalanobis distance of `d`.
 
     For many differences under one covariance, multiply by this rather than calling

@@ -33,6 +33,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.errors import ConfigurationError
+from torchcss.types import Numbers
 
 
 class RobustValue(NamedTuple):
@@ -44,9 +45,9 @@ class RobustValue(NamedTuple):
         second: Second derivative, never positive.
     """
 
-    rho: Float[Tensor, "*batch"]
-    first: Float[Tensor, "*batch"]
-    second: Float[Tensor, "*batch"]
+    rho: Numbers
+    first: Numbers
+    second: Numbers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +70,7 @@ class RobustPotential(ABC):
                 )
 
     @abstractmethod
-    def __call__(self, s: Float[Tensor, "*batch"]) -> RobustValue:
+    def __call__(self, s: Numbers) -> RobustValue:
         """Evaluate at squared weighted errors, none negative."""
 
 
@@ -82,7 +83,7 @@ class Quadratic(RobustPotential):
         sigma: Scale of the central peak in the unit of the weighted residual.
     """
 
-    def __call__(self, s: Float[Tensor, "*batch"]) -> RobustValue:
+    def __call__(self, s: Numbers) -> RobustValue:
         """Evaluate at squared weighted errors."""
         slope = self.nu / self.sigma**2
         return RobustValue(slope * s, torch.full_like(s, slope), torch.zeros_like(s))
@@ -97,7 +98,7 @@ class Lorentzian(RobustPotential):
         sigma: Scale of the central peak in the unit of the weighted residual.
     """
 
-    def __call__(self, s: Float[Tensor, "*batch"]) -> RobustValue:
+    def __call__(self, s: Numbers) -> RobustValue:
         """Evaluate at squared weighted errors."""
         variance = self.sigma**2
         inverse = (s + variance).reciprocal()
@@ -114,7 +115,7 @@ class Leclerc(RobustPotential):
         sigma: Scale of the central peak in the unit of the weighted residual.
     """
 
-    def __call__(self, s: Float[Tensor, "*batch"]) -> RobustValue:
+    def __call__(self, s: Numbers) -> RobustValue:
         """Evaluate at squared weighted errors."""
         variance = self.sigma**2
         z = s / variance
@@ -127,7 +128,7 @@ def residual_cost(
     residual: Float[Tensor, "*batch c"],
     weight: Float[Tensor, "*#batch"],
     share: Float[Tensor, "*#batch"] | float = 1.0,
-) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch c"], Float[Tensor, "*batch c c"]]:
+) -> tuple[Numbers, Float[Tensor, "*batch c"], Float[Tensor, "*batch c c"]]:
     """Costs of residuals with their derivatives in the residuals.
 
     Args:

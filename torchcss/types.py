@@ -28,6 +28,24 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+Vector = Float[Tensor, " n"]
+"""One number for each parameter."""
+
+Vectors = Float[Tensor, "*batch n"]
+"""A state of each item, or a derivative in it."""
+
+Matrices = Float[Tensor, "*batch n n"]
+"""A Hessian or a covariance of each item."""
+
+Numbers = Float[Tensor, "*batch"]
+"""One number for each item, such as its cost in nats."""
+
+Trajectory = Float[Tensor, "t n"]
+"""A state in every frame, or a derivative in it."""
+
+Items = Int[Tensor, " m"]
+"""Which items, by index."""
+
 
 class LocalModel(NamedTuple):
     """A cost and its first two derivatives at a state; the quadratic model of eq. 11 and 12 [IJRR].
@@ -38,9 +56,9 @@ class LocalModel(NamedTuple):
         hessian: Second derivative, symmetric; it may be indefinite.
     """
 
-    value: Float[Tensor, "*batch"]
-    gradient: Float[Tensor, "*batch n"]
-    hessian: Float[Tensor, "*batch n n"]
+    value: Numbers
+    gradient: Vectors
+    hessian: Matrices
 
 
 class PointCost(NamedTuple):
@@ -65,10 +83,10 @@ class Bounds(NamedTuple):
         upper: Greatest admissible value; `inf` where there is none.
     """
 
-    lower: Float[Tensor, " n"]
-    upper: Float[Tensor, " n"]
+    lower: Vector
+    upper: Vector
 
-    def project(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
+    def project(self, x: Vectors) -> Vectors:
         """Return the nearest admissible state."""
         return x.clamp(self.lower.to(x), self.upper.to(x))
 
@@ -76,9 +94,7 @@ class Bounds(NamedTuple):
         """The same in the type and on the device of a tensor."""
         return Bounds(self.lower.to(like), self.upper.to(like))
 
-    def hold(
-        self, x: Float[Tensor, "*batch n"], gradient: Float[Tensor, "*batch n"]
-    ) -> Bool[Tensor, "*batch n"]:
+    def hold(self, x: Vectors, gradient: Vectors) -> Bool[Tensor, "*batch n"]:
         """Variables at a bound that a cost of this gradient pushes against it."""
         return ((x <= self.lower) & (gradient > 0)) | ((x >= self.upper) & (gradient < 0))
 
@@ -128,14 +144,14 @@ class Modes(NamedTuple):
         num_steps: Iterations taken per item.
     """
 
-    mean: Float[Tensor, "*batch n"]
-    covariance: Float[Tensor, "*batch n n"]
-    cost: Float[Tensor, "*batch"]
+    mean: Vectors
+    covariance: Matrices
+    cost: Numbers
     active: Int[Tensor, "*batch n"]
     status: Int[Tensor, "*batch"]
     num_steps: Int[Tensor, "*batch"]
 
-    def take(self, items: Int[Tensor, " m"] | slice | int) -> Modes:
+    def take(self, items: Items | slice | int) -> Modes:
         """Some of the items, of the first leading dimension."""
         return Modes(*(field[items] for field in self))
 
@@ -143,7 +159,7 @@ class Modes(NamedTuple):
 class Differentiable(Protocol):
     """Anything that gives a cost and its derivatives, item by item."""
 
-    def local_model(self, x: Float[Tensor, "*batch n"]) -> LocalModel:
+    def local_model(self, x: Vectors) -> LocalModel:
         """Cost, gradient and Hessian at `x`, image matches held fixed."""
         ...
 
@@ -152,11 +168,11 @@ class Differentiable(Protocol):
 class CostFunction(Differentiable, Protocol):
     """Anything that the optimiser can search: the negative log posterior, eq. 3."""
 
-    def value(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    def value(self, x: Vectors) -> Numbers:
         """Cost in nats; a pure function of `x`."""
         ...
 
-    def take(self, items: Int[Tensor, " m"]) -> CostFunction:
+    def take(self, items: Items) -> CostFunction:
         """The cost of some items of the batch; itself, where all items have the same cost."""
         ...
 
@@ -165,9 +181,7 @@ class CostFunction(Differentiable, Protocol):
 class BlendedCost(CostFunction, Protocol):
     """A cost with a Hessian that is positive far from the minimum, and exact at it."""
 
-    def blended_model(
-        self, x: Float[Tensor, "*batch n"], share: Float[Tensor, "*batch"]
-    ) -> LocalModel:
+    def blended_model(self, x: Vectors, share: Numbers) -> LocalModel:
         """Cost, gradient and a share, 0 to 1, of the second-order parts of the Hessian."""
         ...
 

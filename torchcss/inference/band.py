@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchcss.linalg import mask_free, multiply, symmetric_part
+from torchcss.types import Trajectory
 
 _ROUNDS = 200
 """Sets of pinned variables tried; ten are many."""
@@ -31,7 +32,7 @@ class Band(NamedTuple):
 
     block: Float[Tensor, "t w n n"]
 
-    def times(self, vector: Float[Tensor, "t n"]) -> Float[Tensor, "t n"]:
+    def times(self, vector: Trajectory) -> Trajectory:
         """Matrix times vector."""
         out = multiply(self.block[:, 0], vector)
         for d in range(1, min(self.block.shape[1], len(vector))):
@@ -79,7 +80,7 @@ class BandFactor(NamedTuple):
 
     block: Float[Tensor, "t w n n"]
 
-    def solve(self, vector: Float[Tensor, "t n"]) -> Float[Tensor, "t n"]:
+    def solve(self, vector: Trajectory) -> Trajectory:
         """Inverse of the matrix times a vector."""
         t, width = self.block.shape[:2]
         out = [vector[0]] * t
@@ -131,7 +132,7 @@ class BandFactor(NamedTuple):
 
 def least_in_box(
     band: Band, gradient: Tensor, lower: Tensor, upper: Tensor, held: Tensor
-) -> Float[Tensor, "t n"] | None:
+) -> Trajectory | None:
     """Minimise a quadratic in a box by projected Newton steps (Bertsekas 1982).
 
     Args:

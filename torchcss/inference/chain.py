@@ -20,7 +20,7 @@ from torch import Tensor
 from torchcss.errors import ConfigurationError
 from torchcss.inference.band import Band, least_in_box
 from torchcss.linalg import mask_free, multiply, symmetric_part
-from torchcss.types import Bounds, Differentiable, LocalModel, Status
+from torchcss.types import Bounds, Differentiable, LocalModel, Status, Trajectory, Vector
 
 Changes = Mapping[int, Callable[[Tensor], Tensor]]
 """By the index of a frame, a differentiable map `[*batch n] -> [*batch n]` from the coordinates of
@@ -89,7 +89,7 @@ class Motion(NamedTuple):
     """
 
     value: Float[Tensor, ""]
-    gradient: Float[Tensor, "t n"]
+    gradient: Trajectory
     band: Float[Tensor, "t w n n"]
 
 
@@ -105,7 +105,7 @@ class Chain(NamedTuple):
     """
 
     value: Float[Tensor, ""]
-    gradient: Float[Tensor, "t n"]
+    gradient: Trajectory
     hessian: Float[Tensor, "t n n"]
     motion: Float[Tensor, "t w n n"]
     frames: LocalModel
@@ -164,7 +164,7 @@ class ChainSum(NamedTuple):
     changes: Changes
     dtype: torch.dtype
 
-    def at(self, x: Float[Tensor, "t n"]) -> Chain:
+    def at(self, x: Trajectory) -> Chain:
         """The model of the sum at a state."""
         model = self.cost.local_model(x.to(self.dtype))
         frames = LocalModel(*(self.evidence * part.detach().double() for part in model))
@@ -173,7 +173,7 @@ class ChainSum(NamedTuple):
 
 def descend(
     sum_: ChainSum, x: Tensor, limits: Bounds, max_steps: int, tolerance: float
-) -> tuple[Float[Tensor, "t n"], Chain, Status, int]:
+) -> tuple[Trajectory, Chain, Status, int]:
     """Newton's method on all frames at once.
 
     Args:
@@ -219,7 +219,7 @@ def descend(
 
 
 def marginals(
-    chain: Chain, free: Bool[Tensor, "t n"], prior_variance: Float[Tensor, " n"]
+    chain: Chain, free: Bool[Tensor, "t n"], prior_variance: Vector
 ) -> Float[Tensor, "t n n"]:
     """Covariances of the states: diagonal blocks of the inverse Hessian on the free variables.
 
@@ -251,7 +251,7 @@ def held_by(x: Tensor, gradient: Tensor, bounds: Bounds) -> Bool[Tensor, "t n"]:
 
 
 def motion_terms(
-    x: Float[Tensor, "t n"], times: Float[Tensor, " t"], transition: Transition, changes: Changes
+    x: Trajectory, times: Float[Tensor, " t"], transition: Transition, changes: Changes
 ) -> Motion:
     """Value, gradient and (Gauss-Newton) Hessian of the transitions.
 
@@ -324,7 +324,7 @@ def with_slope(
 
 def _chain_step(
     chain: Chain, x: Tensor, limits: Bounds, damping: float
-) -> tuple[Float[Tensor, "t n"], float]:
+) -> tuple[Trajectory, float]:
     """The step to the least of the damped model in the box, and the damping that it took."""
     fixed, held = limits.lower == limits.upper, held_by(x, chain.gradient, limits)
     lower, upper = limits.lower - x, limits.upper - x

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.linalg import symmetric_part
+from torchcss.types import Vector
 
 Deviation = float | tuple[float, ...]
 """Standard deviation of every parameter, or one number for all."""
@@ -77,7 +78,7 @@ class ConstantVelocity:
         return Diffusion(deviation=self.deviation).predict(moved, velocity)
 
 
-Transition = Callable[[Float[Tensor, " n"], Float[Tensor, " n"]], Float[Tensor, " n"]]
+Transition = Callable[[Vector, Vector], Vector]
 """Next state, expected, from one state and how far it moved in the last frame. It must be made of
 operations that `torch.func` can map over modes and differentiate."""
 

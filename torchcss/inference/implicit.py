@@ -31,7 +31,7 @@ from torch import Tensor, nn
 from torchcss.errors import ConfigurationError, check_shape
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.linalg import multiply, symmetric_part
-from torchcss.types import Bounds, CostFunction
+from torchcss.types import Bounds, CostFunction, Matrices, Vector, Vectors
 
 OPTIMISER = TrustRegionNewton(max_steps=60, tolerance=1e-8)
 """How `weighted_minimum` descends by default: to the end, where the theorem holds."""
@@ -44,7 +44,7 @@ class WeighedCost(CostFunction, Protocol):
         """The same with further factors on named terms, one where none is given."""
         ...
 
-    def gradients(self, x: Float[Tensor, "*batch n"]) -> Mapping[str, Float[Tensor, "*batch n"]]:
+    def gradients(self, x: Vectors) -> Mapping[str, Vectors]:
         """Gradient of every term by name, times its weight."""
         ...
 
@@ -90,12 +90,12 @@ class TermWeights(nn.Module):
 def weighted_minimum(
     cost: WeighedCost,
     weights: TermWeights,
-    x0: Float[Tensor, "b n"],
+    x0: Vectors,
     bounds: Bounds,
     *,
     optimiser: TrustRegionNewton = OPTIMISER,
-    scale: Float[Tensor, " n"] | None = None,
-) -> Float[Tensor, "b n"]:
+    scale: Vector | None = None,
+) -> Vectors:
     """Descend on a weighted sum to a minimum that can be differentiated in its weights.
 
     Args:
@@ -121,12 +121,12 @@ def weighted_minimum(
 
 
 def differentiable_minimum(
-    x: Float[Tensor, "*batch n"],
-    hessian: Float[Tensor, "*batch n n"],
+    x: Vectors,
+    hessian: Matrices,
     gradients: Float[Tensor, "*batch t n"],
     active: Bool[Tensor, "*batch n"],
     weights: Float[Tensor, " t"],
-) -> Float[Tensor, "*batch n"]:
+) -> Vectors:
     """Attach to a minimum how it depends on the weights of the terms that were summed.
 
     Args:

@@ -25,12 +25,12 @@ import math
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.inference.mixture import draw_components
 from torchcss.inference.proposals import Samples
-from torchcss.types import CostFunction
+from torchcss.types import CostFunction, Items
 
 
 class Survival(NamedTuple):
@@ -108,9 +108,7 @@ def tempered_log_weight(
     return math.exp(low) * log_weight, math.exp(low)
 
 
-def resample(
-    log_weight: Float[Tensor, " s"], num: int, *, generator: torch.Generator
-) -> Int[Tensor, " m"]:
+def resample(log_weight: Float[Tensor, " s"], num: int, *, generator: torch.Generator) -> Items:
     """Draw samples again by their weight, at equal steps of the cumulated weight.
 
     Args:

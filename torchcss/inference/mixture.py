@@ -31,6 +31,7 @@ from torchcss.linalg import (
     whitener,
     with_least_width,
 )
+from torchcss.types import Items, Matrices, Numbers, Vector, Vectors
 
 _STATES_AT_ONCE = 1024
 """States whose differences from all components are held in memory together."""
@@ -61,7 +62,7 @@ class GaussianMixture(NamedTuple):
         shifted = self.log_weight - torch.where(total.isfinite(), total, 0.0)
         return self._replace(log_weight=torch.where(total.isfinite(), shifted, equal))
 
-    def take(self, modes: Int[Tensor, " m"]) -> GaussianMixture:
+    def take(self, modes: Items) -> GaussianMixture:
         """Keep some modes, in the order given, with the weights that they have."""
         return GaussianMixture(self.mean[modes], self.covariance[modes], self.log_weight[modes])
 
@@ -70,7 +71,7 @@ class GaussianMixture(NamedTuple):
         order = self.log_weight.argsort(descending=True, stable=True)
         return self.take(order[:num_modes]).normalise()
 
-    def squared_distance(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch k"]:
+    def squared_distance(self, x: Vectors) -> Float[Tensor, "*batch k"]:
         """Squared Mahalanobis distance from every component, in that component's own metric."""
         shape, n = x.shape[:-1], x.shape[-1]
         white, parts = whitener(self.covariance), []
@@ -80,12 +81,12 @@ class GaussianMixture(NamedTuple):
             parts.append((apart @ white.mT).square().sum(-1).mT)
         return torch.cat(parts).reshape(*shape, len(self.mean))
 
-    def component_log_density(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch k"]:
+    def component_log_density(self, x: Vectors) -> Float[Tensor, "*batch k"]:
         """Log-density of every component, without its weight."""
         normaliser = x.shape[-1] * math.log(2 * math.pi) + log_determinant(self.covariance)
         return -0.5 * (self.squared_distance(x) + normaliser)
 
-    def log_density(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    def log_density(self, x: Vectors) -> Numbers:
         """Log-density of the mixture, its weights normalised."""
         return (self.component_log_density(x) + self.normalise().log_weight).logsumexp(-1)
 
@@ -118,7 +119,7 @@ class GaussianMixture(NamedTuple):
         factor = covariance_factor(self.covariance)[component]
         return MixtureSamples(self.mean[component] + multiply(factor, normal), component)
 
-    def moments(self) -> tuple[Float[Tensor, " n"], Float[Tensor, "n n"]]:
+    def moments(self) -> tuple[Vector, Float[Tensor, "n n"]]:
         """Mean and covariance of the whole mixture."""
         weight = self.weight
         mean = weight @ self.mean
@@ -224,7 +225,7 @@ def distinct_modes(
     *,
     distance: float = 1.0,
     most: int | None = None,
-) -> Int[Tensor, " m"]:
+) -> Items:
     """Discard modes that have been found before, Fig. 6 step 2.3.
 
     The paper gives no threshold (decision "distinct minima"). Here a mode is a duplicate of one of
@@ -253,9 +254,7 @@ def distinct_modes(
     return torch.stack(kept) if kept else order[:0]
 
 
-def tempered(
-    covariance: Float[Tensor, "*batch n n"], power: float, prior_variance: Float[Tensor, " n"]
-) -> Float[Tensor, "*batch n n"]:
+def tempered(covariance: Matrices, power: float, prior_variance: Vector) -> Matrices:
     """Covariances of modes if the likelihood counts with a power below one.
 
     A mode's covariance is that of likelihood and prior together, and never wider than the prior P

@@ -23,7 +23,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchcss.inference.mixture import Prior
-from torchcss.types import CostFunction
+from torchcss.types import CostFunction, Items, Numbers, Vectors
 
 
 class SearchProblem(NamedTuple):
@@ -43,16 +43,16 @@ class SearchProblem(NamedTuple):
     cost: CostFunction
     coarse: CostFunction | None = None
     screening: CostFunction | None = None
-    weight_only: Callable[[Float[Tensor, "b n"]], Float[Tensor, " b"]] | None = None
-    landmarks: Callable[[Float[Tensor, "b n"]], Float[Tensor, "b m d"]] | None = None
-    restrict: Callable[[Int[Tensor, " m"]], SearchProblem] | None = None
+    weight_only: Callable[[Vectors], Numbers] | None = None
+    landmarks: Callable[[Vectors], Float[Tensor, "b m d"]] | None = None
+    restrict: Callable[[Items], SearchProblem] | None = None
     of_children: Callable[[Int[Tensor, " s"], Prior], SearchProblem] | None = None
 
     def children(self, component: Int[Tensor, " s"], prior: Prior) -> SearchProblem:
         """The problem of samples of a prior's components."""
         return self if self.of_children is None else self.of_children(component, prior)
 
-    def take(self, items: Int[Tensor, " m"]) -> SearchProblem:
+    def take(self, items: Items) -> SearchProblem:
         """The problem of some of the samples."""
         if self.restrict is not None:
             return self.restrict(items)

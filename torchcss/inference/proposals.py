@@ -48,7 +48,7 @@ from torchcss.errors import ConfigurationError
 from torchcss.inference.dynamics import Deviation, noise_covariance
 from torchcss.inference.mixture import GaussianMixture, MixtureSamples, Prior
 from torchcss.linalg import cholesky_apply, log_determinant, mask_free, multiply
-from torchcss.types import Bounds
+from torchcss.types import Bounds, Items, Numbers, Vectors
 
 
 class Samples(NamedTuple):
@@ -70,7 +70,7 @@ class Samples(NamedTuple):
     jumps: Prior | None = None
     drawn: Float[Tensor, "s n"] | None = None
 
-    def take(self, items: Int[Tensor, " m"]) -> Samples:
+    def take(self, items: Items) -> Samples:
         """Some of the samples."""
         drawn = None if self.drawn is None else self.drawn[items]
         parts = self.x[items], self.parent[items], self.log_weight[items]
@@ -94,14 +94,12 @@ class Proposal(ABC):
             generator: Where randomness comes from.
         """
 
-    def log_density(
-        self, mixture: GaussianMixture, x: Float[Tensor, "*batch n"]
-    ) -> Float[Tensor, "*batch"]:
+    def log_density(self, mixture: GaussianMixture, x: Vectors) -> Numbers:
         """Log-density of what is drawn at random, before projection; `-inf` if nothing is."""
         return torch.full_like(x[..., 0], -math.inf)
 
 
-def unbounded(like: Float[Tensor, "*batch n"]) -> Bounds:
+def unbounded(like: Vectors) -> Bounds:
     """No limits on states like these."""
     limit = torch.full_like(like.reshape(-1, like.shape[-1])[0], math.inf)
     return Bounds(-limit, limit)
@@ -237,7 +235,7 @@ class _Law(NamedTuple):
         x, component = (torch.cat(field)[:num] for field in zip(*parts, strict=True))
         return MixtureSamples(x, component)
 
-    def log_density(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    def log_density(self, x: Vectors) -> Numbers:
         """Log-density of what is drawn."""
         components = self._component_log_density(x)
         if not self.piecewise:
@@ -259,7 +257,7 @@ class _Law(NamedTuple):
         own = density.gather(-1, samples.component[:, None])[:, 0] >= density.amax(-1)
         return MixtureSamples(samples.x[own], samples.component[own])
 
-    def _component_log_density(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch k"]:
+    def _component_log_density(self, x: Vectors) -> Float[Tensor, "*batch k"]:
         """Log-densities of the components with their weights."""
         mixture, degrees, n = self.mixture, self.degrees_of_freedom, x.shape[-1]
         log_weight = mixture.normalise().log_weight
@@ -291,9 +289,7 @@ class _RandomProposal(Proposal):
     def law(self, mixture: GaussianMixture) -> _Law:
         """What is drawn from, before projection; of the same mixture object if that is its law."""
 
-    def log_density(
-        self, mixture: GaussianMixture, x: Float[Tensor, "*batch n"]
-    ) -> Float[Tensor, "*batch"]:
+    def log_density(self, mixture: GaussianMixture, x: Vectors) -> Numbers:
         """Log-density of what is drawn at random, before projection."""
         return self.law(mixture).log_density(x)
 
@@ -606,9 +602,7 @@ class MixtureOfProposals(Proposal):
         whole = [math.ceil(num * end / ends[-1] - 1e-6) for end in ends]
         return [after - before for before, after in pairwise(whole)]
 
-    def log_density(
-        self, mixture: GaussianMixture, x: Float[Tensor, "*batch n"]
-    ) -> Float[Tensor, "*batch"]:
+    def log_density(self, mixture: GaussianMixture, x: Vectors) -> Numbers:
         """Log-density of the random members together, in their shares of each other."""
         return self._joint_log_density(mixture, x, self._shares)
 

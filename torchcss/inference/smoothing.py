@@ -54,7 +54,7 @@ from torchcss.inference.chain import (
 )
 from torchcss.inference.trust_region import default_prior_variance
 from torchcss.linalg import multiply, symmetric_part, whitener, with_least_width
-from torchcss.types import Bounds, Differentiable, LocalModel, Status
+from torchcss.types import Bounds, Differentiable, LocalModel, Status, Trajectory, Vector
 
 
 class Path(NamedTuple):
@@ -82,7 +82,7 @@ class Refined(NamedTuple):
         num_steps: Iterations, a scalar.
     """
 
-    mean: Float[Tensor, "t n"]
+    mean: Trajectory
     covariance: Float[Tensor, "t n n"]
     cost: Float[Tensor, " t"]
     total: Float[Tensor, ""]
@@ -103,12 +103,12 @@ class GaussianEvidence(NamedTuple):
         precision: Inverse covariance; zero for a frame that says nothing.
     """
 
-    mean: Float[Tensor, "t n"]
+    mean: Trajectory
     precision: Float[Tensor, "t n n"]
 
     @staticmethod
     def of_modes(
-        mean: Float[Tensor, "t n"],
+        mean: Trajectory,
         covariance: Float[Tensor, "t n n"],
         *,
         seen: Bool[Tensor, " t"] | None = None,
@@ -126,7 +126,7 @@ class GaussianEvidence(NamedTuple):
             precision = torch.where(seen[:, None, None], precision, 0.0)
         return GaussianEvidence(mean.double(), precision)
 
-    def local_model(self, x: Float[Tensor, "t n"]) -> LocalModel:
+    def local_model(self, x: Trajectory) -> LocalModel:
         """Cost, gradient and Hessian of every frame."""
         apart = x - self.mean
         pull = multiply(self.precision, apart)
@@ -142,7 +142,7 @@ def best_path(
     *,
     evidence: float = 1.0,
     changes: Changes | None = None,
-    period: Float[Tensor, " n"] | None = None,
+    period: Vector | None = None,
 ) -> Path:
     """Choose the mode of every frame, all frames considered.
 
@@ -217,7 +217,7 @@ class Refinement:
     """
 
     likelihood_power: float = 1.0
-    prior_variance: Float[Tensor, " n"] | None = None
+    prior_variance: Vector | None = None
     max_steps: int = 50
     tolerance: float = 1e-6
 
@@ -248,7 +248,7 @@ class Windows:
 
 def refine(
     cost: Differentiable,
-    start: Float[Tensor, "t n"],
+    start: Trajectory,
     times: Float[Tensor, " t"],
     transition: Transition,
     bounds: Bounds,
@@ -289,7 +289,7 @@ def refine(
 
 def refine_in_windows(
     costs: Iterable[Differentiable],
-    start: Float[Tensor, "t n"],
+    start: Trajectory,
     times: Float[Tensor, " t"],
     transition: Transition,
     bounds: Bounds,
@@ -398,7 +398,7 @@ def _short_way(apart: Tensor, period: Tensor | None) -> Tensor:
 
 
 def _gaussian_cost(
-    apart: Float[Tensor, "*b n"], deviation: Float[Tensor, " n"], wide: Tensor | None
+    apart: Float[Tensor, "*b n"], deviation: Vector, wide: Tensor | None
 ) -> Float[Tensor, "*b"]:
     """Negative log density of differences under the motion and the modes' own covariances.
 
@@ -438,7 +438,7 @@ class _FrameByFrame(NamedTuple):
 
     costs: list[Differentiable | None]
 
-    def local_model(self, x: Float[Tensor, "t n"]) -> LocalModel:
+    def local_model(self, x: Trajectory) -> LocalModel:
         """Cost, gradient and Hessian of every frame."""
         models = [
             LocalModel(
@@ -452,7 +452,7 @@ class _FrameByFrame(NamedTuple):
 
 
 def _refined(
-    x: Float[Tensor, "t n"],
+    x: Trajectory,
     chain: Chain,
     status: Status,
     steps: int,
@@ -489,7 +489,7 @@ def _checked_times(times: Tensor, t: int) -> Float[Tensor, " t"]:
 
 def _checked(
     start: Tensor, times: Tensor, bounds: Bounds
-) -> tuple[Float[Tensor, "t n"], Float[Tensor, " t"], Bounds]:
+) -> tuple[Trajectory, Float[Tensor, " t"], Bounds]:
     """The start within the bounds, times and bounds of every frame, in float64."""
     check_shape("start", start, None, None)
     t, n = start.shape

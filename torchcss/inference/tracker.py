@@ -52,7 +52,7 @@ from torchcss.inference.trust_region import (
     default_prior_variance,
 )
 from torchcss.linalg import constrained_inverse, log_determinant
-from torchcss.types import Bounds, Modes, Status
+from torchcss.types import Bounds, Items, Modes, Status
 
 _ROUNDS = ((0, 6.0), (1, 2.0), (5, 1.0))
 """Rounds of successive halving: steps of descent, and how many samples are left then, in multiples
@@ -475,9 +475,7 @@ class Tracker(SequenceTracker):
         best = torch.cat([own, best[~is_mode[best]]])
         return best[: max(size, len(own))].sort().values
 
-    def _minima(
-        self, search: _Search, bounds: Bounds
-    ) -> tuple[Modes, Int[Tensor, " m"], Int[Tensor, ""]]:
+    def _minima(self, search: _Search, bounds: Bounds) -> tuple[Modes, Items, Int[Tensor, ""]]:
         """Descend to the end: all ends, which are distinct by ascending cost, `num_floored`."""
         descents = self.optimiser.descend(search.problem.cost, search.descents, bounds)
         modes = self.optimiser.modes(descents, bounds)
@@ -491,12 +489,7 @@ class Tracker(SequenceTracker):
         return modes, distinct, floored
 
     def _posterior(
-        self,
-        state: TrackerState,
-        prior: Prior,
-        problem: SearchProblem,
-        modes: Modes,
-        origin: Int[Tensor, " m"],
+        self, state: TrackerState, prior: Prior, problem: SearchProblem, modes: Modes, origin: Items
     ) -> _Kept:
         """Steps 3 to 6: weigh the distinct modes, keep the best, and multiply in their pasts."""
         cost = modes.cost

@@ -58,7 +58,19 @@ from torchcss.linalg import (
     solve_lower,
     wall,
 )
-from torchcss.types import BlendedCost, Bounds, CostFunction, LocalModel, Modes, Status
+from torchcss.types import (
+    BlendedCost,
+    Bounds,
+    CostFunction,
+    Items,
+    LocalModel,
+    Matrices,
+    Modes,
+    Numbers,
+    Status,
+    Vector,
+    Vectors,
+)
 
 LEAST_RATIO = 1e-4
 """Share of the predicted decrease below which a step is not worth taking."""
@@ -88,17 +100,17 @@ class TrustRegionState(NamedTuple):
         num_steps: Iterations taken.
     """
 
-    x: Float[Tensor, "b n"]
+    x: Vectors
     model: LocalModel
-    share: Float[Tensor, " b"]
-    radius: Float[Tensor, " b"]
-    damping: Float[Tensor, " b"]
-    step: Float[Tensor, "b n"]
-    predicted: Float[Tensor, " b"]
+    share: Numbers
+    radius: Numbers
+    damping: Numbers
+    step: Vectors
+    predicted: Numbers
     status: Int[Tensor, " b"]
     num_steps: Int[Tensor, " b"]
 
-    def take(self, items: Int[Tensor, " m"]) -> TrustRegionState:
+    def take(self, items: Items) -> TrustRegionState:
         """Some of the items, as a copy."""
         return TrustRegionState.of([field[items] for field in self.tensors])
 
@@ -122,7 +134,7 @@ class TrustRegionInfo(NamedTuple):
     """
 
     accepted: Bool[Tensor, " b"]
-    decrease: Float[Tensor, " b"]
+    decrease: Numbers
 
 
 class _Trial(NamedTuple):
@@ -135,9 +147,9 @@ class _Trial(NamedTuple):
         greatest_radius: Bound on trust radii.
     """
 
-    x: Float[Tensor, "b n"]
+    x: Vectors
     model: LocalModel
-    share: Float[Tensor, " b"]
+    share: Numbers
     greatest_radius: float
 
 
@@ -184,12 +196,7 @@ class TrustRegionNewton:
         )
 
     def init(
-        self,
-        cost: CostFunction,
-        x0: Float[Tensor, "b n"],
-        bounds: Bounds,
-        *,
-        scale: Float[Tensor, " n"] | None = None,
+        self, cost: CostFunction, x0: Vectors, bounds: Bounds, *, scale: Vector | None = None
     ) -> TrustRegionState:
         """Evaluate the cost at the starts, moved into the bounds, and plan the first steps.
 
@@ -206,7 +213,7 @@ class TrustRegionNewton:
         state, _ = self.step(cost, self.start(x0), bounds, scale=scale)
         return state
 
-    def start(self, x0: Float[Tensor, "b n"]) -> TrustRegionState:
+    def start(self, x0: Vectors) -> TrustRegionState:
         """Items that wait for their first evaluation, which is not counted as a step."""
         b, n = x0.shape
         zero = x0.new_zeros(b)
@@ -228,7 +235,7 @@ class TrustRegionNewton:
         state: TrustRegionState,
         bounds: Bounds,
         *,
-        scale: Float[Tensor, " n"] | None = None,
+        scale: Vector | None = None,
     ) -> tuple[TrustRegionState, TrustRegionInfo]:
         """Evaluate the planned steps once, keep those that lower the cost, and plan the next.
 
@@ -259,7 +266,7 @@ class TrustRegionNewton:
         return self._advance(state, trial, bounds, weight)
 
     def _advance_compiled(
-        self, state: TrustRegionState, trial: _Trial, bounds: Bounds, weight: Float[Tensor, " n"]
+        self, state: TrustRegionState, trial: _Trial, bounds: Bounds, weight: Vector
     ) -> tuple[TrustRegionState, TrustRegionInfo]:
         """The same as `_advance` in one compiled call."""
         from torchcss.inference import planning  # compiled: only where it is used
@@ -287,7 +294,7 @@ class TrustRegionNewton:
         return TrustRegionState.of(fields), info
 
     def _advance(
-        self, state: TrustRegionState, trial: _Trial, bounds: Bounds, weight: Float[Tensor, " n"]
+        self, state: TrustRegionState, trial: _Trial, bounds: Bounds, weight: Vector
     ) -> tuple[TrustRegionState, TrustRegionInfo]:
         """Keep the trials that lower the cost, and plan the next steps."""
         candidate, model, share, greatest_radius = trial
@@ -323,11 +330,11 @@ class TrustRegionNewton:
     def minimise(
         self,
         cost: CostFunction,
-        x0: Float[Tensor, "*batch n"],
+        x0: Vectors,
         bounds: Bounds,
         *,
-        scale: Float[Tensor, " n"] | None = None,
-        prior_variance: Float[Tensor, " n"] | None = None,
+        scale: Vector | None = None,
+        prior_variance: Vector | None = None,
     ) -> Modes:
         """Descend from every start until it stops, and return the modes with their covariances.
 
@@ -362,7 +369,7 @@ class TrustRegionNewton:
         state: TrustRegionState,
         bounds: Bounds,
         *,
-        scale: Float[Tensor, " n"] | None = None,
+        scale: Vector | None = None,
     ) -> TrustRegionState:
         """Go on from a state until every item stops.
 
@@ -402,11 +409,7 @@ class TrustRegionNewton:
         return result
 
     def modes(
-        self,
-        state: TrustRegionState,
-        bounds: Bounds,
-        *,
-        prior_variance: Float[Tensor, " n"] | None = None,
+        self, state: TrustRegionState, bounds: Bounds, *, prior_variance: Vector | None = None
     ) -> Modes:
         """Where the items of a state stand, with the covariances there; see `minimise`."""
         bounds, model = bounds.to(state.x), state.model
@@ -437,11 +440,7 @@ class TrustRegionNewton:
         return self.modes(state._replace(x=ends, model=model), bounds)
 
     def _plan(
-        self,
-        state: TrustRegionState,
-        bounds: Bounds,
-        weight: Float[Tensor, " n"],
-        accepted: Bool[Tensor, " b"],
+        self, state: TrustRegionState, bounds: Bounds, weight: Vector, accepted: Bool[Tensor, " b"]
     ) -> TrustRegionState:
         """Find the next step of every running item, and stop those with nothing to gain.
 
@@ -487,11 +486,11 @@ class _Quadratic(NamedTuple):
         weight: Diagonal of `W`.
     """
 
-    hessian: Float[Tensor, "b n n"]
-    gradient: Float[Tensor, "b n"]
-    ridge: Float[Tensor, "b n"]
+    hessian: Matrices
+    gradient: Vectors
+    ridge: Vectors
     free: Bool[Tensor, "b n"]
-    weight: Float[Tensor, " n"]
+    weight: Vector
 
     @staticmethod
     def of(model: LocalModel, free: Tensor, weight: Tensor) -> _Quadratic:
@@ -504,23 +503,23 @@ class _Quadratic(NamedTuple):
             model.hessian, torch.where(free, model.gradient, 0.0), ridge, free, weight
         )
 
-    def take(self, items: Int[Tensor, " m"]) -> _Quadratic:
+    def take(self, items: Items) -> _Quadratic:
         """Some of the items."""
         # Several times faster than indexing, which gathers entry by entry.
         fields = (field.index_select(0, items) for field in self[:-1])
         return _Quadratic(*fields, weight=self.weight)
 
-    def times(self, vector: Float[Tensor, "b n"]) -> Float[Tensor, "b n"]:
+    def times(self, vector: Vectors) -> Vectors:
         """Hessian times a vector."""
         # As a row: twice as fast as a column on a CPU, and rounded alike in a batch of one.
         return (vector[:, None, :] @ self.hessian)[:, 0]
 
-    def norm(self, vector: Float[Tensor, "b n"]) -> Float[Tensor, " b"]:
+    def norm(self, vector: Vectors) -> Numbers:
         """Length in the metric `W`."""
         return (self.weight * vector.square()).sum(-1).sqrt()
 
 
-def default_prior_variance(bounds: Bounds) -> Float[Tensor, " n"]:
+def default_prior_variance(bounds: Bounds) -> Vector:
     """Square of a quarter of each parameter's range; 1 where a bound is infinite.
 
     A parameter whose range has no width gets the least variance that is safe to divide by.
@@ -575,7 +574,7 @@ def _next_radius(radius: Tensor, length: Tensor, ratio: Tensor, accepted: Tensor
 
 def _change_of_damping(
     state: TrustRegionState, model: LocalModel, accepted: Tensor, weight: Tensor
-) -> Float[Tensor, " b"]:
+) -> Numbers:
     """First guess of the next lambda over the last one: it falls with the gradient."""
     before, after = (
         (gradient.square() / weight).sum(-1).sqrt()
@@ -586,12 +585,8 @@ def _change_of_damping(
 
 
 def _damped_step(
-    problem: _Quadratic,
-    radius: Float[Tensor, " b"],
-    damping: Float[Tensor, " b"],
-    floor: float,
-    rounds: int,
-) -> tuple[Float[Tensor, "b n"], Float[Tensor, " b"]]:
+    problem: _Quadratic, radius: Numbers, damping: Numbers, floor: float, rounds: int
+) -> tuple[Vectors, Numbers]:
     """Solve `(H + lambda W) dx = -g` for the least admissible lambda.
 
     Admissible is a positive definite matrix, `lambda >= floor`, and `|dx| <= radius` in the metric
@@ -646,7 +641,7 @@ def _damped_step(
 
 
 def _solve_damped(
-    problem: _Quadratic, items: Int[Tensor, " m"], damping: Float[Tensor, "m n"]
+    problem: _Quadratic, items: Items, damping: Float[Tensor, "m n"]
 ) -> tuple[Float[Tensor, "m n"], Float[Tensor, " m"], Bool[Tensor, " m"]]:
     """Steps of some items, `-1/2` the derivative of their squared lengths, and which exist.
 
@@ -665,7 +660,7 @@ def _solve_damped(
 
 def _along_negative_curvature(
     problem: _Quadratic,
-    items: Int[Tensor, " m"],
+    items: Items,
     damping: Float[Tensor, "m n"],
     step: Float[Tensor, "m n"],
     radius: Float[Tensor, " m"],
@@ -687,12 +682,12 @@ def _along_negative_curvature(
 
 def _step_in_box(
     problem: _Quadratic,
-    damping: Float[Tensor, " b"],
-    x: Float[Tensor, "b n"],
-    step: Float[Tensor, "b n"],
+    damping: Numbers,
+    x: Vectors,
+    step: Vectors,
     bounds: Bounds,
     negligible: float,
-) -> Float[Tensor, "b n"]:
+) -> Vectors:
     """Solve the damped quadratic inside the box, for the items whose step leaves it.
 
     Free variables that cross a bound are pinned to it and the others solved again, until none
@@ -736,7 +731,7 @@ def _step_in_box(
     return bounds.project(x + step) - x
 
 
-def _weight(x: Float[Tensor, "b n"], scale: Tensor | None) -> Float[Tensor, " n"]:
+def _weight(x: Vectors, scale: Tensor | None) -> Vector:
     """Diagonal of `W`."""
     if scale is None:
         return x.new_ones(x.shape[-1])
@@ -765,7 +760,7 @@ def _array(tensor: Tensor) -> np.ndarray:
     return tensor.detach().contiguous().numpy()
 
 
-def _share_of_second_order(value: Float[Tensor, " b"], predicted: Float[Tensor, " b"]) -> Tensor:
+def _share_of_second_order(value: Numbers, predicted: Numbers) -> Tensor:
     """How much of the second-order parts the model at the next candidate is to contain.
 
     None as long as the step promises to remove a good part of what the cost can fall by, all of
@@ -776,7 +771,7 @@ def _share_of_second_order(value: Float[Tensor, " b"], predicted: Float[Tensor, 
     return torch.where(value.isinf(), 0.0, exact.clamp(0, 1))
 
 
-def _write(result: TrustRegionState, items: Int[Tensor, " m"], part: TrustRegionState) -> None:
+def _write(result: TrustRegionState, items: Items, part: TrustRegionState) -> None:
     """Write items into a state that belongs to the caller alone."""
     for into, field in zip(result.tensors, part.tensors, strict=True):
         into[items] = field

@@ -28,7 +28,7 @@ from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.initialise.from_joints import hang_before_camera
 from torchcss.initialise.multi_start import descend, starts_about
 from torchcss.initialise.options import InitialiseOptions
-from torchcss.types import Bounds, Keypoints
+from torchcss.types import Bounds, Keypoints, Vectors
 from torchcss.vision.camera import Camera
 
 MEAN, DEVIATION = math.log(0.9), 0.25
@@ -148,9 +148,7 @@ def _before(cost: TrackingCost, camera: Camera, frame: Int[Tensor, " b"]) -> Tra
     return replace(cost, views=views, past=(), bound={}, parent=frame)
 
 
-def _refitted(
-    cost: TrackingCost, x: Float[Tensor, "b n"], bounds: Bounds
-) -> tuple[Float[Tensor, "b n"], Float[Tensor, ""]]:
+def _refitted(cost: TrackingCost, x: Vectors, bounds: Bounds) -> tuple[Vectors, Float[Tensor, ""]]:
     """Two fits to every frame, and the sum of what the better ones cost."""
     fits = _OPTIMISER.minimise(cost, x, bounds)
     return fits.mean, fits.cost.nan_to_num(math.inf).view(-1, 2).amin(1).sum()

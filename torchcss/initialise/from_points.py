@@ -16,7 +16,7 @@ from torch import Tensor
 from torchcss.body.model import BodyModel
 from torchcss.cost.targets import PointDistances
 from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.types import Bounds, Keypoints
+from torchcss.types import Bounds, Keypoints, Vectors
 from torchcss.vision.camera import Camera
 
 _BONES = tuple(
@@ -30,11 +30,7 @@ _SIGMA = 0.03
 
 
 def start_from_points(
-    body: BodyModel,
-    camera: Camera,
-    keypoints: Keypoints,
-    starts: Float[Tensor, "b n"],
-    bounds: Bounds,
+    body: BodyModel, camera: Camera, keypoints: Keypoints, starts: Vectors, bounds: Bounds
 ) -> Float[Tensor, "s n"]:
     """The pose whose joints are where the points are; none where too few are known.
 

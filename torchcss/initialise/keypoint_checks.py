@@ -10,8 +10,6 @@ import statistics
 from collections.abc import Mapping, Sequence
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from torchcss.body.root import has_root
 from torchcss.cost.total import TrackingCost
@@ -19,7 +17,7 @@ from torchcss.errors import KeypointError
 from torchcss.initialise.multi_start import Search, multi_start_fits
 from torchcss.initialise.outliers import capped_cost
 from torchcss.joint_names import JOINT_NAMES, canonical_joint_name
-from torchcss.types import Keypoints
+from torchcss.types import Keypoints, Vector
 from torchcss.vision.camera import Camera
 
 _SUSPICIOUS = 0.5
@@ -124,9 +122,7 @@ def check_joints(name: str, keypoints: Keypoints, camera: Camera, least: int) ->
     return tuple(report)
 
 
-def swapped_sides(
-    cost: TrackingCost, x: Float[Tensor, " n"], generator: torch.Generator
-) -> tuple[str, ...]:
+def swapped_sides(cost: TrackingCost, x: Vector, generator: torch.Generator) -> tuple[str, ...]:
     """Say where exchanging left and right would fit much better; nothing is exchanged.
 
     Args:

@@ -44,7 +44,7 @@ from torchcss.inference.mixture import GaussianMixture, distinct_modes
 from torchcss.inference.proposals import CovarianceScaled
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.initialise.from_points import start_from_points
-from torchcss.types import Bounds, Modes
+from torchcss.types import Bounds, Modes, Numbers, Vectors
 
 _WIDE, _MIDDLE = 16.0, 4.0
 """Factors on the keypoints' scale: a random start is off by some hundred pixels, of which the
@@ -207,7 +207,7 @@ def widened(cost: TrackingCost, factor: float) -> TrackingCost:
     return replace(cost, choice=cost.choice.having(wide))
 
 
-def starts_about(body: BodyModel, num: int, generator: torch.Generator) -> Float[Tensor, "b n"]:
+def starts_about(body: BodyModel, num: int, generator: torch.Generator) -> Vectors:
     """Poses all around the vertical, spread about the stabilisers' rest; the first at rest."""
     size = (num, body.num_parameters)
     noise = torch.randn(size, generator=generator, dtype=torch.float64).to(body.tie)
@@ -221,15 +221,13 @@ def starts_about(body: BodyModel, num: int, generator: torch.Generator) -> Float
     return body.bounds.project(x)
 
 
-def _all_round(x: Float[Tensor, "b n"]) -> Float[Tensor, " b"]:
+def _all_round(x: Vectors) -> Numbers:
     """As many angles as there are states, evenly round the circle from zero."""
     turn = torch.arange(len(x), device=x.device).to(x) * (2 * math.pi / len(x))
     return torch.remainder(turn + math.pi, 2 * math.pi) - math.pi
 
 
-def _coarse_start(
-    cost: TrackingCost, x: Float[Tensor, "1 n"], search: Search
-) -> Float[Tensor, "1 n"]:
+def _coarse_start(cost: TrackingCost, x: Vectors, search: Search) -> Vectors:
     """A start with the parameters of the coarse pose, turned as the keypoints say."""
     body, x = cost.body, x.clone()
     for name, value in search.coarse_pose.items():
@@ -242,7 +240,7 @@ def _coarse_start(
 
 
 def _distinct_trunks(
-    cost: TrackingCost, segments: Segments, x: Float[Tensor, "b n"], num: int
+    cost: TrackingCost, segments: Segments, x: Vectors, num: int
 ) -> Float[Tensor, "m n"]:
     """The best fits whose trunks differ."""
     value = widened(cost, _MIDDLE).value(x).nan_to_num(math.inf)
@@ -261,11 +259,7 @@ def _distinct_trunks(
 
 
 def flips(
-    cost: TrackingCost,
-    segments: Segments,
-    x: Float[Tensor, "m n"],
-    bounds: Bounds,
-    num: int,
+    cost: TrackingCost, segments: Segments, x: Float[Tensor, "m n"], bounds: Bounds, num: int
 ) -> Float[Tensor, "s n"]:
     """The best combinations of forward-backward flips of some poses, their angles solved for.
 

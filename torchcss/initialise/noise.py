@@ -27,7 +27,7 @@ from torchcss.cost.total import TrackingCost
 from torchcss.initialise.multi_start import Search, widened
 from torchcss.initialise.outliers import refine
 from torchcss.linalg import symmetric_part
-from torchcss.types import Curvature
+from torchcss.types import Curvature, Vector, Vectors
 
 BELIEF = 10.0
 """How many numbers the noise that is assumed is worth."""
@@ -57,7 +57,7 @@ def briefly(search: Search) -> Search:
     )
 
 
-def noise_factor(cost: TrackingCost, x: Float[Tensor, " n"], search: Search) -> float:
+def noise_factor(cost: TrackingCost, x: Vector, search: Search) -> float:
     """How many times as noisy as a cost assumes its keypoints are.
 
     Args:
@@ -74,7 +74,7 @@ def noise_factor(cost: TrackingCost, x: Float[Tensor, " n"], search: Search) -> 
     return factor
 
 
-def _left_over(cost: TrackingCost, x: Float[Tensor, "1 n"], search: Search) -> float:
+def _left_over(cost: TrackingCost, x: Vectors, search: Search) -> float:
     """The factor that follows from the errors of one fit."""
     joints, points = cost.choice.find(JointTerm), cost.body.pose(x[0]).joints
     assert joints is not None
@@ -94,7 +94,7 @@ def _left_over(cost: TrackingCost, x: Float[Tensor, "1 n"], search: Search) -> f
     return math.sqrt((BELIEF + float((w * z2).sum())) / (BELIEF + expected))
 
 
-def _explained(cost: TrackingCost, x: Float[Tensor, "1 n"], search: Search) -> float:
+def _explained(cost: TrackingCost, x: Vectors, search: Search) -> float:
     """How many parameters the keypoints determine."""
     lower, upper = search.bounds(cost.body)
     moves = (x[0] > lower) & (x[0] < upper)

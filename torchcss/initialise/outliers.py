@@ -30,7 +30,7 @@ from torchcss.cost.total import TrackingCost
 from torchcss.inference.mixture import distinct_modes
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.initialise.multi_start import Search, descend, multi_start_fits
-from torchcss.types import Modes
+from torchcss.types import Modes, Numbers, Vectors
 
 SHARE = 0.05
 """Share of outliers that is expected."""
@@ -132,7 +132,7 @@ def price_of_leaving_out(cost: TrackingCost) -> Float[Tensor, " j"]:
     return (odds * targets.weight).clamp(min=1.0).log()
 
 
-def capped_cost(cost: TrackingCost, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+def capped_cost(cost: TrackingCost, x: Vectors) -> Numbers:
     """Cost in nats if no keypoint costs more than leaving it out."""
     joints, targets = _matched(cost)
     points = cost.body.pose(x).joints[..., targets.joint, :]
@@ -150,7 +150,7 @@ def without(cost: TrackingCost, outliers: Bool[Tensor, "*b j"]) -> TrackingCost:
     return cost.with_keypoints(keypoints._replace(positions=places).without(outliers))
 
 
-def refine(cost: TrackingCost, x: Float[Tensor, "b n"], search: Search) -> Modes:
+def refine(cost: TrackingCost, x: Vectors, search: Search) -> Modes:
     """Descend from fits to other keypoints or lengths: wide at first, then to the end."""
     bounds = search.bounds(cost.body)
     x = descend(cost, x, bounds, ((4.0, 8),))

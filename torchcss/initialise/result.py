@@ -26,7 +26,7 @@ from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.trust_region import default_prior_variance
 from torchcss.initialise.multi_start import Search
 from torchcss.linalg import inverse_on_free
-from torchcss.types import Modes
+from torchcss.types import Modes, Vector, Vectors
 
 STANDARD_STATURE = 1.75
 """Stature of the standard humanoid, metres."""
@@ -50,7 +50,7 @@ class Stage(NamedTuple):
 
     name: str
     body: BodyModel
-    state: Float[Tensor, " n"]
+    state: Vector
     cost: float
 
 
@@ -123,16 +123,12 @@ def hang_on_best(body: BodyModel, fits: Modes) -> tuple[BodyModel, Modes]:
     return body, fits._replace(mean=mean).take(keep)
 
 
-def columns_of(
-    source: BodyModel, target: BodyModel, x: Float[Tensor, "b n"]
-) -> Float[Tensor, "b m"]:
+def columns_of(source: BodyModel, target: BodyModel, x: Vectors) -> Float[Tensor, "b m"]:
     """The parameters of one body out of the states of another that has them too."""
     return x[:, [source.state_index(name) for name in target.state_names]]
 
 
-def spread_to(
-    source: BodyModel, target: BodyModel, x: Float[Tensor, "b n"]
-) -> Float[Tensor, "b m"]:
+def spread_to(source: BodyModel, target: BodyModel, x: Vectors) -> Float[Tensor, "b m"]:
     """States of a body as those of one with more parameters, which stay at zero."""
     full = x.new_zeros(len(x), target.num_parameters)
     full[:, [target.state_index(name) for name in source.state_names]] = x
@@ -211,9 +207,7 @@ def scale_of(stature: float | None) -> float:
     return stature / STANDARD_STATURE
 
 
-def fitted_lengths(
-    body: BodyModel, x: Float[Tensor, " n"], stature: float | None
-) -> dict[str, float]:
+def fitted_lengths(body: BodyModel, x: Vector, stature: float | None) -> dict[str, float]:
     """Fitted lengths; with known stature made to add up to it, as far as their interval allows."""
     lengths = {
         name: body.lengths[name] + float(x[body.state_index(f"{name}_length")])

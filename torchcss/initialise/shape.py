@@ -22,7 +22,7 @@ from torchcss.body.shape import CROSS_SECTIONS, ShapeParameters
 from torchcss.cost.shaped import Outline, ShapedCost
 from torchcss.cost.total import TrackingCost
 from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.types import Bounds
+from torchcss.types import Bounds, Vector
 
 
 class ShapeFit(NamedTuple):
@@ -35,7 +35,7 @@ class ShapeFit(NamedTuple):
         cost: Nats.
     """
 
-    state: Float[Tensor, " n"]
+    state: Vector
     start: int
     shape: Float[Tensor, " z"]
     cost: float

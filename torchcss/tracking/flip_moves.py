@@ -25,7 +25,7 @@ from torchcss.cost.total import TrackingCost
 from torchcss.inference.mixture import GaussianMixture, separated
 from torchcss.inference.proposals import Move
 from torchcss.initialise.multi_start import flips
-from torchcss.types import Bounds, Keypoints
+from torchcss.types import Bounds, Keypoints, Vector
 from torchcss.vision.camera import Camera
 
 _NOISE = 0.02
@@ -65,9 +65,7 @@ class Flips(Move):
         return flipped_poses(self.body, self.camera, bounds.project(best.mean[0]), num=self.num)
 
 
-def flipped_poses(
-    body: BodyModel, camera: Camera, x: Float[Tensor, " n"], *, num: int
-) -> Float[Tensor, "s n"]:
+def flipped_poses(body: BodyModel, camera: Camera, x: Vector, *, num: int) -> Float[Tensor, "s n"]:
     """Other poses whose joints project to where a pose's do, the most plausible first.
 
     Args:

@@ -30,7 +30,7 @@ from torchcss.cost.total import TrackingCost
 from torchcss.inference.mixture import GaussianMixture, Prior, separated
 from torchcss.inference.proposals import Move
 from torchcss.tracking.flip_moves import APART
-from torchcss.types import Bounds
+from torchcss.types import Bounds, Vector
 
 REACH = 0.2
 """Seconds of everyday motion within which, as a standard deviation, an arm is looked for."""
@@ -75,7 +75,7 @@ class LostLimbs(Move):
         return torch.cat(found)
 
 
-def astray_limbs(cost: TrackingCost, body: BodyModel, x: Float[Tensor, " n"]) -> list[Limb]:
+def astray_limbs(cost: TrackingCost, body: BodyModel, x: Vector) -> list[Limb]:
     """The arms with which the body looks hardly more like itself than without: by less than `GAIN`.
 
     Args:
@@ -93,7 +93,7 @@ def astray_limbs(cost: TrackingCost, body: BodyModel, x: Float[Tensor, " n"]) ->
 def other_poses(
     cost: TrackingCost,
     body: BodyModel,
-    x: Float[Tensor, " n"],
+    x: Vector,
     limb: Limb,
     bounds: Bounds,
     *,
@@ -140,7 +140,7 @@ def other_poses(
     return every[order[separated(joints, APART, num, fill=False)]]
 
 
-def _without(cost: TrackingCost, body: BodyModel, limb: Limb, x: Float[Tensor, " n"]) -> float:
+def _without(cost: TrackingCost, body: BodyModel, limb: Limb, x: Vector) -> float:
     """What the colours cost with a limb so thin that it covers nothing, nats."""
     ancestors = body.tree.ancestors
     hung = ancestors[:, body.marker_link[body.joint_index(limb.joint)]]

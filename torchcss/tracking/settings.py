@@ -12,8 +12,6 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, NamedTuple
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from torchcss.body.load import has_free_root
 from torchcss.body.model import BodyModel
@@ -35,7 +33,7 @@ from torchcss.robust import Lorentzian, Quadratic
 from torchcss.tracking.presets import PRESETS, Preset, make_tracker, preset_name
 from torchcss.tracking.recovery import Recovery
 from torchcss.tracking.view import CameraView, Observer
-from torchcss.types import Bounds, Curvature
+from torchcss.types import Bounds, Curvature, Vector
 from torchcss.vision.edges import EdgeConfiguration
 from torchcss.vision.features import FeatureExtractor
 from torchcss.vision.flow import TRACKING
@@ -441,7 +439,7 @@ def _printed(
 
 
 def make_settings_tracker(
-    settings: Settings, motion: Float[Tensor, " n"], free_root: bool | None = None
+    settings: Settings, motion: Vector, free_root: bool | None = None
 ) -> SequenceTracker:
     """The tracker that the settings ask for.
 

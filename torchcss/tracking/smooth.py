@@ -33,6 +33,7 @@ from torchcss.inference.smoothing import (
     best_path,
     refine,
 )
+from torchcss.types import Trajectory, Vector
 
 _SAME_BASE = 1e-9
 
@@ -230,7 +231,7 @@ def base_changes(
     return {step: change(step) for step in moved}
 
 
-def _periods(body: BodyModel) -> Float[Tensor, " n"]:
+def _periods(body: BodyModel) -> Vector:
     """After how much each parameter comes round; infinite but for the angles of the root."""
     period = torch.full((body.num_parameters,), math.inf, dtype=torch.float64)
     if has_root(body):
@@ -239,10 +240,8 @@ def _periods(body: BodyModel) -> Float[Tensor, " n"]:
 
 
 def _unwrapped(
-    state: Float[Tensor, "t n"],
-    changes: dict[int, Callable[[Tensor], Tensor]],
-    period: Float[Tensor, " n"],
-) -> Float[Tensor, "t n"]:
+    state: Trajectory, changes: dict[int, Callable[[Tensor], Tensor]], period: Vector
+) -> Trajectory:
     """The same states with every angle within half a turn of the one before."""
     turns = period.isfinite()
     whole, out = torch.where(turns, period, 1.0), [state[0]]

@@ -36,7 +36,7 @@ from torchcss.tracking.smooth import (
     smooth_modes,
 )
 from torchcss.tracking.view import NOTHING_KNOWN, NOTHING_SEEN, CameraView, Observer
-from torchcss.types import Frame
+from torchcss.types import Frame, Trajectory
 
 IMAGES = Smoothing(acceleration_ratio=20.0)
 """How to smooth by default. Images say where the body is more exactly than the modes of a tracker
@@ -129,7 +129,7 @@ def _moments(
 def _costs(
     body: BodyModel,
     bases: Float[Tensor, "t 4 4"],
-    start: Float[Tensor, "t n"],
+    start: Trajectory,
     moments: Iterable[tuple[Frame | None, ...]],
     plan: Plan,
     views: Sequence[CameraView],

@@ -37,7 +37,7 @@ from torchcss.cost.visibility import facing_nodes, seen_nodes
 from torchcss.inference.dynamics import Dynamics
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.types import Bounds, Curvature, LocalModel, PointCost
+from torchcss.types import Bounds, Curvature, Items, LocalModel, Numbers, PointCost, Vector, Vectors
 from torchcss.vision.camera import Camera
 from torchcss.vision.spline import SplineField
 
@@ -99,7 +99,7 @@ class SurfaceMotion:
         before: Float[Tensor, "k n"],
         velocity: Float[Tensor, "k n"],
         expected: Float[Tensor, "k n"],
-        deviation: Float[Tensor, " n"] | None,
+        deviation: Vector | None,
     ) -> Float[Tensor, "k n"]:
         """Poses with the trunk where the pictures have carried it.
 
@@ -174,7 +174,7 @@ class SurfaceDynamics:
     motion: SurfaceMotion
     body: BodyModel
     pairs: Sequence[PicturePair]
-    deviation: Float[Tensor, " n"] | None
+    deviation: Vector | None
 
     def predict(self, mixture: GaussianMixture, velocity: Float[Tensor, "k n"]) -> GaussianMixture:
         """Return the prior of the next frame.
@@ -229,8 +229,8 @@ class SurfaceCost:
     nodes: InteriorNodes
     chosen: Int[Tensor, " p"]
     views: tuple[SurfaceView, ...]
-    columns: Int[Tensor, " m"]
-    held: Float[Tensor, "b n"]
+    columns: Items
+    held: Vectors
     expected: Float[Tensor, "b m"]
     deviation: Float[Tensor, " m"]
     term: SurfaceTerm = field(default_factory=SurfaceTerm)
@@ -241,7 +241,7 @@ class SurfaceCost:
         held, expected = self.held[items], self.expected[items]
         return replace(self, views=tuple(views), held=held, expected=expected)
 
-    def value(self, x: Float[Tensor, "b m"]) -> Float[Tensor, " b"]:
+    def value(self, x: Float[Tensor, "b m"]) -> Numbers:
         """Cost, nats."""
         points, normals = self._surface(self.body.pose(self._whole(x)))
         total = 0.5 * ((x - self.expected) / self.deviation).square().sum(-1)
@@ -291,7 +291,7 @@ def _share(targets: SurfaceTargets) -> Float[Tensor, "b 1"]:
     return _NATS / targets.weight.sum(-1, keepdim=True).clamp(min=_FEW_NODES)
 
 
-def trunk_of(body: BodyModel) -> tuple[Int[Tensor, " m"], Bool[Tensor, " parts"]]:
+def trunk_of(body: BodyModel) -> tuple[Items, Bool[Tensor, " parts"]]:
     """What limbs of both sides hang on: the parameters that move these, and the parts between.
 
     Neither has entries for a body without root, or without sides.
