@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchcss.linalg import mask_free, multiply, symmetric_part
-from torchcss.types import Trajectory
+from torchcss.types import Matrices, Trajectory
 
 _ROUNDS = 200
 """Sets of pinned variables tried; ten are many."""
@@ -100,7 +100,7 @@ class BandFactor(NamedTuple):
             )[:, 0]
         return torch.stack(out)
 
-    def inverse_diagonal(self) -> Float[Tensor, "t n n"]:
+    def inverse_diagonal(self) -> Matrices:
         """Diagonal blocks of the inverse, from the last frame back.
 
         A vector e of unit variance gives `L^-T e`, whose covariance is the inverse: each frame is

@@ -18,13 +18,13 @@ from torch import Tensor
 
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.linalg import symmetric_part
-from torchcss.types import Vector
+from torchcss.types import Matrices, Vector, Vectors
 
 Deviation = float | tuple[float, ...]
 """Standard deviation of every parameter, or one number for all."""
 
 
-def noise_covariance(deviation: Deviation, like: Float[Tensor, "k n n"]) -> Float[Tensor, "n n"]:
+def noise_covariance(deviation: Deviation, like: Matrices) -> Float[Tensor, "n n"]:
     """Covariance of independent dynamical noise, in the type of other covariances."""
     noise = torch.as_tensor(deviation, dtype=like.dtype, device=like.device)
     return torch.diag_embed(noise.square().expand(like.shape[-1]))
@@ -33,7 +33,7 @@ def noise_covariance(deviation: Deviation, like: Float[Tensor, "k n n"]) -> Floa
 class Dynamics(Protocol):
     """Anything that predicts a mixture one frame ahead."""
 
-    def predict(self, mixture: GaussianMixture, velocity: Float[Tensor, "k n"]) -> GaussianMixture:
+    def predict(self, mixture: GaussianMixture, velocity: Vectors) -> GaussianMixture:
         """Return the prior of the next frame.
 
         Args:
@@ -54,7 +54,7 @@ class Diffusion:
 
     deviation: Deviation = 0.0
 
-    def predict(self, mixture: GaussianMixture, velocity: Float[Tensor, "k n"]) -> GaussianMixture:
+    def predict(self, mixture: GaussianMixture, velocity: Vectors) -> GaussianMixture:
         """Add the variance of the motion; the velocity is not used."""
         motion = noise_covariance(self.deviation, mixture.covariance)
         return mixture._replace(covariance=mixture.covariance + motion)
@@ -72,7 +72,7 @@ class ConstantVelocity:
     deviation: Deviation = 0.0
     persistence: float = 1.0
 
-    def predict(self, mixture: GaussianMixture, velocity: Float[Tensor, "k n"]) -> GaussianMixture:
+    def predict(self, mixture: GaussianMixture, velocity: Vectors) -> GaussianMixture:
         """Add the velocity to the means and the variance of its change to the covariances."""
         moved = mixture._replace(mean=mixture.mean + self.persistence * velocity)
         return Diffusion(deviation=self.deviation).predict(moved, velocity)
@@ -99,7 +99,7 @@ class Learned:
     transition: Transition
     deviation: Deviation = 0.0
 
-    def predict(self, mixture: GaussianMixture, velocity: Float[Tensor, "k n"]) -> GaussianMixture:
+    def predict(self, mixture: GaussianMixture, velocity: Vectors) -> GaussianMixture:
         """Apply the transition to every mode."""
         mean = torch.func.vmap(self.transition)(mixture.mean, velocity).detach()
         covariance = mixture.covariance

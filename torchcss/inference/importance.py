@@ -30,7 +30,7 @@ from torch import Tensor
 
 from torchcss.inference.mixture import draw_components
 from torchcss.inference.proposals import Samples
-from torchcss.types import CostFunction, Items
+from torchcss.types import CostFunction, Items, Numbers
 
 
 class Survival(NamedTuple):
@@ -48,7 +48,7 @@ class Survival(NamedTuple):
     expected_survivors: Float[Tensor, ""]
 
 
-def normalised_log_weight(log_weight: Float[Tensor, " s"]) -> Float[Tensor, " s"]:
+def normalised_log_weight(log_weight: Numbers) -> Numbers:
     """Scale weights to sum to one; equal weights if every one is zero."""
     if not len(log_weight):
         return log_weight
@@ -59,7 +59,7 @@ def normalised_log_weight(log_weight: Float[Tensor, " s"]) -> Float[Tensor, " s"
     return torch.where(top.isfinite(), shifted - shifted.logsumexp(0), equal)
 
 
-def survival(log_weight: Float[Tensor, " s"]) -> Survival:
+def survival(log_weight: Numbers) -> Survival:
     """Survival diagnostics of unnormalised weights.
 
     Balanced weights do not prove that all modes were found: samples trapped in one mode have them
@@ -73,7 +73,7 @@ def survival(log_weight: Float[Tensor, " s"]) -> Survival:
     return Survival(effective, effective / num, survivors)
 
 
-def posterior_log_weight(samples: Samples, cost: CostFunction) -> Float[Tensor, " s"]:
+def posterior_log_weight(samples: Samples, cost: CostFunction) -> Numbers:
     """Unnormalised log-weights that turn samples of a proposal into samples of the posterior.
 
     Args:
@@ -84,9 +84,7 @@ def posterior_log_weight(samples: Samples, cost: CostFunction) -> Float[Tensor, 
     return samples.log_weight - torch.where(value.isfinite(), value, torch.inf)
 
 
-def tempered_log_weight(
-    log_weight: Float[Tensor, " s"], survival_rate: float
-) -> tuple[Float[Tensor, " s"], float]:
+def tempered_log_weight(log_weight: Numbers, survival_rate: float) -> tuple[Numbers, float]:
     """Raise weights to the power that leaves a given survival rate.
 
     Args:
@@ -108,7 +106,7 @@ def tempered_log_weight(
     return math.exp(low) * log_weight, math.exp(low)
 
 
-def resample(log_weight: Float[Tensor, " s"], num: int, *, generator: torch.Generator) -> Items:
+def resample(log_weight: Numbers, num: int, *, generator: torch.Generator) -> Items:
     """Draw samples again by their weight, at equal steps of the cumulated weight.
 
     Args:
@@ -123,7 +121,7 @@ def resample(log_weight: Float[Tensor, " s"], num: int, *, generator: torch.Gene
 
 
 def fair_samples(
-    samples: Samples, log_weight: Float[Tensor, " s"], num: int, *, generator: torch.Generator
+    samples: Samples, log_weight: Numbers, num: int, *, generator: torch.Generator
 ) -> Samples:
     """Draw equally weighted samples of what the weights stand for, the prior or the posterior.
 

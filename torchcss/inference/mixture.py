@@ -51,7 +51,7 @@ class GaussianMixture(NamedTuple):
     log_weight: Float[Tensor, " k"]
 
     @property
-    def weight(self) -> Float[Tensor, " k"]:
+    def weight(self) -> Numbers:
         """Weights that sum to one."""
         return self.normalise().log_weight.exp()
 
@@ -219,9 +219,9 @@ def draw_components(
 
 
 def distinct_modes(
-    mean: Float[Tensor, "s n"],
-    covariance: Float[Tensor, "s n n"],
-    cost: Float[Tensor, " s"],
+    mean: Vectors,
+    covariance: Matrices,
+    cost: Numbers,
     *,
     distance: float = 1.0,
     most: int | None = None,

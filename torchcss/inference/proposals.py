@@ -48,7 +48,7 @@ from torchcss.errors import ConfigurationError
 from torchcss.inference.dynamics import Deviation, noise_covariance
 from torchcss.inference.mixture import GaussianMixture, MixtureSamples, Prior
 from torchcss.linalg import cholesky_apply, log_determinant, mask_free, multiply
-from torchcss.types import Bounds, Items, Numbers, Vectors
+from torchcss.types import Bounds, Items, Matrices, Numbers, Vectors
 
 
 class Samples(NamedTuple):
@@ -105,9 +105,7 @@ def unbounded(like: Vectors) -> Bounds:
     return Bounds(-limit, limit)
 
 
-def _capped(
-    covariance: Float[Tensor, "k n n"], max_deviation: Deviation | None
-) -> Float[Tensor, "k n n"]:
+def _capped(covariance: Matrices, max_deviation: Deviation | None) -> Matrices:
     """Shrink parameters whose standard deviation exceeds a limit; correlations stay."""
     if max_deviation is None:
         return covariance
@@ -135,9 +133,7 @@ _PATIENCE = 3
 """Rounds in which the parameters that are wrong need not become fewer."""
 
 
-def project_in_metric(
-    x: Float[Tensor, "s n"], covariance: Float[Tensor, "s n n"], bounds: Bounds
-) -> Float[Tensor, "s n"]:
+def project_in_metric(x: Vectors, covariance: Matrices, bounds: Bounds) -> Vectors:
     """Nearest admissible states in the metric of their covariances.
 
     Parameters that are outside are held at their bounds and the others take their means given that,
@@ -663,7 +659,7 @@ class Move(Proposal):
     log_odds: float = -5.0
 
     @abstractmethod
-    def states(self, best: GaussianMixture, bounds: Bounds) -> Float[Tensor, "j n"]:
+    def states(self, best: GaussianMixture, bounds: Bounds) -> Vectors:
         """Other states, the most plausible first.
 
         Args:

@@ -52,7 +52,7 @@ from torchcss.inference.trust_region import (
     default_prior_variance,
 )
 from torchcss.linalg import constrained_inverse, log_determinant
-from torchcss.types import Bounds, Items, Modes, Status
+from torchcss.types import Bounds, Items, Modes, Numbers, Status, Vectors
 
 _ROUNDS = ((0, 6.0), (1, 2.0), (5, 1.0))
 """Rounds of successive halving: steps of descent, and how many samples are left then, in multiples
@@ -557,13 +557,13 @@ class Tracker(SequenceTracker):
         return _Kept(mixture, velocity, cost, best, best, torch.zeros_like(prior.log_weight[0]))
 
 
-def _start(modes: GaussianMixture, prior: Prior) -> Float[Tensor, "k n"]:
+def _start(modes: GaussianMixture, prior: Prior) -> Vectors:
     """Where each component of a prior was a frame ago: what a move put elsewhere was there."""
     expected = prior.mixture.mean[prior.parent]
     return torch.where(prior.mixture.mean == expected, modes.mean[prior.parent], prior.mixture.mean)
 
 
-def finite_cost(modes: Modes, *, converged_only: bool = False) -> Float[Tensor, " s"]:
+def finite_cost(modes: Modes, *, converged_only: bool = False) -> Numbers:
     """Costs by which ends of descents are told apart.
 
     Args:

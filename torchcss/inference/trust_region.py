@@ -659,12 +659,8 @@ def _solve_damped(
 
 
 def _along_negative_curvature(
-    problem: _Quadratic,
-    items: Items,
-    damping: Float[Tensor, "m n"],
-    step: Float[Tensor, "m n"],
-    radius: Float[Tensor, " m"],
-) -> Float[Tensor, "m n"]:
+    problem: _Quadratic, items: Items, damping: Vectors, step: Vectors, radius: Numbers
+) -> Vectors:
     """Extend steps to the radius along the lowest eigenvector, found by two inverse iterations."""
     part = problem.take(items)
     weight, free = part.weight, part.free

@@ -31,7 +31,7 @@ _SIGMA = 0.03
 
 def start_from_points(
     body: BodyModel, camera: Camera, keypoints: Keypoints, starts: Vectors, bounds: Bounds
-) -> Float[Tensor, "s n"]:
+) -> Vectors:
     """The pose whose joints are where the points are; none where too few are known.
 
     Args:

@@ -239,9 +239,7 @@ def _coarse_start(cost: TrackingCost, x: Vectors, search: Search) -> Vectors:
     return body.bounds.project(x)
 
 
-def _distinct_trunks(
-    cost: TrackingCost, segments: Segments, x: Vectors, num: int
-) -> Float[Tensor, "m n"]:
+def _distinct_trunks(cost: TrackingCost, segments: Segments, x: Vectors, num: int) -> Vectors:
     """The best fits whose trunks differ."""
     value = widened(cost, _MIDDLE).value(x).nan_to_num(math.inf)
     order = value.argsort(stable=True)
@@ -258,9 +256,7 @@ def _distinct_trunks(
     return x[kept]
 
 
-def flips(
-    cost: TrackingCost, segments: Segments, x: Float[Tensor, "m n"], bounds: Bounds, num: int
-) -> Float[Tensor, "s n"]:
+def flips(cost: TrackingCost, segments: Segments, x: Vectors, bounds: Bounds, num: int) -> Vectors:
     """The best combinations of forward-backward flips of some poses, their angles solved for.
 
     Args:

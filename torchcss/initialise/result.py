@@ -83,7 +83,7 @@ class Initialisation(NamedTuple):
     left_out: tuple[str, ...] = ()
     noise: float = 1.0
 
-    def hypotheses(self, num: int, *, generator: torch.Generator) -> Float[Tensor, "num n"]:
+    def hypotheses(self, num: int, *, generator: torch.Generator) -> Vectors:
         """The first `num` states to believe in: the fits, then samples of their mixture.
 
         Args:

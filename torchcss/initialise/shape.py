@@ -22,7 +22,7 @@ from torchcss.body.shape import CROSS_SECTIONS, ShapeParameters
 from torchcss.cost.shaped import Outline, ShapedCost
 from torchcss.cost.total import TrackingCost
 from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.types import Bounds, Vector
+from torchcss.types import Bounds, Vector, Vectors
 
 
 class ShapeFit(NamedTuple):
@@ -43,7 +43,7 @@ class ShapeFit(NamedTuple):
 
 def fit_shape(
     base: TrackingCost,
-    states: Float[Tensor, "k n"],
+    states: Vectors,
     parameters: ShapeParameters,
     outlines: tuple[Outline, ...],
     *,

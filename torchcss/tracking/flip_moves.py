@@ -13,8 +13,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from torchcss.body.flips import Segments
 from torchcss.body.model import BodyModel
@@ -25,7 +23,7 @@ from torchcss.cost.total import TrackingCost
 from torchcss.inference.mixture import GaussianMixture, separated
 from torchcss.inference.proposals import Move
 from torchcss.initialise.multi_start import flips
-from torchcss.types import Bounds, Keypoints, Vector
+from torchcss.types import Bounds, Keypoints, Vector, Vectors
 from torchcss.vision.camera import Camera
 
 _NOISE = 0.02
@@ -60,12 +58,12 @@ class Flips(Move):
     camera: Camera
     num: int
 
-    def states(self, best: GaussianMixture, bounds: Bounds) -> Float[Tensor, "j n"]:
+    def states(self, best: GaussianMixture, bounds: Bounds) -> Vectors:
         """The flips, the most plausible first; they obey the body's own limits."""
         return flipped_poses(self.body, self.camera, bounds.project(best.mean[0]), num=self.num)
 
 
-def flipped_poses(body: BodyModel, camera: Camera, x: Vector, *, num: int) -> Float[Tensor, "s n"]:
+def flipped_poses(body: BodyModel, camera: Camera, x: Vector, *, num: int) -> Vectors:
     """Other poses whose joints project to where a pose's do, the most plausible first.
 
     Args:

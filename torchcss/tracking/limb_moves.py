@@ -20,8 +20,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from torchcss.body.flips import Limb, Segments
 from torchcss.body.model import BodyModel
@@ -30,7 +28,7 @@ from torchcss.cost.total import TrackingCost
 from torchcss.inference.mixture import GaussianMixture, Prior, separated
 from torchcss.inference.proposals import Move
 from torchcss.tracking.flip_moves import APART
-from torchcss.types import Bounds, Vector
+from torchcss.types import Bounds, Vector, Vectors
 
 REACH = 0.2
 """Seconds of everyday motion within which, as a standard deviation, an arm is looked for."""
@@ -62,7 +60,7 @@ class LostLimbs(Move):
     cost: TrackingCost
     num: int
 
-    def states(self, best: GaussianMixture, bounds: Bounds) -> Float[Tensor, "j n"]:
+    def states(self, best: GaussianMixture, bounds: Bounds) -> Vectors:
         """The best mode as it is expected, but for one arm."""
         expected, found = bounds.project(best.mean[0]), [best.mean[:0]]
         for limb in astray_limbs(self.cost, self.body, expected):
@@ -99,7 +97,7 @@ def other_poses(
     *,
     prior: GaussianMixture,
     num: int,
-) -> Float[Tensor, "s n"]:
+) -> Vectors:
     """Poses with one limb elsewhere that cost less, the best first.
 
     They are of a low-discrepancy sequence (Sobol), so that nothing is random. What they cost is all

@@ -96,11 +96,11 @@ class SurfaceMotion:
         body: BodyModel,
         pairs: Sequence[PicturePair],
         *,
-        before: Float[Tensor, "k n"],
-        velocity: Float[Tensor, "k n"],
-        expected: Float[Tensor, "k n"],
+        before: Vectors,
+        velocity: Vectors,
+        expected: Vectors,
         deviation: Vector | None,
-    ) -> Float[Tensor, "k n"]:
+    ) -> Vectors:
         """Poses with the trunk where the pictures have carried it.
 
         Args:
@@ -136,7 +136,7 @@ class SurfaceMotion:
         return expected.index_copy(-1, columns, found.mean)
 
     def views(
-        self, body: BodyModel, pairs: Sequence[PicturePair], before: Float[Tensor, "k n"]
+        self, body: BodyModel, pairs: Sequence[PicturePair], before: Vectors
     ) -> tuple[SurfaceView, ...]:
         """What the cameras that have two pictures tell of the trunk.
 
@@ -176,7 +176,7 @@ class SurfaceDynamics:
     pairs: Sequence[PicturePair]
     deviation: Vector | None
 
-    def predict(self, mixture: GaussianMixture, velocity: Float[Tensor, "k n"]) -> GaussianMixture:
+    def predict(self, mixture: GaussianMixture, velocity: Vectors) -> GaussianMixture:
         """Return the prior of the next frame.
 
         Args:

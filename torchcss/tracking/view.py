@@ -16,15 +16,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
-from torch import Tensor
 
 from torchcss.body.model import BodyModel
 from torchcss.cost.frame import FrameCosts
 from torchcss.cost.total import TrackingCost
 from torchcss.initialise.keypoint_checks import typical_sigma
 from torchcss.stopwatch import Stopwatch
-from torchcss.types import Frame, Keypoints
+from torchcss.types import Frame, Keypoints, Numbers, Vectors
 from torchcss.vision.appearance import Appearance
 from torchcss.vision.background import Background
 from torchcss.vision.camera import Camera
@@ -142,7 +140,7 @@ class Observer:
             contrast = spline_field(local_contrast(features.grey.float()).to(features.grey))
         return ViewObservation(frame, frame.image, features, contrast, before.contrast)
 
-    def window(self, body: BodyModel, modes: Float[Tensor, "k n"]) -> Window | None:
+    def window(self, body: BodyModel, modes: Vectors) -> Window | None:
         """Where the body can be two frames after it was in one of these poses.
 
         None where it may be anywhere: where it is not seen, or where the background matters.
@@ -183,7 +181,7 @@ class Observer:
         seen: ViewObservation,
         memory: ViewMemory,
         body: BodyModel,
-        before: Float[Tensor, "k n"] | None,
+        before: Vectors | None,
         *,
         keypoints: bool = True,
         stopwatch: Stopwatch | None = None,
@@ -213,8 +211,8 @@ class Observer:
         memory: ViewMemory,
         seen: ViewObservation,
         body: BodyModel,
-        modes: Float[Tensor, "k n"],
-        log_weight: Float[Tensor, " k"] | None = None,
+        modes: Vectors,
+        log_weight: Numbers | None = None,
     ) -> ViewMemory:
         """Take in what body, surroundings and background look like in a frame.
 
