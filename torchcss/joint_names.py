@@ -19,154 +19,119 @@ By default call `canonical_joint_name` for files with names, `ALIASES` for files
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from typing import Final
 
-_PAIRED = (
-    "hip", "knee", "ankle", "midtarsal", "toe", "heel",
-    "eye", "ear", "shoulder", "elbow", "wrist", "hand_tip",
-)  # fmt: skip
-_SINGLE = ("HumanoidRoot", "vl5", "vt1", "vc7", "skullbase", "skull_tip", "nose")
 
-JOINT_NAMES: Final[tuple[str, ...]] = (
-    "HumanoidRoot",
-    "l_hip", "r_hip", "l_knee", "r_knee", "l_ankle", "r_ankle",
-    "l_midtarsal", "r_midtarsal", "l_toe", "r_toe", "l_heel", "r_heel",
-    "vl5", "vt1", "vc7", "skullbase", "skull_tip",
-    "nose", "l_eye", "r_eye", "l_ear", "r_ear",
-    "l_shoulder", "r_shoulder", "l_elbow", "r_elbow", "l_wrist", "r_wrist",
-    "l_hand_tip", "r_hand_tip",
-)  # fmt: skip
+def names_in(text: str) -> tuple[str, ...]:
+    """The names in a text, which spaces part."""
+    return tuple(text.split())
+
+
+def _columns(text: str) -> tuple[str | None, ...]:
+    """The same; `-` is a place that has none."""
+    return tuple(None if name == "-" else name for name in names_in(text))
+
+
+def _by_word(places: Mapping[str, str]) -> dict[str, str]:
+    """The place that every word means, of the words of every place."""
+    return {word: place for place, words in places.items() for word in names_in(words)}
+
+
+JOINT_NAMES: Final = names_in(
+    """
+    HumanoidRoot
+    l_hip r_hip l_knee r_knee l_ankle r_ankle
+    l_midtarsal r_midtarsal l_toe r_toe l_heel r_heel
+    vl5 vt1 vc7 skullbase skull_tip
+    nose l_eye r_eye l_ear r_ear
+    l_shoulder r_shoulder l_elbow r_elbow l_wrist r_wrist
+    l_hand_tip r_hand_tip
+    """
+)
 """Every joint and landmark that the bodies of this package name."""
 
+_PAIRED: Final = tuple(name[2:] for name in JOINT_NAMES if name.startswith("l_"))
+_SINGLE: Final = tuple(name for name in JOINT_NAMES if name[:2] not in ("l_", "r_"))
+
+_COCO = _columns(
+    "nose l_eye r_eye l_ear r_ear l_shoulder r_shoulder l_elbow r_elbow l_wrist r_wrist "
+    "l_hip r_hip l_knee r_knee l_ankle r_ankle"
+)
+_COCO_FEET = _columns("l_toe - l_heel r_toe - r_heel")
+_OPENPOSE_ARMS = _columns("nose vt1 r_shoulder r_elbow r_wrist l_shoulder l_elbow l_wrist")
+_OPENPOSE_LEGS = _columns("r_hip r_knee r_ankle l_hip l_knee l_ankle")
+_OPENPOSE_HEAD = _columns("r_eye l_eye r_ear l_ear")
+_BODY_19 = (*_OPENPOSE_ARMS, "HumanoidRoot", *_OPENPOSE_LEGS, *_OPENPOSE_HEAD)
+_H36M = _columns("HumanoidRoot r_hip r_knee r_ankle l_hip l_knee l_ankle - vt1")
+_H36M_END = _columns("skull_tip l_shoulder l_elbow l_wrist r_shoulder r_elbow r_wrist")
 # AlphaPose's body with feet: COCO's order, then MPII's head top, upper neck and hips' middle, then
 # big toes, small toes and heels. Face and hands follow in the layout of 136.
-_HALPE_26: Final[tuple[str | None, ...]] = (
-    "nose", "l_eye", "r_eye", "l_ear", "r_ear",
-    "l_shoulder", "r_shoulder", "l_elbow", "r_elbow", "l_wrist", "r_wrist",
-    "l_hip", "r_hip", "l_knee", "r_knee", "l_ankle", "r_ankle",
-    "skull_tip", "vc7", "HumanoidRoot",
-    "l_toe", "r_toe", None, None, "l_heel", "r_heel",
-)  # fmt: skip
+_HALPE = (*_COCO, *_columns("skull_tip vc7 HumanoidRoot l_toe r_toe - - l_heel r_heel"))
+_FACE_AND_HANDS = (None,) * 110
 
 ALIASES: Final[dict[str, tuple[str | None, ...]]] = {
     # OpenPose's default: 1 Neck, 8 MidHip, 19 to 24 the feet (big toe, small toe, heel).
-    "BODY_25": (
-        "nose", "vt1",
-        "r_shoulder", "r_elbow", "r_wrist", "l_shoulder", "l_elbow", "l_wrist",
-        "HumanoidRoot", "r_hip", "r_knee", "r_ankle", "l_hip", "l_knee", "l_ankle",
-        "r_eye", "l_eye", "r_ear", "l_ear",
-        "l_toe", None, "l_heel", "r_toe", None, "r_heel",
-    ),
+    "BODY_25": (*_BODY_19, *_COCO_FEET),
     # OpenPose's experimental model: COCO's order, upper neck and head top, then the feet.
-    "BODY_25B": (
-        "nose", "l_eye", "r_eye", "l_ear", "r_ear",
-        "l_shoulder", "r_shoulder", "l_elbow", "r_elbow", "l_wrist", "r_wrist",
-        "l_hip", "r_hip", "l_knee", "r_knee", "l_ankle", "r_ankle",
-        "vc7", "skull_tip",
-        "l_toe", None, "l_heel", "r_toe", None, "r_heel",
-    ),
-    "COCO-17": (
-        "nose", "l_eye", "r_eye", "l_ear", "r_ear",
-        "l_shoulder", "r_shoulder", "l_elbow", "r_elbow", "l_wrist", "r_wrist",
-        "l_hip", "r_hip", "l_knee", "r_knee", "l_ankle", "r_ankle",
-    ),
-    "COCO-18": (
-        "nose", "vt1",
-        "r_shoulder", "r_elbow", "r_wrist", "l_shoulder", "l_elbow", "l_wrist",
-        "r_hip", "r_knee", "r_ankle", "l_hip", "l_knee", "l_ankle",
-        "r_eye", "l_eye", "r_ear", "l_ear",
-    ),
+    "BODY_25B": (*_COCO, "vc7", "skull_tip", *_COCO_FEET),
+    "COCO-17": _COCO,
+    "COCO-18": (*_OPENPOSE_ARMS, *_OPENPOSE_LEGS, *_OPENPOSE_HEAD),
     # MMPose, RTMPose and DWPose: COCO's order and the feet, then face and hands.
-    "COCO-133": (
-        "nose", "l_eye", "r_eye", "l_ear", "r_ear",
-        "l_shoulder", "r_shoulder", "l_elbow", "r_elbow", "l_wrist", "r_wrist",
-        "l_hip", "r_hip", "l_knee", "r_knee", "l_ankle", "r_ankle",
-        "l_toe", None, "l_heel", "r_toe", None, "r_heel",
-        *(None,) * 110,
-    ),
-    "MPII-16": (
-        "r_ankle", "r_knee", "r_hip", "l_hip", "l_knee", "l_ankle",
-        "HumanoidRoot", "vt1", "vc7", "skull_tip",
-        "r_wrist", "r_elbow", "r_shoulder", "l_shoulder", "l_elbow", "l_wrist",
+    "COCO-133": (*_COCO, *_COCO_FEET, *_FACE_AND_HANDS),
+    "MPII-16": _columns(
+        "r_ankle r_knee r_hip l_hip l_knee l_ankle HumanoidRoot vt1 vc7 skull_tip "
+        "r_wrist r_elbow r_shoulder l_shoulder l_elbow l_wrist"
     ),
     # The head's place is its middle, which is none of ours.
-    "HumanEva-15": (
-        "HumanoidRoot", "vt1", "l_shoulder", "l_elbow", "l_wrist", "r_shoulder", "r_elbow",
-        "r_wrist", "l_hip", "l_knee", "l_ankle", "r_hip", "r_knee", "r_ankle", None,
+    "HumanEva-15": _columns(
+        "HumanoidRoot vt1 l_shoulder l_elbow l_wrist r_shoulder r_elbow r_wrist "
+        "l_hip l_knee l_ankle r_hip r_knee r_ankle -"
     ),
     # The first 18 of BODY_25, the middle of the hips among them.
-    "BODY_18": (
-        "nose", "vt1",
-        "r_shoulder", "r_elbow", "r_wrist", "l_shoulder", "l_elbow", "l_wrist",
-        "HumanoidRoot", "r_hip", "r_knee", "r_ankle", "l_hip", "l_knee", "l_ankle",
-        "r_eye", "l_eye", "r_ear",
-    ),
-    "Halpe-26": _HALPE_26,
-    "Halpe-136": (*_HALPE_26, *(None,) * 110),
+    "BODY_18": _BODY_19[:18],
+    "Halpe-26": _HALPE,
+    "Halpe-136": (*_HALPE, *_FACE_AND_HANDS),
     # The eyes' inner and outer corners, the mouth and the knuckles are no joints of ours.
-    "MediaPipe-33": (
-        "nose", None, "l_eye", None, None, "r_eye", None, "l_ear", "r_ear", None, None,
-        "l_shoulder", "r_shoulder", "l_elbow", "r_elbow", "l_wrist", "r_wrist",
-        None, None, None, None, None, None,
-        "l_hip", "r_hip", "l_knee", "r_knee", "l_ankle", "r_ankle",
-        "l_heel", "r_heel", "l_toe", "r_toe",
+    "MediaPipe-33": _columns(
+        "nose - l_eye - - r_eye - l_ear r_ear - - "
+        "l_shoulder r_shoulder l_elbow r_elbow l_wrist r_wrist - - - - - - "
+        "l_hip r_hip l_knee r_knee l_ankle r_ankle l_heel r_heel l_toe r_toe"
     ),
     # 7 is the middle of the spine and 9 lies between nose and neck: neither is a place of ours.
-    "H36M-17": (
-        "HumanoidRoot", "r_hip", "r_knee", "r_ankle", "l_hip", "l_knee", "l_ankle",
-        None, "vt1", None, "skull_tip",
-        "l_shoulder", "l_elbow", "l_wrist", "r_shoulder", "r_elbow", "r_wrist",
-    ),
+    "H36M-17": (*_H36M, None, *_H36M_END),
     # Without the place between nose and neck.
-    "H36M-16": (
-        "HumanoidRoot", "r_hip", "r_knee", "r_ankle", "l_hip", "l_knee", "l_ankle",
-        None, "vt1", "skull_tip",
-        "l_shoulder", "l_elbow", "l_wrist", "r_shoulder", "r_elbow", "r_wrist",
-    ),
+    "H36M-16": (*_H36M, *_H36M_END),
     # 'foot' is the ball of the foot, 'hand' the knuckles, 'head' the joint under the skull.
-    "SMPL-24": (
-        "HumanoidRoot", "l_hip", "r_hip", "vl5", "l_knee", "r_knee", None, "l_ankle", "r_ankle",
-        None, "l_midtarsal", "r_midtarsal", "vt1", None, None, "skullbase",
-        "l_shoulder", "r_shoulder", "l_elbow", "r_elbow", "l_wrist", "r_wrist", None, None,
+    "SMPL-24": _columns(
+        "HumanoidRoot l_hip r_hip vl5 l_knee r_knee - l_ankle r_ankle - l_midtarsal r_midtarsal "
+        "vt1 - - skullbase l_shoulder r_shoulder l_elbow r_elbow l_wrist r_wrist - -"
     ),
     "H-Anim": JOINT_NAMES,
-}  # fmt: skip
+}
 """Layout name to the catalogue's name of every column, `None` for a place that has none."""
 
-# What else the places are called, written without side, case and separators.
+# What the places are called, written without side, case and separators.
 _PLACES: Final[dict[str, str]] = {
     **{name.replace("_", "").lower(): name for name in (*_PAIRED, *_SINGLE)},
-    "bigtoe": "toe",
-    "footindex": "toe",
-    "foot": "midtarsal",
-    "forefoot": "midtarsal",
-    "ballfoot": "midtarsal",
-    "balloffoot": "midtarsal",
-    "fingertip": "hand_tip",
-    "middletip": "hand_tip",
-    "middlefinger4": "hand_tip",
-    "middlefingertip": "hand_tip",
-    "hip": "hip",
-    "pelvis": "HumanoidRoot",
-    "root": "HumanoidRoot",
-    "midhip": "HumanoidRoot",
-    "hipcenter": "HumanoidRoot",
-    "lumbar": "vl5",
-    "spine1": "vl5",
-    "neck": "vt1",
-    "neckbase": "vt1",
-    "thorax": "vt1",
-    "upperneck": "vc7",
-    "head": "skull_tip",
-    "headtop": "skull_tip",
-    "tophead": "skull_tip",
-    "skulltip": "skull_tip",
+    **_by_word(
+        {
+            "toe": "bigtoe footindex",
+            "midtarsal": "foot forefoot ballfoot balloffoot",
+            "hand_tip": "fingertip middletip middlefinger4 middlefingertip",
+            "HumanoidRoot": "pelvis root midhip hipcenter",
+            "vl5": "lumbar spine1",
+            "vt1": "neck neckbase thorax",
+            "vc7": "upperneck",
+            "skull_tip": "head headtop tophead",
+        }
+    ),
 }
+_PAIRED_WORDS: Final = {word for word, place in _PLACES.items() if place in _PAIRED}
 _CASE: Final = r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])"
 """Where a word begins by its case."""
 
-_SIDES: Final[dict[str, str]] = {"l": "l_", "left": "l_", "r": "r_", "right": "r_"}
+_SIDES: Final[dict[str, str]] = {"left": "l_", "right": "r_", "l": "l_", "r": "r_"}
 
 
 def canonical_joint_name(name: str) -> str | None:
@@ -193,17 +158,22 @@ def canonical_joint_name(name: str) -> str | None:
             break
     place = "".join(words)
     if not side:
-        # lshoulder, leftshoulder: the side is glued to the word.
-        for prefix in ("left", "right", "l", "r"):
-            if place.startswith(prefix) and _PLACES.get(place.removeprefix(prefix)) in _PAIRED:
-                side, place = _SIDES[prefix], place.removeprefix(prefix)
-                break
+        side, place = _unglued(place, _PAIRED_WORDS)
     if not side and place == "hip":
         return "HumanoidRoot"
     known = _PLACES.get(place)
     if known is None or (known in _PAIRED) != bool(side):
         return None
     return side + known
+
+
+def _unglued(word: str, known: Container[str]) -> tuple[str, str]:
+    """Side and place of a word that may begin with the side: lshoulder, leftshoulder."""
+    for prefix, side in _SIDES.items():
+        place = word.removeprefix(prefix)
+        if place != word and place in known:
+            return side, place
+    return "", word
 
 
 def layout_of_names(names: tuple[str, ...]) -> tuple[str | None, ...]:
@@ -236,14 +206,20 @@ def _numbered_side(name: str, names: Sequence[str]) -> str | None:
 
 LIMB_PLACES: Final[tuple[str, ...]] = ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")
 
-LIMB_WORDS: Final[dict[str, tuple[str, ...]]] = {
-    "hip": ("upleg", "upperleg", "thigh", "thighbend", "hip"),
-    "knee": ("knee", "lowerleg", "leg", "calf", "shin"),
-    "ankle": ("ankle", "foot"),
-    "shoulder": ("upperarm", "uarm", "arm", "shldr", "shldrbend", "shoulder"),
-    "elbow": ("elbow", "forearm", "lowerarm", "farm", "forearmbend"),
-    "wrist": ("wrist", "hand"),
-}
+
+def _of_limbs(*words: str) -> dict[str, tuple[str, ...]]:
+    """What the places of the limbs are called."""
+    return dict(zip(LIMB_PLACES, map(names_in, words), strict=True))
+
+
+LIMB_WORDS: Final = _of_limbs(
+    "upleg upperleg thigh thighbend hip",
+    "knee lowerleg leg calf shin",
+    "ankle foot",
+    "upperarm uarm arm shldr shldrbend shoulder",
+    "elbow forearm lowerarm farm forearmbend",
+    "wrist hand",
+)
 """What skeletons call the joint in which a limb's segment starts, without side and prefix; of
 several that are there the first: MotionBuilder, Mixamo, Rokoko; Unity, VRM and Xsens; Unreal,
 Biped and Character Creator; Rigify; Poser and DAZ Studio; OptiTrack; Kinect, SMPL and robots."""
@@ -253,37 +229,22 @@ _SEGMENTS: Final = frozenset(
 ) - {"hand"}
 """Words of a limb's parts; files that use them call no joint after itself."""
 
-_ACCLAIM: Final[dict[str, tuple[str, ...]]] = {
-    place: (word,)
-    for place, word in zip(
-        LIMB_PLACES, ("femur", "tibia", "foot", "humerus", "radius", "hand"), strict=True
-    )
-}
+_ACCLAIM: Final = _of_limbs("femur", "tibia", "foot", "humerus", "radius", "hand")
 """Acclaim's bones by their starts, as in models for MuJoCo."""
 
-_ENDS: Final[dict[str, tuple[str, ...]]] = {
-    place: (word,)
-    for place, word in zip(
-        LIMB_PLACES, ("hipjoint", "femur", "tibia", "clavicle", "humerus", "wrist"), strict=True
-    )
-}
+_ENDS: Final = _of_limbs("hipjoint", "femur", "tibia", "clavicle", "humerus", "wrist")
 """The same where joints are the ends of Acclaim's bones. `radius` and `wrist` together are the
 forearm, cut where it twists."""
 
-_SKELETON_PLACES: Final[dict[str, str]] = {
-    "neck": "vt1",
-    "head": "skullbase",
-    "headend": "skull_tip",
-    "headtopend": "skull_tip",
-    "toebase": "midtarsal",
-    "toes": "midtarsal",
-    "toe": "midtarsal",
-    "ball": "midtarsal",
-    "toebaseend": "toe",
-    "toesend": "toe",
-    "toeend": "toe",
-    "ballend": "toe",
-}
+_SKELETON_PLACES: Final = _by_word(
+    {
+        "vt1": "neck",
+        "skullbase": "head",
+        "skull_tip": "headend headtopend",
+        "midtarsal": "toebase toes toe ball",
+        "toe": "toebaseend toesend toeend ballend",
+    }
+)
 """Other joints of skeletons that are places of ours; `head` is where it turns, not its top."""
 
 
@@ -328,11 +289,12 @@ def _limbs(spelt: Sequence[tuple[str, str]], table: Mapping[str, Sequence[str]])
     alone = not places & {"upleg", "upperleg", "thigh", "forearm", "lowerarm"}
     found: dict[str, int] = {}
     for limb, words in table.items():
+        if alone:
+            words = tuple(word for word in words if word not in ("arm", "leg"))
         for side in ("l_", "r_"):
-            for word in words:
-                if (side, word) in spelt and not (alone and word in ("arm", "leg")):
-                    found[side + limb] = spelt.index((side, word))
-                    break
+            there = [word for word in words if (side, word) in spelt]
+            if there:
+                found[side + limb] = spelt.index((side, there[0]))
     return found
 
 
@@ -357,10 +319,6 @@ def _spelt(names: Sequence[str]) -> list[tuple[str, str]]:
             words = words[1:]
         place = "".join(words)
         if not side and place not in known:
-            for prefix in ("left", "right", "l", "r"):  # glued to the word
-                rest = place.removeprefix(prefix)
-                if place.startswith(prefix) and rest in known:
-                    side, place = _SIDES[prefix], rest
-                    break
+            side, place = _unglued(place, known)
         result.append((side, place))
     return result
