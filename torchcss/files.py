@@ -18,6 +18,9 @@ import numpy as np
 
 from torchcss.errors import OutputError, TorchcssError
 
+StrPath = str | os.PathLike[str]
+"""A path in any form."""
+
 _ADVICE = {
     errno.ENOSPC: "the disk is full; free some space or choose another folder with --out",
     errno.EDQUOT: "your disk quota is used up; free some space or choose another folder with --out",
@@ -106,7 +109,7 @@ def temporary_name(path: Path) -> Path:
     return path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
 
 
-def prepare_output_folder(path: str | os.PathLike[str]) -> Path:
+def prepare_output_folder(path: StrPath) -> Path:
     """Create an output folder and make sure that it can be written, before any work is done.
 
     Args:
@@ -221,9 +224,6 @@ def shortened(value: object) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-__all__ = ["load_array", "load_arrays", "load_json", "one_line", "real_numbers", "shortened"]
-
-
 def load_json(path: Path, error_class: type[TorchcssError]) -> Any:
     """Return the content of a JSON file.
 
@@ -274,15 +274,25 @@ def _check_sizes(path: Path) -> None:
                 _check_header(stream, member.file_size)
 
 
-def _check_header(stream: IO[bytes], size: int) -> None:
-    """Refuse an array whose heading says more numbers than there are bytes."""
-    header = {
+def array_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype] | None:
+    """Shape and type of the NPY file that begins in a stream; None: of a version unknown here."""
+    readers = {
         (1, 0): np.lib.format.read_array_header_1_0,
         (2, 0): np.lib.format.read_array_header_2_0,
-    }.get(np.lib.format.read_magic(stream))
+    }
+    read = readers.get(np.lib.format.read_magic(stream))
+    if read is None:
+        return None
+    shape, _, dtype = read(stream)
+    return shape, dtype
+
+
+def _check_header(stream: IO[bytes], size: int) -> None:
+    """Refuse an array whose heading says more numbers than there are bytes."""
+    header = array_header(stream)
     if header is None:
         return  # NumPy says what is wrong
-    shape, _, dtype = header(stream)
+    shape, dtype = header
     if math.prod(shape) * max(dtype.itemsize, 1) > size:
         raise ValueError(f"its heading says {list(shape)} of {dtype}, which is more than it holds")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
@@ -17,7 +16,7 @@ from torch import Tensor
 from torchcss.app.view_files import Selection, moments, open_view
 from torchcss.body.bases import pose_track
 from torchcss.errors import ConfigurationError, TrackFileError
-from torchcss.files import prepare_output_folder
+from torchcss.files import StrPath, prepare_output_folder
 from torchcss.inference.smoothing import Refined
 from torchcss.io.run import Run, as_run, body_of_track
 from torchcss.io.tracks import TRACK_NAME, Track, save_track, write_summary
@@ -46,11 +45,11 @@ class SmoothedTrack(NamedTuple):
 
 
 def smooth(
-    run: Run | str | os.PathLike[str],
+    run: Run | StrPath,
     choice: Smoothing | None = None,
     *,
     images: bool = False,
-    out: str | os.PathLike[str] | None = None,
+    out: StrPath | None = None,
 ) -> Run:
     """Smooth a run.
 

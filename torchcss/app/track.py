@@ -7,7 +7,6 @@ comes out as it goes.
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -28,6 +27,7 @@ from torchcss.app.recorder import CHECKPOINT_EVERY, Begun, Recorder, Sink
 from torchcss.app.view_files import OpenView, Selection, moments, open_view
 from torchcss.cost.view import View
 from torchcss.errors import CameraError, ConfigurationError, TrackFileError
+from torchcss.files import StrPath
 from torchcss.initialise.noise import Noise
 from torchcss.initialise.result import Initialisation
 from torchcss.io.cameras import LoadedCamera
@@ -102,11 +102,11 @@ class TrackOptions:
 
 
 def track_video(
-    video: str | os.PathLike[str],
+    video: StrPath,
     *,
-    camera: str | os.PathLike[str] | None = None,
-    keypoints: str | os.PathLike[str] | None = None,
-    out: str | os.PathLike[str],
+    camera: StrPath | None = None,
+    keypoints: StrPath | None = None,
+    out: StrPath,
     settings: Settings | None = None,
     start: int = 0,
     stop: int | None = None,
@@ -187,7 +187,7 @@ _KEYPOINTS_NAME = "keypoints.npz"
 
 def _files_of(
     video: Path,
-    keypoints: str | os.PathLike[str] | None,
+    keypoints: StrPath | None,
     out: Path,
     selection: Selection,
     options: TrackOptions,
@@ -232,7 +232,7 @@ def _detect_further(run: Run, selection: Selection, options: TrackOptions) -> No
 
 def _all_views(
     own: ViewFiles,
-    camera: str | os.PathLike[str] | None,
+    camera: StrPath | None,
     selection: Selection,
     settings: Settings,
     options: TrackOptions,
@@ -254,7 +254,7 @@ def _now(what: str) -> None:
     tqdm.write(f"{what} ...", file=sys.stderr)
 
 
-def resume(run: Run | str | os.PathLike[str], *, live: Sink | None = None) -> Run:
+def resume(run: Run | StrPath, *, live: Sink | None = None) -> Run:
     """Go on with an interrupted run, as if it had never been interrupted.
 
     Args:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -12,6 +11,7 @@ from typing import Any
 from torchcss.app import smooth as smoothing
 from torchcss.app.smooth import SmoothedTrack, smooth
 from torchcss.body.model import BodyModel
+from torchcss.files import StrPath
 from torchcss.initialise.result import Initialisation
 from torchcss.io.export import Export, ExportOptions, export
 from torchcss.io.run import Given, GivenKeypoints, Run, body_of_track
@@ -20,8 +20,6 @@ from torchcss.tracking.session import Images, Posterior, TrackingSession
 from torchcss.tracking.settings import Settings
 from torchcss.tracking.smooth import Smoothing
 from torchcss.tracking.view import CameraView
-
-StrPath = str | os.PathLike[str]
 
 
 def smooth_track(

@@ -15,7 +15,6 @@ By default: `read_camera(path, name)` or `read_cameras(path)`; for a video
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -25,7 +24,7 @@ import numpy as np
 
 from torchcss.body.rotations import from_axis_angle
 from torchcss.errors import CameraError
-from torchcss.files import real_numbers, shortened
+from torchcss.files import StrPath, real_numbers, shortened
 from torchcss.io.calibrations import Entry, read_entries
 from torchcss.io.video import VideoReader
 from torchcss.vision.camera import Camera
@@ -50,25 +49,25 @@ class LoadedCamera(NamedTuple):
 
 
 def read_camera(
-    path: str | os.PathLike[str],
+    path: StrPath,
     name: str | None = None,
     *,
-    video: str | os.PathLike[str] | None = None,
+    video: StrPath | None = None,
 ) -> Camera:
     """Read one camera of a calibration file; see `load_camera`."""
     return load_camera(path, name, video=video).camera
 
 
-def read_cameras(path: str | os.PathLike[str]) -> dict[str, Camera]:
+def read_cameras(path: StrPath) -> dict[str, Camera]:
     """Read all cameras of a calibration file, by name; see `load_camera`."""
     return {name: load_camera(path, name).camera for name in read_entries(Path(path))}
 
 
 def load_camera(
-    path: str | os.PathLike[str],
+    path: StrPath,
     name: str | None = None,
     *,
-    video: str | os.PathLike[str] | None = None,
+    video: StrPath | None = None,
 ) -> LoadedCamera:
     """Read one camera of a calibration file, and what the file says about it.
 
@@ -180,7 +179,7 @@ def camera_entry(camera: Camera) -> dict[str, Any]:
     }
 
 
-def calibration(*cameras: tuple[Camera, str | os.PathLike[str] | None]) -> dict[str, Any]:
+def calibration(*cameras: tuple[Camera, StrPath | None]) -> dict[str, Any]:
     """Return what a camera file in JSON holds.
 
     Args:

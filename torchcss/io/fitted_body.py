@@ -39,7 +39,7 @@ from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES
 from torchcss.body.shape import with_shape
 from torchcss.errors import BodyError
-from torchcss.files import load_arrays, save_arrays
+from torchcss.files import StrPath, load_arrays, save_arrays
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.initialise.result import Initialisation
 from torchcss.io.track_body import PARAMETER_NUMBERS, set_numbers
@@ -49,7 +49,7 @@ SCHEMA_VERSION = 1
 FITTED_BODY_NAME = "body.npz"
 
 
-def write_fitted_body(path: str | os.PathLike[str], found: Initialisation, camera: Camera) -> None:
+def write_fitted_body(path: StrPath, found: Initialisation, camera: Camera) -> None:
     """Write the result of an initialisation.
 
     Args:
@@ -91,7 +91,7 @@ def write_fitted_body(path: str | os.PathLike[str], found: Initialisation, camer
 
 
 def read_fitted_body(
-    path: str | os.PathLike[str],
+    path: StrPath,
     *,
     camera: Camera | None = None,
     dtype: torch.dtype = torch.float64,

@@ -10,7 +10,6 @@ lacks is given in `Given`; asking a `Run` for what neither says is an error of o
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
@@ -26,6 +25,7 @@ from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES
 from torchcss.errors import TorchcssError, TrackFileError
+from torchcss.files import StrPath
 from torchcss.io.cameras import read_camera
 from torchcss.io.checkpoint import Checkpoint, read_checkpoint
 from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body
@@ -92,7 +92,7 @@ class Run:
     @classmethod
     def open(
         cls,
-        folder: str | os.PathLike[str],
+        folder: StrPath,
         given: Given | None = None,
         keypoints: GivenKeypoints | None = None,
     ) -> Run:
@@ -169,7 +169,7 @@ class Run:
         return read_checkpoint(self.folder)
 
 
-def as_run(run: Run | str | os.PathLike[str]) -> Run:
+def as_run(run: Run | StrPath) -> Run:
     """A run, or the one in a folder."""
     return run if isinstance(run, Run) else Run.open(run)
 

@@ -52,6 +52,7 @@ from torchcss.body.bases import on_origin
 from torchcss.body.model import BodyModel
 from torchcss.errors import ShapeError, TorchcssError, TrackFileError
 from torchcss.files import (
+    StrPath,
     load_arrays,
     load_json,
     one_line,
@@ -240,7 +241,7 @@ class TrackWriter:
         begun: What goes before: `Track.empty`, or the frames of a run that goes on.
     """
 
-    def __init__(self, path: str | os.PathLike[str], begun: Track) -> None:
+    def __init__(self, path: StrPath, begun: Track) -> None:
         self.path = Path(path)
         self._begun = begun
         self._rows = begun.rows()
@@ -317,7 +318,7 @@ class TrackWriter:
         save_track(self.path, self.track())
 
 
-def save_track(path: str | os.PathLike[str], track: Track) -> None:
+def save_track(path: StrPath, track: Track) -> None:
     """Write a track; the file is replaced in one step, or stays as it was.
 
     Args:
@@ -340,7 +341,7 @@ def save_track(path: str | os.PathLike[str], track: Track) -> None:
     save_arrays(Path(path), {"schema_version": SCHEMA_VERSION, **arrays})
 
 
-def load_track(path: str | os.PathLike[str]) -> Track:
+def load_track(path: StrPath) -> Track:
     """Read a track back.
 
     Args:
@@ -435,7 +436,7 @@ def _described(arrays: Mapping[str, np.ndarray], path: Path) -> dict[str, Any]:
         ) from error
 
 
-def write_summary(path: str | os.PathLike[str], summary: Mapping[str, Any]) -> None:
+def write_summary(path: StrPath, summary: Mapping[str, Any]) -> None:
     """Write what was run and what came out, as JSON with sorted keys; what is no number is null.
 
     Args:
@@ -453,7 +454,7 @@ def write_summary(path: str | os.PathLike[str], summary: Mapping[str, Any]) -> N
     write_text(path, text + "\n")
 
 
-def read_summary(path: str | os.PathLike[str]) -> dict[str, Any]:
+def read_summary(path: StrPath) -> dict[str, Any]:
     """Read a `summary.json`, or the one in a folder.
 
     Raises:

@@ -28,7 +28,7 @@ from jaxtyping import UInt8
 from PIL import ExifTags, Image, ImageOps
 
 from torchcss.errors import ConfigurationError, ShapeError, VideoError
-from torchcss.files import output_error, temporary_name
+from torchcss.files import StrPath, output_error, temporary_name
 from torchcss.io.high_dynamic_range import table
 from torchcss.types import Frame
 
@@ -91,7 +91,7 @@ class VideoReader:
 
     def __init__(
         self,
-        path: str | os.PathLike[str],
+        path: StrPath,
         *,
         start: int = 0,
         stop: int | None = None,
@@ -347,9 +347,7 @@ class VideoWriter:
         OutputError: If the file cannot be written, from any method.
     """
 
-    def __init__(
-        self, path: str | os.PathLike[str], frame_rate: Fraction | float, *, crf: int = 20
-    ) -> None:
+    def __init__(self, path: StrPath, frame_rate: Fraction | float, *, crf: int = 20) -> None:
         self.path = Path(path)
         if self.path.suffix.lower() not in (".mp4", ".mov", ".mkv"):
             raise ConfigurationError(
@@ -458,7 +456,7 @@ class VideoWriter:
             self.close()
 
 
-def read_image(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "h w 3"]:
+def read_image(path: StrPath) -> UInt8[np.ndarray, "h w 3"]:
     """Read one image as 8-bit red, green, blue, turned upright.
 
     16-bit grey is scaled to 8 bit; transparent images are laid over black.
@@ -496,7 +494,7 @@ def read_image(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "h w 3"]:
         ) from error
 
 
-def read_frame(path: str | os.PathLike[str], index: int = 0) -> UInt8[np.ndarray, "h w 3"]:
+def read_frame(path: StrPath, index: int = 0) -> UInt8[np.ndarray, "h w 3"]:
     """Read one frame of a video, or one image.
 
     Args:
@@ -510,7 +508,7 @@ def read_frame(path: str | os.PathLike[str], index: int = 0) -> UInt8[np.ndarray
         return next(iter(frames)).image
 
 
-def focal_length_35mm(path: str | os.PathLike[str]) -> float | None:
+def focal_length_35mm(path: StrPath) -> float | None:
     """What a file says of its lens: the focal length in mm that shows as much on 35 mm film.
 
     Read are Apple's and Android's keys of a video, and EXIF's of a picture or of the first one of a

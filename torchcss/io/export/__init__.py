@@ -16,7 +16,6 @@ Each format is a module of its own that makes the content; only this one touches
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -24,7 +23,7 @@ from typing import Literal, NamedTuple
 
 from torchcss.body.model import BodyModel
 from torchcss.errors import ConfigurationError
-from torchcss.files import prepare_output_folder, replace_file, save_arrays, write_text
+from torchcss.files import StrPath, prepare_output_folder, replace_file, save_arrays, write_text
 from torchcss.io.export.bvh import BvhStyle, bvh_text
 from torchcss.io.export.c3d import write_c3d
 from torchcss.io.export.mot import mot_text
@@ -74,8 +73,8 @@ class Export(NamedTuple):
 
 
 def export(
-    run: Run | Track | str | os.PathLike[str],
-    path: str | os.PathLike[str] | None = None,
+    run: Run | Track | StrPath,
+    path: StrPath | None = None,
     *,
     to: str | None = None,
     options: ExportOptions | None = None,
@@ -165,9 +164,7 @@ def _write_table(path: Path, to: str, selection: Selection, body: BodyModel) -> 
     save_arrays(path, {**npz_arrays(selection, covariance), **smpl})
 
 
-def _paths(
-    source: Path | None, to: str, labels: Sequence[str], out: str | os.PathLike[str] | None
-) -> list[Path]:
+def _paths(source: Path | None, to: str, labels: Sequence[str], out: StrPath | None) -> list[Path]:
     """The files to write, one per label, in a folder that can be written."""
     usual = Path(_NAMES.get(to, f"track.{to}"))
     if out is None and source is None:

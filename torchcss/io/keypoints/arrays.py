@@ -10,6 +10,7 @@ be called `scores` and the like.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -19,22 +20,11 @@ import torch
 from torchcss.errors import KeypointError
 from torchcss.files import load_arrays
 from torchcss.io.keypoints.people import People, Person, is_there, screened
-from torchcss.joint_names import ALIASES
+from torchcss.joint_names import ALIASES, names_in
 from torchcss.types import Keypoints
 
-_PLACES = (
-    "keypoints",
-    "keypoints_2d",
-    "keypoints2d",
-    "joints_2d",
-    "joints2d",
-    "kps",
-    "poses",
-    "positions",
-)
-_CONFIDENCES = (
-    "confidence", "confidences", "scores", "score", "keypoint_scores", "conf", "likelihood",
-)  # fmt: skip
+_PLACES = names_in("keypoints keypoints_2d keypoints2d joints_2d joints2d kps poses positions")
+_CONFIDENCES = names_in("confidence confidences scores score keypoint_scores conf likelihood")
 _COUNTS = {len(joints) for joints in ALIASES.values()}
 
 
@@ -59,13 +49,11 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
         report = ["format: MoveNet's arrays, y before x, fractions of the image"]
     given = next((key for key in _CONFIDENCES if key in arrays), None)
     if given is not None:
-        values = np.concatenate(
-            [values[..., :2], _confidence(path, given, arrays[given], values.shape)[..., None]], -1
-        )
+        confidence = _confidence(path, given, arrays[given], values.shape[:3])
+        values = np.concatenate([values[..., :2], confidence[..., None]], -1)
     elif values.shape[-1] == 2:
         report.append("no confidence in the file: 1 for every joint that is a number")
-        places = np.where(np.isfinite(values), values, np.nan)
-        values = screened(places)
+        values = screened(np.where(np.isfinite(values), values, np.nan))
     else:
         report.append(f"confidence: the third numbers of {name}")
     tracks = _tracks(path, arrays.get("person_ids"), values.shape[1])
@@ -77,14 +65,15 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
         ]
         for frame in values
     ]
-    size, noise = arrays.get("image_size_wh"), arrays.get("relative_noise")
+    size = _positive(path, "image_size_wh", arrays, 2)
+    noise = _positive(path, "relative_noise", arrays, 1) or [1.0]
     return People(
         people,
         _names(path, arrays.get("joint_names"), values.shape[2]),
         report,
         corner_fractions=is_movenet,
-        size_wh=None if size is None else _size(path, size),
-        relative_noise=1.0 if noise is None else _positive(path, "relative_noise", noise, 1)[0],
+        size_wh=None if size is None else (size[0], size[1]),
+        relative_noise=noise[0],
     )
 
 
@@ -108,25 +97,29 @@ def read_points(path: Path, keypoints: Keypoints) -> Keypoints:
     return keypoints._replace(points=points[torch.arange(len(gap)), gap.argmin(1)])
 
 
+def _unfit(path: Path, name: str, array: np.ndarray, expected: str) -> KeypointError:
+    """The error for an array of another kind or shape."""
+    got = f"{array.dtype} {list(array.shape)}"
+    return KeypointError(f"{path}: {name}: expected {expected}, got {got}")
+
+
 def _tracks(path: Path, ids: np.ndarray | None, count: int) -> list[str | None]:
     if ids is None:
         return [None] * count
     if ids.shape != (count,) or ids.dtype.kind not in "iuU":
-        raise KeypointError(
-            f"{path}: person_ids: expected {count} numbers, got {ids.dtype} {list(ids.shape)}"
-        )
+        raise _unfit(path, "person_ids", ids, f"{count} numbers")
     return [str(number) for number in ids]
 
 
-def _size(path: Path, array: np.ndarray) -> tuple[float, float]:
-    width, height = _positive(path, "image_size_wh", array, 2)
-    return width, height
-
-
-def _positive(path: Path, name: str, array: np.ndarray, count: int) -> list[float]:
+def _positive(
+    path: Path, name: str, arrays: Mapping[str, np.ndarray], count: int
+) -> list[float] | None:
+    """So many numbers, if the file has them."""
+    if (array := arrays.get(name)) is None:
+        return None
     if array.size != count or array.dtype.kind not in "iuf" or not (array > 0).all():
         raise KeypointError(f"{path}: {name}: expected {count} positive numbers, got {array}")
-    return [float(number) for number in array.ravel()]
+    return array.ravel().astype(float).tolist()
 
 
 def _people(path: Path, name: str, array: np.ndarray) -> np.ndarray:
@@ -146,25 +139,19 @@ def _people(path: Path, name: str, array: np.ndarray) -> np.ndarray:
             return values
         if len(shape) == 5 and tuple(shape[1:3]) == (1, 1) and shape[4] == 3:
             return values[:, 0]
-    raise KeypointError(
-        f"{path}: {name}: expected numbers [frames, joints, 2 or 3] or [frames, people, joints, "
-        f"2 or 3], got {array.dtype} {list(shape)}"
-    )
+    expected = "numbers [frames, joints, 2 or 3] or [frames, people, joints, 2 or 3]"
+    raise _unfit(path, name, array, expected)
 
 
-def _confidence(path: Path, name: str, array: np.ndarray, shape: Sequence[int]) -> np.ndarray:
-    if array.dtype.kind not in "biuf" or array.size != int(np.prod(shape[:3])):
-        raise KeypointError(
-            f"{path}: {name}: expected numbers {[n for n in shape[:3] if n != 1]}, "
-            f"got {array.dtype} {list(array.shape)}"
-        )
-    return array.astype(np.float64).reshape(tuple(shape[:3]))
+def _confidence(path: Path, name: str, array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    if array.dtype.kind not in "biuf" or array.size != math.prod(shape):
+        raise _unfit(path, name, array, f"numbers {[n for n in shape if n != 1]}")
+    return array.astype(np.float64).reshape(shape)
 
 
 def _names(path: Path, names: np.ndarray | None, num_joints: int) -> tuple[str, ...] | None:
-    if names is not None and (names.shape != (num_joints,) or names.dtype.kind != "U"):
-        raise KeypointError(
-            f"{path}: joint_names: expected {num_joints} names, got {names.dtype} "
-            f"{list(names.shape)}"
-        )
-    return None if names is None else tuple(map(str, names))
+    if names is None:
+        return None
+    if names.shape != (num_joints,) or names.dtype.kind != "U":
+        raise _unfit(path, "joint_names", names, f"{num_joints} names")
+    return tuple(map(str, names))

@@ -15,7 +15,7 @@ import numpy as np
 from torchcss.errors import KeypointError
 from torchcss.files import real_numbers, shortened
 from torchcss.io.keypoints.json_people import JOINTS, PEOPLE
-from torchcss.io.keypoints.people import Key, Marked, People, united
+from torchcss.io.keypoints.people import Frames, People, Person, united
 from torchcss.joint_names import JOINT_NAMES, canonical_joint_name
 
 
@@ -44,13 +44,13 @@ def read_clicked(path: Path, content: Mapping[str, Any], image_size_wh: tuple[in
     frames = content.get("frames", {"0": content.get("joints")})
     if not isinstance(frames, dict) or not frames:
         raise KeypointError(f"{path}: expected 'frames' to name frames, found {shortened(frames)}")
-    clicked: dict[Key, list[Marked]] = {}
+    clicked: Frames = {}
     for key, joints in frames.items():
         if not re.fullmatch(r"[0-9]{1,6}", key):
             raise KeypointError(f"{path}: expected a frame number, found {shortened(key)}")
         named = _clicked_joints(f"{path}: frame {key}", joints)
         rows = np.array(list(named.values())).reshape(-1, 3)
-        clicked[int(key)] = [Marked(rows, tuple(named))] if named else []
+        clicked[int(key)] = [Person(rows, names=tuple(named))] if named else []
     found, names = united(path, clicked)
     return People(found, names, ["format: clicked joints"], first=0)
 

@@ -13,7 +13,7 @@ from typing import Any
 from torchcss.errors import KeypointError
 from torchcss.files import shortened
 from torchcss.io.keypoints.json_people import one_person, said_size
-from torchcss.io.keypoints.people import Key, People, Person, track_of
+from torchcss.io.keypoints.people import Frames, Key, People, Person, track_of
 from torchcss.io.video import natural_order
 from torchcss.joint_names import canonical_joint_name
 
@@ -25,7 +25,7 @@ def read_coco(path: Path, content: Mapping[str, Any]) -> People:
         raise KeypointError(f"{path}: expected a list of detections, found {shortened(entries)}")
     report = ["format: COCO"]
     names, category = _coco_names(content, entries, report)
-    found: dict[Key, list[Person]] = {}
+    found: Frames = {}
     for index, entry in enumerate(entries):
         where = f"{path}: detection {index}"
         image = entry.get("image_id")
@@ -33,11 +33,10 @@ def read_coco(path: Path, content: Mapping[str, Any]) -> People:
             raise KeypointError(f"{where}: expected an image_id, found {shortened(image)}")
         # COCO also annotates things that have no joints, and other skeletons.
         if "keypoints" in entry and category in (None, entry.get("category_id")):
-            marked = one_person(where, entry["keypoints"], entry)
             about = entry.get("attributes")
             track = track_of({**entry, **(about if isinstance(about, dict) else {})}, ("track_id",))
-            people = found.setdefault(image, [])
-            people += [] if marked is None else [Person(marked.joints, track)]
+            people = one_person(where, entry["keypoints"], entry)
+            found.setdefault(image, []).extend(person._replace(track=track) for person in people)
     values = {value for people in found.values() for p in people for value in p.joints[:, 2]}
     if 2 in values and values <= {0, 1, 2}:
         # 0 not labelled, 1 labelled but hidden, 2 seen.
@@ -72,7 +71,7 @@ def _coco_names(
 
 def _by_images(
     path: Path, images: object, found: Mapping[Key, list[Person]]
-) -> tuple[dict[Key, list[Person]], tuple[float, float] | None]:
+) -> tuple[Frames, tuple[float, float] | None]:
     """People by the names of their pictures, and the size that all of these have."""
     if not isinstance(images, list) or not all(
         isinstance(image, dict) and isinstance(image.get("id"), (int, str)) for image in images
@@ -82,7 +81,7 @@ def _by_images(
     if unknown := [image for image in found if image not in identifiers]:
         raise KeypointError(f"{path}: detection of image {unknown[0]!r}, which is not in 'images'")
     ordered = sorted(images, key=lambda each: natural_order(str(each.get("file_name", each["id"]))))
-    frames: dict[Key, list[Person]] = {
+    frames: Frames = {
         str(image.get("file_name", image["id"])): found.get(image["id"], []) for image in ordered
     }
     sizes = {said_size(image) for image in images}

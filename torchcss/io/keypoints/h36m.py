@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from torchcss.errors import KeypointError
-from torchcss.files import one_line, shortened
+from torchcss.files import array_header, one_line, shortened
 from torchcss.io.keypoints.people import People, Person, screened
 
 _LAYOUTS = {
@@ -181,16 +181,9 @@ def _object(path: Path, name: str) -> Any:
         with zipfile.ZipFile(path) as archive, archive.open(f"{name}.npy") as stream:
             data = stream.read(_MOST_BYTES)
         source = io.BytesIO(data)
-        version = np.lib.format.read_magic(source)
-        read_header = {
-            (1, 0): np.lib.format.read_array_header_1_0,
-            (2, 0): np.lib.format.read_array_header_2_0,
-        }.get(version)
-        if read_header is None:
-            raise ValueError(f"version {version} of NumPy's format")
-        shape, _, dtype = read_header(source)
-        if not dtype.hasobject:
-            raise ValueError(f"expected objects, got {dtype} {list(shape)}")
+        header = array_header(source)
+        if header is None or not header[1].hasobject:
+            raise ValueError(f"expected objects, got {header}")
         content = PlainUnpickler(source, encoding="latin1").load()
     except Exception as error:  # zipfile, pickle and NumPy raise whatever the damage leads to
         raise KeypointError(

@@ -19,7 +19,7 @@ import numpy as np
 from torchcss.errors import KeypointError, MissingExtraError
 from torchcss.files import one_line, read_bytes
 from torchcss.io.keypoints.h36m import PlainUnpickler
-from torchcss.io.keypoints.people import Key, People, Person, is_there, screened
+from torchcss.io.keypoints.people import Frames, People, Person, is_there, screened
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _MOST_NUMBERS = 2**26
@@ -138,7 +138,7 @@ def _read_pandas(path: Path, group: Any) -> People:
             place = names.index(column[-2]), _KINDS.index(column[-1])
             joints[:, person, place[0], place[1]] = values[:, number]
     found = screened(joints[..., :2], joints[..., 2])
-    frames: dict[Key, list[Person]] = {
+    frames: Frames = {
         int(key): [Person(p, w or None) for p, w in zip(people, who, strict=True) if is_there(p)]
         for key, people in zip(index.tolist(), found, strict=True)
     }

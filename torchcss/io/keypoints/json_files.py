@@ -31,17 +31,18 @@ from torchcss.io.keypoints.json_people import (
     people_of,
     said_size,
 )
-from torchcss.io.keypoints.mediapipe import LAYOUT, NAMES
+from torchcss.io.keypoints.mediapipe import LAYOUT, NUM_LANDMARKS, landmark_order, reordered
 from torchcss.io.keypoints.people import (
     FRAME_NAMES,
+    Frames,
     Key,
-    Marked,
     People,
     Person,
     is_there,
     united,
 )
 from torchcss.io.video import natural_order
+from torchcss.joint_names import names_in
 
 _FORMATS = {
     "pose_keypoints_2d": "OpenPose", "pose_keypoints": "OpenPose", "bodies": "AlphaPose",
@@ -52,8 +53,9 @@ _FORMATS = {
 """Whose a file is, by a word in it."""
 
 _FRAMES = ("frames", "instance_info", "results", "data")
-_PICTURES = ("image_id", "file_name", "filename", "image", "image_name", "img_name", "image_path",
-             "imagePath", "frame_name")  # fmt: skip
+_PICTURES = names_in(
+    "image_id file_name filename image image_name img_name image_path imagePath frame_name"
+)
 _TIMES = {"timestamp_ms": 1e-3, "time_ms": 1e-3, "timestamp_us": 1e-6, "time_s": 1.0,
           "timestamp": None, "time": None, "t": None}  # fmt: skip
 """Words for a time, and its unit in seconds, where the word says it."""
@@ -79,16 +81,12 @@ def read_json(path: Path, image_size_wh: tuple[int, int], num_frames: int | None
         if is_clicked(content):
             return read_clicked(path, content, image_size_wh)
     name = _format_of(content)
-    first = 1 if name == "openpifpaf" or _said_from_one(content) else None
-    names = _said_names(content)
+    from_one = name == "openpifpaf" or (isinstance(content, dict) and "instance_info" in content)
     frames = _frames(path, content, num_frames)
-    size = said_size(content)
-    if isinstance(frames, list):
-        counted: dict[Key, list[Marked]] = dict(enumerate(frames))
-        found, own = united(path, counted)
-        return _people(name, list(found.values()), own or names)._replace(size_wh=size)
-    found, own = united(path, frames)
-    return _people(name, found, own or names)._replace(first=first, size_wh=size)
+    in_order = isinstance(frames, list)
+    found, own = united(path, dict(enumerate(frames)) if in_order else frames)
+    people = _people(name, found, own or _said_names(content), in_order=in_order)
+    return people._replace(first=1 if from_one else None, size_wh=said_size(content))
 
 
 def read_folder(path: Path) -> People:
@@ -98,7 +96,7 @@ def read_folder(path: Path) -> People:
         KeypointError: If there is none, or one is none of the formats.
     """
     files = sorted(path.glob("*.json"), key=lambda entry: natural_order(entry.name))
-    found: dict[Key, list[Marked]] = {}
+    found: Frames = {}
     size, name = None, "OpenPose"
     for file in files:
         content = _load(file)
@@ -115,29 +113,21 @@ def read_folder(path: Path) -> People:
 
 
 def _people(
-    name: str, frames: dict[Key, list[Person]] | list[list[Person]], names: tuple[str, ...] | None
+    name: str, frames: Frames, names: tuple[str, ...] | None, *, in_order: bool = False
 ) -> People:
     """People of a format; 33 joints are MediaPipe's, whatever they are called or how ordered."""
-    report = [f"format: {name}"]
-    each = list(frames.values()) if isinstance(frames, dict) else frames
-    if not all(is_there(person.joints) for people in each for person in people):
+    everyone = [person for people in frames.values() for person in people]
+    if not all(is_there(person.joints) for person in everyone):
         # Who is not in a frame keeps his place there (Pose2Sim's): the place says who it is.
-        for people in each:
+        for people in frames.values():
             people[:] = [p._replace(track=p.track or f"{n}") for n, p in enumerate(people)]
-    count = next((len(person.joints) for people in each for person in people), 0)
-    lower = [re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_") for name in names or ()]
-    order: list[int] | None = None
-    if lower and all(map(str.isdigit, lower)):
-        order = sorted(range(count), key=lambda index: int(lower[index]))
-    elif set(lower) == set(NAMES):
-        order = [lower.index(own) for own in NAMES]
+    order = landmark_order(names or ())
     if order is not None:
-        names = None
-        each = [[p._replace(joints=p.joints[order]) for p in people] for people in each]
-        frames = dict(zip(frames, each, strict=True)) if isinstance(frames, dict) else each
-    if names is None and count == len(NAMES):
-        return People(frames, None, ["format: MediaPipe landmarks"], LAYOUT, corner_fractions=True)
-    return People(frames, names, report)
+        names, frames = None, reordered(frames, order)
+    found = list(frames.values()) if in_order else frames
+    if names is None and everyone and len(everyone[0].joints) == NUM_LANDMARKS:
+        return People(found, None, ["format: MediaPipe landmarks"], LAYOUT, corner_fractions=True)
+    return People(found, names, [f"format: {name}"])
 
 
 def _load(path: Path) -> Any:
@@ -172,10 +162,6 @@ def _format_of(content: object) -> str:
     return next((name for word, name in _FORMATS.items() if word in words), "JSON")
 
 
-def _said_from_one(content: object) -> bool:
-    return isinstance(content, dict) and "instance_info" in content
-
-
 def _said_names(content: object) -> tuple[str, ...] | None:
     """The joints' names that MMPose writes in the head."""
     head = content.get("meta_info") if isinstance(content, dict) else None
@@ -188,9 +174,7 @@ def _said_names(content: object) -> tuple[str, ...] | None:
 # Frames.
 
 
-def _frames(
-    path: Path, content: Any, num_frames: int | None
-) -> list[list[Marked]] | dict[Key, list[Marked]]:
+def _frames(path: Path, content: Any, num_frames: int | None) -> list[list[Person]] | Frames:
     """The people of every frame, by what the file says of it, or in order."""
     if isinstance(content, dict):
         inner = next(
@@ -215,7 +199,7 @@ def _frames(
         if one or not content:
             return [people_of(str(path), content)]
         return [people_of(f"{path}: frame {index}", entry) for index, entry in enumerate(content)]
-    found: dict[Key, list[Marked]] = {}
+    found: Frames = {}
     for index, (key, entry) in enumerate(zip(keys, content, strict=True)):
         if key is None:
             raise KeypointError(
@@ -245,7 +229,7 @@ def _key_of(where: str, entry: object) -> Key | None:
     return next((entry[name] for name in _PICTURES if isinstance(entry.get(name), str)), None)
 
 
-def _in_seconds(entries: Sequence[Any], found: dict[Key, list[Marked]]) -> dict[Key, list[Marked]]:
+def _in_seconds(entries: Sequence[Any], found: Frames) -> Frames:
     """Times in seconds; where the word does not say the unit, no frame lasts a second."""
     if not all(isinstance(key, float) for key in found):
         return found
@@ -264,6 +248,5 @@ def _read_vitpose(path: Path, content: Mapping[str, Any]) -> People:
     frames: list[list[Person]] = []
     for index, entry in enumerate(content["keypoints"]):
         people = people_of(f"{path}: frame {index}", entry)
-        swapped = [Person(person.joints[:, [1, 0, 2]], person.track) for person in people]
-        frames.append(swapped)
+        frames.append([person._replace(joints=person.joints[:, [1, 0, 2]]) for person in people])
     return People(frames, names or None, ["format: easy_ViTPose (y before x)"])

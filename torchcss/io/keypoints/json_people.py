@@ -17,16 +17,23 @@ import numpy as np
 
 from torchcss.errors import KeypointError
 from torchcss.files import shortened
-from torchcss.io.keypoints.people import CONFIDENCE_NAMES, Marked, numbers, screened, track_of
+from torchcss.io.keypoints.people import CONFIDENCE_NAMES, Person, numbers, screened, track_of
+from torchcss.joint_names import names_in
 
-PEOPLE = ("people", "bodies", "instances", "predictions", "annots", "poses", "persons",
-           "detections")  # fmt: skip
-JOINTS = ("pose_keypoints_2d", "pose_keypoints", "keypoints", "pose_landmarks", "landmarks",
-           "landmark", "joints", "pose", "kps")  # fmt: skip
-_SCORES = ("keypoint_scores", "keypoints_scores", "scores", "confidences", "keypoints_conf")
+PEOPLE = names_in("people bodies instances predictions annots poses persons detections")
+JOINTS = names_in(
+    "pose_keypoints_2d pose_keypoints keypoints pose_landmarks landmarks landmark joints pose kps"
+)
+_SCORES = names_in("keypoint_scores keypoints_scores scores confidences keypoints_conf")
+_SIZES = (
+    ("canvas_width", "canvas_height"),
+    ("imageWidth", "imageHeight"),
+    ("image_width", "image_height"),
+    ("width", "height"),
+)
 
 
-def people_of(where: str, value: Any, *, alone: bool = False) -> list[Marked]:
+def people_of(where: str, value: Any, *, alone: bool = False) -> list[Person]:
     """The people of a frame, out of whatever they are wrapped in.
 
     Args:
@@ -52,24 +59,20 @@ def people_of(where: str, value: Any, *, alone: bool = False) -> list[Marked]:
                 return people_of(where, inner)
             if isinstance(inner, list) and inner and not is_joints(inner) and not _flat(inner):
                 return people_of(f"{where}: {key}", inner)
-            person = one_person(f"{where}: {key}", inner, value)
-            return [] if person is None else [person]
-        if _is_by_name(value):
-            person = one_person(where, value, {})
-            return [] if person is None else [person]
+            return one_person(f"{where}: {key}", inner, value)
+        if all(is_joints([each]) for each in value.values()):
+            return one_person(where, value)
         if alone or not all(isinstance(each, (list, dict)) for each in value.values()):
             raise KeypointError(f"{where}: expected keypoints, found {shortened(list(value))}")
         # By the people's own numbers.
-        everyone = [
-            (key, person)
+        return [
+            person._replace(track=person.track or key)
             for key, each in value.items()
             for person in people_of(f"{where}: {key}", each)
         ]
-        return [person._replace(track=person.track or key) for key, person in everyone]
     if isinstance(value, list):
         if is_joints(value) or _flat(value):
-            person = one_person(where, value, {})
-            return [] if person is None else [person]
+            return one_person(where, value)
         return [
             person
             for index, each in enumerate(value)
@@ -92,12 +95,9 @@ def is_joints(value: list[Any]) -> bool:
     )
 
 
-def _is_by_name(value: Mapping[str, Any]) -> bool:
-    return all(is_joints([each]) for each in value.values())
-
-
-def one_person(where: str, value: Any, around: Mapping[str, Any]) -> Marked | None:
-    """One person's joints; None for somebody who is not there."""
+def one_person(where: str, value: Any, around: Mapping[str, Any] | None = None) -> list[Person]:
+    """One person by the joints, and what the file says around them; nobody where there are none."""
+    around = around or {}
     names: list[Any] | None = None
     if isinstance(value, dict):
         if isinstance(value.get("x"), list):  # a list of x, of y, of confidences
@@ -107,7 +107,7 @@ def one_person(where: str, value: Any, around: Mapping[str, Any]) -> Marked | No
         else:
             names, value = list(value), list(value.values())
     if value is None or value == []:
-        return None
+        return []
     if not isinstance(value, list):
         raise KeypointError(f"{where}: expected numbers, found {shortened(value)}")
     scores = next((around[key] for key in _SCORES if key in around), None)
@@ -122,7 +122,7 @@ def one_person(where: str, value: Any, around: Mapping[str, Any]) -> Marked | No
             said = [row.get("name", row.get("part")) for row in value]
             names = said if all(isinstance(name, str) for name in said) else None
         joints = _with_scores(where, joints, scores)
-    return Marked(joints, None if names is None else tuple(map(str, names)), track_of(around))
+    return [Person(joints, track_of(around), None if names is None else tuple(map(str, names)))]
 
 
 def listed(value: object) -> list[Any]:
@@ -172,7 +172,7 @@ def _row(where: str, row: Any) -> list[float]:
     return [*values.tolist(), np.nan][:3]
 
 
-def _labelme(where: str, shapes: object) -> list[Marked]:
+def _labelme(where: str, shapes: object) -> list[Person]:
     """People whose joints are labelled as points, by the number of their group."""
     people: dict[str, dict[str, list[float]]] = {}
     for index, shape in enumerate(listed(shapes)):
@@ -188,7 +188,7 @@ def _labelme(where: str, shapes: object) -> list[Marked]:
             raise KeypointError(f"{place}: {label!r} twice; give people a group_id of their own")
         group[label] = [*point[0].tolist(), 1.0]
     return [
-        Marked(np.array(list(joints.values())), tuple(joints), None if key == "None" else key)
+        Person(np.array(list(joints.values())), None if key == "None" else key, tuple(joints))
         for key, joints in people.items()
     ]
 
@@ -197,14 +197,9 @@ def said_size(content: object) -> tuple[float, float] | None:
     """The size of the image that a file names."""
     if isinstance(content, list) and content:
         content = content[0]
-    for keys in (
-        ("canvas_width", "canvas_height"),
-        ("imageWidth", "imageHeight"),
-        ("image_width", "image_height"),
-        ("width", "height"),
-    ):
-        if not isinstance(content, dict) or "x" in content:  # of a box
-            return None
+    if not isinstance(content, dict) or "x" in content:  # of a box
+        return None
+    for keys in _SIZES:
         width, height = (content.get(key) for key in keys)
         if isinstance(width, int) and isinstance(height, int) and min(width, height) > 0:
             return float(width), float(height)

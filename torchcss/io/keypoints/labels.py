@@ -14,7 +14,7 @@ import numpy as np
 from torchcss.errors import KeypointError
 from torchcss.files import read_text, shortened
 from torchcss.io.keypoints.frames import plain_name
-from torchcss.io.keypoints.people import Key, People, Person, screened
+from torchcss.io.keypoints.people import Frames, People, Person, screened
 
 _BOX = 5
 _COUNTS = (17, 26, 133)
@@ -27,7 +27,7 @@ def read_labels(folder: Path, image_size_wh: tuple[int, int]) -> People:
         KeypointError: If a line is none; the message names it.
     """
     files = [file for file in sorted(folder.glob("*.txt")) if file.name != "classes.txt"]
-    frames: dict[Key, list[Person]] = {}
+    frames: Frames = {}
     for file in files:
         lines = read_text(file, KeypointError).splitlines() if file.stat().st_size else []
         frames[plain_name(file.name)] = [

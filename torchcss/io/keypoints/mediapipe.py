@@ -8,23 +8,41 @@ the file tells. z is unreliable, and not used.
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
+
 import numpy as np
 
-from torchcss.io.keypoints.people import People, Person, screened
-from torchcss.joint_names import ALIASES
+from torchcss.io.keypoints.people import Frames, People, Person, screened
+from torchcss.joint_names import ALIASES, names_in
 
 LAYOUT = "MediaPipe-33"
 NUM_LANDMARKS = len(ALIASES[LAYOUT])
 
-NAMES = (
-    "nose", "left_eye_inner", "left_eye", "left_eye_outer",
-    "right_eye_inner", "right_eye", "right_eye_outer", "left_ear", "right_ear",
-    "mouth_left", "mouth_right", "left_shoulder", "right_shoulder", "left_elbow", "right_elbow",
-    "left_wrist", "right_wrist", "left_pinky", "right_pinky", "left_index", "right_index",
-    "left_thumb", "right_thumb", "left_hip", "right_hip", "left_knee", "right_knee",
-    "left_ankle", "right_ankle", "left_heel", "right_heel", "left_foot_index", "right_foot_index",
-)  # fmt: skip
+NAMES = names_in(
+    "nose left_eye_inner left_eye left_eye_outer right_eye_inner right_eye right_eye_outer "
+    "left_ear right_ear mouth_left mouth_right left_shoulder right_shoulder left_elbow right_elbow "
+    "left_wrist right_wrist left_pinky right_pinky left_index right_index left_thumb right_thumb "
+    "left_hip right_hip left_knee right_knee left_ankle right_ankle left_heel right_heel "
+    "left_foot_index right_foot_index"
+)
 """MediaPipe's own names, in its order."""
+
+
+def landmark_order(names: Sequence[str]) -> list[int] | None:
+    """Where the joints stand in their order, if they are numbered, or MediaPipe's landmarks."""
+    plain = [re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_") for name in names]
+    if plain and all(map(str.isdigit, plain)):
+        return sorted(range(len(plain)), key=lambda index: int(plain[index]))
+    return [plain.index(name) for name in NAMES] if set(plain) == set(NAMES) else None
+
+
+def reordered(frames: Frames, order: list[int]) -> Frames:
+    """The people with their joints in that order."""
+    return {
+        key: [person._replace(joints=person.joints[order]) for person in people]
+        for key, people in frames.items()
+    }
 
 
 def read_landmark_array(name: str, array: np.ndarray) -> People:
@@ -39,9 +57,7 @@ def read_landmark_array(name: str, array: np.ndarray) -> People:
         report.append(
             "three numbers per landmark taken as x, y, z: confidence 1 where there is one"
         )
-    return People(
-        [[Person(person)] for person in found], None, report, LAYOUT, corner_fractions=True
-    )
+    return People([[Person(each)] for each in found], None, report, LAYOUT, corner_fractions=True)
 
 
 def is_landmark_array(array: np.ndarray) -> bool:

@@ -11,23 +11,22 @@ Missing joints are simply missing. Call `read_joints`.
 
 from __future__ import annotations
 
-import csv
 import math
-import os
 import re
 from pathlib import Path
 
 import torch
 
 from torchcss.errors import KeypointError
-from torchcss.files import load_json
+from torchcss.files import StrPath, load_json
 from torchcss.io.keypoints.read import Scale, read_keypoints
+from torchcss.io.keypoints.tables import Row, table_rows
 from torchcss.joint_names import JOINT_NAMES, canonical_joint_name
 from torchcss.types import Keypoints
 
 
 def read_joints(
-    path: str | os.PathLike[str],
+    path: StrPath,
     *,
     image_size_wh: tuple[int, int],
     layout: str | None = None,
@@ -49,7 +48,7 @@ def read_joints(
     """
     path = Path(path)
     if path.suffix.lower() == ".csv":
-        rows = _csv_rows(path)
+        rows = table_rows(path)
         if _are_joints(rows):
             if normalised not in (False, "pixels"):
                 raise KeypointError(
@@ -76,57 +75,44 @@ def _frame_of_single_image(content: object, otherwise: int) -> int:
     return int(digits[-1]) if digits else otherwise
 
 
-def _csv_rows(path: Path) -> list[list[str]]:
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            return [[cell.strip() for cell in row] for row in csv.reader(file) if any(row)]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise KeypointError(f"{path}: cannot be read as CSV: {error}") from error
-
-
-def _is_heading(row: list[str]) -> bool:
+def _is_heading(cells: list[str]) -> bool:
     """Whether a first row names the columns: it is of no joint, and holds words."""
-    if canonical_joint_name(row[0]) is not None:
-        return False
+    return canonical_joint_name(cells[0]) is None and _values(cells) is None
+
+
+def _values(cells: list[str]) -> list[float] | None:
+    """u, v and confidence of a row, as far as it has them; None: they are no numbers."""
     try:
-        [float(cell) for cell in row[1:4] if cell]
+        return [float(cell) for cell in cells[1:4] if cell]
     except ValueError:
-        return True
-    return False
+        return None
 
 
-def _are_joints(rows: list[list[str]]) -> bool:
+def _are_joints(rows: list[Row]) -> bool:
     """Whether these are rows `joint, u, v[, confidence]` and not another table with a heading."""
-    if len(rows) < 2 or not _is_heading(rows[0]):
+    heading = rows[0][1]
+    if len(rows) < 2 or not _is_heading(heading):
         return True
     # MediaPipe's landmarks are a row each too, with a depth or under their own word.
-    names = [cell.lower() for cell in rows[0]]
+    names = [cell.lower() for cell in heading]
     if "z" in names or "landmark" in names[0]:
         return False
-    return any(canonical_joint_name(row[0]) for row in rows[1:])
+    return any(canonical_joint_name(cells[0]) for _, cells in rows[1:])
 
 
-def _read_csv(path: Path, rows: list[list[str]]) -> Keypoints:
+def _read_csv(path: Path, rows: list[Row]) -> Keypoints:
     table: dict[str, list[float]] = {}
-    for number, row in enumerate(rows):
-        where = f"{path}: row {number + 1}"
-        name = canonical_joint_name(row[0]) if row else None
-        try:
-            values = [float(cell) for cell in row[1:4] if cell]
-        except ValueError:
-            if number == 0 and _is_heading(row):
-                continue
+    for number, cells in rows[_is_heading(rows[0][1]) :]:
+        where = f"{path}: row {number}"
+        name, values = canonical_joint_name(cells[0]), _values(cells)
+        if values is not None and name is None:
             raise KeypointError(
-                f"{where}: expected joint, u, v[, confidence], found {row}"
-            ) from None
-        if name is None:
-            raise KeypointError(
-                f"{where}: unknown joint {row[0]!r}; the known ones are {', '.join(JOINT_NAMES)}"
+                f"{where}: unknown joint {cells[0]!r}; the known ones are {', '.join(JOINT_NAMES)}"
             )
-        if not values:
+        if name is not None and values == []:
             continue  # a joint without a place is missing
-        if len(values) == 1 or not all(math.isfinite(value) for value in values):
-            raise KeypointError(f"{where}: expected joint, u, v[, confidence], found {row}")
+        if not name or not values or len(values) == 1 or not all(map(math.isfinite, values)):
+            raise KeypointError(f"{where}: expected joint, u, v[, confidence], found {cells}")
         if name in table:
             raise KeypointError(f"{where}: {name} is marked twice; leave one of the rows out")
         table[name] = [*values, 1.0][:3]

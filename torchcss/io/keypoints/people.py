@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -11,23 +10,20 @@ from jaxtyping import Float
 
 from torchcss.errors import KeypointError
 from torchcss.files import real_numbers, shortened
+from torchcss.joint_names import names_in
 
-FRAME_NAMES = (
-    "frame", "frame_number", "frame_index", "frame_idx", "frame_id", "frame_no", "frame_num",
-    "frameid", "image_id",
-)  # fmt: skip
+FRAME_NAMES = names_in(
+    "frame frame_number frame_index frame_idx frame_id frame_no frame_num frameid image_id"
+)
 """What files call the number of a frame."""
 
-CONFIDENCE_NAMES = (
-    "confidence", "conf", "c", "score", "keypoint_score", "likelihood", "p", "prob", "probability",
-    "visibility", "visible", "vis", "v", "presence",
-)  # fmt: skip
+CONFIDENCE_NAMES = names_in(
+    "confidence conf c score keypoint_score likelihood p prob probability visibility visible vis v "
+    "presence"
+)
 """What files call the confidence of a joint, the best first where there are several."""
 
-TRACK_NAMES = (
-    "track_id", "track", "idx", "id_", "person_id", "personID", "person", "tracking_id",
-    "individual", "id",
-)  # fmt: skip
+TRACK_NAMES = names_in("track_id track idx id_ person_id personID person tracking_id individual id")
 """What files call that by which a person is known again in another frame."""
 
 Key = int | float | str
@@ -40,10 +36,16 @@ class Person(NamedTuple):
     Attributes:
         joints: u, v and confidence of every joint.
         track: By what the file knows the person again in other frames; None: it does not.
+        names: Names of these joints, in files that may name everyone's otherwise.
     """
 
     joints: Float[np.ndarray, "j 3"]
     track: str | None = None
+    names: tuple[str, ...] | None = None
+
+
+Frames = dict[Key, list[Person]]
+"""The people of every frame that a file tells of."""
 
 
 class People(NamedTuple):
@@ -63,7 +65,7 @@ class People(NamedTuple):
             detectors have.
     """
 
-    frames: list[list[Person]] | dict[Key, list[Person]]
+    frames: list[list[Person]] | Frames
     names: tuple[str, ...] | None
     report: list[str]
     layout: str | None = None
@@ -74,23 +76,7 @@ class People(NamedTuple):
     relative_noise: float = 1.0
 
 
-class Marked(NamedTuple):
-    """A person of a file that may name the joints of everyone otherwise.
-
-    Attributes:
-        joints: u, v and confidence of every joint.
-        names: Their names, if there are any.
-        track: As in `Person`.
-    """
-
-    joints: Float[np.ndarray, "j 3"]
-    names: tuple[str, ...] | None
-    track: str | None = None
-
-
-def united(
-    where: object, frames: Mapping[Key, Sequence[Marked]]
-) -> tuple[dict[Key, list[Person]], tuple[str, ...] | None]:
+def united(where: object, frames: Frames) -> tuple[Frames, tuple[str, ...] | None]:
     """People whose joints are all in one order, and the names; joints that someone lacks are zero.
 
     Raises:
@@ -98,12 +84,10 @@ def united(
     """
     everyone = [person for people in frames.values() for person in people]
     if all(person.names is None for person in everyone):
-        return {
-            key: [Person(p.joints, p.track) for p in people] for key, people in frames.items()
-        }, None
+        return frames, None
     names = tuple(dict.fromkeys(name for person in everyone for name in person.names or ()))
     place = {name: index for index, name in enumerate(names)}
-    found: dict[Key, list[Person]] = {}
+    found: Frames = {key: [] for key in frames}
     for key, people in frames.items():
         for person in people:
             if person.names is None or len(set(person.names)) < len(person.joints):
@@ -113,8 +97,7 @@ def united(
                 )
             joints = np.zeros((len(names), 3))
             joints[[place[name] for name in person.names]] = person.joints
-            found.setdefault(key, []).append(Person(joints, person.track))
-        found.setdefault(key, [])
+            found[key].append(Person(joints, person.track))
     return found, names
 
 
@@ -165,11 +148,3 @@ def track_of(entry: Mapping[str, object], names: Sequence[str] = TRACK_NAMES) ->
             text = str(value)
             return None if text in ("-1", "") else text
     return None
-
-
-def frame_number(where: object, text: str) -> int:
-    """The number of a frame, alone or at the end of a picture's name."""
-    match = re.fullmatch(r"(?:.*[^0-9-])?([0-9]{1,9})(?:\.0*|\.[A-Za-z]+)?", text)
-    if match is None:
-        raise KeypointError(f"{where}: expected a frame number, found {shortened(text)}")
-    return int(match[1])

@@ -29,7 +29,6 @@ By default: `read_keypoints(path, image_size_wh=(w, h), num_frames=t)`.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
@@ -38,7 +37,7 @@ import numpy as np
 import torch
 
 from torchcss.errors import KeypointError
-from torchcss.files import load_array, load_arrays, shortened
+from torchcss.files import StrPath, load_array, load_arrays, shortened
 from torchcss.io.keypoints.arrays import read_arrays
 from torchcss.io.keypoints.findings import findings
 from torchcss.io.keypoints.frames import Film, in_order, wrong_count
@@ -61,12 +60,9 @@ OWN_NAMES = "own"
 
 # Which layout a number of unnamed joints means; the first is the default.
 _LAYOUTS_BY_COUNT: dict[int, tuple[str, ...]] = {}
-for _name in (
-    "COCO-17", "COCO-18", "BODY_18", "BODY_25", "BODY_25B", "MediaPipe-33", "SMPL-24", "H36M-17",
-    "Halpe-26", "Halpe-136", "COCO-133", "MPII-16", "H36M-16", "HumanEva-15",
-):  # fmt: skip
-    _LAYOUTS_BY_COUNT.setdefault(len(ALIASES[_name]), ())
-    _LAYOUTS_BY_COUNT[len(ALIASES[_name])] += (_name,)
+for _name, _joints in ALIASES.items():
+    if _joints is not JOINT_NAMES:
+        _LAYOUTS_BY_COUNT[len(_joints)] = (*_LAYOUTS_BY_COUNT.get(len(_joints), ()), _name)
 
 _NORMALISED_EXTENT = 2.0
 """No person is so few pixels large: coordinates that all lie within are fractions of the image."""
@@ -82,7 +78,7 @@ _INSIDE_SHARE = 0.1
 
 
 def read_keypoints(
-    path: str | os.PathLike[str],
+    path: StrPath,
     *,
     image_size_wh: tuple[int, int],
     num_frames: int | None = None,
@@ -124,7 +120,7 @@ def read_keypoints(
 
 
 def read_person(
-    path: str | os.PathLike[str],
+    path: StrPath,
     *,
     film: Film,
     whom: Whom,

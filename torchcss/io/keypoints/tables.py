@@ -27,16 +27,17 @@ import numpy as np
 
 from torchcss.errors import KeypointError
 from torchcss.files import read_text, shortened
-from torchcss.io.keypoints.mediapipe import LAYOUT, NAMES
+from torchcss.io.keypoints.mediapipe import LAYOUT, NUM_LANDMARKS, landmark_order, reordered
 from torchcss.io.keypoints.people import (
     CONFIDENCE_NAMES,
     FRAME_NAMES,
+    Frames,
     Key,
     People,
     Person,
-    frame_number,
     screened,
 )
+from torchcss.joint_names import names_in
 
 _PARTS = {
     **dict.fromkeys(("x", "u"), 0),
@@ -46,10 +47,11 @@ _PARTS = {
 }
 """What a column's name says that it is: 0, 1 coordinates, 2 confidence, 3 not used."""
 
-_JOINTS = ("landmark", "landmark_id", "landmark_name", "landmark_index", "joint", "joint_name",
-           "joint_id", "bodypart", "keypoint", "name", "id", "index")  # fmt: skip
-
-_TRACKS = ("track", "track_id", "track_name", "person", "person_id", "individual", "individuals")
+_JOINTS = names_in(
+    "landmark landmark_id landmark_name landmark_index joint joint_name joint_id bodypart keypoint "
+    "name id index"
+)
+_TRACKS = names_in("track track_id track_name person person_id individual individuals")
 _TIMES = {"timestamp_ms": 1e-3, "time_ms": 1e-3, "timestamp_s": 1.0, "time_s": 1.0, "time": 1.0,
           "timestamp": 1.0}  # fmt: skip
 """Columns of times, in seconds unless the name says otherwise."""
@@ -84,19 +86,7 @@ def read_table(path: Path) -> People:
     Raises:
         KeypointError: If it is none of those above; the message names the row.
     """
-    text = read_text(path, KeypointError)
-    comma = max(",;\t", key=text[:4096].count)
-    try:
-        lines = list(csv.reader(io.StringIO(text, newline=""), delimiter=comma))
-    except csv.Error as error:
-        raise KeypointError(f"{path}: cannot be read as CSV: {error}") from error
-    rows = [
-        (number, [cell.strip() for cell in row])
-        for number, row in enumerate(lines, start=1)
-        if any(row)
-    ]
-    if not rows:
-        raise KeypointError(f"{path}: the file is empty")
+    rows = table_rows(path)
     firsts = [row[0].lower() for _, row in rows[:4]]
     if "bodyparts" in firsts and "coords" in firsts:
         columns, body, report = _deeplabcut(path, rows)
@@ -107,20 +97,31 @@ def read_table(path: Path) -> People:
     columns = _headed(path, rows[0][1])
     report = [_confidence_line(rows[0][1], columns)]
     joints, frames = _read_rows(path, columns, rows[1:])
-    lower = [re.sub(r"[^a-z0-9]+", "_", name.lower()) for name in joints]
-    numbered = all(map(str.isdigit, lower))
-    if len(joints) == len(NAMES) and (set(lower) == set(NAMES) or numbered):
-        key = int if numbered else NAMES.index
-        order = sorted(range(len(lower)), key=lambda index: key(lower[index]))
-        frames = {
-            place: [each._replace(joints=each.joints[order]) for each in people]
-            for place, people in frames.items()
-        }
+    order = landmark_order(joints)
+    if order is not None and len(joints) == NUM_LANDMARKS:
         report.insert(0, "format: CSV of MediaPipe's landmarks")
-        return People(frames, None, report, LAYOUT, corner_fractions=True)
+        return People(reordered(frames, order), None, report, LAYOUT, corner_fractions=True)
     report.insert(0, "format: CSV, a heading per column")
     first = 0 if any(cell.lower() == "frame_idx" for cell in rows[0][1]) else None  # SLEAP's
-    return People(frames, None if numbered else tuple(joints), report, first=first)
+    return People(frames, None if order is not None else tuple(joints), report, first=first)
+
+
+def table_rows(path: Path) -> list[Row]:
+    """The rows of a CSV that hold anything, whatever separates their cells.
+
+    Raises:
+        KeypointError: If there are none, or it is none.
+    """
+    text = read_text(path, KeypointError)
+    comma = max(",;\t", key=text[:4096].count)
+    try:
+        lines = list(csv.reader(io.StringIO(text, newline=""), delimiter=comma))
+    except csv.Error as error:
+        raise KeypointError(f"{path}: cannot be read as CSV: {error}") from error
+    rows = [(n, [cell.strip() for cell in row]) for n, row in enumerate(lines, 1) if any(row)]
+    if not rows:
+        raise KeypointError(f"{path}: the file is empty")
+    return rows
 
 
 def _headed(path: Path, heading: Sequence[str]) -> _Columns:
@@ -200,9 +201,7 @@ def _deeplabcut(path: Path, rows: Sequence[Row]) -> tuple[_Columns, Sequence[Row
     return _Columns(parts, size, start - 1 if start else None), body, report
 
 
-def _read_rows(
-    path: Path, columns: _Columns, body: Sequence[Row]
-) -> tuple[list[str], dict[Key, list[Person]]]:
+def _read_rows(path: Path, columns: _Columns, body: Sequence[Row]) -> tuple[list[str], Frames]:
     """Names of the joints, and the people in every frame."""
     joints: dict[str, None] = {}
     found: dict[Key, dict[str, dict[str, list[float]]]] = {}
@@ -246,8 +245,12 @@ def _place(where: str, columns: _Columns, cells: Sequence[str], index: int) -> K
     cell = cells[columns.frame]
     if columns.unit is not None:
         return columns.unit * _number(where, cell)
-    # Of labelled frames the picture's name.
-    return frame_number(where, cell) if re.fullmatch(r"[0-9.-]*", cell) else cell
+    if not re.fullmatch(r"[0-9.-]*", cell):
+        return cell  # of labelled frames the picture's name
+    match = re.fullmatch(r"(?:.*\.)?([0-9]{1,9})(?:\.0*)?", cell)
+    if match is None:
+        raise KeypointError(f"{where}: expected a frame number, found {shortened(cell)}")
+    return int(match[1])
 
 
 def _number(where: str, cell: str) -> float:

@@ -25,7 +25,6 @@ for the joints that the catalogue names.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, Literal, NamedTuple
@@ -44,7 +43,7 @@ from torchcss.body.files.bvh import (
 from torchcss.body.files.bvh_parser import Segment, parse_bvh
 from torchcss.body.rotations import about
 from torchcss.errors import ConfigurationError, MotionCaptureError
-from torchcss.files import shortened
+from torchcss.files import StrPath, shortened
 from torchcss.io.motion.acclaim import parse_acclaim
 from torchcss.joint_names import LIMB_PLACES, skeleton_joint_names
 
@@ -85,9 +84,9 @@ class MotionCapture(NamedTuple):
 
 
 def read_motion_capture(
-    path: str | os.PathLike[str],
+    path: StrPath,
     *,
-    skeleton: str | os.PathLike[str] | None = None,
+    skeleton: StrPath | None = None,
     units: str | float | None = None,
     frame_rate: float | None = None,
     up: Literal["y", "z"] | None = None,
@@ -145,7 +144,7 @@ class _Parsed(NamedTuple):
     report: tuple[str, ...] = ()
 
 
-def _parse(path: Path, skeleton: str | os.PathLike[str] | None) -> _Parsed:
+def _parse(path: Path, skeleton: StrPath | None) -> _Parsed:
     """What either format says."""
     suffix = path.suffix.lower()
     if suffix == ".bvh":
