@@ -26,6 +26,7 @@ import struct
 import tomllib
 import zlib
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,7 +35,16 @@ import yaml
 
 from torchcss.body.files.xml import parse_xml
 from torchcss.errors import BodyError, CameraError, MissingExtraError
-from torchcss.files import load_arrays, load_json, one_line, read_bytes, read_text, shortened
+from torchcss.files import (
+    load_arrays,
+    load_json,
+    one_line,
+    read_bytes,
+    read_text,
+    real_numbers,
+    shortened,
+)
+from torchcss.joint_names import names_in
 
 INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
 
@@ -43,9 +53,9 @@ class Entry(NamedTuple):
     """One camera of a file, whatever the format; `None` for what the file does not have.
 
     Attributes:
-        K: Intrinsic matrix, pixel centres at integers.
+        K: Intrinsic matrix, its nine numbers, or fx, fy, cx, cy; pixel centres at integers.
         image_size_wh: Width and height.
-        distortion: In OpenCV's order.
+        distortion: In OpenCV's order; this and the next two in rows, columns or one list.
         rotation: World to camera, a matrix or axis times angle.
         translation: World to camera.
         units: Unit of the world and of pixels.
@@ -66,18 +76,22 @@ class Entry(NamedTuple):
 
 
 _WORDS = {
-    "K": ("K", "camera_matrix", "matrix", "intrinsic_matrix", "cameraMatrix", "mtx", "k",
-          "intrinsics", "camera_intrinsics", "IntrinsicMatrix"),
-    "distortion": ("distortion", "distortions", "distortion_coefficients", "distortion_coeffs",
-                   "dist_coeffs", "dist_coeff", "distCoeffs", "distCoef", "dist", "D", "d"),
-    "rotation": ("R", "rotation", "Rot", "rvec", "rotation_matrix"),
-    "translation": ("t", "translation", "T", "tvec"),
-    "size": ("image_size_wh", "size", "resolution", "image_size", "img_size", "image_shape_wh"),
-}  # fmt: skip
+    "K": names_in(
+        "K camera_matrix matrix intrinsic_matrix cameraMatrix mtx k intrinsics camera_intrinsics "
+        "IntrinsicMatrix"
+    ),
+    "distortion": names_in(
+        "distortion distortions distortion_coefficients distortion_coeffs dist_coeffs dist_coeff "
+        "distCoeffs distCoef dist D d"
+    ),
+    "rotation": names_in("R rotation Rot rvec rotation_matrix"),
+    "translation": names_in("t translation T tvec"),
+    "image_size_wh": names_in("image_size_wh size resolution image_size img_size image_shape_wh"),
+}
 """What a camera's numbers are called, the first that is there."""
 
 _SIZES = (("image_width", "image_height"), ("width", "height"), ("w", "h"), ("W", "H"))
-_FISHEYE = ("equidistant", "fisheye", "kannala_brandt", "omni", "ds", "eucm", "fov")
+_FISHEYE = names_in("equidistant fisheye kannala_brandt omni ds eucm fov")
 
 _MOST_MATLAB = 2**26
 """Bytes of the largest calibration of MATLAB's, unpacked; they hold the pictures' corners too."""
@@ -130,21 +144,16 @@ def _entry(values: Mapping[str, Any], units: Any = "metre") -> Entry:
         for key, words in _WORDS.items()
     }
     for pair in _SIZES:
-        size = [values.get(key) for key in pair]
-        if found["size"] is None and None not in size:
-            found["size"] = size
+        if found["image_size_wh"] is None:
+            found["image_size_wh"] = _size(*map(values.get, pair))
     model = str(values.get("distortion_model", values.get("camera_model", ""))).lower()
     fisheye = values.get("fisheye", False) or any(word in model.split("-") for word in _FISHEYE)
-    return Entry(
-        _intrinsic_matrix(found["K"]),
-        found["size"],
-        _flat(found["distortion"]),
-        found["rotation"] if _depth(found["rotation"], 3) else _flat(found["rotation"]),
-        _flat(found["translation"]),
-        units,
-        values.get("video"),
-        fisheye,
-    )
+    return Entry(**found, units=units, video=values.get("video"), fisheye=fisheye)
+
+
+def _size(width: Any, height: Any) -> list[Any] | None:
+    """The image size, where both of its numbers are there."""
+    return None if width is None or height is None else [width, height]
 
 
 def _plain(value: Any) -> Any:
@@ -155,34 +164,6 @@ def _plain(value: Any) -> Any:
         if isinstance(rows, int) and isinstance(columns, int) and rows * columns == len(data):
             return [data[i : i + columns] for i in range(0, len(data), columns)] if columns else []
     return value
-
-
-def _depth(value: Any, rows: int) -> bool:
-    """Whether a value is a list of so many lists of as many."""
-    return (
-        isinstance(value, list)
-        and len(value) == rows
-        and all(isinstance(row, list) and len(row) == rows for row in value)
-    )
-
-
-def _flat(value: Any) -> Any:
-    """Nested lists as one list, as OpenCV writes vectors in rows or columns."""
-    while isinstance(value, list) and any(isinstance(each, list) for each in value):
-        value = [item for each in value for item in (each if isinstance(each, list) else [each])]
-    if isinstance(value, list) and len(value) == 9:  # a rotation in a row
-        return [value[:3], value[3:6], value[6:]]
-    return value
-
-
-def _intrinsic_matrix(value: Any) -> Any:
-    """K of a matrix, of its nine numbers in a row, or of fx, fy, cx, cy."""
-    if not isinstance(value, list) or any(isinstance(each, list) for each in value):
-        return value
-    if len(value) == 4:
-        fx, fy, cx, cy = value
-        return [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
-    return _flat(value)
 
 
 def _has_camera(values: object) -> bool:
@@ -250,28 +231,20 @@ def _read_toml(path: Path) -> dict[str, Entry]:
 
 def _in_metres(entries: dict[str, Entry], is_anipose: bool) -> dict[str, Entry]:
     """Millimetres where the cameras would stand hundreds of metres away, else as they are."""
-    lengths = [
-        float(np.linalg.norm(entry.translation))
-        for entry in entries.values()
-        if isinstance(entry.translation, list)
-        and all(isinstance(each, (int, float)) for each in entry.translation)
-    ]
-    farthest = max(lengths, default=0.0)
+    places: dict[str, np.ndarray] = {}
+    for name, entry in entries.items():
+        with suppress(CameraError):  # said to whoever wants that camera
+            places[name] = real_numbers(entry.translation, name, CameraError).ravel()
+    farthest = max((float(np.linalg.norm(place)) for place in places.values()), default=0.0)
     if farthest >= 100:
         note = (
             f"its world is taken to be in millimetres: in metres a camera would stand "
             f"{farthest:.0f} m from the origin"
         )
-        return {
-            name: entry._replace(
-                translation=[0.001 * each for each in entry.translation], note=note
-            )
-            if isinstance(entry.translation, list)
-            and all(isinstance(each, (int, float)) for each in entry.translation)
-            else entry
-            for name, entry in entries.items()
-        }
-    if is_anipose and farthest > 12:
+        for name, place in places.items():
+            metres = (0.001 * place).tolist()
+            entries[name] = entries[name]._replace(translation=metres, note=note)
+    elif is_anipose and farthest > 12:
         return {name: entry._replace(units=None) for name, entry in entries.items()}
     return entries
 
@@ -317,10 +290,9 @@ def _read_yaml(path: Path) -> dict[str, Entry]:
         return _kalibr(path, chain)
     if _has_camera(content):
         return _alone(path, content)
-    if isinstance(content.get("cameras"), dict) and all(
-        map(_has_camera, content["cameras"].values())
-    ):
-        return {str(name): _entry(each) for name, each in content["cameras"].items()}
+    cameras = content.get("cameras")
+    if isinstance(cameras, dict) and all(map(_has_camera, cameras.values())):
+        return {str(name): _entry(each) for name, each in cameras.items()}
     raise CameraError(
         f"{path}: expected 'names', as EasyMocap writes them, 'camera_matrix' (OpenCV, ROS) or "
         f"'cam0' (Kalibr), found {shortened(list(content))}"
@@ -360,10 +332,9 @@ def _read_easymocap(path: Path) -> dict[str, Entry]:
         )
     cameras = {}
     for name in map(str, names):
-        size = [first.get(f"W_{name}"), first.get(f"H_{name}")]
         cameras[name] = Entry(
             first.get(f"K_{name}"),
-            None if None in size else size,
+            _size(first.get(f"W_{name}"), first.get(f"H_{name}")),
             first.get(f"dist_{name}", first.get(f"D_{name}")),
             second.get(f"Rot_{name}", second.get(f"R_{name}")),
             second.get(f"T_{name}"),
@@ -388,10 +359,8 @@ def _read_matlab(path: Path) -> dict[str, Entry]:
     values = {key: _listed(each) for key, each in content.items() if not key.startswith("__")}
     values = next((each for each in values.values() if isinstance(each, dict)), values)
     if {"fc", "cc"} <= values.keys():  # Bouguet's toolbox, whose pixels count from 0
-        K = [*values["fc"], *values["cc"]]
-        size = [values.get("nx"), values.get("ny")]
-        entry = _entry({"K": K, "D": values.get("kc")})
-        return {path.stem: entry._replace(image_size_wh=None if None in size else size)}
+        K, size = [*values["fc"], *values["cc"]], _size(values.get("nx"), values.get("ny"))
+        return {path.stem: Entry(K, size, values.get("kc"), None, None)}
     if not _has_camera(values):
         raise CameraError(
             f"{path}: expected toStruct(cameraParams) or Bouguet's fc and cc, found "

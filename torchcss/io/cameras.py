@@ -107,39 +107,39 @@ def load_camera(
 def _make_camera(entry: Entry, name: str, path: Path) -> Camera:
     """The camera of an entry, in the file's world, after its numbers are checked."""
     where = f"{path}: camera {name!r}"
-    given = {
-        "K": entry.K,
-        "image size": entry.image_size_wh,
-        "distortion": entry.distortion,
-        "rotation": entry.rotation,
-        "translation": entry.translation,
-    }
     if entry.K is None:
         raise CameraError(f"{where}: K (matrix) is missing")
     if entry.image_size_wh is None:
         raise CameraError(
             f"{where}: the file does not say the image size; give the video, or image_size_wh"
         )
-    intrinsics, size, distortion, rotation, translation = (
+    K, size, distortion, rotation, translation = (
         None if value is None else real_numbers(value, f"{where}: {key}", CameraError)
-        for key, value in given.items()
+        for key, value in zip(
+            ("K", "image size", "distortion", "rotation", "translation"), entry, strict=False
+        )
     )
-    assert intrinsics is not None
+    assert K is not None
     assert size is not None
     if size.shape != (2,) or not (np.isfinite(size) & (size == np.round(size))).all():
         raise CameraError(
             f"{where}: image size: expected whole numbers [width, height], "
             f"found {shortened(entry.image_size_wh)}"
         )
-    if rotation is not None and rotation.shape == (3,):
-        rotation = rotation_matrix(rotation, where)
+    if K.shape == (4,):
+        K = np.array([[K[0], 0.0, K[2]], [0.0, K[1], K[3]], [0.0, 0.0, 1.0]])
+    if rotation is not None and rotation.shape != (3, 3):
+        # OpenCV writes vectors in rows or columns, and some write matrices in a row.
+        rotation = rotation.ravel()
+        is_matrix = rotation.size == 9
+        rotation = rotation.reshape(3, 3) if is_matrix else rotation_matrix(rotation, where)
     try:
         return Camera(
-            intrinsics,
+            K.reshape(3, 3) if K.shape == (9,) else K,
             (int(size[0]), int(size[1])),
-            distortion=None if distortion is None else _five(distortion, where),
+            distortion=None if distortion is None else _five(distortion.ravel(), where),
             R_camera_world=rotation,
-            t_camera_world=translation,
+            t_camera_world=None if translation is None else translation.ravel(),
             name=name,
         )
     except CameraError as error:
@@ -152,11 +152,11 @@ def _five(distortion: np.ndarray, where: str) -> np.ndarray:
     Raises:
         CameraError: If they are not.
     """
-    if distortion.ndim == 1 and len(distortion) < 4:  # k1, k2 of simpler models
+    if len(distortion) < 4:  # k1, k2 of simpler models
         if len(distortion) == 3:
             raise CameraError(f"{where}: distortion: expected k1 k2 p1 p2 [k3], found 3 numbers")
         return np.concatenate([distortion, np.zeros(4 - len(distortion))])
-    if distortion.ndim == 1 and (distortion[5:] != 0).any():
+    if distortion[5:].any():
         raise CameraError(
             f"{where}: distortion of {len(distortion)} coefficients (OpenCV's rational model) is "
             "not supported; calibrate with five, or undistort the video first"
