@@ -208,7 +208,7 @@ def read_lines(path: Path, error_class: type[TorchcssError]) -> list[Line]:
     return lines
 
 
-def one_line(error: BaseException) -> str:
+def one_line(error: BaseException | str) -> str:
     """What an exception says, in one short line."""
     return " ".join(str(error).split())[:120] or type(error).__name__
 

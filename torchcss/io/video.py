@@ -28,8 +28,9 @@ from jaxtyping import UInt8
 from PIL import ExifTags, Image, ImageOps
 
 from torchcss.errors import ConfigurationError, ShapeError, VideoError
-from torchcss.files import StrPath, output_error, temporary_name
+from torchcss.files import StrPath, one_line, output_error, temporary_name
 from torchcss.io.high_dynamic_range import table
+from torchcss.joint_names import names_in
 from torchcss.types import Frame
 
 if TYPE_CHECKING:  # PyAV takes long to import: only where a video is read or written
@@ -37,11 +38,11 @@ if TYPE_CHECKING:  # PyAV takes long to import: only where a video is read or wr
     from av.container import InputContainer
     from av.video.stream import VideoStream
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
+IMAGE_SUFFIXES = names_in(".jpg .jpeg .png .bmp .tif .tiff .webp .pgm .ppm")
 """What counts as a frame in a folder of images."""
 
 # Demuxers that make pictures out of text or of anything at all: no video comes in them.
-_NOT_VIDEOS = frozenset({"tty", "ansi", "bin", "xbin", "adf", "idf", "rawvideo", "subviewer"})
+_NOT_VIDEOS = {*names_in("tty ansi bin xbin adf idf rawvideo subviewer")}
 
 _SECONDS_BETWEEN_KEY_FRAMES = 1
 
@@ -115,7 +116,6 @@ class VideoReader:
             raise VideoError(
                 f"{self.path}: frames per second must be positive, got {image_frame_rate}"
             )
-        self._iterators: list[Generator[Frame]] = []
         self._images = self._find_images()
         self.info = self._probe_container() if self._images is None else self._probe_images()
         if self.info.num_frames is not None and start >= self.info.num_frames:
@@ -154,20 +154,7 @@ class VideoReader:
         return count
 
     def __iter__(self) -> Iterator[Frame]:
-        frames = self._read_container() if self._images is None else self._read_images()
-        self._iterators.append(frames)
-        return frames
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """End every iteration that is under way and close its file."""
-        while self._iterators:
-            self._iterators.pop().close()
+        return self._read_container() if self._images is None else self._read_images()
 
     def _beyond_the_end(self, num_frames: int) -> VideoError:
         return VideoError(
@@ -184,9 +171,9 @@ class VideoReader:
         # Only this file: playlists that name other files or addresses are refused.
         return av.open(f"file:{self.path}", container_options={"protocol_whitelist": "file"})
 
-    def _not_a_video(self, reason: object) -> VideoError:
+    def _not_a_video(self, reason: str) -> VideoError:
         return VideoError(
-            f"{self.path}: not a video that can be read ({_reason(reason)}); expected a complete "
+            f"{self.path}: not a video that can be read ({reason}); expected a complete "
             "video file or a folder of images"
         )
 
@@ -200,16 +187,11 @@ class VideoReader:
                 stream = container.streams.video[0]
                 rate = stream.average_rate or stream.guessed_rate or stream.base_rate
                 num_frames = stream.frames or None
-                if (
-                    num_frames
-                    and rate
-                    and stream.duration
-                    and stream.time_base
-                    and "mp4" in container.format.name
-                ):
+                duration = (stream.duration or 0) * (stream.time_base or 0) * (rate or 0)
+                if num_frames and duration and "mp4" in container.format.name:
                     # An edit list may show a part of the frames that are stored.
-                    shown = round(stream.duration * stream.time_base * rate)
-                    num_frames = num_frames if abs(shown - num_frames) <= 1 else self.count_frames()
+                    is_whole = abs(round(duration) - num_frames) <= 1
+                    num_frames = num_frames if is_whole else self.count_frames()
                 first = next(iter(_decode(container)), None)
                 if first is None:
                     raise self._not_a_video("its first frame cannot be decoded")
@@ -217,14 +199,14 @@ class VideoReader:
         except VideoError:
             raise
         except (*_av_errors(), ValueError, _Damage) as error:
-            raise self._not_a_video(error) from error
+            raise self._not_a_video(_reason(error)) from error
         return VideoInfo(rate or Fraction(25), width, height, num_frames)
 
     def _read_container(self) -> Generator[Frame]:
-        num_read = 0
+        num_read, promised = 0, self.info.num_frames
         origin: float | None = None
         time: float | None = None
-        damage: str | None = None
+        damage = ""
         try:
             with self.opened() as container:
                 for picture in _decode(container):
@@ -244,23 +226,16 @@ class VideoReader:
                             "all frames must have one size"
                         )
                     yield Frame(index, time, image)
-                container_name = container.format.name
+                # An MP4 may hide frames by its edit list: there a smaller count is no damage.
+                if num_read < (promised or 0) and "mp4" not in container.format.name:
+                    damage = "the file ends early"
         except VideoError:
             raise
         except (*_av_errors(), ValueError, _Damage) as error:
-            damage, container_name = _reason(error), ""
+            damage = _reason(error)
         if self._stop is not None and num_read >= self._stop:
             return
-        promised = self.info.num_frames
-        # An MP4 may hide frames by its edit list, so there a smaller count alone is no damage.
-        if (
-            damage is None
-            and promised is not None
-            and num_read < promised
-            and "mp4" not in container_name
-        ):
-            damage = "the file ends early"
-        if damage is not None:
+        if damage:
             of = "" if promised is None else f" of {promised}"
             raise VideoError(
                 f"{self.path}: {num_read}{of} frames could be read ({damage}); "
@@ -377,10 +352,10 @@ class VideoWriter:
                 f"image: expected uint8 [height, width, 3], got {image.dtype} {list(image.shape)}"
             )
         height, width = image.shape[:2]
-        if self._size_hw not in (None, (height, width)):
+        size = self._size_hw or (height, width)
+        if size != (height, width):
             raise ShapeError(
-                f"image: expected the first frame's size {list(self._size_hw or ())}, "
-                f"got {[height, width]}"
+                f"image: expected the first frame's size {list(size)}, got {[height, width]}"
             )
         image = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
         from av import VideoFrame
@@ -504,8 +479,7 @@ def read_frame(path: StrPath, index: int = 0) -> UInt8[np.ndarray, "h w 3"]:
     Raises:
         VideoError: If it cannot be read, or the video ends before it.
     """
-    with VideoReader(path, start=index, stop=index + 1) as frames:
-        return next(iter(frames)).image
+    return next(iter(VideoReader(path, start=index, stop=index + 1))).image
 
 
 def focal_length_35mm(path: StrPath) -> float | None:
@@ -597,10 +571,9 @@ def _upright(picture: VideoFrame, stream: VideoStream) -> UInt8[np.ndarray, "h w
     return np.ascontiguousarray(np.rot90(image, quarter_turns)) if quarter_turns else image
 
 
-def _reason(error: object) -> str:
+def _reason(error: Exception) -> str:
     """One short line of what a library said."""
-    said = getattr(error, "strerror", None) or error
-    return " ".join(str(said).split())[:120] or type(error).__name__
+    return one_line(getattr(error, "strerror", None) or error)
 
 
 def _as_os_error(error: Exception) -> OSError:
