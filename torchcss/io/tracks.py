@@ -37,7 +37,6 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, is_dataclass
 from enum import Enum
-from fractions import Fraction
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -56,36 +55,16 @@ from torchcss.files import (
     load_arrays,
     load_json,
     one_line,
-    prepare_output_folder,
     save_arrays,
     write_text,
 )
+from torchcss.files import prepare_output_folder as prepare_output_folder
 from torchcss.io.track_body import body_from_plain, body_to_plain
 from torchcss.io.view_files import RecordedCamera, camera_from_plain, camera_to_plain
-
-__all__ = [
-    "SCHEMA_VERSION",
-    "SUMMARY_NAME",
-    "TRACK_NAME",
-    "FrameModes",
-    "Track",
-    "TrackWriter",
-    "load_track",
-    "prepare_output_folder",
-    "read_summary",
-    "save_track",
-    "write_summary",
-]
 
 SCHEMA_VERSION = 2
 TRACK_NAME = "track.npz"
 SUMMARY_NAME = "summary.json"
-
-_PER_MODE: dict[str, tuple[str | int, ...]] = {
-    "state": ("n",), "covariance": ("n", "n"), "log_weight": (), "cost": (), "parent": (),
-    "joints_world": ("j", 3),
-}  # fmt: skip
-"""What a frame has of each mode, and of which shape."""
 
 _ABSENT = {"log_weight": -np.inf, "cost": np.inf, "parent": -1}
 """What stands where there is no mode, if not zero."""
@@ -118,6 +97,15 @@ class FrameModes(NamedTuple):
     parent: Tensor
     joints_world: Tensor
     base_transform: Tensor = torch.eye(4, dtype=torch.float64)
+
+
+_PER_MODE = FrameModes._fields[2:-1]
+"""What a frame has of each mode."""
+
+
+def _shapes(n: int, j: int) -> dict[str, tuple[int, ...]]:
+    """Its shapes, for so many parameters and joints."""
+    return dict(zip(_PER_MODE, ((n,), (n, n), (), (), (), (j, 3)), strict=True))
 
 
 class Track(NamedTuple):
@@ -196,8 +184,11 @@ class Track(NamedTuple):
 
     def first(self, num_frames: int) -> Track:
         """The same track up to a frame, as when no more had been tracked."""
-        n, j = len(self.state_names), len(self.joint_names)
-        return self._replace(**_stacked(self.rows()[:num_frames], n, j))
+        return self.of(self.rows()[:num_frames])
+
+    def of(self, rows: Sequence[FrameModes]) -> Track:
+        """The same track with other frames."""
+        return self._replace(**_stacked(rows, len(self.state_names), len(self.joint_names)))
 
     def modes(self, row: int) -> FrameModes:
         """The modes of a frame, counted in the track."""
@@ -217,16 +208,14 @@ class Track(NamedTuple):
 def _stacked(rows: Sequence[FrameModes], n: int, j: int) -> dict[str, Any]:
     """The arrays of a track from its frames, filled up to the largest number of modes."""
     t, k = len(rows), max((len(np.asarray(row.cost)) for row in rows), default=0)
-    sizes: dict[str | int, int] = {"n": n, "j": j, 3: 3}
     arrays: dict[str, Any] = {
         "frames": np.array([row.frame for row in rows], dtype=np.int64),
         "times": np.array([row.time_s for row in rows], dtype=np.float64),
         "base_transform": np.array([row.base_transform.numpy() for row in rows]).reshape(-1, 4, 4),
     }
-    for name, shape in _PER_MODE.items():
+    for name, shape in _shapes(n, j).items():
         kind = np.int64 if name == "parent" else np.float64
-        full = (t, k, *(sizes[size] for size in shape))
-        arrays[name] = np.full(full, _ABSENT.get(name, 0), dtype=kind)
+        arrays[name] = np.full((t, k, *shape), _ABSENT.get(name, 0), dtype=kind)
         for index, row in enumerate(rows):
             values = np.asarray(getattr(row, name))
             arrays[name][index, : len(values)] = values
@@ -264,12 +253,9 @@ class TrackWriter:
         """
         frame, weights = int(modes.frame), _array("log_weight", modes.log_weight, (None,))
         (k,) = weights.shape
-        sizes: dict[str | int, int] = {
-            "n": len(self._begun.state_names), "j": len(self._begun.joint_names), 3: 3,
-        }  # fmt: skip
+        shapes = _shapes(len(self._begun.state_names), len(self._begun.joint_names))
         per_mode = {
-            name: _array(name, getattr(modes, name), (k, *(sizes[size] for size in shape)))
-            for name, shape in _PER_MODE.items()
+            name: _array(name, getattr(modes, name), (k, *shape)) for name, shape in shapes.items()
         }
         cost, parents = per_mode["cost"], per_mode["parent"].astype(np.int64)
         base = _array("base_transform", modes.base_transform, (4, 4))
@@ -305,9 +291,7 @@ class TrackWriter:
 
     def track(self) -> Track:
         """Return all frames so far."""
-        begun = self._begun
-        arrays = _stacked(self._rows, len(begun.state_names), len(begun.joint_names))
-        return begun._replace(**arrays)
+        return self._begun.of(self._rows)
 
     def save(self) -> None:
         """Write all frames so far; the file is replaced in one step, or stays as it was.
@@ -353,9 +337,7 @@ def load_track(path: StrPath) -> Track:
     Raises:
         TrackFileError: If it is missing, damaged, no track, or of another schema version.
     """
-    path = Path(path)
-    if _is_folder(path):
-        path = path / TRACK_NAME
+    path = _in_folder(path, TRACK_NAME)
     arrays = load_arrays(path, TrackFileError)
     version = arrays.get("schema_version")
     if version is None or version.shape != () or version.dtype.kind not in "iu":
@@ -373,26 +355,23 @@ def load_track(path: StrPath) -> Track:
 
 def _checked_arrays(arrays: Mapping[str, np.ndarray], path: Path) -> dict[str, Any]:
     """The numbers of a track, of the shapes and types that they must have."""
-    obligatory = [name for name in Track._fields[: -len(_DESCRIBED)] if name not in _OPTIONAL]
-    if missing := [name for name in obligatory if name not in arrays]:
+    optional = {"base_transform", *Track._field_defaults}
+    if missing := [name for name in Track._fields if name not in {*arrays, *optional}]:
         raise TrackFileError(f"{path}: not a complete track: {', '.join(missing)} missing")
     t, k = arrays["log_weight"].shape if arrays["log_weight"].ndim == 2 else (-1, -1)
     n, j = arrays["state_names"].size, arrays["joint_names"].size
-    sizes: dict[str | int, int] = {"n": n, "j": j, 3: 3}
     shapes: dict[str, tuple[int, ...]] = {
         "frames": (t,), "times": (t,), "state_names": (n,), "joint_names": (j,),
         "base_transform": (t, 4, 4), _POWER_KEY: (),
-        **{name: (t, k, *map(sizes.__getitem__, shape)) for name, shape in _PER_MODE.items()},
+        **{name: (t, k, *shape) for name, shape in _shapes(n, j).items()},
     }  # fmt: skip
     # A track of somebody else's may be in the world frame, and of the cost as it is.
-    absent = {
-        "base_transform": np.tile(np.eye(4), (max(t, 0), 1, 1)),
-        _POWER_KEY: np.ones(()),
-    }
+    standing = np.tile(np.eye(4), (max(t, 0), 1, 1))
+    arrays = {"base_transform": standing, _POWER_KEY: np.ones(()), **arrays}
     kinds = {"frames": "iu", "parent": "iu", "state_names": "U", "joint_names": "U"}
     values: dict[str, Any] = {}
     for name, shape in shapes.items():
-        array = arrays.get(name, absent.get(name, np.zeros(0)))
+        array = arrays[name]
         if array.shape != shape or array.dtype.kind not in kinds.get(name, "f"):
             raise TrackFileError(
                 f"{path}: {name}: expected shape {list(shape)}, "
@@ -415,7 +394,6 @@ _DAMAGE = (TorchcssError, ArithmeticError, AttributeError, LookupError, RuntimeE
 """What comes of building a body or a camera from any JSON."""
 
 _DESCRIBED = ("body", "cameras", "settings")
-_OPTIONAL = ("base_transform", "likelihood_power")
 
 
 def _described(arrays: Mapping[str, np.ndarray], path: Path) -> dict[str, Any]:
@@ -447,9 +425,7 @@ def write_summary(path: StrPath, summary: Mapping[str, Any]) -> None:
     Raises:
         OutputError: If it cannot be written.
     """
-    path = Path(path)
-    if _is_folder(path):
-        path = path / SUMMARY_NAME
+    path = _in_folder(path, SUMMARY_NAME)
     text = json.dumps(_plain(summary), indent=2, sort_keys=True, allow_nan=False)
     write_text(path, text + "\n")
 
@@ -460,20 +436,20 @@ def read_summary(path: StrPath) -> dict[str, Any]:
     Raises:
         TrackFileError: If it is missing or not an object in JSON.
     """
-    path = Path(path)
-    if _is_folder(path):
-        path = path / SUMMARY_NAME
+    path = _in_folder(path, SUMMARY_NAME)
     summary = load_json(path, TrackFileError)
     if not isinstance(summary, dict):
         raise TrackFileError(f"{path}: not a summary; expected a JSON object")
     return summary
 
 
-def _is_folder(path: Path) -> bool:
+def _in_folder(path: StrPath, name: str) -> Path:
+    """The file of that name if the path is a folder, else the path."""
+    path = Path(path)
     try:
-        return path.is_dir()
+        return path / name if path.is_dir() else path
     except (OSError, ValueError):  # a name that cannot be one; opening it tells why
-        return False
+        return path
 
 
 def _array(name: str, value: Tensor | ArrayLike, shape: tuple[int | None, ...]) -> np.ndarray:
@@ -498,20 +474,20 @@ def _plain(value: Any) -> Any:
         value = value.detach().cpu().numpy()
     if isinstance(value, (np.ndarray, np.generic)):
         value = value.tolist()
+    if isinstance(value, Enum):
+        value = value.value
+    if is_dataclass(value) and not isinstance(value, type):
+        value = asdict(value)
+    if isinstance(value, tuple) and hasattr(value, "_asdict"):
+        value = value._asdict()  # pyright: ignore[reportAttributeAccessIssue]
     if value is None or isinstance(value, (bool, str)):
         return value
-    if isinstance(value, Enum):
-        return _plain(value.value)
     if isinstance(value, Integral):
         return int(value)
-    if isinstance(value, (Real, Fraction)):
+    if isinstance(value, Real):
         return float(value) if math.isfinite(value) else None
     if isinstance(value, os.PathLike):
         return os.fspath(value)
-    if is_dataclass(value) and not isinstance(value, type):
-        return _plain(asdict(value))
-    if isinstance(value, tuple) and hasattr(value, "_asdict"):
-        return _plain(value._asdict())  # pyright: ignore[reportAttributeAccessIssue]
     if isinstance(value, Mapping):
         return {str(key): _plain(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple, set, frozenset)):
