@@ -31,16 +31,17 @@ class _Acclaim(NamedTuple):
     metres_per_unit: float | None
 
 
-def _sections(lines: Sequence[Line]) -> list[tuple[Line, list[Line]]]:
+def _sections(lines: Sequence[Line]) -> dict[str, tuple[Line, list[Line]]]:
     """The parts of a file that start with `:keyword`, without comments."""
-    found: list[tuple[Line, list[Line]]] = []
+    found: dict[str, tuple[Line, list[Line]]] = {}
+    part: list[Line] = []
     for line in lines:
-        if line.words[0].startswith("#"):
-            continue
-        if line.words[0].startswith(":"):
-            found.append((line, []))
-        elif found:
-            found[-1][1].append(line)
+        first = line.words[0].lower()
+        if first.startswith(":"):
+            part = []
+            found[first] = line, part
+        elif not first.startswith("#"):
+            part.append(line)
     return found
 
 
@@ -62,7 +63,7 @@ def parse_acclaim(
 
 
 def _parse_asf(path: Path, lines: list[Line]) -> _Acclaim:
-    sections = {head.words[0].lower(): (head, body) for head, body in _sections(lines)}
+    sections = _sections(lines)
     for name in (":root", ":bonedata", ":hierarchy"):
         if name not in sections:
             raise bad(path, lines[-1].number, f"a section {name}", ", ".join(sections) or "none")
@@ -70,47 +71,50 @@ def _parse_asf(path: Path, lines: list[Line]) -> _Acclaim:
     bones = _bones(path, sections[":bonedata"][1], radians)
     root = _entries(sections[":root"][1])
     parents = _hierarchy(path, sections[":hierarchy"], set(bones))
-
-    is_angle: list[bool] = []
-    columns: dict[str, list[int]] = {}
-
-    def turns_of(name: str, line: int, freedom: Sequence[str]) -> tuple[Turn, ...]:
-        first = len(is_angle)
-        turns = []
-        for word in freedom:
-            kind, axis = word[:1].lower(), axis_of(word[1:] or "?")
-            if len(word) != 2 or kind not in "rt" or axis < 0 or (kind == "t" and name != "root"):
-                raise bad(path, line, "degrees of freedom rx, ry, rz", word)
-            turns.append(Turn(first + len(turns), axis, kind == "r"))
-        if len({turn[1:] for turn in turns}) < len(turns):
-            raise bad(path, line, "every degree of freedom once", " ".join(freedom))
-        is_angle.extend(turn.is_rotation for turn in turns)
-        if turns:
-            columns[name] = [turn.column for turn in turns]
-        return tuple(reversed(turns))  # about fixed axes, the last factor acts first
-
     if "order" not in root:
         raise bad(path, sections[":root"][0].number, "an order in :root", "none")
 
     def vector(key: str) -> tuple[float, float, float]:
-        if key not in root:
-            return 0.0, 0.0, 0.0
-        words = root[key].words[1:4]
-        values = numbers(path, root[key].number, words, "three numbers")
-        if len(values) != 3:
-            raise bad(path, root[key].number, "three numbers", " ".join(words))
-        return values[0], values[1], values[2]
+        return _vector(path, root[key], "three numbers") if key in root else (0.0, 0.0, 0.0)
 
     order, axes = root["order"], _turned(vector("orientation"), "XYZ", radians)
-    turns = turns_of("root", order.number, order.words[1:])
-    segments = [Segment("root", -1, vector("position"), axes, turns, False)]
-    index = {"root": 0}
-    for name, parent in parents.items():
+    bones["root"] = _Bone(order.number, vector("position"), axes, tuple(order.words[1:]))
+    index = {name: number for number, name in enumerate(("root", *parents))}
+    is_angle: list[bool] = []
+    columns: dict[str, list[int]] = {}
+    segments: list[Segment] = []
+    for name in index:
         bone = bones[name]
-        turns = turns_of(name, bone.line, bone.freedom)
-        segments.append(Segment(name, index[parent], bone.offset, bone.axes, turns, True))
-        index[name] = len(segments) - 1
+        turns = _turns(path, bone, len(is_angle), may_travel=name == "root")
+        is_angle += [turn.is_rotation for turn in turns]
+        if turns:
+            columns[name] = [turn.column for turn in turns]
+        above = index.get(parents.get(name, ""), -1)
+        # About fixed axes, the last factor acts first.
+        segments.append(Segment(name, above, bone.offset, bone.axes, turns[::-1], name != "root"))
     return _Acclaim(segments, columns, is_angle, radians, metres)
+
+
+def _turns(path: Path, bone: _Bone, first: int, *, may_travel: bool) -> tuple[Turn, ...]:
+    """What moves a bone, by columns from the first one on."""
+    turns = []
+    for column, word in enumerate(bone.freedom, first):
+        kind, axis = word[:1].lower(), axis_of(word[1:] or "?")
+        if len(word) != 2 or axis < 0 or kind not in ("rt" if may_travel else "r"):
+            raise bad(path, bone.line, "degrees of freedom rx, ry, rz", word)
+        turns.append(Turn(column, axis, kind == "r"))
+    if len({turn[1:] for turn in turns}) < len(turns):
+        raise bad(path, bone.line, "every degree of freedom once", " ".join(bone.freedom))
+    return tuple(turns)
+
+
+def _vector(path: Path, line: Line, expected: str) -> tuple[float, float, float]:
+    """The three numbers of a line."""
+    words = line.words[1:4]
+    values = numbers(path, line.number, words, expected)
+    if len(values) != 3:
+        raise bad(path, line.number, expected, " ".join(words))
+    return values[0], values[1], values[2]
 
 
 def _units(path: Path, lines: Sequence[Line]) -> tuple[bool, float | None]:
@@ -165,19 +169,17 @@ def _bone(path: Path, block: Sequence[Line], radians: bool) -> tuple[str, _Bone]
         if key not in entries or len(entries[key].words) < 1 + size:
             raise bad(path, first, f"{key} of a bone", ", ".join(entries))
 
-    def values_of(key: str, size: int) -> list[float]:
-        line = entries[key]
-        return numbers(path, line.number, line.words[1 : 1 + size], f"{size} numbers")
-
-    direction, axis = values_of("direction", 3), values_of("axis", 3)
-    (length,) = values_of("length", 1)
+    direction = _vector(path, entries["direction"], "3 numbers")
+    axis = _vector(path, entries["axis"], "3 numbers")
+    line = entries["length"]
+    (length,) = numbers(path, line.number, line.words[1:2], "1 numbers")
     order = (entries["axis"].words[4:5] or ["XYZ"])[0].upper()
     if sorted(order) != ["X", "Y", "Z"]:
         raise bad(path, entries["axis"].number, "an order of X, Y and Z", order)
     x, y, z = (length * value for value in direction)
-    freedom = tuple(entries["dof"].words[1:]) if "dof" in entries else ()
+    freedom = entries.get("dof", Line(first, ["dof"]))
     return entries["name"].words[1], _Bone(
-        entries.get("dof", block[0]).number, (x, y, z), _turned(axis, order, radians), freedom
+        freedom.number, (x, y, z), _turned(axis, order, radians), tuple(freedom.words[1:])
     )
 
 
@@ -207,7 +209,7 @@ def _hierarchy(path: Path, section: tuple[Line, list[Line]], bones: set[str]) ->
 
 def _parse_amc(path: Path, lines: list[Line], skeleton: _Acclaim) -> Float[np.ndarray, "t c"]:
     radians = skeleton.radians
-    frames: list[Line] = []
+    frames: list[str] = []
     values: list[list[float]] = []
     filled: set[str] = set()
     for line in lines:
@@ -218,12 +220,14 @@ def _parse_amc(path: Path, lines: list[Line], skeleton: _Acclaim) -> Float[np.nd
             radians = {":radians": True, ":degrees": False}.get(first.lower(), radians)
             continue
         if len(line.words) == 1 and first.isdigit():
-            _check_frame(path, line.number, skeleton, filled if frames else None)
-            if frames and count(path, line.number, first, "a frame number") != (
-                count(path, line.number, frames[-1].words[0], "a frame number") + 1
-            ):
-                raise bad(path, line.number, f"the frame after {frames[-1].words[0]}", first)
-            frames.append(line)
+            if frames:
+                _check_frame(path, line.number, skeleton, filled)
+                number, before = (
+                    count(path, line.number, word, "a frame number") for word in (first, frames[-1])
+                )
+                if number != before + 1:
+                    raise bad(path, line.number, f"the frame after {frames[-1]}", first)
+            frames.append(first)
             values.append([0.0] * len(skeleton.is_angle))
             filled = set()
             continue
@@ -249,7 +253,7 @@ def _parse_amc(path: Path, lines: list[Line], skeleton: _Acclaim) -> Float[np.nd
     return np.where(np.array(skeleton.is_angle, dtype=bool), np.radians(table), table)
 
 
-def _check_frame(path: Path, line: int, skeleton: _Acclaim, filled: set[str] | None) -> None:
+def _check_frame(path: Path, line: int, skeleton: _Acclaim, filled: set[str]) -> None:
     """A frame is over: it must have told of every bone."""
-    if filled is not None and (missing := sorted(set(skeleton.columns) - filled)):
+    if missing := sorted(set(skeleton.columns) - filled):
         raise bad(path, line, "all bones in the frame before", f"none for {', '.join(missing)}")

@@ -132,8 +132,8 @@ def read_motion_capture(
         raise MotionCaptureError(
             f"{path}: frame {frame + 1}: the positions are beyond all bounds; the file is damaged"
         )
-    names, parents = ([each.name for each in segments], [each.parent for each in segments])
-    return MotionCapture(tuple(names), tuple(parents), rest, joints, rate, tuple(report))
+    names, parents = zip(*((each.name, each.parent) for each in segments), strict=True)
+    return MotionCapture(names, parents, rest, joints, rate, tuple(report))
 
 
 class _Parsed(NamedTuple):
