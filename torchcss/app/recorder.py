@@ -148,7 +148,8 @@ class Recorder:
         else:
             track = begun.track
             self._wall = begun.notes["wall_s"]
-            self._totals = _Totals.from_plain(begun.notes["totals"])
+            totals = begun.notes["totals"]
+            self._totals = _Totals(**{**totals, "statuses": torch.tensor(totals["statuses"])})
             self.notes, self.extra = begun.notes["notes"], begun.notes["extra"]
         self._writer = TrackWriter(self.folder / TRACK_NAME, track)
 
@@ -168,20 +169,16 @@ class Recorder:
             stack.enter_context(ended_by_sigterm())
             for sink in self.sinks:
                 stack.push(partial(_close, sink))
-            bar = stack.enter_context(
-                tqdm(
-                    frames, "tracking", total, initial=len(writer), unit="frame", dynamic_ncols=True
-                )
+            bar = tqdm(
+                frames, "tracking", total, initial=len(writer), unit="frame", dynamic_ncols=True
             )
+            stack.enter_context(bar)
             try:
                 for frame in bar:
                     self._take(frame)
-                    bar.set_postfix(
-                        cost=f"{float(frame.info.cost[0]):.1f}",
-                        modes=len(frame.state.mixture.mean),
-                    )
-                    first = len(writer) == 1
-                    if first or time.perf_counter() - saved >= self.checkpoint_every:
+                    cost, num_modes = float(frame.info.cost[0]), len(frame.state.mixture.mean)
+                    bar.set_postfix(cost=f"{cost:.1f}", modes=num_modes)
+                    if len(writer) == 1 or time.perf_counter() - saved >= self.checkpoint_every:
                         self._save(ended)
                         saved = time.perf_counter()
                 ended = "complete"
@@ -217,12 +214,7 @@ class Recorder:
             **self._totals.summary(len(self._writer)),
             "notes": list(self.notes),
             # As in a camera file, so that this file is one.
-            **calibration(
-                *(
-                    (camera, None if files is None else files.video)
-                    for camera, files in self.recorded
-                )
-            ),
+            **calibration(*((camera, files and files.video) for camera, files in self.recorded)),
             **self.extra,
         }
 
@@ -242,14 +234,13 @@ class Recorder:
         """Write track, summary and checkpoint, in this order: the checkpoint is never ahead."""
         if self.lock is not None and not self.lock.holds:
             raise OutputError(f"{self.folder}: another process has taken over; it goes on there")
-        first = len(self._writer) == 1
         self._writer.save()
-        if first and self.on_first_frame is not None:
+        if len(self._writer) == 1 and self.on_first_frame is not None:
             self.on_first_frame()
         write_summary(self.folder, self.summary(ended))
         notes = {
             "wall_s": self._wall + time.perf_counter() - self._began,
-            "totals": self._totals.plain(),
+            "totals": {**asdict(self._totals), "statuses": self._totals.statuses.tolist()},
             "notes": list(self.notes),
             "extra": dict(self.extra),
         }
@@ -342,19 +333,16 @@ class _Totals:
 
     def add(self, frame: Posterior) -> None:
         """Take in a frame."""
-        for into, values in (
-            (self.seconds, frame.seconds),
-            (self.terms, frame.terms),
-            (self.term_seconds, frame.term_seconds),
-        ):
-            for name, value in values.items():
-                into[name] = into.get(name, 0.0) + value
-        self.samples += int(frame.info.num_samples)
-        self.iterations += int(frame.info.num_steps.sum())
-        self.distinct += int(frame.info.num_distinct)
+        for name in ("seconds", "terms", "term_seconds"):
+            into, values = getattr(self, name), getattr(frame, name)
+            into.update({key: into.get(key, 0.0) + value for key, value in values.items()})
+        info = frame.info
+        self.samples += int(info.num_samples)
+        self.iterations += int(info.num_steps.sum())
+        self.distinct += int(info.num_distinct)
         self.lost += frame.lost
-        self.floored += int(frame.info.num_floored)
-        self.statuses += frame.info.status_counts.cpu()
+        self.floored += int(info.num_floored)
+        self.statuses += info.status_counts.cpu()
         was_lost = bool(self.events) and self.events[-1]["event"] == "lost"
         if frame.lost != was_lost:
             self.events.append(
@@ -365,15 +353,6 @@ class _Totals:
                     "deviations": frame.loss_score,
                 }
             )
-
-    def plain(self) -> dict[str, Any]:
-        """The same as JSON knows it."""
-        return {**asdict(self), "statuses": self.statuses.tolist()}
-
-    @classmethod
-    def from_plain(cls, plain: Mapping[str, Any]) -> _Totals:
-        """What `plain` has taken apart."""
-        return cls(**{**plain, "statuses": torch.tensor(plain["statuses"])})
 
     def summary(self, num_frames: int) -> dict[str, Any]:
         """The entries of the summary.

@@ -77,8 +77,7 @@ def smooth(
     run = replace(run, track=track)
     done = _with_images(run, choice or IMAGES) if images else smooth_track(track, choice)
     save_track(path, done.track)
-    entry = {"file": path, **done.effect, "modes": done.modes}
-    summary = {**run.summary, "smoothed": entry}
+    summary = {**run.summary, "smoothed": {"file": path, **done.effect, "modes": done.modes}}
     write_summary(into, summary)
     return Run(path=path, track=done.track, summary=summary)
 
@@ -137,16 +136,9 @@ def smooth_frames(
 
 def _tensors(track: Track) -> TrackedModes:
     """The modes of a track as tensors."""
-    return TrackedModes(
-        *map(
-            torch.from_numpy,
-            (
-                *(track.frames, track.times, track.base_transform),
-                *(track.state, track.covariance, track.log_weight, track.cost),
-            ),
-        ),
-        likelihood_power=track.likelihood_power,
-    )
+    names = ("frames", "times", "base_transform", "state", "covariance", "log_weight", "cost")
+    arrays = (torch.from_numpy(getattr(track, name)) for name in names)
+    return TrackedModes(*arrays, likelihood_power=track.likelihood_power)
 
 
 def _smoothed(
@@ -204,16 +196,14 @@ def _effect(track: Track, modes: Int[np.ndarray, " t"], smooth: Track) -> dict[s
     everywhere = np.arange(len(modes))
     parent = track.parent[everywhere, modes]
     switched = (parent[1:] != modes[:-1]) & (parent[1:] >= 0)
-    best, path, after = (
-        track.joints_world[:, 0],
-        track.joints_world[everywhere, modes],
-        smooth.joints_world[:, 0],
-    )
+    best, path = track.joints_world[:, 0], track.joints_world[everywhere, modes]
+    after = smooth.joints_world[:, 0]
+    moved = np.linalg.norm(after - best, axis=-1)
     return {
         "frames_not_the_trackers_best": int((modes != 0).sum()),
         "path_switches": int(switched.sum()),
-        "mean_change_mm": 1000 * float(np.linalg.norm(after - best, axis=-1).mean()),
-        "greatest_change_mm": 1000 * float(np.linalg.norm(after - best, axis=-1).max()),
+        "mean_change_mm": 1000 * float(moved.mean()),
+        "greatest_change_mm": 1000 * float(moved.max()),
         "jitter_before_m_per_s2": jitter(best, track.times),
         "jitter_of_the_path_m_per_s2": jitter(path, track.times),
         "jitter_after_m_per_s2": jitter(after, track.times),

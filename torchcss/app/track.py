@@ -30,10 +30,9 @@ from torchcss.errors import CameraError, ConfigurationError, TrackFileError
 from torchcss.files import StrPath
 from torchcss.initialise.noise import Noise
 from torchcss.initialise.result import Initialisation
-from torchcss.io.cameras import LoadedCamera
 from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body, write_fitted_body
 from torchcss.io.keypoints.read import Scale
-from torchcss.io.run import Run
+from torchcss.io.run import Run, as_run
 from torchcss.io.tracks import TRACK_NAME, prepare_output_folder
 from torchcss.io.view_files import ViewFiles
 from torchcss.show.track_pictures import write_overlays
@@ -137,8 +136,10 @@ def track_video(
     out = prepare_output_folder(Path(out))
     selection = Selection(start=start, stop=stop, stride=options.stride)
     with locked(out) as lock:
-        if options.resume and (begun := _begun(out)) is not None:
-            return _go_on(begun, settings, selection, options, lock)
+        if options.resume and (out / TRACK_NAME).is_file():
+            begun = Run.open(out)
+            if begun.checkpoint is not None:
+                return _go_on(begun, settings, selection, options, lock)
         files = _files_of(Path(video), keypoints, out, selection, options)
         views = _all_views(files, camera, selection, settings, options)
         return _begin(views, out, settings, selection, options, lock)
@@ -166,6 +167,9 @@ def _begin(
     session = TrackingSession(
         settings, first, looking, frame_interval=interval, generator=generator
     )
+    body = out / FITTED_BODY_NAME
+    given = None if options.init is None else Path(options.init).resolve()
+    is_given = given in (out.resolve(), body.resolve())  # what was started from stays as it is
     recorder = Recorder(
         folder=out,
         session=session,
@@ -174,7 +178,7 @@ def _begin(
         notes=notes,
         extra=_description(views, first, selection),
         sinks=() if options.live is None else (options.live,),
-        on_first_frame=_writes_body(out, options.init, first, eye),
+        on_first_frame=None if is_given else partial(write_fitted_body, body, first, eye),
         checkpoint_every=options.checkpoint_every,
         lock=lock,
     )
@@ -240,10 +244,18 @@ def _all_views(
     """The files of all cameras opened, with a focal length that is fitted if nothing tells it."""
     lens = Lens(focal=options.focal, fov=options.fov)
     if camera is not None:
-        return _open_views((own, *options.others), lens.unless(Path(camera)), selection)
-    lens = lens.of(own.video)
-    views = _open_views((own, *options.others), lens.camera(own.video), selection)
-    if lens.is_known:
+        source = lens.unless(Path(camera))
+    else:
+        lens = lens.of(own.video)
+        source = lens.camera(own.video)
+    views = [open_view(each, source, selection) for each in (own, *options.others)]
+    for opened in views:
+        if len(views) > 1 and not opened.camera.metric:
+            raise CameraError(
+                f"{own.video}: several cameras need their places in one world, in metres; "
+                f"that of {opened.files.video} is not known so: give R and t"
+            )
+    if camera is not None or lens.is_known:
         return views
     _now("fitting the focal length to the keypoints")
     return [fitted(views[0], settings)]
@@ -268,7 +280,7 @@ def resume(run: Run | StrPath, *, live: Sink | None = None) -> Run:
         TorchcssError: If it left no checkpoint, its files are gone, or another process goes on
             with it.
     """
-    run = run if isinstance(run, Run) else Run.open(run)
+    run = as_run(run)
     if run.checkpoint is None:
         raise TrackFileError(
             f"{run.folder}: no checkpoint to go on from; track again, without --resume"
@@ -277,14 +289,6 @@ def resume(run: Run | StrPath, *, live: Sink | None = None) -> Run:
     settings = settings_from_plain(run.settings)
     with locked(run.folder) as lock:
         return _go_on(run, settings, Selection(**known), TrackOptions(live=live), lock)
-
-
-def _begun(out: Path) -> Run | None:
-    """The run that was interrupted in a folder; None if there is none to go on with."""
-    if not (out / TRACK_NAME).is_file():
-        return None
-    run = Run.open(out)
-    return None if run.checkpoint is None else run
 
 
 def _go_on(
@@ -333,36 +337,17 @@ def _record(recorder: Recorder, views: Sequence[OpenView]) -> Run:
 
 def _check_same(run: Run, settings: Settings, selection: Selection, known: dict[str, Any]) -> None:
     """Refuse to go on with other settings or frames than a run was begun with."""
-    plain = asdict(settings_from_plain(run.settings))
+    before = {**asdict(settings_from_plain(run.settings)), **known}
     other = [
-        f"{name} {plain[name]}, now {value}"
-        for name, value in asdict(settings).items()
-        if name not in ("overlay", "threads") and plain[name] != value
-    ]
-    other += [
-        f"{name} {known[name]}, now {value}"
-        for name, value in asdict(selection).items()
-        if name != "stop" and known[name] != value
+        f"{name} {before[name]}, now {value}"
+        for name, value in {**asdict(settings), **asdict(selection)}.items()
+        if name not in ("overlay", "threads", "stop") and before[name] != value
     ]
     if other:
         raise ConfigurationError(
             f"{run.folder}: the run was begun with {'; '.join(other)}; give the same, or leave "
             "--resume out to start anew"
         )
-
-
-def _open_views(
-    files: Sequence[ViewFiles], camera: Path | LoadedCamera, selection: Selection
-) -> list[OpenView]:
-    """The files of all cameras of one calibration, the places of several in one world."""
-    views = [open_view(each, camera, selection) for each in files]
-    for opened in views:
-        if len(views) > 1 and not opened.camera.metric:
-            raise CameraError(
-                f"{files[0].video}: several cameras need their places in one world, in metres; "
-                f"that of {opened.files.video} is not known so: give R and t"
-            )
-    return views
 
 
 def _first_pose(
@@ -418,16 +403,6 @@ def _first_pose_from_file(path: Path, camera: Camera, settings: Settings) -> Ini
             f"give the body {fitted.body.name}"
         )
     return fitted
-
-
-def _writes_body(
-    out: Path, init: Path | None, first: Initialisation, eye: Camera
-) -> partial[None] | None:
-    """Writes `body.npz`; None where it is what was started from, which stays as it is."""
-    path = out / FITTED_BODY_NAME
-    if init is not None and Path(init).resolve() in (out.resolve(), path.resolve()):
-        return None
-    return partial(write_fitted_body, path, first, eye)
 
 
 def _description(

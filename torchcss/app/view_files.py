@@ -60,16 +60,13 @@ class OpenView(NamedTuple):
     @property
     def notes(self) -> list[str]:
         """What the files' readers have to say, for the user."""
-        said = () if self.keypoints is None else self.keypoints.report
-        return [note for note in (self.rate_note, self.camera.units_note, *said) if note]
-
-    @property
-    def rate_note(self) -> str | None:
-        """How fast a folder of images is taken to be."""
-        if self.reader.image_names is None:
-            return None
-        given = "as given" if self.files.frame_rate else "assumed: say it with --frame-rate"
-        return f"{float(self.reader.info.frame_rate):g} images a second, {given}"
+        notes = [self.camera.units_note]
+        if self.reader.image_names is not None:
+            given = "as given" if self.files.frame_rate else "assumed: say it with --frame-rate"
+            notes.insert(0, f"{float(self.reader.info.frame_rate):g} images a second, {given}")
+        if self.keypoints is not None:
+            notes += self.keypoints.report
+        return [note for note in notes if note]
 
     def view(self, like: Tensor) -> CameraView:
         """The camera that looks on, for a session.
