@@ -208,6 +208,18 @@ def read_lines(path: Path, error_class: type[TorchcssError]) -> list[Line]:
     return lines
 
 
+@contextmanager
+def naming(path: object, error_class: type[TorchcssError]) -> Iterator[None]:
+    """Put the path before the message of an error that does not begin with it."""
+    try:
+        yield
+    except error_class as error:
+        begins = (f"{path}{sign}" for sign in (":", "#", "[", os.sep))
+        if str(error).startswith((*begins, repr(str(path)))):
+            raise
+        raise error_class(f"{path}: {error}") from error
+
+
 def one_line(error: BaseException | str) -> str:
     """What an exception says, in one short line."""
     return " ".join(str(error).split())[:120] or type(error).__name__

@@ -30,7 +30,7 @@ def test_csv_with_and_without_heading(tmp_path: Path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "no joints"),
+        ("", "the file is empty"),
         ("a,b,c\n", "no joints"),
         ("l_wrist,1,2\ntentacle,1,2\n", "row 2: unknown joint"),
         ("l_wrist,1\n", "row 1"),

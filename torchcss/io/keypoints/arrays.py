@@ -39,24 +39,24 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
         name = next(iter(arrays))
     if name is None:
         raise KeypointError(
-            f"{path}: expected the arrays keypoints, confidence and joint_names, "
+            f"expected the arrays keypoints, confidence and joint_names, "
             f"found {', '.join(arrays) or 'none'}"
         )
     report = [f"format: {path.suffix[1:].upper()}"]
-    values, is_movenet = _people(path, name, arrays[name]), arrays[name].ndim == 5
+    values, is_movenet = _people(name, arrays[name]), arrays[name].ndim == 5
     if is_movenet:
         values = values[..., [1, 0, 2]]
         report = ["format: MoveNet's arrays, y before x, fractions of the image"]
     given = next((key for key in _CONFIDENCES if key in arrays), None)
     if given is not None:
-        confidence = _confidence(path, given, arrays[given], values.shape[:3])
+        confidence = _confidence(given, arrays[given], values.shape[:3])
         values = np.concatenate([values[..., :2], confidence[..., None]], -1)
     elif values.shape[-1] == 2:
         report.append("no confidence in the file: 1 for every joint that is a number")
         values = screened(np.where(np.isfinite(values), values, np.nan))
     else:
         report.append(f"confidence: the third numbers of {name}")
-    tracks = _tracks(path, arrays.get("person_ids"), values.shape[1])
+    tracks = _tracks(arrays.get("person_ids"), values.shape[1])
     people = [
         [
             Person(joints, track)
@@ -65,11 +65,11 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
         ]
         for frame in values
     ]
-    size = _positive(path, "image_size_wh", arrays, 2)
-    noise = _positive(path, "relative_noise", arrays, 1) or [1.0]
+    size = _positive("image_size_wh", arrays, 2)
+    noise = _positive("relative_noise", arrays, 1) or [1.0]
     return People(
         people,
-        _names(path, arrays.get("joint_names"), values.shape[2]),
+        _names(arrays.get("joint_names"), values.shape[2]),
         report,
         corner_fractions=is_movenet,
         size_wh=None if size is None else (size[0], size[1]),
@@ -97,32 +97,30 @@ def read_points(path: Path, keypoints: Keypoints) -> Keypoints:
     return keypoints._replace(points=points[torch.arange(len(gap)), gap.argmin(1)])
 
 
-def _unfit(path: Path, name: str, array: np.ndarray, expected: str) -> KeypointError:
+def _unfit(name: str, array: np.ndarray, expected: str) -> KeypointError:
     """The error for an array of another kind or shape."""
     got = f"{array.dtype} {list(array.shape)}"
-    return KeypointError(f"{path}: {name}: expected {expected}, got {got}")
+    return KeypointError(f"{name}: expected {expected}, got {got}")
 
 
-def _tracks(path: Path, ids: np.ndarray | None, count: int) -> list[str | None]:
+def _tracks(ids: np.ndarray | None, count: int) -> list[str | None]:
     if ids is None:
         return [None] * count
     if ids.shape != (count,) or ids.dtype.kind not in "iuU":
-        raise _unfit(path, "person_ids", ids, f"{count} numbers")
+        raise _unfit("person_ids", ids, f"{count} numbers")
     return [str(number) for number in ids]
 
 
-def _positive(
-    path: Path, name: str, arrays: Mapping[str, np.ndarray], count: int
-) -> list[float] | None:
+def _positive(name: str, arrays: Mapping[str, np.ndarray], count: int) -> list[float] | None:
     """So many numbers, if the file has them."""
     if (array := arrays.get(name)) is None:
         return None
     if array.size != count or array.dtype.kind not in "iuf" or not (array > 0).all():
-        raise KeypointError(f"{path}: {name}: expected {count} positive numbers, got {array}")
+        raise KeypointError(f"{name}: expected {count} positive numbers, got {array}")
     return array.ravel().astype(float).tolist()
 
 
-def _people(path: Path, name: str, array: np.ndarray) -> np.ndarray:
+def _people(name: str, array: np.ndarray) -> np.ndarray:
     """`[t p j 2]` or `[t p j 3]`, from any of the shapes."""
     shape: Sequence[int] = array.shape
     if array.dtype.kind in "iuf" and 0 not in shape:
@@ -140,18 +138,18 @@ def _people(path: Path, name: str, array: np.ndarray) -> np.ndarray:
         if len(shape) == 5 and tuple(shape[1:3]) == (1, 1) and shape[4] == 3:
             return values[:, 0]
     expected = "numbers [frames, joints, 2 or 3] or [frames, people, joints, 2 or 3]"
-    raise _unfit(path, name, array, expected)
+    raise _unfit(name, array, expected)
 
 
-def _confidence(path: Path, name: str, array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def _confidence(name: str, array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     if array.dtype.kind not in "biuf" or array.size != math.prod(shape):
-        raise _unfit(path, name, array, f"numbers {[n for n in shape if n != 1]}")
+        raise _unfit(name, array, f"numbers {[n for n in shape if n != 1]}")
     return array.astype(np.float64).reshape(shape)
 
 
-def _names(path: Path, names: np.ndarray | None, num_joints: int) -> tuple[str, ...] | None:
+def _names(names: np.ndarray | None, num_joints: int) -> tuple[str, ...] | None:
     if names is None:
         return None
     if names.shape != (num_joints,) or names.dtype.kind != "U":
-        raise _unfit(path, "joint_names", names, f"{num_joints} names")
+        raise _unfit("joint_names", names, f"{num_joints} names")
     return tuple(map(str, names))

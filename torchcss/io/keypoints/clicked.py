@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,25 +32,25 @@ def is_clicked(content: Mapping[str, Any]) -> bool:
     )
 
 
-def read_clicked(path: Path, content: Mapping[str, Any], image_size_wh: tuple[int, int]) -> People:
+def read_clicked(content: Mapping[str, Any], image_size_wh: tuple[int, int]) -> People:
     """Read joints by name, for one frame or for some."""
     size = content.get("image_size_wh")
     if size is not None and size != list(image_size_wh):
         raise KeypointError(
-            f"{path}: clicked in images of {shortened(size)} pixels, "
+            f"clicked in images of {shortened(size)} pixels, "
             f"the video has {list(image_size_wh)}; click in this video"
         )
     frames = content.get("frames", {"0": content.get("joints")})
     if not isinstance(frames, dict) or not frames:
-        raise KeypointError(f"{path}: expected 'frames' to name frames, found {shortened(frames)}")
+        raise KeypointError(f"expected 'frames' to name frames, found {shortened(frames)}")
     clicked: Frames = {}
     for key, joints in frames.items():
         if not re.fullmatch(r"[0-9]{1,6}", key):
-            raise KeypointError(f"{path}: expected a frame number, found {shortened(key)}")
-        named = _clicked_joints(f"{path}: frame {key}", joints)
+            raise KeypointError(f"expected a frame number, found {shortened(key)}")
+        named = _clicked_joints(f"frame {key}", joints)
         rows = np.array(list(named.values())).reshape(-1, 3)
         clicked[int(key)] = [Person(rows, names=tuple(named))] if named else []
-    found, names = united(path, clicked)
+    found, names = united(clicked)
     return People(found, names, ["format: clicked joints"], first=0)
 
 

@@ -7,7 +7,6 @@ Call `read_coco`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from torchcss.errors import KeypointError
@@ -18,16 +17,16 @@ from torchcss.io.video import natural_order
 from torchcss.joint_names import canonical_joint_name
 
 
-def read_coco(path: Path, content: Mapping[str, Any]) -> People:
+def read_coco(content: Mapping[str, Any]) -> People:
     """Read annotations, as COCO, CVAT and their like have them."""
     entries = content["annotations"]
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise KeypointError(f"{path}: expected a list of detections, found {shortened(entries)}")
+        raise KeypointError(f"expected a list of detections, found {shortened(entries)}")
     report = ["format: COCO"]
     names, category = _coco_names(content, entries, report)
     found: Frames = {}
     for index, entry in enumerate(entries):
-        where = f"{path}: detection {index}"
+        where = f"detection {index}"
         image = entry.get("image_id")
         if not isinstance(image, (int, str)) or isinstance(image, bool):
             raise KeypointError(f"{where}: expected an image_id, found {shortened(image)}")
@@ -45,7 +44,7 @@ def read_coco(path: Path, content: Mapping[str, Any]) -> People:
         report.append("visibility 0, 1, 2 of the annotations taken as confidence 0, 0.5, 1")
     if "images" not in content:
         return People(found, names, report)
-    frames, size = _by_images(path, content["images"], found)
+    frames, size = _by_images(content["images"], found)
     return People(frames, names, report, size_wh=size, whole=True)
 
 
@@ -70,21 +69,21 @@ def _coco_names(
 
 
 def _by_images(
-    path: Path, images: object, found: Mapping[Key, list[Person]]
+    images: object, found: Mapping[Key, list[Person]]
 ) -> tuple[Frames, tuple[float, float] | None]:
     """People by the names of their pictures, and the size that all of these have."""
     if not isinstance(images, list) or not all(
         isinstance(image, dict) and isinstance(image.get("id"), (int, str)) for image in images
     ):
-        raise KeypointError(f"{path}: expected 'images' to be a list with an id each")
+        raise KeypointError("expected 'images' to be a list with an id each")
     identifiers = {image["id"] for image in images}
     if unknown := [image for image in found if image not in identifiers]:
-        raise KeypointError(f"{path}: detection of image {unknown[0]!r}, which is not in 'images'")
+        raise KeypointError(f"detection of image {unknown[0]!r}, which is not in 'images'")
     ordered = sorted(images, key=lambda each: natural_order(str(each.get("file_name", each["id"]))))
     frames: Frames = {
         str(image.get("file_name", image["id"])): found.get(image["id"], []) for image in ordered
     }
     sizes = {said_size(image) for image in images}
     if len(sizes) > 1:
-        raise KeypointError(f"{path}: pictures of several sizes; expected those of one video")
+        raise KeypointError("pictures of several sizes; expected those of one video")
     return frames, next(iter(sizes), None)

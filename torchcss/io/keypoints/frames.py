@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 from typing import NamedTuple
 
 import numpy as np
@@ -36,11 +36,10 @@ class Film(NamedTuple):
     rate: float | None = None
 
 
-def in_order(path: Path, people: People, film: Film, report: list[str]) -> list[list[Person]]:
+def in_order(people: People, film: Film, report: list[str]) -> list[list[Person]]:
     """The people of every frame of the video; frames that the file leaves out are empty.
 
     Args:
-        path: The file, for messages.
         people: What was found in it.
         film: The video.
         report: Gets a line for everything that was assumed.
@@ -52,32 +51,30 @@ def in_order(path: Path, people: People, film: Film, report: list[str]) -> list[
     if isinstance(frames, list):
         return frames
     if frames and all(isinstance(key, float) for key in frames):
-        places = _by_time(path, [float(key) for key in frames], film, report)
+        places = _by_time([float(key) for key in frames], film, report)
     elif (by_name := _by_name(frames, film, report)) is not None:
         places = by_name
     else:
-        places = _by_number(path, people, list(frames), film, report)
+        places = _by_number(people, list(frames), film, report)
     if len({place for place in places if place is not None}) < sum(p is not None for p in places):
-        raise KeypointError(
-            f"{path}: two entries of one frame; expected each frame once, numbered or named"
-        )
+        raise KeypointError("two entries of one frame; expected each frame once, numbered or named")
     found = {
         place: frames[key] for place, key in zip(places, frames, strict=True) if place is not None
     }
     total = max(max(found, default=-1) + 1, film.num_frames or 0)
     if film.num_frames is not None and total > film.num_frames:
-        raise wrong_count(path, film.num_frames, total)
+        raise wrong_count(film.num_frames, total)
     if total > _MOST_FRAMES:
-        raise KeypointError(f"{path}: {total - 1} is not a frame number; number the frames from 0")
+        raise KeypointError(f"{total - 1} is not a frame number; number the frames from 0")
     if len(found) < total:
         report.append(f"{len(found)} of {total} frames are in the file, the others have nobody")
     return [found.get(index, []) for index in range(total)]
 
 
-def wrong_count(path: Path, expected: int, found: int) -> KeypointError:
+def wrong_count(expected: int, found: int) -> KeypointError:
     """The error for a file that has other frames than the video."""
     return KeypointError(
-        f"{path}: expected {expected} frames, as the video has, found {found}; "
+        f"expected {expected} frames, as the video has, found {found}; "
         "make the keypoints from this very video"
     )
 
@@ -109,27 +106,25 @@ def _by_name(
     return places
 
 
-def _by_number(
-    path: Path, people: People, keys: Sequence[Key], film: Film, report: list[str]
-) -> list[int]:
-    numbers = [key if isinstance(key, int) else _number(path, str(key)) for key in keys]
+def _by_number(people: People, keys: Sequence[Key], film: Film, report: list[str]) -> list[int]:
+    numbers = [key if isinstance(key, int) else _number(str(key)) for key in keys]
     if people.whole and None in numbers:
         report.append("frames in the order of the names")
         return list(range(len(keys)))
     if None in numbers:
         raise KeypointError(
-            f"{path}: {shortened(keys[numbers.index(None)])} has no frame number of its own; "
+            f"{shortened(keys[numbers.index(None)])} has no frame number of its own; "
             "number the images, or give the folder of pictures as the video"
         )
     places = [number for number in numbers if number is not None]
     if min(places, default=0) < 0:
-        raise KeypointError(f"{path}: {min(places)} is not a frame number; number them from 0")
-    first = _first(path, people, places, film.num_frames)
+        raise KeypointError(f"{min(places)} is not a frame number; number them from 0")
+    first = _first(people, places, film.num_frames)
     report.append(f"frame {first} is the first frame")
     return [place - first for place in places]
 
 
-def _first(path: Path, people: People, places: Sequence[int], num_frames: int | None) -> int:
+def _first(people: People, places: Sequence[int], num_frames: int | None) -> int:
     """Which number the first frame has."""
     low, high = min(places, default=0), max(places, default=0)
     if people.first is not None:
@@ -144,13 +139,13 @@ def _first(path: Path, people: People, places: Sequence[int], num_frames: int | 
         return low
     if low > num_frames:
         raise KeypointError(
-            f"{path}: frames {low} to {high} for a video of {num_frames}: which of them is the "
+            f"frames {low} to {high} for a video of {num_frames}: which of them is the "
             "first is not known; number them from 0, or give the folder of pictures as the video"
         )
     return 0
 
 
-def _number(path: Path, text: str) -> int | None:
+def _number(text: str) -> int | None:
     """The last number in a picture's name."""
     digits = re.findall(r"[0-9]+", plain_name(text))
     if not digits or len(digits[-1]) > 12 or text.startswith("-"):
@@ -158,7 +153,7 @@ def _number(path: Path, text: str) -> int | None:
     return int(digits[-1])
 
 
-def _by_time(path: Path, times: Sequence[float], film: Film, report: list[str]) -> list[int]:
+def _by_time(times: Sequence[float], film: Film, report: list[str]) -> list[int]:
     """Places by time; the interval is the video's, or else the shortest one between entries."""
     order = np.argsort(times)
     sorted_times = np.array(times)[order]
@@ -169,7 +164,7 @@ def _by_time(path: Path, times: Sequence[float], film: Film, report: list[str]) 
         return places.tolist()
     gaps = np.diff(sorted_times)
     if film.rate is None and not (len(gaps) and gaps.min() > 0):
-        raise KeypointError(f"{path}: times do not rise from entry to entry; number the frames")
+        raise KeypointError("times do not rise from entry to entry; number the frames")
     with np.errstate(all="ignore"):
         interval = 1 / film.rate if film.rate else _interval(gaps)
         start = 0.0
@@ -178,7 +173,7 @@ def _by_time(path: Path, times: Sequence[float], film: Film, report: list[str]) 
         found = np.round((sorted_times - start) / interval)
     if not ((found >= 0) & (found < _MOST_FRAMES)).all():
         raise KeypointError(
-            f"{path}: times from {sorted_times[0]:.4g} to {sorted_times[-1]:.4g} s, one every "
+            f"times from {sorted_times[0]:.4g} to {sorted_times[-1]:.4g} s, one every "
             f"{interval:.3g} s, are no video's; number the frames"
         )
     places[order] = found

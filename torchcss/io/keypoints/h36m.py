@@ -78,7 +78,7 @@ def read_h36m(path: Path, selection: str) -> People:
     chosen: Any = _object(path, "positions_2d")
     rest, steps = selection, []
     for kind in ("subject", "action", "camera"):
-        options = _options(path, chosen, kind)
+        options = _options(chosen, kind)
         # Names may hold slashes themselves.
         fitting = [name for name in options if f"{rest}/".startswith(f"{name}/")]
         step = max(fitting, key=len, default=None)
@@ -88,15 +88,14 @@ def read_h36m(path: Path, selection: str) -> People:
             problem = "say which" if not rest else f"no {kind} {rest.split('/')[0]!r}"
             prefix = "/".join([*steps, kind.upper()])
             raise KeypointError(
-                f"{path}: {problem} recording, as {path.name}#{prefix}...; there are: "
-                f"{', '.join(options)}"
+                f"{problem} recording, as {path.name}#{prefix}...; there are: {', '.join(options)}"
             )
         rest = rest[len(step) + 1 :] if rest else ""
         steps.append(step)
         chosen = options[step]
     if rest:
-        raise KeypointError(f"{path}: expected SUBJECT/ACTION/CAMERA, found {selection!r}")
-    where = f"{path}: {'/'.join(steps)}"
+        raise KeypointError(f"expected SUBJECT/ACTION/CAMERA, found {selection!r}")
+    where = "/".join(steps)
     try:
         points = np.asarray(chosen, dtype=np.float64)
     except (ValueError, TypeError) as error:
@@ -128,8 +127,7 @@ def _read_detections(path: Path) -> People:
         shape: Sequence[int] = found.shape
         if found.size and (len(shape) != 3 or shape[1] not in (3, 4)):
             raise KeypointError(
-                f"{path}: frame {index}: expected numbers [people, 4, joints], got "
-                f"{list(found.shape)}"
+                f"frame {index}: expected numbers [people, 4, joints], got {list(found.shape)}"
             )
         rows = found.swapaxes(1, 2)[..., [0, 1, -1]] if found.size else ()
         frames.append([Person(joints) for joints in rows])
@@ -159,7 +157,7 @@ def _size(entry: object) -> tuple[float, float] | None:
     return float(found[0]), float(found[1])  # type: ignore[arg-type]
 
 
-def _options(path: Path, value: Any, kind: str) -> dict[str, Any]:
+def _options(value: Any, kind: str) -> dict[str, Any]:
     """What can be chosen at one level, by name; cameras by number."""
     if kind == "camera":
         items = list(value) if isinstance(value, (list, tuple, np.ndarray)) else []
@@ -170,7 +168,7 @@ def _options(path: Path, value: Any, kind: str) -> dict[str, Any]:
         found = {str(key): item for key, item in value.items()} if isinstance(value, dict) else {}
     if not found:
         raise KeypointError(
-            f"{path}: positions_2d: expected recordings by {kind}, found {shortened(value)}"
+            f"positions_2d: expected recordings by {kind}, found {shortened(value)}"
         )
     return found
 
@@ -187,6 +185,6 @@ def _object(path: Path, name: str) -> Any:
         content = PlainUnpickler(source, encoding="latin1").load()
     except Exception as error:  # zipfile, pickle and NumPy raise whatever the damage leads to
         raise KeypointError(
-            f"{path}: {name}: cannot be read: {one_line(error)}; get a complete copy"
+            f"{name}: cannot be read: {one_line(error)}; get a complete copy"
         ) from error
     return content.item() if isinstance(content, np.ndarray) and content.shape == () else content

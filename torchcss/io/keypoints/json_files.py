@@ -75,16 +75,16 @@ def read_json(path: Path, image_size_wh: tuple[int, int], num_frames: int | None
     content = _load(path)
     if isinstance(content, dict):
         if "annotations" in content:
-            return read_coco(path, content)
+            return read_coco(content)
         if "skeleton" in content and isinstance(content.get("keypoints"), list):
             return _read_vitpose(path, content)
         if is_clicked(content):
-            return read_clicked(path, content, image_size_wh)
+            return read_clicked(content, image_size_wh)
     name = _format_of(content)
     from_one = name == "openpifpaf" or (isinstance(content, dict) and "instance_info" in content)
     frames = _frames(path, content, num_frames)
     in_order = isinstance(frames, list)
-    found, own = united(path, dict(enumerate(frames)) if in_order else frames)
+    found, own = united(dict(enumerate(frames)) if in_order else frames)
     people = _people(name, found, own or _said_names(content), in_order=in_order)
     return people._replace(first=1 if from_one else None, size_wh=said_size(content))
 
@@ -106,7 +106,7 @@ def read_folder(path: Path) -> People:
         if key in found:
             raise KeypointError(f"{file}: a second file of the frame {key}; expected one for each")
         found[key] = people_of(str(file), content)
-    frames, names = united(path, found)
+    frames, names = united(found)
     people = _people(f"{name}, {len(files)} files", frames, names)
     # A labelled picture has a file; of a video every frame has one.
     return people._replace(whole=name != "labelme", size_wh=size)

@@ -76,7 +76,7 @@ class People(NamedTuple):
     relative_noise: float = 1.0
 
 
-def united(where: object, frames: Frames) -> tuple[Frames, tuple[str, ...] | None]:
+def united(frames: Frames) -> tuple[Frames, tuple[str, ...] | None]:
     """People whose joints are all in one order, and the names; joints that someone lacks are zero.
 
     Raises:
@@ -92,7 +92,7 @@ def united(where: object, frames: Frames) -> tuple[Frames, tuple[str, ...] | Non
         for person in people:
             if person.names is None or len(set(person.names)) < len(person.joints):
                 raise KeypointError(
-                    f"{where}: {key}: expected a name of its own for every joint, found "
+                    f"{key}: expected a name of its own for every joint, found "
                     f"{shortened(person.names)}"
                 )
             joints = np.zeros((len(names), 3))

@@ -37,7 +37,7 @@ import numpy as np
 import torch
 
 from torchcss.errors import KeypointError
-from torchcss.files import StrPath, load_array, load_arrays, shortened
+from torchcss.files import StrPath, load_array, load_arrays, naming, shortened
 from torchcss.io.keypoints.arrays import read_arrays
 from torchcss.io.keypoints.findings import findings
 from torchcss.io.keypoints.frames import Film, in_order, wrong_count
@@ -139,34 +139,41 @@ def read_person(
     Raises:
         KeypointError: The same, or that person is not in the file.
     """
-    path, (first_frame, _, image_size_wh), num_frames = Path(path), whom, film.num_frames
-    if layout is not None and layout not in (OWN_NAMES, *ALIASES):
-        raise KeypointError(
-            f"{path}: unknown layout {layout!r}; the known ones are "
-            f"{', '.join((*ALIASES, OWN_NAMES))}"
-        )
-    people = _read(path, image_size_wh, num_frames)
+    with naming(path, KeypointError):
+        if layout is not None and layout not in (OWN_NAMES, *ALIASES):
+            raise KeypointError(
+                f"unknown layout {layout!r}; the known ones are {', '.join((*ALIASES, OWN_NAMES))}"
+            )
+        people = _read(Path(path), whom.image_size_wh, film.num_frames)
+        return _person(people, film, whom, layout or people.layout, normalised)
+
+
+def _person(
+    people: People, film: Film, whom: Whom, layout: str | None, normalised: bool | Scale
+) -> Keypoints:
+    """Who is followed, checked and in pixels."""
+    first_frame, _, image_size_wh = whom
     report = list(people.report)
-    everyone = in_order(path, people, film, report)
+    everyone = in_order(people, film, report)
     everyone = [[p for p in frame if is_there(p.joints)] for frame in everyone]
-    frames = _stacked(path, everyone)
-    _check_counts(path, frames, people.names, num_frames, first_frame)
-    frames = _checked_numbers(path, frames, people.names, report)
-    _check_somebody(path, frames, first_frame)
+    frames = _stacked(everyone)
+    _check_counts(frames, people.names, film.num_frames, first_frame)
+    frames = _checked_numbers(frames, people.names, report)
+    _check_somebody(frames, first_frame)
     points = np.concatenate([frame[frame[..., 2] > 0.0][:, :2] for frame in frames])
     if people.corner_fractions:
-        scale, shift, note = _from_corner(path, points, image_size_wh)
+        scale, shift, note = _from_corner(points, image_size_wh)
     elif people.size_wh is not None:
-        scale, shift, note = _from_other_size(path, people.size_wh, image_size_wh)
+        scale, shift, note = _from_other_size(people.size_wh, image_size_wh)
     else:
-        scale, shift, note = _from_border_pixels(path, points, image_size_wh, normalised)
+        scale, shift, note = _from_border_pixels(points, image_size_wh, normalised)
     report += note
-    _check_places(path, scale * points + shift, image_size_wh)
+    _check_places(scale * points + shift, image_size_wh)
     for frame in frames:
         frame[..., :2] = scale * frame[..., :2] + shift
     tracks = [[person.track for person in frame] for frame in everyone]
     chosen = follow(frames, tracks, whom, report)
-    names = _joint_names(path, people, chosen, layout or people.layout, report)
+    names = _joint_names(people, chosen, layout, report)
     report += findings(chosen, names, image_size_wh, first_frame)
     positions = np.where(chosen[..., 2:] > 0.0, chosen[..., :2], 0.0)
     confidence = torch.from_numpy(chosen[..., 2].copy())
@@ -175,12 +182,12 @@ def read_person(
     )
 
 
-def _stacked(path: Path, frames: Sequence[Sequence[Person]]) -> list[np.ndarray]:
+def _stacked(frames: Sequence[Sequence[Person]]) -> list[np.ndarray]:
     """`[p j 3]` of every frame."""
     counts = sorted({len(person.joints) for frame in frames for person in frame})
     if len(counts) > 1:
         raise KeypointError(
-            f"{path}: people with {' and '.join(map(str, counts))} joints; "
+            f"people with {' and '.join(map(str, counts))} joints; "
             "expected one layout in the whole file"
         )
     nobody = np.zeros((0, *counts, 3) if counts else (0, 0, 3))
@@ -224,7 +231,7 @@ def _read_folder(path: Path, image_size_wh: tuple[int, int]) -> People:
     if len(folders) == 1:
         return _read_folder(path / folders[0], image_size_wh)
     raise KeypointError(
-        f"{path}: no JSON files in this folder; expected OpenPose's, EasyMocap's or YOLO's labels, "
+        "no JSON files in this folder; expected OpenPose's, EasyMocap's or YOLO's labels, "
         "one for every frame"
         + (f"; give one of {shortened(', '.join(folders))}" if folders else "")
     )
@@ -245,7 +252,6 @@ def _read_numpy(path: Path) -> People:
 
 
 def _check_counts(
-    path: Path,
     frames: list[np.ndarray],
     names: tuple[str, ...] | None,
     num_frames: int | None,
@@ -253,25 +259,22 @@ def _check_counts(
 ) -> None:
     """Refuse another number of frames than the video's, and of names than joints."""
     if num_frames is not None and len(frames) != num_frames:
-        raise wrong_count(path, num_frames, len(frames))
+        raise wrong_count(num_frames, len(frames))
     if not 0 <= first_frame < max(1, len(frames)):
         raise KeypointError(
-            f"{path}: the first frame {first_frame} is beyond the file, "
-            f"which has {len(frames)} frames"
+            f"the first frame {first_frame} is beyond the file, which has {len(frames)} frames"
         )
     num_joints = max((frame.shape[1] for frame in frames), default=0)
     if names is None or not num_joints:  # nobody in the whole file: another check says so
         return
     if len(names) != num_joints:
-        raise KeypointError(
-            f"{path}: {len(names)} joint names for {num_joints} joints; expected as many"
-        )
+        raise KeypointError(f"{len(names)} joint names for {num_joints} joints; expected as many")
     if len(set(names)) < num_joints:
-        raise KeypointError(f"{path}: the same joint name twice in {shortened(names)}")
+        raise KeypointError(f"the same joint name twice in {shortened(names)}")
 
 
 def _checked_numbers(
-    path: Path, frames: list[np.ndarray], names: tuple[str, ...] | None, report: list[str]
+    frames: list[np.ndarray], names: tuple[str, ...] | None, report: list[str]
 ) -> list[np.ndarray]:
     """Refuse numbers that are not finite where they count; bring confidences into their range."""
     checked, clipped = [], 0
@@ -283,14 +286,12 @@ def _checked_numbers(
         if bad.any():
             joint = int(np.argwhere(bad)[0, -1])
             raise KeypointError(
-                f"{path}: frame {index}: joint {repr(names[joint]) if names else joint} is not a "
+                f"frame {index}: joint {repr(names[joint]) if names else joint} is not a "
                 f"number though its confidence is {float(confidence[bad][0]):g}; expected "
                 "confidence 0 where a joint is missing"
             )
         if (confidence > 10.0).any():
-            raise KeypointError(
-                f"{path}: frame {index}: confidence {confidence.max():g}; expected 0 to 1"
-            )
+            raise KeypointError(f"frame {index}: confidence {confidence.max():g}; expected 0 to 1")
         clipped += int(((confidence < 0.0) | (confidence > 1.0)).sum())
         places = np.where((confidence > 0.0)[..., None], frame[..., :2], 0.0)
         checked.append(np.concatenate([places, confidence.clip(0.0, 1.0)[..., None]], axis=-1))
@@ -299,7 +300,7 @@ def _checked_numbers(
     return checked
 
 
-def _check_somebody(path: Path, frames: list[np.ndarray], first_frame: int) -> None:
+def _check_somebody(frames: list[np.ndarray], first_frame: int) -> None:
     seen = [index for index, frame in enumerate(frames) if (frame[..., 2] > 0.0).any()]
     if first_frame in seen:
         return
@@ -310,7 +311,7 @@ def _check_somebody(path: Path, frames: list[np.ndarray], first_frame: int) -> N
     if first_frame == 0 and later == 1:
         advice += ", or number the frames from 0, if the file counts them from 1"
     raise KeypointError(
-        f"{path}: nobody in the first frame ({first_frame}), where tracking starts; {advice}"
+        f"nobody in the first frame ({first_frame}), where tracking starts; {advice}"
     )
 
 
@@ -318,27 +319,25 @@ Change = tuple[np.ndarray | float, np.ndarray | float, list[str]]
 """Factor and shift that make pixels of coordinates, and what to report."""
 
 
-def _from_corner(path: Path, points: np.ndarray, image_size_wh: tuple[int, int]) -> Change:
+def _from_corner(points: np.ndarray, image_size_wh: tuple[int, int]) -> Change:
     """Pixels, or fractions of the image from its corner; MediaPipe's numbers tell which."""
     sizes = np.abs(points).max(-1)
     if np.median(sizes) > _LARGEST_FRACTION:
         return 1.0, 0.0, ["coordinates are pixels already"]
     if sizes.max() > 100 * _LARGEST_FRACTION:
         raise KeypointError(
-            f"{path}: expected fractions of the image, as most are, found {sizes.max():.4g}"
+            f"expected fractions of the image, as most are, found {sizes.max():.4g}"
         )
     # Pixel centres are at integers.
     return np.array(image_size_wh), -0.5, ["fractions of the image converted to pixels"]
 
 
-def _from_other_size(
-    path: Path, size_wh: tuple[float, float], image_size_wh: tuple[int, int]
-) -> Change:
+def _from_other_size(size_wh: tuple[float, float], image_size_wh: tuple[int, int]) -> Change:
     """Pixels of images of another size, if it is the same picture."""
     scale = np.array(image_size_wh) / size_wh
     if abs(scale[0] / scale[1] - 1) > 0.02:
         raise KeypointError(
-            f"{path}: made from images of {size_wh[0]:g} x {size_wh[1]:g} pixels, the video has "
+            f"made from images of {size_wh[0]:g} x {size_wh[1]:g} pixels, the video has "
             f"{image_size_wh[0]} x {image_size_wh[1]}, which is another shape; make the keypoints "
             "from this very video"
         )
@@ -352,26 +351,26 @@ def _from_other_size(
 
 
 def _from_border_pixels(
-    path: Path, points: np.ndarray, image_size_wh: tuple[int, int], normalised: bool | Scale
+    points: np.ndarray, image_size_wh: tuple[int, int], normalised: bool | Scale
 ) -> Change:
     """Pixels, or fractions from the centres of border pixels, as the caller says."""
     fractions = bool((np.abs(points) <= _NORMALISED_EXTENT).all())
     if normalised is False or normalised == "pixels":
         if fractions:
             raise KeypointError(
-                f"{path}: expected pixels, but all coordinates lie between {points.min():.3g} and "
+                f"expected pixels, but all coordinates lie between {points.min():.3g} and "
                 f"{points.max():.3g}: they seem to be fractions of the image; if so, "
                 "set normalised to zero-one or plus-minus-one"
             )
         return 1.0, 0.0, []
     if not fractions:
         raise KeypointError(
-            f"{path}: expected fractions of the image, but coordinates reach "
+            f"expected fractions of the image, but coordinates reach "
             f"{np.abs(points).max():.4g}: they seem to be pixels; if so, leave normalised out"
         )
     if normalised is True and (points < 0.0).any():
         raise KeypointError(
-            f"{path}: some coordinates are negative: say whether they run from 0 to 1 with joints "
+            "some coordinates are negative: say whether they run from 0 to 1 with joints "
             "outside the image (normalised 'zero-one') or from -1 to 1 ('plus-minus-one')"
         )
     largest = np.asarray(image_size_wh, dtype=np.float64) - 1.0
@@ -380,36 +379,36 @@ def _from_border_pixels(
     return largest, 0.0, ["coordinates from 0 to 1 converted to pixels"]
 
 
-def _check_places(path: Path, points: np.ndarray, image_size_wh: tuple[int, int]) -> None:
+def _check_places(points: np.ndarray, image_size_wh: tuple[int, int]) -> None:
     size = np.asarray(image_size_wh, dtype=np.float64)
     outside = np.maximum(-points, points - size).max(axis=1)
     if (outside > _OUTSIDE * size.max()).any():
         u, v = points[outside.argmax()]
         raise KeypointError(
-            f"{path}: a joint at ({u:.5g}, {v:.5g}) is far outside the image of "
+            f"a joint at ({u:.5g}, {v:.5g}) is far outside the image of "
             f"{image_size_wh[0]} x {image_size_wh[1]} pixels; expected pixels of this video"
         )
     inside = float((outside <= 0.0).mean())
     if inside < _INSIDE_SHARE:
         raise KeypointError(
-            f"{path}: only {inside:.0%} of the joints lie inside the image of {image_size_wh[0]} x "
+            f"only {inside:.0%} of the joints lie inside the image of {image_size_wh[0]} x "
             f"{image_size_wh[1]} pixels; expected keypoints of this video, at its size"
         )
 
 
 def _joint_names(
-    path: Path, people: People, chosen: np.ndarray, layout: str | None, report: list[str]
+    people: People, chosen: np.ndarray, layout: str | None, report: list[str]
 ) -> tuple[str, ...]:
     num_joints, own = chosen.shape[1], people.names or ()
     if layout == OWN_NAMES:
         if not own:
-            raise KeypointError(f"{path}: layout {OWN_NAMES}: the file does not name its joints")
+            raise KeypointError(f"layout {OWN_NAMES}: the file does not name its joints")
         report.append(f"layout: {num_joints} names as they are")
         return tuple(own)
     if layout is not None and len(ALIASES[layout]) != num_joints:
         fitting = ", ".join(_LAYOUTS_BY_COUNT.get(num_joints, ())) or "none of the known"
         raise KeypointError(
-            f"{path}: layout {layout} has {len(ALIASES[layout])} joints, "
+            f"layout {layout} has {len(ALIASES[layout])} joints, "
             f"the file has {num_joints}; fitting layouts: {fitting}"
         )
     if layout is not None:
@@ -423,7 +422,7 @@ def _joint_names(
     else:
         found = f"names {shortened(list(own))}" if own else "joints without names"
         raise KeypointError(
-            f"{path}: unknown layout: found {num_joints} {found}; the known layouts are "
+            f"unknown layout: found {num_joints} {found}; the known layouts are "
             + ", ".join(f"{name} ({len(joints)})" for name, joints in ALIASES.items())
             + (f"; names that are a robot's own take layout {OWN_NAMES}" if own else "")
         )

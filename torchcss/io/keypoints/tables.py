@@ -89,14 +89,14 @@ def read_table(path: Path) -> People:
     rows = table_rows(path)
     firsts = [row[0].lower() for _, row in rows[:4]]
     if "bodyparts" in firsts and "coords" in firsts:
-        columns, body, report = _deeplabcut(path, rows)
-        joints, frames = _read_rows(path, columns, body)
+        columns, body, report = _deeplabcut(rows)
+        joints, frames = _read_rows(columns, body)
         return People(frames, tuple(joints), report, first=0)
     if len(rows) == 1:
-        raise KeypointError(f"{path}: row 1: a heading and nothing below it; get a complete copy")
-    columns = _headed(path, rows[0][1])
+        raise KeypointError("row 1: a heading and nothing below it; get a complete copy")
+    columns = _headed(rows[0][1])
     report = [_confidence_line(rows[0][1], columns)]
-    joints, frames = _read_rows(path, columns, rows[1:])
+    joints, frames = _read_rows(columns, rows[1:])
     order = landmark_order(joints)
     if order is not None and len(joints) == NUM_LANDMARKS:
         report.insert(0, "format: CSV of MediaPipe's landmarks")
@@ -124,7 +124,7 @@ def table_rows(path: Path) -> list[Row]:
     return rows
 
 
-def _headed(path: Path, heading: Sequence[str]) -> _Columns:
+def _headed(heading: Sequence[str]) -> _Columns:
     """The columns of a table with one heading, long or wide."""
     names = [re.sub(r"[\s.\-]+", "_", cell.lower()) for cell in heading]
     frame, unit = _first_of(FRAME_NAMES, names), None
@@ -139,12 +139,12 @@ def _headed(path: Path, heading: Sequence[str]) -> _Columns:
         if (split := _split(name)) is not None:
             own = columns.setdefault(("", split[0]), {})
             if split[1] in own and split[1] != 3:
-                raise KeypointError(f"{path}: row 1: column {heading[index]!r} is there twice")
+                raise KeypointError(f"row 1: column {heading[index]!r} is there twice")
             own[split[1]] = index
     columns = {joint: parts for joint, parts in columns.items() if {0, 1} <= set(parts)}
     if not columns:
         raise KeypointError(
-            f"{path}: row 1: expected DeepLabCut's headings, or columns such as nose_x and nose_y, "
+            f"row 1: expected DeepLabCut's headings, or columns such as nose_x and nose_y, "
             f"found {shortened(', '.join(heading))}"
         )
     return _Columns(columns, len(names), frame, None, track, unit)
@@ -169,7 +169,7 @@ def _split(name: str) -> tuple[str, int] | None:
     return None
 
 
-def _deeplabcut(path: Path, rows: Sequence[Row]) -> tuple[_Columns, Sequence[Row], list[str]]:
+def _deeplabcut(rows: Sequence[Row]) -> tuple[_Columns, Sequence[Row], list[str]]:
     """The columns of DeepLabCut's headings, the rows below, and what to report."""
     headings = {row[0].lower(): row for _, row in rows[:4]}
     coords, joints = headings["coords"], headings["bodyparts"]
@@ -179,8 +179,7 @@ def _deeplabcut(path: Path, rows: Sequence[Row]) -> tuple[_Columns, Sequence[Row
     animals = headings.get("individuals", ["one"] * size)
     if start is None or not len(joints) == len(animals) == size:
         raise KeypointError(
-            f"{path}: expected x, y, likelihood under every body part, found "
-            f"{shortened(', '.join(coords))}"
+            f"expected x, y, likelihood under every body part, found {shortened(', '.join(coords))}"
         )
     parts: dict[tuple[str, str], dict[int, int]] = {}
     for column in range(start, size):
@@ -189,24 +188,24 @@ def _deeplabcut(path: Path, rows: Sequence[Row]) -> tuple[_Columns, Sequence[Row
             own.setdefault(kinds.index(coords[column]), column)
     for (_, joint), own in parts.items():
         if not {0, 1} <= own.keys():
-            raise KeypointError(f"{path}: coords: expected x and y of {joint!r}")
+            raise KeypointError(f"coords: expected x and y of {joint!r}")
     people = len({person for person, _ in parts})
     report = [f"format: DeepLabCut, {people} individual{'s' * (people > 1)}"]
     if others := sorted({kind for kind in coords[start:] if kind not in kinds}):
         report.append(f"columns left out: {shortened(', '.join(others))}")
     body = rows[1 + [row[0].lower() for _, row in rows[:4]].index("coords") :]
     if not body:
-        raise KeypointError(f"{path}: no frames below the headings; get a complete copy")
+        raise KeypointError("no frames below the headings; get a complete copy")
     # Of labelled frames the picture's name is the index; of a video's its number.
     return _Columns(parts, size, start - 1 if start else None), body, report
 
 
-def _read_rows(path: Path, columns: _Columns, body: Sequence[Row]) -> tuple[list[str], Frames]:
+def _read_rows(columns: _Columns, body: Sequence[Row]) -> tuple[list[str], Frames]:
     """Names of the joints, and the people in every frame."""
     joints: dict[str, None] = {}
     found: dict[Key, dict[str, dict[str, list[float]]]] = {}
     for index, (row, cells) in enumerate(body):
-        where = f"{path}: row {row}"
+        where = f"row {row}"
         if len(cells) != columns.size:
             raise KeypointError(
                 f"{where}: expected {columns.size} columns, as the heading has, found "
