@@ -37,6 +37,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn import functional
 
 from torchcss.body.catalog import ARM_NAMES, BODY_NAMES, LENGTHS, PROPORTION_RANGE
 from torchcss.body.load import load_body
@@ -170,7 +171,9 @@ def retarget(
         raise ConfigurationError(f"body: expected one of {whole}, got {body!r}")
     source, level = torch.from_numpy(motion.joints).clone(), []
     if centred:
-        source -= _middle_of_path(source[:, limb], names)
+        hips = _places(names, source[:, limb])["hips"]
+        # The middle of their path comes to stand over the origin.
+        source -= 0.5 * (hips.amax(0) + hips.amin(0)) * hips.new_tensor([1, 0, 1])
         source, level = levelled(source, source[:, limb].mean(1))
     lengths, report = fit_lengths(names, source[:, limb], foot=_foot_length(motion, names, index))
     model = load_body(body, lengths=lengths)
@@ -242,16 +245,14 @@ def with_lengths(
         limbs: Their positions, metres.
         lengths: Lengths of the catalogue, metres.
     """
-    place = {name: limbs[:, i] for i, name in enumerate(names)}
+    place = _places(names, limbs)
     factor = {name: lengths[name] / value for name, value in _measured(names, limbs).items()}
     width = lengths["shoulder_width"] + _STERNOCLAVICULAR
-    shoulders = place["l_shoulder"] - place["r_shoulder"]
-    factor["shoulder_width"] = 2 * width / float(shoulders.norm(dim=-1).median())
-    hips = 0.5 * (place["l_hip"] + place["r_hip"])
-    trunk = 0.5 * (place["l_shoulder"] + place["r_shoulder"]) - hips
+    factor["shoulder_width"] = 2 * width / _distance(place["l_shoulder"], place["r_shoulder"])
+    hips, trunk = place["hips"], place["shoulders"] - place["hips"]
     moved = {}
-    for name, at in place.items():  # each after the one above
-        side, joint = name.split("_")
+    for name in names:  # each after the one above
+        at, (side, joint) = place[name], name.split("_")
         if joint == "hip":
             moved[name] = hips + factor["hip_width"] * (at - hips)
         elif joint == "shoulder":
@@ -268,24 +269,37 @@ def with_lengths(
 
 def _measured(names: tuple[str, ...], limbs: Float[Tensor, "t limbs 3"]) -> dict[str, float]:
     """Those lengths of the catalogue that the limbs' joints tell: medians, of both sides alike."""
-    place = {name: limbs[:, i] for i, name in enumerate(names)}
-    hips = 0.5 * (place["l_hip"] + place["r_hip"])
-    shoulders = 0.5 * (place["l_shoulder"] + place["r_shoulder"])
-    width = float((place["l_shoulder"] - place["r_shoulder"]).norm(dim=-1).median())
+    place = _places(names, limbs)
+    width = _distance(place["l_shoulder"], place["r_shoulder"])
     found = {
-        "hip_width": float((place["l_hip"] - place["r_hip"]).norm(dim=-1).median()) / 2,
-        "trunk": float((shoulders - hips).norm(dim=-1).median()),
+        "hip_width": _distance(place["l_hip"], place["r_hip"]) / 2,
+        "trunk": _distance(place["shoulders"], place["hips"]),
         "shoulder_width": width / 2 - _STERNOCLAVICULAR,
     }
     for joint, (above, length) in _ABOVE.items():
         both = [
-            float((place[f"{side}_{joint}"] - place[f"{side}_{above}"]).norm(dim=-1).median())
+            _distance(place[f"{side}_{joint}"], place[f"{side}_{above}"])
             for side in "lr"
             if {f"{side}_{joint}", f"{side}_{above}"} <= set(place)
         ]
         if both:
             found[length] = sum(both) / len(both)
     return found
+
+
+def _places(
+    names: tuple[str, ...], limbs: Float[Tensor, "t limbs 3"]
+) -> dict[str, Float[Tensor, "t 3"]]:
+    """Where the limbs' joints are, and the middles of "hips" and "shoulders"."""
+    place = dict(zip(names, limbs.unbind(1), strict=True))
+    for joint in ("hip", "shoulder"):
+        place[f"{joint}s"] = 0.5 * (place[f"l_{joint}"] + place[f"r_{joint}"])
+    return place
+
+
+def _distance(one: Float[Tensor, "t 3"], other: Float[Tensor, "t 3"]) -> float:
+    """Median distance of two joints, metres."""
+    return float((one - other).norm(dim=-1).median())
 
 
 def collision_depth(
@@ -359,15 +373,6 @@ def levelled(
     return joints @ turn.T, [f"floor: tilted by {abs(degrees):.1f} degrees in the source, levelled"]
 
 
-def _middle_of_path(
-    limbs: Float[Tensor, "t limbs 3"], names: tuple[str, ...]
-) -> Float[Tensor, "3"]:
-    """Middle of the hips' path, on the floor."""
-    hips = limbs[:, [names.index("l_hip"), names.index("r_hip")]].mean(1)
-    middle = 0.5 * (hips.amax(0) + hips.amin(0))
-    return middle * middle.new_tensor([1, 0, 1])
-
-
 def _face_middle(
     body: BodyModel, states: Float[Tensor, "t n"]
 ) -> tuple[BodyModel, Float[Tensor, "t n"]]:
@@ -382,23 +387,17 @@ def _face_middle(
     return body.with_base(facing, torch.zeros(3)), states
 
 
-def _frame(left: Tensor, up: Tensor) -> Float[Tensor, "*batch 3 3"]:
-    """Axes (columns) left, up, forward: the first exactly, the second as nearly as may be."""
-    x = torch.nn.functional.normalize(left, dim=-1)
-    z = torch.nn.functional.normalize(torch.linalg.cross(x, up), dim=-1)
-    return torch.stack([x, torch.linalg.cross(z, x), z], dim=-1)
-
-
 def _root_by_trunk(
     names: tuple[str, ...], limbs: Float[Tensor, "t limbs 3"]
 ) -> Float[Tensor, "t 6"]:
     """Place and turns of the root as hips and shoulders show them, turns without jumps."""
-    place = {name: limbs[:, i] for i, name in enumerate(names)}
-    hips = 0.5 * (place["l_hip"] + place["r_hip"])
-    shoulders = 0.5 * (place["l_shoulder"] + place["r_shoulder"])
-    turned = root_angles(_frame(place["l_hip"] - place["r_hip"], shoulders - hips))
+    place = _places(names, limbs)
+    up = place["shoulders"] - place["hips"]
+    left = functional.normalize(place["l_hip"] - place["r_hip"], dim=-1)
+    forward = functional.normalize(torch.linalg.cross(left, up), dim=-1)
+    turned = root_angles(torch.stack([left, torch.linalg.cross(forward, left), forward], dim=-1))
     unwrapped = torch.from_numpy(np.unwrap(turned.numpy(), axis=0))
-    return torch.cat([hips, unwrapped], dim=-1)
+    return torch.cat([place["hips"], unwrapped], dim=-1)
 
 
 def _foot_length(
