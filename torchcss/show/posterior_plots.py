@@ -37,6 +37,7 @@ from torchcss.show.style import OKABE_ITO, save_figure
 from torchcss.show.track_pictures import has_pictures, pictures_of, rows_with_modes
 from torchcss.show.track_plots import (
     effective_number,
+    is_length,
     label,
     mode_colour,
     modes_figure,
@@ -201,7 +202,7 @@ def angles_figure(track: Track) -> Figure:
     for axes in grid.flat[len(track.state_names) :]:
         axes.set_visible(False)
     for index, (axes, name) in enumerate(zip(grid.flat, track.state_names, strict=False)):
-        factor, unit = (1.0, "m") if _is_length(name) else (180 / math.pi, "degrees")
+        factor, unit = (1.0, "m") if is_length(name) else (180 / math.pi, "degrees")
         values = factor * track.state[rows, :, index]
         breaks = moved if name in ROOT_NAMES else moved[:0]
         _draw(axes, track, rows, values, factor * deviation[:, index], breaks=breaks)
@@ -344,10 +345,6 @@ def _caption(what: str) -> str:
         f"{what}: the best mode with {DEVIATIONS:g} standard deviations; "
         "dots: the other modes, fainter the less they weigh"
     )
-
-
-def _is_length(name: str) -> bool:
-    return name in ROOT_NAMES[:3] or name.endswith("_length")
 
 
 def _edges(times: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t+1"]:

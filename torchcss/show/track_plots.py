@@ -27,6 +27,7 @@ from PIL import Image
 
 from torchcss.body.bases import pose_track
 from torchcss.body.model import BodyModel
+from torchcss.body.root import ROOT_NAMES
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.io.run import body_of_track
@@ -117,7 +118,9 @@ def side_view_figure(
     body = body_of_track(track)
     modes = track.modes(row)
     pose = pose_track(body, modes.state, modes.base_transform)
-    camera = _own_frame() if camera is None else camera.to(dtype=torch.float64, device="cpu")
+    # Of a camera at the world's origin only place and axes matter.
+    camera = camera or Camera(torch.eye(3), (1, 1))
+    camera = camera.to(dtype=torch.float64, device="cpu")
     turn = camera.R_camera_world
     spread = (turn @ joint_covariance(body, pose, modes.covariance) @ turn.T).numpy()
     joints = camera.to_camera_frame(pose.joints).numpy()
@@ -141,7 +144,11 @@ def side_view_figure(
         for joint in _first_of_links(body) if weight[mode] >= _LEAST_WEIGHT else ():
             ellipse = _one_deviation(joints[mode, joint, [2, 1]], spread[mode, joint])
             ellipse.set(
-                fc=mode_colour(mode), ec=_darker(mode), alpha=look["alpha"], lw=0.9, zorder=5
+                fc=mode_colour(mode),
+                ec=[0.5 * part for part in mode_colour(mode)],
+                alpha=look["alpha"],
+                lw=0.9,
+                zorder=5,
             )
             side.add_patch(ellipse)
     if reference is not None:
@@ -372,11 +379,6 @@ def _row_of(track: Track, frame: int) -> int:
     return int(rows[0])
 
 
-def _own_frame() -> Camera:
-    """A camera at the origin of its world; only its place and its axes matter."""
-    return Camera([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]], (1, 1))
-
-
 def _first_of_links(body: BodyModel) -> list[int]:
     """The first joint centre of every link; the others are rigid with it."""
     links = body.marker_link.tolist()
@@ -387,10 +389,6 @@ def mode_colour(mode: int) -> tuple[float, float, float]:
     """The colour of the mode of a rank, as in the overlay; red, green, blue from 0 to 1."""
     red, green, blue = PALETTE[mode % len(PALETTE)]
     return red / 255, green / 255, blue / 255
-
-
-def _darker(mode: int) -> tuple[float, ...]:
-    return tuple(0.5 * part for part in mode_colour(mode))
 
 
 def in_perspective(joints: np.ndarray, distance: float) -> np.ndarray:
@@ -463,6 +461,11 @@ def _draw_reference(
     look = {"color": "black", "lw": 1.3, "ls": "--", "zorder": 5}
     draw_bones(front, in_perspective(places, distance), rows, look, label="reference")
     draw_bones(side, places[:, [2, 1]], rows, look)
+
+
+def is_length(name: str) -> bool:
+    """Whether a parameter of a state is a length, metres; others are angles."""
+    return name in ROOT_NAMES[:3] or name.endswith("_length")
 
 
 def label(axes: Axes, title: str = "", x: str = "", y: str = "") -> None:

@@ -214,16 +214,15 @@ def open_recording(
     return recording
 
 
-def close_recording(recording: rr.RecordingStream, *, patience_s: float = 10.0) -> None:
+def close_recording(recording: rr.RecordingStream) -> None:
     """Hand over what was logged, and end a recording.
 
     Args:
         recording: What `open_recording` gave; it may have been closed already.
-        patience_s: How long to wait for a viewer that does not answer.
     """
     # A viewer that was closed before the end is no reason to fail.
     with suppress(RuntimeError):
-        recording.flush(timeout_sec=patience_s)
+        recording.flush(timeout_sec=10.0)  # a viewer may not answer
     recording.disconnect()
 
 
@@ -257,7 +256,7 @@ class Viewer:
         up: str = "y",
         events: bool = True,
     ) -> None:
-        self._recording = recording
+        self._recording, self._rr, self._log = recording, rerun(), recording.log
         self._body = body = on_origin(body)
         self._bones = np.array(bones_of(body), dtype=np.int64).reshape(-1, 2)
         self._camera = camera
@@ -277,7 +276,6 @@ class Viewer:
         Args:
             frame: The frame, later than the last.
         """
-        package, log = rerun(), self._recording.log
         modes = frame.modes
         pose = pose_track(self._body, modes.state, modes.base_transform)
         weight = modes.log_weight.softmax(0)
@@ -289,73 +287,72 @@ class Viewer:
         self._recording.set_time("frame", sequence=modes.frame)
         self._recording.set_time("time", duration=modes.time_s)
         if frame.picture is not None:
-            log("world/camera/picture", _jpeg(frame.picture))
+            self._log("world/camera/picture", _jpeg(frame.picture))
+        for mode in range(self._known, len(weight)):
+            self._introduce(mode)
+        self._known = max(self._known, len(weight))
         for mode in range(len(weight)):
-            if mode == self._known:
-                self._introduce(mode)
-                self._known += 1
             share = float(weight[mode] / weight[0]) if weight[0] > 0 else 1.0
             self._log_pose(mode, share, joints[mode], spread[mode])
             self._log_shape(mode, share, rotation[mode], centre[mode])
             nats = float(cost[mode]) if np.isfinite(cost[mode]) else np.nan
-            log(f"cost/{mode}", package.Scalars(nats))
-            log(f"weight/{mode}", package.Scalars(float(weight[mode])))
+            self._log(f"cost/{mode}", self._rr.Scalars(nats))
+            self._log(f"weight/{mode}", self._rr.Scalars(float(weight[mode])))
         for mode in range(len(weight), self._shown):
             self._hide_mode(mode)
         self._shown = len(weight)
         numbers = (len(weight), count_apart(joints), 1 / np.square(weight).sum())
         for name, number in zip(_COUNTS, numbers, strict=True):
-            log(f"modes/{name}", package.Scalars(float(number)))
+            self._log(f"modes/{name}", self._rr.Scalars(float(number)))
         if frame.lost != self._lost:
             text = f"frame {modes.frame}: told {'lost' if frame.lost else 'found'}"
-            level = package.TextLogLevel.WARN if frame.lost else package.TextLogLevel.INFO
-            log("events", package.TextLog(text, level=level))
+            level = self._rr.TextLogLevel.WARN if frame.lost else self._rr.TextLogLevel.INFO
+            self._log("events", self._rr.TextLog(text, level=level))
         self._lost = frame.lost
 
     def _begin(self, best: Float[np.ndarray, "j 3"]) -> None:
         """Log what does not change, and how the viewer is to be laid out."""
-        package, log = rerun(), self._recording.log
-        log("world", world_axes(self._up), static=True)
+        self._log("world", world_axes(self._up), static=True)
         if self._camera is not None:
             self._log_camera(self._camera, best)
         for (name, label), colour in zip(_COUNTS.items(), PALETTE, strict=False):
-            line = package.SeriesLines(colors=colour, names=label, widths=2.0)
-            log(f"modes/{name}", line, static=True)
+            line = self._rr.SeriesLines(colors=colour, names=label, widths=2.0)
+            self._log(f"modes/{name}", line, static=True)
         self._recording.send_blueprint(layout(best, self._camera, self._up, events=self._events))
 
     def _introduce(self, mode: int) -> None:
         """Log what does not change of a mode."""
-        package, log = rerun(), self._recording.log
         for name, vertices, normals in zip(
             self._body.part_names, self._vertices, self._normals, strict=True
         ):
-            mesh = package.Mesh3D(
+            mesh = self._rr.Mesh3D(
                 vertex_positions=vertices, vertex_normals=normals, triangle_indices=self._faces
             )
-            log(f"world/modes/{mode}/body/{name}", mesh, static=True)
-        line = package.SeriesLines(
+            self._log(f"world/modes/{mode}/body/{name}", mesh, static=True)
+        line = self._rr.SeriesLines(
             colors=PALETTE[mode % len(PALETTE)],
             names="best mode" if mode == 0 else f"mode {mode + 1}",
             widths=2.5 if mode == 0 else 1.2,
         )
         for series in ("cost", "weight"):
-            log(f"{series}/{mode}", line, static=True)
+            self._log(f"{series}/{mode}", line, static=True)
 
     def _log_camera(self, camera: Camera, joints: Float[np.ndarray, "j 3"]) -> None:
-        package, log = rerun(), self._recording.log
         camera = _reduced(camera)
         turn = _array(camera.R_camera_world).T
         centre = _array(camera.centre_world)
         K = _array(camera.K).copy()
         K[:2, 2] += 0.5  # the viewer counts pixels from the picture's corner, we from a centre
-        log("world/camera", package.Transform3D(translation=centre, mat3x3=turn), static=True)
-        pinhole = package.Pinhole(
+        self._log(
+            "world/camera", self._rr.Transform3D(translation=centre, mat3x3=turn), static=True
+        )
+        pinhole = self._rr.Pinhole(
             image_from_camera=K,
             resolution=camera.image_size_wh,
-            camera_xyz=package.ViewCoordinates.RDF,
+            camera_xyz=self._rr.ViewCoordinates.RDF,
             image_plane_distance=_PLANE * float(np.linalg.norm(joints.mean(0) - centre)),
         )
-        log("world/camera", pinhole, static=True)
+        self._log("world/camera", pinhole, static=True)
 
     def _log_pose(
         self,
@@ -365,17 +362,16 @@ class Viewer:
         covariance: Float[np.ndarray, "j 3 3"],
     ) -> None:
         """Log a mode's joints, which weighs `share` as much as the best."""
-        package, log = rerun(), self._recording.log
         path = f"world/modes/{mode}"
         colour = _colour(mode, _opacity(share))
         thickness = 1.0 if mode == 0 else 0.7
-        strips = package.LineStrips3D(
+        strips = self._rr.LineStrips3D(
             joints[self._bones], colors=colour, radii=thickness * _BONE_RADIUS
         )
-        log(f"{path}/skeleton", strips)
-        fill = package.components.FillMode
+        self._log(f"{path}/skeleton", strips)
+        fill = self._rr.components.FillMode
         half_sizes, quaternions = ellipsoids(covariance)
-        shapes = package.Ellipsoids3D(
+        shapes = self._rr.Ellipsoids3D(
             centers=joints,
             half_sizes=half_sizes,
             quaternions=quaternions,
@@ -384,7 +380,7 @@ class Viewer:
             # A mode of little weight may be very uncertain: filled, it would hide all others.
             fill_mode=fill.TransparentFillMajorWireframe if mode == 0 else fill.MajorWireframe,
         )
-        log(f"{path}/uncertainty", shapes)
+        self._log(f"{path}/uncertainty", shapes)
 
     def _log_shape(
         self,
@@ -394,24 +390,22 @@ class Viewer:
         centre: Float[np.ndarray, "p 3"],
     ) -> None:
         """Log a mode's parts, which weighs `share` as much as the best."""
-        package, log = rerun(), self._recording.log
         colour = _colour(mode, _SHAPE * share * _opacity(share))
-        surface = package.Mesh3D.from_fields(albedo_factor=colour)
+        surface = self._rr.Mesh3D.from_fields(albedo_factor=colour)
         for name, turn, place in zip(self._body.part_names, rotation, centre, strict=True):
-            at = package.Transform3D(translation=place, mat3x3=turn)
-            log(f"world/modes/{mode}/body/{name}", at, surface)
+            at = self._rr.Transform3D(translation=place, mat3x3=turn)
+            self._log(f"world/modes/{mode}/body/{name}", at, surface)
 
     def _hide_mode(self, mode: int) -> None:
         """From here on there is no such mode."""
-        package, log = rerun(), self._recording.log
         for name in ("skeleton", "uncertainty"):
-            log(f"world/modes/{mode}/{name}", package.Clear(recursive=False))
+            self._log(f"world/modes/{mode}/{name}", self._rr.Clear(recursive=False))
         # Meshes do not change and cannot be cleared: they become invisible.
         for name in self._body.part_names:
-            hidden = package.Mesh3D.from_fields(albedo_factor=(0, 0, 0, 0))
-            log(f"world/modes/{mode}/body/{name}", hidden)
+            hidden = self._rr.Mesh3D.from_fields(albedo_factor=(0, 0, 0, 0))
+            self._log(f"world/modes/{mode}/body/{name}", hidden)
         for series in ("cost", "weight"):
-            log(f"{series}/{mode}", package.Scalars(np.nan))
+            self._log(f"{series}/{mode}", self._rr.Scalars(np.nan))
 
 
 def _opacity(share: float) -> float:

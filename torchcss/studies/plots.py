@@ -19,9 +19,8 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from torchcss.body.root import ROOT_NAMES
 from torchcss.show.style import OKABE_ITO
-from torchcss.show.track_plots import tidy
+from torchcss.show.track_plots import is_length, tidy
 from torchcss.studies.metrics import spread
 from torchcss.studies.slices import PROMINENCE, Line, Slice
 
@@ -65,7 +64,7 @@ def unit_of(line: Line, *, close: bool = False) -> Unit:
         if close:
             return Unit("standard deviations", 1 / line.deviation)
         return Unit("length of the step (radians and metres)")
-    if line.name in ROOT_NAMES[:3] or line.name.endswith("_length"):
+    if is_length(line.name):
         return Unit("metres")
     return Unit("degrees", 180 / math.pi)
 
