@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from torchcss.errors import ShapeError
+from torchcss.errors import BodyError
 from torchcss.inference.proposals import CovarianceScaled
 from torchcss.studies.sampling_study import (
     ExactSteps,
@@ -53,7 +53,7 @@ def test_options_change_what_they_say(problem):
     given = other(pose={"r_elbow_flexion": 1.0})
     assert float(given.truth[given.body.state_index("r_elbow_flexion")]) == 1.0
     assert float(given.cost.value(given.truth[None])) < 50
-    with pytest.raises(ShapeError, match="no parameter 'elbow'; it has"):
+    with pytest.raises(BodyError, match="no parameter 'elbow'; it has"):
         other(pose={"elbow": 1.0})
 
 

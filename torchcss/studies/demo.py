@@ -96,7 +96,7 @@ def track_sequence(
 
 
 def write_clip(
-    folder: Path, sequence: SyntheticSequence, *, generator: torch.Generator, crf: int = 13
+    folder: Path, sequence: SyntheticSequence, *, generator: torch.Generator
 ) -> Initialisation:
     """Write a sequence as the demo's clip is, with noisy joints of the first frame.
 
@@ -104,7 +104,6 @@ def write_clip(
         folder: The folder; made if missing.
         sequence: The sequence and its truth.
         generator: Source of the noise, and of the search for the first pose.
-        crf: Quality of the film, see `VideoWriter`.
 
     Returns:
         The first pose that was found.
@@ -113,7 +112,7 @@ def write_clip(
         OutputError: If the folder cannot be written.
     """
     prepare_output_folder(folder)
-    with VideoWriter(folder / "video.mp4", sequence.frame_rate, crf=crf) as film:
+    with VideoWriter(folder / "video.mp4", sequence.frame_rate, crf=13) as film:
         for image in sequence.frames:
             film.write(image)
     write_camera(folder / "cameras.json", sequence.camera)
@@ -123,18 +122,18 @@ def write_clip(
     write_arrays(
         folder / "keypoints.npz",
         {
-            "keypoints": torch.cat([seen.positions, torch.zeros(later)]).numpy(),
-            "confidence": torch.cat([seen.confidence, torch.zeros(later[:2])]).numpy(),
-            "joint_names": np.array(seen.names),
+            "keypoints": torch.cat([seen.positions, torch.zeros(later)]),
+            "confidence": torch.cat([seen.confidence, torch.zeros(later[:2])]),
+            "joint_names": seen.names,
         },
     )
     write_fitted_body(folder / "body.npz", first, sequence.camera)
     write_arrays(
         folder / "reference3d.npz",
         {
-            "joints": sequence.joints_world.double().cpu().numpy(),
-            "joint_names": np.array(sequence.body.joint_names),
-            "units": np.array("m"),
+            "joints": sequence.joints_world.double().cpu(),
+            "joint_names": sequence.body.joint_names,
+            "units": "m",
         },
     )
     return first

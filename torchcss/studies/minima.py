@@ -107,6 +107,9 @@ class _NearPlane:
         )
 
 
+_NEIGHBOURS = 3
+"""How many lower minima each is tried against."""
+
 _CHECKS = 5
 """Interior points at which the cost along a straight segment is evaluated."""
 
@@ -185,7 +188,6 @@ def joined_minima(
     bounds: Bounds,
     *,
     rise: float = 0.1,
-    neighbours: int = 3,
 ) -> Int[Tensor, " m"]:
     """Find out which minima are one valley: joined by paths along which the cost hardly rises.
 
@@ -198,7 +200,6 @@ def joined_minima(
         value: Their costs, nats.
         bounds: Box limits.
         rise: Nats above the higher of two minima that a path between them may reach.
-        neighbours: How many lower minima each is tried against.
 
     Returns:
         For each minimum, the index of the lowest minimum of its valley; as many valleys as there
@@ -211,7 +212,7 @@ def joined_minima(
     distance = GaussianMixture(mean, covariance, torch.zeros_like(value)).squared_distance(mean)
     rank = value.argsort(stable=True).argsort()
     distance = torch.where(rank[None, :] < rank[:, None], distance, torch.inf)
-    near, lower = distance.topk(min(neighbours, num - 1), largest=False)
+    near, lower = distance.topk(min(_NEIGHBOURS, num - 1), largest=False)
     higher = torch.arange(num, device=mean.device)[:, None].expand_as(lower)
     pairs = near.isfinite()
     low = low_path(cost, mean[higher[pairs]], mean[lower[pairs]], bounds, rise=rise)

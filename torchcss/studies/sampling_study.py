@@ -19,8 +19,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchcss.body.model import BodyModel
-from torchcss.errors import ShapeError
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.proposals import Proposal
 from torchcss.inference.trust_region import TrustRegionNewton
@@ -166,6 +164,9 @@ def study_problem(
 
     Returns:
         The problem; its body, cost, bounds and start agree with the choice.
+
+    Raises:
+        BodyError: If the body has no such parameter.
     """
     choice = choice or StudyChoice()
     problem = reprojection_problem(
@@ -179,7 +180,9 @@ def study_problem(
     cost.body.sticky_deviation.mul_(choice.prior_scale)
     if pose is not None:
         noise = problem.observed - _project(problem, truth)
-        truth = _pose(cost.body, pose)
+        truth = torch.zeros_like(truth)
+        truth[[cost.body.state_index(name) for name in pose]] = truth.new_tensor([*pose.values()])
+        truth = cost.body.bounds.project(truth)
         cost = replace(cost, target=_project(problem, truth) + noise)
     if not choice.limits:
         infinite = torch.full_like(bounds.lower, math.inf)
@@ -189,17 +192,6 @@ def study_problem(
     return problem._replace(
         truth=truth, observed=cost.target, cost=cost, bounds=bounds, start=start
     )
-
-
-def _pose(body: BodyModel, pose: dict[str, float]) -> Float[Tensor, " n"]:
-    x = torch.zeros_like(body.rest)
-    for name, value in pose.items():
-        if name not in body.state_names:
-            raise ShapeError(
-                f"pose: {body.name} has no parameter {name!r}; it has {', '.join(body.state_names)}"
-            )
-        x[body.state_index(name)] = value
-    return body.bounds.project(x)
 
 
 def _project(problem: ReprojectionProblem, x: Float[Tensor, " n"]) -> Float[Tensor, "j 2"]:

@@ -22,6 +22,7 @@ import os
 import zipfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -43,7 +44,6 @@ def write_sequence(
     shot: Shot,
     *,
     noise_px: float = 2.0,
-    crf: int = 14,
     progress: bool = False,
 ) -> Path:
     """Render a shot into a folder.
@@ -52,7 +52,6 @@ def write_sequence(
         folder: The folder; made if missing, files in it are replaced.
         shot: What to render.
         noise_px: Standard deviation of the 2D joints' noise.
-        crf: Quality of the film, see `VideoWriter`.
         progress: Whether to show a bar.
 
     Returns:
@@ -65,29 +64,27 @@ def write_sequence(
     frames: Iterable[SequenceFrame] = shot.frames()
     if progress:
         frames = tqdm(frames, total=len(shot.states), desc=shot.name, unit="frame")
-    joints = _write_frames(folder, shot, frames, crf)
+    joints = _write_frames(folder, shot, frames)
     _write_joints(folder, shot, joints, noise_px)
     write_camera(folder / "cameras.json", shot.camera)
     body = shot.body
     write_arrays(
         folder / "truth.npz",
         {
-            "body": np.array(body.name),
-            "lengths": np.array(json.dumps(body.lengths)),
-            "base_transform": shot.base_transform.numpy(),
-            "state_names": np.array(body.state_names),
-            "states": shot.states.numpy(),
-            "frame_rate": np.array(shot.frame_rate),
-            "seed": np.array(shot.seed),
-            "description": np.array(shot.description),
+            "body": body.name,
+            "lengths": json.dumps(body.lengths),
+            "base_transform": shot.base_transform,
+            "state_names": body.state_names,
+            "states": shot.states,
+            "frame_rate": shot.frame_rate,
+            "seed": shot.seed,
+            "description": shot.description,
         },
     )
     return folder
 
 
-def _write_frames(
-    folder: Path, shot: Shot, frames: Iterable[SequenceFrame], crf: int
-) -> list[Tensor]:
+def _write_frames(folder: Path, shot: Shot, frames: Iterable[SequenceFrame]) -> list[Tensor]:
     """Write film, flow and masks as the frames are rendered.
 
     Returns the joints of all frames: in space, in the image, whether visible, whether inside it.
@@ -98,7 +95,7 @@ def _write_frames(
     occluded = np.zeros((count - 1, height, width), bool)
     joints: list[tuple[Tensor, ...]] = []
     with (
-        VideoWriter(folder / "video.mp4", shot.frame_rate, crf=crf) as film,
+        VideoWriter(folder / "video.mp4", shot.frame_rate, crf=14) as film,
         replace_file(folder / "flow.npz") as partial,
         zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
     ):
@@ -125,31 +122,28 @@ def _write_joints(folder: Path, shot: Shot, joints: list[Tensor], noise_px: floa
     # Its own generator: the noise of the keypoints does not depend on how the picture was made.
     generator = torch.Generator().manual_seed(shot.seed + 1)
     noise = torch.randn(exact.shape, generator=generator, dtype=exact.dtype)
-    visible = seen.numpy()
-    names = np.array(shot.body.joint_names)
-    frame_rate = np.array(shot.frame_rate)
     write_arrays(
         folder / "keypoints2d.npz",
         {
-            "keypoints": (exact + noise_px * noise).numpy(),
-            "keypoints_exact": exact.numpy(),
-            "confidence": np.where(visible, 1.0, _HIDDEN_CONFIDENCE),
-            "visible": visible,
-            "in_image": inside.numpy(),
-            "joint_names": names,
-            "frame_rate": frame_rate,
-            "noise_px": np.array(noise_px),
+            "keypoints": exact + noise_px * noise,
+            "keypoints_exact": exact,
+            "confidence": np.where(seen, 1.0, _HIDDEN_CONFIDENCE),
+            "visible": seen,
+            "in_image": inside,
+            "joint_names": shot.body.joint_names,
+            "frame_rate": shot.frame_rate,
+            "noise_px": noise_px,
         },
     )
     write_arrays(
         folder / "reference3d.npz",
         {
-            "joints": places.numpy(),
-            "joint_names": names,
-            "camera_names": np.array([shot.camera.name]),
-            "frame_rate": frame_rate,
+            "joints": places,
+            "joint_names": shot.body.joint_names,
+            "camera_names": [shot.camera.name],
+            "frame_rate": shot.frame_rate,
             "time_s": np.arange(len(places)) / shot.frame_rate,
-            "units": np.array("m"),
+            "units": "m",
         },
     )
 
@@ -172,7 +166,7 @@ def write_camera(path: Path, camera: Camera) -> None:
         partial.write_text(json.dumps(content, indent=1), encoding="utf-8")
 
 
-def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write arrays by name."""
+def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Write arrays by name, or what NumPy makes arrays of."""
     with replace_file(path) as partial:
-        np.savez_compressed(partial, **arrays)  # pyright: ignore[reportArgumentType]
+        np.savez_compressed(partial, **arrays)

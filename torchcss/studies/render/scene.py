@@ -89,8 +89,6 @@ class Style:
         shininess: Their exponent.
         pillar: Place of the bright pillar of the clutter, as a share of the picture's width.
         wall: Distance from the farthest point of the motion to the wall, metres.
-        read_noise: Standard deviation of the sensor's noise in the dark, grey levels.
-        shot_noise: Its variance per grey level.
     """
 
     scene: str = "clutter"
@@ -105,8 +103,6 @@ class Style:
     shininess: float = 18.0
     pillar: float = 0.68
     wall: float = 0.7
-    read_noise: float = 1.5
-    shot_noise: float = 0.02
 
     def __post_init__(self) -> None:
         if self.scene not in ("clutter", "dark"):

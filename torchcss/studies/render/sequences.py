@@ -281,10 +281,7 @@ class Shot:
         upcoming = posed(self.states[0])
         for index in range(len(self.states)):
             meshes, labels = upcoming
-            picture = add_sensor_noise(
-                renderer.picture(meshes), generator=generator, read=self.style.read_noise,
-                shot=self.style.shot_noise,
-            )  # fmt: skip
+            picture = add_sensor_noise(renderer.picture(meshes), generator=generator)
             flow, occluded = None, None
             if index + 1 < len(self.states):
                 upcoming = posed(self.states[index + 1])
