@@ -20,7 +20,6 @@ from torchcss.studies.metrics import (
     best_of_modes,
     coverage,
     first_loss,
-    frames_lost,
     mask_overlap,
     mpjpe_mm,
     pa_mpjpe_mm,
@@ -205,8 +204,12 @@ def test_best_of_modes_picks_frame_by_frame_among_the_present() -> None:
 
 def test_frames_lost_by_their_mean_error() -> None:
     errors = np.array([[300.0, 100.0], [300.0, 210.0], [np.nan, 250.1], [np.nan, np.nan]])
-    assert frames_lost(errors).tolist() == [False, True, True, False]
-    assert frames_lost(errors, threshold_mm=100.0).tolist() == [True, True, True, False]
+    tracked, reference = np.zeros((4, 1, 3, 3)), np.zeros((4, 3, 3))
+    tracked[:, 0, 1:, 0] = np.nan_to_num(errors) / 1000
+    reference[:, 1:][np.isnan(errors)] = np.nan
+    names = ("l_hip", "l_knee", "l_ankle")
+    found = track_errors(tracked, reference, names, compared=names[1:], root="l_hip")
+    assert found.lost.tolist() == [False, True, True, False]
 
 
 def test_track_errors_hold_every_kind() -> None:

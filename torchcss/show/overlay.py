@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from torch import Tensor
 from torch.nn import functional
 
@@ -128,6 +128,11 @@ class _Window(NamedTuple):
     @property
     def coarse(self) -> tuple[int, int]:
         return max(round(self.height * self.scale), 1), max(round(self.width * self.scale), 1)
+
+    def of(self, picture: Shaped[Tensor, "H W *c"], more: int = 0) -> Shaped[Tensor, "h w *c"]:
+        """This part of a picture, or with so many rows and columns more."""
+        rows, columns = self.height + more, self.width + more
+        return picture[self.top : self.top + rows, self.left : self.left + columns]
 
     def place(self, uv: Float[Tensor, "v 2"]) -> Float[Tensor, "v 2"]:
         """Pixels of the frame to coarse pixels of the window."""
@@ -326,7 +331,7 @@ def _blend(
     target: UInt8[Tensor, "h w 3"], window: _Window, colour: Tensor, opacity: Float[Tensor, "h w"]
 ) -> None:
     """Mix `colour` (one, or one per pixel) into the window of the frame, in place."""
-    view = target[window.top : window.top + window.height, window.left : window.left + window.width]
+    view = window.of(target)
     touched = torch.nonzero(opacity > 0, as_tuple=True)
     alpha = opacity[touched][:, None]
     paint = colour if colour.ndim == 1 else colour[touched]
@@ -419,10 +424,9 @@ def _hidden_borders(
         if box is None:
             continue
         own = _labels(alone, box) == number
-        here = (slice(box.top, box.top + box.height), slice(box.left, box.left + box.width))
         border = _borders(own.long())
         # A lattice point counts as hidden where none of its four pixels shows this part.
-        shows = functional.pad(visible[here] == number, (1, 1, 1, 1))
+        shows = functional.pad(box.of(visible) == number, (1, 1, 1, 1))
         shows = shows[1:] | shows[:-1]
         border = border * ~(shows[:, 1:] | shows[:, :-1])
         # Dashes run along the axis that the outline follows more closely, so that lines of every
@@ -435,11 +439,8 @@ def _hidden_borders(
         row = torch.arange(box.height + 1, device=visible.device)[:, None] + box.top
         column = torch.arange(box.width + 1, device=visible.device)[None] + box.left
         phase = torch.where(across > down, row, column) // dash
-        lattice = (
-            slice(box.top, box.top + box.height + 1),
-            slice(box.left, box.left + box.width + 1),
-        )
-        dashes[lattice] = torch.maximum(dashes[lattice], border * (phase % 2 == 0))
+        lattice = box.of(dashes, 1)
+        lattice.copy_(lattice.maximum(border * (phase % 2 == 0)))
     return dashes
 
 

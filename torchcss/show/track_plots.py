@@ -181,11 +181,8 @@ def num_explanations(track: Track, *, apart: float = APART) -> np.ndarray:
         track: The track.
         apart: Distance of some joint centre from which modes differ, metres.
     """
-    counts = [
-        count_apart(joints[:num], apart=apart)
-        for joints, num in zip(track.joints_world, track.num_modes, strict=True)
-    ]
-    return np.array(counts, np.int64)
+    frames = zip(track.joints_world, track.num_modes, strict=True)
+    return np.array([count_apart(joints[:num], apart=apart) for joints, num in frames], np.int64)
 
 
 def count_apart(joints: Float[np.ndarray, "k j 3"], *, apart: float = APART) -> int:
@@ -309,10 +306,8 @@ def contact_sheet(
     """
     if not len(frames):
         raise ConfigurationError("frames: expected at least one, got none")
-    place = {int(frame): int(frame) for frame in frames}
-    if track is not None:
-        row = {int(frame): row for row, frame in enumerate(track.frames)}
-        place = {frame: row.get(frame, -1) for frame in place}
+    known = {} if track is None else {int(frame): row for row, frame in enumerate(track.frames)}
+    place = {int(f): int(f) if track is None else known.get(int(f), -1) for f in frames}
     images: dict[int, tuple[float, np.ndarray]] = {}
     for frame in VideoReader(video, stop=max(*place.values(), 0) + 1):
         if frame.index in place.values():
@@ -321,11 +316,9 @@ def contact_sheet(
     if missing := [frame for frame, row in place.items() if row not in images]:
         raise ConfigurationError(f"{video}: no frames {missing}; choose others")
 
-    shown = [images[place[int(index)]] for index in frames]
-    titles = [
-        f"frame {index}, {time:.2f} s" for index, (time, _) in zip(frames, shown, strict=True)
-    ]
-    return sheet_of([image for _, image in shown], titles, columns=columns)
+    times, shown = zip(*(images[place[int(frame)]] for frame in frames), strict=True)
+    titles = [f"frame {frame}, {time:.2f} s" for frame, time in zip(frames, times, strict=True)]
+    return sheet_of(shown, titles, columns=columns)
 
 
 def sheet_of(
@@ -456,8 +449,8 @@ def _draw_reference(
     pairs = [pair for pair in (*pairs, *_TRUNK) if set(pair) <= set(known)]
     if not pairs:
         return
-    places = np.array([known[name] for pair in pairs for name in pair])
-    rows = [(2 * pair, 2 * pair + 1) for pair in range(len(pairs))]
+    names, places = list(known), np.array(list(known.values()))
+    rows = [(names.index(first), names.index(second)) for first, second in pairs]
     look = {"color": "black", "lw": 1.3, "ls": "--", "zorder": 5}
     draw_bones(front, in_perspective(places, distance), rows, look, label="reference")
     draw_bones(side, places[:, [2, 1]], rows, look)

@@ -166,9 +166,9 @@ def retarget(
     choice = choice or Retargeting()
     names, index, _ = limb_positions(motion)
     limb = list(index)
-    if body not in BODY_NAMES or body in ARM_NAMES:
-        whole = ", ".join(name for name in BODY_NAMES if name not in ARM_NAMES)
-        raise ConfigurationError(f"body: expected one of {whole}, got {body!r}")
+    whole = [name for name in BODY_NAMES if name not in ARM_NAMES]
+    if body not in whole:
+        raise ConfigurationError(f"body: expected one of {', '.join(whole)}, got {body!r}")
     source, level = torch.from_numpy(motion.joints).clone(), []
     if centred:
         hips = _places(names, source[:, limb])["hips"]
@@ -188,7 +188,7 @@ def retarget(
     if centred:
         feet = [model.joint_index(f"{side}_{end}") for side in "lr" for end in ("heel", "toe")]
         floor = model.pose(states).joints[:, feet, 1].amin(-1).quantile(_ON_FLOOR)
-        drop = torch.stack([0 * floor, -floor, 0 * floor])
+        drop = -floor * floor.new_tensor([0.0, 1.0, 0.0])
         model = model.with_base(model.base_rotation, drop)
         source, limbs = source + drop, limbs + drop
     joints = model.pose(states).joints

@@ -100,7 +100,8 @@ class TrackErrors(NamedTuple):
         absolute_best_of_modes: Of the mode that is best by this error, frame by frame.
         root_aligned_best_of_modes: Of the mode that is best by this error.
         procrustes_best_of_modes: Of the mode that is best by this error.
-        lost: True where the best mode's root-aligned error exceeds `LOST_MM`.
+        lost: True where the best mode's mean root-aligned error exceeds `LOST_MM`; a frame without
+            any is not lost.
     """
 
     joint_names: tuple[str, ...]
@@ -274,18 +275,6 @@ def best_of_modes(
     return np.where(measured, best[..., 0, :], np.nan), mode[..., 0]
 
 
-def frames_lost(
-    root_aligned_errors_mm: Float[ArrayLike, "*batch j"], *, threshold_mm: float = LOST_MM
-) -> Bool[np.ndarray, "*batch"]:
-    """Tell in which frames the body was lost: their mean root-aligned error is above the threshold.
-
-    Args:
-        root_aligned_errors_mm: Errors of one mode per frame. Frames without any are not lost.
-        threshold_mm: The limit.
-    """
-    return np.nan_to_num(_mean(np.asarray(root_aligned_errors_mm, np.float64))) > threshold_mm
-
-
 def track_errors(
     tracked_m: Float[ArrayLike, "t k j 3"],
     reference_m: Float[ArrayLike, "t j 3"],
@@ -340,7 +329,7 @@ def track_errors(
         f"{kind}_best_of_modes": JointErrors(best_of_modes(errors, present)[0])
         for kind, errors in kinds.items()
     }
-    lost = frames_lost(of_kind["root_aligned"].errors_mm)
+    lost = np.nan_to_num(of_kind["root_aligned"].per_frame_mm) > LOST_MM
     return TrackErrors(joint_names=tuple(chosen), lost=lost, **of_kind)
 
 
