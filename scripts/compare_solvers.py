@@ -46,6 +46,7 @@ os.environ.setdefault(
 import numpy as np
 import torch
 from common import Table, start, write_report
+from peers.compiled_reprojection import CompiledReprojection
 from torch import Tensor
 
 from torchcss.errors import ConfigurationError
@@ -53,7 +54,6 @@ from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.kernels import compiler
 from torchcss.linalg import covariance_factor
 from torchcss.robust import Lorentzian, Quadratic
-from torchcss.studies.compiled_reprojection import CompiledReprojection
 from torchcss.studies.reprojection import ReprojectionProblem, reprojection_problem
 
 OURS, EAGER = "torchcss", "torchcss, torch cost"

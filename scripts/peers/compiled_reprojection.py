@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
+from peers.reprojection_kernel import Reprojection, Scratch, evaluate
 from torch import Tensor
 
 from torchcss.cost.fused.pack import array, carried, pack_potential, pack_tree
 from torchcss.cost.fused.records import Array, Points, Result, Tree
-from torchcss.cost.fused.reprojection import Reprojection, Scratch, evaluate
 from torchcss.errors import ConfigurationError, check_shape
 from torchcss.studies.reprojection import ReprojectionCost
 from torchcss.types import LocalModel

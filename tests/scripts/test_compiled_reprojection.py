@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from peers.compiled_reprojection import CompiledReprojection
 
 from torchcss.errors import ConfigurationError
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.kernels import compiler
 from torchcss.robust import Leclerc, Lorentzian, Quadratic
-from torchcss.studies.compiled_reprojection import CompiledReprojection
 from torchcss.studies.reprojection import ReprojectionProblem, reprojection_problem
 from torchcss.types import BlendedCost
 
@@ -94,7 +94,8 @@ print(CompiledReprojection.of(problem.cost).local_model(x).hessian.sum().item())
 
 def test_no_index_is_out_of_range() -> None:
     here = Path(__file__).parent
-    paths = os.pathsep.join([str(here), str(here.parents[1])])
+    repository = here.parents[1]
+    paths = os.pathsep.join(map(str, (here, repository, repository / "scripts")))
     environment = {**os.environ, "TORCHCSS_CHECK_KERNELS": "1", "PYTHONPATH": paths}
     run = [sys.executable, "-c", CHECK]
     done = subprocess.run(run, env=environment, capture_output=True, text=True, check=False)
