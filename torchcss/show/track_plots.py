@@ -119,8 +119,7 @@ def side_view_figure(
     modes = track.modes(row)
     pose = pose_track(body, modes.state, modes.base_transform)
     # Of a camera at the world's origin only place and axes matter.
-    camera = camera or Camera(torch.eye(3), (1, 1))
-    camera = camera.to(dtype=torch.float64, device="cpu")
+    camera = (camera or Camera(torch.eye(3), (1, 1))).to(dtype=torch.float64, device="cpu")
     turn = camera.R_camera_world
     spread = (turn @ joint_covariance(body, pose, modes.covariance) @ turn.T).numpy()
     joints = camera.to_camera_frame(pose.joints).numpy()
