@@ -41,6 +41,12 @@ from torchcss.vision.rasterise import (
     vertex_normals,
 )
 
+Picture = UInt8[Tensor, "h w 3"]
+"""Red, green and blue."""
+
+Labels = Int[Tensor, "r s"]
+"""Part of the body, or triangle, of every coarse pixel; -1 where there is none."""
+
 _ORDER = ("sky", "orange", "purple", "green", "vermilion", "yellow", "blue")
 PALETTE = tuple(tuple(bytes.fromhex(OKABE_ITO[name].removeprefix("#"))) for name in _ORDER)
 """Colours of the modes, RGB, best mode first: Okabe and Ito's set without black."""
@@ -77,7 +83,7 @@ class ProjectedBody(NamedTuple):
         own = torch.zeros_like(self.valid).index_fill(0, faces.flatten(), True)
         return self._replace(valid=self.valid & own, faces=faces, part=self.part[chosen])
 
-    def parts_seen(self, face: Int[Tensor, "r s"]) -> Int[Tensor, "r s"]:
+    def parts_seen(self, face: Labels) -> Labels:
         """The part of every pixel's triangle, -1 where there is none."""
         if not len(self.part):
             return face
@@ -197,14 +203,14 @@ def draw_poses(
 
 
 def draw_overlay(
-    image: UInt8[Tensor, "h w 3"],
+    image: Picture,
     modes: Sequence[ProjectedBody],
     *,
     weights: Float[Tensor, " k"] | Sequence[float] | None = None,
     keypoints: Float[Tensor, "j 2"] | None = None,
     text: str | None = None,
     style: OverlayStyle | None = None,
-) -> UInt8[Tensor, "h w 3"]:
+) -> Picture:
     """Draw the modes of a tracker over a frame.
 
     Args:
@@ -275,13 +281,13 @@ def _window(
     return _Window(top, left, rows, columns, min(1.0, (resolution / (rows * columns)) ** 0.5))
 
 
-def _labels(mode: ProjectedBody, window: _Window) -> Int[Tensor, "r s"]:
+def _labels(mode: ProjectedBody, window: _Window) -> Labels:
     """Part labels of a body in its window."""
     place, depth, valid = window.place(mode.uv)[None], mode.depth[None], mode.valid[None]
     return mode.parts_seen(nearest_faces(place, depth, mode.faces, *window.coarse, valid=valid)[0])
 
 
-def _borders(part: Int[Tensor, "r s"]) -> Float[Tensor, "R S"]:
+def _borders(part: Labels) -> Float[Tensor, "R S"]:
     """Length of outline that passes each lattice point, in coarse pixels; zero for most.
 
     The lattice lies between the pixels and is one larger than the image. An outline runs along the
@@ -327,9 +333,7 @@ def _cover(
     return (width / 2 + 0.5 - squared.sqrt()).clamp(0, 1)
 
 
-def _blend(
-    target: UInt8[Tensor, "h w 3"], window: _Window, colour: Tensor, opacity: Float[Tensor, "h w"]
-) -> None:
+def _blend(target: Picture, window: _Window, colour: Tensor, opacity: Float[Tensor, "h w"]) -> None:
     """Mix `colour` (one, or one per pixel) into the window of the frame, in place."""
     view = window.of(target)
     touched = torch.nonzero(opacity > 0, as_tuple=True)
@@ -339,7 +343,7 @@ def _blend(
 
 
 def _draw_outline(
-    target: UInt8[Tensor, "h w 3"],
+    target: Picture,
     mode: ProjectedBody,
     colour: Float[Tensor, "3"],
     line: float,
@@ -356,7 +360,7 @@ def _draw_outline(
 
 
 def _draw_body(
-    target: UInt8[Tensor, "h w 3"],
+    target: Picture,
     mode: ProjectedBody,
     colour: Float[Tensor, "3"],
     line: float,
@@ -411,7 +415,7 @@ def _shading(
 
 
 def _hidden_borders(
-    mode: ProjectedBody, visible: Int[Tensor, "r s"], window: _Window, line: float
+    mode: ProjectedBody, visible: Labels, window: _Window, line: float
 ) -> Float[Tensor, "R S"]:
     """Dashed lattice of part silhouettes that lie behind other parts of the same body."""
     rows, columns = visible.shape
@@ -444,9 +448,7 @@ def _hidden_borders(
     return dashes
 
 
-def _draw_keypoints(
-    target: UInt8[Tensor, "h w 3"], keypoints: Float[Tensor, "j 2"], radius: float
-) -> None:
+def _draw_keypoints(target: Picture, keypoints: Float[Tensor, "j 2"], radius: float) -> None:
     """Yellow rings with a dark rim."""
     height, width = target.shape[:2]
     yellow = target.new_tensor(PALETTE[5], dtype=torch.float32)
@@ -465,7 +467,7 @@ def _draw_keypoints(
         _blend(target, window, yellow, (0.3 * radius + 0.5 - off).clamp(0, 1).float())
 
 
-def _draw_text(target: UInt8[Tensor, "h w 3"], text: str) -> None:
+def _draw_text(target: Picture, text: str) -> None:
     """One line in the lower left corner, white on a dark strip."""
     # Pillow comes with matplotlib; imported here because nothing else of the overlay needs it.
     from PIL import Image, ImageDraw, ImageFont

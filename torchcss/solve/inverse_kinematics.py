@@ -44,7 +44,7 @@ from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.proposals import CovarianceScaled
 from torchcss.inference.trust_region import TrustRegionNewton, default_prior_variance
 from torchcss.linalg import inverse_on_free
-from torchcss.solve.self_motion import Curve, SolutionSet, distance_from
+from torchcss.solve.self_motion import Curve, SolutionSet, States, distance_from
 from torchcss.types import Bounds
 
 _NEAR = 0.02
@@ -255,7 +255,7 @@ class _Problem(NamedTuple):
             )
         return redundancy
 
-    def samples(self, known: Float[Tensor, "k m"], generator: torch.Generator) -> Tensor:
+    def samples(self, known: States, generator: torch.Generator) -> Tensor:
         """Starts of a round: uniform ones, and some about what is known."""
         num = self.search.num_samples
         about = round(self.search.share * num) if len(known) else 0
@@ -274,7 +274,7 @@ class _Problem(NamedTuple):
         drawn = proposal.sample(mixture, about, self.states.bounds, generator=generator).x
         return torch.cat([uniform, drawn])
 
-    def turned(self, x: Float[Tensor, "k m"]) -> Float[Tensor, "s m"]:
+    def turned(self, x: States) -> Float[Tensor, "s m"]:
         """Solutions with one joint turned by half or whole turns, or mirrored in its range."""
         eye = torch.eye(len(self.lower), dtype=x.dtype, device=x.device)
         steps = torch.cat([k * math.pi * eye for k in (-2, -1, 1, 2)])
@@ -283,7 +283,7 @@ class _Problem(NamedTuple):
         mirrored = x[:, None] + eye * (self.lower + self.upper - 2 * x)[:, None]
         return torch.cat([turned[inside], mirrored.flatten(0, 1)])
 
-    def solve(self, starts: Float[Tensor, "s m"]) -> Float[Tensor, "k m"]:
+    def solve(self, starts: Float[Tensor, "s m"]) -> States:
         """Descend and polish; what reaches the pose."""
         modes = _DESCENT.minimise(self.states.cost, starts, self.states.bounds)
         near = modes.cost <= 0.5 * (_NEAR / self.search.sigma) ** 2
@@ -303,7 +303,7 @@ class _Found:
         self.states, self.spacing, self.isolated = problem.states, problem.search.spacing, isolated
         self.curves: list[Curve] = []
 
-    def add(self, x: Float[Tensor, "k m"]) -> Float[Tensor, "a m"]:
+    def add(self, x: States) -> Float[Tensor, "a m"]:
         """Take in solutions; returns one of each new set."""
         for curve in self.curves:
             x = x[~self._on(curve, x)]
@@ -322,7 +322,7 @@ class _Found:
                     x = x[~(same | self._on(curve, x))]
         return torch.stack(fresh) if fresh else x
 
-    def _on(self, curve: Curve, x: Float[Tensor, "k m"]) -> Bool[Tensor, " k"]:
+    def _on(self, curve: Curve, x: States) -> Bool[Tensor, " k"]:
         """Which states are one with an isolated solution, or lie on a curve."""
         near = _SAME if self.isolated else 0.25 * self.spacing
         return distance_from(curve, x, self.states.period) <= near
@@ -340,7 +340,7 @@ class _Found:
         return torch.arange(len(sizes), device=device).repeat_interleave(sizes), closed
 
 
-def _thinned(states: SolutionSet, x: Float[Tensor, "k m"], distance: float) -> Float[Tensor, "a m"]:
+def _thinned(states: SolutionSet, x: States, distance: float) -> Float[Tensor, "a m"]:
     """A choice of states, none nearer to another than a distance."""
     chosen = []
     while len(x):

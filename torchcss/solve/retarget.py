@@ -78,6 +78,9 @@ _SLACK = 1e-6
 _DEEP = 0.01
 """Metres that a surface must be inside another part to count as a collision."""
 
+Limbs = Float[Tensor, "t limbs 3"]
+"""Joint centres of the limbs, frame by frame, metres."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Retargeting:
@@ -133,7 +136,7 @@ class Retargeted(NamedTuple):
     states: Float[Tensor, "t n"]
     joints: Float[Tensor, "t j 3"]
     target_names: tuple[str, ...]
-    targets: Float[Tensor, "t limbs 3"]
+    targets: Limbs
     source: Float[Tensor, "t k 3"]
     error: Float[Tensor, "t limbs"]
     at_limit: Bool[Tensor, "t n"]
@@ -204,7 +207,7 @@ def retarget(
 
 def fit_lengths(
     names: tuple[str, ...],
-    limbs: Float[Tensor, "t limbs 3"],
+    limbs: Limbs,
     *,
     foot: float | None = None,
 ) -> tuple[dict[str, float], list[str]]:
@@ -235,9 +238,7 @@ def fit_lengths(
     return lengths, [f"lengths held within 10 % of the standard humanoid's, mm: {', '.join(held)}"]
 
 
-def with_lengths(
-    names: tuple[str, ...], limbs: Float[Tensor, "t limbs 3"], lengths: Mapping[str, float]
-) -> Float[Tensor, "t limbs 3"]:
+def with_lengths(names: tuple[str, ...], limbs: Limbs, lengths: Mapping[str, float]) -> Limbs:
     """Joint centres that keep their directions from each other, and take other lengths.
 
     Args:
@@ -267,7 +268,7 @@ def with_lengths(
     return torch.stack([moved[name] for name in names], dim=1)
 
 
-def _measured(names: tuple[str, ...], limbs: Float[Tensor, "t limbs 3"]) -> dict[str, float]:
+def _measured(names: tuple[str, ...], limbs: Limbs) -> dict[str, float]:
     """Those lengths of the catalogue that the limbs' joints tell: medians, of both sides alike."""
     place = _places(names, limbs)
     width = _distance(place["l_shoulder"], place["r_shoulder"])
@@ -287,9 +288,7 @@ def _measured(names: tuple[str, ...], limbs: Float[Tensor, "t limbs 3"]) -> dict
     return found
 
 
-def _places(
-    names: tuple[str, ...], limbs: Float[Tensor, "t limbs 3"]
-) -> dict[str, Float[Tensor, "t 3"]]:
+def _places(names: tuple[str, ...], limbs: Limbs) -> dict[str, Float[Tensor, "t 3"]]:
     """Where the limbs' joints are, and the middles of "hips" and "shoulders"."""
     place = dict(zip(names, limbs.unbind(1), strict=True))
     for joint in ("hip", "shoulder"):
@@ -387,9 +386,7 @@ def _face_middle(
     return body.with_base(facing, torch.zeros(3)), states
 
 
-def _root_by_trunk(
-    names: tuple[str, ...], limbs: Float[Tensor, "t limbs 3"]
-) -> Float[Tensor, "t 6"]:
+def _root_by_trunk(names: tuple[str, ...], limbs: Limbs) -> Float[Tensor, "t 6"]:
     """Place and turns of the root as hips and shoulders show them, turns without jumps."""
     place = _places(names, limbs)
     up = place["shoulders"] - place["hips"]

@@ -36,6 +36,9 @@ _LEAST_STEP = 1e-4
 
 _MOST_STEPS = 5000
 
+States = Float[Tensor, "k m"]
+"""Some states, a row each."""
+
 
 class Curve(NamedTuple):
     """A connected piece of a solution set within the bounds.
@@ -74,8 +77,8 @@ class SolutionSet(NamedTuple):
         return self.apart(x, torch.zeros_like(x))
 
     def polish(
-        self, x: Float[Tensor, "k m"], held: Bool[Tensor, "k m"] | None = None
-    ) -> tuple[Float[Tensor, "k m"], Bool[Tensor, " k"]]:
+        self, x: States, held: Bool[Tensor, "k m"] | None = None
+    ) -> tuple[States, Bool[Tensor, " k"]]:
         """Go to the nearest states of the set by Gauss-Newton steps of least length.
 
         Args:
@@ -100,7 +103,7 @@ class SolutionSet(NamedTuple):
             x[todo] = self.bounds.project(x[todo] - step[..., 0])
         return x, exact
 
-    def follow(self, x: Float[Tensor, "k m"], spacing: float) -> list[Curve]:
+    def follow(self, x: States, spacing: float) -> list[Curve]:
         """Walk along the curves through some states until they close or end at bounds.
 
         Args:
@@ -121,14 +124,12 @@ class SolutionSet(NamedTuple):
             exact.append(Curve(polished[on_target], curve.closed))
         return exact
 
-    def _direction(self, x: Float[Tensor, "k m"]) -> Float[Tensor, "k m"]:
+    def _direction(self, x: States) -> States:
         """Unit null vectors of the Jacobian, of either sign."""
         jacobian = self.cost.errors(x)[1].flatten(1, 2)
         return torch.linalg.eigh(jacobian.mT @ jacobian)[1][..., 0]
 
-    def _walk(
-        self, start: Float[Tensor, "k m"], direction: Float[Tensor, "k m"], spacing: float
-    ) -> list[Curve]:
+    def _walk(self, start: States, direction: States, spacing: float) -> list[Curve]:
         """Walk one way from every start."""
         chains = [[point] for point in start]
         closed = [False] * len(start)
@@ -167,8 +168,8 @@ class SolutionSet(NamedTuple):
         return [Curve(torch.stack(c), done) for c, done in zip(chains, closed, strict=True)]
 
     def _step(
-        self, x: Float[Tensor, "k m"], along: Float[Tensor, "k m"], step: Float[Tensor, " k"]
-    ) -> tuple[Float[Tensor, "k m"], Bool[Tensor, " k"]]:
+        self, x: States, along: States, step: Float[Tensor, " k"]
+    ) -> tuple[States, Bool[Tensor, " k"]]:
         """A step along the curve, and which of them came back to it."""
         ahead = x + step[:, None] * along
         target = ahead
@@ -182,9 +183,7 @@ class SolutionSet(NamedTuple):
         aside = (target - ahead).norm(dim=-1)
         return target, (error <= _ON_THE_CURVE) & (aside <= 0.5 * step)
 
-    def _land(
-        self, x: Float[Tensor, "k m"], beyond: Float[Tensor, "k m"]
-    ) -> tuple[Float[Tensor, "k m"], Bool[Tensor, " k"]]:
+    def _land(self, x: States, beyond: States) -> tuple[States, Bool[Tensor, " k"]]:
         """Where curves from within the bounds meet them; False where that is at x itself."""
         move = beyond - x
         limit = torch.where(move > 0, self.bounds.upper, self.bounds.lower)
@@ -200,7 +199,7 @@ class SolutionSet(NamedTuple):
 
 
 def distance_from(
-    curve: Curve, x: Float[Tensor, "k m"], period: Float[Tensor, " m"] | None = None
+    curve: Curve, x: States, period: Float[Tensor, " m"] | None = None
 ) -> Float[Tensor, " k"]:
     """Distance of states from the line through the points of a curve.
 

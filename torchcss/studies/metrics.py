@@ -60,6 +60,9 @@ REGAIN_S: Final = 0.5
 LEVELS: Final = (0.5, 0.9, 0.95)
 """Probabilities of the regions by which calibration is told."""
 
+Places = Float[ArrayLike, "*batch j 3"]
+"""Joint positions, metres."""
+
 _FEWEST_TO_ALIGN = 3
 _MILLIMETRES = 1000.0
 
@@ -119,9 +122,7 @@ class TrackErrors(NamedTuple):
         return int(np.isfinite(self.root_aligned.errors_mm).any(-1).sum())
 
 
-def absolute_errors_mm(
-    tracked_m: Float[ArrayLike, "*batch j 3"], reference_m: Float[ArrayLike, "*batch j 3"]
-) -> Float[np.ndarray, "*batch j"]:
+def absolute_errors_mm(tracked_m: Places, reference_m: Places) -> Float[np.ndarray, "*batch j"]:
     """Distance of every joint from its reference, as they stand.
 
     Args:
@@ -135,8 +136,8 @@ def absolute_errors_mm(
 
 
 def root_aligned_errors_mm(
-    tracked_m: Float[ArrayLike, "*batch j 3"],
-    reference_m: Float[ArrayLike, "*batch j 3"],
+    tracked_m: Places,
+    reference_m: Places,
     joint_names: Sequence[str],
     *,
     root: str | None = None,
@@ -173,9 +174,7 @@ def root_aligned_errors_mm(
     return _distances_mm(centred(tracked), centred(reference))
 
 
-def procrustes_errors_mm(
-    tracked_m: Float[ArrayLike, "*batch j 3"], reference_m: Float[ArrayLike, "*batch j 3"]
-) -> Float[np.ndarray, "*batch j"]:
+def procrustes_errors_mm(tracked_m: Places, reference_m: Places) -> Float[np.ndarray, "*batch j"]:
     """Distance of every joint from its reference after the best similarity of the pose.
 
     Args:
@@ -189,9 +188,7 @@ def procrustes_errors_mm(
     return _distances_mm(procrustes_align(tracked_m, reference_m), np.asarray(reference_m))
 
 
-def procrustes_align(
-    tracked_m: Float[ArrayLike, "*batch j 3"], reference_m: Float[ArrayLike, "*batch j 3"]
-) -> Float[np.ndarray, "*batch j 3"]:
+def procrustes_align(tracked_m: Places, reference_m: Places) -> Float[np.ndarray, "*batch j 3"]:
     """Rotate, shift and scale every tracked pose to where it is nearest to its reference.
 
     Args:
@@ -226,16 +223,14 @@ def procrustes_align(
     return np.where(count >= _FEWEST_TO_ALIGN, moved + reference_mean, np.nan)
 
 
-def mpjpe_mm(
-    tracked_m: Float[ArrayLike, "*batch j 3"], reference_m: Float[ArrayLike, "*batch j 3"]
-) -> Float[np.ndarray, "*batch"]:
+def mpjpe_mm(tracked_m: Places, reference_m: Places) -> Float[np.ndarray, "*batch"]:
     """Mean over the known joints of `absolute_errors_mm`, pose by pose; NaN where none is known."""
     return _mean(absolute_errors_mm(tracked_m, reference_m))
 
 
 def root_aligned_mpjpe_mm(
-    tracked_m: Float[ArrayLike, "*batch j 3"],
-    reference_m: Float[ArrayLike, "*batch j 3"],
+    tracked_m: Places,
+    reference_m: Places,
     joint_names: Sequence[str],
     *,
     root: str | None = None,
@@ -244,9 +239,7 @@ def root_aligned_mpjpe_mm(
     return _mean(root_aligned_errors_mm(tracked_m, reference_m, joint_names, root=root))
 
 
-def pa_mpjpe_mm(
-    tracked_m: Float[ArrayLike, "*batch j 3"], reference_m: Float[ArrayLike, "*batch j 3"]
-) -> Float[np.ndarray, "*batch"]:
+def pa_mpjpe_mm(tracked_m: Places, reference_m: Places) -> Float[np.ndarray, "*batch"]:
     """Mean over the known joints of `procrustes_errors_mm`, pose by pose."""
     return _mean(procrustes_errors_mm(tracked_m, reference_m))
 

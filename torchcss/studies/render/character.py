@@ -80,6 +80,9 @@ _THUMB_TILT = 0.55
 _INFLUENCES = 4
 """Parts that may share a vertex."""
 
+Vertices = Float[Tensor, "v 3"]
+"""Three numbers of every vertex: place (metres) or colour."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Clothing:
@@ -134,10 +137,10 @@ class _OnBody(NamedTuple):
     body: BodyModel
     shape: Float[Tensor, "parts 9"]
     nearest: Int[Tensor, " v"]
-    local: Float[Tensor, "v 3"]
+    local: Vertices
 
     @property
-    def in_semi_axes(self) -> Float[Tensor, "v 3"]:
+    def in_semi_axes(self) -> Vertices:
         """Place in the part's frame, in units of its semi-axes."""
         return self.local / self.shape[self.nearest, :3]
 
@@ -203,7 +206,7 @@ class Character:
         clothing, vertices = self.clothing, self._vertices
         colour, cloth = _colours(place, clothing, vertices, generator)
         # Borders of patterns and clothes run through the middle of triangles.
-        self.colour: Float[Tensor, "v 3"] = _smooth(colour, self.faces, 1)
+        self.colour: Vertices = _smooth(colour, self.faces, 1)
         radius = (self.shape[:, 0] * self.shape[:, 1]).sqrt()
         radius = (self._weight * radius[self._owner]).sum(-1)
         still = place.on("head", "hand", "foot", "neck")
@@ -358,7 +361,7 @@ def _smooth_union(
     rotation: Float[Tensor, "parts 3 3"],
     centre: Float[Tensor, "parts 3"],
     spacing: float,
-) -> tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]:
+) -> tuple[Vertices, Int[Tensor, "f 3"]]:
     """Mesh of the smooth union of posed parts; its triangles run anticlockwise from outside."""
     margin = 6 * _BLEND
     # A part's box in the world, with room for its taper and for the blend.
@@ -387,7 +390,7 @@ def _smooth_union(
 
 def _level_set(
     field: Float[Tensor, "x y z"],
-) -> tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]:
+) -> tuple[Vertices, Int[Tensor, "f 3"]]:
     """Mesh of where a field is 0, in cells: surface nets (Gibson 1998).
 
     Every cell with a change of sign has one vertex, in the middle of the crossings on its edges;
@@ -466,7 +469,7 @@ def _muscle(place: _OnBody) -> Float[Tensor, " v"]:
 
 def _colours(
     place: _OnBody, clothing: Clothing, vertices: Tensor, generator: torch.Generator
-) -> tuple[Float[Tensor, "v 3"], Tensor]:
+) -> tuple[Vertices, Tensor]:
     """Display colours of all vertices, and which of them are covered by loose cloth."""
     on, along = place.on, _along_limb(place)
     shirt = on("chest", "clavicle") | (on("upper_arm", "forearm") & (along < clothing.sleeve))
@@ -497,11 +500,11 @@ def _colours(
     return _head(place, clothing, colour).clamp(0, 1), cloth
 
 
-def _painted(colour: Float[Tensor, "v 3"], where: Bool[Tensor, " v"], paint: Colour) -> Tensor:
+def _painted(colour: Vertices, where: Bool[Tensor, " v"], paint: Colour) -> Tensor:
     return torch.where(where[:, None], colour.new_tensor(paint), colour)
 
 
-def _head(place: _OnBody, clothing: Clothing, colour: Float[Tensor, "v 3"]) -> Tensor:
+def _head(place: _OnBody, clothing: Clothing, colour: Vertices) -> Tensor:
     """Hair, eyes and mouth."""
     # The head's z axis points up, its y axis backwards.
     x, y, z = place.in_semi_axes.unbind(-1)

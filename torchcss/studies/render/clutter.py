@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from torchcss.studies.render.renderer import to_bytes, value_noise
+from torchcss.studies.render.renderer import Picture, to_bytes, value_noise
 
 
 def clutter_background(
     height: int, width: int, *, generator: torch.Generator, pillar: float | None = None
-) -> UInt8[Tensor, "h w 3"]:
+) -> Picture:
     """Paint a cluttered and unevenly lit room: what an edge tracker finds hardest.
 
     A wall with posters, shelves of books, a window with blinds, a bright pillar, a floor of boards
@@ -40,9 +39,7 @@ def clutter_background(
     return painter.develop()
 
 
-def dark_background(
-    height: int, width: int, *, generator: torch.Generator
-) -> UInt8[Tensor, "h w 3"]:
+def dark_background(height: int, width: int, *, generator: torch.Generator) -> Picture:
     """Paint a dark curtain.
 
     Args:
@@ -177,7 +174,7 @@ class _Painter:
         print_ = self.box(left + 0.015, left + 0.06, bottom - 0.05, bottom - 0.015)
         self.fill(print_ & ((self.y * 110) % 1 < 0.5), brown * 0.3)
 
-    def develop(self) -> UInt8[Tensor, "h w 3"]:
+    def develop(self) -> Picture:
         """Light the room unevenly, average to the final size, and round."""
         rows, columns = self.canvas.shape[1:]
         blotch = value_noise(rows, columns, cell=rows / 2, octaves=2, generator=self.generator)

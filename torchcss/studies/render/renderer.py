@@ -36,7 +36,15 @@ _GAMMA = 2.2
 Colour = tuple[float, float, float]
 """Red, green and blue, 0 to 1."""
 
-Texture = Callable[[Float[Tensor, "i 3"]], Float[Tensor, "i 1"]]
+Point = tuple[float, float, float]
+"""A place in the world, metres."""
+
+Picture = UInt8[Tensor, "h w 3"]
+
+Triples = Float[Tensor, "i 3"]
+"""Three numbers of listed samples or points: place (metres), normal, colour or light."""
+
+Texture = Callable[[Triples], Float[Tensor, "i 1"]]
 """Part coordinates (metres) to a factor on the colour."""
 
 
@@ -85,8 +93,8 @@ class Lighting:
         colour: Colour of the lamp.
     """
 
-    lamp_world: tuple[float, float, float] = (-1.5, 2.5, 2.5)
-    target_world: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    lamp_world: Point = (-1.5, 2.5, 2.5)
+    target_world: Point = (0.0, 0.0, 0.0)
     cone: float = 0.6
     lamp: float = 0.9
     ambient: float = 0.25
@@ -97,11 +105,11 @@ class Lighting:
 
     def shade(
         self,
-        points: Float[Tensor, "i 3"],
-        normals: Float[Tensor, "i 3"],
-        albedo: Float[Tensor, "i 3"],
+        points: Triples,
+        normals: Triples,
+        albedo: Triples,
         eye: Float[Tensor, "3"],
-    ) -> Float[Tensor, "i 3"]:
+    ) -> Triples:
         """Light that surface points send to the eye.
 
         Args:
@@ -135,11 +143,11 @@ class Light(Protocol):
 
     def shade(
         self,
-        points: Float[Tensor, "i 3"],
-        normals: Float[Tensor, "i 3"],
-        albedo: Float[Tensor, "i 3"],
+        points: Triples,
+        normals: Triples,
+        albedo: Triples,
         eye: Float[Tensor, "3"],
-    ) -> Float[Tensor, "i 3"]:
+    ) -> Triples:
         """Light that surface points send to the eye; see `Lighting.shade`."""
         ...
 
@@ -155,7 +163,7 @@ class Waves(NamedTuple):
     vectors: Float[Tensor, "m 3"]
     phases: Float[Tensor, " m"]
 
-    def angles(self, points: Float[Tensor, "i 3"]) -> Float[Tensor, "i m"]:
+    def angles(self, points: Triples) -> Float[Tensor, "i m"]:
         """Where in its period every wave is at some points, radians."""
         return points @ self.vectors.to(points).T + self.phases.to(points)
 
@@ -213,7 +221,7 @@ def random_texture(
     # A sine of amplitude a has the variance a^2 / 2.
     amplitudes = torch.full_like(waves.phases, contrast * (2 / len(waves.phases)) ** 0.5)
 
-    def texture(points: Float[Tensor, "i 3"]) -> Float[Tensor, "i 1"]:
+    def texture(points: Triples) -> Float[Tensor, "i 1"]:
         shade = waves.angles(points).sin() @ amplitudes.to(points)[:, None]
         return (1 + shade).clamp_min(0.1)
 
@@ -224,9 +232,9 @@ def render_meshes(
     meshes: Sequence[Mesh],
     camera: Camera,
     *,
-    background: UInt8[Tensor, "h w 3"],
+    background: Picture,
     lighting: Light | None = None,
-) -> UInt8[Tensor, "h w 3"]:
+) -> Picture:
     """Draw meshes before a background.
 
     The picture is rendered with two samples per pixel and axis, and averaged.
@@ -269,12 +277,12 @@ def render_meshes(
     return to_bytes(pooled[..., :3] * 255 + (1 - pooled[..., 3:]) * background.to(pooled))
 
 
-def to_display(light: Float[Tensor, "i 3"]) -> Float[Tensor, "i 3"]:
+def to_display(light: Triples) -> Triples:
     """Display values of light, 0 to 1."""
     return light.clamp(0, 1) ** (1 / _GAMMA)
 
 
-def to_light(display: Float[Tensor, "i 3"]) -> Float[Tensor, "i 3"]:
+def to_light(display: Triples) -> Triples:
     """Light of display values."""
     return display**_GAMMA
 
@@ -337,18 +345,18 @@ def value_noise(
     return total
 
 
-def to_bytes(image: Float[Tensor, "h w 3"]) -> UInt8[Tensor, "h w 3"]:
+def to_bytes(image: Float[Tensor, "h w 3"]) -> Picture:
     """Round grey levels from 0 to 255."""
     return image.round().clamp(0, 255).to(torch.uint8)
 
 
 def add_sensor_noise(
-    image: UInt8[Tensor, "h w 3"],
+    image: Picture,
     *,
     generator: torch.Generator,
     read: float = 1.5,
     shot: float = 0.02,
-) -> UInt8[Tensor, "h w 3"]:
+) -> Picture:
     """Add the noise of a sensor: Gaussian, with the variance `read^2 + shot * grey level`.
 
     Args:

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
@@ -26,6 +26,8 @@ from torchcss.studies.render.clutter import clutter_background, dark_background
 from torchcss.studies.render.renderer import (
     Lighting,
     Mesh,
+    Picture,
+    Point,
     render_meshes,
     to_bytes,
     to_display,
@@ -59,8 +61,8 @@ class Place(NamedTuple):
 
 
 def lamp(
-    place: tuple[float, float, float],
-    target: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    place: Point,
+    target: Point = (0.0, 0.0, 0.0),
     strength: float = 0.9,
 ) -> Lighting:
     """A warm spotlight, placed about the characters' middle."""
@@ -148,7 +150,7 @@ class SceneRenderer:
         )
         self._first, self._others = matt.parts(self._points, normals, albedo, camera.centre_world)
 
-    def picture(self, meshes: Sequence[Mesh]) -> UInt8[Tensor, "h w 3"]:
+    def picture(self, meshes: Sequence[Mesh]) -> Picture:
         """Take a picture, without sensor noise.
 
         Args:
@@ -257,7 +259,7 @@ def _scene_light(style: Style, middle: Float[Tensor, "3"], axes: Tensor) -> _Sce
         lamp_world=(4.0, 5.0, 30.0), lamp=style.fill, cone=100.0, ambient=style.ambient, upward=0.0
     )
 
-    def about(offset: tuple[float, float, float]) -> tuple[float, float, float]:
+    def about(offset: Point) -> Point:
         x, y, z = (middle.to(axes) + axes.new_tensor(offset) @ axes).tolist()
         return x, y, z
 

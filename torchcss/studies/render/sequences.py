@@ -42,6 +42,7 @@ from torchcss.studies.render.motions import MOTIONS, Motion, sample_times
 from torchcss.studies.render.renderer import (
     Lighting,
     Mesh,
+    Picture,
     add_sensor_noise,
     random_texture,
     render_meshes,
@@ -114,7 +115,7 @@ def film_parts(
     painted: Sequence[Mesh],
     *,
     camera: Camera,
-    background: UInt8[Tensor, "h w 3"],
+    background: Picture,
     lighting: Lighting,
     frame_rate: float,
     generator: torch.Generator,
@@ -204,7 +205,7 @@ class SequenceFrame(NamedTuple):
         occluded: Whether what is seen here is hidden or out of the image in the next frame.
     """
 
-    image: UInt8[Tensor, "h w 3"]
+    image: Picture
     mask: Bool[Tensor, "h w"]
     part: Int[Tensor, "h w"]
     depth: Float[Tensor, "h w"]
