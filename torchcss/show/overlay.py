@@ -153,11 +153,7 @@ class _Window(NamedTuple):
         return functional.interpolate(maps[None], (self.height, self.width), mode="bilinear")[0]
 
 
-def project_body(
-    body: BodyModel,
-    x: Float[Tensor, "k n"],
-    camera: Camera,
-) -> list[ProjectedBody]:
+def project_body(body: BodyModel, x: Float[Tensor, "k n"], camera: Camera) -> list[ProjectedBody]:
     """Project the surface of a body in several poses, as `draw_overlay` takes it.
 
     Args:

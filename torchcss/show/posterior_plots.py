@@ -114,10 +114,7 @@ def plot_track(
 
 
 def joints_figure(
-    track: Track,
-    *,
-    camera: Camera | None = None,
-    joints: Sequence[str] | None = None,
+    track: Track, *, camera: Camera | None = None, joints: Sequence[str] | None = None
 ) -> Figure:
     """Places of joints over time, a row per joint, a column per direction.
 
@@ -142,9 +139,7 @@ def joints_figure(
     chosen = [track.joint_names.index(name) for name in names]
     body = body_of_track(track)
     pose = pose_track(
-        body,
-        torch.from_numpy(track.state[rows, 0]),
-        torch.from_numpy(track.base_transform[rows]),
+        body, torch.from_numpy(track.state[rows, 0]), torch.from_numpy(track.base_transform[rows])
     )
     spread = joint_covariance(body, pose, torch.from_numpy(track.covariance[rows, 0])).numpy()
     places, labels = track.joints_world[rows], ("world x", "world y", "world z")

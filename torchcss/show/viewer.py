@@ -161,11 +161,7 @@ def has_display() -> bool:
 
 
 def open_recording(
-    name: str,
-    *,
-    save: Path | None = None,
-    connect: str | None = None,
-    spawn: bool | None = None,
+    name: str, *, save: Path | None = None, connect: str | None = None, spawn: bool | None = None
 ) -> rr.RecordingStream:
     """Start a recording that goes to a file, to a viewer, or to both.
 

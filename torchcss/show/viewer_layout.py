@@ -63,10 +63,7 @@ def layout(
         contents=["$origin/**", *([] if camera is not None else ["- /world/camera/**"])],
         name="the modes in space",
         eye_controls=blueprint.EyeControls3D(
-            kind=blueprint.Eye3DKind.Orbital,
-            position=position,
-            look_target=target,
-            eye_up=vertical,
+            kind=blueprint.Eye3DKind.Orbital, position=position, look_target=target, eye_up=vertical
         ),
     )
     picture = blueprint.Spatial2DView(

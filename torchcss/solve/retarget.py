@@ -206,10 +206,7 @@ def retarget(
 
 
 def fit_lengths(
-    names: tuple[str, ...],
-    limbs: Limbs,
-    *,
-    foot: float | None = None,
+    names: tuple[str, ...], limbs: Limbs, *, foot: float | None = None
 ) -> tuple[dict[str, float], list[str]]:
     """Lengths of the catalogue from joint centres.
 
@@ -534,11 +531,7 @@ def _fit(
 
 
 def _findings(
-    body: BodyModel,
-    states: Tensor,
-    at_limit: Tensor,
-    depth: Tensor,
-    pairs: list[str],
+    body: BodyModel, states: Tensor, at_limit: Tensor, depth: Tensor, pairs: list[str]
 ) -> list[str]:
     """Lines about turns, limits and collisions."""
     lines = []

@@ -136,11 +136,7 @@ def absolute_errors_mm(tracked_m: Places, reference_m: Places) -> Float[np.ndarr
 
 
 def root_aligned_errors_mm(
-    tracked_m: Places,
-    reference_m: Places,
-    joint_names: Sequence[str],
-    *,
-    root: str | None = None,
+    tracked_m: Places, reference_m: Places, joint_names: Sequence[str], *, root: str | None = None
 ) -> Float[np.ndarray, "*batch j"]:
     """Distance of every joint from its reference when both roots are at the origin.
 
@@ -229,11 +225,7 @@ def mpjpe_mm(tracked_m: Places, reference_m: Places) -> Float[np.ndarray, "*batc
 
 
 def root_aligned_mpjpe_mm(
-    tracked_m: Places,
-    reference_m: Places,
-    joint_names: Sequence[str],
-    *,
-    root: str | None = None,
+    tracked_m: Places, reference_m: Places, joint_names: Sequence[str], *, root: str | None = None
 ) -> Float[np.ndarray, "*batch"]:
     """Mean over the known joints of `root_aligned_errors_mm`, pose by pose; see there."""
     return _mean(root_aligned_errors_mm(tracked_m, reference_m, joint_names, root=root))

@@ -86,10 +86,7 @@ class _NearPlane:
 
     def take(self, items: Int[Tensor, " m"]) -> _NearPlane:
         return _NearPlane(
-            self.cost.take(items),
-            self.point[items],
-            self.normal[items],
-            self.stiffness[items],
+            self.cost.take(items), self.point[items], self.normal[items], self.stiffness[items]
         )
 
     def value(self, x: Float[Tensor, "b n"]) -> Float[Tensor, " b"]:

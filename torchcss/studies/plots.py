@@ -79,13 +79,7 @@ def title_of(line: Line) -> str:
     return line.name.replace("_", " ").replace("eigen", "eigen-direction")
 
 
-def draw_slice(
-    axes: Axes,
-    sampled: Slice,
-    unit: Unit,
-    *,
-    prominence: float = PROMINENCE,
-) -> None:
+def draw_slice(axes: Axes, sampled: Slice, unit: Unit, *, prominence: float = PROMINENCE) -> None:
     """Draw every term of a slice, and their sum in black with its minima as open circles.
 
     All curves are relative to their value at offset zero, so that they add up by eye.
@@ -176,11 +170,7 @@ def error_curves(
 
 
 def failure_figure(
-    times_s: Float[np.ndarray, " t"],
-    curves: Sequence[ErrorCurves],
-    *,
-    title: str,
-    failed_mm: float,
+    times_s: Float[np.ndarray, " t"], curves: Sequence[ErrorCurves], *, title: str, failed_mm: float
 ) -> Figure:
     """Median error over the seeds against time, with the range of the seeds as a band.
 

@@ -25,13 +25,7 @@ from torchcss.body.root import move_base
 from torchcss.cost.anthropometric import Anthropometric, proportion_columns
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.studies.metrics import LIMB_JOINTS
-from torchcss.studies.reprojection import (
-    DISTANCE,
-    HEIGHT,
-    WIDTH,
-    camera_in_front,
-    plausible_pose,
-)
+from torchcss.studies.reprojection import DISTANCE, HEIGHT, WIDTH, camera_in_front, plausible_pose
 from torchcss.vision.camera import Camera
 
 MARKED = (*LIMB_JOINTS, "vc7", "skull_tip")

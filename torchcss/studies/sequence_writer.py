@@ -40,11 +40,7 @@ _HIDDEN_CONFIDENCE = 0.3
 
 
 def write_sequence(
-    folder: str | os.PathLike[str],
-    shot: Shot,
-    *,
-    noise_px: float = 2.0,
-    progress: bool = False,
+    folder: str | os.PathLike[str], shot: Shot, *, noise_px: float = 2.0, progress: bool = False
 ) -> Path:
     """Render a shot into a folder.
 

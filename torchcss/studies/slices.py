@@ -105,9 +105,7 @@ class Line(NamedTuple):
 
 
 def joint_lines(
-    names: Sequence[str],
-    centre: Float[Tensor, " n"],
-    covariance: Float[Tensor, "n n"],
+    names: Sequence[str], centre: Float[Tensor, " n"], covariance: Float[Tensor, "n n"]
 ) -> list[Line]:
     """The lines along which one parameter moves and the others stay.
 

@@ -388,9 +388,7 @@ def _smooth_union(
     return _smooth(vertices, faces, 2), faces
 
 
-def _level_set(
-    field: Float[Tensor, "x y z"],
-) -> tuple[Vertices, Int[Tensor, "f 3"]]:
+def _level_set(field: Float[Tensor, "x y z"]) -> tuple[Vertices, Int[Tensor, "f 3"]]:
     """Mesh of where a field is 0, in cells: surface nets (Gibson 1998).
 
     Every cell with a change of sign has one vertex, in the middle of the crossings on its edges;

@@ -104,11 +104,7 @@ class Lighting:
     colour: Colour = (1.0, 1.0, 1.0)
 
     def shade(
-        self,
-        points: Triples,
-        normals: Triples,
-        albedo: Triples,
-        eye: Float[Tensor, "3"],
+        self, points: Triples, normals: Triples, albedo: Triples, eye: Float[Tensor, "3"]
     ) -> Triples:
         """Light that surface points send to the eye.
 
@@ -142,11 +138,7 @@ class Light(Protocol):
     """What lights surfaces: a `Lighting`, or the lamps of a scene with their shadows."""
 
     def shade(
-        self,
-        points: Triples,
-        normals: Triples,
-        albedo: Triples,
-        eye: Float[Tensor, "3"],
+        self, points: Triples, normals: Triples, albedo: Triples, eye: Float[Tensor, "3"]
     ) -> Triples:
         """Light that surface points send to the eye; see `Lighting.shade`."""
         ...
@@ -229,11 +221,7 @@ def random_texture(
 
 
 def render_meshes(
-    meshes: Sequence[Mesh],
-    camera: Camera,
-    *,
-    background: Picture,
-    lighting: Light | None = None,
+    meshes: Sequence[Mesh], camera: Camera, *, background: Picture, lighting: Light | None = None
 ) -> Picture:
     """Draw meshes before a background.
 
@@ -351,11 +339,7 @@ def to_bytes(image: Float[Tensor, "h w 3"]) -> Picture:
 
 
 def add_sensor_noise(
-    image: Picture,
-    *,
-    generator: torch.Generator,
-    read: float = 1.5,
-    shot: float = 0.02,
+    image: Picture, *, generator: torch.Generator, read: float = 1.5, shot: float = 0.02
 ) -> Picture:
     """Add the noise of a sensor: Gaussian, with the variance `read^2 + shot * grey level`.
 

@@ -39,11 +39,7 @@ _ENDLESS = math.pi
 """Range of a joint without limits, to either side."""
 
 
-def robot_arm(
-    path: str | Path,
-    *,
-    usual: Float[Tensor, " n"] | None = None,
-) -> BodyModel:
+def robot_arm(path: str | Path, *, usual: Float[Tensor, " n"] | None = None) -> BodyModel:
     """Load an arm, standing on the world's origin, Y up.
 
     A shoulder of three joints reaches every pose of the upper arm in two ways, which no image tells

@@ -60,11 +60,7 @@ class Place(NamedTuple):
     behind: float
 
 
-def lamp(
-    place: Point,
-    target: Point = (0.0, 0.0, 0.0),
-    strength: float = 0.9,
-) -> Lighting:
+def lamp(place: Point, target: Point = (0.0, 0.0, 0.0), strength: float = 0.9) -> Lighting:
     """A warm spotlight, placed about the characters' middle."""
     return Lighting(
         lamp_world=place,

@@ -353,13 +353,7 @@ DARK = Style(
 STYLES = {"clutter": CLUTTER, "dark": DARK}
 
 
-def shot(
-    name: str,
-    *,
-    seed: int = 0,
-    num_frames: int | None = None,
-    small: bool = False,
-) -> Shot:
+def shot(name: str, *, seed: int = 0, num_frames: int | None = None, small: bool = False) -> Shot:
     """One of the sequences of section 6 [IJRR], ready to be rendered.
 
     Args:
