@@ -304,7 +304,7 @@ def _profile(border: Float[Tensor, "R S"], sigma: float) -> Float[Tensor, "r s"]
     """
     reach = int(3 * sigma + 1)
     # Lattice points lie half a pixel off the centres: an even kernel, cut to the image.
-    taps = torch.arange(-reach, reach, device=border.device) + 0.5
+    taps = torch.arange(-reach, reach) + 0.5
     kernel = torch.exp(-0.5 * (taps / sigma) ** 2)
     kernel = kernel / kernel.sum()
     smooth = functional.pad(border, (reach - 1,) * 4)
@@ -405,7 +405,7 @@ def _shading(
     normal = functional.normalize(interpolate(normals, mesh.faces, faces[pixel], weights), dim=-1)
     normal = torch.where(normal[:, 2:] > 0, -normal, normal)  # towards the viewer
     lamp = functional.normalize(normal.new_tensor([-0.4, -0.6, -0.7]), dim=0)
-    light = torch.ones(seen.numel(), device=normal.device)
+    light = torch.ones(seen.numel())
     light[pixel] = (0.3 + 0.8 * (normal @ lamp).clamp_min(0)).clamp_max(1.0).float()
     return light.view(seen.shape), seen.float()
 
@@ -436,8 +436,8 @@ def _hidden_borders(
         )[0, 0]
         across = (soft[1:, 1:] - soft[1:, :-1]).abs()
         down = (soft[1:, 1:] - soft[:-1, 1:]).abs()
-        row = torch.arange(box.height + 1, device=visible.device)[:, None] + box.top
-        column = torch.arange(box.width + 1, device=visible.device)[None] + box.left
+        row = torch.arange(box.height + 1)[:, None] + box.top
+        column = torch.arange(box.width + 1)[None] + box.left
         phase = torch.where(across > down, row, column) // dash
         lattice = box.of(dashes, 1)
         lattice.copy_(lattice.maximum(border * (phase % 2 == 0)))
@@ -456,8 +456,8 @@ def _draw_keypoints(target: Picture, keypoints: Float[Tensor, "j 2"], radius: fl
         top, left = max(int(v - reach), 0), max(int(u - reach), 0)
         bottom, right = min(int(v + reach) + 2, height), min(int(u + reach) + 2, width)
         window = _Window(top, left, bottom - top, right - left, 1.0)
-        y = torch.arange(top, bottom, device=target.device)[:, None] - v
-        x = torch.arange(left, right, device=target.device)[None] - u
+        y = torch.arange(top, bottom)[:, None] - v
+        x = torch.arange(left, right)[None] - u
         off = ((x**2 + y**2).sqrt() - radius).abs()
         _blend(target, window, 0 * yellow, 0.7 * (0.3 * radius + 1.5 - off).clamp(0, 1).float())
         _blend(target, window, yellow, (0.3 * radius + 0.5 - off).clamp(0, 1).float())
@@ -477,7 +477,7 @@ def _draw_text(target: Picture, text: str) -> None:
     ink = Image.new("L", (right - left + 2 * pad, bottom - top + 2 * pad), 0)
     ImageDraw.Draw(ink).text((pad - left, pad - top), text, fill=255, font=font)
     cover = torch.from_numpy(np.array(ink, dtype=np.float32) / 255)
-    cover = cover[-height:, :width].to(target.device)
+    cover = cover[-height:, :width]
     rows, columns = cover.shape
     window = _Window(height - rows, 0, rows, columns, 1.0)
     white = cover.new_full((3,), 255.0)

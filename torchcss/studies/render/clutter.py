@@ -22,7 +22,7 @@ def clutter_background(
     Args:
         height: Rows.
         width: Columns.
-        generator: Source of randomness; its device is the picture's.
+        generator: Source of randomness.
         pillar: Left side of the pillar as a share of the width; None: random, near the middle.
     """
     painter = _Painter(2 * height, 2 * width, generator)  # twice the size, averaged at the end
@@ -57,17 +57,17 @@ class _Painter:
 
     def __init__(self, rows: int, columns: int, generator: torch.Generator) -> None:
         self.generator = generator
-        self.y = ((torch.arange(rows, device=generator.device) + 0.5) / rows)[:, None]
-        self.x = ((torch.arange(columns, device=generator.device) + 0.5) / rows)[None]
-        self.canvas = torch.zeros(3, rows, columns, device=generator.device)
+        self.y = ((torch.arange(rows) + 0.5) / rows)[:, None]
+        self.x = ((torch.arange(columns) + 0.5) / rows)[None]
+        self.canvas = torch.zeros(3, rows, columns)
 
     def uniform(self, low: float, high: float) -> float:
-        draw = torch.rand((), generator=self.generator, device=self.generator.device)
+        draw = torch.rand((), generator=self.generator)
         return low + (high - low) * float(draw)
 
     def colour(self, low: float, high: float, saturation: float) -> Tensor:
         """A random colour of lightness between `low` and `high`."""
-        hue = torch.rand(3, generator=self.generator, device=self.generator.device)
+        hue = torch.rand(3, generator=self.generator)
         level = self.uniform(low, high)
         return (level * (1 + saturation * (hue - hue.mean()))).clamp(0, 1)
 
@@ -79,7 +79,7 @@ class _Painter:
 
     def fill(self, inside: Tensor, colour: Tensor, shading: Tensor | float = 1.0) -> None:
         """Paint `colour` times `shading` where `inside`."""
-        shading = torch.as_tensor(shading, device=self.canvas.device)
+        shading = torch.as_tensor(shading)
         self.canvas = torch.where(inside, colour[:, None, None] * shading, self.canvas)
 
     def box(self, left: float, right: float, top: float, bottom: float) -> Tensor:

@@ -177,11 +177,10 @@ def random_waves(
         generator: Source of randomness.
         dtype: Floating type.
     """
-    device = generator.device
-    direction = torch.randn(count, 3, generator=generator, dtype=dtype, device=device)
-    share = torch.linspace(0, 1, count, dtype=dtype, device=device)
+    direction = torch.randn(count, 3, generator=generator, dtype=dtype)
+    share = torch.linspace(0, 1, count, dtype=dtype)
     wavelength = shortest * (longest / shortest) ** share
-    phases = 2 * math.pi * torch.rand(count, generator=generator, dtype=dtype, device=device)
+    phases = 2 * math.pi * torch.rand(count, generator=generator, dtype=dtype)
     direction = functional.normalize(direction, dim=-1)
     return Waves(2 * math.pi / wavelength[:, None] * direction, phases)
 
@@ -321,13 +320,11 @@ def value_noise(
         octaves: Number of grids; each has half the cell and half the amplitude of the one before.
         generator: Source of randomness.
     """
-    total = torch.zeros(height, width, device=generator.device)
+    total = torch.zeros(height, width)
     for octave in range(octaves):
         size = max(cell / 2**octave, 1.0)
-        grid = torch.randn(
-            1, 1, int(height / size) + 2, int(width / size) + 2,
-            generator=generator, device=generator.device,
-        )  # fmt: skip
+        rows, columns = int(height / size) + 2, int(width / size) + 2
+        grid = torch.randn(1, 1, rows, columns, generator=generator)
         smooth = functional.interpolate(grid, (height, width), mode="bicubic", align_corners=True)
         total += smooth[0, 0] * 0.5**octave
     return total
@@ -345,7 +342,7 @@ def add_sensor_noise(
 
     Args:
         image: The clean picture.
-        generator: Source of randomness, on the picture's device.
+        generator: Source of randomness.
         read: Standard deviation in the dark, grey levels.
         shot: Variance per grey level of signal.
 
@@ -357,5 +354,5 @@ def add_sensor_noise(
             f"sensor noise: expected read >= 0 and shot >= 0, got {read} and {shot}"
         )
     clean = image.float()
-    noise = torch.randn(clean.shape, generator=generator, device=clean.device)
+    noise = torch.randn(clean.shape, generator=generator)
     return to_bytes(clean + noise * (read**2 + shot * clean).sqrt())
