@@ -92,7 +92,7 @@ def picture(x: Tensor, *, lamp: float = 0.9, plain: bool = False) -> Tensor:
     background = (255 * wall).byte()[..., None].expand(-1, -1, 3).contiguous()
 
     light = Lighting(lamp_world=(1.0, 2.0, 1.0), target_world=(0.0, 0.0, -3.0), lamp=lamp)
-    image = render_meshes(meshes, camera, background=background, lighting=light)
+    image = render_meshes(meshes, camera, background=background, shade=light.shade)
     return image.double().mean(-1) / 255
 
 

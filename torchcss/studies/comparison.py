@@ -68,17 +68,12 @@ def find_start(sequence: RecordedSequence, settings: Settings, *, start: int = 0
         first = initialise(
             None, keypoints.at(start), camera, placed, generator=generator, options=options
         )
-        return Start(first, sigma, generator)
-    sigma = typical_sigma(keypoints)
-    first = initialise_video(
-        sequence.video,
-        keypoints,
-        camera,
-        settings,
-        start=start,
-        noise=Noise(sigma),
-        generator=generator,
-    )
+    else:
+        sigma = typical_sigma(keypoints)
+        first = initialise_video(
+            sequence.video, keypoints, camera, settings, start=start, noise=Noise(sigma),
+            generator=generator,
+        )  # fmt: skip
     return Start(first, sigma, generator)
 
 

@@ -237,7 +237,6 @@ def run_sampler(
     *,
     generator: torch.Generator,
     distance: float = 1.0,
-    rise: float = 0.1,
     exact_steps: bool = True,
 ) -> SamplerRun:
     """Search a problem from its start mode, and sum up what was found.
@@ -248,7 +247,6 @@ def run_sampler(
         num_samples: How many.
         generator: Source of the samples.
         distance: Threshold of `distinct_modes`.
-        rise: See `joined_minima`.
         exact_steps: See `ExactSteps`.
     """
     start, bounds = problem.start, problem.bounds
@@ -270,7 +268,6 @@ def run_sampler(
         torch.cat([start.covariance[None], modes.covariance[minima]]),
         torch.cat([start.cost[None], modes.cost[minima]]),
         bounds,
-        rise=rise,
     )
     return SamplerRun(
         found=found,

@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from torchcss.files import prepare_output_folder, replace_file
+from torchcss.files import prepare_output_folder, replace_file, write_text
 from torchcss.io.cameras import camera_entry
 from torchcss.io.video import VideoWriter
 from torchcss.studies.render.sequences import SequenceFrame, Shot
@@ -158,8 +158,7 @@ def write_camera(path: Path, camera: Camera) -> None:
         "units": "metre, pixel",
         "cameras": {camera.name: entry},
     }
-    with replace_file(path) as partial:
-        partial.write_text(json.dumps(content, indent=1), encoding="utf-8")
+    write_text(path, json.dumps(content, indent=1))
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:

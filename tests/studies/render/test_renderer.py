@@ -376,7 +376,7 @@ def test_a_rendered_frame_agrees_with_its_labels():
     assert (image[away] == 40).all()
     alone = render_meshes(
         [m._replace(colour=torch.ones(3)) for m in meshes], eye, background=0 * background,
-        lighting=Lighting(lamp=0.0, ambient=1.0, upward=0.0),
+        shade=Lighting(lamp=0.0, ambient=1.0, upward=0.0).shade,
     )  # fmt: skip
     levels = alone[..., 0]
     assert (levels[core((~mask).float()[None], 3, 1, 1)[0] == 0] == 255).all()
@@ -395,7 +395,7 @@ def test_colour_per_vertex_and_texture(generator):
     flat = Lighting(lamp=0.0, ambient=1.0, upward=0.0)
 
     def draw(mesh):
-        return render_meshes([mesh], eye, background=background, lighting=flat)
+        return render_meshes([mesh], eye, background=background, shade=flat.shade)
 
     two = draw(plain._replace(colour=halves))
     assert two[20, 12, 0] > 200

@@ -82,6 +82,9 @@ class _Painter:
         shading = torch.as_tensor(shading)
         self.canvas = torch.where(inside, colour[:, None, None] * shading, self.canvas)
 
+    def darken(self, inside: Tensor, factor: float) -> None:
+        self.canvas = torch.where(inside, factor * self.canvas, self.canvas)
+
     def box(self, left: float, right: float, top: float, bottom: float) -> Tensor:
         return (self.x > left) & (self.x < right) & (self.y > top) & (self.y < bottom)
 
@@ -114,7 +117,7 @@ class _Painter:
         across, down = self.x - left + tilt * (self.y - top), self.y - top - tilt * (self.x - left)
         sheet = (across > 0) & (across < wide) & (down > 0) & (down < high)
         shadow = (across > 0.008) & (across < wide + 0.008) & (down > 0.008) & (down < high + 0.008)
-        self.canvas = torch.where(shadow, self.canvas * 0.6, self.canvas)
+        self.darken(shadow, 0.6)
         self.fill(sheet, self.colour(0.7, 0.85, 0.3))
         edge = 0.014
         inner = (across > edge) & (across < wide - edge) & (down > edge) & (down < high - edge)
@@ -152,7 +155,7 @@ class _Painter:
 
     def pillar(self, left: float, wide: float) -> None:
         shadow = self.box(left + wide, left + 1.5 * wide, 0, 0.95)
-        self.canvas = torch.where(shadow, self.canvas * 0.65, self.canvas)
+        self.darken(shadow, 0.65)
         round_ = ((self.x - left) / wide * 2 - 0.8).clamp(-1, 1.2)
         self.fill(
             self.box(left, left + wide, -1, 0.96), self.colour(0.8, 0.85, 0.1), 1 - 0.4 * round_**2

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn import functional
 
 from torchcss.body.model import BodyModel
 from torchcss.studies.render.character import distance_to_parts
@@ -141,14 +142,11 @@ class MeshTruth:
 
     def _depth_around(self, labels: Labels, uv: Tensor) -> Tensor:
         """The farthest of the four surfaces around a point of the picture, half a pixel apart."""
-        fine = (uv + 0.5) * 2 - 0.5
-        low = fine.floor().long()
-        found = []
-        for du, dv in ((0, 0), (1, 0), (0, 1), (1, 1)):
-            column = (low[:, 0] + du).clamp(0, 2 * self.width - 1)
-            row = (low[:, 1] + dv).clamp(0, 2 * self.height - 1)
-            found.append(labels.fine_depth[row, column])
-        return torch.stack(found).amax(0)
+        # Beyond the border the outermost surfaces go on.
+        fine = functional.pad(labels.fine_depth[None], (1, 1, 1, 1), mode="replicate")
+        farthest = functional.max_pool2d(fine, 2, stride=1)[0]
+        column, row = ((uv + 0.5) * 2 + 0.5).floor().long().unbind(-1)
+        return farthest[row.clamp(0, 2 * self.height), column.clamp(0, 2 * self.width)]
 
 
 def joints_own_parts(body: BodyModel) -> Bool[Tensor, "j parts"]:

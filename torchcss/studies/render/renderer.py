@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int, UInt8
@@ -74,6 +74,10 @@ class Mesh(NamedTuple):
             normals_world=self.normals_world @ rotation.T,
             points_part=self.vertices_world,
         )
+
+
+Shade = Callable[[Triples, Triples, Triples, Tensor], Triples]
+"""What lights surfaces: `Lighting.shade`, or that of the lamps of a scene with their shadows."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,16 +136,6 @@ class Lighting:
         ambient = self.ambient * (1 + self.upward * normal[:, 1:2])
         # The highlight vanishes with the facing term, or it would glow beyond the shadow line.
         return albedo * (ambient + beam * facing) + beam * self.specular * highlight * facing
-
-
-class Light(Protocol):
-    """What lights surfaces: a `Lighting`, or the lamps of a scene with their shadows."""
-
-    def shade(
-        self, points: Triples, normals: Triples, albedo: Triples, eye: Float[Tensor, "3"]
-    ) -> Triples:
-        """Light that surface points send to the eye; see `Lighting.shade`."""
-        ...
 
 
 class Waves(NamedTuple):
@@ -220,7 +214,7 @@ def random_texture(
 
 
 def render_meshes(
-    meshes: Sequence[Mesh], camera: Camera, *, background: Picture, lighting: Light | None = None
+    meshes: Sequence[Mesh], camera: Camera, *, background: Picture, shade: Shade | None = None
 ) -> Picture:
     """Draw meshes before a background.
 
@@ -230,7 +224,7 @@ def render_meshes(
         meshes: What to draw.
         camera: Who looks.
         background: What is behind the meshes, of the camera's image size.
-        lighting: The light on the meshes; the default lamp when absent.
+        shade: The light on the meshes; that of the default lamp when absent.
 
     Raises:
         ShapeError: If a mesh or the background has the wrong shape.
@@ -255,7 +249,7 @@ def render_meshes(
             here = torch.nonzero(owner[face] == index)[:, 0]
             factor[here] = mesh.texture(local[here]).to(factor)
     albedo = (albedo * factor).clamp(0, 1)
-    light = (lighting or Lighting()).shade(points, normals, albedo, camera.centre_world)
+    light = (shade or Lighting().shade)(points, normals, albedo, camera.centre_world)
     # Colours and coverage of all samples, 0 where nothing is seen, averaged over the pixels.
     canvas = light.new_zeros(rows * columns, 4)
     canvas[sample] = torch.cat((to_display(light), torch.ones_like(light[:, :1])), -1)

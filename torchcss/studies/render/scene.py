@@ -157,7 +157,7 @@ class SceneRenderer:
         reached = 1 - light.covered(self._points)
         shown = to_display(self._others + reached[:, None] * self._first)
         behind = to_bytes(255 * shown.reshape(height, width, 3))
-        return render_meshes(meshes, self.camera, background=behind, lighting=light)
+        return render_meshes(meshes, self.camera, background=behind, shade=light.shade)
 
 
 def _level_axes(camera: Camera) -> Float[Tensor, "3 3"]:
@@ -243,7 +243,7 @@ class _SceneLight:
         return first, torch.stack([torch.zeros_like(first), *light[1:]]).sum(0)
 
     def shade(self, points: Tensor, normals: Tensor, albedo: Tensor, eye: Tensor) -> Tensor:
-        """Light that surface points send to the eye; see `Light`."""
+        """Light that surface points send to the eye; see `Lighting.shade`."""
         first, others = self.parts(points, normals, albedo, eye)
         return first + others
 

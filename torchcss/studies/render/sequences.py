@@ -139,7 +139,7 @@ def film_parts(
             mesh.moved(turn, place)
             for mesh, turn, place in zip(painted, rotation, centre, strict=True)
         ]
-        picture = render_meshes(meshes, camera, background=background, lighting=lighting)
+        picture = render_meshes(meshes, camera, background=background, shade=lighting.shade)
         frames.append(add_sensor_noise(picture, generator=generator).numpy())
     return SyntheticSequence(
         frames=frames, frame_rate=frame_rate, camera=camera, body=body, states=states
