@@ -289,8 +289,7 @@ class Viewer:
         self._known = max(self._known, len(weight))
         for mode in range(len(weight)):
             share = float(weight[mode] / weight[0]) if weight[0] > 0 else 1.0
-            self._log_pose(mode, share, joints[mode], spread[mode])
-            self._log_shape(mode, share, rotation[mode], centre[mode])
+            self._log_mode(mode, share, joints[mode], spread[mode], rotation[mode], centre[mode])
             nats = float(cost[mode]) if np.isfinite(cost[mode]) else np.nan
             self._log(f"cost/{mode}", self._rr.Scalars(nats))
             self._log(f"weight/{mode}", self._rr.Scalars(float(weight[mode])))
@@ -350,16 +349,19 @@ class Viewer:
         )
         self._log("world/camera", pinhole, static=True)
 
-    def _log_pose(
+    def _log_mode(
         self,
         mode: int,
         share: float,
         joints: Float[np.ndarray, "j 3"],
         covariance: Float[np.ndarray, "j 3 3"],
+        rotation: Float[np.ndarray, "p 3 3"],
+        centre: Float[np.ndarray, "p 3"],
     ) -> None:
-        """Log a mode's joints, which weighs `share` as much as the best."""
+        """Log the joints and the parts of a mode, which weighs `share` as much as the best."""
         path = f"world/modes/{mode}"
-        colour = _colour(mode, _opacity(share))
+        opacity = _FAINTEST + (1 - _FAINTEST) * min(share, 1.0)
+        colour = _colour(mode, opacity)
         thickness = 1.0 if mode == 0 else 0.7
         strips = self._rr.LineStrips3D(
             joints[self._bones], colors=colour, radii=thickness * _BONE_RADIUS
@@ -377,20 +379,10 @@ class Viewer:
             fill_mode=fill.TransparentFillMajorWireframe if mode == 0 else fill.MajorWireframe,
         )
         self._log(f"{path}/uncertainty", shapes)
-
-    def _log_shape(
-        self,
-        mode: int,
-        share: float,
-        rotation: Float[np.ndarray, "p 3 3"],
-        centre: Float[np.ndarray, "p 3"],
-    ) -> None:
-        """Log a mode's parts, which weighs `share` as much as the best."""
-        colour = _colour(mode, _SHAPE * share * _opacity(share))
-        surface = self._rr.Mesh3D.from_fields(albedo_factor=colour)
+        surface = self._rr.Mesh3D.from_fields(albedo_factor=_colour(mode, _SHAPE * share * opacity))
         for name, turn, place in zip(self._body.part_names, rotation, centre, strict=True):
             at = self._rr.Transform3D(translation=place, mat3x3=turn)
-            self._log(f"world/modes/{mode}/body/{name}", at, surface)
+            self._log(f"{path}/body/{name}", at, surface)
 
     def _hide_mode(self, mode: int) -> None:
         """From here on there is no such mode."""
@@ -402,11 +394,6 @@ class Viewer:
             self._log(f"world/modes/{mode}/body/{name}", hidden)
         for series in ("cost", "weight"):
             self._log(f"{series}/{mode}", self._rr.Scalars(np.nan))
-
-
-def _opacity(share: float) -> float:
-    """Of the lines of a mode that weighs `share` as much as the best."""
-    return _FAINTEST + (1 - _FAINTEST) * min(share, 1.0)
 
 
 def _colour(mode: int, opacity: float) -> tuple[int, ...]:

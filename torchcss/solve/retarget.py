@@ -78,6 +78,9 @@ _SLACK = 1e-6
 _DEEP = 0.01
 """Metres that a surface must be inside another part to count as a collision."""
 
+States = Float[Tensor, "t n"]
+"""States of a body, a row a frame."""
+
 Limbs = Float[Tensor, "t limbs 3"]
 """Joint centres of the limbs, frame by frame, metres."""
 
@@ -133,7 +136,7 @@ class Retargeted(NamedTuple):
     """
 
     body: BodyModel
-    states: Float[Tensor, "t n"]
+    states: States
     joints: Float[Tensor, "t j 3"]
     target_names: tuple[str, ...]
     targets: Limbs
@@ -298,9 +301,7 @@ def _distance(one: Float[Tensor, "t 3"], other: Float[Tensor, "t 3"]) -> float:
     return float((one - other).norm(dim=-1).median())
 
 
-def collision_depth(
-    body: BodyModel, states: Float[Tensor, "t n"]
-) -> tuple[Float[Tensor, " t"], list[str]]:
+def collision_depth(body: BodyModel, states: States) -> tuple[Float[Tensor, " t"], list[str]]:
     """How deep surfaces are inside other parts, and which, state by state.
 
     Along the ray from the centre of the outer part, which exceeds the distance to its surface
@@ -369,9 +370,7 @@ def levelled(
     return joints @ turn.T, [f"floor: tilted by {abs(degrees):.1f} degrees in the source, levelled"]
 
 
-def _face_middle(
-    body: BodyModel, states: Float[Tensor, "t n"]
-) -> tuple[BodyModel, Float[Tensor, "t n"]]:
+def _face_middle(body: BodyModel, states: States) -> tuple[BodyModel, States]:
     """The same motion on a base that faces the middle of all turns: most room to both limits."""
     place = [body.state_index(name) for name in ROOT_NAMES[:3]]
     yaw = body.state_index("root_yaw")
@@ -504,7 +503,7 @@ def _fit(
     rate: float,
     choice: Retargeting,
     generator: torch.Generator,
-) -> Float[Tensor, "t n"]:
+) -> States:
     """States of all frames: several descents each, the best path through them, smoothing."""
     body, frames, k = cost.body, len(root), choice.num_starts
     bounds = free_turns(body)

@@ -514,16 +514,14 @@ def _modes(held: Sequence[FrameMeasures], thresholds: Thresholds) -> dict[str, f
         (m, n) for m, n in zip(held, near, strict=True) if not np.isnan(m.root_aligned_mm).all()
     ]
     several = [(m, n) for m, n in told if len(m.weight) > 1]
-    angles_known = not np.isnan(held[0].angle_deviations).all()
+    with_angles = [m for m in held if not np.isnan(m.angle_deviations).all()]
     row = {
         "true_mode_kept": _mean(
             [_mean(m.root_aligned_mm[n]) < thresholds.true_mode_mm for m, n in told]
         ),
         "true_angles_kept": _mean(
-            [np.nanmin(m.angle_deviations) < thresholds.true_mode_deviations for m in held]
-        )
-        if angles_known
-        else math.nan,
+            [np.nanmin(m.angle_deviations) < thresholds.true_mode_deviations for m in with_angles]
+        ),
         "modes": _mean([len(m.weight) for m in held]),
         # Of a calibrated mixture these two are equal: how sure it is of its best mode, and how
         # often that is the nearest to the truth, where it has more than one.

@@ -29,6 +29,9 @@ from torchcss.types import Curvature, PointCost
 
 _METRES = ("root_x", "root_y", "root_z")
 
+States = Float[Tensor, "t n"]
+"""States of a body, a row a frame."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class KeyPoses:
@@ -65,7 +68,7 @@ class KeyPoses:
         """Seconds from the first to the last key pose."""
         return self.times[-1]
 
-    def states(self, body: BodyModel, times: Float[Tensor, " t"]) -> Float[Tensor, "t n"]:
+    def states(self, body: BodyModel, times: Float[Tensor, " t"]) -> States:
         """The motion at given times.
 
         Args:
@@ -90,7 +93,7 @@ class Motion(NamedTuple):
     """
 
     body: BodyModel
-    states: Float[Tensor, "t n"]
+    states: States
     frame_rate: float
     description: str = ""
 
@@ -126,7 +129,7 @@ def clamped_spline(
     return a + h * (slope[i] * t * (1 - t) ** 2 - slope[i + 1] * t * t * (1 - t))
 
 
-def plant_feet(body: BodyModel, states: Float[Tensor, "t n"]) -> Float[Tensor, "t n"]:
+def plant_feet(body: BodyModel, states: States) -> States:
     """Turn the legs so that the feet stay where they are in the first state.
 
     Heel, midtarsal and toe are held by least squares over the five angles of a leg (Gauss-Newton,

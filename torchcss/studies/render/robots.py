@@ -23,6 +23,7 @@ from torchcss.body.load import FileOptions, load_body
 from torchcss.body.model import BodyModel
 from torchcss.errors import BodyError
 from torchcss.studies.render.clutter import clutter_background
+from torchcss.studies.render.motions import States
 from torchcss.studies.render.renderer import Lighting, Mesh, capsule, random_texture
 from torchcss.studies.render.scene import look_at
 from torchcss.studies.render.sequences import SyntheticSequence, film_parts
@@ -89,7 +90,7 @@ def swing(
     generator: torch.Generator,
     middle: Float[Tensor, " n"] | None = None,
     amplitude: float = 0.5,
-) -> Float[Tensor, "t n"]:
+) -> States:
     """Smooth states within the limits: every joint swings about a middle pose.
 
     Args:
@@ -136,7 +137,7 @@ def robot_sequence(
 
 def film_robot(
     body: BodyModel,
-    states: Float[Tensor, "t n"],
+    states: States,
     *,
     generator: torch.Generator,
     cameras: Sequence[Camera] = (),
@@ -209,7 +210,7 @@ def stand(body: BodyModel) -> Float[Tensor, " n"]:
     return state
 
 
-def trot(body: BodyModel, times: Float[Tensor, " t"]) -> Float[Tensor, "t n"]:
+def trot(body: BodyModel, times: Float[Tensor, " t"]) -> States:
     """States of a quadruped that trots forwards, turning slowly to its left.
 
     Args:

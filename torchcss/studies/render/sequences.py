@@ -38,7 +38,7 @@ from torchcss.studies.random_person import random_lengths
 from torchcss.studies.render.character import Character, Clothing
 from torchcss.studies.render.clutter import clutter_background
 from torchcss.studies.render.mesh_truth import Labels, MeshTruth, joints_own_parts
-from torchcss.studies.render.motions import MOTIONS, Motion, sample_times
+from torchcss.studies.render.motions import MOTIONS, Motion, States, sample_times
 from torchcss.studies.render.renderer import (
     Lighting,
     Mesh,
@@ -74,7 +74,7 @@ class SyntheticSequence:
     frame_rate: float
     camera: Camera
     body: BodyModel
-    states: Float[Tensor, "t n"]
+    states: States
 
     @property
     def joints_world(self) -> Float[Tensor, "t j 3"]:
@@ -82,7 +82,7 @@ class SyntheticSequence:
         return self.body.pose(self.states).joints
 
 
-def arm_motion(body: BodyModel, times: Float[Tensor, " t"]) -> Float[Tensor, "t n"]:
+def arm_motion(body: BodyModel, times: Float[Tensor, " t"]) -> States:
     """States of arm8 that bend, rotate and reach towards the camera.
 
     Args:
@@ -111,7 +111,7 @@ def arm_motion(body: BodyModel, times: Float[Tensor, " t"]) -> Float[Tensor, "t 
 
 def film_parts(
     body: BodyModel,
-    states: Float[Tensor, "t n"],
+    states: States,
     painted: Sequence[Mesh],
     *,
     camera: Camera,
@@ -238,7 +238,7 @@ class Shot:
 
     name: str
     body: BodyModel
-    states: Float[Tensor, "t n"]
+    states: States
     frame_rate: float
     camera: Camera
     style: Style = field(default_factory=Style)
@@ -468,7 +468,7 @@ def shot_of_motion(
 
 def camera_in_front(
     body: BodyModel,
-    states: Float[Tensor, "t n"],
+    states: States,
     *,
     focal_px: float = 720.0,
     azimuth: float = 0.0,
