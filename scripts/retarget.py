@@ -21,7 +21,6 @@ up, the middle of the path over the origin, floor at height 0) holds
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,6 +37,8 @@ from torchcss.files import replace_file
 from torchcss.io.motion.positions import MotionCapture, read_motion_capture, resample
 from torchcss.io.tracks import prepare_output_folder
 from torchcss.solve.retarget import Retargeted, retarget
+from torchcss.studies import sequence_writer
+from torchcss.studies.render.motions import Motion
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,25 +152,18 @@ def print_table(report: dict[str, Any]) -> None:
 
 
 def write_motion(path: Path, config: Config, result: Retargeted) -> None:
-    body = result.body
-    base = np.eye(4)
-    base[:3, :3], base[:3, 3] = body.base_rotation.numpy(), body.base_translation.numpy()
-    with replace_file(path) as partial, partial.open("wb") as stream:
-        np.savez(
-            stream,
-            body=np.array(body.name),
-            lengths=np.array(json.dumps(body.lengths)),
-            state_names=np.array(body.state_names),
-            states=result.states.numpy(),
-            frame_rate=np.array(config.rate),
-            base_transform=base,
-            joint_names=np.array(body.joint_names),
-            joints_world=result.joints.numpy(),
-            error_mm=1000 * result.error.mean(1).numpy(),
-            source=np.array(config.file.name),
-            start_s=np.array(config.start),
-            description=np.array(f"motion capture {config.file.name} from {config.start:g} s on"),
-        )
+    description = f"motion capture {config.file.name} from {config.start:g} s on"
+    sequence_writer.write_motion(
+        path,
+        Motion(result.body, result.states, config.rate, description),
+        {
+            "joint_names": result.body.joint_names,
+            "joints_world": result.joints,
+            "error_mm": 1000 * result.error.mean(1),
+            "source": config.file.name,
+            "start_s": config.start,
+        },
+    )
 
 
 def write_reference(path: Path, config: Config, result: Retargeted) -> None:
@@ -181,16 +175,14 @@ def write_reference(path: Path, config: Config, result: Retargeted) -> None:
             [*names, name],
             np.concatenate([joints, joints[:, pair].mean(1)[:, None]], 1),
         )
-    rate = config.rate
-    with replace_file(path) as partial, partial.open("wb") as stream:
-        np.savez(
-            stream,
-            joints=joints,
-            joint_names=np.array(names),
-            frame_rate=np.array(rate),
-            time_s=np.arange(len(joints)) / rate,
-            units=np.array("m"),
-        )
+    found = {
+        "joints": joints,
+        "joint_names": names,
+        "frame_rate": config.rate,
+        "time_s": np.arange(len(joints)) / config.rate,
+        "units": "m",
+    }
+    sequence_writer.write_arrays(path, found)
 
 
 def picture(motion: MotionCapture, result: Retargeted, columns: int = 7) -> Figure:

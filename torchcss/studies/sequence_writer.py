@@ -32,6 +32,7 @@ from tqdm import tqdm
 from torchcss.files import prepare_output_folder, replace_file, write_text
 from torchcss.io.cameras import camera_entry
 from torchcss.io.video import VideoWriter
+from torchcss.studies.render.motions import Motion
 from torchcss.studies.render.sequences import SequenceFrame, Shot
 from torchcss.vision.camera import Camera
 
@@ -63,20 +64,8 @@ def write_sequence(
     joints = _write_frames(folder, shot, frames)
     _write_joints(folder, shot, joints, noise_px)
     write_camera(folder / "cameras.json", shot.camera)
-    body = shot.body
-    write_arrays(
-        folder / "truth.npz",
-        {
-            "body": body.name,
-            "lengths": json.dumps(body.lengths),
-            "base_transform": shot.base_transform,
-            "state_names": body.state_names,
-            "states": shot.states,
-            "frame_rate": shot.frame_rate,
-            "seed": shot.seed,
-            "description": shot.description,
-        },
-    )
+    motion = Motion(shot.body, shot.states, shot.frame_rate, shot.description)
+    write_motion(folder / "truth.npz", motion, {"seed": shot.seed})
     return folder
 
 
@@ -161,7 +150,24 @@ def write_camera(path: Path, camera: Camera) -> None:
     write_text(path, json.dumps(content, indent=1))
 
 
+def write_motion(path: Path, motion: Motion, more: Mapping[str, Any]) -> None:
+    """Write a motion file, see `torchcss.studies.sequences`, with some more arrays."""
+    body = motion.body
+    base = np.eye(4)
+    base[:3, :3], base[:3, 3] = body.base_rotation, body.base_translation
+    known = {
+        "body": body.name,
+        "lengths": json.dumps(body.lengths),
+        "base_transform": base,
+        "state_names": body.state_names,
+        "states": motion.states,
+        "frame_rate": motion.frame_rate,
+        "description": motion.description,
+    }
+    write_arrays(path, {**known, **more})
+
+
 def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
     """Write arrays by name, or what NumPy makes arrays of."""
-    with replace_file(path) as partial:
-        np.savez_compressed(partial, **arrays)
+    with replace_file(path) as partial, partial.open("wb") as stream:
+        np.savez_compressed(stream, **arrays)

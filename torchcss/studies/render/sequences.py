@@ -249,13 +249,6 @@ class Shot:
     bystander: bool = False
     spacing: float = 0.009
 
-    @property
-    def base_transform(self) -> Float[Tensor, "4 4"]:
-        """Base of the body in the world."""
-        matrix = torch.eye(4, dtype=self.body.dtype)
-        matrix[:3, :3], matrix[:3, 3] = self.body.base_rotation, self.body.base_translation
-        return matrix
-
     def frames(self) -> Iterator[SequenceFrame]:
         """Render; the same frames whenever it is called.
 
