@@ -33,7 +33,7 @@ def _columns(text: str) -> tuple[str | None, ...]:
     return tuple(None if name == "-" else name for name in names_in(text))
 
 
-def _by_word(places: Mapping[str, str]) -> dict[str, str]:
+def by_word(places: Mapping[str, str]) -> dict[str, str]:
     """The place that every word means, of the words of every place."""
     return {word: place for place, words in places.items() for word in names_in(words)}
 
@@ -114,7 +114,7 @@ ALIASES: Final[dict[str, tuple[str | None, ...]]] = {
 # What the places are called, written without side, case and separators.
 _PLACES: Final[dict[str, str]] = {
     **{name.replace("_", "").lower(): name for name in (*_PAIRED, *_SINGLE)},
-    **_by_word(
+    **by_word(
         {
             "toe": "bigtoe footindex",
             "midtarsal": "foot forefoot ballfoot balloffoot",
@@ -236,7 +236,7 @@ _ENDS: Final = _of_limbs("hipjoint", "femur", "tibia", "clavicle", "humerus", "w
 """The same where joints are the ends of Acclaim's bones. `radius` and `wrist` together are the
 forearm, cut where it twists."""
 
-_SKELETON_PLACES: Final = _by_word(
+_SKELETON_PLACES: Final = by_word(
     {
         "vt1": "neck",
         "skullbase": "head",

@@ -110,11 +110,9 @@ def _coarse_pose(path: Path | None) -> dict[str, float]:
     if path is None:
         return {}
     pose: Any = load_json(path, ConfigurationError)
-    if not isinstance(pose, dict) or not all(_is_number(value) for value in pose.values()):
+    if not isinstance(pose, dict) or not all(
+        isinstance(value, int | float) and math.isfinite(value) for value in pose.values()
+    ):
         example = '{"l_elbow_flexion": 1.2}'
         raise ConfigurationError(f"{path}: expected numbers by parameter, such as {example}")
     return pose
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and math.isfinite(value)

@@ -22,7 +22,6 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
 
 import tyro
 
@@ -63,19 +62,7 @@ class Demo:
         )
 
 
-Verb = (
-    Annotated[Demo, tyro.conf.subcommand("demo")]
-    | Annotated[Init, tyro.conf.subcommand("init")]
-    | Annotated[Detect, tyro.conf.subcommand("detect")]
-    | Annotated[Track, tyro.conf.subcommand("track")]
-    | Annotated[Batch, tyro.conf.subcommand("batch")]
-    | Annotated[Smooth, tyro.conf.subcommand("smooth")]
-    | Annotated[Export, tyro.conf.subcommand("export")]
-    | Annotated[View, tyro.conf.subcommand("view")]
-    | Annotated[Plot, tyro.conf.subcommand("plot")]
-    | Annotated[Report, tyro.conf.subcommand("report")]
-)
-
+Verb = Demo | Init | Detect | Track | Batch | Smooth | Export | View | Plot | Report
 
 _OLD_NAMES = {
     "--evidence": "--likelihood-power",

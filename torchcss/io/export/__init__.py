@@ -19,9 +19,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
-from torchcss.body.model import BodyModel
 from torchcss.errors import ConfigurationError
 from torchcss.files import StrPath, prepare_output_folder, replace_file, save_arrays, write_text
 from torchcss.io.export.bvh import BvhStyle, bvh_text
@@ -34,14 +33,11 @@ from torchcss.io.export.trc import trc_text
 from torchcss.io.run import Run, as_run, body_of_track
 from torchcss.io.tracks import Track
 
-__all__ = ["FORMATS", "Export", "ExportOptions", "export"]
-
 Format = Literal["bvh", "trc", "c3d", "mot", "csv", "npz", "npz-smpl"]
-FORMATS: tuple[str, ...] = ("bvh", "trc", "c3d", "mot", "csv", "npz", "npz-smpl")
+FORMATS: tuple[str, ...] = get_args(Format)
 
 _NAMES = {"csv": "track_joints.csv", "npz": "track_joints.npz", "npz-smpl": "track_smpl.npz"}
 _Y_UP = ("bvh", "trc", "mot")  # formats whose readers take Y for up
-_TABLES = ("csv", "npz", "npz-smpl")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,12 +113,18 @@ def export(
         options.selection,
         y_up=options.frame == "y-up" or (options.frame is None and to in _Y_UP),
     )
-    one_file = to in _TABLES
+    one_file = to in _NAMES
     labels = [""] if one_file and options.selection.mode == "all" else selection.labels
     paths = _paths(source, to, labels, path)
     report = list(selection.report)
     if one_file:
-        _write_table(paths[0], to, selection, body_of_track(track))
+        body = body_of_track(track)
+        covariance = joint_covariances(selection, body)
+        if to == "csv":
+            write_text(paths[0], csv_text(selection, covariance))
+        else:
+            smpl = smpl_arrays(selection, body) if to == "npz-smpl" else {}
+            save_arrays(paths[0], {**npz_arrays(selection, covariance), **smpl})
     else:
         report += _write_modes(paths, to, selection, track, options.bvh)
     return Export(tuple(paths), tuple(report))
@@ -132,36 +134,25 @@ def _write_modes(
     paths: Sequence[Path], to: str, selection: Selection, track: Track, style: BvhStyle
 ) -> list[str]:
     """Write a file for every mode; returns what to report."""
-    if to == "c3d":
+    if to in ("c3d", "trc"):  # formats of places, which need no body
         for index, path in enumerate(paths):
-            with replace_file(path) as partial:
-                write_c3d(partial, selection, index)
-        return []
-    if to == "trc":  # as C3D a format of places, which needs no body
-        for index, path in enumerate(paths):
-            write_text(path, trc_text(selection, index, path.name))
+            if to == "trc":
+                write_text(path, trc_text(selection, index, path.name))
+            else:
+                with replace_file(path) as partial:
+                    write_c3d(partial, selection, index)
         return []
     body, report = body_of_track(track), []
     if not selection.present.all():
         report.append(f"{to} cannot leave frames out: there the mode's nearest pose stands")
     for index, path in enumerate(paths):
-        text, notes = (
-            (mot_text(selection, index, body), ())
-            if to == "mot"
-            else bvh_text(selection, index, body, style)
-        )
-        report += [note for note in notes if note not in report]
-        write_text(path, text)
+        if to == "mot":
+            write_text(path, mot_text(selection, index, body))
+        else:
+            text, notes = bvh_text(selection, index, body, style)
+            report += [note for note in notes if note not in report]
+            write_text(path, text)
     return report
-
-
-def _write_table(path: Path, to: str, selection: Selection, body: BodyModel) -> None:
-    covariance = joint_covariances(selection, body)
-    if to == "csv":
-        write_text(path, csv_text(selection, covariance))
-        return
-    smpl = smpl_arrays(selection, body) if to == "npz-smpl" else {}
-    save_arrays(path, {**npz_arrays(selection, covariance), **smpl})
 
 
 def _paths(source: Path | None, to: str, labels: Sequence[str], out: StrPath | None) -> list[Path]:

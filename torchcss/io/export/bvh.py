@@ -13,7 +13,7 @@ Call `bvh_text`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -43,20 +43,10 @@ class BvhStyle:
     rest_pose: Literal["hanging", "t-pose"] = "hanging"
 
 
-class Bvh(NamedTuple):
-    """A file's content.
-
-    Attributes:
-        text: The file.
-        report: What a reader should know, one line each.
-    """
-
-    text: str
-    report: tuple[str, ...]
-
-
-def bvh_text(selection: Selection, mode: int, body: BodyModel, style: BvhStyle) -> Bvh:
-    """Write one mode as BVH.
+def bvh_text(
+    selection: Selection, mode: int, body: BodyModel, style: BvhStyle
+) -> tuple[str, list[str]]:
+    """Write one mode as BVH; the text, and what a reader should know, one line each.
 
     Args:
         selection: The frames.
@@ -101,14 +91,15 @@ def bvh_text(selection: Selection, mode: int, body: BodyModel, style: BvhStyle) 
         "HIERARCHY",
         *_hierarchy(skeleton, scale * offsets, decimals, style.rotation_order),
         "MOTION",
+        f"Frames: {len(channels)}",
+        f"Frame Time: {1 / selection.rate:.8f}",
     ]
-    lines += [f"Frames: {len(channels)}", f"Frame Time: {1 / selection.rate:.8f}"]
     formats = [decimals] * 3 + [6] * (channels.shape[1] - 3)
     lines += [
         " ".join(_number(value, digits) for value, digits in zip(row, formats, strict=True))
         for row in channels
     ]
-    return Bvh("\n".join(lines) + "\n", tuple(report))
+    return "\n".join(lines) + "\n", report
 
 
 def _local(skeleton: Skeleton, rotation: Float[np.ndarray, "t nodes 3 3"]) -> np.ndarray:

@@ -55,7 +55,8 @@ def mot_text(selection: Selection, mode: int, body: BodyModel) -> str:
         body: The body, on the origin.
     """
     values = selection.state[:, mode].copy()
-    turns = np.array([_turns(body, column) for column in range(values.shape[1])], dtype=bool)
+    joints = (body.tie != 0).T  # which a parameter moves
+    turns = np.array([bool(body.tree.is_revolute[moved].all()) for moved in joints])
     if has_root(body):
         index = [body.state_index(name) for name in ROOT_NAMES]
         root, base = values[:, index], selection.base[:, mode]
@@ -66,8 +67,3 @@ def mot_text(selection: Selection, mode: int, body: BodyModel) -> str:
     table = np.concatenate([selection.times[:, None], values], axis=1)
     rows = ["\t".join(f"{value:16.8f}" for value in row) for row in table]
     return mot_header(("time", *selection.state_names), len(rows)) + "\n".join(rows) + "\n"
-
-
-def _turns(body: BodyModel, column: int) -> bool:
-    """Whether a parameter is an angle."""
-    return bool(body.tree.is_revolute[body.tie[:, column] != 0].all())

@@ -27,8 +27,6 @@ from torchcss.vision.camera import Camera
 DEFAULT_RATE = 25.0
 """Frames per second where a single frame, or equal times, do not tell."""
 
-UP_AXES = ("x", "y", "z", "-x", "-y", "-z")
-
 _TO_Y_UP: dict[str, tuple[tuple[int, int, int], ...]] = {
     # Z up: the cyclic exchange, file's (X, Y, Z) = world's (y, z, x), as Pose2Sim writes TRC files.
     "y": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
@@ -38,6 +36,7 @@ _TO_Y_UP: dict[str, tuple[tuple[int, int, int], ...]] = {
     "-z": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
     "-x": ((0, 1, 0), (-1, 0, 0), (0, 0, 1)),
 }
+UP_AXES = ("x", "y", "z", "-x", "-y", "-z")
 
 
 class Selection(NamedTuple):
@@ -127,8 +126,7 @@ def select(track: Track, choice: SelectionChoice | None = None, *, y_up: bool = 
     kept = inside[:: choice.stride]
     wanted, ranks = _ranks(track, choice, inside)
     labels = ("",) if choice.mode == "best" else tuple(f"mode{rank}" for rank in wanted)
-    for label, column in zip(labels, ranks.T, strict=True):
-        missing = int((column < 0).sum())
+    for label, missing in zip(labels, (ranks < 0).sum(axis=0), strict=True):
         if missing:
             report.append(f"{label or 'best mode'}: absent in {missing} of {len(kept)} frames")
     turn, upright = _frame_of_file(track, kept, y_up, choice.world_up, report)
@@ -167,11 +165,8 @@ def select(track: Track, choice: SelectionChoice | None = None, *, y_up: bool = 
 def _frames_inside(track: Track, choice: SelectionChoice) -> np.ndarray:
     """Rows of the track from `start` to `stop`."""
     start, stop, frames = choice.start, choice.stop, track.frames
-    inside = np.ones(len(frames), dtype=bool)
-    if start is not None:
-        inside &= frames >= start
-    if stop is not None:
-        inside &= frames < stop
+    after = frames >= (-np.inf if start is None else start)
+    inside = after & (frames < (np.inf if stop is None else stop))
     if not inside.any():
         known = f"the frames {frames[0]} to {frames[-1]}" if frames.size else "no frames"
         raise ConfigurationError(
@@ -256,9 +251,7 @@ def _frame_of_file(
                 f"{angle:.0f} degrees from it); set the axis with --world-up (world_up)"
             )
     matrix = np.array(_TO_Y_UP[axis], dtype=np.float64)
-    if y_up:
-        return matrix, np.eye(3)
-    return np.eye(3), matrix.T
+    return (matrix, np.eye(3)) if y_up else (np.eye(3), matrix.T)
 
 
 _UPRIGHT = ("HumanoidRoot", "skull_tip")

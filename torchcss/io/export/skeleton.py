@@ -22,26 +22,20 @@ from jaxtyping import Float
 from torchcss.body.bases import pose_track
 from torchcss.body.model import BodyModel
 from torchcss.body.rotations import about
+from torchcss.joint_names import by_word
 
 # Where H-Anim hangs what we fix in the link below. Both ends turn alike, so only the picture of
 # the bones differs.
-_PARENTS = {
-    "l_sternoclavicular": "vt1",
-    "r_sternoclavicular": "vt1",
-    "l_shoulder": "vt1",
-    "r_shoulder": "vt1",
-    "vc7": "vt1",
-    "skull_tip": "skullbase",
-    "nose": "skullbase",
-    "l_eye": "skullbase",
-    "r_eye": "skullbase",
-    "l_ear": "skullbase",
-    "r_ear": "skullbase",
-    "l_toe": "l_midtarsal",
-    "r_toe": "r_midtarsal",
-    "l_hand_tip": "l_wrist",
-    "r_hand_tip": "r_wrist",
-}
+_PARENTS = by_word(
+    {
+        "vt1": "l_sternoclavicular r_sternoclavicular l_shoulder r_shoulder vc7",
+        "skullbase": "skull_tip nose l_eye r_eye l_ear r_ear",
+        "l_midtarsal": "l_toe",
+        "r_midtarsal": "r_toe",
+        "l_wrist": "l_hand_tip",
+        "r_wrist": "r_hand_tip",
+    }
+)
 
 # Joints of the catalogue that carry no landmark at their place.
 _NAMES = {
@@ -85,14 +79,6 @@ class Skeleton(NamedTuple):
     def parents(self) -> tuple[int, ...]:
         """Parent of every node, -1 for the root."""
         return tuple(node.parent for node in self.nodes)
-
-    def above(self, index: int) -> list[int]:
-        """The node and all nodes that it hangs on."""
-        chain = []
-        while index >= 0:
-            chain.append(index)
-            index = self.parents[index]
-        return chain
 
 
 def make_skeleton(body: BodyModel) -> Skeleton:
@@ -214,9 +200,10 @@ def t_pose(skeleton: Skeleton) -> Float[np.ndarray, "nodes 3 3"]:
         skeleton: A skeleton with a shoulder, else nothing is turned.
     """
     turns = np.tile(np.eye(3), (len(skeleton.nodes), 1, 1))
-    for index in range(len(skeleton.nodes)):
-        above = {skeleton.names[i] for i in skeleton.above(index)}
-        for shoulder, angle in (("l_shoulder", np.pi / 2), ("r_shoulder", -np.pi / 2)):
-            if shoulder in above:
-                turns[index] = about(2, np.array(angle))
+    angles = {"l_shoulder": np.pi / 2, "r_shoulder": -np.pi / 2}
+    for index, node in enumerate(skeleton.nodes):
+        if node.name in angles:
+            turns[index] = about(2, np.array(angles[node.name]))
+        elif node.parent >= 0:
+            turns[index] = turns[node.parent]
     return turns

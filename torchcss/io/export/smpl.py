@@ -27,31 +27,35 @@ from torchcss.errors import ConfigurationError
 from torchcss.io.export.selection import Selection
 from torchcss.io.export.skeleton import make_skeleton, node_poses, t_pose
 
-SMPL_JOINTS: tuple[tuple[str, int, str | None], ...] = (
-    ("pelvis", -1, "HumanoidRoot"),
-    ("left_hip", 0, "l_hip"),
-    ("right_hip", 0, "r_hip"),
-    ("spine1", 0, "vl5"),
-    ("left_knee", 1, "l_knee"),
-    ("right_knee", 2, "r_knee"),
-    ("spine2", 3, None),
-    ("left_ankle", 4, "l_ankle"),
-    ("right_ankle", 5, "r_ankle"),
-    ("spine3", 6, None),
-    ("left_foot", 7, None),
-    ("right_foot", 8, None),
-    ("neck", 9, "vc7"),
-    ("left_collar", 9, "l_sternoclavicular"),
-    ("right_collar", 9, "r_sternoclavicular"),
-    ("head", 12, None),
-    ("left_shoulder", 13, "l_shoulder"),
-    ("right_shoulder", 14, "r_shoulder"),
-    ("left_elbow", 16, "l_elbow"),
-    ("right_elbow", 17, "r_elbow"),
-    ("left_wrist", 18, "l_wrist"),
-    ("right_wrist", 19, "r_wrist"),
-    ("left_hand", 20, None),
-    ("right_hand", 21, None),
+_TABLE = """
+pelvis         -1  HumanoidRoot
+left_hip        0  l_hip
+right_hip       0  r_hip
+spine1          0  vl5
+left_knee       1  l_knee
+right_knee      2  r_knee
+spine2          3  -
+left_ankle      4  l_ankle
+right_ankle     5  r_ankle
+spine3          6  -
+left_foot       7  -
+right_foot      8  -
+neck            9  vc7
+left_collar     9  l_sternoclavicular
+right_collar    9  r_sternoclavicular
+head           12  -
+left_shoulder  13  l_shoulder
+right_shoulder 14  r_shoulder
+left_elbow     16  l_elbow
+right_elbow    17  r_elbow
+left_wrist     18  l_wrist
+right_wrist    19  r_wrist
+left_hand      20  -
+right_hand     21  -
+"""
+SMPL_JOINTS: tuple[tuple[str, int, str | None], ...] = tuple(
+    (name, int(parent), None if ours == "-" else ours)
+    for name, parent, ours in map(str.split, _TABLE.strip().splitlines())
 )
 """SMPL's name, its parent, and the joint of ours that turns there."""
 
