@@ -40,21 +40,22 @@ from torchcss.files import load_json, one_line, prepare_output_folder, read_text
 from torchcss.io.checkpoint import CHECKPOINT_NAME
 from torchcss.io.tracks import TRACK_NAME
 from torchcss.io.video import VideoReader
+from torchcss.joint_names import names_in
 from torchcss.tracking.session import Posterior
 from torchcss.tracking.settings import Settings, settings_from_plain
 
-FILES = ("video", "camera", "keypoints", "masks", "init")
+FILES = names_in("video camera keypoints masks init")
 """Columns that are paths, from the manifest's folder on."""
 
-OPTIONS = ("camera_name", "layout", "person", "frame_rate", "sigma", "focal", "fov", "stride")
+OPTIONS = names_in("camera_name layout person frame_rate sigma focal fov stride")
 """Columns that are options of the files, see `TrackOptions`."""
 
-SETTINGS = ("body", "preset", "seed", "samples", "modes", "keypoints_use", "working_size")
+SETTINGS = names_in("body preset seed samples modes keypoints_use working_size")
 """Columns that are settings of this clip alone."""
 
 _NUMBERS = {
-    **dict.fromkeys(("start", "stop", "stride", "seed", "samples", "modes", "working_size"), int),
-    **dict.fromkeys(("frame_rate", "sigma", "focal", "fov"), float),
+    **dict.fromkeys(names_in("start stop stride seed samples modes working_size"), int),
+    **dict.fromkeys(names_in("frame_rate sigma focal fov"), float),
 }
 _COLUMNS = ("name", "start", "stop", *FILES, *OPTIONS, *SETTINGS)
 _POLL_S = 0.5
@@ -136,10 +137,6 @@ class Clip(NamedTuple):
 
     name: str
     row: Mapping[str, Any]
-
-    def path(self, column: str) -> Path | None:
-        """One of its files."""
-        return Path(self.row[column]) if column in self.row else None
 
     def fingerprint(self) -> list[list[int]]:
         """What changes when its files do."""
@@ -251,10 +248,8 @@ class Job(NamedTuple):
         clips, out = read_manifest(batch.manifest), prepare_output_folder(batch.out)
         for name in ("claims", "work", "failed"):
             prepare_output_folder(out / ".batch" / name)
-        plain = asdict(batch.settings)
-        about = json.loads(
-            json.dumps({"clips": [clip._asdict() for clip in clips], "settings": plain})
-        )
+        plain = {"clips": [c._asdict() for c in clips], "settings": asdict(batch.settings)}
+        about = json.loads(json.dumps(plain))
         path = out / ".batch" / "manifest.json"
         if not path.exists():
             write_text(path, json.dumps(about, indent=1))
@@ -265,17 +260,13 @@ class Job(NamedTuple):
             )
         claims = Claims(out / ".batch" / "claims", patience_s=batch.patience)
         job = cls(tuple(clips), batch.settings, out, claims)
-        job._forgive(all_failures=batch.retry_failed)
-        return job
-
-    def _forgive(self, *, all_failures: bool) -> None:
-        """Let clips be tried again."""
-        for clip in self.clips:
-            failure = self.failure(clip)
+        for clip in clips:  # let them be tried again
+            failure = job.failure(clip)
             if failure is not None and (
-                all_failures or failure["of_disk"] or failure["files"] != clip.fingerprint()
+                batch.retry_failed or failure["of_disk"] or failure["files"] != clip.fingerprint()
             ):
-                self._failed(clip).unlink(missing_ok=True)
+                job._failed(clip).unlink(missing_ok=True)
+        return job
 
     def _failed(self, clip: Clip) -> Path:
         return self.out / ".batch" / "failed" / f"{clip.name}.json"
@@ -412,17 +403,16 @@ def _track_into(place: Path, job: Job, clip: Clip, watch: _Watch) -> None:
     watch.total = VideoReader(row["video"], start=begin, stop=end).num_selected
     own = {name: row[name] for name in SETTINGS if name in row}
     options = {name: row[name] for name in OPTIONS if name in row}
+    options |= {name: Path(row[name]) for name in ("masks", "init") if name in row}
     track_video(
         row["video"],
-        camera=clip.path("camera"),
-        keypoints=clip.path("keypoints"),
+        camera=row.get("camera"),
+        keypoints=row.get("keypoints"),
         out=place,
         settings=settings_from_plain({**asdict(job.settings), **own}),
         start=begin,
         stop=end,
-        options=TrackOptions(
-            masks=clip.path("masks"), init=clip.path("init"), live=watch, resume=True, **options
-        ),
+        options=TrackOptions(live=watch, resume=True, **options),
     )
 
 

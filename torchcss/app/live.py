@@ -14,7 +14,6 @@ from torchcss.app.recorder import Picture, modes_of
 from torchcss.io.export.selection import camera_up, up_axis
 from torchcss.show.viewer import ShownFrame, Viewer, close_recording, open_recording
 from torchcss.tracking.session import Posterior
-from torchcss.vision.camera import Camera
 
 
 class LiveViewer:
@@ -53,16 +52,12 @@ class LiveViewer:
             picture: How it looks.
         """
         if self._viewer is None:
-            up = _up(frame, picture.camera)
+            joints = frame.joints_world[:1].double().cpu().numpy()
+            upward = camera_up(picture.camera)
+            up, _ = up_axis(frame.body.joint_names, joints, np.eye(4)[None], upward)
             self._viewer = Viewer(self._recording, frame.body, camera=picture.camera, up=up)
         self._viewer.add(ShownFrame(modes_of(frame), picture.image, frame.lost))
 
     def close(self) -> None:
         """End the recording; a viewer stays open."""
         close_recording(self._recording)
-
-
-def _up(frame: Posterior, camera: Camera) -> str:
-    """Which axis of the world is up, as the first frame has it."""
-    joints = frame.joints_world[:1].double().cpu().numpy()
-    return up_axis(frame.body.joint_names, joints, np.eye(4)[None], camera_up(camera))[0]

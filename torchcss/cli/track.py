@@ -94,11 +94,11 @@ class Track:
     def others(self) -> list[ViewFiles]:
         """What the further cameras recorded."""
         count = len(self.other_videos)
-        for name in ("other_keypoints", "other_offsets", "other_cameras"):
-            if len(getattr(self, name)) not in (0, count):
+        for name in ("keypoints", "offsets", "cameras"):
+            if (number := len(getattr(self, f"other_{name}"))) not in (0, count):
                 raise ConfigurationError(
-                    f"--{name.replace('_', '-')}: expected one for each of the {count} other "
-                    f"videos, or none at all; got {len(getattr(self, name))}"
+                    f"--other-{name}: expected one for each of the {count} other videos, or none "
+                    f"at all; got {number}"
                 )
         return [
             ViewFiles(

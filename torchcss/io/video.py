@@ -101,9 +101,8 @@ class VideoReader:
     ) -> None:
         self.path = Path(path)
         self._start, self._stop, self._stride = start, stop, stride
-        self._image_frame_rate = Fraction(
-            30 if image_frame_rate is None else image_frame_rate
-        ).limit_denominator(1001)
+        rate = 30 if image_frame_rate is None else image_frame_rate
+        self._image_frame_rate = Fraction(rate).limit_denominator(1001)
         if stride < 1:
             raise VideoError(f"{self.path}: stride must be at least 1, got {stride}")
         if start < 0:
@@ -117,7 +116,11 @@ class VideoReader:
                 f"{self.path}: frames per second must be positive, got {image_frame_rate}"
             )
         self._images = self._find_images()
-        self.info = self._probe_container() if self._images is None else self._probe_images()
+        if self._images is None:
+            self.info = self._probe_container()
+        else:
+            height, width = read_image(self._images[0]).shape[:2]
+            self.info = VideoInfo(self._image_frame_rate, width, height, len(self._images))
         if self.info.num_frames is not None and start >= self.info.num_frames:
             raise self._beyond_the_end(self.info.num_frames)
 
@@ -285,11 +288,6 @@ class VideoReader:
         except (OSError, ValueError) as error:  # ValueError: a null character in the name
             raise VideoError(f"{str(self.path)!r}: cannot be read: {_reason(error)}") from error
         return [self.path] if self.path.suffix.lower() in IMAGE_SUFFIXES else None
-
-    def _probe_images(self) -> VideoInfo:
-        assert self._images is not None
-        height, width = read_image(self._images[0]).shape[:2]
-        return VideoInfo(self._image_frame_rate, width, height, len(self._images))
 
     def _read_images(self) -> Generator[Frame]:
         assert self._images is not None

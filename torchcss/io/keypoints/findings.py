@@ -38,15 +38,14 @@ def _outside(joints: np.ndarray, image_size_wh: tuple[int, int], first_frame: in
     confident = joints[..., 2] > _CONFIDENT
     low, high = -0.5, np.array(image_size_wh) - 0.5
     outside = confident & ((joints[..., :2] < low) | (joints[..., :2] > high)).any(-1)
-    counts = [(int(o.sum()), int(c.sum())) for o, c in zip(outside, confident, strict=True)]
-    frames = [index for index, (out, _) in enumerate(counts) if out]
-    if not frames:
+    out, of = outside.sum(axis=1), confident.sum(axis=1)
+    frames = np.flatnonzero(out)
+    if not len(frames):
         return []
-    index = first_frame if first_frame in frames else frames[0]
-    out, of = counts[index]
+    index = first_frame if out[first_frame] else frames[0]
     line = (
-        f"{out} of {of} confident joints of frame {index} lie outside the image, and some in "
-        f"{len(frames)} of {len(joints)} frames"
+        f"{out[index]} of {of[index]} confident joints of frame {index} lie outside the image, and "
+        f"some in {len(frames)} of {len(joints)} frames"
     )
     if outside.sum() > 0.2 * confident.sum():
         line += "; were the keypoints made from this video, at this size?"

@@ -56,11 +56,10 @@ def in_order(people: People, film: Film, report: list[str]) -> list[list[Person]
         places = by_name
     else:
         places = _by_number(people, list(frames), film, report)
-    if len({place for place in places if place is not None}) < sum(p is not None for p in places):
+    known = [(place, key) for place, key in zip(places, frames, strict=True) if place is not None]
+    found = {place: frames[key] for place, key in known}
+    if len(found) < len(known):
         raise KeypointError("two entries of one frame; expected each frame once, numbered or named")
-    found = {
-        place: frames[key] for place, key in zip(places, frames, strict=True) if place is not None
-    }
     total = max(max(found, default=-1) + 1, film.num_frames or 0)
     if film.num_frames is not None and total > film.num_frames:
         raise wrong_count(film.num_frames, total)

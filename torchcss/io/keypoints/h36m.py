@@ -24,6 +24,7 @@ import numpy as np
 from torchcss.errors import KeypointError
 from torchcss.files import array_header, one_line, shortened
 from torchcss.io.keypoints.people import People, Person, screened
+from torchcss.joint_names import names_in
 
 _LAYOUTS = {
     ("h36m", 17): "H36M-17", ("h36m", 16): "H36M-16", ("coco", 17): "COCO-17",
@@ -31,14 +32,12 @@ _LAYOUTS = {
 }  # fmt: skip
 _MOST_BYTES = 2**30
 
-_ALLOWED = {
-    ("builtins", "dict"), ("builtins", "list"), ("builtins", "tuple"), ("builtins", "set"),
-    ("_codecs", "encode"),
-    *((f"numpy.{core}.multiarray", name) for core in ("core", "_core")
-      for name in ("_reconstruct", "scalar")),
-    *((f"numpy.{core}.numeric", "_frombuffer") for core in ("core", "_core")),
-    ("numpy", "ndarray"), ("numpy", "dtype"),
-}  # fmt: skip
+_ALLOWED = names_in(
+    "builtins.dict builtins.list builtins.tuple builtins.set _codecs.encode numpy.ndarray "
+    "numpy.dtype numpy.core.multiarray._reconstruct numpy._core.multiarray._reconstruct "
+    "numpy.core.multiarray.scalar numpy._core.multiarray.scalar numpy.core.numeric._frombuffer "
+    "numpy._core.numeric._frombuffer"
+)
 """What an archive of arrays needs, old NumPy or new."""
 
 
@@ -47,19 +46,24 @@ class PlainUnpickler(pickle.Unpickler):
 
     def find_class(self, module_name: str, global_name: str) -> Any:
         """Return what the data asks for, if it is harmless."""
-        if (module_name, global_name) not in _ALLOWED:
+        if f"{module_name}.{global_name}" not in _ALLOWED:
             raise pickle.UnpicklingError(f"it asks for {module_name}.{global_name}")
         return super().find_class(module_name.replace(".core.", "._core."), global_name)
 
 
 def is_h36m(path: Path) -> bool:
     """Whether a file is such an archive."""
+    names = _names(path)
+    return "positions_2d.npy" in names or {"boxes.npy", "keypoints.npy"} <= names
+
+
+def _names(path: Path) -> set[str]:
+    """What is in an archive."""
     try:
         with zipfile.ZipFile(path) as archive:
-            names = set(archive.namelist())
-            return "positions_2d.npy" in names or {"boxes.npy", "keypoints.npy"} <= names
+            return set(archive.namelist())
     except (OSError, ValueError, NotImplementedError, zipfile.BadZipFile):
-        return False
+        return set()
 
 
 def read_h36m(path: Path, selection: str) -> People:
@@ -73,7 +77,7 @@ def read_h36m(path: Path, selection: str) -> People:
         KeypointError: If the archive is damaged, or which recording is meant is not clear; the
             message names those that there are.
     """
-    if not _has(path, "positions_2d"):
+    if "positions_2d.npy" not in _names(path):
         return _read_detections(path)
     chosen: Any = _object(path, "positions_2d")
     rest, steps = selection, []
@@ -133,11 +137,6 @@ def _read_detections(path: Path) -> People:
         frames.append([Person(joints) for joints in rows])
     size = _size(_metadata(path))
     return People(frames, None, ["format: VideoPose3D's detections"], size_wh=size)
-
-
-def _has(path: Path, name: str) -> bool:
-    with zipfile.ZipFile(path) as archive:
-        return f"{name}.npy" in archive.namelist()
 
 
 def _metadata(path: Path) -> dict[str, Any]:

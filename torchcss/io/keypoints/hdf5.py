@@ -114,20 +114,15 @@ def _read_pandas(path: Path, group: Any) -> People:
         table = _array(path, group["table"])
         fields = table.dtype.names or ()
         values = table[next(name for name in fields if name.startswith("values_block"))]
-        columns = _unpickled(group.attrs["non_index_axes"])[0][1]
+        axes = io.BytesIO(bytes(group.attrs["non_index_axes"]))  # a Python object
+        columns = PlainUnpickler(axes, encoding="latin1").load()[0][1]
         index = table["index"]
     else:
         values, index = _array(path, group["block0_values"]), _array(path, group["axis1"])
         levels = sorted(key for key in group if key.startswith("axis0_level"))
-        columns = zip(
-            *(
-                np.array(_texts(path, group[key]))[
-                    _array(path, group[key.replace("level", "label")])
-                ]
-                for key in levels
-            ),
-            strict=True,
-        )
+        labels = (_array(path, group[key.replace("level", "label")]) for key in levels)
+        texts = (np.array(_texts(path, group[key])) for key in levels)
+        columns = zip(*(t[label] for t, label in zip(texts, labels, strict=True)), strict=True)
     columns = [list(map(str, column)) for column in columns]
     who = list(dict.fromkeys(column[-3] for column in columns)) if len(columns[0]) > 3 else [""]
     names = list(dict.fromkeys(column[-2] for column in columns))
@@ -144,8 +139,3 @@ def _read_pandas(path: Path, group: Any) -> People:
     }
     report = [f"format: DeepLabCut, {len(who)} individual{'s' * (len(who) > 1)}"]
     return People(frames, tuple(names), report, first=0)
-
-
-def _unpickled(value: Any) -> Any:
-    """A Python object that pandas keeps as an attribute."""
-    return PlainUnpickler(io.BytesIO(bytes(value)), encoding="latin1").load()

@@ -34,7 +34,7 @@ class Whom(NamedTuple):
         middles = np.array([p[p[:, 2] > 0.0, :2].mean(0) if p.any() else (0, 0) for p in people])
         away = np.linalg.norm(middles - 0.5 * np.array(self.image_size_wh), axis=1)
         ranks = {
-            "prominent": [-_prominence(person) for person in people],
+            "prominent": [-person[:, 2].sum() * size_of(person) for person in people],
             "largest": [-size_of(person) for person in people],
             "leftmost": middles[:, 0],
             "centre": away,
@@ -94,8 +94,7 @@ def follow(
     """
     first_frame, start = whom.frame, frames[whom.frame]
     place = whom.choose(start, tracks[first_frame])
-    num_joints = frames[first_frame].shape[1]
-    chosen = np.zeros((len(frames), num_joints, 3))
+    chosen = np.zeros((len(frames), start.shape[1], 3))
     most = max(len(frame) for frame in frames)
     if most <= 1 and len({track for of in tracks for track in of}) <= 1:
         for index, frame in enumerate(frames):
@@ -167,11 +166,6 @@ def size_of(person: np.ndarray) -> float:
     """The diagonal of the box around a person's confident joints, at least one pixel."""
     points = person[person[:, 2] > 0.0, :2]
     return max(1.0, float(np.linalg.norm(np.ptp(points, axis=0)))) if len(points) else 1.0
-
-
-def _prominence(person: np.ndarray) -> float:
-    """Sum of confidences times size: the largest and most certain person."""
-    return float(person[:, 2].sum()) * size_of(person)
 
 
 def _distance(last: np.ndarray, person: np.ndarray) -> float:

@@ -95,7 +95,10 @@ def read_table(path: Path) -> People:
     if len(rows) == 1:
         raise KeypointError("row 1: a heading and nothing below it; get a complete copy")
     columns = _headed(rows[0][1])
-    report = [_confidence_line(rows[0][1], columns)]
+    found = [rows[0][1][parts[2]] for parts in columns.parts.values() if 2 in parts]
+    report = ["no confidence in the file: 1 for every joint that has a place other than (0, 0)"]
+    if found:
+        report = [f"confidence: columns such as {found[0]}"]
     joints, frames = _read_rows(columns, rows[1:])
     order = landmark_order(joints)
     if order is not None and len(joints) == NUM_LANDMARKS:
@@ -148,14 +151,6 @@ def _headed(heading: Sequence[str]) -> _Columns:
             f"found {shortened(', '.join(heading))}"
         )
     return _Columns(columns, len(names), frame, None, track, unit)
-
-
-def _confidence_line(heading: Sequence[str], columns: _Columns) -> str:
-    """Which column was taken for the confidence."""
-    found = [heading[parts[2]] for parts in columns.parts.values() if 2 in parts]
-    if not found:
-        return "no confidence in the file: 1 for every joint that has a place other than (0, 0)"
-    return f"confidence: columns such as {found[0]}"
 
 
 def _split(name: str) -> tuple[str, int] | None:

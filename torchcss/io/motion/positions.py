@@ -115,7 +115,7 @@ def read_motion_capture(
             f"{path}: a skeleton without motion; it is a body (load_body), not a motion"
         )
     if frame_rate is not None:
-        rate, report = frame_rate, ()
+        rate, report = frame_rate, []
     report = [f"{len(values)} frames, {rate:g} per second", *report]
     with np.errstate(all="ignore"):  # whatever overflows is found below
         rest, joints = rest_positions(segments), _positions(segments, values)
@@ -136,19 +136,13 @@ def read_motion_capture(
     return MotionCapture(names, parents, rest, joints, rate, tuple(report))
 
 
-class _Parsed(NamedTuple):
-    segments: list[Segment]
-    values: Float[np.ndarray, "t c"]
-    rate: float
-    metres_per_unit: float | None = None
-    report: tuple[str, ...] = ()
-
-
-def _parse(path: Path, skeleton: StrPath | None) -> _Parsed:
-    """What either format says."""
+def _parse(
+    path: Path, skeleton: StrPath | None
+) -> tuple[list[Segment], Float[np.ndarray, "t c"], float, float | None, list[str]]:
+    """What either format says: segments, their numbers, rate, metres per unit, and notes."""
     suffix = path.suffix.lower()
     if suffix == ".bvh":
-        return _Parsed(*parse_bvh(path))
+        return *parse_bvh(path), None, []
     if suffix != ".amc":
         raise MotionCaptureError(
             f"{path}: expected a .bvh file, or an .amc file with its .asf, found {suffix!r}"
@@ -160,8 +154,7 @@ def _parse(path: Path, skeleton: StrPath | None) -> _Parsed:
             "its ASF file"
         )
     segments, values, stated = parse_acclaim(beside, path)
-    note = "rate assumed: an AMC does not say it"
-    return _Parsed(segments, values, ACCLAIM_RATE, stated, (note,))
+    return segments, values, ACCLAIM_RATE, stated, ["rate assumed: an AMC does not say it"]
 
 
 def resample(
