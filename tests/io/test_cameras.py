@@ -72,7 +72,7 @@ error = 0.0
 def test_json_camera(tmp_path: Path) -> None:
     loaded = load_camera(write(tmp_path / "a.json", {"one": entry()}))
     camera = loaded.camera
-    assert (loaded.metric, loaded.units_note, loaded.video) == (True, None, "a.mp4")
+    assert (loaded.metric, loaded.units_note) == (True, None)
     assert camera.name == "one"
     assert tuple(camera.image_size_wh) == (640, 480)
     torch.testing.assert_close(camera.K, torch.tensor(K, dtype=camera.K.dtype))

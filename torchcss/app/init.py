@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import csv
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,7 @@ from torchcss.io.keypoints.one_image import read_joints
 from torchcss.io.keypoints.read import Scale
 from torchcss.io.tracks import write_summary
 from torchcss.io.video import read_frame
+from torchcss.joint_names import names_in
 from torchcss.show.overlay import draw_poses
 from torchcss.tracking.settings import Settings, check_seed
 from torchcss.types import Keypoints
@@ -84,7 +85,7 @@ class PictureFiles:
                 width, height, focal_px=focal, field_of_view_degrees=angle
             )
             return camera, [note]
-        if focal is not None or angle is not None:
+        if (focal, angle) != (None, None):
             raise CameraError("give a camera file, a focal length or a field of view, not several")
         loaded = load_camera(self.camera, self.camera_name, video=image)
         check_image_size(loaded.camera, width, height)
@@ -153,7 +154,10 @@ def initialise_image(
     known = keypoints.confidence[:, None] > 0
     _draw(out, found, picture, camera, torch.where(known, keypoints.positions, torch.nan))
     rows = proportion_table(found.lengths, found.scale)
-    _write_table(out / "proportions.csv", rows)
+    with replace_file(out / "proportions.csv") as partial, partial.open("w", newline="") as file:
+        table = csv.DictWriter(file, names_in("name fitted_m standard_m difference_percent"))
+        table.writeheader()
+        table.writerows(rows)
     summary: dict[str, Any] = {
         "image": image,
         "frame": files.frame,
@@ -174,14 +178,6 @@ def initialise_image(
         summary["stature_known"] = options.stature is not None
     write_summary(out / "summary.json", summary)
     return found, summary
-
-
-def _write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write the table of proportions as CSV."""
-    with replace_file(path) as partial, partial.open("w", newline="") as file:
-        writer = csv.DictWriter(file, ["name", "fitted_m", "standard_m", "difference_percent"])
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def initialise_video(

@@ -82,7 +82,7 @@ class Lens:
             info.width, info.height, focal_px=self.focal, field_of_view_degrees=self.fov
         )
         note = note.replace("as given", self.source)
-        return LoadedCamera(camera, metric=False, units_note=note, video=None)
+        return LoadedCamera(camera, metric=False, units_note=note)
 
 
 def fitted(view: OpenView, settings: Settings) -> OpenView:

@@ -10,6 +10,7 @@ written piecemeal, the overlay film, is made at the end (`torchcss.show.track_pi
 from __future__ import annotations
 
 import platform
+import re
 import signal
 import threading
 import time
@@ -251,7 +252,7 @@ class Recorder:
         """Remove what belongs to another track, now that there will be one in its place."""
         remove_checkpoint(self.folder)
         for old in (self.folder / SMOOTH_NAME, *self.folder.glob("overlay*.mp4")):
-            if old.stem in ("smooth", "overlay") or old.stem.removeprefix("overlay_").isdigit():
+            if re.fullmatch("smooth|overlay(_[0-9]+)?", old.stem):
                 try:
                     old.unlink(missing_ok=True)
                 except OSError as error:
@@ -261,8 +262,7 @@ class Recorder:
 def modes_of(frame: Posterior, *, is_first: bool = False) -> FrameModes:
     """A frame as the track takes it."""
     base = torch.eye(4, dtype=torch.float64)
-    base[:3, :3] = frame.body.base_rotation
-    base[:3, 3] = frame.body.base_translation
+    base[:3, :3], base[:3, 3] = frame.body.base_rotation, frame.body.base_translation
     mixture, parent = frame.state.mixture, frame.info.parent
     numbers = {
         "state": mixture.mean,

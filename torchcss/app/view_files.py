@@ -166,7 +166,7 @@ def open_view(
                 f"{masks.info.width} x {masks.info.height}"
             )
     if isinstance(camera, Camera):
-        loaded = LoadedCamera(camera, metric=True, units_note=None, video=None)
+        loaded = LoadedCamera(camera, metric=True, units_note=None)
     elif isinstance(camera, LoadedCamera):
         loaded = camera
     else:

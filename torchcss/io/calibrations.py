@@ -65,10 +65,10 @@ class Entry(NamedTuple):
     """
 
     K: Any
-    image_size_wh: Any
-    distortion: Any
-    rotation: Any
-    translation: Any
+    image_size_wh: Any = None
+    distortion: Any = None
+    rotation: Any = None
+    translation: Any = None
     units: Any = "metre"
     video: Any = None
     fisheye: Any = False
@@ -263,7 +263,7 @@ def _read_colmap(path: Path) -> dict[str, Entry]:
             size = values = []
         names = _COLMAP.get(model, "").split()
         if "FISHEYE" in model:
-            entries[words[0]] = Entry([], size, None, None, None, fisheye=True)
+            entries[words[0]] = Entry([], size, fisheye=True)
             continue
         if not names or len(values) != len(names) or len(size) != 2:
             raise CameraError(
@@ -274,9 +274,8 @@ def _read_colmap(path: Path) -> dict[str, Entry]:
         fx, fy = given.get("fx", given.get("f")), given.get("fy", given.get("f"))
         # The corner of the image is (0, 0) there.
         K = [[fx, 0.0, given["cx"] - 0.5], [0.0, fy, given["cy"] - 0.5], [0.0, 0.0, 1.0]]
-        keys = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-        lens = [given.get(key, 0.0) for key in keys]
-        entries[words[0]] = Entry(K, size, lens, None, None)
+        lens = [given.get(key, 0.0) for key in names_in("k1 k2 p1 p2 k3 k4 k5 k6")]
+        entries[words[0]] = Entry(K, size, lens)
     return entries
 
 
@@ -360,7 +359,7 @@ def _read_matlab(path: Path) -> dict[str, Entry]:
     values = next((each for each in values.values() if isinstance(each, dict)), values)
     if {"fc", "cc"} <= values.keys():  # Bouguet's toolbox, whose pixels count from 0
         K, size = [*values["fc"], *values["cc"]], _size(values.get("nx"), values.get("ny"))
-        return {path.stem: Entry(K, size, values.get("kc"), None, None)}
+        return {path.stem: Entry(K, size, values.get("kc"))}
     if not _has_camera(values):
         raise CameraError(
             f"{path}: expected toStruct(cameraParams) or Bouguet's fc and cc, found "
@@ -394,13 +393,13 @@ def _matlab_entry(values: Mapping[str, Any]) -> Entry:
     K = np.array(_entry(values).K, float)
     K = K.T if K[2, 0] or K[2, 1] else K  # old ones have the principal point below
     K[:2, 2] -= 1
-    radial = np.ravel(values.get("RadialDistortion", values.get("RDistort", [0, 0])))
-    tangential = np.ravel(values.get("TangentialDistortion", values.get("TDistort", [0, 0])))
+    radial = np.ravel(values.get("RadialDistortion", values.get("RDistort", [])))
+    tangential = np.ravel(values.get("TangentialDistortion", values.get("TDistort", [])))
     k1, k2, k3 = [*radial.tolist(), 0.0, 0.0, 0.0][:3]
     p1, p2 = [*tangential.tolist(), 0.0, 0.0][:2]
     size = values.get("ImageSize")
     wh = [int(size[1]), int(size[0])] if isinstance(size, list) and len(size) == 2 else None
-    return Entry(K.tolist(), wh, [k1, k2, p1, p2, k3], None, None)
+    return Entry(K.tolist(), wh, [k1, k2, p1, p2, k3])
 
 
 def _listed(value: Any) -> Any:

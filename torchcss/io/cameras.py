@@ -39,13 +39,11 @@ class LoadedCamera(NamedTuple):
         camera: The camera; in its own frame unless `metric`.
         metric: Whether the world frame is the file's, in metres.
         units_note: Why the camera is in its own frame, or which unit was assumed, for the user.
-        video: Name of the video file that the camera took, where the calibration says it.
     """
 
     camera: Camera
     metric: bool
     units_note: str | None
-    video: str | None
 
 
 def read_camera(
@@ -98,10 +96,9 @@ def load_camera(
         entry = entry._replace(image_size_wh=[info.width, info.height])
     camera = _make_camera(entry, name, path)
     note = _own_frame_note(name, entry)
-    video_name = entry.video if isinstance(entry.video, str) else None
     if note is not None:
         camera = camera.in_own_frame()
-    return LoadedCamera(camera, note is None, note or entry.note, video_name)
+    return LoadedCamera(camera, note is None, note or entry.note)
 
 
 def _make_camera(entry: Entry, name: str, path: Path) -> Camera:

@@ -19,6 +19,7 @@ import torch
 
 from torchcss.errors import KeypointError
 from torchcss.files import load_arrays
+from torchcss.io.keypoints.mediapipe import is_landmark_array, read_landmark_array
 from torchcss.io.keypoints.people import People, Person, is_there, screened
 from torchcss.joint_names import ALIASES, names_in
 from torchcss.types import Keypoints
@@ -35,8 +36,10 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
         KeypointError: If there are none of the shapes above.
     """
     name = next((name for name in _PLACES if name in arrays), None)
-    if name is None and len(arrays) == 1:
-        name = next(iter(arrays))
+    if len(arrays) == 1:
+        (name,) = arrays
+        if is_landmark_array(arrays[name]):
+            return read_landmark_array(name, arrays[name])
     if name is None:
         raise KeypointError(
             f"expected the arrays keypoints, confidence and joint_names, "

@@ -45,7 +45,6 @@ from torchcss.io.keypoints.h36m import is_h36m, read_h36m
 from torchcss.io.keypoints.hdf5 import read_hdf5
 from torchcss.io.keypoints.json_files import read_folder, read_json
 from torchcss.io.keypoints.labels import read_labels
-from torchcss.io.keypoints.mediapipe import is_landmark_array, read_landmark_array
 from torchcss.io.keypoints.one_person import Whom, follow, size_of
 from torchcss.io.keypoints.people import People, Person, is_there
 from torchcss.io.keypoints.tables import read_table
@@ -213,8 +212,10 @@ def _read(path: Path, image_size_wh: tuple[int, int], num_frames: int | None) ->
             f"{path}#{selection}: there is no such file, and only VideoPose3D's archives hold "
             "several recordings to choose from"
         )
-    if suffix in (".npz", ".npy"):
-        return _read_numpy(path)
+    if suffix == ".npz":
+        return read_arrays(path, load_arrays(path, KeypointError))
+    if suffix == ".npy":
+        return read_arrays(path, {path.name: load_array(path, KeypointError)})
     if suffix in (".csv", ".tsv"):
         return read_table(path)
     if suffix in (".h5", ".hdf5", ".slp"):
@@ -224,9 +225,10 @@ def _read(path: Path, image_size_wh: tuple[int, int], num_frames: int | None) ->
 
 def _read_folder(path: Path, image_size_wh: tuple[int, int]) -> People:
     """A file for every frame; or a folder of one camera's folder of them."""
-    for pattern, read in (("*.json", read_folder), ("*.txt", None)):
-        if next(path.glob(pattern), None) is not None:
-            return read(path) if read is not None else read_labels(path, image_size_wh)
+    if next(path.glob("*.json"), None) is not None:
+        return read_folder(path)
+    if next(path.glob("*.txt"), None) is not None:
+        return read_labels(path, image_size_wh)
     folders = sorted(entry.name for entry in path.iterdir() if entry.is_dir())
     if len(folders) == 1:
         return _read_folder(path / folders[0], image_size_wh)
@@ -235,17 +237,6 @@ def _read_folder(path: Path, image_size_wh: tuple[int, int]) -> People:
         "one for every frame"
         + (f"; give one of {shortened(', '.join(folders))}" if folders else "")
     )
-
-
-def _read_numpy(path: Path) -> People:
-    if path.suffix.lower() == ".npy":
-        arrays = {path.name: load_array(path, KeypointError)}
-    else:
-        arrays = dict(load_arrays(path, KeypointError))
-    found = [name for name, array in arrays.items() if is_landmark_array(array)]
-    if len(found) == 1 and len(arrays) == 1:
-        return read_landmark_array(found[0], arrays[found[0]])
-    return read_arrays(path, arrays)
 
 
 # What is checked and decided.
