@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from torchcss.cli.options import GivenOptions, PathArgument
 from torchcss.io.export import ExportOptions, Format, export
 from torchcss.io.run import Given, Run
 
@@ -16,7 +17,7 @@ from torchcss.io.run import Given, Run
 class Export:
     """Write a track as BVH, TRC, C3D, MOT, SMPL parameters, or a table with uncertainties."""
 
-    track: Annotated[Path, tyro.conf.Positional]
+    track: PathArgument
     """The run's folder, or a track's file in it."""
     to: Format
     """bvh: skeleton and turns; trc, c3d: joints as markers, metres; mot: joint angles, degrees;
@@ -26,7 +27,7 @@ class Export:
     options: Annotated[ExportOptions, tyro.conf.OmitArgPrefixes] = field(
         default_factory=ExportOptions
     )
-    given: Annotated[Given, tyro.conf.OmitArgPrefixes] = field(default_factory=Given)
+    given: GivenOptions = field(default_factory=Given)
 
     def run(self) -> None:
         """Run the verb."""

@@ -12,6 +12,7 @@ import tyro
 
 from torchcss.app.init import PictureFiles, initialise_image
 from torchcss.body.catalog import PROPORTIONS
+from torchcss.cli.options import PathArgument
 from torchcss.errors import ConfigurationError, KeypointError
 from torchcss.files import load_json, prepare_output_folder
 from torchcss.initialise.multi_start import PAPER_PROPORTIONS, Search
@@ -23,7 +24,7 @@ from torchcss.io.video import read_frame
 class Init:
     """Fit pose, proportions and shape to one picture with marked joints."""
 
-    image: Annotated[Path, tyro.conf.Positional]
+    image: PathArgument
     """The picture, or a video."""
     click: bool = False
     """Mark the joints by clicking in a window; they are saved as joints.json too."""

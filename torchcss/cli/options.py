@@ -20,8 +20,15 @@ from typing import Annotated
 
 import tyro
 
+from torchcss.io.run import Given
 from torchcss.io.tracks import read_summary
 from torchcss.tracking.settings import Settings
+
+PathArgument = Annotated[Path, tyro.conf.Positional]
+"""What a verb works on."""
+
+GivenOptions = Annotated[Given, tyro.conf.OmitArgPrefixes]
+"""What a run lacks."""
 
 SettingsOptions = Annotated[Settings, tyro.conf.arg(name="")]
 """How to track; each field is an option of its own name."""

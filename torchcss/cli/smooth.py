@@ -12,7 +12,7 @@ from typing import Annotated
 import tyro
 
 from torchcss.app.smooth import report, smooth
-from torchcss.cli.options import Terminal, TerminalOptions
+from torchcss.cli.options import GivenOptions, PathArgument, Terminal, TerminalOptions
 from torchcss.errors import ConfigurationError
 from torchcss.io.run import Given, GivenKeypoints, Run
 from torchcss.tracking.smooth import Smoothing
@@ -23,7 +23,7 @@ from torchcss.tracking.smooth_images import IMAGES
 class Smooth:
     """Choose among the modes of a track with all frames in view, and smooth what was chosen."""
 
-    track: Annotated[Path, tyro.conf.Positional]
+    track: PathArgument
     """The run's folder, or its track.npz, which stays as it is."""
     out: Path | None = None
     """Folder for smooth.npz and summary.json; by default the run's folder."""
@@ -39,7 +39,7 @@ class Smooth:
     with images."""
     lag: int | None = None
     """Most frames after each one that may say something of it; all by default."""
-    given: Annotated[Given, tyro.conf.OmitArgPrefixes] = field(default_factory=Given)
+    given: GivenOptions = field(default_factory=Given)
     keypoints: Annotated[GivenKeypoints, tyro.conf.OmitArgPrefixes] = field(
         default_factory=GivenKeypoints
     )

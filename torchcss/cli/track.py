@@ -11,7 +11,7 @@ import tyro
 
 from torchcss.app.smooth import report, smooth
 from torchcss.app.track import TrackOptions, track_video
-from torchcss.cli.options import SettingsOptions, Terminal, TerminalOptions
+from torchcss.cli.options import PathArgument, SettingsOptions, Terminal, TerminalOptions
 from torchcss.errors import ConfigurationError
 from torchcss.io.view_files import ViewFiles
 from torchcss.tracking.settings import Settings
@@ -21,7 +21,7 @@ from torchcss.tracking.settings import Settings
 class Track:
     """Track a body through a video, and write its track, summary, overlay and report.html."""
 
-    video: Annotated[Path, tyro.conf.Positional]
+    video: PathArgument
     """A video in any container, or a folder of images."""
     camera: Path | None = None
     """Calibration, if there is one: cameras.json, or the file of Pose2Sim, Anipose, Caliscope,

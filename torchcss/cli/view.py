@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
 
-import tyro
-
+from torchcss.cli.options import GivenOptions, PathArgument
 from torchcss.io.run import Given, Run
 from torchcss.show.track_pictures import has_pictures
 
@@ -16,13 +14,13 @@ from torchcss.show.track_pictures import has_pictures
 class View:
     """Look at a track in the rerun viewer, or save a recording of it that needs no video."""
 
-    track: Annotated[Path, tyro.conf.Positional]
+    track: PathArgument
     """The run's folder, or a track's file in it (track.npz, smooth.npz)."""
     save: Path | None = None
     """Write a recording, FILE.rrd, instead of opening a viewer; `rerun FILE.rrd` opens it."""
     connect: str | None = None
     """Address of a viewer that runs, instead of opening one."""
-    given: Annotated[Given, tyro.conf.OmitArgPrefixes] = field(default_factory=Given)
+    given: GivenOptions = field(default_factory=Given)
 
     def run(self) -> None:
         """Run the verb."""
@@ -40,13 +38,13 @@ class View:
 class Plot:
     """Draw a track's modes, trajectories with uncertainties, and frames, as PNG files."""
 
-    track: Annotated[Path, tyro.conf.Positional]
+    track: PathArgument
     """The run's folder, or a track's file in it (track.npz, smooth.npz)."""
     out: Path | None = None
     """Folder for the figures; by default `plots` in the run's folder."""
     frame: int | None = None
     """Frame that is seen from the side; by default the one with the most explanations."""
-    given: Annotated[Given, tyro.conf.OmitArgPrefixes] = field(default_factory=Given)
+    given: GivenOptions = field(default_factory=Given)
 
     def run(self) -> None:
         """Run the verb."""
@@ -62,9 +60,9 @@ class Plot:
 class Report:
     """Write report.html: film, figures, what was assumed and how to go on, on one page."""
 
-    track: Annotated[Path, tyro.conf.Positional]
+    track: PathArgument
     """The run's folder, or a track's file in it (track.npz, smooth.npz)."""
-    given: Annotated[Given, tyro.conf.OmitArgPrefixes] = field(default_factory=Given)
+    given: GivenOptions = field(default_factory=Given)
 
     def run(self) -> None:
         """Run the verb."""

@@ -115,7 +115,7 @@ class Run:
             path=path,
             track=track._replace(
                 body=_body(track, path.parent, given),
-                cameras=_with_keypoints(_cameras(track, own, summary, given), keypoints),
+                cameras=_cameras(track, own, summary, given, keypoints),
                 settings=track.settings or summary.get("settings", {}),
             ),
             summary=summary,
@@ -229,9 +229,13 @@ def _body(track: Track, folder: Path, given: Given) -> BodyModel | None:
 
 
 def _cameras(
-    track: Track, own: Path, summary: Mapping[str, Any], given: Given
+    track: Track,
+    own: Path,
+    summary: Mapping[str, Any],
+    given: Given,
+    keypoints: GivenKeypoints,
 ) -> tuple[RecordedCamera, ...]:
-    """The cameras, the one that is given first."""
+    """The cameras, the one that is given first, with what is given of its files."""
     known = track.cameras or _cameras_of_summary(own, summary)
     wanted = None if given.video is None else given.video.name
     if given.camera is not None:
@@ -252,14 +256,21 @@ def _cameras(
                 f"{', '.join(each.camera.name for each in known) or 'none that is known'}"
             )
         known = (*chosen, *(each for each in known if each not in chosen))
-    if given.video is None:
+    told: dict[str, Any] = {name: value for name, value in asdict(keypoints).items() if value}
+    if given.video is not None:
+        if not known:
+            raise TrackFileError(
+                f"{own.parent}: --video: the run does not say which camera took it; give --camera"
+            )
+        told["video"] = given.video
+        known = (known[0]._replace(files=known[0].files or _files_of(given.video)), *known[1:])
+    if not told or not known or known[0].files is None:
         return known
-    if not known:
-        raise TrackFileError(
-            f"{own.parent}: --video: the run does not say which camera took it; give --camera"
-        )
-    files = known[0].files or ViewFiles(video=given.video, keypoints=None)
-    return (known[0]._replace(files=replace(files, video=given.video)), *known[1:])
+    return (known[0]._replace(files=replace(known[0].files, **told)), *known[1:])
+
+
+def _files_of(video: Path) -> ViewFiles:
+    return ViewFiles(video=video, keypoints=None)
 
 
 def _cameras_of_summary(own: Path, summary: Mapping[str, Any]) -> tuple[RecordedCamera, ...]:
@@ -268,17 +279,7 @@ def _cameras_of_summary(own: Path, summary: Mapping[str, Any]) -> tuple[Recorded
     for view in (summary, *summary.get("other_views", [])) if summary.get("cameras") else ():
         name = view.get("camera") or next(iter(summary["cameras"]))
         video = view.get("video")
-        files = None if video is None else ViewFiles(video=Path(video), keypoints=None)
+        files = None if video is None else _files_of(Path(video))
         with suppress(TorchcssError):  # a summary that somebody edited: as if it had none
             found.append(RecordedCamera(read_camera(own, name), files))
     return tuple(found)
-
-
-def _with_keypoints(
-    known: tuple[RecordedCamera, ...], given: GivenKeypoints
-) -> tuple[RecordedCamera, ...]:
-    """The cameras, with what is given of the first one's video."""
-    told: dict[str, Any] = {name: value for name, value in asdict(given).items() if value}
-    if not told or not known or known[0].files is None:
-        return known
-    return (known[0]._replace(files=replace(known[0].files, **told)), *known[1:])
