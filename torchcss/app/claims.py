@@ -109,11 +109,8 @@ class Claims:
 
     def sight(self, name: str) -> Sight | None:
         """The newest claim to something; None: nobody has claimed it."""
-        found = [
-            int(path.suffix[1:])
-            for path in self.folder.glob(f"{name}.*")
-            if path.stem == name and path.suffix[1:].isdigit()
-        ]
+        claims = [path for path in self.folder.glob(f"{name}.*") if path.stem == name]
+        found = [int(path.suffix[1:]) for path in claims if path.suffix[1:].isdigit()]
         if not found:
             return None
         try:

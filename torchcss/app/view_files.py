@@ -158,12 +158,12 @@ def open_view(
     masks = None
     if files.masks is not None:
         masks = VideoReader(files.masks, start=start, stop=stop, stride=stride)
+        _, *theirs, _ = masks.info
         # Films of odd sizes are a row or column larger.
-        ours = (masks.info.width, masks.info.height)
-        if ours not in ((width, height), (width + width % 2, height + height % 2)):
+        if theirs not in ([width, height], [width + width % 2, height + height % 2]):
             raise VideoError(
                 f"{files.masks}: masks must have the video's size {width} x {height}, these have "
-                f"{masks.info.width} x {masks.info.height}"
+                f"{theirs[0]} x {theirs[1]}"
             )
     if isinstance(camera, Camera):
         loaded = LoadedCamera(camera, metric=True, units_note=None)
@@ -174,11 +174,8 @@ def open_view(
     check_image_size(loaded.camera, width, height)
     if files.keypoints is None:
         return OpenView(files, reader, masks, loaded, None, 1.0)
-    film = Film(
-        reader.info.num_frames or reader.count_frames(),
-        reader.image_names,
-        None if reader.image_names else float(reader.info.frame_rate),
-    )
+    rate = None if reader.image_names else float(reader.info.frame_rate)
+    film = Film(reader.info.num_frames or reader.count_frames(), reader.image_names, rate)
     keypoints = read_person(
         files.keypoints,
         film=film,

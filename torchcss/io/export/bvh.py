@@ -58,12 +58,12 @@ def bvh_text(
         ConfigurationError: If the style makes no sense, or a T-pose is wanted of a body without
             shoulders.
     """
-    for name, value, known in (
-        ("rotation order", style.rotation_order, ROTATION_ORDERS),
-        ("rest pose", style.rest_pose, ("hanging", "t-pose")),
-    ):
-        if value not in known:
-            raise ConfigurationError(f"{name}: expected {', '.join(known)}, got {value!r}")
+    if style.rotation_order not in ROTATION_ORDERS:
+        raise ConfigurationError(
+            f"rotation order: expected {', '.join(ROTATION_ORDERS)}, got {style.rotation_order!r}"
+        )
+    if style.rest_pose not in ("hanging", "t-pose"):
+        raise ConfigurationError(f"rest pose: expected hanging, t-pose, got {style.rest_pose!r}")
     if not 0 < style.scale < np.inf:
         raise ConfigurationError(f"scale: expected a positive number, got {style.scale}")
     scale, hung = style.scale, style.rest_pose == "hanging"

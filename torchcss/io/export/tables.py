@@ -31,9 +31,13 @@ from torchcss.body.bases import pose_track
 from torchcss.body.model import BodyModel
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.io.export.selection import Selection
+from torchcss.joint_names import names_in
 
 _CHUNK = 1024  # poses at a time: 30 MB of Jacobians
 _UPPER = np.triu_indices(3)
+_COLUMNS = names_in(
+    "frame time mode parent weight cost joint x y z cov_xx cov_xy cov_xz cov_yy cov_yz cov_zz"
+)
 
 
 def joint_covariances(selection: Selection, body: BodyModel) -> Float[np.ndarray, "t m j 3 3"]:
@@ -65,20 +69,13 @@ def csv_text(selection: Selection, covariance: Float[np.ndarray, "t m j 3 3"]) -
     """
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    names = ["cov_" + "xyz"[i] + "xyz"[j] for i, j in zip(*_UPPER, strict=True)]
-    writer.writerow(
-        ["frame", "time", "mode", "parent", "weight", "cost", "joint", "x", "y", "z", *names]
-    )
+    writer.writerow(_COLUMNS)
     numbers = np.concatenate([selection.joints, covariance[..., _UPPER[0], _UPPER[1]]], axis=-1)
     for t, m in np.argwhere(selection.present):
-        head = [
-            int(selection.frames[t]),
-            float(selection.times[t]),
-            int(selection.rank[t, m]),
-            int(selection.parent[t, m]),
-            float(np.exp(selection.log_weight[t, m])),
-            float(selection.cost[t, m]),
-        ]
+        weight = np.exp(selection.log_weight[t, m])
+        head = [array[t].item() for array in (selection.frames, selection.times)]
+        head += [array[t, m].item() for array in (selection.rank, selection.parent)]
+        head += [float(weight), float(selection.cost[t, m])]
         for name, row in zip(selection.joint_names, numbers[t, m].tolist(), strict=True):
             writer.writerow([*head, name, *row])
     return out.getvalue()

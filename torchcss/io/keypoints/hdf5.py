@@ -123,15 +123,16 @@ def _read_pandas(path: Path, group: Any) -> People:
         labels = (_array(path, group[key.replace("level", "label")]) for key in levels)
         texts = (np.array(_texts(path, group[key])) for key in levels)
         columns = zip(*(t[label] for t, label in zip(texts, labels, strict=True)), strict=True)
-    columns = [list(map(str, column)) for column in columns]
-    who = list(dict.fromkeys(column[-3] for column in columns)) if len(columns[0]) > 3 else [""]
+    # Scorer, individual where there are several, body part and kind.
+    columns = [tuple(map(str, column)) for column in columns]
+    several = len(columns[0]) > 3
+    who = list(dict.fromkeys(column[-3] if several else "" for column in columns))
     names = list(dict.fromkeys(column[-2] for column in columns))
     joints = np.full((len(values), len(who), len(names), 3), np.nan)
-    for number, column in enumerate(columns):
-        if column[-1] in _KINDS:
-            person = who.index(column[-3]) if len(column) > 3 else 0
-            place = names.index(column[-2]), _KINDS.index(column[-1])
-            joints[:, person, place[0], place[1]] = values[:, number]
+    for number, (*_, person, name, kind) in enumerate(columns):
+        if kind in _KINDS:
+            place = who.index(person) if several else 0
+            joints[:, place, names.index(name), _KINDS.index(kind)] = values[:, number]
     found = screened(joints[..., :2], joints[..., 2])
     frames: Frames = {
         int(key): [Person(p, w or None) for p, w in zip(people, who, strict=True) if is_there(p)]

@@ -31,7 +31,7 @@ class Whom(NamedTuple):
         Raises:
             KeypointError: If nobody is called so.
         """
-        middles = np.array([p[p[:, 2] > 0.0, :2].mean(0) if p.any() else (0, 0) for p in people])
+        middles = np.array([_middle(p) if p.any() else (0, 0) for p in people])
         away = np.linalg.norm(middles - 0.5 * np.array(self.image_size_wh), axis=1)
         ranks = {
             "prominent": [-person[:, 2].sum() * size_of(person) for person in people],
@@ -95,11 +95,10 @@ def follow(
     first_frame, start = whom.frame, frames[whom.frame]
     place = whom.choose(start, tracks[first_frame])
     chosen = np.zeros((len(frames), start.shape[1], 3))
-    most = max(len(frame) for frame in frames)
+    most = max(map(len, frames))
     if most <= 1 and len({track for of in tracks for track in of}) <= 1:
-        for index, frame in enumerate(frames):
-            if len(frame):
-                chosen[index] = frame[0]
+        for row, frame in zip(chosen, frames, strict=True):
+            row[:] = frame[0] if len(frame) else 0.0
         return chosen
     chosen[first_frame] = start[place]
     own, lost = tracks[first_frame][place], []
@@ -162,6 +161,11 @@ def _next(
     return nearest
 
 
+def _middle(person: np.ndarray) -> np.ndarray:
+    """The mean place of a person's confident joints."""
+    return person[person[:, 2] > 0.0, :2].mean(0)
+
+
 def size_of(person: np.ndarray) -> float:
     """The diagonal of the box around a person's confident joints, at least one pixel."""
     points = person[person[:, 2] > 0.0, :2]
@@ -175,5 +179,5 @@ def _distance(last: np.ndarray, person: np.ndarray) -> float:
     if both.any():
         gaps = last[both, :2] - person[both, :2]
     else:
-        gaps = (last[last[:, 2] > 0.0, :2].mean(0) - person[person[:, 2] > 0.0, :2].mean(0))[None]
+        gaps = (_middle(last) - _middle(person))[None]
     return float(np.linalg.norm(gaps, axis=1).mean()) / size

@@ -293,9 +293,9 @@ def _checked_numbers(
 
 def _check_somebody(frames: list[np.ndarray], first_frame: int) -> None:
     seen = [index for index, frame in enumerate(frames) if (frame[..., 2] > 0.0).any()]
-    if first_frame in seen:
+    later = next((index for index in seen if index >= first_frame), None)
+    if later == first_frame:
         return
-    later = next((index for index in seen if index > first_frame), None)
     advice = f"the first frame with somebody is {later}: start there"
     if later is None:
         advice = "there is none later either"

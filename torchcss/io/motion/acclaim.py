@@ -8,7 +8,7 @@ Call `parse_acclaim`; BVH, the other format, is parsed in `torchcss.body.files.b
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,10 +22,10 @@ from torchcss.files import Line, read_lines
 
 
 class _Acclaim(NamedTuple):
-    """An ASF file: the tree, the columns of every bone with freedom, and what it says of units."""
+    """An ASF file: the tree, how many numbers move each of its bones, and what it says of units."""
 
     segments: list[Segment]
-    columns: dict[str, list[int]]
+    counts: dict[str, int]
     is_angle: list[bool]
     radians: bool
     metres_per_unit: float | None
@@ -81,18 +81,18 @@ def _parse_asf(path: Path, lines: list[Line]) -> _Acclaim:
     bones["root"] = _Bone(order.number, vector("position"), axes, tuple(order.words[1:]))
     index = {name: number for number, name in enumerate(("root", *parents))}
     is_angle: list[bool] = []
-    columns: dict[str, list[int]] = {}
+    counts: dict[str, int] = {}
     segments: list[Segment] = []
     for name in index:
         bone = bones[name]
         turns = _turns(path, bone, len(is_angle), may_travel=name == "root")
         is_angle += [turn.is_rotation for turn in turns]
         if turns:
-            columns[name] = [turn.column for turn in turns]
+            counts[name] = len(turns)
         above = index.get(parents.get(name, ""), -1)
         # About fixed axes, the last factor acts first.
         segments.append(Segment(name, above, bone.offset, bone.axes, turns[::-1], name != "root"))
-    return _Acclaim(segments, columns, is_angle, radians, metres)
+    return _Acclaim(segments, counts, is_angle, radians, metres)
 
 
 def _turns(path: Path, bone: _Bone, first: int, *, may_travel: bool) -> tuple[Turn, ...]:
@@ -210,50 +210,45 @@ def _hierarchy(path: Path, section: tuple[Line, list[Line]], bones: set[str]) ->
 def _parse_amc(path: Path, lines: list[Line], skeleton: _Acclaim) -> Float[np.ndarray, "t c"]:
     radians = skeleton.radians
     frames: list[str] = []
-    values: list[list[float]] = []
-    filled: set[str] = set()
+    rows: list[dict[str, list[float]]] = []
     for line in lines:
-        first = line.words[0]
+        first, *words = line.words
         if first.startswith("#"):
             continue
         if first.startswith(":"):
             radians = {":radians": True, ":degrees": False}.get(first.lower(), radians)
             continue
-        if len(line.words) == 1 and first.isdigit():
+        if not words and first.isdigit():
             if frames:
-                _check_frame(path, line.number, skeleton, filled)
+                _check_frame(path, line.number, skeleton, rows[-1])
                 number, before = (
                     count(path, line.number, word, "a frame number") for word in (first, frames[-1])
                 )
                 if number != before + 1:
                     raise bad(path, line.number, f"the frame after {frames[-1]}", first)
             frames.append(first)
-            values.append([0.0] * len(skeleton.is_angle))
-            filled = set()
+            rows.append({})
             continue
         if not frames:
             raise bad(path, line.number, "the number of the first frame, as in an AMC", first)
-        columns = skeleton.columns.get(first)
-        if columns is None:
+        if first not in skeleton.counts:
             raise bad(path, line.number, "a bone of the skeleton with freedom", first)
-        if first in filled:
+        if first in rows[-1]:
             raise bad(path, line.number, "every bone once in a frame", first)
-        filled.add(first)
-        row = numbers(path, line.number, line.words[1:], "numbers")
-        if len(row) != len(columns):
-            raise bad(path, line.number, f"{len(columns)} numbers for {first}", len(row))
-        for column, value in zip(columns, row, strict=True):
-            values[-1][column] = value
+        row = rows[-1][first] = numbers(path, line.number, words, "numbers")
+        if len(row) != (size := skeleton.counts[first]):
+            raise bad(path, line.number, f"{size} numbers for {first}", len(row))
     if not frames:
         raise bad(path, lines[-1].number, "frames, as in an AMC", "none")
-    _check_frame(path, lines[-1].number, skeleton, filled)
-    table = np.array(values).reshape(len(values), len(skeleton.is_angle))
+    _check_frame(path, lines[-1].number, skeleton, rows[-1])
+    values = [number for row in rows for bone in skeleton.counts for number in row[bone]]
+    table = np.array(values).reshape(len(rows), len(skeleton.is_angle))
     if radians:
         return table
     return np.where(np.array(skeleton.is_angle, dtype=bool), np.radians(table), table)
 
 
-def _check_frame(path: Path, line: int, skeleton: _Acclaim, filled: set[str]) -> None:
+def _check_frame(path: Path, line: int, skeleton: _Acclaim, filled: Collection[str]) -> None:
     """A frame is over: it must have told of every bone."""
-    if missing := sorted(set(skeleton.columns) - filled):
+    if missing := sorted({*skeleton.counts} - {*filled}):
         raise bad(path, line, "all bones in the frame before", f"none for {', '.join(missing)}")
