@@ -190,11 +190,7 @@ _KEYPOINTS_NAME = "keypoints.npz"
 
 
 def _files_of(
-    video: Path,
-    keypoints: StrPath | None,
-    out: Path,
-    selection: Selection,
-    options: TrackOptions,
+    video: Path, keypoints: StrPath | None, out: Path, selection: Selection, options: TrackOptions
 ) -> ViewFiles:
     """The first camera's files; keypoints that are not given are detected."""
     masks = options.masks

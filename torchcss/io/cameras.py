@@ -46,12 +46,7 @@ class LoadedCamera(NamedTuple):
     units_note: str | None
 
 
-def read_camera(
-    path: StrPath,
-    name: str | None = None,
-    *,
-    video: StrPath | None = None,
-) -> Camera:
+def read_camera(path: StrPath, name: str | None = None, *, video: StrPath | None = None) -> Camera:
     """Read one camera of a calibration file; see `load_camera`."""
     return load_camera(path, name, video=video).camera
 
@@ -62,10 +57,7 @@ def read_cameras(path: StrPath) -> dict[str, Camera]:
 
 
 def load_camera(
-    path: StrPath,
-    name: str | None = None,
-    *,
-    video: StrPath | None = None,
+    path: StrPath, name: str | None = None, *, video: StrPath | None = None
 ) -> LoadedCamera:
     """Read one camera of a calibration file, and what the file says about it.
 

@@ -91,10 +91,7 @@ class Run:
 
     @classmethod
     def open(
-        cls,
-        folder: StrPath,
-        given: Given | None = None,
-        keypoints: GivenKeypoints | None = None,
+        cls, folder: StrPath, given: Given | None = None, keypoints: GivenKeypoints | None = None
     ) -> Run:
         """Open a run.
 
@@ -200,11 +197,7 @@ def body_of_track(track: Track, body: BodyModel | None = None) -> BodyModel:
     rows = np.flatnonzero(track.num_modes > 0)
     state, base, target = (
         torch.from_numpy(array)
-        for array in (
-            track.state[rows, 0],
-            track.base_transform[rows],
-            track.joints_world[rows, 0],
-        )
+        for array in (track.state[rows, 0], track.base_transform[rows], track.joints_world[rows, 0])
     )
     gap = (pose_track(body, state, base).joints - target).abs()
     if gap.numel() and float(gap.max()) > TOLERANCE:
@@ -229,11 +222,7 @@ def _body(track: Track, folder: Path, given: Given) -> BodyModel | None:
 
 
 def _cameras(
-    track: Track,
-    own: Path,
-    summary: Mapping[str, Any],
-    given: Given,
-    keypoints: GivenKeypoints,
+    track: Track, own: Path, summary: Mapping[str, Any], given: Given, keypoints: GivenKeypoints
 ) -> tuple[RecordedCamera, ...]:
     """The cameras, the one that is given first, with what is given of its files."""
     known = track.cameras or _cameras_of_summary(own, summary)

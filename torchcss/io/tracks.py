@@ -50,14 +50,7 @@ from torch import Tensor
 from torchcss.body.bases import on_origin
 from torchcss.body.model import BodyModel
 from torchcss.errors import ShapeError, TorchcssError, TrackFileError
-from torchcss.files import (
-    StrPath,
-    load_arrays,
-    load_json,
-    one_line,
-    save_arrays,
-    write_text,
-)
+from torchcss.files import StrPath, load_arrays, load_json, one_line, save_arrays, write_text
 from torchcss.files import prepare_output_folder as prepare_output_folder
 from torchcss.io.track_body import body_from_plain, body_to_plain
 from torchcss.io.view_files import RecordedCamera, camera_from_plain, camera_to_plain

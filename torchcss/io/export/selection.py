@@ -229,11 +229,7 @@ def _nearest_present(present: np.ndarray) -> np.ndarray:
 
 
 def _frame_of_file(
-    track: Track,
-    kept: np.ndarray,
-    y_up: bool,
-    world_up: str,
-    report: list[str],
+    track: Track, kept: np.ndarray, y_up: bool, world_up: str, report: list[str]
 ) -> tuple[np.ndarray, np.ndarray]:
     """The file's frame from the world's, and a standing body's orientation in it."""
     axis = world_up

@@ -32,15 +32,7 @@ from torchcss.io.keypoints.json_people import (
     said_size,
 )
 from torchcss.io.keypoints.mediapipe import LAYOUT, NUM_LANDMARKS, landmark_order, reordered
-from torchcss.io.keypoints.people import (
-    FRAME_NAMES,
-    Frames,
-    Key,
-    People,
-    Person,
-    is_there,
-    united,
-)
+from torchcss.io.keypoints.people import FRAME_NAMES, Frames, Key, People, Person, is_there, united
 from torchcss.io.video import natural_order
 from torchcss.joint_names import names_in
 
