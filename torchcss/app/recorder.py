@@ -20,7 +20,7 @@ from dataclasses import asdict, dataclass, field
 from functools import cached_property, partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -34,6 +34,7 @@ from torchcss.errors import OutputError
 from torchcss.files import output_error
 from torchcss.io.cameras import calibration
 from torchcss.io.checkpoint import Checkpoint, remove_checkpoint, write_checkpoint
+from torchcss.io.run import Run
 from torchcss.io.tracks import TRACK_NAME, FrameModes, Track, TrackWriter, write_summary
 from torchcss.io.view_files import RecordedCamera
 from torchcss.show.overlay import draw_poses
@@ -89,18 +90,6 @@ class Terminated(KeyboardInterrupt):
     """The process was asked to end (SIGTERM)."""
 
 
-class Begun(NamedTuple):
-    """What an interrupted run has left.
-
-    Attributes:
-        track: Its frames up to the checkpoint.
-        notes: What its recorder put into the checkpoint.
-    """
-
-    track: Track
-    notes: Mapping[str, Any]
-
-
 @dataclass(kw_only=True)
 class Recorder:
     """Writes a run as it goes.
@@ -115,8 +104,9 @@ class Recorder:
         sinks: What sees the frames besides; closed at the end of the run.
         on_first_frame: Writes what else belongs to the run, when its first frame is saved.
         checkpoint_every: Seconds of wall time between checkpoints.
-        begun: The run that is gone on with; None: it starts.
+        begun: The run that is gone on with, which has a checkpoint; None: it starts.
         lock: The lock of the folder: nothing is written when another process has taken it over.
+        num_done: Frames that were tracked before this run goes on.
     """
 
     folder: Path
@@ -128,15 +118,16 @@ class Recorder:
     sinks: Sequence[Sink] = ()
     on_first_frame: Callable[[], None] | None = None
     checkpoint_every: float = CHECKPOINT_EVERY
-    begun: Begun | None = None
+    begun: Run | None = None
     lock: Claim | None = None
 
     def __post_init__(self) -> None:
-        session, begun = self.session, self.begun
+        session = self.session
+        going_on = None if self.begun is None else self.begun.checkpoint
         self._wall, self._began = 0.0, time.perf_counter()
         self._totals = _Totals()
         self._state = session.checkpoint()
-        if begun is None:
+        if self.begun is None or going_on is None:
             body = session.state.body
             track = Track.empty(
                 body.state_names,
@@ -147,11 +138,11 @@ class Recorder:
                 settings=asdict(session.settings),
             )
         else:
-            track = begun.track
-            self._wall = begun.notes["wall_s"]
-            totals = begun.notes["totals"]
+            track, notes = self.begun.track.first(going_on.num_frames), going_on.notes
+            self._wall, totals = notes["wall_s"], notes["totals"]
             self._totals = _Totals(**{**totals, "statuses": torch.tensor(totals["statuses"])})
-            self.notes, self.extra = begun.notes["notes"], begun.notes["extra"]
+            self.notes, self.extra = notes["notes"], notes["extra"]
+        self.num_done = len(track.frames)
         self._writer = TrackWriter(self.folder / TRACK_NAME, track)
 
     def run(self, frames: Iterable[Posterior], total: int | None) -> dict[str, Any]:

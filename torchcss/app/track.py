@@ -23,7 +23,7 @@ from torchcss.app.detect import DetectOptions, detect_video, is_detected, masks_
 from torchcss.app.init import initialise_video
 from torchcss.app.lens import Lens, fitted
 from torchcss.app.lock import locked
-from torchcss.app.recorder import CHECKPOINT_EVERY, Begun, Recorder, Sink
+from torchcss.app.recorder import CHECKPOINT_EVERY, Recorder, Sink
 from torchcss.app.view_files import OpenView, Selection, moments, open_view
 from torchcss.cost.view import View
 from torchcss.errors import CameraError, ConfigurationError, TrackFileError
@@ -309,7 +309,7 @@ def _go_on(
         frame_interval=interval,
         sinks=() if options.live is None else (options.live,),
         checkpoint_every=options.checkpoint_every,
-        begun=Begun(run.track.first(checkpoint.num_frames), checkpoint.notes),
+        begun=run,
         lock=lock,
     )
     return _record(recorder, views)
@@ -317,8 +317,7 @@ def _go_on(
 
 def _record(recorder: Recorder, views: Sequence[OpenView]) -> Run:
     """Track the frames that are left, and make what is made when all are tracked."""
-    done = 0 if recorder.begun is None else len(recorder.begun.track.frames)
-    left = islice(moments(views), done, None)
+    left = islice(moments(views), recorder.num_done, None)
     recorder.run(recorder.session.track(left), views[0].reader.num_selected)
     run = Run.open(recorder.folder)
     if recorder.session.settings.overlay:

@@ -451,19 +451,15 @@ class _Loader(yaml.SafeLoader):
 
 
 def _matrix(loader: yaml.SafeLoader, node: yaml.Node) -> list[Any]:
-    """A matrix as nested lists; one of a single row or column as a list."""
+    """A matrix as nested lists."""
     values = loader.construct_mapping(node, deep=True) if isinstance(node, yaml.MappingNode) else {}
-    rows, columns, data = (values.get(key) for key in ("rows", "cols", "data"))
-    if not (isinstance(rows, int) and isinstance(columns, int) and isinstance(data, list)):
-        raise yaml.YAMLError("an opencv-matrix has rows, cols and data")
-    if rows < 1 or columns < 1 or rows * columns != len(data):
+    matrix = _plain(values)
+    if matrix is values:
         raise yaml.YAMLError(
-            f"line {node.start_mark.line + 1}: an opencv-matrix of {rows} rows and {columns} "
-            f"columns has other than as many numbers"
+            f"line {node.start_mark.line + 1}: an opencv-matrix has rows, cols and as many numbers "
+            "in data"
         )
-    if 1 in (rows, columns):
-        return data
-    return [data[row * columns : (row + 1) * columns] for row in range(rows)]
+    return matrix
 
 
 def _whole(loader: yaml.SafeLoader, node: yaml.ScalarNode) -> int | str:

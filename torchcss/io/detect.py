@@ -88,9 +88,7 @@ def open_detector(name: DetectorName, model: Path | None) -> Detector:
         MissingExtraError: If its package, or a library of the system, is not installed.
         DetectorError: If there is no model.
     """
-    if name == "mediapipe":
-        return MediaPipe(model)
-    return Rtmlib(model)
+    return MediaPipe(model) if name == "mediapipe" else Rtmlib(model)
 
 
 class MediaPipe:
