@@ -20,7 +20,7 @@ import torch
 from torchcss.errors import KeypointError
 from torchcss.files import load_arrays
 from torchcss.io.keypoints.mediapipe import is_landmark_array, read_landmark_array
-from torchcss.io.keypoints.people import People, Person, is_there, screened
+from torchcss.io.keypoints.people import Names, People, Person, is_there, screened
 from torchcss.joint_names import ALIASES, names_in
 from torchcss.types import Keypoints
 
@@ -150,7 +150,7 @@ def _confidence(name: str, array: np.ndarray, shape: tuple[int, ...]) -> np.ndar
     return array.astype(np.float64).reshape(shape)
 
 
-def _names(names: np.ndarray | None, num_joints: int) -> tuple[str, ...] | None:
+def _names(names: np.ndarray | None, num_joints: int) -> Names | None:
     if names is None:
         return None
     if names.shape != (num_joints,) or names.dtype.kind != "U":

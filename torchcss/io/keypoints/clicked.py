@@ -14,7 +14,7 @@ import numpy as np
 from torchcss.errors import KeypointError
 from torchcss.files import real_numbers, shortened
 from torchcss.io.keypoints.json_people import JOINTS, PEOPLE
-from torchcss.io.keypoints.people import Frames, People, Person, united
+from torchcss.io.keypoints.people import Frames, People, Person, Size, united
 from torchcss.joint_names import JOINT_NAMES, canonical_joint_name
 
 
@@ -32,7 +32,7 @@ def is_clicked(content: Mapping[str, Any]) -> bool:
     )
 
 
-def read_clicked(content: Mapping[str, Any], image_size_wh: tuple[int, int]) -> People:
+def read_clicked(content: Mapping[str, Any], image_size_wh: Size) -> People:
     """Read joints by name, for one frame or for some."""
     size = content.get("image_size_wh")
     if size is not None and size != list(image_size_wh):

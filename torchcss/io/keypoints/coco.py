@@ -12,7 +12,7 @@ from typing import Any
 from torchcss.errors import KeypointError
 from torchcss.files import shortened
 from torchcss.io.keypoints.json_people import one_person, said_size
-from torchcss.io.keypoints.people import Frames, Key, People, Person, track_of
+from torchcss.io.keypoints.people import Frames, Key, Names, People, Person, track_of
 from torchcss.io.video import natural_order
 from torchcss.joint_names import canonical_joint_name
 
@@ -50,11 +50,11 @@ def read_coco(content: Mapping[str, Any]) -> People:
 
 def _coco_names(
     content: Mapping[str, Any], entries: Sequence[Mapping[str, Any]], report: list[str]
-) -> tuple[tuple[str, ...] | None, Any]:
+) -> tuple[Names | None, Any]:
     """Names of the joints; of several skeletons that are used the one with most joints of ours."""
     used = {str(entry.get("category_id")) for entry in entries if entry.get("keypoints")}
     listed = content.get("categories")
-    skeletons: list[tuple[int, tuple[str, ...], Any]] = []
+    skeletons: list[tuple[int, Names, Any]] = []
     for category in listed if isinstance(listed, list) else ():
         names = category.get("keypoints") if isinstance(category, dict) else None
         if isinstance(names, list) and names and all(isinstance(name, str) for name in names):

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from torchcss.io.keypoints.one_person import size_of
+from torchcss.io.keypoints.people import Size
 
 _CONFIDENT = 0.3
 _APART = 0.05
@@ -20,7 +21,7 @@ _APART = 0.05
 def findings(
     joints: Float[np.ndarray, "t j 3"],
     names: Sequence[str],
-    image_size_wh: tuple[int, int],
+    image_size_wh: Size,
     first_frame: int,
 ) -> list[str]:
     """Lines about joints outside the image, and about sides that look exchanged.
@@ -34,7 +35,7 @@ def findings(
     return [*_outside(joints, image_size_wh, first_frame), *_sides(joints, names)]
 
 
-def _outside(joints: np.ndarray, image_size_wh: tuple[int, int], first_frame: int) -> list[str]:
+def _outside(joints: np.ndarray, image_size_wh: Size, first_frame: int) -> list[str]:
     confident = joints[..., 2] > _CONFIDENT
     low, high = -0.5, np.array(image_size_wh) - 0.5
     outside = confident & ((joints[..., :2] < low) | (joints[..., :2] > high)).any(-1)

@@ -32,7 +32,17 @@ from torchcss.io.keypoints.json_people import (
     said_size,
 )
 from torchcss.io.keypoints.mediapipe import LAYOUT, NUM_LANDMARKS, landmark_order, reordered
-from torchcss.io.keypoints.people import FRAME_NAMES, Frames, Key, People, Person, is_there, united
+from torchcss.io.keypoints.people import (
+    FRAME_NAMES,
+    Frames,
+    Key,
+    Names,
+    People,
+    Person,
+    Size,
+    is_there,
+    united,
+)
 from torchcss.io.video import natural_order
 from torchcss.joint_names import names_in
 
@@ -53,7 +63,7 @@ _TIMES = {"timestamp_ms": 1e-3, "time_ms": 1e-3, "timestamp_us": 1e-6, "time_s":
 """Words for a time, and its unit in seconds, where the word says it."""
 
 
-def read_json(path: Path, image_size_wh: tuple[int, int], num_frames: int | None) -> People:
+def read_json(path: Path, image_size_wh: Size, num_frames: int | None) -> People:
     """Read a file of one picture or of a video.
 
     Args:
@@ -104,9 +114,7 @@ def read_folder(path: Path) -> People:
     return people._replace(whole=name != "labelme", size_wh=size)
 
 
-def _people(
-    name: str, frames: Frames, names: tuple[str, ...] | None, *, in_order: bool = False
-) -> People:
+def _people(name: str, frames: Frames, names: Names | None, *, in_order: bool = False) -> People:
     """People of a format; 33 joints are MediaPipe's, whatever they are called or how ordered."""
     everyone = [person for people in frames.values() for person in people]
     if not all(is_there(person.joints) for person in everyone):
@@ -154,7 +162,7 @@ def _format_of(content: object) -> str:
     return next((name for word, name in _FORMATS.items() if word in words), "JSON")
 
 
-def _said_names(content: object) -> tuple[str, ...] | None:
+def _said_names(content: object) -> Names | None:
     """The joints' names that MMPose writes in the head."""
     head = content.get("meta_info") if isinstance(content, dict) else None
     names = head.get("keypoint_id2name") if isinstance(head, dict) else None

@@ -14,13 +14,13 @@ import numpy as np
 from torchcss.errors import KeypointError
 from torchcss.files import read_text, shortened
 from torchcss.io.keypoints.frames import plain_name
-from torchcss.io.keypoints.people import Frames, People, Person, screened
+from torchcss.io.keypoints.people import Frames, People, Person, Size, screened
 
 _BOX = 5
 _COUNTS = (17, 26, 133)
 
 
-def read_labels(folder: Path, image_size_wh: tuple[int, int]) -> People:
+def read_labels(folder: Path, image_size_wh: Size) -> People:
     """Read the labels of a video or of a folder of pictures.
 
     Raises:
@@ -38,7 +38,7 @@ def read_labels(folder: Path, image_size_wh: tuple[int, int]) -> People:
     return People(frames, None, [f"format: YOLO, {len(files)} files"], first=1)
 
 
-def _person(where: str, words: list[str], image_size_wh: tuple[int, int]) -> Person:
+def _person(where: str, words: list[str], image_size_wh: Size) -> Person:
     try:
         values = np.array([float(word) for word in words])
     except ValueError:

@@ -19,6 +19,7 @@ import torch
 
 from torchcss.errors import KeypointError
 from torchcss.files import StrPath, load_json
+from torchcss.io.keypoints.people import Size
 from torchcss.io.keypoints.read import Scale, read_keypoints
 from torchcss.io.keypoints.tables import Row, table_rows
 from torchcss.joint_names import JOINT_NAMES, canonical_joint_name
@@ -28,7 +29,7 @@ from torchcss.types import Keypoints
 def read_joints(
     path: StrPath,
     *,
-    image_size_wh: tuple[int, int],
+    image_size_wh: Size,
     layout: str | None = None,
     normalised: bool | Scale = False,
     frame: int = 0,

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from torchcss.errors import KeypointError
+from torchcss.io.keypoints.people import Size
 
 _JUMP = 0.5
 """How far (in sizes of the person) a person may move from one frame to the next and be the same."""
@@ -23,7 +24,7 @@ class Whom(NamedTuple):
 
     frame: int
     person: str
-    image_size_wh: tuple[int, int]
+    image_size_wh: Size
 
     def choose(self, people: np.ndarray, tracks: list[str | None]) -> int:
         """The person's place among those of the frame.

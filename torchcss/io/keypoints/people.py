@@ -30,6 +30,13 @@ Key = int | float | str
 """The number of a frame, its time in seconds, or the name of its picture."""
 
 
+Names = tuple[str, ...]
+"""Names of joints, in their order."""
+
+Size = tuple[int, int]
+"""Width and height of an image in pixels."""
+
+
 class Person(NamedTuple):
     """A person in one frame.
 
@@ -41,7 +48,7 @@ class Person(NamedTuple):
 
     joints: Float[np.ndarray, "j 3"]
     track: str | None = None
-    names: tuple[str, ...] | None = None
+    names: Names | None = None
 
 
 Frames = dict[Key, list[Person]]
@@ -66,7 +73,7 @@ class People(NamedTuple):
     """
 
     frames: list[list[Person]] | Frames
-    names: tuple[str, ...] | None
+    names: Names | None
     report: list[str]
     layout: str | None = None
     corner_fractions: bool = False
@@ -76,7 +83,7 @@ class People(NamedTuple):
     relative_noise: float = 1.0
 
 
-def united(frames: Frames) -> tuple[Frames, tuple[str, ...] | None]:
+def united(frames: Frames) -> tuple[Frames, Names | None]:
     """People whose joints are all in one order, and the names; joints that someone lacks are zero.
 
     Raises:

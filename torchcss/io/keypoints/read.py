@@ -46,7 +46,7 @@ from torchcss.io.keypoints.hdf5 import read_hdf5
 from torchcss.io.keypoints.json_files import read_folder, read_json
 from torchcss.io.keypoints.labels import read_labels
 from torchcss.io.keypoints.one_person import Whom, follow, size_of
-from torchcss.io.keypoints.people import People, Person, is_there
+from torchcss.io.keypoints.people import Names, People, Person, Size, is_there
 from torchcss.io.keypoints.tables import read_table
 from torchcss.joint_names import ALIASES, JOINT_NAMES, layout_of_names
 from torchcss.types import Keypoints
@@ -79,7 +79,7 @@ _INSIDE_SHARE = 0.1
 def read_keypoints(
     path: StrPath,
     *,
-    image_size_wh: tuple[int, int],
+    image_size_wh: Size,
     num_frames: int | None = None,
     layout: str | None = None,
     normalised: bool | Scale = False,
@@ -196,7 +196,7 @@ def _stacked(frames: Sequence[Sequence[Person]]) -> list[np.ndarray]:
 # The formats.
 
 
-def _read(path: Path, image_size_wh: tuple[int, int], num_frames: int | None) -> People:
+def _read(path: Path, image_size_wh: Size, num_frames: int | None) -> People:
     if path.is_dir():
         return _read_folder(path, image_size_wh)
     archive, mark, selection = str(path).rpartition("#")
@@ -223,7 +223,7 @@ def _read(path: Path, image_size_wh: tuple[int, int], num_frames: int | None) ->
     return read_json(path, image_size_wh, num_frames)
 
 
-def _read_folder(path: Path, image_size_wh: tuple[int, int]) -> People:
+def _read_folder(path: Path, image_size_wh: Size) -> People:
     """A file for every frame; or a folder of one camera's folder of them."""
     if next(path.glob("*.json"), None) is not None:
         return read_folder(path)
@@ -244,7 +244,7 @@ def _read_folder(path: Path, image_size_wh: tuple[int, int]) -> People:
 
 def _check_counts(
     frames: list[np.ndarray],
-    names: tuple[str, ...] | None,
+    names: Names | None,
     num_frames: int | None,
     first_frame: int,
 ) -> None:
@@ -265,7 +265,7 @@ def _check_counts(
 
 
 def _checked_numbers(
-    frames: list[np.ndarray], names: tuple[str, ...] | None, report: list[str]
+    frames: list[np.ndarray], names: Names | None, report: list[str]
 ) -> list[np.ndarray]:
     """Refuse numbers that are not finite where they count; bring confidences into their range."""
     checked, clipped = [], 0
@@ -310,7 +310,7 @@ Change = tuple[np.ndarray | float, np.ndarray | float, list[str]]
 """Factor and shift that make pixels of coordinates, and what to report."""
 
 
-def _from_corner(points: np.ndarray, image_size_wh: tuple[int, int]) -> Change:
+def _from_corner(points: np.ndarray, image_size_wh: Size) -> Change:
     """Pixels, or fractions of the image from its corner; MediaPipe's numbers tell which."""
     sizes = np.abs(points).max(-1)
     if np.median(sizes) > _LARGEST_FRACTION:
@@ -323,7 +323,7 @@ def _from_corner(points: np.ndarray, image_size_wh: tuple[int, int]) -> Change:
     return np.array(image_size_wh), -0.5, ["fractions of the image converted to pixels"]
 
 
-def _from_other_size(size_wh: tuple[float, float], image_size_wh: tuple[int, int]) -> Change:
+def _from_other_size(size_wh: tuple[float, float], image_size_wh: Size) -> Change:
     """Pixels of images of another size, if it is the same picture."""
     scale = np.array(image_size_wh) / size_wh
     if abs(scale[0] / scale[1] - 1) > 0.02:
@@ -342,7 +342,7 @@ def _from_other_size(size_wh: tuple[float, float], image_size_wh: tuple[int, int
 
 
 def _from_border_pixels(
-    points: np.ndarray, image_size_wh: tuple[int, int], normalised: bool | Scale
+    points: np.ndarray, image_size_wh: Size, normalised: bool | Scale
 ) -> Change:
     """Pixels, or fractions from the centres of border pixels, as the caller says."""
     fractions = bool((np.abs(points) <= _NORMALISED_EXTENT).all())
@@ -370,7 +370,7 @@ def _from_border_pixels(
     return largest, 0.0, ["coordinates from 0 to 1 converted to pixels"]
 
 
-def _check_places(points: np.ndarray, image_size_wh: tuple[int, int]) -> None:
+def _check_places(points: np.ndarray, image_size_wh: Size) -> None:
     size = np.asarray(image_size_wh, dtype=np.float64)
     outside = np.maximum(-points, points - size).max(axis=1)
     if (outside > _OUTSIDE * size.max()).any():
@@ -389,7 +389,7 @@ def _check_places(points: np.ndarray, image_size_wh: tuple[int, int]) -> None:
 
 def _joint_names(
     people: People, chosen: np.ndarray, layout: str | None, report: list[str]
-) -> tuple[str, ...]:
+) -> Names:
     num_joints, own = chosen.shape[1], people.names or ()
     if layout == OWN_NAMES:
         if not own:
