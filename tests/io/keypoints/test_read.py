@@ -636,3 +636,15 @@ def test_real_body_25b_as_openpose_writes_it(shared_data: Path, tmp_path: Path) 
     torch.testing.assert_close(found.positions, named.positions)
     places = [i for i, name in enumerate(named.names) if name in JOINT_NAMES]
     assert all(found.names[i] == named.names[i] for i in places)
+
+
+@pytest.mark.parametrize("text", ["[1, 2", "{}", '{"people": 3}', "[]"])
+def test_an_error_names_the_file_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bad.json").write_text(text)
+    with pytest.raises(KeypointError) as caught:
+        read_keypoints("./bad.json", image_size_wh=SIZE, num_frames=5)
+    assert str(caught.value).startswith("bad.json: ")
+    assert str(caught.value).count("bad.json") == 1

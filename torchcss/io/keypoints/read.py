@@ -138,12 +138,13 @@ def read_person(
     Raises:
         KeypointError: The same, or that person is not in the file.
     """
+    path = Path(path)
     with naming(path, KeypointError):
         if layout is not None and layout not in (OWN_NAMES, *ALIASES):
             raise KeypointError(
                 f"unknown layout {layout!r}; the known ones are {', '.join((*ALIASES, OWN_NAMES))}"
             )
-        people = _read(Path(path), whom.image_size_wh, film.num_frames)
+        people = _read(path, whom.image_size_wh, film.num_frames)
         return _person(people, film, whom, layout or people.layout, normalised)
 
 
