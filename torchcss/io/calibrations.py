@@ -456,8 +456,8 @@ def _matrix(loader: yaml.SafeLoader, node: yaml.Node) -> list[Any]:
     matrix = _plain(values)
     if matrix is values:
         raise yaml.YAMLError(
-            f"line {node.start_mark.line + 1}: an opencv-matrix has rows, cols and as many numbers "
-            "in data"
+            f"line {node.start_mark.line + 1}: an opencv-matrix of {values.get('rows')} rows and "
+            f"{values.get('cols')} columns needs as many numbers as data"
         )
     return matrix
 
