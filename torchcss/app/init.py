@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from torchcss.cost.view import View
 from torchcss.errors import CameraError, KeypointError
@@ -151,8 +150,7 @@ def initialise_image(
     found = found._replace(report=(*notes, *keypoints.report, *found.report))
     camera = camera.to(dtype=options.dtype, device=options.device)
     write_fitted_body(out / FITTED_BODY_NAME, found, camera)
-    known = keypoints.confidence[:, None] > 0
-    _draw(out, found, picture, camera, torch.where(known, keypoints.positions, torch.nan))
+    _draw(out, found, picture, camera, keypoints)
     rows = proportion_table(found.lengths, found.scale)
     with replace_file(out / "proportions.csv") as partial, partial.open("w", newline="") as file:
         table = csv.DictWriter(file, names_in("name fitted_m standard_m difference_percent"))
@@ -231,9 +229,12 @@ def initialise_video(
     )
 
 
-def _draw(out: Path, found: Initialisation, picture: Any, camera: Camera, known: Tensor) -> None:
+def _draw(
+    out: Path, found: Initialisation, picture: Any, camera: Camera, keypoints: Keypoints
+) -> None:
     from torchcss.show.initialisation_views import draw_hypotheses
 
+    known = torch.where(keypoints.confidence[:, None] > 0, keypoints.positions, torch.nan)
     pictures = {
         f"stage{number}.png": draw_poses(
             picture, stage.body, stage.state[None], camera, keypoints=known,
