@@ -39,13 +39,13 @@ from torch import Tensor
 
 from torchcss.body.model import BodyModel
 from torchcss.cost.targets import pose_targets
-from torchcss.errors import ConfigurationError
+from torchcss.errors import ConfigurationError, check_positive
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.proposals import CovarianceScaled
 from torchcss.inference.trust_region import TrustRegionNewton, default_prior_variance
 from torchcss.linalg import inverse_on_free
 from torchcss.solve.self_motion import Curve, SolutionSet, States, distance_from
-from torchcss.types import Bounds
+from torchcss.types import Bounds, Numbers, Vectors
 
 _NEAR = 0.02
 """Metres by which a descent may miss the pose to be worth polishing."""
@@ -118,11 +118,9 @@ class Search:
     tolerance: float = 1e-11
 
     def __post_init__(self) -> None:
-        for name in ("num_samples", "patience", "max_rounds", "sigma", "spacing", "tolerance"):
-            if not getattr(self, name) > 0:
-                raise ConfigurationError(
-                    f"Search.{name}: expected a positive number, got {getattr(self, name)}"
-                )
+        check_positive(
+            self, "num_samples", "patience", "max_rounds", "sigma", "spacing", "tolerance"
+        )
 
 
 def inverse_kinematics(
@@ -171,9 +169,7 @@ def inverse_kinematics(
     return Solutions(x, *found.branches(), position, angle, descents, rounds)
 
 
-def link_pose(
-    body: BodyModel, link: str, x: Float[Tensor, "*batch n"]
-) -> Float[Tensor, "*batch 4 4"]:
+def link_pose(body: BodyModel, link: str, x: Vectors) -> Float[Tensor, "*batch 4 4"]:
     """Frame of a link in the world."""
     return body.forward_kinematics(x)[..., body.tree.link_index(link), :, :]
 
@@ -182,8 +178,8 @@ def pose_errors(
     body: BodyModel,
     link: str,
     pose: Float[Tensor, "4 4"] | Float[Tensor, "3"],
-    x: Float[Tensor, "*batch n"],
-) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    x: Vectors,
+) -> tuple[Numbers, Numbers]:
     """Distance of a link from its place, metres, and angle from its orientation, radians."""
     index, pose = body.tree.link_index(link), pose.to(x)
     tree = body.pose(x).tree

@@ -7,7 +7,7 @@ shoulders, elbows and wrists. A body is therefore fitted to where these are, fra
    % of the standard humanoid (section 3.2.3 [IJRR]). Where that holds a length, the joints keep
    their directions and take the body's: else narrow shoulders, which many skeletons of recordings
    have, would be clavicles bent back to their limits.
-2. *States*, from several starting poses per frame, all in one batch of the bound-constrained
+2. *Trajectory*, from several starting poses per frame, all in one batch of the bound-constrained
    search of section 4.1 [IJRR]: squared distances in space and the sticky prior of section 3.2.2
    on what the joints do not tell (the twist of a straight arm).
 3. *One path* through the poses found in every frame, that of least cost and motion, and
@@ -50,6 +50,7 @@ from torchcss.errors import ConfigurationError
 from torchcss.inference.smoothing import Refinement, Transition, best_path, refine
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.io.motion.positions import MotionCapture, limb_positions
+from torchcss.types import Trajectory
 
 _STERNOCLAVICULAR = 0.03
 """Metres from the midline to where the body's shoulder width begins."""
@@ -77,9 +78,6 @@ _SLACK = 1e-6
 """Radians or metres from a limit at which it holds an angle."""
 _DEEP = 0.01
 """Metres that a surface must be inside another part to count as a collision."""
-
-States = Float[Tensor, "t n"]
-"""States of a body, a row a frame."""
 
 Limbs = Float[Tensor, "t limbs 3"]
 """Joint centres of the limbs, frame by frame, metres."""
@@ -136,7 +134,7 @@ class Retargeted(NamedTuple):
     """
 
     body: BodyModel
-    states: States
+    states: Trajectory
     joints: Float[Tensor, "t j 3"]
     target_names: tuple[str, ...]
     targets: Limbs
@@ -301,7 +299,7 @@ def _distance(one: Float[Tensor, "t 3"], other: Float[Tensor, "t 3"]) -> float:
     return float((one - other).norm(dim=-1).median())
 
 
-def collision_depth(body: BodyModel, states: States) -> tuple[Float[Tensor, " t"], list[str]]:
+def collision_depth(body: BodyModel, states: Trajectory) -> tuple[Float[Tensor, " t"], list[str]]:
     """How deep surfaces are inside other parts, and which, state by state.
 
     Along the ray from the centre of the outer part, which exceeds the distance to its surface
@@ -370,7 +368,7 @@ def levelled(
     return joints @ turn.T, [f"floor: tilted by {abs(degrees):.1f} degrees in the source, levelled"]
 
 
-def _face_middle(body: BodyModel, states: States) -> tuple[BodyModel, States]:
+def _face_middle(body: BodyModel, states: Trajectory) -> tuple[BodyModel, Trajectory]:
     """The same motion on a base that faces the middle of all turns: most room to both limits."""
     place = [body.state_index(name) for name in ROOT_NAMES[:3]]
     yaw = body.state_index("root_yaw")
@@ -503,8 +501,8 @@ def _fit(
     rate: float,
     choice: Retargeting,
     generator: torch.Generator,
-) -> States:
-    """States of all frames: several descents each, the best path through them, smoothing."""
+) -> Trajectory:
+    """Trajectory of all frames: several descents each, the best path through them, smoothing."""
     body, frames, k = cost.body, len(root), choice.num_starts
     bounds = free_turns(body)
     noise = torch.randn(k, body.num_parameters, generator=generator, dtype=body.dtype)

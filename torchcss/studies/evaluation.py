@@ -73,7 +73,7 @@ from torchcss.studies.metrics import (
 )
 from torchcss.studies.sequences import RecordedSequence, common_name, read_reference
 from torchcss.tracking.session import Posterior
-from torchcss.types import Frame
+from torchcss.types import Frame, Numbers, Vector
 from torchcss.vision.camera import Camera
 
 ARM_LOST_MM = 150.0
@@ -189,7 +189,7 @@ def num_evaluations(info: TrackerInfo) -> int:
 
 def penetration_depth(
     body: BodyModel, pose: BodyPose, pairs: InterpenetrationPairs, surface: Tensor
-) -> Float[Tensor, "*batch"]:
+) -> Numbers:
     """How deep the deepest node of a part is inside a part that is not its neighbour, metres.
 
     Args:
@@ -212,7 +212,7 @@ def penetration_depth(
     return deepest.scatter_reduce(0, near.item[near.owner], depth, "amax").reshape(batch)
 
 
-def silhouette(body: BodyModel, x: Float[Tensor, " n"], camera: Camera) -> Bool[np.ndarray, "h w"]:
+def silhouette(body: BodyModel, x: Vector, camera: Camera) -> Bool[np.ndarray, "h w"]:
     """Pixels whose centres see the posed body.
 
     Args:
@@ -428,7 +428,7 @@ def _apart_weight(joints: Float[np.ndarray, "k j 3"], weight: Float[np.ndarray, 
     return float(weight[apart].sum())
 
 
-def _at_bound(body: BodyModel, x: Float[Tensor, " n"]) -> tuple[str, ...]:
+def _at_bound(body: BodyModel, x: Vector) -> tuple[str, ...]:
     """Joint parameters within half a degree of a limit."""
     close = torch.minimum((x - body.lower).abs(), (body.upper - x).abs()) < math.radians(0.5)
     return tuple(
@@ -438,7 +438,7 @@ def _at_bound(body: BodyModel, x: Float[Tensor, " n"]) -> tuple[str, ...]:
     )
 
 
-def _outside(body: BodyModel, x: Float[Tensor, " n"]) -> float:
+def _outside(body: BodyModel, x: Vector) -> float:
     """How far the worst joint angle is beyond its limit, degrees."""
     joints = [i for i, name in enumerate(body.state_names) if name not in ROOT_NAMES]
     beyond = torch.maximum(body.lower - x, x - body.upper)[joints]

@@ -22,14 +22,14 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchcss.inference.mixture import GaussianMixture, distinct_modes
 from torchcss.inference.proposals import Proposal
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.linalg import mask_free, squared_mahalanobis
-from torchcss.types import Bounds, CostFunction, LocalModel, Modes, Status
+from torchcss.types import Bounds, CostFunction, Items, LocalModel, Modes, Status
 
 
 class MinimumTests(NamedTuple):
@@ -84,7 +84,7 @@ class _NearPlane:
     normal: Float[Tensor, "b n"]
     stiffness: Float[Tensor, " b"]
 
-    def take(self, items: Int[Tensor, " m"]) -> _NearPlane:
+    def take(self, items: Items) -> _NearPlane:
         return _NearPlane(
             self.cost.take(items), self.point[items], self.normal[items], self.stiffness[items]
         )
@@ -185,7 +185,7 @@ def joined_minima(
     bounds: Bounds,
     *,
     rise: float = 0.1,
-) -> Int[Tensor, " m"]:
+) -> Items:
     """Find out which minima are one valley: joined by paths along which the cost hardly rises.
 
     Every minimum is tried against the lower ones that are nearest to it in their own metrics.
@@ -234,12 +234,12 @@ class FoundMinima(NamedTuple):
     raw: Float[Tensor, "s n"]
     modes: Modes
     tests: MinimumTests
-    minima: Int[Tensor, " m"]
+    minima: Items
 
 
 def other_minima(
     modes: Modes, tests: MinimumTests, start: Modes, *, distance: float = 1.0
-) -> Int[Tensor, " m"]:
+) -> Items:
     """Minima that are neither the start nor one found before, by ascending cost.
 
     Args:

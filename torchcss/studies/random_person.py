@@ -26,6 +26,7 @@ from torchcss.cost.anthropometric import Anthropometric, proportion_columns
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.studies.metrics import LIMB_JOINTS
 from torchcss.studies.reprojection import DISTANCE, HEIGHT, WIDTH, camera_in_front, plausible_pose
+from torchcss.types import Vector
 from torchcss.vision.camera import Camera
 
 MARKED = (*LIMB_JOINTS, "vc7", "skull_tip")
@@ -46,7 +47,7 @@ class Person(NamedTuple):
     """
 
     body: BodyModel
-    state: Float[Tensor, " n"]
+    state: Vector
     camera: Camera
     joint_names: tuple[str, ...]
     keypoints: Float[Tensor, "j 2"]

@@ -37,7 +37,7 @@ from torchcss.cost.stabiliser import Stabiliser
 from torchcss.errors import BodyError, CameraError, check_shape
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.robust import Lorentzian, Quadratic, RobustPotential
-from torchcss.types import Bounds, LocalModel, Modes, PointCost
+from torchcss.types import Bounds, LocalModel, Modes, Numbers, PointCost, Vector, Vectors
 from torchcss.vision.camera import Camera
 
 WIDTH, HEIGHT, FOCAL_PX = 1920, 1080, 1900.0
@@ -105,17 +105,15 @@ class ReprojectionCost:
         body = self.body.with_base(self.body.base_rotation, self.body.base_translation)
         return replace(self, body=body.to(dtype), target=self.target.to(dtype))
 
-    def value(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    def value(self, x: Vectors) -> Numbers:
         """Cost in nats."""
         return self._chunked(lambda part, _: (self._value(part),), x)[0]
 
-    def local_model(self, x: Float[Tensor, "*batch n"]) -> LocalModel:
+    def local_model(self, x: Vectors) -> LocalModel:
         """Cost, gradient and exact Hessian."""
         return LocalModel(*self._chunked(lambda part, _: self._local_model(part, None), x))
 
-    def blended_model(
-        self, x: Float[Tensor, "*batch n"], share: Float[Tensor, "*batch"]
-    ) -> LocalModel:
+    def blended_model(self, x: Vectors, share: Numbers) -> LocalModel:
         """The same with a Hessian between Gauss-Newton, never negative, and the exact one.
 
         Args:
@@ -128,8 +126,8 @@ class ReprojectionCost:
     def _chunked(
         self,
         evaluate: Callable[[Tensor, Tensor], tuple[Tensor, ...]],
-        x: Float[Tensor, "*batch n"],
-        share: Float[Tensor, "*batch"] | None = None,
+        x: Vectors,
+        share: Numbers | None = None,
     ) -> tuple[Tensor, ...]:
         check_shape("x", x, self.body.num_parameters)
         batch, n = x.shape[:-1], x.shape[-1]
@@ -245,7 +243,7 @@ class ReprojectionProblem(NamedTuple):
 
     body: BodyModel
     camera: Camera
-    truth: Float[Tensor, " n"]
+    truth: Vector
     joint_names: tuple[str, ...]
     observed: Float[Tensor, "j 2"]
     cost: ReprojectionCost
@@ -305,7 +303,7 @@ def camera_in_front(name: str) -> Camera:
     return Camera(K, (WIDTH, HEIGHT), R_camera_world=upright, name=name)
 
 
-def plausible_pose(body: BodyModel, *, generator: torch.Generator) -> Float[Tensor, " n"]:
+def plausible_pose(body: BodyModel, *, generator: torch.Generator) -> Vector:
     """Draw every parameter from its sticky prior, cut off at the joint limits.
 
     Args:

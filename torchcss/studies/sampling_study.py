@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.inference.mixture import GaussianMixture
@@ -26,7 +26,7 @@ from torchcss.linalg import squared_mahalanobis
 from torchcss.robust import Lorentzian, Quadratic
 from torchcss.studies.minima import FoundMinima, find_minima, joined_minima, other_minima
 from torchcss.studies.reprojection import ReprojectionProblem, reprojection_problem
-from torchcss.types import Bounds, CostFunction, LocalModel, Modes
+from torchcss.types import Bounds, CostFunction, Items, LocalModel, Modes, Numbers, Vector, Vectors
 
 LIMB_JOINTS = (
     "HumanoidRoot", "vt1", "skull_tip", "l_shoulder", "l_elbow", "l_wrist", "r_shoulder", "r_elbow",
@@ -70,15 +70,15 @@ class ExactSteps:
 
     cost: CostFunction
 
-    def value(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    def value(self, x: Vectors) -> Numbers:
         """Cost in nats."""
         return self.cost.value(x)
 
-    def local_model(self, x: Float[Tensor, "*batch n"]) -> LocalModel:
+    def local_model(self, x: Vectors) -> LocalModel:
         """Cost, gradient and exact Hessian."""
         return self.cost.local_model(x)
 
-    def take(self, items: Int[Tensor, " m"]) -> ExactSteps:
+    def take(self, items: Items) -> ExactSteps:
         """The cost of some items."""
         return ExactSteps(self.cost.take(items))
 
@@ -194,7 +194,7 @@ def study_problem(
     )
 
 
-def _project(problem: ReprojectionProblem, x: Float[Tensor, " n"]) -> Float[Tensor, "j 2"]:
+def _project(problem: ReprojectionProblem, x: Vector) -> Float[Tensor, "j 2"]:
     joints = problem.cost.body.pose(x).joints[problem.cost.index]
     return problem.camera.project(joints).uv
 
@@ -225,7 +225,7 @@ def depth_flips(problem: ReprojectionProblem, x: Float[Tensor, "m n"]) -> dict[s
     return {name: count for name, count in ordered if count}
 
 
-def spectrum(covariance: Float[Tensor, "n n"]) -> Float[Tensor, " n"]:
+def spectrum(covariance: Float[Tensor, "n n"]) -> Vector:
     """Standard deviations along a covariance's eigenvectors, the widest first (Fig. 5 [IJRR])."""
     return torch.linalg.eigvalsh(covariance).clamp(min=0).sqrt().flip(0)
 

@@ -41,7 +41,7 @@ from torchcss.studies.sequences import read_reference
 from torchcss.studies.slices import Line, eigen_lines, joint_lines
 from torchcss.tracking.settings import Settings, make_choice, make_plan
 from torchcss.tracking.view import NOTHING_KNOWN, NOTHING_SEEN, CameraView
-from torchcss.types import Bounds, Frame, Modes
+from torchcss.types import Bounds, Frame, Modes, Vector
 from torchcss.vision.features import FrameFeatures
 
 _REACH_M = 0.5
@@ -64,7 +64,7 @@ class Scene(NamedTuple):
     image: UInt8[np.ndarray, "h w 3"]
     features: FrameFeatures
     cost: TrackingCost
-    truth: Float[Tensor, " n"]
+    truth: Vector
     mode: Modes
 
     @property
@@ -72,7 +72,7 @@ class Scene(NamedTuple):
         """The name as a part of a file's name."""
         return self.name.replace(",", "").replace(" ", "_")
 
-    def lines(self, centre: Float[Tensor, " n"]) -> list[Line]:
+    def lines(self, centre: Vector) -> list[Line]:
         """The lines through a state along all joints, then along the mode's eigenvectors.
 
         A line on which the state cannot move either way without leaving its limits is left out.
@@ -82,7 +82,7 @@ class Scene(NamedTuple):
         limits = self.limits(centre)
         return [line for line in lines if line.interval(limits) != (0.0, 0.0)]
 
-    def limits(self, centre: Float[Tensor, " n"]) -> Bounds:
+    def limits(self, centre: Vector) -> Bounds:
         """How far a slice through a state may go: the joint limits, and a sensible reach."""
         names, (lower, upper) = self.cost.body.state_names, self.cost.body.bounds
         reach = [_REACH_M if name in ROOT_NAMES[:3] else math.pi for name in names]
@@ -179,7 +179,7 @@ def _clip_scene(
 def _scene(
     name: str,
     moments: Sequence[Frame],
-    states: Sequence[Float[Tensor, " n"]],
+    states: Sequence[Vector],
     body: BodyModel,
     view: CameraView,
     settings: Settings,

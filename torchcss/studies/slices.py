@@ -39,7 +39,7 @@ from torch import Tensor
 
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.linalg import squared_mahalanobis
-from torchcss.types import Bounds
+from torchcss.types import Bounds, Vector
 
 PROMINENCE = 0.02
 """Share of a slice's range above which a minimum counts."""
@@ -70,8 +70,8 @@ class Line(NamedTuple):
     """
 
     name: str
-    centre: Float[Tensor, " n"]
-    direction: Float[Tensor, " n"]
+    centre: Vector
+    direction: Vector
     deviation: float
 
     def states(self, offsets: Float[ArrayLike, " s"]) -> Float[Tensor, "s n"]:
@@ -105,7 +105,7 @@ class Line(NamedTuple):
 
 
 def joint_lines(
-    names: Sequence[str], centre: Float[Tensor, " n"], covariance: Float[Tensor, "n n"]
+    names: Sequence[str], centre: Vector, covariance: Float[Tensor, "n n"]
 ) -> list[Line]:
     """The lines along which one parameter moves and the others stay.
 
@@ -118,7 +118,7 @@ def joint_lines(
     return [_line(name, centre, d, covariance) for name, d in zip(names, axes, strict=True)]
 
 
-def eigen_lines(centre: Float[Tensor, " n"], covariance: Float[Tensor, "n n"]) -> list[Line]:
+def eigen_lines(centre: Vector, covariance: Float[Tensor, "n n"]) -> list[Line]:
     """The lines along the eigenvectors of a covariance, the least certain first.
 
     Directions have unit length in the units of the state, metres and radians alike, and the sign

@@ -31,6 +31,7 @@ from torch.nn import functional
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.surface import straighten
 from torchcss.studies.render.renderer import Colour, Mesh, random_waves
+from torchcss.types import Vector
 from torchcss.vision.rasterise import vertex_normals
 
 _BLEND = 0.008
@@ -227,7 +228,7 @@ class Character:
         """Number of vertices."""
         return len(self._vertices)
 
-    def pose(self, state: Float[Tensor, " n"]) -> Mesh:
+    def pose(self, state: Vector) -> Mesh:
         """The skin in a pose, with unit normals.
 
         Args:

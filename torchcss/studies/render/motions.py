@@ -25,12 +25,9 @@ from torch import Tensor
 
 from torchcss.body.model import BodyModel
 from torchcss.errors import ConfigurationError
-from torchcss.types import Curvature, PointCost
+from torchcss.types import Curvature, PointCost, Trajectory
 
 _METRES = ("root_x", "root_y", "root_z")
-
-States = Float[Tensor, "t n"]
-"""States of a body, a row a frame."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +65,7 @@ class KeyPoses:
         """Seconds from the first to the last key pose."""
         return self.times[-1]
 
-    def states(self, body: BodyModel, times: Float[Tensor, " t"]) -> States:
+    def states(self, body: BodyModel, times: Float[Tensor, " t"]) -> Trajectory:
         """The motion at given times.
 
         Args:
@@ -88,12 +85,12 @@ class Motion(NamedTuple):
     Attributes:
         body: The body, on its base.
         states: Its states.
-        frame_rate: States per second.
+        frame_rate: Trajectory per second.
         description: One line about it.
     """
 
     body: BodyModel
-    states: States
+    states: Trajectory
     frame_rate: float
     description: str = ""
 
@@ -129,7 +126,7 @@ def clamped_spline(
     return a + h * (slope[i] * t * (1 - t) ** 2 - slope[i + 1] * t * t * (1 - t))
 
 
-def plant_feet(body: BodyModel, states: States) -> States:
+def plant_feet(body: BodyModel, states: Trajectory) -> Trajectory:
     """Turn the legs so that the feet stay where they are in the first state.
 
     Heel, midtarsal and toe are held by least squares over the five angles of a leg (Gauss-Newton,

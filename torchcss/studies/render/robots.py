@@ -23,10 +23,10 @@ from torchcss.body.load import FileOptions, load_body
 from torchcss.body.model import BodyModel
 from torchcss.errors import BodyError
 from torchcss.studies.render.clutter import clutter_background
-from torchcss.studies.render.motions import States
 from torchcss.studies.render.renderer import Lighting, Mesh, capsule, random_texture
 from torchcss.studies.render.scene import look_at
 from torchcss.studies.render.sequences import SyntheticSequence, film_parts
+from torchcss.types import Trajectory, Vector
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import grid_faces
 
@@ -40,7 +40,7 @@ _ENDLESS = math.pi
 """Range of a joint without limits, to either side."""
 
 
-def robot_arm(path: str | Path, *, usual: Float[Tensor, " n"] | None = None) -> BodyModel:
+def robot_arm(path: str | Path, *, usual: Vector | None = None) -> BodyModel:
     """Load an arm, standing on the world's origin, Y up.
 
     A shoulder of three joints reaches every pose of the upper arm in two ways, which no image tells
@@ -88,9 +88,9 @@ def swing(
     times: Float[Tensor, " t"],
     *,
     generator: torch.Generator,
-    middle: Float[Tensor, " n"] | None = None,
+    middle: Vector | None = None,
     amplitude: float = 0.5,
-) -> States:
+) -> Trajectory:
     """Smooth states within the limits: every joint swings about a middle pose.
 
     Args:
@@ -114,7 +114,7 @@ def robot_sequence(
     body: BodyModel,
     *,
     generator: torch.Generator,
-    middle: Float[Tensor, " n"] | None = None,
+    middle: Vector | None = None,
     amplitude: float = 0.5,
     num_frames: int = 50,
     frame_rate: float = 25.0,
@@ -137,7 +137,7 @@ def robot_sequence(
 
 def film_robot(
     body: BodyModel,
-    states: States,
+    states: Trajectory,
     *,
     generator: torch.Generator,
     cameras: Sequence[Camera] = (),
@@ -196,7 +196,7 @@ TROT_LEGS = (("LF", "RH"), ("RF", "LH"))
 """Diagonal pairs of legs, left and right, fore and hind."""
 
 
-def stand(body: BodyModel) -> Float[Tensor, " n"]:
+def stand(body: BodyModel) -> Vector:
     """A quadruped on bent legs, at the origin: the middle of its trot, and no state of it.
 
     Args:
@@ -210,8 +210,8 @@ def stand(body: BodyModel) -> Float[Tensor, " n"]:
     return state
 
 
-def trot(body: BodyModel, times: Float[Tensor, " t"]) -> States:
-    """States of a quadruped that trots forwards, turning slowly to its left.
+def trot(body: BodyModel, times: Float[Tensor, " t"]) -> Trajectory:
+    """Trajectory of a quadruped that trots forwards, turning slowly to its left.
 
     Args:
         body: ANYmal on a free root, or another one whose legs have the joints `LF_HAA` (sideways),

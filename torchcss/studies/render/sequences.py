@@ -38,7 +38,7 @@ from torchcss.studies.random_person import random_lengths
 from torchcss.studies.render.character import Character, Clothing
 from torchcss.studies.render.clutter import clutter_background
 from torchcss.studies.render.mesh_truth import Labels, MeshTruth, joints_own_parts
-from torchcss.studies.render.motions import MOTIONS, Motion, States, sample_times
+from torchcss.studies.render.motions import MOTIONS, Motion, sample_times
 from torchcss.studies.render.renderer import (
     Lighting,
     Mesh,
@@ -48,6 +48,7 @@ from torchcss.studies.render.renderer import (
     render_meshes,
 )
 from torchcss.studies.render.scene import Place, SceneRenderer, Style, lamp, look_at
+from torchcss.types import Trajectory, Vector
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import grid_faces, join_faces
 
@@ -74,7 +75,7 @@ class SyntheticSequence:
     frame_rate: float
     camera: Camera
     body: BodyModel
-    states: States
+    states: Trajectory
 
     @property
     def joints_world(self) -> Float[Tensor, "t j 3"]:
@@ -82,8 +83,8 @@ class SyntheticSequence:
         return self.body.pose(self.states).joints
 
 
-def arm_motion(body: BodyModel, times: Float[Tensor, " t"]) -> States:
-    """States of arm8 that bend, rotate and reach towards the camera.
+def arm_motion(body: BodyModel, times: Float[Tensor, " t"]) -> Trajectory:
+    """Trajectory of arm8 that bend, rotate and reach towards the camera.
 
     Args:
         body: An arm.
@@ -111,7 +112,7 @@ def arm_motion(body: BodyModel, times: Float[Tensor, " t"]) -> States:
 
 def film_parts(
     body: BodyModel,
-    states: States,
+    states: Trajectory,
     painted: Sequence[Mesh],
     *,
     camera: Camera,
@@ -238,7 +239,7 @@ class Shot:
 
     name: str
     body: BodyModel
-    states: States
+    states: Trajectory
     frame_rate: float
     camera: Camera
     style: Style = field(default_factory=Style)
@@ -268,7 +269,7 @@ class Shot:
         place = _place(joints, self.camera, self.floor)
         renderer = SceneRenderer(self.camera, place, self.style, generator=generator)
 
-        def posed(state: Float[Tensor, " n"]) -> tuple[list[Mesh], Labels]:
+        def posed(state: Vector) -> tuple[list[Mesh], Labels]:
             meshes = [character.pose(state), *still]
             return meshes, truth.labels(torch.cat([mesh.vertices_world for mesh in meshes]))
 
@@ -324,7 +325,7 @@ def _rest_of_person(
     )
 
 
-def _stand(body: BodyModel, state: Float[Tensor, " n"]) -> BodyModel:
+def _stand(body: BodyModel, state: Vector) -> BodyModel:
     """The body on a base from which its lowest point in a state touches the ground, Y = 0."""
     lowest = body.surface(body.pose(state)).points[:, 1].min()
     return body.with_base(
@@ -461,7 +462,7 @@ def shot_of_motion(
 
 def camera_in_front(
     body: BodyModel,
-    states: States,
+    states: Trajectory,
     *,
     focal_px: float = 720.0,
     azimuth: float = 0.0,
