@@ -85,6 +85,9 @@ LOSSES = ("lost_s", "limb_lost_s", "limb_lost_of_modes_s")
 APART_M = 0.03
 """How far some joint of two modes is apart if they are two explanations, metres."""
 
+OfModes = Float[np.ndarray, "k j"]
+"""A number for every compared joint of every mode."""
+
 _PLACE = ROOT_NAMES[:3]
 """Where a body stands."""
 
@@ -160,10 +163,10 @@ class FrameMeasures(NamedTuple):
     time_s: float
     failed: bool | None
     weight: Float[np.ndarray, " k"]
-    absolute_mm: Float[np.ndarray, "k j"]
-    root_aligned_mm: Float[np.ndarray, "k j"]
-    procrustes_mm: Float[np.ndarray, "k j"]
-    within: Float[np.ndarray, "k j"]
+    absolute_mm: OfModes
+    root_aligned_mm: OfModes
+    procrustes_mm: OfModes
+    within: OfModes
     angle_deviations: Float[np.ndarray, " k"]
     joints_m: Float[np.ndarray, "j 3"]
     reference_m: Float[np.ndarray, "j 3"]
@@ -231,7 +234,7 @@ def region_probability(
     deviation_m: float,
     *,
     exact: bool = False,
-) -> Float[np.ndarray, "k j"]:
+) -> OfModes:
     """Probability of the region that a mode states for a joint and that just holds the true one.
 
     Where the deviation is an allowance and the reference does not err by it, the squared distance

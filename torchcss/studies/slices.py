@@ -47,6 +47,9 @@ PROMINENCE = 0.02
 Terms = Callable[[Float[Tensor, "s n"]], Mapping[str, Float[Tensor, " s"]]]
 """Cost of every term by name, as `TrackingCost.terms` gives it."""
 
+Curve = Float[np.ndarray, " s"]
+"""A number at every sample of a slice."""
+
 _ROUNDING_NATS = 1e-6
 """A term whose range is below this is constant: what is left is rounding."""
 
@@ -177,7 +180,7 @@ def find_minima(values: Float[ArrayLike, " s"]) -> Minima:
     return Minima(np.array(middle, dtype=int), np.array(prominence, dtype=float))
 
 
-def _climb(levels: Float[np.ndarray, " s"]) -> float:
+def _climb(levels: Curve) -> float:
     """How far one climbs from the first sample on before one is below it, or the end is reached."""
     lower = np.flatnonzero(levels < levels[0])
     return float(levels[: lower[0] if len(lower) else None].max() - levels[0])
@@ -228,8 +231,8 @@ class Slice(NamedTuple):
     """
 
     line: Line
-    offsets: Float[np.ndarray, " s"]
-    values: dict[str, Float[np.ndarray, " s"]]
+    offsets: Curve
+    values: dict[str, Curve]
     fine_offsets: Float[np.ndarray, " f"]
     fine_values: dict[str, Float[np.ndarray, " f"]]
     discontinuity: dict[str, float]
@@ -288,7 +291,7 @@ def sample_slice(
             f"{num_samples} on {low:g} to {high:g}"
         )
 
-    def evaluate(offsets: Float[np.ndarray, " s"]) -> dict[str, Float[np.ndarray, " s"]]:
+    def evaluate(offsets: Curve) -> dict[str, Curve]:
         costs = terms(line.states(offsets))
         curves = {name: cost.detach().cpu().double().numpy() for name, cost in costs.items()}
         return {**curves, "sum": np.sum(list(curves.values()), axis=0)}
