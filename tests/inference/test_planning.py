@@ -179,7 +179,7 @@ def test_what_has_stopped_stays_as_it_is(compiled, monkeypatch, generator):
 def test_an_item_depends_on_no_other(generator):
     """Not on the pool's size, nor on its order, nor on a place in it: bit for bit."""
     cost, x0, bounds = made("body34", generator)
-    state, weight = NEWTON.init(cost, x0, bounds), torch.ones(34).double()
+    (state, _), weight = NEWTON.step(cost, NEWTON.start(x0), bounds), torch.ones(34).double()
     for _ in range(6):
         x = bounds.project(state.x + state.step)
         model, share = cost.local_model(x), torch.ones(len(x)).double()

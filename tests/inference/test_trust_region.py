@@ -317,7 +317,7 @@ def test_what_the_first_step_promises(generator):
     bowl = problems.Bowl(hessian, torch.ones(4).double(), offset=-3.0)
     x0, free = 1 + 0.1 * randn(6, 4, generator=generator), problems.unbounded(4)
     kept = NEWTON.minimise(bowl, x0, free)
-    promised = NEWTON.promised(NEWTON.init(bowl, x0, free), free)
+    promised = NEWTON.promised(NEWTON.step(bowl, NEWTON.start(x0), free)[0], free)
     torch.testing.assert_close(promised.mean, kept.mean, rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(promised.cost, kept.cost)
     torch.testing.assert_close(promised.covariance, kept.covariance)
@@ -329,14 +329,14 @@ def test_what_the_first_step_promises(generator):
             return super().local_model(x)
 
     bounds, x0 = problems.box(3, -1, 0.5), 2 * randn(9, 3, generator=generator)
-    promised = NEWTON.promised(NEWTON.init(Counted(), x0, bounds), bounds)
+    promised = NEWTON.promised(NEWTON.step(Counted(), NEWTON.start(x0), bounds)[0], bounds)
     assert len(calls) == 1
     replace(NEWTON, max_steps=1).minimise(Counted(), x0, bounds)
     torch.testing.assert_close(promised.mean, calls[2])
     assert bool((promised.cost <= problems.Rosenbrock().value(bounds.project(x0))).all())
     broken = torch.tensor([[5.0, 5.0], [0.5, 0.5]]).double()
     free = problems.unbounded(2)
-    cost = NEWTON.promised(NEWTON.init(Broken(), broken, free), free).cost
+    cost = NEWTON.promised(NEWTON.step(Broken(), NEWTON.start(broken), free)[0], free).cost
     assert cost.isinf().tolist() == [True, False]
 
 
@@ -354,7 +354,9 @@ def test_a_descent_goes_on_where_it_stopped(generator, pool_size):
     cost, bounds = problems.Rosenbrock(), problems.box(3, -2, 2)
     x0 = 2 * randn(9, 3, generator=generator)
     whole = newton.minimise(cost, x0, bounds)
-    begun = replace(newton, max_steps=3).descend(cost, newton.init(cost, x0, bounds), bounds)
+    begun = replace(newton, max_steps=3).descend(
+        cost, newton.step(cost, newton.start(x0), bounds)[0], bounds
+    )
     assert bool((begun.num_steps <= 3).all())
     before = [part.clone() for part in (begun.x, *begun.model, *begun[2:])]
     some = torch.tensor([7, 2, 5])
@@ -373,7 +375,7 @@ def test_a_descent_goes_on_where_it_stopped(generator, pool_size):
 def test_verbs_agree_with_minimise(generator):
     cost, bounds = problems.Rosenbrock(), problems.box(3, -2, 2)
     x0 = randn(4, 3, generator=generator)
-    state = NEWTON.init(cost, x0, bounds)
+    state = NEWTON.step(cost, NEWTON.start(x0), bounds)[0]
     for _ in range(NEWTON.max_steps):
         before = state
         state, info = NEWTON.step(cost, state, bounds)

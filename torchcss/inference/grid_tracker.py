@@ -28,7 +28,7 @@ from dataclasses import dataclass, field
 import torch
 
 from torchcss.inference.importance import survival
-from torchcss.inference.mixture import GaussianMixture, Prior
+from torchcss.inference.mixture import GaussianMixture, Prior, cheapest_first
 from torchcss.inference.problem import SearchProblem
 from torchcss.inference.proposals import Proposal
 from torchcss.inference.tracker import (
@@ -93,8 +93,7 @@ class GridTracker(SequenceTracker):
         cost = finite_cost(ends, converged_only=True)
         if own.weight_only is not None:
             cost = cost + own.weight_only(ends.mean)
-        order = cost.argsort(stable=True)
-        order = order[cost[order].isfinite()]
+        order = cheapest_first(cost)
         num_found = len(order)
         if num_found:
             cost, origin = cost[order], origin[order]

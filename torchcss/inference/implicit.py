@@ -105,7 +105,7 @@ def weighted_minimum(
         x0: Where to start.
         bounds: Box limits.
         optimiser: How to descend.
-        scale: See `TrustRegionNewton.init`.
+        scale: See `TrustRegionNewton.step`.
     """
     heavy = cost.with_weights(weights.factors())
     modes = optimiser.minimise(heavy, x0, bounds, scale=scale)

@@ -66,10 +66,14 @@ class GaussianMixture(NamedTuple):
         """Keep some modes, in the order given, with the weights that they have."""
         return GaussianMixture(self.mean[modes], self.covariance[modes], self.log_weight[modes])
 
+    @property
+    def best_first(self) -> Items:
+        """The modes by descending weight."""
+        return self.log_weight.argsort(descending=True, stable=True)
+
     def prune(self, num_modes: int) -> GaussianMixture:
         """Keep the modes of greatest weight, the best first, and normalise (Fig. 6, step 4)."""
-        order = self.log_weight.argsort(descending=True, stable=True)
-        return self.take(order[:num_modes]).normalise()
+        return self.take(self.best_first[:num_modes]).normalise()
 
     def squared_distance(self, x: Vectors) -> Float[Tensor, "*batch k"]:
         """Squared Mahalanobis distance from every component, in that component's own metric."""
@@ -218,6 +222,12 @@ def draw_components(
     return chosen.clamp(max=int(torch.nonzero(weight)[-1, 0]))
 
 
+def cheapest_first(cost: Numbers) -> Items:
+    """Those of finite cost, by ascending cost."""
+    order = cost.argsort(stable=True)
+    return order[cost[order].isfinite()]
+
+
 def distinct_modes(
     mean: Vectors,
     covariance: Matrices,
@@ -243,9 +253,7 @@ def distinct_modes(
     Returns:
         Indices of the modes kept, by ascending cost.
     """
-    order = cost.argsort(stable=True)
-    order = order[cost[order].isfinite()]
-    kept = []
+    order, kept = cheapest_first(cost), []
     while len(order) and len(kept) != most:
         best, order = order[0], order[1:]
         kept.append(best)

@@ -198,7 +198,7 @@ class _Filter(SequenceTracker):
             members = GaussianMixture(x[own], x.new_zeros(1).expand(len(weight), 1, 1), weight)
             fields.append((*members.moments(), total))
         summary = GaussianMixture(*(torch.stack(part) for part in zip(*fields, strict=True)))
-        order = summary.log_weight.argsort(descending=True, stable=True)
+        order = summary.best_first
         rank = torch.empty_like(order)
         rank[order] = torch.arange(len(order), device=order.device)
         return rank[component], summary.take(order).normalise(), torch.stack(leaders)[order]

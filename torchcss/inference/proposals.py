@@ -296,7 +296,7 @@ class _RandomProposal(Proposal):
         law = self.law(mixture)
         own = mixture.log_weight[:0].long()
         if self.include_modes:
-            own = mixture.log_weight.argsort(descending=True, stable=True)[:num]
+            own = mixture.best_first[:num]
         x, component = law.draw(num - len(own), stratified=self.stratified, generator=generator)
         if law.mixture is mixture:  # drawn from the mixture as it is
             log_weight = torch.zeros_like(x[:, 0])
@@ -549,7 +549,7 @@ class EigenDirectionGrid(Proposal):
         steps = self.deviation_scale * torch.stack([-steps, steps], -1).flatten()
         offset = (axes[:, :, None] * steps[:, None]).flatten(1, 2)
         offset = torch.cat([torch.zeros_like(offset[:, :1]), offset], 1)
-        order = mixture.log_weight.argsort(descending=True, stable=True)
+        order = mixture.best_first
         x = (mixture.mean[:, None] + offset)[order].flatten(0, 1)
         parent = order.repeat_interleave(offset.shape[1])
         x, parent = bounds.project(x[:num]), parent[:num]

@@ -37,6 +37,7 @@ from torchcss.inference.mixture import (
     GaussianMixture,
     Past,
     Prior,
+    cheapest_first,
     distinct_modes,
     match_to_prior,
     prior_at,
@@ -437,7 +438,7 @@ class Tracker(SequenceTracker):
         if not self.survivors or len(search.samples.x) <= self.survivors:
             return search
         optimiser = self.optimiser
-        descents = optimiser.init(search.problem.cost, search.samples.x, bounds)
+        descents, _ = optimiser.step(search.problem.cost, search.descents, bounds)
         search = search._replace(descents=descents)
         for max_steps, multiple in _ROUNDS:
             size = round(multiple * self.survivors)
@@ -458,8 +459,7 @@ class Tracker(SequenceTracker):
         energy, is_mode = finite_cost(modes), search.is_mode
         lowest = energy.nan_to_num(posinf=0.0).amin()
         energy = torch.where(is_mode, lowest - 1, energy)
-        order = energy.argsort(stable=True)
-        order = order[energy[order].isfinite()]
+        order = cheapest_first(energy)
         if self.separation and search.problem.landmarks is not None:
             points = search.problem.landmarks(modes.mean[order])
             order = order[separated(points, _CROWDED * self.separation, size)]
@@ -510,7 +510,7 @@ class Tracker(SequenceTracker):
         else:
             past = Past(*(part[kept] for part in past))
         mixture = pruned._replace(log_weight=pruned.log_weight + past.log_weight).normalise()
-        best_first = mixture.log_weight.argsort(descending=True, stable=True)
+        best_first = mixture.best_first
         mixture, match, kept = mixture.take(best_first), past.parent[best_first], kept[best_first]
         moved = mixture.mean - _start(state.mixture, prior)[match.clamp(min=0)]
         velocity = torch.where((match >= 0)[:, None], moved, 0.0)
@@ -532,7 +532,7 @@ class Tracker(SequenceTracker):
         cheapest. Of modes alike, which are one explanation, the cheapest is kept, but for what
         their pasts say: of poses that hardly differ in cost, that of the better past.
         """
-        order = modes.log_weight.argsort(descending=True, stable=True)
+        order = modes.best_first
         if not self.separation or problem.landmarks is None:
             return order[: self.num_modes]
         if past is not None:
@@ -548,7 +548,7 @@ class Tracker(SequenceTracker):
 
     def _carry_over(self, state: TrackerState, prior: GaussianMixture, bounds: Bounds) -> _Kept:
         """The best of the prior, in a frame in which nothing has a finite cost."""
-        best = prior.log_weight.argsort(descending=True, stable=True)[: self.num_modes]
+        best = prior.best_first[: self.num_modes]
         mixture = prior.take(best).normalise()
         mixture = mixture._replace(mean=bounds.project(mixture.mean))
         # What they move now they go on with, so that they come to rest.

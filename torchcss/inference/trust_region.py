@@ -195,24 +195,6 @@ class TrustRegionNewton:
             hint="; leave it out for the default",
         )
 
-    def init(
-        self, cost: CostFunction, x0: Vectors, bounds: Bounds, *, scale: Vector | None = None
-    ) -> TrustRegionState:
-        """Evaluate the cost at the starts, moved into the bounds, and plan the first steps.
-
-        Args:
-            cost: What to minimise.
-            x0: Starts, one leading dimension.
-            bounds: Box limits; infinite where there are none.
-            scale: Positive length of each parameter that the trust region counts as one; ones by
-                default, which suits radians and metres.
-
-        Returns:
-            A state whose non-finite items have `Status.NON_FINITE` and the start as given.
-        """
-        state, _ = self.step(cost, self.start(x0), bounds, scale=scale)
-        return state
-
     def start(self, x0: Vectors) -> TrustRegionState:
         """Items that wait for their first evaluation, which is not counted as a step."""
         b, n = x0.shape
@@ -241,12 +223,14 @@ class TrustRegionNewton:
 
         Args:
             cost: What is minimised, one item per row of the state.
-            state: From `init` or the step before. Items that are not `RUNNING` stay as they are.
+            state: From `start` or the step before. Items that are not `RUNNING` stay as they are.
             bounds: Box limits on the state.
-            scale: See `init`.
+            scale: Positive length of each parameter that the trust region counts as one; ones by
+                default, which suits radians and metres.
 
         Returns:
-            The next state, and what became of the steps.
+            The next state, and what became of the steps. Of an item that is not finite at the
+            start, the state has `Status.NON_FINITE` and the start as given.
         """
         bounds, weight = bounds.to(state.x), _weight(state.x, scale)
         candidate = bounds.project(state.x + state.step)
@@ -343,7 +327,7 @@ class TrustRegionNewton:
                 and restricted to the items still running.
             x0: Starts; those outside the bounds are projected onto them first.
             bounds: Box limits; they hold exactly, in the dtype of `x0`.
-            scale: See `init`.
+            scale: See `step`.
             prior_variance: Variance of each parameter before the image is seen; no direction of a
                 covariance exceeds it. By default `default_prior_variance(bounds)`.
 
@@ -375,10 +359,10 @@ class TrustRegionNewton:
 
         Args:
             cost: What is minimised, one item per row of the state; see `minimise`.
-            state: From `start`, `init` or a descent before; it stays as it is. What stopped at a
+            state: From `start`, `step` or a descent before; it stays as it is. What stopped at a
                 lower step limit goes on.
             bounds: Box limits on the state.
-            scale: See `init`.
+            scale: See `step`.
         """
         bounds = bounds.to(state.x)
         limited = (state.status == Status.STEP_LIMIT) & (state.num_steps < self.max_steps)
@@ -424,10 +408,10 @@ class TrustRegionNewton:
     def promised(self, state: TrustRegionState, bounds: Bounds) -> Modes:
         """Where the next step from every item would lead, by the quadratic model.
 
-        After `init` it says well enough which of many starts are worth a descent.
+        After the first `step` it says well enough which of many starts are worth a descent.
 
         Args:
-            state: From `init`, or later.
+            state: From `step`, or later.
             bounds: Box limits on the state.
 
         Returns:

@@ -35,9 +35,9 @@ from torchcss.cost.shaped import Outline
 from torchcss.cost.total import TrackingCost
 from torchcss.cost.view import View
 from torchcss.errors import CameraError
-from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.initialise.from_joints import fit_joints
 from torchcss.initialise.keypoint_checks import default_sigma, keypoints_by_name, swapped_sides
+from torchcss.initialise.multi_start import optimise
 from torchcss.initialise.noise import briefly, noise_factor
 from torchcss.initialise.options import InitialiseOptions
 from torchcss.initialise.outliers import best_distinct
@@ -254,9 +254,7 @@ def _with_contours(
     body = shaped(load(lengths), whole)
     best = columns_of(loose, body, whole.state[None])
     starts = torch.cat([best, first.mixture.mean])
-    fits = TrustRegionNewton(max_steps=40, tolerance=1e-2).minimise(
-        cost.with_body(body), starts, search.bounds(body)
-    )
+    fits = optimise(cost.with_body(body), starts, search.bounds(body), 40)
     kept = best_distinct(fits, options.num_modes)
     if rooted:
         body, kept = hang_on_best(body, kept)

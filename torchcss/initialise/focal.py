@@ -24,9 +24,8 @@ from torchcss.body.root import ROOT_NAMES
 from torchcss.cost.joints import match_joints
 from torchcss.cost.total import TrackingCost
 from torchcss.cost.view import View
-from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.initialise.from_joints import hang_before_camera
-from torchcss.initialise.multi_start import descend, starts_about
+from torchcss.initialise.multi_start import descend, optimise, starts_about
 from torchcss.initialise.options import InitialiseOptions
 from torchcss.types import Bounds, Keypoints, Vectors
 from torchcss.vision.camera import Camera
@@ -44,7 +43,7 @@ _LEAST_FRAMES = 5
 _LEAST_JOINTS = 10
 _NUM_STARTS = 8
 _SCHEDULE = ((16.0, 12), (4.0, 10))
-_OPTIMISER = TrustRegionNewton(max_steps=25, tolerance=1e-2)
+_MAX_STEPS = 25
 _STEPS = range(-5, 6)  # in halves of the prior's deviation
 
 
@@ -150,5 +149,5 @@ def _before(cost: TrackingCost, camera: Camera, frame: Int[Tensor, " b"]) -> Tra
 
 def _refitted(cost: TrackingCost, x: Vectors, bounds: Bounds) -> tuple[Vectors, Float[Tensor, ""]]:
     """Two fits to every frame, and the sum of what the better ones cost."""
-    fits = _OPTIMISER.minimise(cost, x, bounds)
+    fits = optimise(cost, x, bounds, _MAX_STEPS)
     return fits.mean, fits.cost.nan_to_num(math.inf).view(-1, 2).amin(1).sum()

@@ -164,7 +164,7 @@ def multi_start_fits(cost: TrackingCost, *, search: Search, generator: torch.Gen
         trunks = _distinct_trunks(cost, segments, torch.cat(starts), search.num_trunks)
         starts.append(flips(cost, segments, trunks, bounds, search.num_flips))
     if search.num_samples or search.anneal:
-        modes = _optimise(widened(cost, _MIDDLE), fits, bounds, 2)
+        modes = optimise(widened(cost, _MIDDLE), fits, bounds, 2)
         keep = distinct_modes(modes.mean, modes.covariance, modes.cost)[:16]
         starts[0] = modes.mean[keep]
         if search.num_samples and len(keep):
@@ -176,10 +176,11 @@ def multi_start_fits(cost: TrackingCost, *, search: Search, generator: torch.Gen
             samples = proposal.sample(mixture, search.num_samples, bounds, generator=generator)
             starts.append(samples.x)
     x = descend(cost, torch.cat(starts), bounds, ((_MIDDLE, 10),) if search.anneal else ())
-    return _optimise(cost, x, bounds, search.max_steps)
+    return optimise(cost, x, bounds, search.max_steps)
 
 
-def _optimise(cost: TrackingCost, x: Tensor, bounds: Bounds, steps: int) -> Modes:
+def optimise(cost: TrackingCost, x: Vectors, bounds: Bounds, steps: int) -> Modes:
+    """Descend to a hundredth of a nat, which tells fits apart, in so many steps at the most."""
     return TrustRegionNewton(max_steps=steps, tolerance=1e-2).minimise(cost, x, bounds)
 
 
@@ -195,7 +196,7 @@ def descend(
         schedule: Factors on the scale, and the most steps with each.
     """
     for factor, steps in schedule:
-        x = _optimise(widened(cost, factor), x, bounds, steps).mean
+        x = optimise(widened(cost, factor), x, bounds, steps).mean
     return x
 
 
