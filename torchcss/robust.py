@@ -25,7 +25,6 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -33,7 +32,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.errors import ConfigurationError
-from torchcss.types import Numbers
+from torchcss.types import Numbers, frozen
 
 
 class RobustValue(NamedTuple):
@@ -50,7 +49,7 @@ class RobustValue(NamedTuple):
     second: Numbers
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class RobustPotential(ABC):
     """An increasing function of the squared weighted error with its first two derivatives.
 
@@ -74,7 +73,7 @@ class RobustPotential(ABC):
         """Evaluate at squared weighted errors, none negative."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Quadratic(RobustPotential):
     """The Gaussian error model, rho = nu s / sigma^2: no outliers expected.
 
@@ -89,7 +88,7 @@ class Quadratic(RobustPotential):
         return RobustValue(slope * s, torch.full_like(s, slope), torch.zeros_like(s))
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Lorentzian(RobustPotential):
     """The Lorentzian potential of section 3.1.1 [IJRR], rho = nu log(1 + s / sigma^2).
 
@@ -106,7 +105,7 @@ class Lorentzian(RobustPotential):
         return RobustValue(self.nu * torch.log1p(s / variance), first, -first * inverse)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Leclerc(RobustPotential):
     """The Leclerc potential of section 3.1.1 [IJRR], rho = nu (1 - exp(-s / sigma^2)).
 

@@ -19,14 +19,23 @@ Units are metres, radians, seconds, pixels (pixel centres at integers) and nats.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum, IntEnum
-from typing import NamedTuple, Protocol, Self, runtime_checkable
+from typing import NamedTuple, Protocol, Self, TypeVar, dataclass_transform, runtime_checkable
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
+
+Class = TypeVar("Class")
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(field,))
+def frozen(cls: type[Class]) -> type[Class]:
+    """Make a class a choice: a dataclass that never changes, and whose fields are given by name."""
+    return dataclass(frozen=True, kw_only=True)(cls)
+
 
 Vector = Float[Tensor, " n"]
 """One number for each parameter."""

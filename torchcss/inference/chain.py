@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -20,7 +19,7 @@ from torch import Tensor
 from torchcss.errors import ConfigurationError
 from torchcss.inference.band import Band, least_in_box
 from torchcss.linalg import mask_free, multiply, symmetric_part
-from torchcss.types import Bounds, Differentiable, LocalModel, Status, Trajectory, Vector
+from torchcss.types import Bounds, Differentiable, LocalModel, Status, Trajectory, Vector, frozen
 
 Changes = Mapping[int, Callable[[Tensor], Tensor]]
 """By the index of a frame, a differentiable map `[*batch n] -> [*batch n]` from the coordinates of
@@ -32,7 +31,7 @@ _ATTEMPTS = 60
 """At making a matrix definite by more and more damping, tenfold each time."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Transition:
     """How a state moves between frames: standard deviations of its velocity and acceleration.
 

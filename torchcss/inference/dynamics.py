@@ -9,7 +9,6 @@ a network that knows how people walk. What to call by default: `Diffusion(deviat
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Protocol
 
 import torch
@@ -18,7 +17,7 @@ from torch import Tensor
 
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.linalg import symmetric_part
-from torchcss.types import Matrices, Vector, Vectors
+from torchcss.types import Matrices, Vector, Vectors, frozen
 
 Deviation = float | tuple[float, ...]
 """Standard deviation of every parameter, or one number for all."""
@@ -43,7 +42,7 @@ class Dynamics(Protocol):
         ...
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Diffusion:
     """Modes stay and spread: `Sigma + diag(deviation^2)`.
 
@@ -60,7 +59,7 @@ class Diffusion:
         return mixture._replace(covariance=mixture.covariance + motion)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class ConstantVelocity:
     """Modes move on as they moved last, and spread.
 
@@ -83,7 +82,7 @@ Transition = Callable[[Vector, Vector], Vector]
 operations that `torch.func` can map over modes and differentiate."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Learned:
     """Modes move by any differentiable transition, their covariances by its derivative, and spread.
 

@@ -23,7 +23,7 @@ has not converged is left out; weights are exp(-cost).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import torch
 
@@ -40,7 +40,7 @@ from torchcss.inference.tracker import (
     finite_cost,
 )
 from torchcss.inference.trust_region import TrustRegionNewton, check_bounds
-from torchcss.types import Bounds, CostFunction, Status
+from torchcss.types import Bounds, CostFunction, Status, frozen
 
 
 def by_edges(problem: SearchProblem) -> CostFunction:
@@ -48,7 +48,7 @@ def by_edges(problem: SearchProblem) -> CostFunction:
     return problem.screening or problem.cost
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class GridTracker(SequenceTracker):
     """Fig. 4 [RR]; a `SequenceTracker` without randomness.
 

@@ -18,10 +18,10 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from torchcss.errors import check_positive
+from torchcss.types import frozen
 
 
 class MonitorState(NamedTuple):
@@ -40,7 +40,7 @@ class MonitorState(NamedTuple):
     score: float
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class LossMonitor:
     """Page's cumulative sum over what the observations cost.
 

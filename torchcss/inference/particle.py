@@ -28,7 +28,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import NamedTuple
 
 import torch
@@ -54,7 +54,7 @@ from torchcss.inference.tracker import (
 )
 from torchcss.inference.trust_region import check_bounds
 from torchcss.linalg import covariance_factor, multiply, squared_mahalanobis
-from torchcss.types import Bounds, Status
+from torchcss.types import Bounds, Status, frozen
 
 Energy = Callable[[Float[Tensor, "s n"], Int[Tensor, " s"]], Float[Tensor, " s"]]
 """Cost of states whose ancestors these modes sum up; infinite where it is not finite."""
@@ -76,7 +76,7 @@ class _Weighed(NamedTuple):
     num_weighed: int
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class _Filter(SequenceTracker):
     """What the particle filters share.
 
@@ -204,7 +204,7 @@ class _Filter(SequenceTracker):
         return rank[component], summary.take(order).normalise(), torch.stack(leaders)[order]
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class ParticleFilter(_Filter):
     """CONDENSATION; with dilution or inflated noise, that of section 9 [IJRR].
 
@@ -259,7 +259,7 @@ class ParticleFilter(_Filter):
         return _Weighed(x, correction - cost, ancestor, num_weighed=len(x))
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class AnnealedParticleFilter(_Filter):
     """The annealed particle filter of Deutscher, Blake and Reid.
 

@@ -35,7 +35,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import accumulate, pairwise
 from typing import NamedTuple
@@ -48,7 +47,7 @@ from torchcss.errors import ConfigurationError
 from torchcss.inference.dynamics import Deviation, noise_covariance
 from torchcss.inference.mixture import GaussianMixture, MixtureSamples, Prior
 from torchcss.linalg import cholesky_apply, log_determinant, mask_free, multiply
-from torchcss.types import Bounds, Items, Matrices, Numbers, Vectors
+from torchcss.types import Bounds, Items, Matrices, Numbers, Vectors, frozen
 
 
 class Samples(NamedTuple):
@@ -265,7 +264,7 @@ class _Law(NamedTuple):
         return peak - 0.5 * (degrees + n) * tail + log_weight
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class _RandomProposal(Proposal):
     """A proposal that draws independent samples from a law made of the mixture's modes.
 
@@ -315,7 +314,7 @@ class _RandomProposal(Proposal):
         )
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class _ScaledProposal(_RandomProposal):
     """A random proposal with one factor on the modes' spread.
 
@@ -343,7 +342,7 @@ class _ScaledProposal(_RandomProposal):
         return given[0] if self.covariance_scale is None else math.sqrt(given[0])
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class CovarianceScaled(_ScaledProposal):
     """Sample every mode's Gaussian, inflated: `N(mu_i, s Sigma_i)`, Fig. 6 step 1.
 
@@ -369,7 +368,7 @@ class CovarianceScaled(_ScaledProposal):
         return _Law(mixture._replace(covariance=covariance))
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class HeavyTailed(_ScaledProposal):
     """Sample a Student t of every mode: mostly near, sometimes very far.
 
@@ -401,7 +400,7 @@ class HeavyTailed(_ScaledProposal):
         return _Law(mixture._replace(covariance=covariance), self.degrees_of_freedom)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Spherical(_ScaledProposal):
     """Sample a ball of the same volume as each mode's ellipsoid: the paper's control, Table 1.
 
@@ -425,7 +424,7 @@ class Spherical(_ScaledProposal):
         return _Law(mixture._replace(covariance=self._factor**2 * ball))
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Condensation(_RandomProposal):
     """Randomise the modes by dynamical noise alone: `N(mu_i, Q)`, Fig. 8d (1) [IJRR].
 
@@ -452,7 +451,7 @@ class Condensation(_RandomProposal):
         return _Law(mixture._replace(covariance=noise.expand_as(mixture.covariance)))
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class ChamRehg(_RandomProposal):
     """Sample within the modes' covariances, and add dynamical noise: Fig. 8d (2) [IJRR].
 
@@ -483,7 +482,7 @@ class ChamRehg(_RandomProposal):
         return _Law(mixture._replace(covariance=covariance), piecewise=self.piecewise)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class InflatedPosterior(_ScaledProposal):
     """Sample the posterior raised to the power 1/s, then noise: section 9 [IJRR].
 
@@ -516,7 +515,7 @@ class InflatedPosterior(_ScaledProposal):
         return _Law(GaussianMixture(mixture.mean, covariance, mixture.log_weight / scale))
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class EigenDirectionGrid(Proposal):
     """Step along each mode's most uncertain directions: the regular pattern of Fig. 4 [RR].
 
@@ -556,7 +555,7 @@ class EigenDirectionGrid(Proposal):
         return Samples(x, parent, torch.full_like(x[:, 0], -math.inf))
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class MixtureOfProposals(Proposal):
     """Several proposals in fixed shares: local and far samples, random and regular ones.
 
@@ -641,7 +640,7 @@ class MixtureOfProposals(Proposal):
         return Samples(x, torch.cat(parents), log_weight, jumps, drawn)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Move(Proposal):
     """A proposal that knows where else to look: it adds components to the prior.
 

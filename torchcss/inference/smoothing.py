@@ -33,7 +33,6 @@ t + 1. Everything is computed in float64 and returned in the type that came in.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -54,7 +53,7 @@ from torchcss.inference.chain import (
 )
 from torchcss.inference.trust_region import default_prior_variance
 from torchcss.linalg import multiply, symmetric_part, whitener, with_least_width
-from torchcss.types import Bounds, Differentiable, LocalModel, Status, Trajectory, Vector
+from torchcss.types import Bounds, Differentiable, LocalModel, Status, Trajectory, Vector, frozen
 
 
 class Path(NamedTuple):
@@ -202,7 +201,7 @@ def _checked_modes(
     return mean.double(), None if covariance is None else covariance.double(), node
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Refinement:
     """How all frames descend together.
 
@@ -222,11 +221,14 @@ class Refinement:
     tolerance: float = 1e-6
 
 
+TO_CONVERGENCE = Refinement()
+"""For all frames at once."""
+
 IN_WINDOWS = Refinement(max_steps=15, tolerance=0.05)
 """For a window of frames, which those after it will move again."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Windows:
     """How many frames are moved together.
 
@@ -246,6 +248,9 @@ class Windows:
             )
 
 
+WINDOWS = Windows()
+
+
 def refine(
     cost: Differentiable,
     start: Trajectory,
@@ -253,7 +258,7 @@ def refine(
     transition: Transition,
     bounds: Bounds,
     *,
-    choice: Refinement = Refinement(),
+    choice: Refinement = TO_CONVERGENCE,
     changes: Changes | None = None,
 ) -> Refined:
     """Move the states of all frames together to where costs and transitions are least.
@@ -295,7 +300,7 @@ def refine_in_windows(
     bounds: Bounds,
     *,
     choice: Refinement = IN_WINDOWS,
-    windows: Windows = Windows(),
+    windows: Windows = WINDOWS,
     changes: Changes | None = None,
 ) -> Refined:
     """`refine` a window of frames at a time, for costs that are dear to keep.

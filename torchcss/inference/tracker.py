@@ -23,7 +23,7 @@ exactly as one that was never interrupted.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import NamedTuple
 
 import torch
@@ -53,7 +53,7 @@ from torchcss.inference.trust_region import (
     default_prior_variance,
 )
 from torchcss.linalg import constrained_inverse, log_determinant
-from torchcss.types import Bounds, Items, Modes, Numbers, Status, Vectors
+from torchcss.types import Bounds, Items, Modes, Numbers, Status, Vectors, frozen
 
 _ROUNDS = ((0, 6.0), (1, 2.0), (5, 1.0))
 """Rounds of successive halving: steps of descent, and how many samples are left then, in multiples
@@ -137,7 +137,7 @@ class TrackerInfo(NamedTuple):
     prior: Prior
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class SequenceTracker(ABC):
     """Anything that follows a mixture through a sequence of frames.
 
@@ -246,7 +246,7 @@ class _Kept(NamedTuple):
     effective_sample_size: Float[Tensor, ""]
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Tracker(SequenceTracker):
     """The multiple-mode tracker of section 4.2 [IJRR].
 

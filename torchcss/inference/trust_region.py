@@ -40,7 +40,6 @@ Call `TrustRegionNewton().minimise(cost, x0, bounds)`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -70,6 +69,7 @@ from torchcss.types import (
     Status,
     Vector,
     Vectors,
+    frozen,
 )
 
 LEAST_RATIO = 1e-4
@@ -164,7 +164,7 @@ _FACTOR_CHUNK = 128
 """Matrices factored at a time: they and their factors stay in the caches."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class TrustRegionNewton:
     """Second-order descent from many starts at once, eq. 13 [IJRR].
 

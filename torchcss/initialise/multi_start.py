@@ -25,7 +25,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import torch
 from jaxtyping import Float
@@ -44,7 +44,7 @@ from torchcss.inference.mixture import GaussianMixture, distinct_modes
 from torchcss.inference.proposals import CovarianceScaled
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.initialise.from_points import start_from_points
-from torchcss.types import Bounds, Modes, Numbers, Vectors
+from torchcss.types import Bounds, Modes, Numbers, Vectors, frozen
 
 _WIDE, _MIDDLE = 16.0, 4.0
 """Factors on the keypoints' scale: a random start is off by some hundred pixels, of which the
@@ -60,7 +60,7 @@ _SAME_ANGLE = 0.05
 """Radians within which two flips of a limb are one: limits or the sight line closed the other."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Search:
     """How widely poses are looked for.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Literal
 
 import torch
@@ -22,12 +22,13 @@ from torchcss.cost.view import View
 from torchcss.errors import ConfigurationError
 from torchcss.initialise.multi_start import PAPERS, Search
 from torchcss.robust import Lorentzian
+from torchcss.types import frozen
 
 LEAST_JOINTS = 3
 """Fewer joints than this fix neither depth nor direction of a body."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class InitialiseOptions:
     """How a first pose is found.
 

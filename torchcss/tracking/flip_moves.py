@@ -10,8 +10,6 @@ sample).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 
 from torchcss.body.flips import Segments
@@ -23,7 +21,7 @@ from torchcss.cost.total import TrackingCost
 from torchcss.inference.mixture import GaussianMixture, separated
 from torchcss.inference.proposals import Move
 from torchcss.initialise.multi_start import flips
-from torchcss.types import Bounds, Keypoints, Vector, Vectors
+from torchcss.types import Bounds, Keypoints, Vector, Vectors, frozen
 from torchcss.vision.camera import Camera
 
 _NOISE = 0.02
@@ -42,7 +40,7 @@ APART = 0.15
 that differ by the tilt of a foot or of the trunk, and they are the most plausible."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Flips(Move):
     """The flips of the best mode; see `Move` for how they are sampled.
 

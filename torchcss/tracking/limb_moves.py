@@ -17,7 +17,7 @@ body has turned or gone, and a leg put elsewhere explains what the trunk has lef
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 
@@ -28,7 +28,7 @@ from torchcss.cost.total import TrackingCost
 from torchcss.inference.mixture import GaussianMixture, Prior, separated
 from torchcss.inference.proposals import Move
 from torchcss.tracking.flip_moves import APART
-from torchcss.types import Bounds, Vector, Vectors
+from torchcss.types import Bounds, Vector, Vectors, frozen
 
 REACH = 0.2
 """Seconds of everyday motion within which, as a standard deviation, an arm is looked for."""
@@ -44,7 +44,7 @@ _SWINGING = ("arm",)
 """Which limbs are looked for."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class LostLimbs(Move):
     """Other poses of the arms of the best mode that are astray; see `Move` for their samples.
 

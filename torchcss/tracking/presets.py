@@ -38,7 +38,7 @@ Rehg's "ssd" row has Gaussian errors, Gauss-Newton Hessians, no joint limits and
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from types import MappingProxyType
 from typing import Literal
 
@@ -59,10 +59,10 @@ from torchcss.inference.proposals import (
 )
 from torchcss.inference.tracker import SequenceTracker, Tracker
 from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.types import Bounds, Curvature
+from torchcss.types import Bounds, Curvature, frozen
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Preset:
     """One row of the table.
 

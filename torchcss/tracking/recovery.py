@@ -11,16 +11,17 @@ image. A track that was lost for that reason is found in one frame.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 from torchcss.cost.choice import TERM_TABLE
 from torchcss.inference.loss_monitor import LossMonitor, MonitorState
 from torchcss.inference.particle import AnnealedParticleFilter, ParticleFilter
 from torchcss.inference.proposals import CovarianceScaled, HeavyTailed
 from torchcss.inference.tracker import SequenceTracker, Tracker
+from torchcss.types import frozen
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Recovery:
     """How losses are told, and how the search widens then.
 

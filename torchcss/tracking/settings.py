@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import field, fields, replace
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -33,7 +33,7 @@ from torchcss.robust import Lorentzian, Quadratic
 from torchcss.tracking.presets import PRESETS, Preset, make_tracker, preset_name
 from torchcss.tracking.recovery import Recovery
 from torchcss.tracking.view import CameraView, Observer
-from torchcss.types import Bounds, Curvature, Vector
+from torchcss.types import Bounds, Curvature, Vector, frozen
 from torchcss.vision.edges import EdgeConfiguration
 from torchcss.vision.features import FeatureExtractor
 from torchcss.vision.flow import TRACKING
@@ -91,7 +91,7 @@ _OF_SAMPLES = ("prediction", "oversampling", "likelihood_power", "limb_jumps")
 """Settings of trackers that descend from samples."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Settings:
     """How to track; everything here is in `summary.json`.
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -33,12 +32,12 @@ from torchcss.inference.smoothing import (
     best_path,
     refine,
 )
-from torchcss.types import Trajectory, Vector
+from torchcss.types import Trajectory, Vector, frozen
 
 _SAME_BASE = 1e-9
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Smoothing:
     """How to smooth.
 

@@ -21,7 +21,7 @@ tracker.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import NamedTuple
 
 import torch
@@ -37,7 +37,17 @@ from torchcss.cost.visibility import facing_nodes, seen_nodes
 from torchcss.inference.dynamics import Dynamics
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.types import Bounds, Curvature, Items, LocalModel, Numbers, PointCost, Vector, Vectors
+from torchcss.types import (
+    Bounds,
+    Curvature,
+    Items,
+    LocalModel,
+    Numbers,
+    PointCost,
+    Vector,
+    Vectors,
+    frozen,
+)
 from torchcss.vision.camera import Camera
 from torchcss.vision.spline import SplineField
 
@@ -156,7 +166,7 @@ class SurfaceMotion:
         return tuple(views)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class SurfaceDynamics:
     """Dynamics of one frame: the trunk goes where the pictures have carried it.
 
@@ -209,7 +219,7 @@ class SurfaceView(NamedTuple):
     targets: SurfaceTargets
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class SurfaceCost:
     """The cost of the module's docstring, of some parameters; each item holds its others.
 

@@ -12,7 +12,6 @@ back.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +21,7 @@ from torchcss.cost.frame import FrameCosts
 from torchcss.cost.total import TrackingCost
 from torchcss.initialise.keypoint_checks import typical_sigma
 from torchcss.stopwatch import Stopwatch
-from torchcss.types import Frame, Keypoints, Numbers, Vectors
+from torchcss.types import Frame, Keypoints, Numbers, Vectors, frozen
 from torchcss.vision.appearance import Appearance
 from torchcss.vision.background import Background
 from torchcss.vision.camera import Camera
@@ -101,7 +100,7 @@ NOTHING_SEEN = ViewObservation(None)
 NOTHING_KNOWN = ViewMemory()
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Observer:
     """One camera's part of the loop.
 
