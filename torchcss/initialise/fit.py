@@ -107,44 +107,31 @@ def initialise(
             there is neither picture nor camera.
         BodyError: If the stature is no person's.
     """
-    options = options or InitialiseOptions()
+    options, others = options or InitialiseOptions(), tuple(others)
     if not isinstance(keypoints, Keypoints):
         keypoints = keypoints_by_name(keypoints)
     camera, notes = _camera_of(image, camera)
     view = View(camera=camera.to(dtype=options.dtype, device=options.device), keypoints=keypoints)
     with threads_for(options.evaluator):
-        return _all_stages(image, view, body, generator, options, tuple(others), notes)
-
-
-def _all_stages(
-    image: Picture | None,
-    view: View,
-    body: str | BodyModel,
-    generator: torch.Generator,
-    options: InitialiseOptions,
-    others: tuple[View, ...],
-    notes: list[str],
-) -> Initialisation:
-    assert view.keypoints is not None
-    learns = options.sigma is None if options.learn_noise is None else options.learn_noise
-    sigma = options.sigma or default_sigma(view.keypoints)
-    options = replace(options, sigma=sigma)
-    noise = 1.0
-    if learns:
-        brief = replace(options, search=briefly(options.search))
-        rough = fit_joints(body, view, generator=generator, options=brief, others=others)
-        noise = _noise(rough, view, others, options)
-        options = replace(options, sigma=noise * sigma)
-        notes.append(f"keypoints: noise of a wrist {noise * sigma:.1f} px, from the best fit")
-    first = fit_joints(body, view, generator=generator, options=options, others=others)
-    first = first._replace(noise=noise)
-    given = view.keypoints.only(first.body.joint_names).to(first.body.tie)
-    alone = options.joint_cost(first.body, [view._replace(keypoints=given)])
-    notes += swapped_sides(alone, first.mixture.mean[0], generator)
-    first = first._replace(report=(*notes, *first.report))
-    if image is None or not options.contours or isinstance(body, BodyModel):
-        return first
-    return _to_the_picture(first, image, view._replace(keypoints=given), others, options)
+        learns = options.sigma is None if options.learn_noise is None else options.learn_noise
+        sigma = options.sigma or default_sigma(keypoints)
+        options = replace(options, sigma=sigma)
+        noise = 1.0
+        if learns:
+            brief = replace(options, search=briefly(options.search))
+            rough = fit_joints(body, view, generator=generator, options=brief, others=others)
+            noise = _noise(rough, view, others, options)
+            options = replace(options, sigma=noise * sigma)
+            notes.append(f"keypoints: noise of a wrist {noise * sigma:.1f} px, from the best fit")
+        first = fit_joints(body, view, generator=generator, options=options, others=others)
+        first = first._replace(noise=noise)
+        given = keypoints.only(first.body.joint_names).to(first.body.tie)
+        alone = options.joint_cost(first.body, [view._replace(keypoints=given)])
+        notes += swapped_sides(alone, first.mixture.mean[0], generator)
+        first = first._replace(report=(*notes, *first.report))
+        if image is None or not options.contours or isinstance(body, BodyModel):
+            return first
+        return _to_the_picture(first, image, view._replace(keypoints=given), others, options)
 
 
 def _camera_of(image: Picture | None, camera: Camera | None) -> tuple[Camera, list[str]]:

@@ -27,7 +27,7 @@ from torchcss.cost.view import View
 from torchcss.initialise.from_joints import hang_before_camera
 from torchcss.initialise.multi_start import descend, optimise, starts_about
 from torchcss.initialise.options import InitialiseOptions
-from torchcss.types import Bounds, Keypoints, Vectors
+from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
 
 MEAN, DEVIATION = math.log(0.9), 0.25
@@ -123,7 +123,10 @@ def _costs(
     for order in (range(middle, len(cameras)), range(middle - 1, -1, -1)):
         y = x
         for number in order:
-            y, found[number] = _refitted(_before(cost, cameras[number], frame), y, bounds)
+            fits = optimise(_before(cost, cameras[number], frame), y, bounds, _MAX_STEPS)
+            y = fits.mean
+            # The better of two fits to every frame.
+            found[number] = fits.cost.nan_to_num(math.inf).view(-1, 2).amin(1).sum()
             if number == middle:
                 x = y
     return found
@@ -145,9 +148,3 @@ def _before(cost: TrackingCost, camera: Camera, frame: Int[Tensor, " b"]) -> Tra
     """The cost of samples that belong to these frames, before another camera."""
     views = (replace(cost.views[0], camera=camera),)
     return replace(cost, views=views, past=(), bound={}, parent=frame)
-
-
-def _refitted(cost: TrackingCost, x: Vectors, bounds: Bounds) -> tuple[Vectors, Float[Tensor, ""]]:
-    """Two fits to every frame, and the sum of what the better ones cost."""
-    fits = optimise(cost, x, bounds, _MAX_STEPS)
-    return fits.mean, fits.cost.nan_to_num(math.inf).view(-1, 2).amin(1).sum()

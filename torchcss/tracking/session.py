@@ -296,20 +296,16 @@ class TrackingSession:
             images: One of each view, or that of the only one.
         """
         with threads_for(self.plan.engine):
-            return self._observed(images)
-
-    def _observed(self, images: Images) -> Observation:
-        began = time.perf_counter()
-        given = (images,) if isinstance(images, Image) else tuple(images)
-        frames = [
-            self._placed(image, observer) for image, observer in zip_longest(given, self._observers)
-        ]
-        self._num_seen += 1
-        windows: Windows = (None,) * len(frames)
-        if self._ahead:
-            windows = self._ahead.popleft()
-        self._seen = tuple(map(Observer.observe, self._observers, frames, self._seen, windows))
-        return Observation(self._seen, time.perf_counter() - began)
+            began = time.perf_counter()
+            given = (images,) if isinstance(images, Image) else tuple(images)
+            pairs = zip_longest(given, self._observers)
+            frames = [self._placed(image, observer) for image, observer in pairs]
+            self._num_seen += 1
+            windows: Windows = (None,) * len(frames)
+            if self._ahead:
+                windows = self._ahead.popleft()
+            self._seen = tuple(map(Observer.observe, self._observers, frames, self._seen, windows))
+            return Observation(self._seen, time.perf_counter() - began)
 
     def _placed(self, image: Image | None, observer: Observer | None) -> Frame | None:
         """An image with its place in its video; a view without an image is out."""
