@@ -31,7 +31,7 @@ from torch import Tensor, nn
 from torchcss.errors import ConfigurationError, check_shape
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.linalg import multiply, symmetric_part
-from torchcss.types import Bounds, CostFunction, Matrices, Vector, Vectors
+from torchcss.types import Bounds, CostFunction, Matrices, Vectors
 
 OPTIMISER = TrustRegionNewton(max_steps=60, tolerance=1e-8)
 """How `weighted_minimum` descends by default: to the end, where the theorem holds."""
@@ -94,7 +94,6 @@ def weighted_minimum(
     bounds: Bounds,
     *,
     optimiser: TrustRegionNewton = OPTIMISER,
-    scale: Vector | None = None,
 ) -> Vectors:
     """Descend on a weighted sum to a minimum that can be differentiated in its weights.
 
@@ -105,10 +104,9 @@ def weighted_minimum(
         x0: Where to start.
         bounds: Box limits.
         optimiser: How to descend.
-        scale: See `TrustRegionNewton.step`.
     """
     heavy = cost.with_weights(weights.factors())
-    modes = optimiser.minimise(heavy, x0, bounds, scale=scale)
+    modes = optimiser.minimise(heavy, x0, bounds)
     x = modes.mean
     plain = cost.with_weights(dict.fromkeys(weights.names, 1.0)).gradients(x)
     return differentiable_minimum(

@@ -35,7 +35,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchcss.errors import ConfigurationError, check_positive
+from torchcss.errors import ConfigurationError
 from torchcss.inference.dynamics import Diffusion, Dynamics
 from torchcss.inference.importance import (
     normalised_log_weight,
@@ -84,16 +84,9 @@ class _Filter(SequenceTracker):
         num_samples: Particles.
         num_modes: Most components of the mixture that sums them up.
         dynamics: How particles move between frames; its noise is all the search that there is.
-        cluster_distance: Particles are gathered within this many times the typical distance,
-            `sqrt(2 n)` in the metric of the dynamics' noise, of two draws of that noise.
     """
 
     dynamics: Dynamics = field(default_factory=Diffusion)
-    cluster_distance: float = 1.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_positive(self, "cluster_distance")
 
     @abstractmethod
     def _weigh(
@@ -179,7 +172,8 @@ class _Filter(SequenceTracker):
         noise: Float[Tensor, "n n"],
     ) -> tuple[Int[Tensor, " s"], GaussianMixture, Int[Tensor, " k"]]:
         """Gather particles into components: whose each is, the mixture, each one's heaviest."""
-        reach = 2 * x.shape[-1] * self.cluster_distance**2
+        # The typical distance of two draws of the dynamics' noise, squared and in its metric.
+        reach = 2 * x.shape[-1]
         left = torch.ones_like(log_weight, dtype=torch.bool)
         leaders, distances = [], []
         while len(leaders) < self.num_modes and bool(left.any()):
@@ -212,8 +206,6 @@ class ParticleFilter(_Filter):
         num_samples: Particles.
         num_modes: As in the module's page.
         dynamics: How particles move between frames; its noise is all the search that there is.
-        cluster_distance: Particles are gathered within this many times the typical distance of two
-            draws of the noise.
         dilution: Power of the weights by which particles are resampled, from 0 (all alike) to 1
             (CONDENSATION).
         noise_scale: Factor on the noise's covariance when drawing, at least 1.
@@ -271,8 +263,6 @@ class AnnealedParticleFilter(_Filter):
         num_samples: Particles; each is weighed once per layer.
         num_modes: As in the module's page.
         dynamics: How particles move between frames; its noise is that of the first layer.
-        cluster_distance: Particles are gathered within this many times the typical distance of two
-            draws of the noise.
         num_layers: Layers per frame.
         survival_rate: Share of the particles that survives a layer, by effective sample size.
     """

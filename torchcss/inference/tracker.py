@@ -256,7 +256,6 @@ class Tracker(SequenceTracker):
         num_modes: Modes kept, `K`; the papers use 3 for an arm and 7 for a body.
         optimiser: How samples descend.
         dynamics: What happens between frames; the papers' driftless diffusion by default.
-        duplicate_distance: See `distinct_modes`.
         laplace_evidence: Weigh a mode by its Laplace evidence, likelihood times
             `sqrt(det Sigma)`, instead of the likelihood at the mode alone (decision "mode
             weights").
@@ -301,7 +300,6 @@ class Tracker(SequenceTracker):
     proposal: Proposal
     optimiser: TrustRegionNewton = field(default_factory=TrustRegionNewton)
     dynamics: Dynamics = field(default_factory=Diffusion)
-    duplicate_distance: float = 1.0
     laplace_evidence: bool = False
     forgetting: float = 1.0
     likelihood_power: float = 1.0
@@ -317,7 +315,7 @@ class Tracker(SequenceTracker):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_positive(self, "duplicate_distance", "oversampling")
+        check_positive(self, "oversampling")
         if not 0 <= self.forgetting <= 1:
             raise ConfigurationError(f"Tracker.forgetting: expected 0 to 1, got {self.forgetting}")
 
@@ -465,11 +463,7 @@ class Tracker(SequenceTracker):
             order = order[separated(points, _CROWDED * self.separation, size)]
         # Samples in one minimum count as one, or the best would take all places.
         distinct = distinct_modes(
-            modes.mean[order],
-            modes.covariance[order],
-            energy[order],
-            distance=self.duplicate_distance,
-            most=size,
+            modes.mean[order], modes.covariance[order], energy[order], most=size
         )
         own, best = is_mode.nonzero()[:, 0], order[distinct]
         best = torch.cat([own, best[~is_mode[best]]])
@@ -483,9 +477,7 @@ class Tracker(SequenceTracker):
         if not self.capped:
             modes, floored = as_printed(modes, descents, bounds)
         energy = finite_cost(modes, converged_only=self.converged_only)
-        distinct = distinct_modes(
-            modes.mean, modes.covariance, energy, distance=self.duplicate_distance
-        )
+        distinct = distinct_modes(modes.mean, modes.covariance, energy)
         return modes, distinct, floored
 
     def _posterior(

@@ -232,7 +232,9 @@ class TrustRegionNewton:
             The next state, and what became of the steps. Of an item that is not finite at the
             start, the state has `Status.NON_FINITE` and the start as given.
         """
-        bounds, weight = bounds.to(state.x), _weight(state.x, scale)
+        bounds, weight = bounds.to(state.x), state.x.new_ones(state.x.shape[-1])
+        if scale is not None:
+            weight = scale.to(state.x).square().reciprocal()
         candidate = bounds.project(state.x + state.step)
         greatest_radius = torch.inf
         if isinstance(cost, BlendedCost):
@@ -259,7 +261,8 @@ class TrustRegionNewton:
         info = TrustRegionInfo(
             torch.empty_like(state.status, dtype=torch.bool), torch.empty_like(state.radius)
         )
-        arrays, real = [_array(field) for field in fields], _real(state.x)
+        arrays = [_array(field) for field in fields]
+        real: Any = np.float32 if state.x.dtype == torch.float32 else np.float64
         run(
             planning.advance,
             planning.Items(planning.Points(*arrays[:5]), *arrays[5:]),
@@ -711,13 +714,6 @@ def _step_in_box(
     return bounds.project(x + step) - x
 
 
-def _weight(x: Vectors, scale: Tensor | None) -> Vector:
-    """Diagonal of `W`."""
-    if scale is None:
-        return x.new_ones(x.shape[-1])
-    return scale.to(x).square().reciprocal()
-
-
 def _is_finite(model: LocalModel) -> Bool[Tensor, " b"]:
     # A sum is finite if its terms are (short of overflow), and far cheaper than looking at each.
     parts = model.value + model.gradient.sum(-1) + model.hessian.flatten(1).sum(-1)
@@ -728,11 +724,6 @@ def _is_compiled(x: Tensor) -> bool:
     """Whether the step of these items has a compiled twin."""
     known = x.device.type == "cpu" and x.dtype in (torch.float32, torch.float64)
     return compiler.AVAILABLE and known and not torch.compiler.is_compiling()
-
-
-def _real(x: Tensor) -> Any:
-    """Numpy's type of the same precision."""
-    return np.float32 if x.dtype == torch.float32 else np.float64
 
 
 def _array(tensor: Tensor) -> np.ndarray:
