@@ -193,9 +193,11 @@ class _Filter(SequenceTracker):
             fields.append((*members.moments(), total))
         summary = GaussianMixture(*(torch.stack(part) for part in zip(*fields, strict=True)))
         order = summary.best_first
-        rank = torch.empty_like(order)
-        rank[order] = torch.arange(len(order), device=order.device)
-        return rank[component], summary.take(order).normalise(), torch.stack(leaders)[order]
+        return (
+            order.argsort()[component],
+            summary.take(order).normalise(),
+            torch.stack(leaders)[order],
+        )
 
 
 @frozen

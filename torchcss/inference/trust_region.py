@@ -378,21 +378,15 @@ class TrustRegionNewton:
         part = cost if len(items) == len(status) else cost.take(items)
         while len(items):
             pool, _ = self.step(part, pool, bounds, scale=scale)
-            done = torch.nonzero(pool.status != Status.RUNNING)[:, 0]
-            if not len(done):
+            running = pool.status == Status.RUNNING
+            if bool(running.all()):
                 continue
-            _write(result, items[done], pool.take(done))
+            for into, field in zip(result.tensors, pool.tensors, strict=True):
+                into[items] = field
             # Waiting items take the places of finished ones; when none waits the pool shrinks.
-            new, queue = queue[: len(done)], queue[len(done) :]
-            places, left = done[: len(new)], done[len(new) :]
-            if len(new):
-                _write(pool, places, result.take(new))
-                items = items.index_copy(0, places, new)
-            if len(left):
-                kept = torch.ones_like(items, dtype=torch.bool).index_fill(0, left, False)
-                kept = torch.nonzero(kept)[:, 0]
-                items, pool = items[kept], pool.take(kept)
-            part = cost.take(items)
+            places = int((~running).sum())
+            items, queue = torch.cat([items[running], queue[:places]]), queue[places:]
+            pool, part = result.take(items), cost.take(items)
         return result
 
     def modes(
@@ -740,9 +734,3 @@ def _share_of_second_order(value: Numbers, predicted: Numbers) -> Tensor:
     promise = predicted / torch.where(value > 0, value, 1.0)
     exact = (_FAST - promise) / (_FAST - _SLOW)
     return torch.where(value.isinf(), 0.0, exact.clamp(0, 1))
-
-
-def _write(result: TrustRegionState, items: Items, part: TrustRegionState) -> None:
-    """Write items into a state that belongs to the caller alone."""
-    for into, field in zip(result.tensors, part.tensors, strict=True):
-        into[items] = field

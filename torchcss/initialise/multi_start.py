@@ -40,7 +40,7 @@ from torchcss.cost.joints import JointTerm
 from torchcss.cost.targets import PointDistances
 from torchcss.cost.total import TrackingCost
 from torchcss.errors import ConfigurationError
-from torchcss.inference.mixture import GaussianMixture, distinct_modes
+from torchcss.inference.mixture import GaussianMixture, cheapest_first, distinct_modes
 from torchcss.inference.proposals import CovarianceScaled
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.initialise.from_points import start_from_points
@@ -332,8 +332,7 @@ def _best_combinations(
     for number in range(len(limbs)):
         total = total + extra[:, number, combinations[:, number]]
     flat = total.flatten().nan_to_num(math.inf)
-    best = flat.argsort(stable=True)[:num]
-    best = best[flat[best].isfinite()]
+    best = cheapest_first(flat)[:num]
     trunk, chosen = best // len(combinations), combinations[best % len(combinations)]
     poses = x[trunk, 0].clone()
     for number, limb in enumerate(limbs):

@@ -253,7 +253,7 @@ def undetermined_line(body: BodyModel, modes: Modes, joints: TrackingCost) -> st
         joints, choice=joints.choice.without("stabiliser", "anthropometric", "pose_prior")
     )
     curvature = image.local_model(modes.mean[:1]).hessian[0].diagonal()
-    free = torch.as_tensor(modes.active[0]) == 0
+    free = modes.active[0] == 0
     deviation = modes.covariance[0].diagonal().sqrt()
     loose = free & (deviation > _UNDETERMINED * prior)
     # A parameter that moves no known joint has no curvature at all.
