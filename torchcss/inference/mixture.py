@@ -195,7 +195,7 @@ def draw_components(
     *,
     generator: torch.Generator,
     stratified: bool = False,
-) -> Int[Tensor, " s"]:
+) -> Items:
     """Choose components with the probability of their weight.
 
     Args:
@@ -288,7 +288,7 @@ def tempered(covariance: Matrices, power: float, prior_variance: Vector) -> Matr
 
 def separated(
     landmarks: Float[Tensor, "k m d"], distance: float, num: int, *, fill: bool = True
-) -> Int[Tensor, " num"]:
+) -> Items:
     """Choose modes that are unlike each other, best first.
 
     Args:

@@ -54,9 +54,9 @@ from torchcss.inference.tracker import (
 )
 from torchcss.inference.trust_region import check_bounds
 from torchcss.linalg import covariance_factor, multiply, squared_mahalanobis
-from torchcss.types import Bounds, Status, frozen
+from torchcss.types import Bounds, Items, Numbers, Status, Vectors, frozen
 
-Energy = Callable[[Float[Tensor, "s n"], Int[Tensor, " s"]], Float[Tensor, " s"]]
+Energy = Callable[[Vectors, Items], Numbers]
 """Cost of states whose ancestors these modes sum up; infinite where it is not finite."""
 
 
@@ -170,7 +170,7 @@ class _Filter(SequenceTracker):
         x: Float[Tensor, "s n"],
         log_weight: Float[Tensor, " s"],
         noise: Float[Tensor, "n n"],
-    ) -> tuple[Int[Tensor, " s"], GaussianMixture, Int[Tensor, " k"]]:
+    ) -> tuple[Items, GaussianMixture, Items]:
         """Gather particles into components: whose each is, the mixture, each one's heaviest."""
         # The typical distance of two draws of the dynamics' noise, squared and in its metric.
         reach = 2 * x.shape[-1]

@@ -223,7 +223,7 @@ class _Search(NamedTuple):
     is_mode: Bool[Tensor, " s"]
     given_up: Int[Tensor, " r"]
 
-    def take(self, items: Int[Tensor, " k"]) -> _Search:
+    def take(self, items: Items) -> _Search:
         """Go on with some of the samples."""
         others = torch.ones_like(self.is_mode).index_fill(0, items, False)
         return _Search(
@@ -410,9 +410,7 @@ class Tracker(SequenceTracker):
         rough = self.optimiser.minimise(coarse, samples.x[some], bounds)
         return samples._replace(x=samples.x.index_copy(0, some, rough.mean))
 
-    def _modes_among(
-        self, samples: Samples, prior: Prior, bounds: Bounds
-    ) -> tuple[Samples, Int[Tensor, " c"]]:
+    def _modes_among(self, samples: Samples, prior: Prior, bounds: Bounds) -> tuple[Samples, Items]:
         """Choose the samples that descend on the coarse cost, every mode's own copy among them.
 
         They are taken from those that were drawn, so that the modes descend as they are, too; where
@@ -452,7 +450,7 @@ class Tracker(SequenceTracker):
             search = search.take(self._promising(search, modes, size))
         return search
 
-    def _promising(self, search: _Search, modes: Modes, size: int) -> Int[Tensor, " k"]:
+    def _promising(self, search: _Search, modes: Modes, size: int) -> Items:
         """Which samples go on, in their order; the modes of the last frame are never given up."""
         energy, is_mode = finite_cost(modes), search.is_mode
         lowest = energy.nan_to_num(posinf=0.0).amin()
@@ -516,7 +514,7 @@ class Tracker(SequenceTracker):
         modes: GaussianMixture,
         log_likelihood: Float[Tensor, " m"],
         past: Past | None,
-    ) -> Int[Tensor, " k"]:
+    ) -> Items:
         """Choose the modes that are kept.
 
         First the one that will weigh most after step 5: one frame does not decide what it is worth,

@@ -245,7 +245,7 @@ class SurfaceCost:
     deviation: Float[Tensor, " m"]
     term: SurfaceTerm = field(default_factory=SurfaceTerm)
 
-    def take(self, items: Int[Tensor, " s"]) -> SurfaceCost:
+    def take(self, items: Items) -> SurfaceCost:
         """The cost restricted to some items."""
         views = (view._replace(targets=view.targets.take(items)) for view in self.views)
         held, expected = self.held[items], self.expected[items]
