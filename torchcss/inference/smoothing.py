@@ -23,7 +23,7 @@ Both terms are deviations per frame and not densities of a Wiener process: error
 over frames, so that more frames per second are not more evidence, and with terms that scale in the
 same way the smoothing of a motion does not depend on the frame rate. For the same reason a cost
 counts less than its nats when frames are weighed against each other: the parameter `evidence`, as
-`Tracker.memory` does while tracking.
+`Tracker.likelihood_power` does while tracking.
 
 Where the coordinates of the state change between frames (a body is hung on another base),
 `changes` maps them: a step t that is in it takes states of frame t into the coordinates of frame
