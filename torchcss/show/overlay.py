@@ -76,6 +76,11 @@ class ProjectedBody(NamedTuple):
     faces: Int[Tensor, "f 3"]
     part: Int[Tensor, " f"]
 
+    @property
+    def in_front(self) -> Float[Tensor, "u 2"]:
+        """Those vertices that may be used, pixels."""
+        return self.uv[self.valid & (self.depth > 0)]
+
     def alone(self, part: int) -> ProjectedBody:
         """One part of it."""
         chosen = self.part == part
@@ -261,10 +266,10 @@ def draw_overlay(
 
 
 def _window(
-    mode: ProjectedBody, height: int, width: int, margin: float, resolution: int
+    uv: Float[Tensor, "v 2"], height: int, width: int, margin: float, resolution: int
 ) -> _Window | None:
-    """Bounding box of a body's usable vertices and `margin` in the frame; `None` if it is empty."""
-    uv = mode.uv[mode.valid & (mode.depth > 0) & torch.isfinite(mode.uv).all(-1)]
+    """Bounding box of points and `margin` in the frame; `None` if it is empty."""
+    uv = uv[torch.isfinite(uv).all(-1)]
     if not uv.numel():
         return None
     bound = uv.new_tensor([width, height])
@@ -347,7 +352,8 @@ def _draw_outline(
     style: OverlayStyle,
 ) -> None:
     """Thin outlines of the visible parts."""
-    window = _window(mode, target.shape[0], target.shape[1], line + 1, style.resolution // 3)
+    height, width = target.shape[:2]
+    window = _window(mode.in_front, height, width, line + 1, style.resolution // 3)
     if window is None:
         return
     sigma = _line_spread(line, window.scale)
@@ -363,13 +369,14 @@ def _draw_body(
     style: OverlayStyle,
 ) -> None:
     """Translucent shaded parts, their outlines, and dashes for what is hidden."""
-    window = _window(mode, target.shape[0], target.shape[1], 2 * line + 2, style.resolution)
+    height, width = target.shape[:2]
+    window = _window(mode.in_front, height, width, 2 * line + 2, style.resolution)
     if window is None:
         return
     place = window.place(mode.uv)
     fragments = rasterise(place, mode.depth, mode.faces, *window.coarse, valid=mode.valid)
     part = mode.parts_seen(fragments.face)
-    light, seen = _shading(mode, fragments, target.shape[0], target.shape[1])
+    light, seen = _shading(mode, fragments, height, width)
     sigma = _line_spread(line, window.scale)
     visible = _profile(_borders(part), sigma)
     hidden = _profile(_hidden_borders(mode, part, window, line), sigma)
@@ -420,7 +427,7 @@ def _hidden_borders(
     placed = mode._replace(uv=window.place(mode.uv))
     for number in mode.part.unique().tolist():
         alone = placed.alone(number)
-        box = _window(alone, rows, columns, 2, rows * columns)
+        box = _window(alone.in_front, rows, columns, 2, rows * columns)
         if box is None:
             continue
         own = _labels(alone, box) == number
@@ -448,16 +455,13 @@ def _draw_keypoints(target: Picture, keypoints: Float[Tensor, "j 2"], radius: fl
     """Yellow rings with a dark rim."""
     height, width = target.shape[:2]
     yellow = target.new_tensor(PALETTE[5], dtype=torch.float32)
-    for u, v in keypoints.detach().double().cpu().tolist():
-        reach = radius + 2
-        # Also false for a keypoint that is not a number.
-        if not (-reach < u < width - 1 + reach and -reach < v < height - 1 + reach):
+    for place in keypoints.detach().double().cpu():
+        window = _window(place[None], height, width, radius + 2, height * width)
+        if window is None:
             continue
-        top, left = max(int(v - reach), 0), max(int(u - reach), 0)
-        bottom, right = min(int(v + reach) + 2, height), min(int(u + reach) + 2, width)
-        window = _Window(top, left, bottom - top, right - left, 1.0)
-        y = torch.arange(top, bottom)[:, None] - v
-        x = torch.arange(left, right)[None] - u
+        u, v = place.tolist()
+        y = torch.arange(window.top, window.top + window.height)[:, None] - v
+        x = torch.arange(window.left, window.left + window.width)[None] - u
         off = ((x**2 + y**2).sqrt() - radius).abs()
         _blend(target, window, 0 * yellow, 0.7 * (0.3 * radius + 1.5 - off).clamp(0, 1).float())
         _blend(target, window, yellow, (0.3 * radius + 0.5 - off).clamp(0, 1).float())
