@@ -158,9 +158,13 @@ def _write_modes(
 def _paths(source: Path | None, to: str, labels: Sequence[str], out: StrPath | None) -> list[Path]:
     """The files to write, one per label, in a folder that can be written."""
     usual = Path(_NAMES.get(to, f"track.{to}"))
-    if out is None and source is None:
-        raise ConfigurationError("path: a track in memory has no folder; give a file or a folder")
-    target = source.parent if out is None and source is not None else Path(str(out))
+    if out is None:
+        if source is None:
+            raise ConfigurationError(
+                "path: a track in memory has no folder; give a file or a folder"
+            )
+        out = source.parent
+    target = Path(out)
     is_folder = target.is_dir() or not target.suffix
     name = usual if is_folder else Path(target.name)
     if name.suffix.lower() != usual.suffix:

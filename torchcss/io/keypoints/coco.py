@@ -11,7 +11,7 @@ from typing import Any
 
 from torchcss.errors import KeypointError
 from torchcss.files import shortened
-from torchcss.io.keypoints.json_people import one_person, said_size
+from torchcss.io.keypoints.json_people import listed, one_person, said_size
 from torchcss.io.keypoints.people import Frames, Key, Names, People, Person, track_of
 from torchcss.io.video import natural_order
 from torchcss.joint_names import canonical_joint_name
@@ -53,9 +53,8 @@ def _coco_names(
 ) -> tuple[Names | None, Any]:
     """Names of the joints; of several skeletons that are used the one with most joints of ours."""
     used = {str(entry.get("category_id")) for entry in entries if entry.get("keypoints")}
-    listed = content.get("categories")
     skeletons: list[tuple[int, Names, Any]] = []
-    for category in listed if isinstance(listed, list) else ():
+    for category in listed(content.get("categories")):
         names = category.get("keypoints") if isinstance(category, dict) else None
         if isinstance(names, list) and names and all(isinstance(name, str) for name in names):
             known = sum(canonical_joint_name(name) is not None for name in names)
