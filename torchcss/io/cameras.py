@@ -30,6 +30,8 @@ from torchcss.io.video import VideoReader
 from torchcss.vision.camera import Camera
 
 _METRES = frozenset({"m", "metre", "metres", "meter", "meters"})
+_NUMBERS = ("K", "image size", "distortion", "rotation", "translation")
+"""What messages call the first fields of an `Entry`."""
 
 
 class LoadedCamera(NamedTuple):
@@ -104,9 +106,7 @@ def _make_camera(entry: Entry, name: str, path: Path) -> Camera:
         )
     K, size, distortion, rotation, translation = (
         None if value is None else real_numbers(value, f"{where}: {key}", CameraError)
-        for key, value in zip(
-            ("K", "image size", "distortion", "rotation", "translation"), entry, strict=False
-        )
+        for key, value in zip(_NUMBERS, entry, strict=False)
     )
     assert K is not None
     assert size is not None
