@@ -10,7 +10,7 @@ from jaxtyping import Float
 from peers.reprojection_kernel import Reprojection, Scratch, evaluate
 from torch import Tensor
 
-from torchcss.cost.fused.pack import array, carried, pack_potential, pack_tree
+from torchcss.cost.fused.pack import array, carried_markers, pack_potential, pack_tree
 from torchcss.cost.fused.records import Array, Points, Result, Tree
 from torchcss.errors import ConfigurationError, check_shape
 from torchcss.studies.reprojection import ReprojectionCost
@@ -38,22 +38,20 @@ class CompiledReprojection(NamedTuple):
             ConfigurationError: If its potential has no compiled twin.
         """
         body, camera, noise = cost.body, cost.camera, cost.pixel_noise
-        potential = pack_potential(cost.potential, np.float64)
+        potential = pack_potential(cost.potential)
         if potential is None:
             raise ConfigurationError(f"{type(cost.potential).__name__} has no compiled twin")
-        offset = body.marker_offset[cost.index]
-        homogeneous = torch.cat([offset, torch.ones_like(offset[:, :1])], dim=1)[:, :, None]
-        row, place = carried(body, body.marker_link[cost.index], homogeneous)
-        sharpness = 1 / array(body.sticky_deviation, np.float64)
+        row, place = carried_markers(body, cost.index)
+        sharpness = 1 / array(body.sticky_deviation)
         seen = Reprojection(
             row=row,
-            place=place[:, :, 0].copy(),
-            shift=array((camera.K[:2, 2] - cost.target) / noise, np.float64),
+            place=place,
+            shift=array((camera.K[:2, 2] - cost.target) / noise),
             focal=np.array(cost.focal),
             far=np.array(camera.image_size_wh) / noise,
             near=float(camera.near),
             potential=potential,
-            mean=array(body.sticky_mean, np.float64),
+            mean=array(body.sticky_mean),
             sharpness=0 * sharpness if cost.stabiliser is None else sharpness,
             nu=1.0 if cost.stabiliser is None else float(cost.stabiliser.nu),
         )
@@ -80,9 +78,9 @@ class CompiledReprojection(NamedTuple):
     def _evaluated(self, x: Tensor, share: Tensor | None, size: int) -> LocalModel:
         check_shape("x", x, len(self.seen.mean))
         batch, number = x.shape[:-1], x.shape[:-1].numel()
-        shares = np.ones(number) if share is None else array(share.reshape(number), np.float64)
+        shares = np.ones(number) if share is None else array(share.reshape(number))
         result = Result(np.zeros(number), np.zeros((number, size)), np.zeros((number, size, size)))
-        states = array(x.reshape(number, -1), np.float64)
+        states = array(x.reshape(number, -1))
         evaluate(states, shares, self.tree, self.seen, self._scratch(), result)
         value, gradient, hessian = map(torch.from_numpy, result)
         return LocalModel(

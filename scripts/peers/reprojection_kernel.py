@@ -6,53 +6,37 @@ The twin of `torchcss.studies.reprojection.ReprojectionCost`.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections import namedtuple
 
 from torchcss.cost.fused.kinematics import find_twists, pose_tree
 from torchcss.cost.fused.lift import lift, sum_points
 from torchcss.cost.fused.potentials import potential_of
 from torchcss.cost.fused.projection import Spatial, write_point
-from torchcss.cost.fused.records import Array, Points, Potential, Result, Tree
+from torchcss.cost.fused.records import Array, Points, Result, Tree
 from torchcss.kernels.checked import run
 from torchcss.kernels.compiler import entry, kernel
 
+Reprojection = namedtuple(
+    "Reprojection", "row place shift focal far near potential mean sharpness nu"
+)
+"""What the cost compares with; image lengths are in units of the noise.
 
-class Reprojection(NamedTuple):
-    """What the cost compares with; image lengths are in units of the noise.
-
-    Attributes:
-        row: Row of the frame that carries each joint.
-        place: The joint in that frame, metres.
-        shift: Principal point less the observed place, `[joints 2]`.
-        focal: Focal lengths.
-        far: What an error counts as where a joint cannot be seen.
-        near: Least depth that can be seen, metres.
-        potential: `rho`.
-        mean: Where the priors pull to.
-        sharpness: Reciprocals of their deviations; zero: there is no prior.
-        nu: Height of their tails, nats.
-    """
-
-    row: Array
-    place: Array
-    shift: Array
-    focal: Array
-    far: Array
-    near: float
-    potential: Potential
-    mean: Array
-    sharpness: Array
-    nu: float
+Attributes:
+    row: Row of the frame that carries each joint.
+    place: The joint in that frame, metres.
+    shift: Principal point less the observed place, `[joints 2]`.
+    focal: Focal lengths.
+    far: What an error counts as where a joint cannot be seen.
+    near: Least depth that can be seen, metres.
+    potential: `rho`.
+    mean: Where the priors pull to.
+    sharpness: Reciprocals of their deviations; zero: there is no prior.
+    nu: Height of their tails, nats.
+"""
 
 
-class Scratch(NamedTuple):
-    """Memory for one state; see `Workspace`."""
-
-    frames: Array
-    points: Points
-    sums: Array
-    twists: Array
-    reference: Array
+Scratch = namedtuple("Scratch", "frames points sums twists reference")
+"""Memory for one state; see `Workspace`."""
 
 
 @entry

@@ -31,12 +31,10 @@ from torchcss.cost.fused.pose_prior import add_pose_prior
 from torchcss.cost.fused.priors import add_priors
 from torchcss.cost.fused.records import (
     Array,
-    Flow,
     Gaussian,
     Limbs,
     LongTails,
     Mixture,
-    PackedKeypoints,
     Parts,
     Repulsion,
     Result,
@@ -182,7 +180,7 @@ class FusedEngine:
         self, cost: TrackingCost, x: Tensor, *, slopes: bool
     ) -> tuple[Result, TrackingCost | None]:
         """What the kernels give, and the cost of what they leave out; None: nothing."""
-        states = pack.array(x.reshape(-1, x.shape[-1]), np.float64)
+        states = pack.array(x.reshape(-1, x.shape[-1]))
         size, n = states.shape
         width = n if slopes else 0
         result = Result(np.zeros(size), np.zeros((size, width)), np.zeros((size, width, width)))
@@ -313,34 +311,32 @@ class FusedEngine:
             record, kind = None, type(term)
             if kind in _IMAGES and isinstance(bound, OnPoints) and bound.camera is None:
                 weight = cost.choice.weight(term.name)
-                record = _IMAGES[kind][1](term, bound, weight, context, real)
+                record = _IMAGES[kind][1](term, bound, weight, context)
             if record is None:
                 others.add(term.name)
             else:
                 made[_IMAGES[kind][0]] = record
+        if not made:
+            return None, frozenset(others)
         predictor = None
         if "edges" in made or "colours" in made:
             predictor = context.tables.of(ContourPredictor)
-        if not made:
-            return None, frozenset(others)
         tree, parts = pack.pack_tree(body, camera), pack.pack_parts(body, predictor, real)
-        num = len(parts.row)
-        edges = made.get("edges", pack.no_edges(real))
-        colours = made.get("colours", pack.no_colours(num, real))
-        flow, keypoints = _for_all_modes(
-            made.get("flow", pack.no_flow(num, real)), made.get("keypoints", pack.no_keypoints())
-        )
+        num, lens = len(parts.row), pack.pack_lens(camera)
+        records = {
+            field: pack.in_precision(record, np.float64 if field == "keypoints" else real)
+            for field, record in {**pack.absent(num), **made}.items()
+        }
+        _repeat_for_all_modes(records, "flow", "keypoints")
+        edges, colours = records["edges"], records["colours"]
         nothing = edges.scale * edges.back_facing + colours.scale * colours.back_facing
         view = View(
-            lens=pack.pack_lens(camera, real),
-            precise=pack.pack_lens(camera, np.float64),
+            lens=pack.in_precision(lens, real),
+            precise=lens,
             curves=pack.pack_curves(predictor, num, real),
-            edges=edges,
-            colours=colours,
-            flow=flow,
-            keypoints=keypoints,
             nothing=float(nothing) * (0 if predictor is None else predictor.num_nodes),
             exact=cost.choice.curvature is not Curvature.GAUSS_NEWTON,
+            **records,
         )
         interior = view.flow.nodes.shape[2]
         make = partial(
@@ -349,14 +345,13 @@ class FusedEngine:
         return _PackedView(tree, parts, view, Workspaces(make)), frozenset(others)
 
 
-def _for_all_modes(flow: Flow, keypoints: PackedKeypoints) -> tuple[Flow, PackedKeypoints]:
-    """With as many modes each: what is the same for all of them is repeated."""
-    modes = max(len(flow.target), len(keypoints.target))
-    targets = (
-        np.repeat(record.target, modes, 0) if len(record.target) < modes else record.target
-        for record in (flow, keypoints)
-    )
-    return flow._replace(target=next(targets)), keypoints._replace(target=next(targets))
+def _repeat_for_all_modes(records: dict[str, Any], *fields: str) -> None:
+    """Give records the targets of as many modes each: what is the same for all is repeated."""
+    modes = max(len(records[field].target) for field in fields)
+    for field in fields:
+        target = records[field].target
+        if len(target) < modes:
+            records[field] = records[field]._replace(target=np.repeat(target, modes, 0))
 
 
 def _rows(parent: Array | None, modes: int, size: int) -> Array:

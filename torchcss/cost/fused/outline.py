@@ -27,7 +27,8 @@ def find_outline(curves: Curves, posed: Array, facing: Array, nodes: Nodes) -> N
         clear = _GRAZING * sqrt(ex * ex + ey * ey + ez * ez)
         _face(table, ex, ey, ez, facing)
         for ring in range(curves.rings):
-            start, size = ring * curves.ring_nodes, curves.ring_nodes
+            size: int = curves.ring_nodes
+            start = ring * size
             most, least = facing[start], facing[start]
             for k in range(start + 1, start + size):
                 most, least = max(most, facing[k]), min(least, facing[k])
@@ -40,7 +41,7 @@ def find_outline(curves: Curves, posed: Array, facing: Array, nodes: Nodes) -> N
                     _add_node(table, facing, step, share, frame, nodes, count)
                     count += 1
         for meridian in range(curves.meridians):
-            start = curves.rings * curves.ring_nodes + meridian * curves.meridian_nodes
+            start: int = curves.rings * curves.ring_nodes + meridian * curves.meridian_nodes
             for rising in range(2):
                 step = _first_crossing(facing, start, curves.meridian_nodes, rising)
                 if step < 0:

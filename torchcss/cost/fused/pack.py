@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -62,33 +62,49 @@ from torchcss.vision.camera import GRAZING_RADIUS, Camera
 Real = Any
 """`np.float32` or `np.float64`."""
 
+_Record = TypeVar("_Record", bound=tuple[Any, ...])
 
-def array(tensor: Tensor, real: Real) -> Array:
+
+def array(tensor: Tensor, real: Real = np.float64) -> Array:
     """A tensor as contiguous numbers of a type."""
     return np.ascontiguousarray(tensor.detach().cpu().numpy(), dtype=real)
 
 
+def in_precision(record: _Record, real: Real) -> _Record:
+    """A record with its tensors and plain numbers in a precision; what NumPy has made stays."""
+
+    def converted(value: Any) -> Any:
+        if isinstance(value, Tensor):
+            return array(value, real)
+        if isinstance(value, tuple):
+            return in_precision(value, real)
+        return real(value) if type(value) in (int, float) else value
+
+    fields: Any = record
+    return fields._make(map(converted, record))
+
+
 def pack_tree(body: BodyModel, camera: Camera) -> Tree:
     """A body's tree before a camera."""
-    tree, double = body.tree, np.float64
+    tree = body.tree
     above = tree.joint_ancestors.cpu().numpy()
     depth = above.sum(0)
     parent = np.zeros(len(depth), np.int64)
     for joint in range(len(depth)):
         row = np.flatnonzero(above[:, joint] & (depth == depth[joint] - 1))
         parent[joint] = 1 + row[0] if len(row) else 0
-    tie = array(body.tie, double)
+    tie = array(body.tie)
     column = np.abs(tie).argmax(1)
-    turn = array(camera.R_camera_world, double)
+    turn = array(camera.R_camera_world)
     base = np.empty((3, 4))
-    base[:, :3] = turn @ array(body.base_rotation, double)
-    base[:, 3] = turn @ array(body.base_translation, double) + array(camera.t_camera_world, double)
+    base[:, :3] = turn @ array(body.base_rotation)
+    base[:, 3] = turn @ array(body.base_translation) + array(camera.t_camera_world)
     return Tree(
         column=column,
         factor=tie[np.arange(len(column)), column],
-        offset=array(body.offset, double),
+        offset=array(body.offset),
         parent=parent,
-        constant=array(tree.joint_constant[tree.joint_place - 1][:, :3], double),
+        constant=array(tree.joint_constant[tree.joint_place - 1][:, :3]),
         revolute=tree.is_revolute.cpu().numpy(),
         base=base,
     )
@@ -99,8 +115,15 @@ def carried(body: BodyModel, link: Tensor, own: Tensor) -> tuple[Array, Array]:
     tree = body.tree
     place = tree.link_place[link]
     row = torch.where(place > 0, 1 + tree.joint_order[(place - 1).clamp(min=0)], 0)
-    constant = (tree.link_constant[link][:, :3] @ own).double()
-    return row.cpu().numpy(), np.ascontiguousarray(constant.cpu().numpy())
+    return row.cpu().numpy(), array(tree.link_constant[link][:, :3] @ own)
+
+
+def carried_markers(body: BodyModel, marker: Tensor) -> tuple[Array, Array]:
+    """Rows of the frames that carry some joint centres, and their places in these frames."""
+    offset = body.marker_offset[marker]
+    homogeneous = torch.cat([offset, torch.ones_like(offset[:, :1])], dim=1)[:, :, None]
+    row, place = carried(body, body.marker_link[marker], homogeneous)
+    return row, place[:, :, 0].copy()
 
 
 def pack_parts(body: BodyModel, predictor: ContourPredictor | None, real: Real) -> Parts:
@@ -110,36 +133,41 @@ def pack_parts(body: BodyModel, predictor: ContourPredictor | None, real: Real) 
     last = like.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(num, 1, 4)
     row, constant = carried(body, body.part_link, torch.cat([own, last], dim=1))
     ramp = 0.010 if predictor is None else predictor.ramp
-    clearance = 0.005 if predictor is None else predictor.clearance
     table = tabulate_parts(body.part_shape, ramp)
     touching = np.zeros((num, num), bool)
     for first, second in body.neighbours:
         i, j = body.part_names.index(first), body.part_names.index(second)
         touching[i, j] = touching[j, i] = i != j
-    return Parts(
+    parts = Parts(
         row=row,
         constant=constant,
-        shape=array(table.table, real),
-        radius=array(table.radius, real),
-        around=array(table.around, real),
-        within=array(table.within, real),
-        behind=array(BEHIND * body.part_shape[:, :2].mean(-1), real),
+        shape=table.table,
+        radius=table.radius,
+        around=table.around,
+        within=table.within,
+        behind=BEHIND * body.part_shape[:, :2].mean(-1),
         plain=table.plain.cpu().numpy(),
         touching=touching,
-        ramp=real(ramp),
-        clearance=real(clearance),
+        ramp=ramp,
+        clearance=0.005 if predictor is None else predictor.clearance,
     )
+    return in_precision(parts, real)
 
 
-def pack_lens(camera: Camera, real: Real) -> Lens:
+def pack_lens(camera: Camera) -> Lens:
     """A camera's lens."""
     (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
-    k1, k2, p1, p2, k3 = camera.distortion.tolist()
     limit = min(float(camera.maximum_radius), GRAZING_RADIUS)
-    numbers = [real(value) for value in (fx, fy, cx, cy, k1, k2, p1, p2, k3)]
     width, height = camera.image_size_wh
-    rest = [real(value) for value in (camera.near, limit, width, height)]
-    return Lens(*numbers, camera.has_distortion, *rest)  # type: ignore[arg-type]
+    return Lens(
+        *(fx, fy, cx, cy),
+        *camera.distortion.tolist(),
+        distorts=camera.has_distortion,
+        near=camera.near,
+        limit=limit,
+        width=float(width),
+        height=float(height),
+    )
 
 
 def pack_curves(predictor: ContourPredictor | None, num_parts: int, real: Real) -> Curves:
@@ -154,58 +182,63 @@ def pack_curves(predictor: ContourPredictor | None, num_parts: int, real: Real) 
     return Curves(array(table, real), *sizes)
 
 
-def pack_potential(potential: RobustPotential, real: Real) -> Potential | None:
+def pack_potential(potential: RobustPotential) -> Potential | None:
     """A potential, None: kernels do not know it."""
     if type(potential) not in KINDS:
         return None
-    kind = KINDS.index(type(potential))
-    return Potential(kind, real(potential.nu), real(potential.sigma**2))
+    kind = np.int64(KINDS.index(type(potential)))
+    return Potential(kind, float(potential.nu), float(potential.sigma**2))
 
 
-def no_potential(real: Real) -> Potential:
-    """What stands where nothing is compared."""
-    return Potential(0, real(1), real(1))
+def absent(num_parts: int) -> dict[str, Any]:
+    """Records of image terms that are not there, by their fields in `View`; their scale is zero."""
+    zeros, whole = torch.zeros, np.zeros(num_parts, np.int64)
+    field, target, potential = zeros(2, 8, 8), zeros(1, 3, 0), Potential(np.int64(0), 1.0, 1.0)
+    corner, steps, kind = torch.ones(2), zeros(5), np.int64(0)
+    edges = dict(field=field, corner=corner, steps=steps, assignment=kind, strength=False)
+    nodes = dict(nodes=zeros(num_parts, 6, 0), target=zeros(1, 3, num_parts, 0))
+    joints = dict(row=whole[:0], place=np.zeros((0, 3)), target=target)
+    records: dict[str, tuple[Any, dict[str, Any]]] = {
+        "edges": (Edges, {**edges, "potential": potential}),
+        "colours": (Colours, dict(field=field, corner=corner, layer=whole)),
+        "flow": (Flow, {**nodes, "potential": potential}),
+        "keypoints": (PackedKeypoints, {**joints, "potential": potential}),
+    }
+    return {
+        name: record(**{**dict.fromkeys(record._fields, 0.0), **given})
+        for name, (record, given) in records.items()
+    }
 
 
 def pack_edges(
-    term: ContourTerm, bound: OnPoints, weight: float, context: FrameContext, real: Real
+    term: ContourTerm, bound: OnPoints, weight: float, context: FrameContext
 ) -> Edges | None:
     """The contour term of a frame."""
-    field, potential = bound.image, pack_potential(term.potential, real)
+    field, potential = bound.image, pack_potential(term.potential)
     height, width = field.shape[1:]
     if potential is None or min(height, width) < 2:
         return None
     reach = math.ceil(term.window / term.step) + 2
     back_facing = term.fitted_level * term.nu
     return Edges(
-        scale=real(weight * bound.scale),
-        field=array(field.movedim(0, -1), real),
-        corner=np.array([width - 1, height - 1], real),
-        steps=(term.step * np.arange(-reach, reach + 1)).astype(real),
-        step=real(term.step),
-        window=real(term.window),
-        unmatched=real(term.unmatched),
-        back_facing=real(back_facing),
-        hidden=real(term.occlusion_factor * back_facing),
+        scale=weight * bound.scale,
+        field=field.movedim(0, -1),
+        corner=torch.tensor([width - 1.0, height - 1.0]),
+        steps=term.step * torch.arange(-reach, reach + 1).double(),
+        step=term.step,
+        window=term.window,
+        unmatched=term.unmatched,
+        back_facing=back_facing,
+        hidden=term.occlusion_factor * back_facing,
         potential=potential,
-        assignment=ASSIGNMENTS.index(term.assignment),
+        assignment=np.int64(ASSIGNMENTS.index(term.assignment)),
         strength=term.strength,
-        least=real(term.least_edge),
-    )
-
-
-def no_edges(real: Real) -> Edges:
-    """Without the contour term."""
-    zero = real(0)
-    steps, field = np.zeros(5, real), np.zeros((2, 2, 2), real)
-    corner, potential = np.ones(2, real), no_potential(real)
-    return Edges(
-        zero, field, corner, steps, zero, zero, zero, zero, zero, potential, 0, False, zero
+        least=term.least_edge,
     )
 
 
 def pack_colours(
-    term: RegionTerm, bound: OnPoints, weight: float, context: FrameContext, real: Real
+    term: RegionTerm, bound: OnPoints, weight: float, context: FrameContext
 ) -> Colours:
     """The region term of a frame."""
     images, back_facing = bound.image, term.fitted_level * term.nu
@@ -213,81 +246,55 @@ def pack_colours(
     height, width = coefficients.shape[1:]
     layer = images.layer[:: max(1, len(images.layer) // max(1, context.body.num_parts))]
     return Colours(
-        scale=real(weight * bound.scale),
-        field=array(coefficients, real),
-        corner=np.array([width - 6.5, height - 6.5], real),
+        scale=weight * bound.scale,
+        field=coefficients,
+        corner=torch.tensor([width - 6.5, height - 6.5]),
         layer=np.ascontiguousarray(layer.cpu().numpy()),
-        offset=real(term.offset),
-        nu=real(term.nu),
-        back_facing=real(back_facing),
-        hidden=real(term.occlusion_factor * back_facing),
+        offset=term.offset,
+        nu=term.nu,
+        back_facing=back_facing,
+        hidden=term.occlusion_factor * back_facing,
     )
 
 
-def no_colours(num_parts: int, real: Real) -> Colours:
-    """Without the region term."""
-    zero, layer = real(0), np.zeros(num_parts, np.int64)
-    return Colours(zero, np.zeros((1, 8, 8), real), np.ones(2, real), layer, *(zero,) * 4)
-
-
-def pack_flow(
-    term: FlowTerm, bound: OnPoints, weight: float, context: FrameContext, real: Real
-) -> Flow | None:
+def pack_flow(term: FlowTerm, bound: OnPoints, weight: float, context: FrameContext) -> Flow | None:
     """The flow term of a frame."""
     nodes, targets = context.tables.of(InteriorNodes), bound.image
-    potential = pack_potential(term.potential, real)
+    potential = pack_potential(term.potential)
     if potential is None:
         return None
     table = torch.cat([nodes.points_part, nodes.normals_part], dim=-1).mT
     rows = torch.cat([targets.uv, targets.weight[..., None]], dim=-1).mT
     back_facing = term.fitted_level * term.nu
     return Flow(
-        scale=real(weight * bound.scale),
-        nodes=array(table, real),
-        target=array(rows.reshape(len(rows), 3, *table.shape[::2]), real),
-        back_facing=real(back_facing),
-        untold=real(term.untold),
-        hidden=real(term.occlusion_factor * back_facing),
-        far=real(math.hypot(*context.camera.image_size_wh) ** 2),
+        scale=weight * bound.scale,
+        nodes=table,
+        target=rows.reshape(len(rows), 3, *table.shape[::2]),
+        back_facing=back_facing,
+        untold=term.untold,
+        hidden=term.occlusion_factor * back_facing,
+        far=math.hypot(*context.camera.image_size_wh) ** 2,
         potential=potential,
     )
-
-
-def no_flow(num_parts: int, real: Real) -> Flow:
-    """Without the flow term."""
-    nodes, target = np.zeros((num_parts, 6, 0), real), np.zeros((1, 3, num_parts, 0), real)
-    zero, potential = real(0), no_potential(real)
-    return Flow(zero, nodes, target, zero, zero, zero, zero, potential)
 
 
 def pack_keypoints(
-    term: JointTerm, bound: OnPoints, weight: float, context: FrameContext, _: Real
+    term: JointTerm, bound: OnPoints, weight: float, context: FrameContext
 ) -> PackedKeypoints | None:
     """The keypoints of a frame."""
-    real, body, (joint, position, precision) = np.float64, context.body, bound.image
-    potential = pack_potential(term.potential, real)
+    joint, position, precision = bound.image
+    potential = pack_potential(term.potential)
     if potential is None:
         return None
-    offset = body.marker_offset[joint]
-    homogeneous = torch.cat([offset, torch.ones_like(offset[:, :1])], dim=1)[:, :, None]
-    row, place = carried(body, bound.link, homogeneous)
+    row, place = carried_markers(context.body, joint)
     target = torch.cat([position, precision[..., None]], dim=-1).mT
     return PackedKeypoints(
-        scale=real(weight * bound.scale),
+        scale=weight * bound.scale,
         row=row,
-        place=place[:, :, 0].copy(),
-        target=array(target.reshape(-1, *target.shape[-2:]), real),
-        far=real((OUTLIER_LENGTHS * term.sigma) ** 2),
+        place=place,
+        target=target.reshape(-1, *target.shape[-2:]),
+        far=(OUTLIER_LENGTHS * term.sigma) ** 2,
         potential=potential,
-    )
-
-
-def no_keypoints() -> PackedKeypoints:
-    """Without keypoints."""
-    real = np.float64
-    row, place = np.zeros(0, np.int64), np.zeros((0, 3))
-    return PackedKeypoints(
-        real(0), row, place, np.zeros((1, 3, 0), real), real(0), no_potential(real)
     )
 
 
@@ -300,23 +307,24 @@ def pack_repulsion(
     pair[pairs.first.cpu().numpy(), pairs.second.cpu().numpy()] = np.arange(pairs.num_pairs)
     inner = array(pairs.nodes.abs().amax(dim=1), real)
     outer = array(term.reach * pairs.extent, real)
-    size = pairs.nodes.shape[1]
-    spheres = np.linalg.norm(inner, axis=1)[:, None] + np.linalg.norm(outer, axis=1)
-    numbers = (
-        *(weight * term.weight / size, term.p, term.sharpness),
-        *(END ** (1 / term.p), term.reach**2, END, math.exp(-END)),
-    )
-    return Repulsion(
-        *(real(number) for number in numbers),  # type: ignore[arg-type]
-        spheres=spheres,
-        nodes=array(pairs.nodes.mT, real),
-        shape=array(pairs.table, real),
+    repulsion = Repulsion(
+        scale=weight * term.weight / pairs.nodes.shape[1],
+        p=term.p,
+        sharpness=term.sharpness,
+        end=END ** (1 / term.p),
+        reach=term.reach**2,
+        exponent=END,
+        last=math.exp(-END),
+        spheres=np.linalg.norm(inner, axis=1)[:, None] + np.linalg.norm(outer, axis=1),
+        nodes=pairs.nodes.mT,
+        shape=pairs.table,
         inner=inner,
         outer=outer,
         pair=pair,
         chain=pairs.chain.cpu().numpy(),
-        sign=array(pairs.sign, np.float64),
+        sign=array(pairs.sign),
     )
+    return in_precision(repulsion, real)
 
 
 def make_workspace(
@@ -336,11 +344,14 @@ def make_workspace(
     outline = 2 * num_parts * (curves.rings + curves.meridians)
     nodes = max(outline, num_parts * interior, 1)
 
-    def fields(kind: Any, size: int, whole: Sequence[str] = (), first: int = 0) -> Any:
-        made = {name: np.zeros(size, np.int64 if name in whole else real) for name in kind._fields}
-        if first:
-            made["first"] = np.zeros(first, np.int64)
-        return kind(**made)
+    def fields(kind: Any, size: int, first: int = 0) -> Any:
+        whole = {"ray": size, "part": size, "node": size, "first": first}
+        return kind(
+            *(
+                np.zeros(whole[name], np.int64) if name in whole else np.zeros(size, real)
+                for name in kind._fields
+            )
+        )
 
     # Every node may be before or behind every part, or inside; one more, to be overwritten.
     pairs = nodes * max(num_parts, 1) + 1
@@ -356,10 +367,10 @@ def make_workspace(
         outline=fields(Nodes, nodes, first=num_parts + 1),
         interior=fields(Nodes, nodes, first=num_parts + 1),
         rays=fields(Rays, nodes),
-        near=fields(Lines, nodes, whole=("ray", "part")),
-        lines=fields(Lines, pairs, whole=("ray", "part")),
+        near=fields(Lines, nodes),
+        lines=fields(Lines, pairs),
         points=fields(Points, max(pairs, 64), first=num_parts + 1),
-        seen=fields(Seen, nodes, whole=("node", "part"), first=nodes + 1),
+        seen=fields(Seen, nodes, first=nodes + 1),
         peaks=fields(Peaks, nodes * (steps // 2)),
         response=np.zeros(steps, real),
         maxima=np.zeros(steps, np.int64),
@@ -368,31 +379,28 @@ def make_workspace(
 
 def pack_limbs(body: BodyModel, density: BodyDensity, scale: float, camera: Camera) -> Limbs:
     """The prior on poses, its directions in the camera's frame."""
-    double, which = np.float64, density.which
-    link, offset = body.marker_link[which.joint], body.marker_offset[which.joint]
-    homogeneous = torch.cat([offset, torch.ones_like(offset[:, :1])], dim=1)[:, :, None]
-    row, place = carried(body, link, homogeneous)
-    above = array(body.tree.ancestors[:, link], double)
-    difference = array(which.difference, double)
+    which = density.which
+    row, place = carried_markers(body, which.joint)
+    above = array(body.tree.ancestors[:, body.marker_link[which.joint]])
     parts = [density.densities[group.name] for group in which.groups]
     number, size = (max(part.mean.shape[axis] for part in parts) for axis in (0, 1))
     mean, height = (np.zeros((len(parts), number, *more)) for more in ((size,), ()))
     precision = np.zeros((len(parts), number, size, size))
     for g, part in enumerate(parts):
         k, d = part.mean.shape
-        mean[g, :k, :d], height[g, :k] = array(part.mean, double), array(part.height, double)
-        precision[g, :k, :d, :d] = array(part.precision, double)
+        mean[g, :k, :d], height[g, :k] = array(part.mean), array(part.height)
+        precision[g, :k, :d, :d] = array(part.precision)
     return Limbs(
         scale=scale,
         row=row,
-        place=place[:, :, 0].copy(),
+        place=place,
         above=above,
-        difference=difference,
-        fixed=array(which.fixed, double) @ array(camera.R_camera_world, double).T,
+        difference=array(which.difference),
+        fixed=array(which.fixed) @ array(camera.R_camera_world).T,
         first=np.array([group.row.start for group in which.groups]),
         segments=np.array([len(group.known) for group in which.groups]),
         line=np.array([group.line for group in which.groups]),
-        side=np.stack([array(side_of(group.name, body.tie), double) for group in which.groups]),
+        side=np.stack([array(side_of(group.name, body.tie)) for group in which.groups]),
         bends=np.stack([_bends(group, which, above) for group in which.groups]),
         number=np.array([len(part.mean) for part in parts]),
         mean=mean,
@@ -443,28 +451,24 @@ def pack_priors(
     mixture = Mixture(0.0, 1.0, 1.0, np.zeros((0, size)), np.zeros((0, size, size)), np.zeros(0))
     for term, weight in priors:
         if isinstance(term, Stabiliser):
-            mean = array(body.sticky_mean[None], np.float64)
+            mean = array(body.sticky_mean[None])
             tails.append((weight, term.nu, mean, _sharpness(term.deviation(body))))
         elif isinstance(term, TemporalPrior):
             assert context.prior is not None
             assert context.deviation is not None
-            mean = array(context.prior.mean, np.float64)
+            mean = array(context.prior.mean)
             tails.append((weight, term.nu, mean, _sharpness(context.deviation)))
         elif isinstance(term, Anthropometric):
             columns = list(proportion_columns(body).values())
             mean = body.sticky_mean
             precision = term.local_model(mean, body).hessian[columns][:, columns]
-            gaussian = Gaussian(
-                np.array(columns),
-                array(mean[columns], np.float64),
-                weight * array(precision, np.float64),
-            )
+            gaussian = Gaussian(np.array(columns), array(mean[columns]), weight * array(precision))
         elif isinstance(term, MixturePrior):
             assert context.prior is not None
             density = term.density(context.prior)
             most = float(density.precision.amax())
             far = 1e-4 * (torch.finfo(body.dtype).max / most) ** 0.5
-            fields = (array(field, np.float64) for field in density)
+            fields = (array(field) for field in density)
             mixture = Mixture(weight, term.height(size), far, *fields)
     modes = max((len(centre) for _, _, centre, _ in tails), default=1)
     centre = np.zeros((len(tails), modes, size))
@@ -476,4 +480,4 @@ def pack_priors(
 
 
 def _sharpness(deviation: Tensor) -> Array:
-    return 1 / array(deviation, np.float64)
+    return 1 / array(deviation)

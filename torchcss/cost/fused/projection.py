@@ -5,48 +5,21 @@ Points are in the camera's own frame.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections import namedtuple
 
 from torchcss.cost.fused.records import Lens, Points
 from torchcss.kernels.compiler import inlined, sqrt
 
-
-class Pixel(NamedTuple):
-    """An image point and what its derivatives need; see `ProjectionModel`."""
-
-    u: float
-    v: float
-    valid: bool
-    a: float
-    b: float
-    w: float
-    aa: float
-    ab: float
-    bb: float
+Pixel = namedtuple("Pixel", "u v valid a b w aa ab bb")
+"""An image point and what its derivatives need; see `ProjectionModel`."""
 
 
-class Slope(NamedTuple):
-    """First and second derivatives of a cost in an image point, nats per (square) pixel."""
-
-    u: float
-    v: float
-    uu: float
-    uv: float
-    vv: float
+Slope = namedtuple("Slope", "u v uu uv vv")
+"""First and second derivatives of a cost in an image point, nats per (square) pixel."""
 
 
-class Spatial(NamedTuple):
-    """First and second derivatives of a cost in a point, nats per (square) metre."""
-
-    x: float
-    y: float
-    z: float
-    xx: float
-    xy: float
-    xz: float
-    yy: float
-    yz: float
-    zz: float
+Spatial = namedtuple("Spatial", "x y z xx xy xz yy yz zz")
+"""First and second derivatives of a cost in a point, nats per (square) metre."""
 
 
 @inlined

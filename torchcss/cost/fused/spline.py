@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections import namedtuple
 
 from torchcss.cost.fused.records import Array
 from torchcss.kernels.compiler import floor, inlined
@@ -11,24 +11,12 @@ _MARGIN = 4
 _LEAST = 1.5 - _MARGIN
 
 
-class Sample(NamedTuple):
-    """The image at a point, with its derivatives along u and v."""
-
-    value: float
-    u: float
-    v: float
-    uu: float
-    uv: float
-    vv: float
+Sample = namedtuple("Sample", "value u v uu uv vv")
+"""The image at a point, with its derivatives along u and v."""
 
 
-class Basis(NamedTuple):
-    """The four cubic B-splines on a cell, or their derivatives."""
-
-    a: float
-    b: float
-    c: float
-    d: float
+Basis = namedtuple("Basis", "a b c d")
+"""The four cubic B-splines on a cell, or their derivatives."""
 
 
 @inlined

@@ -6,7 +6,7 @@ Shapes are columns of a table with the fields of `Superquadrics` as rows.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections import namedtuple
 
 from torchcss.cost.fused.projection import Spatial
 from torchcss.cost.fused.records import Array
@@ -16,30 +16,12 @@ _SMALL = 0.1
 """Angle, radians, below which a quotient by it is its series."""
 
 
-class Shape(NamedTuple):
-    """A column of the table; see `torchcss.body.superquadric.Superquadrics`."""
-
-    ia: float
-    ib: float
-    ic: float
-    around: float
-    section: float
-    along: float
-    whole: float
-    taper_x: float
-    taper_y: float
-    overhang: float
+Shape = namedtuple("Shape", "ia ib ic around section along whole taper_x taper_y overhang")
+"""A column of the table; see `torchcss.body.superquadric.Superquadrics`."""
 
 
-class Turn(NamedTuple):
-    """How the axis of a bent part turns at a point: see `unbend`."""
-
-    x: float
-    y: float
-    z: float
-    cosine: float
-    sine: float
-    stretch: float
+Turn = namedtuple("Turn", "x y z cosine sine stretch")
+"""How the axis of a bent part turns at a point: see `unbend`."""
 
 
 @inlined
@@ -145,19 +127,8 @@ def bent_radial_square(
     return square, c * towards - s * across, s * towards + c * across, axial
 
 
-class Bowl(NamedTuple):
-    """`R^2` at a point, with its first and second derivatives."""
-
-    square: float
-    x: float
-    y: float
-    z: float
-    xx: float
-    xy: float
-    xz: float
-    yy: float
-    yz: float
-    zz: float
+Bowl = namedtuple("Bowl", "square x y z xx xy xz yy yz zz")
+"""`R^2` at a point, with its first and second derivatives."""
 
 
 @inlined
