@@ -107,16 +107,6 @@ def test_the_evaluation_has_the_poses_of_the_chain(
         body.forward_kinematics(x[..., 1:])
 
 
-def test_first_derivatives_of_the_chain_are_the_same_either_way() -> None:
-    tree = load_body("arm8").tree
-    q = torch.linspace(-1, 1, tree.num_joints, dtype=torch.float64).requires_grad_()
-    slopes = [
-        torch.autograd.grad(tree.link_poses(q, twice=twice).sin().sum(), q)[0]
-        for twice in (True, False)
-    ]
-    torch.testing.assert_close(slopes[0], slopes[1])
-
-
 @pytest.mark.parametrize("tree", trees())
 def test_twists_move_points_as_autograd_says(
     tree: KinematicTree, generator: torch.Generator

@@ -124,7 +124,8 @@ def test_targets_and_costs_are_those_of_the_twin(
     x = random_poses(body, 4, generator=generator)
     visible = random_visibility(4, nodes.num_nodes, generator=generator)
     points, normals = nodes(body, body.pose(x))
-    value = term.value(seen(points, normals, visible, camera), camera, targets.take(parent))
+    of_parents = FlowTargets(targets.uv[parent], targets.weight[parent])
+    value = term.value(seen(points, normals, visible, camera), camera, of_parents)
     before = nodes(body, body.pose(previous))
     choices = {"nu": 1.2, "sigma": term.sigma, "level": term.fitted_level, "factor": 1.1}
     assert float(targets.weight.max()) > 0.3

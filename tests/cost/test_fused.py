@@ -22,7 +22,7 @@ from torchcss.cost.fused.engine import FusedEngine
 from torchcss.cost.fused.priors import add_priors
 from torchcss.cost.fused.repulsion import add_repulsion
 from torchcss.cost.fused.view import add_view
-from torchcss.cost.total import beside, together
+from torchcss.cost.total import beside, numbered, together
 from torchcss.kernels.checked import checked
 from torchcss.types import Curvature, LocalModel
 
@@ -57,7 +57,7 @@ def test_several_views_and_sequences(generator: torch.Generator) -> None:
     body = with_shape(cost.body, shape)
     other = changed(other, body=body, tables=BodyTables(body))
     sequence = torch.tensor([1, 0, 1, 1, 0, 0, 1])
-    assert_close(together([cost, other], sequence), x, "float64")
+    assert_close(together([cost, numbered(other, 1)], sequence), x, "float64")
 
 
 def test_a_sample_does_not_depend_on_its_pool(generator: torch.Generator) -> None:

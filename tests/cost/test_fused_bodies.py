@@ -11,7 +11,7 @@ from made_engines import assert_close, awkward_states, colours_of
 
 from torchcss.body.shape import with_shape
 from torchcss.cost.context import BodyTables
-from torchcss.cost.total import TrackingCost, beside, together
+from torchcss.cost.total import TrackingCost, beside, numbered, together
 
 ROBOTS = [
     *("panda.urdf", "iiwa7.urdf", "ur5.urdf", "anymal_b.urdf", "poppy_torso.urdf"),
@@ -51,7 +51,9 @@ def test_views_and_sequences_of_robots(shared_data: Path, generator: torch.Gener
     x = random_states(first.body, 6, generator=generator)
     assert_close(beside([first, second]), x, "float64")
     first = first.__class__(choice=other.choice, views=first.views)
-    assert_close(together([first, other], torch.tensor([1, 0, 0, 1, 1, 0])), x, "float64")
+    assert_close(
+        together([first, numbered(other, 1)], torch.tensor([1, 0, 0, 1, 1, 0])), x, "float64"
+    )
 
 
 @pytest.mark.parametrize("name", ["arm8", "body34"])

@@ -10,7 +10,7 @@ from made_costs import changed, make_full_cost, random_states
 
 from torchcss.body.shape import with_shape
 from torchcss.cost.context import BodyTables
-from torchcss.cost.total import TrackingCost, together
+from torchcss.cost.total import TrackingCost, numbered, together
 from torchcss.inference.mixture import GaussianMixture, Prior
 from torchcss.types import Keypoints
 
@@ -38,7 +38,7 @@ def two_clips() -> tuple[TrackingCost, TrackingCost]:
 def test_one_call_gives_what_two_calls_give(generator: torch.Generator) -> None:
     first, second = two_clips()
     sequence = torch.tensor([1, 0, 1, 1, 0, 0, 1])
-    both = together([first, second], sequence)
+    both = together([first, numbered(second, 1)], sequence)
     x = random_states(first.body, len(sequence), generator=generator)
     apart = [(cost, x[sequence == number]) for number, cost in enumerate((first, second))]
     whole = both.local_model(x)
@@ -61,7 +61,7 @@ def test_samples_of_several_clips_descend_from_the_modes_of_their_own(
     generator: torch.Generator,
 ) -> None:
     sequence, parent = torch.tensor([1, 0, 1, 0, 0]), torch.tensor([2, 1, 0, 0, 1])
-    costs = [replace(cost, parent=None) for cost in two_clips()]
+    costs = [numbered(replace(c, parent=None), n) for n, c in enumerate(two_clips())]
     priors = [
         Prior.of(
             GaussianMixture(

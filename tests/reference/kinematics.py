@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchcss.body.chain import JointSpecification
 from torchcss.body.kinematics import TreePose
+from torchcss.body.model import BodyModel, BodyPose, differentiate_twice
 from torchcss.types import LocalModel, PointCost
 
 
@@ -88,3 +89,19 @@ def lift(
                     turned = torch.linalg.cross(pose.omega[upper], velocity(lower))
                     hessian[i, j] += cost.gradient[p] @ turned
     return LocalModel(cost.value.sum(), gradient, hessian)
+
+
+def lift_by_autograd(
+    body: BodyModel, pose: BodyPose, points: Tensor, point_link: Tensor, cost: PointCost
+) -> LocalModel:
+    """`BodyModel.lift` by double backward through the kinematics."""
+    rotation, translation = pose.tree.rotation.detach(), pose.tree.translation.detach()
+    local = points.detach() - translation[..., point_link, :]
+    local = (rotation[..., point_link, :, :] * local[..., :, None]).sum(-2)
+    with torch.enable_grad():
+        x = pose.x.detach().requires_grad_()
+        moved = body.points_on_links(body.pose(x).tree, point_link, local)
+        step = moved - points.detach()
+        bowl = (step[..., None, :] @ cost.hessian.detach() @ step[..., :, None]).flatten(-3)
+        value = cost.value.detach().sum(-1) + (cost.gradient.detach() * step).sum((-1, -2))
+        return differentiate_twice(value + 0.5 * bowl.sum(-1), x)

@@ -13,8 +13,8 @@ from common.flow_files import flow_discontinuities, read_flow
 from torch import Tensor
 from torch.nn import functional
 
-from torchcss.errors import ConfigurationError, ShapeError
-from torchcss.vision.boundaries import BoundaryConfiguration, carried, motion_boundaries
+from torchcss.errors import ShapeError
+from torchcss.vision.boundaries import carried, motion_boundaries
 from torchcss.vision.flow import TRACKING, OpticalFlow, robust_flow
 
 
@@ -28,8 +28,7 @@ def with_outliers(outlier: Tensor) -> OpticalFlow:
 def test_clean_boundary(dtype: torch.dtype, smoothing: float) -> None:
     outlier = torch.zeros(40, 41, dtype=dtype)
     outlier[:, 19:21] = 1.0
-    configuration = BoundaryConfiguration(smoothing=smoothing, half_strength_line=0.5)
-    strength, potential = motion_boundaries(with_outliers(outlier), configuration)
+    strength, potential = motion_boundaries(with_outliers(outlier), smoothing=smoothing)
     assert strength.dtype == dtype
     # The line response is the mean of the Gaussian over the two pixels, relative to its peak.
     offset = torch.arange(-math.ceil(3.0 * smoothing), math.ceil(3.0 * smoothing) + 1)
@@ -128,13 +127,6 @@ def test_no_map_is_refused(shape: tuple[int, ...]) -> None:
     broken = OpticalFlow(torch.zeros(2, 4, 4), torch.zeros(4, 4), torch.zeros(shape))
     with pytest.raises(ShapeError, match="smoothness_outlier"):
         motion_boundaries(broken)
-
-
-@pytest.mark.parametrize("name", ["smoothing", "half_strength_line"])
-@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
-def test_choices_without_sense_are_refused(name: str, value: float) -> None:
-    with pytest.raises(ConfigurationError, match=name):
-        BoundaryConfiguration(**{name: value})
 
 
 def test_true_boundaries_are_found(shared_data: Path) -> None:

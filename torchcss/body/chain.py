@@ -105,22 +105,19 @@ def joint_order(joints: Sequence[JointSpecification]) -> list[str]:
     return [joint.name for joint in order if joint.kind != "fixed"]
 
 
-def link_poses(
-    chain: Chain, q: Float[Tensor, "*batch q"], *, twice: bool = True
-) -> Float[Tensor, "*batch l 4 4"]:
+def link_poses(chain: Chain, q: Float[Tensor, "*batch q"]) -> Float[Tensor, "*batch l 4 4"]:
     """Pose of every link in the frame of the root, in the order of the chain's frames.
 
     Args:
         chain: From `make_chain`.
         q: Joint values, radians and metres, in the order of the chain's parameters.
-        twice: Whether the poses can be differentiated twice. The library's quicker backward pass,
-            its default, drops the second-order terms without a word.
     """
     if chain.device != q.device:
         chain.to(device=q.device)
     batch = q.shape[:-1]
     flat = q.reshape(batch.numel(), q.shape[-1]).double()
-    poses = chain.forward_kinematics_tensor(flat, analytical_grad=not twice)
+    # The library's quicker backward pass, its default, drops the second-order terms.
+    poses = chain.forward_kinematics_tensor(flat, analytical_grad=False)
     return poses.movedim(1, 0).unflatten(0, batch).to(q) if batch else poses[:, 0].to(q)
 
 

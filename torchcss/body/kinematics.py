@@ -194,17 +194,14 @@ class KinematicTree(nn.Module):
             raise BodyError(f"no link {name!r}; the links are {', '.join(self.link_names)}")
         return self.link_names.index(name)
 
-    def link_poses(
-        self, q: Float[Tensor, "*batch q"], *, twice: bool = True
-    ) -> Float[Tensor, "*batch l 4 4"]:
+    def link_poses(self, q: Float[Tensor, "*batch q"]) -> Float[Tensor, "*batch l 4 4"]:
         """Pose of every link in the tree's base frame, by pytorch-kinematics.
 
         Args:
             q: Joint values, radians and metres.
-            twice: Whether the poses can be differentiated twice; once is quicker.
         """
         check_shape("q", q, self.num_joints)
-        return link_poses(self.chain, q, twice=twice)
+        return link_poses(self.chain, q)
 
     def forward(
         self,

@@ -214,19 +214,16 @@ class BodyModel(nn.Module):
         other._buffers["base_translation"] = translation.to(self.tie)
         return other
 
-    def forward_kinematics(
-        self, x: Float[Tensor, "*batch n"], *, twice: bool = True
-    ) -> Float[Tensor, "*batch l 4 4"]:
+    def forward_kinematics(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch l 4 4"]:
         """Pose of every link in the world, by pytorch-kinematics; in the order `tree.link_names`.
 
         Args:
             x: State, radians and metres.
-            twice: Whether the poses can be differentiated twice; once is quicker.
         """
         check_shape("x", x, self.num_parameters)
         base = torch.eye(4, dtype=x.dtype, device=x.device)
         base[:3, :3], base[:3, 3] = self.base_rotation.to(x), self.base_translation.to(x)
-        return base @ self.tree.link_poses(x @ self.tie.T.to(x) + self.offset.to(x), twice=twice)
+        return base @ self.tree.link_poses(x @ self.tie.T.to(x) + self.offset.to(x))
 
     def pose(self, x: Float[Tensor, "*batch n"]) -> BodyPose:
         """Pose the body for the evaluation of a cost: the map A of eq. 1 [IJRR].
@@ -323,13 +320,11 @@ class BodyModel(nn.Module):
             points: World positions of the points, metres.
             point_link: The link that carries each point.
             cost: Value, gradient and Hessian of each point's cost in its position.
-            curvature: Which Hessian; see `Curvature`.
+            curvature: Gauss-Newton leaves the second-order kinematics out; else it is exact.
 
         Returns:
             Value, gradient and Hessian in x.
         """
-        if curvature is Curvature.AUTOGRAD:
-            return self._lift_by_autograd(pose, points, point_link, cost)
         joints = lift_to_joints(
             pose.tree,
             self.tree.ancestors,
@@ -337,7 +332,7 @@ class BodyModel(nn.Module):
             points,
             point_link,
             cost,
-            second_order_kinematics=curvature is Curvature.EXACT,
+            second_order_kinematics=curvature is not Curvature.GAUSS_NEWTON,
         )
         return self.tied(joints)
 
@@ -348,22 +343,6 @@ class BodyModel(nn.Module):
         return LocalModel(
             joints.value, joints.gradient @ self.tie, self.tie.T @ joints.hessian @ self.tie
         )
-
-    def _lift_by_autograd(
-        self, pose: BodyPose, points: Tensor, point_link: Tensor, cost: PointCost
-    ) -> LocalModel:
-        """The same by double backward through the kinematics: the reference and the fallback."""
-        rotation, translation = pose.tree.rotation.detach(), pose.tree.translation.detach()
-        local = points.detach() - translation[..., point_link, :]
-        local = (rotation[..., point_link, :, :] * local[..., :, None]).sum(-2)
-        with torch.enable_grad():
-            x = pose.x.detach().requires_grad_()
-            moved = self.points_on_links(self.pose(x).tree, point_link, local)
-            step = moved - points.detach()
-            bowl = (step[..., None, :] @ cost.hessian.detach() @ step[..., :, None]).flatten(-3)
-            value = cost.value.detach().sum(-1) + (cost.gradient.detach() * step).sum((-1, -2))
-            value = value + 0.5 * bowl.sum(-1)
-            return differentiate_twice(value, x)
 
 
 def _driver(joint: str, mimics: Mapping[str, tuple[str, float, float]]) -> tuple[str, float, float]:

@@ -29,7 +29,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 Triple = tuple[Tensor, Tensor, Tensor]
@@ -98,10 +98,6 @@ class Superquadrics(NamedTuple):
         exponent = (1 / e2 - 1, e2 / e1 - 1, 1 / e1 - 1, e1 - 1)
         turn = (direction.cos(), direction.sin())
         return cls(1 / a1, 1 / a2, 1 / a3, *exponent, taper_x, taper_y, overhang, bend, *turn)
-
-    def take(self, index: Int[Tensor, " m"]) -> Superquadrics:
-        """Some of them."""
-        return Superquadrics._make(torch.stack(self).index_select(1, index).unbind(0))
 
     def height(self, w: Tensor) -> Tensor:
         """What a taper is multiplied by at a height in semi-axes."""

@@ -36,7 +36,7 @@ from torch import Tensor
 from torchcss.cost.context import FrameContext
 from torchcss.cost.outline import ImageNodes, OutlineTerm
 from torchcss.cost.term import OnPoints
-from torchcss.errors import ConfigurationError, ShapeError
+from torchcss.errors import ShapeError
 from torchcss.robust import Lorentzian, RobustPotential
 from torchcss.vision.sampling import gaussian_blur
 from torchcss.vision.spline import SplineField, spline_field
@@ -55,7 +55,6 @@ def edge_energy_field(edge_field: Float[Tensor, "2 h w"], *, smoothing: float = 
 
     Raises:
         ShapeError: If the field is not a floating-point `[2, h, w]` with at least one pixel.
-        ConfigurationError: If the smoothing is not positive.
     """
     if (
         edge_field.ndim != 3
@@ -66,10 +65,6 @@ def edge_energy_field(edge_field: Float[Tensor, "2 h w"], *, smoothing: float = 
         raise ShapeError(
             "edge_field: expected a floating-point field [2, h, w] with at least one pixel, "
             f"got {edge_field.dtype} {list(edge_field.shape)}"
-        )
-    if not (math.isfinite(smoothing) and smoothing > 0.0):
-        raise ConfigurationError(
-            f"edge energy: smoothing must be positive and finite, got {smoothing}"
         )
     energy = gaussian_blur(edge_field.norm(dim=0), smoothing)
     # The spline's own kernel has a variance of 1/3.

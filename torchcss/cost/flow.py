@@ -13,7 +13,7 @@ node was hidden, turned away or outside the image at x': there is nothing to fol
 a mode would gain from having lost sight of its nodes. It does not depend on x.
 
 Every sample is compared with the targets of its own parent mode x'. They are computed once per
-parent: `flow_targets` for all modes of the previous frame, then `FlowTargets.take(parent)`.
+parent: `flow_targets` for all modes of the previous frame.
 `FlowTerm.printed` is eq. 9 as it stands: without that constant, and divided by N of eq. 5.
 
 At x, a node that faces away costs `nu_bf`, one hidden behind another part `nu_occ = k nu_bf`
@@ -34,7 +34,7 @@ from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.cost.context import FrameContext
@@ -64,10 +64,6 @@ class FlowTargets(NamedTuple):
 
     uv: Float[Tensor, "*k p 2"]
     weight: Float[Tensor, "*k p"]
-
-    def take(self, parent: Int[Tensor, "*b"]) -> FlowTargets:
-        """The targets of each sample, by the index of its parent mode."""
-        return FlowTargets(self.uv[parent], self.weight[parent])
 
 
 def flow_targets(

@@ -454,52 +454,18 @@ def together(costs: Sequence[TrackingCost], sequence: Int[Tensor, " b"]) -> Trac
     """The cost of samples of several sequences, with bodies, cameras and pictures of their own.
 
     Args:
-        costs: The cost of each sequence, with the same choice of terms; of their samples, those of
-            each keep their order.
-        sequence: Which of the sequences each sample belongs to.
+        costs: The cost of each sequence, numbered (`numbered`) in rising order, with the same
+            choice of terms; of their samples, those of each keep their order.
+        sequence: The number of the sequence that each sample belongs to.
     """
-    renumbered = [numbered(cost, number) for number, cost in enumerate(costs)]
     parent, component = torch.zeros_like(sequence), torch.zeros_like(sequence)
-    for number, cost in enumerate(costs):
+    for cost in costs:
         if cost.parent is not None:
-            own = sequence == number
+            own = sequence == cost.views[0].sequence
             parent[own] = cost.parent
             component[own] = cost.parent if cost.component is None else cost.component
-    return replace(
-        renumbered[0],
-        views=tuple(view for cost in renumbered for view in cost.views),
-        past=tuple(past for cost in renumbered for past in cost.past),
-        bound={key: term for cost in renumbered for key, term in cost.bound.items()},
-        parent=parent,
-        component=component,
-        sequence=sequence,
-    )
-
-
-def joined(costs: Sequence[TrackingCost], sizes: Sequence[int]) -> TrackingCost:
-    """The cost of the samples of several sequences, those of one after those of the other.
-
-    Args:
-        costs: The cost of each, numbered (`numbered`) in rising order, with equal choices of terms.
-        sizes: Samples of each.
-    """
-
-    def each(indices: Iterable[Tensor | None]) -> Tensor:
-        zero = costs[0].body.tie.new_zeros(0, dtype=torch.long)
-        pairs = zip(indices, sizes, strict=True)
-        return torch.cat([zero.new_zeros(n) if i is None else i for i, n in pairs])
-
-    numbers = (torch.full((n,), c.views[0].sequence) for c, n in zip(costs, sizes, strict=True))
-    return replace(
-        costs[0],
-        views=tuple(view for cost in costs for view in cost.views),
-        past=tuple(past for cost in costs for past in cost.past),
-        bound={key: term for cost in costs for key, term in cost.bound.items()},
-        parent=each(cost.parent for cost in costs),
-        component=each(c.parent if c.component is None else c.component for c in costs),
-        sequence=torch.cat(list(numbers)).to(costs[0].body.tie.device),
-        stopwatch=None,
-    )
+    past = tuple(past for cost in costs for past in cost.past)
+    return replace(beside(costs), past=past, parent=parent, component=component, sequence=sequence)
 
 
 def numbered(cost: TrackingCost, number: int) -> TrackingCost:

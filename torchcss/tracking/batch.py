@@ -23,7 +23,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from torchcss.cost.total import Engine, TrackingCost, joined, numbered
+from torchcss.cost.total import Engine, TrackingCost, numbered, together
 from torchcss.tracking.session import Images, Posterior, TrackingSession
 from torchcss.types import LocalModel
 
@@ -193,8 +193,10 @@ def _answer(asks: Sequence[_Ask]) -> None:
         (ask,) = asks
         ask.answer = getattr(ask.cost, ask.what)(ask.x)
         return
-    cost = joined([ask.cost for ask in asks], sizes)
     x = torch.cat([ask.x for ask in asks])
+    numbers = torch.tensor([ask.cost.views[0].sequence for ask in asks])
+    sequence = numbers.repeat_interleave(torch.tensor(sizes)).to(x.device)
+    cost = replace(together([ask.cost for ask in asks], sequence), stopwatch=None)
     if asks[0].what == "value":
         shares: Sequence[Any] = cost.value(x).split(sizes)
     else:

@@ -27,40 +27,18 @@ By default: `motion_boundaries(flow)`.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchcss.errors import ConfigurationError, ShapeError
+from torchcss.errors import ShapeError
 from torchcss.vision.flow import OpticalFlow, has_kernels
 from torchcss.vision.sampling import gaussian_blur
 
 _LEAST_OUTLIER = 1e-3
 """What is less of an outlier is none."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class BoundaryConfiguration:
-    """Choices of the motion boundaries; the papers give none of these numbers.
-
-    Attributes:
-        smoothing: Standard deviation of the Gaussian smoothing, pixels.
-        half_strength_line: The line response, 1 on a clean boundary, whose strength is one half.
-    """
-
-    smoothing: float = 1.5
-    half_strength_line: float = 0.5
-
-    def __post_init__(self) -> None:
-        for name in ("smoothing", "half_strength_line"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise ConfigurationError(
-                    f"boundaries: {name} must be positive and finite, got {value}"
-                )
 
 
 class MotionBoundaries(NamedTuple):
@@ -76,19 +54,19 @@ class MotionBoundaries(NamedTuple):
 
 
 def motion_boundaries(
-    flow: OpticalFlow, configuration: BoundaryConfiguration | None = None
+    flow: OpticalFlow, *, smoothing: float = 1.5, half_strength_line: float = 0.5
 ) -> MotionBoundaries:
     """Turn the outlier map of the smoothness term into motion boundaries of the second frame.
 
     Args:
         flow: What `robust_flow` returns. A flow under quadratic potentials has no outliers, so
             no boundaries either.
-        configuration: The choices; None takes the defaults.
+        smoothing: Standard deviation of the Gaussian smoothing, pixels. The papers give none.
+        half_strength_line: The line response, 1 on a clean boundary, whose strength is one half.
 
     Raises:
         ShapeError: If the outlier map is not `[..., h, w]` with at least one pixel.
     """
-    choice = configuration or BoundaryConfiguration()
     outlier = flow.smoothness_outlier
     if outlier.ndim < 2 or outlier.numel() == 0:
         raise ShapeError(
@@ -100,10 +78,10 @@ def motion_boundaries(
             f"flow: expected two numbers for each pixel of smoothness_outlier "
             f"{list(outlier.shape)}, got {list(flow.flow.shape)}"
         )
-    outlier = carried(outlier, flow.flow, reach=math.ceil(2 * choice.smoothing))
-    blurred = gaussian_blur(outlier, choice.smoothing)
-    squared = (math.sqrt(0.5 * math.pi) * choice.smoothing * blurred).square()
-    strength = squared / (squared + choice.half_strength_line**2)
+    outlier = carried(outlier, flow.flow, reach=math.ceil(2 * smoothing))
+    blurred = gaussian_blur(outlier, smoothing)
+    squared = (math.sqrt(0.5 * math.pi) * smoothing * blurred).square()
+    strength = squared / (squared + half_strength_line**2)
     return MotionBoundaries(strength, 1.0 - strength)
 
 

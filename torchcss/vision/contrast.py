@@ -15,7 +15,7 @@ from __future__ import annotations
 from jaxtyping import Float
 from torch import Tensor
 
-from torchcss.errors import ConfigurationError, check_shape
+from torchcss.errors import check_shape
 from torchcss.vision.sampling import gaussian_blur
 
 
@@ -31,12 +31,8 @@ def local_contrast(
         floor: Deviation below which grey levels are noise.
 
     Raises:
-        ConfigurationError: If one of the three is not positive.
         ShapeError: If the picture is none.
     """
-    for name, value in (("radius", radius), ("blur", blur), ("floor", floor)):
-        if not value > 0:
-            raise ConfigurationError(f"{name} must be positive, got {value}")
     check_shape("grey", grey, None, None)
     difference = grey - gaussian_blur(grey, radius)
     deviation = (gaussian_blur(difference.square(), radius) + floor**2).sqrt()

@@ -148,13 +148,8 @@ def foreground_weight(
 
     Raises:
         ShapeError: If the mask is not a floating-point image `[h, w]` with at least one pixel.
-        ConfigurationError: If the band is not positive or the weight not in 0..1.
     """
     _check_image("mask", mask)
-    if not (math.isfinite(band) and band > 0.0):
-        raise ConfigurationError(f"foreground: band must be positive and finite, got {band}")
-    if not 0.0 <= background <= 1.0:
-        raise ConfigurationError(f"foreground: background must lie in 0..1, got {background}")
     reach = round(band)
     wide = mask[None, None]
     # A square is dilated one axis after the other; beyond the border there is no foreground.
