@@ -21,6 +21,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+Matrix = Float[np.ndarray, "3 3"]
+
 Vector = tuple[float, float, float]
 
 ROTATION_ORDERS = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
@@ -38,7 +40,7 @@ def about(axis: int, angle: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*
     return matrix
 
 
-def about_fixed_axes(angles: Sequence[float], order: str) -> Float[np.ndarray, "3 3"]:
+def about_fixed_axes(angles: Sequence[float], order: str) -> Matrix:
     """Turns about fixed axes one after the other, in the order of the letters, radians."""
     matrix = np.eye(3)
     for angle, letter in zip(angles, order, strict=True):
@@ -46,7 +48,7 @@ def about_fixed_axes(angles: Sequence[float], order: str) -> Float[np.ndarray, "
     return matrix
 
 
-def from_axis_angle(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+def from_axis_angle(vector: Float[np.ndarray, "3"]) -> Matrix:
     """Rotation about a vector by its length in radians (Rodrigues' formula)."""
     x, y, z = vector
     angle = float(np.linalg.norm(vector))
@@ -57,7 +59,7 @@ def from_axis_angle(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     return np.eye(3) + first * cross + second * (cross @ cross)
 
 
-def from_quaternion(quaternion: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
+def from_quaternion(quaternion: Float[np.ndarray, "4"]) -> Matrix:
     """Rotation of a unit quaternion, scalar first."""
     vector = quaternion[1:]
     length = float(np.linalg.norm(vector))
@@ -67,7 +69,7 @@ def from_quaternion(quaternion: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 
 
 def frame_along(
     direction: Sequence[float] | np.ndarray, side: Float[np.ndarray, "3"] | None = None
-) -> Float[np.ndarray, "3 3"]:
+) -> Matrix:
     """A rotation whose third column is a direction, and whose first one is nearest to `side`."""
     z = np.asarray(direction, dtype=np.float64) / np.linalg.norm(direction)
     if side is None:
@@ -183,7 +185,7 @@ def as_vector(values: Float[np.ndarray, "3"]) -> Vector:
     return x, y, z
 
 
-def as_rows(matrix: Float[np.ndarray, "3 3"]) -> tuple[Vector, Vector, Vector]:
+def as_rows(matrix: Matrix) -> tuple[Vector, Vector, Vector]:
     """The rows of a rotation, as specifications hold them."""
     a, b, c = matrix
     return as_vector(a), as_vector(b), as_vector(c)

@@ -25,6 +25,8 @@ from torch import Tensor
 
 from torchcss.body.superquadric import Superquadrics, radial_square, unbend
 
+Vectors = Float[Tensor, "*batch 3"]
+
 SHAPE_NAMES = ("a1", "a2", "a3", "e1", "e2", "taper_x", "taper_y", "bend", "bend_direction")
 
 _SMALL = 0.1
@@ -39,8 +41,8 @@ class SurfaceSample(NamedTuple):
         normals: Perpendicular to the surface, of length one, outwards.
     """
 
-    points: Float[Tensor, "*batch 3"]
-    normals: Float[Tensor, "*batch 3"]
+    points: Vectors
+    normals: Vectors
 
 
 def _signed_power(base: Tensor, exponent: Tensor) -> Tensor:
@@ -129,9 +131,7 @@ def _sinc(angle: Tensor) -> Tensor:
     return torch.where(small, series, safe.sin() / safe)
 
 
-def straighten(
-    shape: Float[Tensor, "*batch 9"], points: Float[Tensor, "*batch 3"]
-) -> Float[Tensor, "*batch 3"]:
+def straighten(shape: Float[Tensor, "*batch 9"], points: Vectors) -> Vectors:
     """Undo bend and taper: part frame to the frame of the plain superquadric.
 
     Args:
@@ -144,9 +144,7 @@ def straighten(
     return torch.stack([x / (1 + rows.taper_x * height), y / (1 + rows.taper_y * height), z], -1)
 
 
-def implicit(
-    shape: Float[Tensor, "*batch 9"], points: Float[Tensor, "*batch 3"]
-) -> Float[Tensor, "*batch"]:
+def implicit(shape: Float[Tensor, "*batch 9"], points: Vectors) -> Float[Tensor, "*batch"]:
     """Inside-outside function: negative inside, zero on the surface, positive outside.
 
     It is `R^2 - 1` with the radial function R of `torchcss.body.superquadric`.

@@ -49,6 +49,9 @@ from torchcss.cost.visibility import places
 from torchcss.robust import Lorentzian, RobustPotential, RobustValue
 from torchcss.vision.sampling import inside_image, interpolate_bilinear
 
+Each = Float[Tensor, " e"]
+"""A number for each edge."""
+
 
 class EdgeAssignments(NamedTuple):
     """Edges found along the search lines of nodes; a node may have several, or none.
@@ -61,17 +64,17 @@ class EdgeAssignments(NamedTuple):
     """
 
     node: Int[Tensor, " e"]
-    distance: Float[Tensor, " e"]
-    weight: Float[Tensor, " e"]
+    distance: Each
+    weight: Each
 
 
 class _Maxima(NamedTuple):
     """Local maxima of the response on search lines; see `EdgeAssignments`."""
 
     node: Int[Tensor, " e"]
-    distance: Float[Tensor, " e"]
-    height: Float[Tensor, " e"]
-    sharpness: Float[Tensor, " e"]
+    distance: Each
+    height: Each
+    sharpness: Each
 
 
 _TINY = 1e-12
@@ -252,9 +255,7 @@ class ContourTerm(OutlineTerm):
         depth, slope, curvature = (torch.cat(parts) for parts in zip(*blocks, strict=True))
         return depth, slope, curvature
 
-    def _well(
-        self, found: EdgeAssignments, distance: Float[Tensor, " e"]
-    ) -> tuple[Float[Tensor, " e"], Float[Tensor, " e"], RobustValue]:
+    def _well(self, found: EdgeAssignments, distance: Each) -> tuple[Each, Each, RobustValue]:
         """What edges at some distance take off U, and rho with what it is of."""
         node, _, weight = found
         if self.assignment == "shared":

@@ -44,6 +44,9 @@ from torchcss.cost.term import Kind, OnStates, Term
 from torchcss.types import LocalModel
 from torchcss.vision.camera import Upright
 
+Batch = Float[Tensor, "*batch d"]
+"""Directions of a group, three numbers each."""
+
 FILE = Path(__file__).with_name("pose_prior.npz")
 
 _CORNERS = ("l_hip", "r_hip", "l_shoulder", "r_shoulder")
@@ -162,9 +165,7 @@ def _axes(unit: Float[Tensor, "*batch m 3"], line: int) -> _Axes:
     return _Axes(torch.stack([left, up, front], dim=-2), normal)
 
 
-def limb_directions(
-    joints: Float[Tensor, "*batch j 3"], which: Directions
-) -> dict[str, Float[Tensor, "*batch d"]]:
+def limb_directions(joints: Float[Tensor, "*batch j 3"], which: Directions) -> dict[str, Batch]:
     """The directions of each group of posed bodies in its frame, three numbers each.
 
     Those of a right arm are mirrored, so that arms are alike.
@@ -331,7 +332,7 @@ class Density(NamedTuple):
     uniform: float
 
     def parts(
-        self, directions: Float[Tensor, "*batch d"]
+        self, directions: Batch
     ) -> tuple[Float[Tensor, "*batch k+1"], Float[Tensor, "*batch k d"]]:
         """Log densities of all parts, the uniform one last, and the pulls of the Gaussians."""
         offset = directions[..., None, :] - self.mean
@@ -340,11 +341,11 @@ class Density(NamedTuple):
         tail = exponent.new_full((*exponent.shape[:-1], 1), self.uniform)
         return torch.cat([exponent, tail], dim=-1), pull
 
-    def cost(self, directions: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch"]:
+    def cost(self, directions: Batch) -> Float[Tensor, "*batch"]:
         """`-log p`, nats."""
         return -self.parts(directions)[0].logsumexp(-1)
 
-    def local_model(self, directions: Float[Tensor, "*batch d"]) -> LocalModel:
+    def local_model(self, directions: Batch) -> LocalModel:
         """`-log p`, its gradient, and a Hessian without negative directions.
 
         The Hessian is that of the bound from above that expectation maximisation uses: the mean
@@ -358,7 +359,7 @@ class Density(NamedTuple):
         return LocalModel(-parts.logsumexp(-1), gradient, hessian)
 
 
-def mirrored(directions: Float[Tensor, "*batch d"], group: str) -> Float[Tensor, "*batch d"]:
+def mirrored(directions: Batch, group: str) -> Batch:
     """The directions of the mirror image of a pose; of trunk or legs, all of them."""
     each = directions.unflatten(-1, (-1, 3)) * directions.new_tensor([-1.0, 1.0, 1.0])
     if group == "trunk":

@@ -27,6 +27,8 @@ from torchcss.cost.stabiliser import Stabiliser
 from torchcss.errors import ShapeError, check_shape
 from torchcss.types import LocalModel, PointCost
 
+States = Float[Tensor, "*batch m"]
+
 _CORNERS = ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))
 """A regular tetrahedron: seen from its middle, errors of orientation about all axes count alike."""
 
@@ -59,25 +61,23 @@ class PointTargets:
         """The same cost: all items have the same targets."""
         return self
 
-    def whole(self, x: Float[Tensor, "*batch m"]) -> Float[Tensor, "*batch n"]:
+    def whole(self, x: States) -> Float[Tensor, "*batch n"]:
         """States of the body: x, and what is held."""
         check_shape("x", x, len(self.columns))
         held = self.held.expand(*x.shape[:-1], len(self.held))
         return held.index_copy(-1, self.columns, x)
 
-    def value(self, x: Float[Tensor, "*batch m"]) -> Float[Tensor, "*batch"]:
+    def value(self, x: States) -> Float[Tensor, "*batch"]:
         """Cost in nats."""
         _, points = self._pose(x)
         squared = (points - self.target[:, :, None]).square().sum(1)
         return (0.5 / self.sigma**2 * (self.weight @ squared)).reshape(x.shape[:-1])
 
-    def local_model(self, x: Float[Tensor, "*batch m"]) -> LocalModel:
+    def local_model(self, x: States) -> LocalModel:
         """Cost, gradient and exact Hessian."""
         return self._local_model(x, None)
 
-    def blended_model(
-        self, x: Float[Tensor, "*batch m"], share: Float[Tensor, "*batch"]
-    ) -> LocalModel:
+    def blended_model(self, x: States, share: Float[Tensor, "*batch"]) -> LocalModel:
         """The same with a Hessian between Gauss-Newton, never negative, and the exact one.
 
         Args:
@@ -97,7 +97,7 @@ class PointTargets:
         moved = torch.where(carries, turned + tree.velocity[:, None], 0.0)
         return place[:, :, 0] - self.target, moved.mT @ self.body.tie[:, self.columns]
 
-    def _pose(self, x: Float[Tensor, "*batch m"]) -> tuple[TreePose, Float[Tensor, "p 3 b"]]:
+    def _pose(self, x: States) -> tuple[TreePose, Float[Tensor, "p 3 b"]]:
         """The tree and the points, the batch flattened; of the links only the base is there."""
         body = self.body
         state = self.whole(x).reshape(x.shape[:-1].numel(), body.num_parameters)
@@ -108,9 +108,7 @@ class PointTargets:
         points = body.tree.points(frames, self.link, self.offset)
         return TreePose(*(part.movedim(-1, 0) for part in parts)), points
 
-    def _local_model(
-        self, x: Float[Tensor, "*batch m"], share: Float[Tensor, "*batch"] | None
-    ) -> LocalModel:
+    def _local_model(self, x: States, share: Float[Tensor, "*batch"] | None) -> LocalModel:
         tree, points = self._pose(x)
         error = points - self.target[:, :, None]
         strength = (self.weight / self.sigma**2)[:, None, None]

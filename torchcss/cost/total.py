@@ -53,6 +53,10 @@ from torchcss.stopwatch import Stopwatch
 from torchcss.types import Curvature, Keypoints, LocalModel, PointCost
 from torchcss.vision.camera import Camera
 
+States = Float[Tensor, "*batch n"]
+Costs = Float[Tensor, "*batch"]
+Indices = Int[Tensor, " b"]
+
 CHUNK = 512
 """Most samples evaluated at a time: enough to hide the overhead of calls."""
 
@@ -68,11 +72,11 @@ the same for one sample and for thousands. 2000 samples of body34 take 1 GB so."
 class Engine(Protocol):
     """Another way to evaluate a cost, with the same results to a tolerance."""
 
-    def value(self, cost: TrackingCost, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    def value(self, cost: TrackingCost, x: States) -> Costs:
         """See `TrackingCost.value`."""
         ...
 
-    def local_model(self, cost: TrackingCost, x: Float[Tensor, "*batch n"]) -> LocalModel:
+    def local_model(self, cost: TrackingCost, x: States) -> LocalModel:
         """See `TrackingCost.local_model`."""
         ...
 
@@ -96,9 +100,9 @@ class TrackingCost:
     choice: CostChoice
     views: tuple[FrameContext, ...]
     past: tuple[FrameContext, ...] = ()
-    parent: Int[Tensor, " b"] | None = None
-    component: Int[Tensor, " b"] | None = None
-    sequence: Int[Tensor, " b"] | None = None
+    parent: Indices | None = None
+    component: Indices | None = None
+    sequence: Indices | None = None
     stopwatch: Stopwatch | None = None
     engine: Engine | None = None
     bound: Mapping[tuple[Term, FrameContext], Any] = field(default_factory=dict, repr=False)
@@ -147,7 +151,7 @@ class TrackingCost:
         first, *others = self.views
         return replace(self, views=(replace(first, keypoints=keypoints), *others))
 
-    def of_children(self, component: Int[Tensor, " b"], *prior: Prior) -> TrackingCost:
+    def of_children(self, component: Indices, *prior: Prior) -> TrackingCost:
         """The cost for samples of a prior: each is compared with what it came from.
 
         Args:
@@ -168,7 +172,7 @@ class TrackingCost:
         every = self.of_children(x.new_zeros(0).long(), Prior.of(single))
         return replace(every, parent=None, component=None)
 
-    def take(self, items: Int[Tensor, " b"]) -> TrackingCost:
+    def take(self, items: Indices) -> TrackingCost:
         """The cost restricted to some samples: each keeps its own parent and sequence."""
         parent, component, sequence = (
             None if index is None else index[items]
@@ -202,11 +206,11 @@ class TrackingCost:
         edges = self.choice.only([term.name for term in self.choice.terms if term.screens])
         return replace(self, choice=edges)
 
-    def landmarks(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch j 3"]:
+    def landmarks(self, x: States) -> Float[Tensor, "*batch j 3"]:
         """Joint centres, metres: by how far they are apart two states are unlike each other."""
         return self.body.pose(x).joints
 
-    def value(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    def value(self, x: States) -> Costs:
         """Cost in nats, visibility and assignments found fresh at x."""
         if self.engine is not None:
             return self.engine.value(self, x)
@@ -214,15 +218,15 @@ class TrackingCost:
             lambda part: {"": torch.stack(list(part.values().values())).sum(0)}, x
         )[""]
 
-    def terms(self, x: Float[Tensor, "*batch n"]) -> dict[str, Float[Tensor, "*batch"]]:
+    def terms(self, x: States) -> dict[str, Costs]:
         """Cost of every term and prior by name, nats."""
         return self._evaluated(_Part.values, x) if x.numel() else {}
 
-    def gradients(self, x: Float[Tensor, "*batch n"]) -> dict[str, Float[Tensor, "*batch n"]]:
+    def gradients(self, x: States) -> dict[str, States]:
         """Gradient of every term and prior by name, visibility and assignments held fixed."""
         return self._evaluated(_Part.gradients, x) if x.numel() else {}
 
-    def local_model(self, x: Float[Tensor, "*batch n"]) -> LocalModel:
+    def local_model(self, x: States) -> LocalModel:
         """Cost, gradient and Hessian, visibility and assignments found at x and held fixed."""
         if self.engine is not None and self.choice.curvature is not Curvature.AUTOGRAD:
             return self.engine.local_model(self, x)
@@ -233,9 +237,7 @@ class TrackingCost:
         """Whether `weight_only` tells poses apart."""
         return self._says("weight-only")
 
-    def weight_only(
-        self, x: Float[Tensor, "*batch n"], *, body: BodyModel | None = None
-    ) -> Float[Tensor, "*batch"]:
+    def weight_only(self, x: States, *, body: BodyModel | None = None) -> Costs:
         """Cost of what has no derivatives, nats: it counts in the weights of modes, not in `value`.
 
         Args:
@@ -244,9 +246,7 @@ class TrackingCost:
         """
         return sum(self.weight_only_terms(x, body=body).values(), x.new_zeros(x.shape[:-1]))
 
-    def weight_only_terms(
-        self, x: Float[Tensor, "*batch n"], *, body: BodyModel | None = None
-    ) -> dict[str, Float[Tensor, "*batch"]]:
+    def weight_only_terms(self, x: States, *, body: BodyModel | None = None) -> dict[str, Costs]:
         """The same by the name of the term; zero for a term that knows nothing of the frame."""
         names = [term.name for term in self.choice.terms if term.kind == "weight-only"]
 
@@ -270,7 +270,7 @@ class TrackingCost:
         return max(1, min(CHUNK, CHUNK_NODES // nodes) * more)
 
     def _evaluated(
-        self, evaluate: Callable[[_Part], dict[str, Tensor]], x: Float[Tensor, "*batch n"]
+        self, evaluate: Callable[[_Part], dict[str, Tensor]], x: States
     ) -> dict[str, Tensor]:
         """Evaluate sequence by sequence, a chunk at a time, and put the results together."""
         flat, found, order = x.reshape(-1, x.shape[-1]), [], []
@@ -316,8 +316,8 @@ class _Part:
     past: FrameContext
     views: Sequence[FrameContext]
     x: Float[Tensor, "b n"]
-    parent: Int[Tensor, " b"] | None
-    component: Int[Tensor, " b"] | None
+    parent: Indices | None
+    component: Indices | None
 
     def values(self) -> dict[str, Tensor]:
         """Cost of every prior and term."""
@@ -419,9 +419,7 @@ class _Part:
                 yield name, self.cost.choice.weight(name), bound, posed
 
 
-def _joined(
-    name: str, parts: Sequence[Mapping[str, Tensor]], rows: Sequence[Int[Tensor, " b"]]
-) -> Tensor:
+def _joined(name: str, parts: Sequence[Mapping[str, Tensor]], rows: Sequence[Indices]) -> Tensor:
     """A result of all parts; zero where a part does not have it."""
     like = next(part[name] for part in parts if name in part)
     none = (like.new_zeros(len(some), *like.shape[1:]) for some in rows)
@@ -450,7 +448,7 @@ def beside(costs: Iterable[TrackingCost]) -> TrackingCost:
     return replace(costs[0], views=views, bound=bound)
 
 
-def together(costs: Sequence[TrackingCost], sequence: Int[Tensor, " b"]) -> TrackingCost:
+def together(costs: Sequence[TrackingCost], sequence: Indices) -> TrackingCost:
     """The cost of samples of several sequences, with bodies, cameras and pictures of their own.
 
     Args:

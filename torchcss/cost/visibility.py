@@ -44,6 +44,10 @@ from torchcss.body.superquadric import EXPONENTS, Superquadrics, radial_square
 from torchcss.body.surface import SurfaceSample, surface_points
 from torchcss.cost.term import Posed
 
+Vectors = Float[Tensor, "*batch p 3"]
+Values = Float[Tensor, "*batch p"]
+Place = Float[Tensor, "3"]
+
 _TINY = 1e-12
 _FAR = 1e6
 """Metres beyond which squares could overflow in single precision; nothing is seen there."""
@@ -83,14 +87,12 @@ class SeenNodes(NamedTuple):
             where a node does not exist: nothing depends on it there.
     """
 
-    points: Float[Tensor, "*batch p 3"]
-    normals: Float[Tensor, "*batch p 3"]
-    exists: Float[Tensor, "*batch p"]
-    visible: Float[Tensor, "*batch p"]
+    points: Vectors
+    normals: Vectors
+    exists: Values
+    visible: Values
 
-    def cost(
-        self, matched: Float[Tensor, "*batch p"], back_facing: float, occlusion_factor: float
-    ) -> Float[Tensor, "*batch p"]:
+    def cost(self, matched: Values, back_facing: float, occlusion_factor: float) -> Values:
         """Cost of every node, whether it is seen or not (eq. 5 [IJRR]).
 
         Args:
@@ -180,9 +182,7 @@ class ContourPredictor(nn.Module):
         """Number of contour nodes."""
         return len(self.node_part)
 
-    def forward(
-        self, body: BodyModel, pose: BodyPose, centre_world: Float[Tensor, "3"]
-    ) -> SeenNodes:
+    def forward(self, body: BodyModel, pose: BodyPose, centre_world: Place) -> SeenNodes:
         """Predict the occluding contours.
 
         Args:
@@ -231,10 +231,10 @@ def contour_nodes(posed: Posed) -> SeenNodes:
 
 
 def front_facing(
-    points: Float[Tensor, "*batch p 3"],
-    normals: Float[Tensor, "*batch p 3"],
-    centre_world: Float[Tensor, "3"],
-) -> Float[Tensor, "*batch p"]:
+    points: Vectors,
+    normals: Vectors,
+    centre_world: Place,
+) -> Values:
     """Whether surface nodes face the camera: 0 where they face away, 1 where clearly towards it.
 
     The ramp between starts where the line of sight grazes the surface.
@@ -253,12 +253,12 @@ def front_facing(
 def visible_nodes(
     body: BodyModel,
     pose: BodyPose,
-    centre_world: Float[Tensor, "3"],
-    points: Float[Tensor, "*batch p 3"],
+    centre_world: Place,
+    points: Vectors,
     node_part: Int[Tensor, " p"],
     *,
-    wanted: Float[Tensor, "*batch p"] | None = None,
-) -> Float[Tensor, "*batch p"]:
+    wanted: Values | None = None,
+) -> Values:
     """Visibility of surface nodes past the other parts: 1 where seen, 0 where hidden.
 
     A node that faces away is hidden by its own part besides, see `front_facing`.
@@ -280,9 +280,9 @@ def visible_nodes(
 
 
 def facing_nodes(
-    points: Float[Tensor, "*batch p 3"],
-    normals: Float[Tensor, "*batch p 3"],
-    centre_world: Float[Tensor, "3"],
+    points: Vectors,
+    normals: Vectors,
+    centre_world: Place,
 ) -> SeenNodes:
     """Surface nodes with which of them face the camera, as if nothing were in front of them.
 
@@ -298,9 +298,9 @@ def facing_nodes(
 def seen_nodes(
     body: BodyModel,
     pose: BodyPose,
-    centre_world: Float[Tensor, "3"],
-    points: Float[Tensor, "*batch p 3"],
-    normals: Float[Tensor, "*batch p 3"],
+    centre_world: Place,
+    points: Vectors,
+    normals: Vectors,
     node_part: Int[Tensor, " p"],
 ) -> SeenNodes:
     """The same with which of them no other part hides.
@@ -323,13 +323,13 @@ def line_of_sight(
     shape: Float[Tensor, "parts 9"],
     rotation: Float[Tensor, "*batch parts 3 3"],
     eye: Float[Tensor, "*batch parts 3"],
-    rays: Float[Tensor, "*batch p 3"],
+    rays: Vectors,
     others: Bool[Tensor, "p parts"],
     *,
     behind: Float[Tensor, "p parts"] | None = None,
-    wanted: Float[Tensor, "*batch p"] | None = None,
+    wanted: Values | None = None,
     ramp: float = 0.010,
-) -> Float[Tensor, "*batch p"]:
+) -> Values:
     """Visibility of points past parts: 1 where nothing is in front, 0 where a part is.
 
     Args:

@@ -29,6 +29,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+Colours = Float[Tensor, "3 h w"]
+Image = Float[Tensor, "h w"]
+
 _DEVIATION = 0.05
 """Standard deviation of a colour channel before anything is learnt: grain and compression."""
 
@@ -79,13 +82,13 @@ class Background(NamedTuple):
         sure: Whether the pixel was bare in those frames; else it may have shown the body.
     """
 
-    mean: Float[Tensor, "3 h w"]
-    squares: Float[Tensor, "h w"]
-    frames: Float[Tensor, "h w"]
+    mean: Colours
+    squares: Image
+    frames: Image
     sure: Bool[Tensor, "h w"]
 
     @classmethod
-    def unknown(cls, like: Float[Tensor, "3 h w"]) -> Background:
+    def unknown(cls, like: Colours) -> Background:
         """What is known before the first frame.
 
         Args:
@@ -95,20 +98,20 @@ class Background(NamedTuple):
         return cls(torch.zeros_like(like), nothing, nothing.clone(), nothing > 0)
 
     @property
-    def confidence(self) -> Float[Tensor, "h w"]:
+    def confidence(self) -> Image:
         """Probability that a pixel without the body shows what it showed before."""
         guess = _GUESS * (self.frames >= _STILL_FRAMES).to(self.frames)
         return guess.masked_fill(self.sure, _SURE)
 
     @property
-    def variance(self) -> Float[Tensor, "h w"]:
+    def variance(self) -> Image:
         """Variance of a colour channel of each pixel."""
         prior = _PRIOR_FRAMES * _DEVIATION**2
         return (self.squares + prior) / (self.frames + _PRIOR_FRAMES)
 
     def learn(
         self,
-        colour: Float[Tensor, "3 h w"],
+        colour: Colours,
         bare: Bool[Tensor, "h w"],
         flow: Float[Tensor, "2 h w"] | None = None,
     ) -> Background:
@@ -145,7 +148,7 @@ class Background(NamedTuple):
         kept = torch.where(full, 1 - 1 / memory, 1.0)
         return Background(mean, kept * squares + gain, frames, sure)
 
-    def holds(self, colour: Float[Tensor, "3 h w"]) -> bool:
+    def holds(self, colour: Colours) -> bool:
         """Whether a frame, wherever the body is in it, can be of the same scene and light.
 
         Args:
@@ -153,7 +156,7 @@ class Background(NamedTuple):
         """
         return self._share_strange(colour, torch.ones_like(self.sure)) <= _MOST_STRANGE
 
-    def log_density(self, colour: Float[Tensor, "3 h w"]) -> Float[Tensor, "h w"]:
+    def log_density(self, colour: Colours) -> Image:
         """Logarithm of B at each pixel's colour; any where nothing is known.
 
         Args:
@@ -170,7 +173,7 @@ class Background(NamedTuple):
         dim = -0.5 * missed / variance - level - extent.log()
         return torch.logaddexp(lit + math.log(1 - _SHADOW), dim + math.log(_SHADOW))
 
-    def _share_strange(self, colour: Float[Tensor, "3 h w"], where: Bool[Tensor, "h w"]) -> float:
+    def _share_strange(self, colour: Colours, where: Bool[Tensor, "h w"]) -> float:
         """Share of the sure pixels in a region that look otherwise than they did."""
         seen = where & self.sure
         if not bool(seen.any()):

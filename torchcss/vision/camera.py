@@ -55,6 +55,11 @@ from torchcss.errors import CameraError, check_shape
 from torchcss.types import PointCost
 from torchcss.vision.sampling import inside_image
 
+Values = Float[Tensor, "*batch p"]
+Pixels = Float[Tensor, "*batch 2"]
+Matrix = Float[Tensor, "3 3"]
+Vectors = Float[Tensor, "*batch 3"]
+
 _LEAST_UPRIGHT = math.cos(math.radians(40))
 """How near an axis of the world must be to the picture's up to be that of the world."""
 
@@ -81,7 +86,7 @@ class Projection(NamedTuple):
     """
 
     uv: Float[Tensor, "*batch p 2"]
-    depth: Float[Tensor, "*batch p"]
+    depth: Values
     valid: Bool[Tensor, "*batch p"]
 
 
@@ -101,14 +106,14 @@ class ProjectionModel(NamedTuple):
     """
 
     uv: Float[Tensor, "*batch p 2"]
-    depth: Float[Tensor, "*batch p"]
+    depth: Values
     valid: Bool[Tensor, "*batch p"]
-    a: Float[Tensor, "*batch p"]
-    b: Float[Tensor, "*batch p"]
-    inverse_depth: Float[Tensor, "*batch p"]
-    lens_aa: Float[Tensor, "*batch p"]
-    lens_ab: Float[Tensor, "*batch p"]
-    lens_bb: Float[Tensor, "*batch p"]
+    a: Values
+    b: Values
+    inverse_depth: Values
+    lens_aa: Values
+    lens_ab: Values
+    lens_bb: Values
 
 
 class Upright(NamedTuple):
@@ -145,9 +150,9 @@ class Camera(nn.Module):
             one, or the image is empty.
     """
 
-    K: Float[Tensor, "3 3"]
+    K: Matrix
     distortion: Float[Tensor, " 5"]
-    R_camera_world: Float[Tensor, "3 3"]
+    R_camera_world: Matrix
     t_camera_world: Float[Tensor, " 3"]
     maximum_radius: Float[Tensor, ""]
 
@@ -261,7 +266,7 @@ class Camera(nn.Module):
         own_frame = bool((self.R_camera_world.diagonal() == 1).all())
         return Upright((direction[0], direction[1], direction[2]), _LEVEL if own_frame else 0.0)
 
-    def to_camera_frame(self, points_world: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    def to_camera_frame(self, points_world: Vectors) -> Vectors:
         """Return the points in the camera's frame, `R x + t`, metres."""
         check_shape("points_world", points_world, 3)
         translation = self.t_camera_world.to(points_world)
@@ -309,7 +314,7 @@ class Camera(nn.Module):
     def pull_back(
         self,
         model: ProjectionModel,
-        value: Float[Tensor, "*batch p"],
+        value: Values,
         gradient_uv: Float[Tensor, "*batch p 2"],
         hessian_uv: Float[Tensor, "*batch p 2 2"],
         *,
@@ -417,7 +422,7 @@ class Camera(nn.Module):
             rows.append(_turned(self.R_camera_world.mT, torch.stack(row).movedim(0, -1)))
         return torch.stack(rows, dim=-2)
 
-    def inside_image(self, uv: Float[Tensor, "*batch 2"]) -> Bool[Tensor, "*batch"]:
+    def inside_image(self, uv: Pixels) -> Bool[Tensor, "*batch"]:
         """Tell which image points lie on a pixel; a pixel reaches half its side each way."""
         check_shape("uv", uv, 2)
         width, height = self.image_size_wh
@@ -425,9 +430,7 @@ class Camera(nn.Module):
 
     # From the image to the world.
 
-    def undistort(
-        self, uv: Float[Tensor, "*batch 2"]
-    ) -> tuple[Float[Tensor, "*batch 2"], Bool[Tensor, "*batch"]]:
+    def undistort(self, uv: Pixels) -> tuple[Pixels, Bool[Tensor, "*batch"]]:
         """Find the normalised coordinates (a, b) whose image is `uv`.
 
         Newton's method, the step halved per point until the residual falls; where the distortion
@@ -481,7 +484,7 @@ class Camera(nn.Module):
         reached = error.sqrt() < 1.0e-5 * (1.0 + torch.linalg.vector_norm(target, dim=-1))
         return point, reached
 
-    def rays(self, uv: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
+    def rays(self, uv: Pixels) -> Vectors:
         """Return unit directions, in the world frame, from `centre_world` through image points.
 
         A pixel that the distortion does not reach (see `undistort`) gets the nearest direction.
@@ -497,9 +500,7 @@ class Camera(nn.Module):
         direction = direction / torch.linalg.vector_norm(direction, dim=-1, keepdim=True)
         return direction @ self.R_camera_world.to(uv)
 
-    def unproject(
-        self, uv: Float[Tensor, "*batch 2"], depth: Float[Tensor, "*batch"]
-    ) -> Float[Tensor, "*batch 3"]:
+    def unproject(self, uv: Pixels, depth: Float[Tensor, "*batch"]) -> Vectors:
         """Return the world points at image points and depths along the optical axis (metres).
 
         Args:
@@ -588,7 +589,7 @@ class Camera(nn.Module):
         return torch.stack([u, v]).movedim(0, -1)
 
 
-def _turned(rotation: Tensor, vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+def _turned(rotation: Tensor, vectors: Vectors) -> Vectors:
     """Turn vectors. In memory each component of the result is one block, fast to work on."""
     components = vectors.movedim(-1, 0)
     turned = rotation.to(vectors) @ components.reshape(3, vectors.shape[:-1].numel())
@@ -660,7 +661,7 @@ def _distortion_hessian(
     )
 
 
-def _congruence(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "6 9"]:
+def _congruence(rotation: Matrix) -> Float[Tensor, "6 9"]:
     """Return the matrix that maps (xx, xy, yy, xz, yz, zz) of S to the nine entries of R^T S R."""
     i, j = (0, 0, 1, 0, 1, 2), (0, 1, 1, 2, 2, 2)
     outer = rotation[i, :, None] * rotation[j, None, :]
@@ -668,7 +669,7 @@ def _congruence(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "6 9"]:
     return torch.where(once[:, None, None], outer, outer + outer.mT).flatten(1)
 
 
-def _within_radius(point: Float[Tensor, "*batch 2"], limit: Tensor) -> Float[Tensor, "*batch 2"]:
+def _within_radius(point: Pixels, limit: Tensor) -> Pixels:
     """Pull points that lie beyond a radius back onto it."""
     radius = torch.linalg.vector_norm(point, dim=-1, keepdim=True)
     outside = radius > limit
@@ -711,7 +712,7 @@ def _finite_tensor(name: str, what: str, value: object, *shape: int) -> Tensor:
     return tensor
 
 
-def _checked_intrinsics(name: str, value: object) -> Float[Tensor, "3 3"]:
+def _checked_intrinsics(name: str, value: object) -> Matrix:
     K = _finite_tensor(name, "K", value, 3, 3)
     if not (K[0, 0] > 0.0 and K[1, 1] > 0.0):
         raise CameraError(
@@ -726,7 +727,7 @@ def _checked_intrinsics(name: str, value: object) -> Float[Tensor, "3 3"]:
     return K
 
 
-def _nearest_rotation(name: str, matrix: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
+def _nearest_rotation(name: str, matrix: Matrix) -> Matrix:
     u, singular_values, vt = torch.linalg.svd(matrix)
     error = float((singular_values.square() - 1.0).abs().max())
     determinant = float(torch.linalg.det(matrix))

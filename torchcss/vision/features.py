@@ -36,9 +36,9 @@ from torchcss.vision.camera import Camera
 from torchcss.vision.edges import EdgeConfiguration, edge_features, foreground_weight
 from torchcss.vision.flow import FlowConfiguration, robust_flow
 
-Frame = (
-    UInt8[Tensor, "h w"] | UInt8[Tensor, "h w c"] | Float[Tensor, "h w"] | Float[Tensor, "h w c"]
-)
+Image = Float[Tensor, "h w"]
+
+Frame = UInt8[Tensor, "h w"] | UInt8[Tensor, "h w c"] | Image | Float[Tensor, "h w c"]
 """A picture: grey, RGB or RGBA, 8 or 16 bits or floating point in 0..1."""
 
 _WHITE = {torch.uint8: 255.0, torch.uint16: 65535.0}
@@ -101,13 +101,13 @@ class FrameFeatures(NamedTuple):
         window: Where the frame was looked at; None: everywhere.
     """
 
-    grey: Float[Tensor, "h w"]
-    edge_energy: Float[Tensor, "h w"]
+    grey: Image
+    edge_energy: Image
     edge_direction: Float[Tensor, "2 h w"]
     flow: Float[Tensor, "2 h w"] | None = None
-    flow_outlier: Float[Tensor, "h w"] | None = None
-    motion_boundary: Float[Tensor, "h w"] | None = None
-    mask: Float[Tensor, "h w"] | None = None
+    flow_outlier: Image | None = None
+    motion_boundary: Image | None = None
+    mask: Image | None = None
     colour: Float[Tensor, "3 h w"] | None = None
     window: Window | None = None
 
@@ -132,7 +132,7 @@ class FrameFeatures(NamedTuple):
             energy = energy * weight
         return energy * self.edge_direction
 
-    def edge_weight(self, *, boundary_emphasis: float = 0.3) -> Float[Tensor, "h w"]:
+    def edge_weight(self, *, boundary_emphasis: float = 0.3) -> Image:
         """The weights of `edge_field` alone, one where nothing weighs the edges.
 
         Args:
@@ -210,7 +210,7 @@ class FeatureExtractor(nn.Module):
         self,
         frame: Frame | np.ndarray,
         previous: Frame | np.ndarray | FrameFeatures | None = None,
-        mask: Bool[Tensor, "h w"] | Float[Tensor, "h w"] | np.ndarray | None = None,
+        mask: Bool[Tensor, "h w"] | Image | np.ndarray | None = None,
         *,
         window: Window | None = None,
     ) -> FrameFeatures:
@@ -256,7 +256,7 @@ class FeatureExtractor(nn.Module):
         )
 
     def _with_motion(
-        self, features: FrameFeatures, previous: Float[Tensor, "h w"], choice: FlowConfiguration
+        self, features: FrameFeatures, previous: Image, choice: FlowConfiguration
     ) -> FrameFeatures:
         """Add flow, outlier map and motion boundaries."""
         grey, window = features.grey, features.window
@@ -281,7 +281,7 @@ class FeatureExtractor(nn.Module):
             motion_boundary=torch.ones_like(grey),
         )
 
-    def _luma(self, planes: Float[Tensor, "c h w"]) -> Float[Tensor, "h w"]:
+    def _luma(self, planes: Float[Tensor, "c h w"]) -> Image:
         """Grey levels of a picture of one colour or three."""
         return planes[0] if len(planes) == 1 else (self.luma[:, None, None] * planes).sum(0)
 
@@ -357,7 +357,7 @@ class FeatureExtractor(nn.Module):
 
 
 def _within(
-    window: Window | None, like: Float[Tensor, "h w"], part: Float[Tensor, "*c y x"], other: float
+    window: Window | None, like: Image, part: Float[Tensor, "*c y x"], other: float
 ) -> Float[Tensor, "*c h w"]:
     """What was found in a window as an image of the whole frame, one number elsewhere."""
     part = part.to(like)
@@ -368,6 +368,6 @@ def _within(
     return whole
 
 
-def _is_flat(grey: Float[Tensor, "h w"]) -> bool:
+def _is_flat(grey: Image) -> bool:
     least, greatest = grey.aminmax()
     return float(greatest - least) <= _FLAT_RANGE

@@ -49,6 +49,17 @@ from torchcss.errors import ConfigurationError, FrameError, ShapeError
 from torchcss.kernels import compiler
 from torchcss.robust import Leclerc, Lorentzian, Quadratic
 
+Images = Float[Tensor, "b c h w"]
+"""Any images."""
+Field = Float[Tensor, "b 2 h w"]
+"""Two numbers for each pixel, along u and along v."""
+Plane = Float[Tensor, "b 1 h w"]
+"""One number for each pixel."""
+Right = Float[Tensor, "b 1 h x"]
+"""One number for each link to the right, and"""
+Down = Float[Tensor, "b 1 y w"]
+"""for each link downwards."""
+
 Potential = Quadratic | Lorentzian | Leclerc
 
 _STRUCTURE_SCALE = 1.0 / 16.0
@@ -178,9 +189,9 @@ class OpticalFlow(NamedTuple):
 class _Constancy(NamedTuple):
     """Constant brightness, linear in the flow: the residual is offset + gradient . flow."""
 
-    gradient: Float[Tensor, "b 2 h w"]
-    offset: Float[Tensor, "b 1 h w"]
-    visible: Float[Tensor, "b 1 h w"]
+    gradient: Field
+    offset: Plane
+    visible: Plane
 
 
 @torch.no_grad()
@@ -263,7 +274,7 @@ def _pyramid_sizes(
     return sizes[::-1]
 
 
-def _resize(images: Float[Tensor, "b c h w"], size: tuple[int, int]) -> Float[Tensor, "b c y x"]:
+def _resize(images: Images, size: tuple[int, int]) -> Float[Tensor, "b c y x"]:
     """Resample with the corners kept; blurs first where it shrinks."""
     if images.shape[-2:] == size:
         return images
@@ -278,7 +289,7 @@ def has_kernels(images: Tensor) -> bool:
     return compiler.COMPILED and single and not torch.compiler.is_compiling()
 
 
-def _structure(images: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+def _structure(images: Images) -> Images:
     """Smooth part of each image: least total variation near the image (Chambolle 2004)."""
     step = 0.249 / _STRUCTURE_SCALE
     if has_kernels(images):
@@ -310,11 +321,11 @@ def _structure(images: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
 
 
 def _refine(
-    flow: Float[Tensor, "b 2 h w"],
-    frames: Float[Tensor, "b 2 h w"],
-    guide: Float[Tensor, "b 1 h w"],
+    flow: Field,
+    frames: Field,
+    guide: Plane,
     configuration: FlowConfiguration,
-) -> Float[Tensor, "b 2 h w"]:
+) -> Field:
     """Minimise on one level."""
     first, second = (torch.cat([f, _gradient(f)], dim=1) for f in frames.split(1, dim=1))
     factors = configuration.sigma_factors
@@ -347,7 +358,7 @@ def _of_scale(potential: Potential, sigma: float) -> Potential:
     return dataclasses.replace(potential, nu=nu, sigma=sigma)
 
 
-def _gradient(image: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 2 h w"]:
+def _gradient(image: Plane) -> Field:
     """Derivatives along u and v, exact for polynomials of degree four."""
     u = functional.pad(image, (2, 2, 0, 0), mode="replicate")
     v = functional.pad(image, (0, 0, 2, 2), mode="replicate")
@@ -356,9 +367,7 @@ def _gradient(image: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 2 h w"]:
     return torch.cat([along_u, along_v], dim=1) / 12
 
 
-def _sample(
-    images: Float[Tensor, "b c h w"], flow: Float[Tensor, "b 2 h w"]
-) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"]]:
+def _sample(images: Images, flow: Field) -> tuple[Images, Plane]:
     """Sample at x + flow (bicubic); also 1 where that is inside the image, 0 elsewhere."""
     height, width = images.shape[-2:]
     u = flow[:, 0] + torch.arange(width, dtype=flow.dtype, device=flow.device)
@@ -372,7 +381,7 @@ def _sample(
 
 
 def _linearise(
-    flow: Float[Tensor, "b 2 h w"],
+    flow: Field,
     first: Float[Tensor, "b 3 h w"],
     second: Float[Tensor, "b 3 h w"],
 ) -> _Constancy:
@@ -401,13 +410,13 @@ def _linearise(
     return _Constancy(gradient, offset, visible)
 
 
-def _residual(constancy: _Constancy, flow: Float[Tensor, "b 2 h w"]) -> Float[Tensor, "b 1 h w"]:
+def _residual(constancy: _Constancy, flow: Field) -> Plane:
     return constancy.offset + (constancy.gradient * flow).sum(dim=1, keepdim=True)
 
 
 def _squared_differences(
-    flow: Float[Tensor, "b 2 h w"],
-) -> tuple[Float[Tensor, "b 1 h x"], Float[Tensor, "b 1 y w"]]:
+    flow: Field,
+) -> tuple[Right, Down]:
     """Squared lengths of the differences to the neighbour on the right and to the one below."""
     right, down = flow.diff(dim=-1), flow.diff(dim=-2)
     return right.square().sum(dim=1, keepdim=True), down.square().sum(dim=1, keepdim=True)
@@ -421,17 +430,13 @@ def _relative_weight(
     return weight.clamp(0.0, 1.0)
 
 
-def _data_held(
-    flow: Float[Tensor, "b 2 h w"], frames: Float[Tensor, "b 2 h w"], potential: Potential
-) -> Float[Tensor, "b 1 h w"]:
+def _data_held(flow: Field, frames: Field, potential: Potential) -> Plane:
     """How far constant brightness holds under the flow: 0 where the pixel leaves the view."""
     warped, visible = _sample(frames[:, 1:], flow)
     return _relative_weight(potential, (warped - frames[:, :1]).square()) * visible
 
 
-def _largest_of_neighbours(
-    right: Float[Tensor, "b 1 h x"], down: Float[Tensor, "b 1 y w"]
-) -> Float[Tensor, "b 1 h w"]:
+def _largest_of_neighbours(right: Right, down: Down) -> Plane:
     """Largest of the values on the four links of each pixel; 0 where it has none."""
     horizontal = functional.pad(right, (1, 1))
     vertical = functional.pad(down, (0, 0, 1, 1))
@@ -440,13 +445,13 @@ def _largest_of_neighbours(
 
 
 def _solve(
-    flow: Float[Tensor, "b 2 h w"],
+    flow: Field,
     constancy: _Constancy,
-    weight: Float[Tensor, "b 1 h w"],
-    right: Float[Tensor, "b 1 h x"],
-    down: Float[Tensor, "b 1 y w"],
+    weight: Plane,
+    right: Right,
+    down: Down,
     num_iterations: int,
-) -> Float[Tensor, "b 2 h w"]:
+) -> Field:
     """Improve the flow on the quadratic energy that fixed weights leave.
 
     The normal equations are (q q^T + L) f = -q sqrt(weight) offset with q = sqrt(weight) gradient
@@ -494,13 +499,13 @@ class _NormalEquations(NamedTuple):
         inverse_uv: The same.
     """
 
-    q: Float[Tensor, "b 2 h w"]
-    degree: Float[Tensor, "b 1 h w"]
-    right: Float[Tensor, "b 1 h x"]
-    down: Float[Tensor, "b 1 y w"]
-    inverse_uu: Float[Tensor, "b 1 h w"]
-    inverse_vv: Float[Tensor, "b 1 h w"]
-    inverse_uv: Float[Tensor, "b 1 h w"]
+    q: Field
+    degree: Plane
+    right: Right
+    down: Down
+    inverse_uu: Plane
+    inverse_vv: Plane
+    inverse_uv: Plane
 
     @staticmethod
     def of(q: Tensor, degree: Tensor, right: Tensor, down: Tensor) -> _NormalEquations:
@@ -509,7 +514,7 @@ class _NormalEquations(NamedTuple):
         blocks = (degree + q_v.square()) * inverse, (degree + q_u.square()) * inverse
         return _NormalEquations(q, degree, right, down, *blocks, -q_u * q_v * inverse)
 
-    def apply(self, x: Float[Tensor, "b 2 h w"]) -> Float[Tensor, "b 2 h w"]:
+    def apply(self, x: Field) -> Field:
         """The matrix times a field."""
         q, right, down = self.q, self.right, self.down
         along = (q[:, :1] * x[:, :1]).addcmul_(q[:, 1:], x[:, 1:])
@@ -520,7 +525,7 @@ class _NormalEquations(NamedTuple):
         product[..., :-1, :].addcmul_(down, x[..., 1:, :], value=-1.0)
         return product
 
-    def precondition(self, x: Float[Tensor, "b 2 h w"]) -> Float[Tensor, "b 2 h w"]:
+    def precondition(self, x: Field) -> Field:
         """The blocks' inverses times a field."""
         product, (u, v), mixed = torch.empty_like(x), x.split(1, dim=1), self.inverse_uv
         torch.mul(self.inverse_uu, u, out=product[:, :1]).addcmul_(mixed, v)
@@ -538,9 +543,7 @@ def _ratio(numerator: Tensor, denominator: Tensor) -> Tensor:
     return torch.where(positive, numerator / denominator.where(positive, 1.0), 0.0)
 
 
-def _degree(
-    like: Float[Tensor, "b 1 h w"], right: Float[Tensor, "b 1 h x"], down: Float[Tensor, "b 1 y w"]
-) -> Float[Tensor, "b 1 h w"]:
+def _degree(like: Plane, right: Right, down: Down) -> Plane:
     """Sum of the weights on the four links of each pixel."""
     degree = torch.zeros_like(like)
     degree[..., :-1] += right
@@ -550,7 +553,7 @@ def _degree(
     return degree
 
 
-def _median(images: Float[Tensor, "b c h w"], radius: int) -> Float[Tensor, "b c h w"]:
+def _median(images: Images, radius: int) -> Images:
     """Median over a square window, the border replicated.
 
     Strip by strip: what is worked on at a time stays in the cache (twice as fast, measured).
@@ -573,7 +576,7 @@ def _median(images: Float[Tensor, "b c h w"], radius: int) -> Float[Tensor, "b c
     return torch.cat(strips, dim=-2)
 
 
-def _inner_median(padded: Float[Tensor, "b c y x"], radius: int) -> Float[Tensor, "b c h w"]:
+def _inner_median(padded: Float[Tensor, "b c y x"], radius: int) -> Images:
     """Median over the windows that lie inside.
 
     Keeps just so many planes that the least and the greatest of them cannot be the median, drops
@@ -612,12 +615,12 @@ def _inner_median(padded: Float[Tensor, "b c y x"], radius: int) -> Float[Tensor
 
 
 def _with_weighted_median_along_jumps(
-    filtered: Float[Tensor, "b 2 h w"],
-    flow: Float[Tensor, "b 2 h w"],
-    held: Float[Tensor, "b 1 h w"],
-    guide: Float[Tensor, "b 1 h w"],
+    filtered: Field,
+    flow: Field,
+    held: Plane,
+    guide: Plane,
     radius: int,
-) -> Float[Tensor, "b 2 h w"]:
+) -> Field:
     """Return the filtered flow with, near jumps, the weighted median of the flow in its place."""
     filtered = filtered.clone()
     height, width = flow.shape[-2:]

@@ -14,6 +14,11 @@ from torch.nn import functional
 from torchcss.errors import ShapeError, check_shape
 from torchcss.kernels import compiler
 
+Faces = Int[Tensor, "f 3"]
+"""Corner indices of triangles."""
+Places = Float[Tensor, "v 2"]
+"""Projected vertices, pixels."""
+
 _NEAREST_DEPTH = 1e-6
 """Metres; a vertex at or behind this depth is behind the camera."""
 
@@ -50,9 +55,9 @@ def _expand(counts: Int[Tensor, " a"]) -> tuple[Int[Tensor, " b"], Int[Tensor, "
 
 
 def rasterise(
-    uv: Float[Tensor, "v 2"],
+    uv: Places,
     depth: Float[Tensor, " v"],
-    faces: Int[Tensor, "f 3"],
+    faces: Faces,
     height: int,
     width: int,
     *,
@@ -130,7 +135,7 @@ def _barycentric(
 def nearest_faces(
     uv: Float[Tensor, "b v 2"],
     depth: Float[Tensor, "b v"],
-    faces: Int[Tensor, "f 3"],
+    faces: Faces,
     height: int,
     width: int,
     *,
@@ -165,9 +170,9 @@ def nearest_faces(
 
 
 def _drawn(
-    place: Float[Tensor, "v 2"],
+    place: Places,
     distance: Float[Tensor, " v"],
-    faces: Int[Tensor, "f 3"],
+    faces: Faces,
     valid: Bool[Tensor, " v"] | None,
 ) -> tuple[Int[Tensor, " d"], Float[Tensor, " f"]]:
     """Which triangles can be drawn, and the doubled areas of all."""
@@ -182,7 +187,7 @@ def _drawn(
     return torch.nonzero(usable[faces].all(-1) & (area.abs() > _LEAST_AREA))[:, 0], area
 
 
-def _twice_area(place: Float[Tensor, "v 2"], faces: Int[Tensor, "f 3"]) -> Float[Tensor, " f"]:
+def _twice_area(place: Places, faces: Faces) -> Float[Tensor, " f"]:
     """Signed area of the projected triangles, doubled."""
     first, second, third = place[faces].unbind(1)
     a, b = second - first, third - first
@@ -190,9 +195,9 @@ def _twice_area(place: Float[Tensor, "v 2"], faces: Int[Tensor, "f 3"]) -> Float
 
 
 def _nearest_faces(
-    place: Float[Tensor, "v 2"],
+    place: Places,
     distance: Float[Tensor, " v"],
-    faces: Int[Tensor, "f 3"],
+    faces: Faces,
     drawn: Int[Tensor, " d"],
     height: int,
     width: int,
@@ -216,9 +221,9 @@ def _nearest_faces(
 
 
 def _by_spans(
-    place: Float[Tensor, "v 2"],
+    place: Places,
     distance: Float[Tensor, " v"],
-    faces: Int[Tensor, "f 3"],
+    faces: Faces,
     drawn: Int[Tensor, " d"],
     height: int,
     width: int,
@@ -306,7 +311,7 @@ def _chunks(length: Int[Tensor, " r"]) -> list[slice]:
     return [slice(a, b) for a, b in pairwise(cuts)]
 
 
-def grid_faces(rings: int, meridians: int) -> Int[Tensor, "f 3"]:
+def grid_faces(rings: int, meridians: int) -> Faces:
     """Triangles of a mesh of rings closed around the part, poles capped by fans.
 
     Args:
@@ -326,7 +331,7 @@ def grid_faces(rings: int, meridians: int) -> Int[Tensor, "f 3"]:
 
 
 def join_faces(
-    faces: Sequence[Int[Tensor, "f 3"]], num_vertices: Sequence[int]
+    faces: Sequence[Faces], num_vertices: Sequence[int]
 ) -> tuple[Int[Tensor, "F 3"], Int[Tensor, " F"]]:
     """Join meshes into one whose vertices are concatenated.
 
@@ -347,7 +352,7 @@ def join_faces(
 
 def interpolate(
     attribute: Float[Tensor, "v c"],
-    faces: Int[Tensor, "f 3"],
+    faces: Faces,
     face: Int[Tensor, " i"],
     barycentric: Float[Tensor, "i 3"],
 ) -> Float[Tensor, "i c"]:
@@ -365,9 +370,7 @@ def interpolate(
     return a * first + b * second + c * third
 
 
-def vertex_normals(
-    vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]
-) -> Float[Tensor, "v 3"]:
+def vertex_normals(vertices: Float[Tensor, "v 3"], faces: Faces) -> Float[Tensor, "v 3"]:
     """Smooth unit normals: the area-weighted mean over the triangles round a vertex.
 
     They point where the corners of a triangle run anticlockwise. A vertex of no triangle, or of
