@@ -7,12 +7,13 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
-from peers.reprojection_kernel import Reprojection, Scratch, evaluate
+from peers.reprojection_kernel import Reprojection, Scratch, add_reprojection
 from torch import Tensor
 
 from torchcss.cost.fused.pack import array, carried_markers, pack_potential, pack_tree
 from torchcss.cost.fused.records import Array, Points, Result, Tree
 from torchcss.errors import ConfigurationError, check_shape
+from torchcss.kernels.checked import run
 from torchcss.studies.reprojection import ReprojectionCost
 from torchcss.types import LocalModel
 
@@ -81,7 +82,7 @@ class CompiledReprojection(NamedTuple):
         shares = np.ones(number) if share is None else array(share.reshape(number))
         result = Result(np.zeros(number), np.zeros((number, size)), np.zeros((number, size, size)))
         states = array(x.reshape(number, -1))
-        evaluate(states, shares, self.tree, self.seen, self._scratch(), result)
+        run(add_reprojection, states, shares, self.tree, self.seen, self._scratch(), result)
         value, gradient, hessian = map(torch.from_numpy, result)
         return LocalModel(
             value.reshape(batch),

@@ -13,7 +13,6 @@ from torchcss.cost.fused.lift import lift, sum_points
 from torchcss.cost.fused.potentials import potential_of
 from torchcss.cost.fused.projection import Spatial, write_point
 from torchcss.cost.fused.records import Array, Points, Result, Tree
-from torchcss.kernels.checked import run
 from torchcss.kernels.compiler import entry, kernel
 
 Reprojection = namedtuple(
@@ -118,10 +117,3 @@ def _priors(x: Array, seen: Reprojection, share: float, gradient: Array, hessian
             bend = first - share * 2.0 * first * z * z / (z * z + nu)
             hessian[i, i] += bend * sharpness * sharpness
     return total
-
-
-def evaluate(
-    x: Array, share: Array, tree: Tree, seen: Reprojection, scratch: Scratch, result: Result
-) -> None:
-    """`add_reprojection`, compiled or checked."""
-    run(add_reprojection, x, share, tree, seen, scratch, result)

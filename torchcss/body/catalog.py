@@ -342,7 +342,7 @@ def scaled(body: BodySpecification, scale: float) -> BodySpecification:
         return body
 
     def times(vector: Vector) -> Vector:
-        return (vector[0] * scale, vector[1] * scale, vector[2] * scale)
+        return as_vector(scale * np.array(vector))
 
     unit = {joint.name: scale if joint.kind == "prismatic" else 1.0 for joint in body.joints}
 

@@ -122,9 +122,7 @@ def point_moments(
 
 
 def reactions(
-    sums: Sequence[Tensor],
-    twist: Sequence[Tensor],
-    second_order_kinematics: bool | Tensor = True,
+    sums: Sequence[Tensor], twist: Sequence[Tensor], second_order_kinematics: bool | Tensor = True
 ) -> tuple[Tensor, list[Tensor]]:
     """How the points below joints react to their twists.
 

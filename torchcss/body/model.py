@@ -298,10 +298,24 @@ class BodyModel(nn.Module):
             Points and normals of shape `[*batch p 3]`, part by part, ring by ring.
         """
         mesh = self.mesh()
+        return self.in_world(pose, mesh.points.flatten(1, 2), mesh.normals.flatten(1, 2))
+
+    def in_world(
+        self,
+        pose: BodyPose,
+        points: Float[Tensor, "parts c 3"],
+        normals: Float[Tensor, "parts c 3"],
+    ) -> SurfaceSample:
+        """World positions and unit outward normals of nodes that are given in their parts' frames.
+
+        Args:
+            pose: A posed body.
+            points: The nodes, metres, `[parts c 3]`.
+            normals: Their unit outward normals.
+        """
         rotation, centre = self.part_poses(pose)
         turn = rotation.transpose(-1, -2)
-        points = mesh.points.flatten(1, 2) @ turn + centre[..., None, :]
-        normals = mesh.normals.flatten(1, 2) @ turn
+        points, normals = points @ turn + centre[..., None, :], normals @ turn
         return SurfaceSample(points.flatten(-3, -2), normals.flatten(-3, -2))
 
     def lift(

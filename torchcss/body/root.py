@@ -79,8 +79,7 @@ def move_base(
         # The derivative in a step that all items share is that of every item in its own. (The
         # forward-mode transforms of torch.func import the compiler: seconds, for a 6 x 6 matrix.)
         jacobian = torch.autograd.functional.jacobian(
-            lambda step: mapped(root + step),
-            root.new_zeros(6),
+            lambda step: mapped(root + step), root.new_zeros(6)
         )
         full = torch.eye(size, dtype=x.dtype, device=x.device).repeat(*x.shape[:-1], 1, 1)
         rows = torch.tensor(index, device=x.device)

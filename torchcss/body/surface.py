@@ -53,9 +53,7 @@ def _signed_power(base: Tensor, exponent: Tensor) -> Tensor:
 
 
 def surface_points(
-    shape: Float[Tensor, "*batch 9"],
-    eta: Float[Tensor, "*batch"],
-    omega: Float[Tensor, "*batch"],
+    shape: Float[Tensor, "*batch 9"], eta: Float[Tensor, "*batch"], omega: Float[Tensor, "*batch"]
 ) -> SurfaceSample:
     """Evaluate the surface and its normals; the map D of eq. 1 [IJRR].
 
@@ -93,8 +91,7 @@ def surface_points(
     axis = torch.zeros_like(normals)
     axis[..., 2] = 1.0
     return SurfaceSample(
-        points,
-        torch.where(length > 0, normals / torch.where(length > 0, length, 1), axis),
+        points, torch.where(length > 0, normals / torch.where(length > 0, length, 1), axis)
     )
 
 

@@ -10,9 +10,10 @@ Call `joint_covariance`; `joint_jacobian` gives J alone.
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchcss.body.kinematics import TreePose
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.errors import check_shape
 
@@ -24,10 +25,23 @@ def joint_jacobian(body: BodyModel, pose: BodyPose) -> Float[Tensor, "*batch j 3
         body: The body.
         pose: What `body.pose` gave.
     """
-    tree = pose.tree
-    swept = torch.linalg.cross(tree.omega[..., None, :, :], pose.joints[..., :, None, :])
+    return point_jacobian(body, pose.tree, pose.joints, body.marker_link)
+
+
+def point_jacobian(
+    body: BodyModel, tree: TreePose, points: Float[Tensor, "*batch p 3"], link: Int[Tensor, " p"]
+) -> Float[Tensor, "*batch p 3 n"]:
+    """The same of any points.
+
+    Args:
+        body: The body.
+        tree: Its twists.
+        points: Points that links carry, metres.
+        link: The link of each.
+    """
+    swept = torch.linalg.cross(tree.omega[..., None, :, :], points[..., :, None, :])
     moved = swept + tree.velocity[..., None, :, :]
-    carries = body.tree.ancestors[:, body.marker_link].T
+    carries = body.tree.ancestors[:, link].T
     return torch.where(carries[..., None], moved, 0.0).mT @ body.tie
 
 

@@ -35,7 +35,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -44,7 +43,7 @@ from torch import Tensor
 from torchcss.body.catalog import PROPORTIONS
 from torchcss.body.model import BodyModel
 from torchcss.cost.context import FrameContext
-from torchcss.cost.term import Kind, OnStates, Term
+from torchcss.cost.term import OnStates, Term
 from torchcss.errors import ConfigurationError
 from torchcss.types import LocalModel
 
@@ -79,8 +78,8 @@ class Anthropometric(Term):
         individual: Factor on the relative deviations of the single lengths, `INDIVIDUAL`.
     """
 
-    name: ClassVar[str] = "anthropometric"
-    kind: ClassVar[Kind] = "prior"
+    name = "anthropometric"
+    kind = "prior"
 
     stature: float = 0.039
     individual: float = 1.0

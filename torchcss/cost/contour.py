@@ -35,7 +35,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -107,7 +107,7 @@ class ContourTerm(OutlineTerm):
         least_edge: As printed: least response of an edge. Ours.
     """
 
-    name: ClassVar[str] = "contour"
+    name = "contour"
 
     weight: float = 150.0
     sigma: float = 2.5

@@ -27,7 +27,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -85,7 +84,7 @@ class EdgeEnergyTerm(OutlineTerm):
         potential_kind: The potential rho.
     """
 
-    name: ClassVar[str] = "edge_energy"
+    name = "edge_energy"
 
     weight: float = 150.0
     sigma: float = 0.5

@@ -31,7 +31,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -39,7 +39,7 @@ from torch import Tensor
 
 from torchcss.cost.context import FrameContext
 from torchcss.cost.interior import InteriorNodes, count_nodes, seen_interior
-from torchcss.cost.term import Kind, Need, OnPoints, Posed, Term
+from torchcss.cost.term import Need, OnPoints, Posed, Term
 from torchcss.cost.visibility import SeenNodes
 from torchcss.errors import ShapeError, check_shape
 from torchcss.robust import Lorentzian, RobustPotential, residual_cost
@@ -123,9 +123,9 @@ class FlowTerm(Term):
         printed: Whether the term is eq. 9 alone; see the module.
     """
 
-    name: ClassVar[str] = "flow"
-    kind: ClassVar[Kind] = "image"
-    watched: ClassVar[bool] = True
+    name = "flow"
+    kind = "image"
+    watched = True
 
     weight: float = 20.0
     sigma: float = 0.5
@@ -192,12 +192,7 @@ class FlowTerm(Term):
         return self._composed(0.5 * self.potential(squared).rho, nodes, near, camera, targets)
 
     def point_cost(
-        self,
-        nodes: SeenNodes,
-        camera: Camera,
-        targets: FlowTargets,
-        *,
-        gauss_newton: bool = False,
+        self, nodes: SeenNodes, camera: Camera, targets: FlowTargets, *, gauss_newton: bool = False
     ) -> PointCost:
         """The same with first and second derivatives in the nodes' positions.
 

@@ -73,11 +73,7 @@ class InteriorNodes(nn.Module):
             body: The body that the nodes were chosen on (its base may have moved).
             pose: Any number of posed bodies.
         """
-        rotation, centre = body.part_poses(pose)
-        turn = rotation.transpose(-1, -2)
-        points = self.points_part @ turn + centre[..., None, :]
-        normals = self.normals_part @ turn
-        return SurfaceSample(points.flatten(-3, -2), normals.flatten(-3, -2))
+        return body.in_world(pose, self.points_part, self.normals_part)
 
 
 def count_nodes(context: FrameContext) -> int:

@@ -43,7 +43,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -54,7 +54,7 @@ from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.superquadric import EXPONENTS, Superquadrics, radial_hessian
 from torchcss.body.surface import surface_points
 from torchcss.cost.context import FrameContext
-from torchcss.cost.term import Kind, OnStates, Term
+from torchcss.cost.term import OnStates, Term
 from torchcss.errors import ConfigurationError
 from torchcss.types import Curvature, LocalModel, PointCost
 
@@ -308,8 +308,8 @@ class Interpenetration(Term):
             `1/(2 sharpness)` of a part's radius outside its surface.
     """
 
-    name: ClassVar[str] = "interpenetration"
-    kind: ClassVar[Kind] = "prior"
+    name = "interpenetration"
+    kind = "prior"
 
     weight: float = 5.0
     p: float = 1.0

@@ -12,14 +12,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchcss.cost.context import FrameContext
-from torchcss.cost.term import Kind, OnPoints, Posed, Term
+from torchcss.cost.term import OnPoints, Posed, Term
 from torchcss.robust import Lorentzian, RobustPotential, residual_cost
 from torchcss.types import Keypoints, PointCost
 from torchcss.vision.camera import Camera
@@ -113,9 +113,9 @@ class JointTerm(Term):
         potential_kind: The potential rho.
     """
 
-    name: ClassVar[str] = "joints"
-    kind: ClassVar[Kind] = "image"
-    watched: ClassVar[bool] = True
+    name = "joints"
+    kind = "image"
+    watched = True
 
     weight: float = 1.0
     sigma: float = 3.0

@@ -13,13 +13,13 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchcss.cost.context import FrameContext
-from torchcss.cost.term import Kind, OnPoints, Term
+from torchcss.cost.term import OnPoints, Term
 from torchcss.cost.visibility import ContourPredictor, SeenNodes, contour_nodes, places
 from torchcss.types import PointCost
 from torchcss.vision.camera import Camera, ProjectionModel
@@ -55,9 +55,9 @@ class OutlineTerm(Term):
             "occlusion levels").
     """
 
-    kind: ClassVar[Kind] = "image"
-    watched: ClassVar[bool] = True
-    screens: ClassVar[bool] = True
+    kind = "image"
+    watched = True
+    screens = True
 
     weight: float
     nu: float = 1.0

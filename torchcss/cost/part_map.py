@@ -90,10 +90,7 @@ def grow(masks: Bool[Tensor, "layers h w"], radius: int) -> Bool[Tensor, "layers
 
 
 def bare_pixels(
-    body: BodyModel,
-    modes: Float[Tensor, "k n"],
-    log_weight: Float[Tensor, " k"],
-    camera: Camera,
+    body: BodyModel, modes: Float[Tensor, "k n"], log_weight: Float[Tensor, " k"], camera: Camera
 ) -> Bool[Tensor, "h w"]:
     """Pixels that no likely pose covers, nor comes near.
 

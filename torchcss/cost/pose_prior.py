@@ -31,7 +31,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -40,7 +40,7 @@ from torch import Tensor
 
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.cost.context import FrameContext
-from torchcss.cost.term import Kind, OnStates, Term
+from torchcss.cost.term import OnStates, Term
 from torchcss.types import LocalModel
 from torchcss.vision.camera import Upright
 
@@ -262,12 +262,7 @@ class PoseMixture(NamedTuple):
         return both._replace(weight=0.5 * both.weight)
 
     def density(
-        self,
-        group: str,
-        known: tuple[int, ...],
-        *,
-        tilt: float = 0.0,
-        share: float = UNIFORM_SHARE,
+        self, group: str, known: tuple[int, ...], *, tilt: float = 0.0, share: float = UNIFORM_SHARE
     ) -> Density:
         """The density of some of the directions of a group.
 
@@ -439,8 +434,8 @@ def density_where(up: Upright | None) -> Callable[[BodyModel], BodyDensity | Non
 class PosePrior(Term):
     """The prior on poses that is learnt from motion capture; see the module."""
 
-    name: ClassVar[str] = "pose_prior"
-    kind: ClassVar[Kind] = "prior"
+    name = "pose_prior"
+    kind = "prior"
 
     def prepare(self, context: FrameContext) -> OnStates | None:
         """Bind the prior to a body; None if it lacks the limbs of a person."""

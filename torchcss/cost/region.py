@@ -25,7 +25,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from types import EllipsisType
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -194,7 +194,7 @@ class RegionTerm(OutlineTerm):
         fitted_level: The mean error per node of a fitted model, 0.23 to 0.32 on the beam clip.
     """
 
-    name: ClassVar[str] = "region"
+    name = "region"
 
     weight: float = 400.0
     background: bool = False

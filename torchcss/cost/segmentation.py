@@ -22,7 +22,7 @@ What to call: `SegmentationTerm.images` once a frame, then `value` at any number
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -32,7 +32,7 @@ from torchcss.body.model import BodyModel
 from torchcss.cost.context import FrameContext
 from torchcss.cost.part_map import part_map
 from torchcss.cost.region import layer_of_part
-from torchcss.cost.term import BoundWeight, Kind, Need, Term
+from torchcss.cost.term import BoundWeight, Need, Term
 from torchcss.vision.camera import Camera
 
 _FEWEST_PIXELS = 20
@@ -68,8 +68,8 @@ class SegmentationTerm(Term):
         meridians: Longitudes of the mesh of each part.
     """
 
-    name: ClassVar[str] = "segmentation"
-    kind: ClassVar[Kind] = "weight-only"
+    name = "segmentation"
+    kind = "weight-only"
 
     weight: float = 400.0
     background: bool = False

@@ -21,12 +21,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchcss.body.shape import (
-    ShapeParameters,
-    lift_with_shape,
-    surface_angles,
-    with_shape,
-)
+from torchcss.body.shape import ShapeParameters, lift_with_shape, surface_angles, with_shape
 from torchcss.cost.outline import OutlineTerm
 from torchcss.cost.total import TrackingCost
 from torchcss.cost.visibility import ContourPredictor

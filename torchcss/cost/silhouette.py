@@ -29,7 +29,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -39,7 +39,7 @@ from torch.nn import functional
 from torchcss.cost.context import FrameContext
 from torchcss.cost.interior import InteriorNodes, interior_nodes
 from torchcss.cost.part_map import grow, part_map
-from torchcss.cost.term import Kind, Need, OnPoints, Term
+from torchcss.cost.term import Need, OnPoints, Term
 from torchcss.types import PointCost
 from torchcss.vision.camera import Camera
 from torchcss.vision.spline import SplineField, spline_field
@@ -88,8 +88,8 @@ class SilhouetteTerm(Term):
         nu: Level of the cost (its unit only).
     """
 
-    name: ClassVar[str] = "silhouette"
-    kind: ClassVar[Kind] = "image"
+    name = "silhouette"
+    kind = "image"
 
     weight: float = 800.0
     sigma: float = 0.11

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -19,7 +18,7 @@ from torch import Tensor
 from torchcss.body.model import BodyModel
 from torchcss.cost.anthropometric import proportion_columns
 from torchcss.cost.context import FrameContext
-from torchcss.cost.term import Kind, OnStates, Term
+from torchcss.cost.term import OnStates, Term
 from torchcss.robust import Lorentzian
 from torchcss.types import LocalModel
 
@@ -64,8 +63,8 @@ class Stabiliser(Term):
             wants: none of the swings and flexions of limbs, which move what the image shows.
     """
 
-    name: ClassVar[str] = "stabiliser"
-    kind: ClassVar[Kind] = "prior"
+    name = "stabiliser"
+    kind = "prior"
 
     nu: float = 9.0
     lengths: bool = False

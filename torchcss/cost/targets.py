@@ -22,6 +22,7 @@ from torch import Tensor
 from torchcss.body.kinematics import TreePose
 from torchcss.body.lift import lift_to_joints
 from torchcss.body.model import BodyModel
+from torchcss.body.uncertainty import point_jacobian
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.errors import ShapeError, check_shape
@@ -91,11 +92,9 @@ class PointTargets:
     ) -> tuple[Float[Tensor, "b p 3"], Float[Tensor, "b p 3 m"]]:
         """By how much the points miss their targets, metres, and the derivatives of that in x."""
         tree, points = self._pose(x)
-        place = points.movedim(-1, 0)[:, :, None]
-        turned = torch.linalg.cross(tree.omega[:, None].expand(-1, len(self.link), -1, -1), place)
-        carries = self.body.tree.ancestors[:, self.link].T[..., None]
-        moved = torch.where(carries, turned + tree.velocity[:, None], 0.0)
-        return place[:, :, 0] - self.target, moved.mT @ self.body.tie[:, self.columns]
+        place = points.movedim(-1, 0)
+        moved = point_jacobian(self.body, tree, place, self.link)
+        return place - self.target, moved[..., self.columns]
 
     def _pose(self, x: States) -> tuple[TreePose, Float[Tensor, "p 3 b"]]:
         """The tree and the points, the batch flattened; of the links only the base is there."""

@@ -11,7 +11,7 @@ not impossible.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -19,7 +19,7 @@ from torch import Tensor
 
 from torchcss.cost.context import FrameContext
 from torchcss.cost.stabiliser import long_tailed
-from torchcss.cost.term import Kind, OnStates, Term
+from torchcss.cost.term import OnStates, Term
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.types import LocalModel
 
@@ -34,8 +34,8 @@ class TemporalPrior(Term):
         nu: Height of the tails, nats.
     """
 
-    name: ClassVar[str] = "temporal"
-    kind: ClassVar[Kind] = "prior"
+    name = "temporal"
+    kind = "prior"
 
     nu: float = 4.0
 
@@ -93,8 +93,8 @@ class MixturePrior(Term):
             expected is at n / 2 on average; twice that is new.
     """
 
-    name: ClassVar[str] = "temporal_mixture"
-    kind: ClassVar[Kind] = "prior"
+    name = "temporal_mixture"
+    kind = "prior"
 
     nu: float | None = None
 

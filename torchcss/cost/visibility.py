@@ -230,11 +230,7 @@ def contour_nodes(posed: Posed) -> SeenNodes:
     return predictor(posed.body, posed.pose, posed.camera.centre_world)
 
 
-def front_facing(
-    points: Vectors,
-    normals: Vectors,
-    centre_world: Place,
-) -> Values:
+def front_facing(points: Vectors, normals: Vectors, centre_world: Place) -> Values:
     """Whether surface nodes face the camera: 0 where they face away, 1 where clearly towards it.
 
     The ramp between starts where the line of sight grazes the surface.
@@ -279,11 +275,7 @@ def visible_nodes(
     return line_of_sight(body.part_shape, rotation, eye, rays, other, wanted=wanted)
 
 
-def facing_nodes(
-    points: Vectors,
-    normals: Vectors,
-    centre_world: Place,
-) -> SeenNodes:
+def facing_nodes(points: Vectors, normals: Vectors, centre_world: Place) -> SeenNodes:
     """Surface nodes with which of them face the camera, as if nothing were in front of them.
 
     Args:

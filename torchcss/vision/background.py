@@ -110,10 +110,7 @@ class Background(NamedTuple):
         return (self.squares + prior) / (self.frames + _PRIOR_FRAMES)
 
     def learn(
-        self,
-        colour: Colours,
-        bare: Bool[Tensor, "h w"],
-        flow: Float[Tensor, "2 h w"] | None = None,
+        self, colour: Colours, bare: Bool[Tensor, "h w"], flow: Float[Tensor, "2 h w"] | None = None
     ) -> Background:
         """Take in a frame.
 

@@ -283,8 +283,7 @@ class Camera(nn.Module):
         """
         a, b, _, depth, valid = self._normalise(points_world)
         if self.has_distortion:
-            distortion = self.distortion.to(a)
-            a, b = _distort(a, b, _radial_factors(a, b, distortion), distortion)
+            a, b = _Lens.at(a, b, self.distortion).distorted()
         return Projection(self._to_pixels(a, b, valid), depth, valid)
 
     def project_with_derivatives(
@@ -300,10 +299,8 @@ class Camera(nn.Module):
         """
         a, b, inverse_depth, depth, valid = self._normalise(points_world)
         if self.has_distortion:
-            distortion = self.distortion.to(a)
-            factors = _radial_factors(a, b, distortion)
-            distorted = _distort(a, b, factors, distortion)
-            lens = _distortion_jacobian(a, b, factors, distortion)
+            at = _Lens.at(a, b, self.distortion)
+            distorted, lens = at.distorted(), at.jacobian()
         else:
             one, zero = a.new_ones(()).expand_as(a), a.new_zeros(()).expand_as(a)
             distorted, lens = (a, b), (one, zero, one)
@@ -346,9 +343,7 @@ class Camera(nn.Module):
             lens, hessian = (model.lens_aa, model.lens_ab, model.lens_bb), (h_aa, h_ab, h_bb)
             f_a, f_b, f_aa, f_ab, f_bb = _through_lens(e_a, e_b, hessian, lens)
             if not gauss_newton:
-                distortion = self.distortion.to(a)
-                factors = _radial_factors(a, b, distortion)
-                aaa, aab, abb, bbb = _distortion_hessian(a, b, factors, distortion)
+                aaa, aab, abb, bbb = _Lens.at(a, b, self.distortion).hessian()
                 f_aa = f_aa + e_a * aaa + e_b * aab
                 f_ab = f_ab + e_a * aab + e_b * abb
                 f_bb = f_bb + e_a * abb + e_b * bbb
@@ -447,15 +442,15 @@ class Camera(nn.Module):
             ShapeError: If the last dimension is not 2.
         """
         check_shape("uv", uv, 2)
-        K, distortion = self.K.to(uv), self.distortion.to(uv)
+        K = self.K.to(uv)
         focal = torch.diagonal(K)[:2]
         target = (uv - K[:2, 2]) / focal
         limit = self.maximum_radius.to(uv).clamp(max=GRAZING_RADIUS)
 
         def residual_of(point: Tensor) -> tuple[Tensor, Tensor]:
             a, b = point.unbind(-1)
-            distorted = _distort(a, b, _radial_factors(a, b, distortion), distortion)
-            residual = torch.stack(distorted, dim=-1) - target
+            lens = _Lens.at(a, b, self.distortion)
+            residual = torch.stack(lens.distorted(), dim=-1) - target
             return residual, residual.square().sum(dim=-1)
 
         point = _within_radius(target, 0.9 * limit)
@@ -466,8 +461,7 @@ class Camera(nn.Module):
             if not (error > tolerance).any():
                 break
             a, b = point.unbind(-1)
-            factors = _radial_factors(a, b, distortion)
-            d_aa, d_ab, d_bb = _distortion_jacobian(a, b, factors, distortion)
+            d_aa, d_ab, d_bb = _Lens.at(a, b, self.distortion).jacobian()
             determinant = d_aa * d_bb - d_ab * d_ab
             determinant = torch.where(determinant > 0.0, determinant, 1.0)
             e_a, e_b = residual.unbind(-1)
@@ -596,24 +590,62 @@ def _turned(rotation: Tensor, vectors: Vectors) -> Vectors:
     return turned.reshape(components.shape).movedim(0, -1)
 
 
-def _radial_factors(a: Tensor, b: Tensor, distortion: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return r2, q(r2) and its first derivative with respect to r2."""
-    k1, k2, _, _, k3 = distortion.unbind()
-    r2 = a * a + b * b
-    q = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    return r2, q, k1 + r2 * (2.0 * k2 + r2 * (3.0 * k3))
+class _Lens(NamedTuple):
+    """The distortion at some normalised coordinates.
 
+    Attributes:
+        a, b: The coordinates.
+        k2, k3, p1, p2: Coefficients of the distortion.
+        r2: Squared radii.
+        q: `q(r2)`.
+        q1: Its first derivative in r2.
+    """
 
-def _distort(
-    a: Tensor, b: Tensor, factors: tuple[Tensor, Tensor, Tensor], distortion: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Apply the lens distortion to normalised coordinates."""
-    _, _, p1, p2, _ = distortion.unbind()
-    r2, q, _ = factors
-    return (
-        a * q + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a),
-        b * q + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b,
-    )
+    a: Tensor
+    b: Tensor
+    k2: Tensor
+    k3: Tensor
+    p1: Tensor
+    p2: Tensor
+    r2: Tensor
+    q: Tensor
+    q1: Tensor
+
+    @classmethod
+    def at(cls, a: Tensor, b: Tensor, distortion: Tensor) -> _Lens:
+        k1, k2, p1, p2, k3 = distortion.to(a).unbind()
+        r2 = a * a + b * b
+        q = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        return cls(a, b, k2, k3, p1, p2, r2, q, k1 + r2 * (2.0 * k2 + r2 * (3.0 * k3)))
+
+    def distorted(self) -> tuple[Tensor, Tensor]:
+        """The distorted coordinates."""
+        a, b, _, _, p1, p2, r2, q, _ = self
+        return (
+            a * q + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a),
+            b * q + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b,
+        )
+
+    def jacobian(self) -> tuple[Tensor, Tensor, Tensor]:
+        """The entries aa, ab, bb of the distortion's Jacobian, which is symmetric."""
+        a, b, _, _, p1, p2, _, q, q1 = self
+        return (
+            q + 2.0 * (a * a * q1 + p1 * b + 3.0 * p2 * a),
+            2.0 * (a * b * q1 + p1 * a + p2 * b),
+            q + 2.0 * (b * b * q1 + 3.0 * p1 * b + p2 * a),
+        )
+
+    def hessian(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The entries aaa, aab, abb, bbb of the distortion's symmetric second derivative."""
+        a, b, k2, k3, p1, p2, r2, _, q1 = self
+        # Four times the second derivative of q(r2).
+        bend = 8.0 * k2 + 24.0 * k3 * r2
+        return (
+            6.0 * (a * q1 + p2) + bend * a * a * a,
+            2.0 * (b * q1 + p1) + bend * a * a * b,
+            2.0 * (a * q1 + p2) + bend * a * b * b,
+            6.0 * (b * q1 + p1) + bend * b * b * b,
+        )
 
 
 def _through_lens(
@@ -629,35 +661,6 @@ def _through_lens(
         aa * along_a[0] + ab * along_a[1],
         ab * along_a[0] + bb * along_a[1],
         ab * along_b[0] + bb * along_b[1],
-    )
-
-
-def _distortion_jacobian(
-    a: Tensor, b: Tensor, factors: tuple[Tensor, Tensor, Tensor], distortion: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the entries aa, ab, bb of the distortion's Jacobian, which is symmetric."""
-    _, _, p1, p2, _ = distortion.unbind()
-    _, q, q1 = factors
-    return (
-        q + 2.0 * (a * a * q1 + p1 * b + 3.0 * p2 * a),
-        2.0 * (a * b * q1 + p1 * a + p2 * b),
-        q + 2.0 * (b * b * q1 + 3.0 * p1 * b + p2 * a),
-    )
-
-
-def _distortion_hessian(
-    a: Tensor, b: Tensor, factors: tuple[Tensor, Tensor, Tensor], distortion: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return the entries aaa, aab, abb, bbb of the distortion's symmetric second derivative."""
-    _, k2, p1, p2, k3 = distortion.unbind()
-    r2, _, q1 = factors
-    # Four times the second derivative of q(r2).
-    bend = 8.0 * k2 + 24.0 * k3 * r2
-    return (
-        6.0 * (a * q1 + p2) + bend * a * a * a,
-        2.0 * (b * q1 + p1) + bend * a * a * b,
-        2.0 * (a * q1 + p2) + bend * a * b * b,
-        6.0 * (b * q1 + p1) + bend * b * b * b,
     )
 
 

@@ -320,12 +320,7 @@ def _structure(images: Images) -> Images:
     return structure
 
 
-def _refine(
-    flow: Field,
-    frames: Field,
-    guide: Plane,
-    configuration: FlowConfiguration,
-) -> Field:
+def _refine(flow: Field, frames: Field, guide: Plane, configuration: FlowConfiguration) -> Field:
     """Minimise on one level."""
     first, second = (torch.cat([f, _gradient(f)], dim=1) for f in frames.split(1, dim=1))
     factors = configuration.sigma_factors
@@ -381,9 +376,7 @@ def _sample(images: Images, flow: Field) -> tuple[Images, Plane]:
 
 
 def _linearise(
-    flow: Field,
-    first: Float[Tensor, "b 3 h w"],
-    second: Float[Tensor, "b 3 h w"],
+    flow: Field, first: Float[Tensor, "b 3 h w"], second: Float[Tensor, "b 3 h w"]
 ) -> _Constancy:
     """Warp the second frame; the gradient is the mean of both frames', zero where it is noise.
 
@@ -414,9 +407,7 @@ def _residual(constancy: _Constancy, flow: Field) -> Plane:
     return constancy.offset + (constancy.gradient * flow).sum(dim=1, keepdim=True)
 
 
-def _squared_differences(
-    flow: Field,
-) -> tuple[Right, Down]:
+def _squared_differences(flow: Field) -> tuple[Right, Down]:
     """Squared lengths of the differences to the neighbour on the right and to the one below."""
     right, down = flow.diff(dim=-1), flow.diff(dim=-2)
     return right.square().sum(dim=1, keepdim=True), down.square().sum(dim=1, keepdim=True)
@@ -445,12 +436,7 @@ def _largest_of_neighbours(right: Right, down: Down) -> Plane:
 
 
 def _solve(
-    flow: Field,
-    constancy: _Constancy,
-    weight: Plane,
-    right: Right,
-    down: Down,
-    num_iterations: int,
+    flow: Field, constancy: _Constancy, weight: Plane, right: Right, down: Down, num_iterations: int
 ) -> Field:
     """Improve the flow on the quadratic energy that fixed weights leave.
 
@@ -615,11 +601,7 @@ def _inner_median(padded: Float[Tensor, "b c y x"], radius: int) -> Images:
 
 
 def _with_weighted_median_along_jumps(
-    filtered: Field,
-    flow: Field,
-    held: Plane,
-    guide: Plane,
-    radius: int,
+    filtered: Field, flow: Field, held: Plane, guide: Plane, radius: int
 ) -> Field:
     """Return the filtered flow with, near jumps, the weighted median of the flow in its place."""
     filtered = filtered.clone()

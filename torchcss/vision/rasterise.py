@@ -170,10 +170,7 @@ def nearest_faces(
 
 
 def _drawn(
-    place: Places,
-    distance: Float[Tensor, " v"],
-    faces: Faces,
-    valid: Bool[Tensor, " v"] | None,
+    place: Places, distance: Float[Tensor, " v"], faces: Faces, valid: Bool[Tensor, " v"] | None
 ) -> tuple[Int[Tensor, " d"], Float[Tensor, " f"]]:
     """Which triangles can be drawn, and the doubled areas of all."""
     usable = (

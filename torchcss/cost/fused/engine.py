@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import warnings
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from functools import cache, partial
@@ -31,14 +31,7 @@ from torchcss.cost.fused.pose_prior import add_pose_prior
 from torchcss.cost.fused.priors import add_priors
 from torchcss.cost.fused.records import (
     Array,
-    Gaussian,
-    Limbs,
-    LongTails,
-    Mixture,
-    Parts,
-    Repulsion,
     Result,
-    Tree,
     View,
 )
 from torchcss.cost.fused.repulsion import add_repulsion
@@ -69,26 +62,6 @@ _IMAGES: dict[type[Any], tuple[str, Callable[..., Any]]] = {
 _PRIORS = (Stabiliser, Anthropometric, TemporalPrior, MixturePrior)
 _KEPT = 8
 """Packed costs that are kept of a frame, as long as that lives: with other terms and weights."""
-
-
-class _PackedView(NamedTuple):
-    tree: Tree
-    parts: Parts
-    view: View
-    workspaces: Workspaces
-
-
-class _PackedPrior(NamedTuple):
-    priors: tuple[LongTails, Gaussian, Mixture]
-    workspaces: Workspaces
-    repulsion: tuple[Tree, Parts, Repulsion, Workspaces] | None
-    limbs: tuple[Tree, Limbs, Workspaces] | None
-
-
-class _Samples(NamedTuple):
-    x: Array
-    parent: Array | None
-    component: Array | None
 
 
 class _Packs:
@@ -130,6 +103,32 @@ class Workspaces:
             workspace = self._make()
         yield workspace
         self._idle.append(workspace)
+
+
+class _Packed(NamedTuple):
+    """What a kernel is called with, besides states and results.
+
+    Attributes:
+        kernel: The kernel.
+        modes: How many modes before samples are compared with; zero: with none.
+        records: What it reads.
+        workspaces: Memory for what it finds on the way.
+    """
+
+    kernel: Callable[..., None]
+    modes: int
+    records: tuple[Any, ...]
+    workspaces: Workspaces
+
+    def add(self, x: Array, mode: Array | None, result: Result) -> None:
+        """Add the kernel's costs of some samples, each compared with a mode."""
+        rows = (_rows(mode, self.modes, len(x)),) if self.modes else ()
+        with self.workspaces.lent() as workspace:
+            run(self.kernel, x, *rows, *self.records, workspace, result)
+
+
+_Found = tuple[list[_Packed], frozenset[str]]
+"""What is packed, and the names of the terms that are not."""
 
 
 @cache
@@ -197,11 +196,20 @@ class FusedEngine:
                 items = (cost.sequence == past.sequence).numpy() & sane
             elif not sane.all():
                 items = sane
-            views = [view for view in cost.views if view.sequence == past.sequence]
             part = states if items is None else np.ascontiguousarray(states[items])
             own = result if items is None else Result(*(np.zeros_like(p[items]) for p in result))
-            of = [i if i is None or items is None else i[items] for i in (parent, component)]
-            left_out |= self._add_sequence(cost, past, views, _Samples(part, *of), own)
+            packed, others = self._prior(cost, past)
+            found = [(packed, component)]
+            left_out |= others
+            for view in cost.views:
+                if view.sequence == past.sequence:
+                    packed, others = self._view(cost, past, view)
+                    found.append((packed, parent))
+                    left_out |= others
+            for packed, index in found:
+                mode = index if index is None or items is None else index[items]
+                for each in packed:
+                    each.add(part, mode, own)
             if items is not None:
                 for whole, some in zip(result, own, strict=True):
                     whole[items] = some
@@ -211,46 +219,11 @@ class FusedEngine:
             return result, None
         return result, replace(cost, engine=None, choice=cost.choice.only(left_out))
 
-    def _add_sequence(
-        self,
-        cost: TrackingCost,
-        past: FrameContext,
-        views: Sequence[FrameContext],
-        samples: _Samples,
-        result: Result,
-    ) -> set[str]:
-        """Add what the kernels know of some samples of one sequence; what they leave out."""
-        (x, parent, component), exact = samples, cost.choice.curvature is not Curvature.GAUSS_NEWTON
-        prior, left_out = self._prior(cost, past)
-        left_out = set(left_out)
-        mode = _rows(component, prior.priors[0].centre.shape[1], len(x))
-        with prior.workspaces.lent() as scratch:
-            run(add_priors, x, mode, *prior.priors, scratch, result)
-        if prior.repulsion is not None:
-            tree, parts, repulsion, workspaces = prior.repulsion
-            with workspaces.lent() as workspace:
-                run(add_repulsion, x, tree, parts, repulsion, exact, workspace, result)
-        if prior.limbs is not None:
-            tree, limbs, workspaces = prior.limbs
-            with workspaces.lent() as scratch:
-                run(add_pose_prior, x, tree, limbs, scratch, result)
-        for context in views:
-            packed, others = self._view(cost, past, context)
-            left_out |= others
-            if packed is not None:
-                modes = len(packed.view.flow.target)
-                with packed.workspaces.lent() as workspace:
-                    mode = _rows(parent, modes, len(x))
-                    run(add_view, x, mode, *packed[:3], workspace, result)
-        return left_out
-
-    def _prior(self, cost: TrackingCost, past: FrameContext) -> tuple[_PackedPrior, frozenset[str]]:
+    def _prior(self, cost: TrackingCost, past: FrameContext) -> _Found:
         return self._priors.of(past, (cost.choice,), lambda: self._pack_prior(cost, past))
 
-    def _pack_prior(
-        self, cost: TrackingCost, past: FrameContext
-    ) -> tuple[_PackedPrior, frozenset[str]]:
-        priors, others, repulsion, limbs = [], set(), None, None
+    def _pack_prior(self, cost: TrackingCost, past: FrameContext) -> _Found:
+        priors, others, repulsion, limbs = [], set(), [], []
         for term in cost.choice.terms:
             if term.kind != "prior" or cost.bound[term, past] is None:
                 continue
@@ -259,49 +232,43 @@ class FusedEngine:
                 priors.append((term, weight))
             elif type(term) is Interpenetration:
                 if weight * past.tables.of(InterpenetrationPairs).num_pairs:
-                    repulsion = self._pack_repulsion(term, weight, past)
+                    repulsion.append(self._pack_repulsion(cost, term, weight, past))
             elif type(term) is PosePrior:
                 limbs = self._pack_limbs(weight, past)
             else:
                 others.add(term.name)
-        packed = pack.pack_priors(priors, past)
-        workspaces = Workspaces(partial(pack.make_prior_scratch, packed[-1]))
-        return _PackedPrior(packed, workspaces, repulsion, limbs), frozenset(others)
+        records = pack.pack_priors(priors, past)
+        workspaces = Workspaces(partial(pack.make_prior_scratch, records[-1]))
+        states = _Packed(add_priors, records[0].centre.shape[1], records, workspaces)
+        return [states, *repulsion, *limbs], frozenset(others)
 
-    def _pack_limbs(
-        self, weight: float, past: FrameContext
-    ) -> tuple[Tree, Limbs, Workspaces] | None:
+    def _pack_limbs(self, weight: float, past: FrameContext) -> list[_Packed]:
         density = past.tables.of(density_where(past.camera.up))
         if density is None:
-            return None
+            return []
         tree = pack.pack_tree(past.body, past.camera)
         limbs = pack.pack_limbs(past.body, density, weight, past.camera)
         make = partial(pack.make_limb_scratch, tree, limbs, past.body.num_parameters)
-        return tree, limbs, Workspaces(make)
+        return [_Packed(add_pose_prior, 0, (tree, limbs), Workspaces(make))]
 
     def _pack_repulsion(
-        self, term: Interpenetration, weight: float, past: FrameContext
-    ) -> tuple[Tree, Parts, Repulsion, Workspaces]:
+        self, cost: TrackingCost, term: Interpenetration, weight: float, past: FrameContext
+    ) -> _Packed:
         tree, real = pack.pack_tree(past.body, past.camera), self.real
         parts = pack.pack_parts(past.body, None, real)
         repulsion = pack.pack_repulsion(term, past.tables.of(InterpenetrationPairs), weight, real)
         curves = pack.pack_curves(None, len(parts.row), real)
         interior, chain = repulsion.nodes.shape[2], repulsion.chain.shape[1]
-        workspaces = Workspaces(
-            partial(pack.make_workspace, tree, curves, interior, chain, (5, real))
-        )
-        return tree, parts, repulsion, workspaces
+        make = partial(pack.make_workspace, tree, curves, interior, chain, (5, real))
+        records = tree, parts, repulsion, _is_exact(cost)
+        return _Packed(add_repulsion, 0, records, Workspaces(make))
 
-    def _view(
-        self, cost: TrackingCost, past: FrameContext, context: FrameContext
-    ) -> tuple[_PackedView | None, frozenset[str]]:
+    def _view(self, cost: TrackingCost, past: FrameContext, context: FrameContext) -> _Found:
         return self._views.of(
             context, (cost.choice, past.body), lambda: self._pack_view(cost, past, context)
         )
 
-    def _pack_view(
-        self, cost: TrackingCost, past: FrameContext, context: FrameContext
-    ) -> tuple[_PackedView | None, frozenset[str]]:
+    def _pack_view(self, cost: TrackingCost, past: FrameContext, context: FrameContext) -> _Found:
         body, real, camera = past.body, self.real, context.camera
         made: dict[str, Any] = {}
         others: set[str] = set()
@@ -317,7 +284,7 @@ class FusedEngine:
             else:
                 made[_IMAGES[kind][0]] = record
         if not made:
-            return None, frozenset(others)
+            return [], frozenset(others)
         predictor = None
         if "edges" in made or "colours" in made:
             predictor = context.tables.of(ContourPredictor)
@@ -335,14 +302,20 @@ class FusedEngine:
             precise=lens,
             curves=pack.pack_curves(predictor, num, real),
             nothing=float(nothing) * (0 if predictor is None else predictor.num_nodes),
-            exact=cost.choice.curvature is not Curvature.GAUSS_NEWTON,
+            exact=_is_exact(cost),
             **records,
         )
         interior = view.flow.nodes.shape[2]
         make = partial(
             pack.make_workspace, tree, view.curves, interior, 1, (len(edges.steps), real)
         )
-        return _PackedView(tree, parts, view, Workspaces(make)), frozenset(others)
+        packed = _Packed(add_view, len(view.flow.target), (tree, parts, view), Workspaces(make))
+        return [packed], frozenset(others)
+
+
+def _is_exact(cost: TrackingCost) -> bool:
+    """Whether the curvature of projection and kinematics counts."""
+    return cost.choice.curvature is not Curvature.GAUSS_NEWTON
 
 
 def _repeat_for_all_modes(records: dict[str, Any], *fields: str) -> None:

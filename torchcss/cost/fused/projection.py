@@ -117,11 +117,7 @@ def pull_back(lens: Lens, pixel: Pixel, slope: Slope, exact: bool) -> Spatial:
 def times(factor: float, slope: Slope) -> Slope:
     """Derivatives of a cost that weighs so much."""
     return Slope(
-        factor * slope.u,
-        factor * slope.v,
-        factor * slope.uu,
-        factor * slope.uv,
-        factor * slope.vv,
+        factor * slope.u, factor * slope.v, factor * slope.uu, factor * slope.uv, factor * slope.vv
     )
 
 

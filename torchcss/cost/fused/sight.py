@@ -8,12 +8,7 @@ steps to where they are nearest to their parts.
 from __future__ import annotations
 
 from torchcss.cost.fused.records import Array, Lines, Nodes, Parts, Rays
-from torchcss.cost.fused.superquadric import (
-    bent_radial_square,
-    narrowed,
-    radial_square,
-    shape_of,
-)
+from torchcss.cost.fused.superquadric import bent_radial_square, narrowed, radial_square, shape_of
 from torchcss.kernels.compiler import inlined, kernel, sqrt
 
 _TINY = 1e-12
