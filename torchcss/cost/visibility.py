@@ -477,29 +477,35 @@ class _Stretches(NamedTuple):
     Attributes:
         ray: The line.
         part: The part.
-        foot: The line's point next to the part's centre, metres.
-        along: The line's unit direction.
+        x, y, z: The line's point next to the part's centre, its foot, metres.
+        u, v, w: The line's unit direction.
         begin: Where the stretch begins, metres from the foot.
         end: Where it ends.
     """
 
     ray: Tensor
     part: Tensor
-    foot: _Triple
-    along: _Triple
+    x: Tensor
+    y: Tensor
+    z: Tensor
+    u: Tensor
+    v: Tensor
+    w: Tensor
     begin: Tensor
     end: Tensor
 
     def take(self, index: Int[Tensor, " k"]) -> _Stretches:
         """Some of them."""
-        columns = (*self[:2], *self.foot, *self.along, *self[4:])
-        ray, part, px, py, pz, dx, dy, dz, *ends = (v.index_select(0, index) for v in columns)
-        return _Stretches(ray, part, (px, py, pz), (dx, dy, dz), *ends)
+        return _Stretches(*(field.index_select(0, index) for field in self))
 
     def point(self, s: Tensor) -> _Triple:
         """Points at distances from the feet."""
-        x, y, z = (a + s * b for a, b in zip(self.foot, self.along, strict=True))
-        return x, y, z
+        return self.x + s * self.u, self.y + s * self.v, self.z + s * self.w
+
+    def slope(self, gradient: _Triple) -> Tensor:
+        """How steeply something rises along the lines."""
+        gx, gy, gz = gradient
+        return gx * self.u + gy * self.v + gz * self.w
 
     def clamp(self, s: Tensor) -> Tensor:
         """The nearest distances on the stretches."""
@@ -544,17 +550,15 @@ def _stretches(
     half = half.clamp(min=0).sqrt()
     stop = start + views.length.flatten().index_select(0, ray)
     stop = stop + behind.flatten().index_select(0, part * nodes + node)
-    return _Stretches(
-        ray, part, foot, (x, y, z), torch.maximum(start, -half), torch.minimum(stop, half)
-    )
+    ends = torch.maximum(start, -half), torch.minimum(stop, half)
+    return _Stretches(ray, part, *foot, x, y, z, *ends)
 
 
 def _is_close(parts: _Parts, lines: _Stretches) -> Bool[Tensor, " m"]:
     """Whether lines meet the ellipsoids around the parts."""
-    scale = parts.around.index_select(1, lines.part)
-    (px, py, pz), (dx, dy, dz) = (
-        (a * b for a, b in zip(v, scale, strict=True)) for v in (lines.foot, lines.along)
-    )
+    sx, sy, sz = parts.around.index_select(1, lines.part)
+    px, py, pz = lines.x * sx, lines.y * sy, lines.z * sz
+    dx, dy, dz = lines.u * sx, lines.v * sy, lines.w * sz
     across, speed = px * dx + py * dy + pz * dz, dx * dx + dy * dy + dz * dz
     return (px * px + py * py + pz * pz - 1) * speed < across.square()
 
@@ -586,11 +590,10 @@ def _gap(
         steps: Steps towards where they are nearest.
         bent: Whether any of the parts is bent.
     """
-    shape, along = parts.shapes(lines.part), lines.along
+    shape = parts.shapes(lines.part)
 
     def slope(s: Tensor) -> Tensor:
-        _, (gx, gy, gz) = radial_square(shape, *lines.point(s), bent=bent)
-        return gx * along[0] + gy * along[1] + gz * along[2]
+        return lines.slope(radial_square(shape, *lines.point(s), bent=bent)[1])
 
     last, before = s, slope(s)
     s = lines.clamp(s - before / curvature)
@@ -610,7 +613,7 @@ def _gap(
 
 def _ellipsoid_minimum(shape: Superquadrics, lines: _Stretches) -> _Triple:
     """Where a stretch is nearest to the tapered ellipsoid, the curvature of R^2/2, and R^2."""
-    (x, y, z), (dx, dy, dz) = lines.foot, lines.along
+    x, y, z, dx, dy, dz = lines[2:8]
     z, dz = z * shape.ic, dz * shape.ic
     curvature = s = torch.zeros_like(lines.begin)
     ix, iy = shape.ia, shape.ib
@@ -630,11 +633,9 @@ def _sampled_minima(parts: _Parts, lines: _Stretches) -> tuple[_Stretches, Tenso
 
     There are no others: a line meets a bent part at most twice.
     """
-    shape, along = parts.shapes(lines.part), lines.along
     places = torch.linspace(0, 1, _SAMPLES).to(lines.end)[:, None]
     s = torch.lerp(lines.begin, lines.end, places)
-    _, (gx, gy, gz) = radial_square(shape, *lines.point(s), bent=parts.bent)
-    rise = gx * along[0] + gy * along[1] + gz * along[2]
+    rise = lines.slope(radial_square(parts.shapes(lines.part), *lines.point(s), bent=parts.bent)[1])
     # A minimum is where a fall meets a climb, or at an end. It lies between samples k - 1 and k.
     falls, anything = rise < 0, torch.ones_like(rise[:1], dtype=torch.bool)
     minimum = torch.cat([anything, falls]) & torch.cat([~falls, anything])

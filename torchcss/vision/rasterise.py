@@ -96,12 +96,12 @@ def rasterise(
     uv, depth, faces = uv.detach(), depth.detach(), faces.long()
     # float64, so that neither large coordinates nor thin triangles open cracks.
     place, distance = uv.double(), depth.double()
-    drawn, area = _drawn(place, distance, faces, valid)
-    nearest = _nearest_faces(place, distance, faces, drawn, height, width)
+    triangles = _Triangles.of(place, distance, faces, valid)
+    nearest = _nearest_faces(triangles, height, width)
     pixel = torch.nonzero(nearest >= 0)[:, 0]
     face = nearest[pixel]
 
-    table = torch.cat((place[faces].flatten(1), distance[faces], area[:, None]), -1)
+    table = torch.cat((place[faces].flatten(1), distance[faces], triangles.area[:, None]), -1)
     parts, weighted = _barycentric(table.index_select(0, face), pixel % width, pixel // width)
     total = weighted.sum(0)
     barycentric = uv.new_zeros(height * width, 3)
@@ -163,71 +163,69 @@ def nearest_faces(
     place, distance = uv.detach().double().flatten(0, 1), depth.detach().double().flatten()
     first = vertices * torch.arange(pictures, device=uv.device)
     every = (faces.long() + first[:, None, None]).flatten(0, 1)
-    drawn, _ = _drawn(place, distance, every, valid.flatten())
-    nearest = _nearest_faces(place, distance, every, drawn, height, width, pictures=pictures)
+    triangles = _Triangles.of(place, distance, every, valid.flatten())
+    nearest = _nearest_faces(triangles, height, width, pictures=pictures)
     nearest = nearest.view(pictures, height, width)
     return nearest if pictures == 1 else nearest.where(nearest < 0, nearest % len(faces))
 
 
-def _drawn(
-    place: Places, distance: Float[Tensor, " v"], faces: Faces, valid: Bool[Tensor, " v"] | None
-) -> tuple[Int[Tensor, " d"], Float[Tensor, " f"]]:
-    """Which triangles can be drawn, and the doubled areas of all."""
-    usable = (
-        (place.abs() < _FARTHEST_PIXEL).all(-1)
-        & (distance > _NEAREST_DEPTH)
-        & torch.isfinite(distance)
-    )
-    if valid is not None:
-        usable = usable & valid
-    area = _twice_area(place, faces)
-    return torch.nonzero(usable[faces].all(-1) & (area.abs() > _LEAST_AREA))[:, 0], area
+class _Triangles(NamedTuple):
+    """Projected triangles, in double precision.
 
+    Attributes:
+        place: Vertices, pixels.
+        distance: Their depths.
+        faces: Corner indices.
+        area: Signed areas, doubled.
+        drawn: Which triangles can be drawn.
+    """
 
-def _twice_area(place: Places, faces: Faces) -> Float[Tensor, " f"]:
-    """Signed area of the projected triangles, doubled."""
-    first, second, third = place[faces].unbind(1)
-    a, b = second - first, third - first
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    place: Places
+    distance: Float[Tensor, " v"]
+    faces: Faces
+    area: Float[Tensor, " f"]
+    drawn: Int[Tensor, " d"]
+
+    @classmethod
+    def of(cls, place: Tensor, distance: Tensor, faces: Tensor, valid: Tensor | None) -> _Triangles:
+        usable = (
+            (place.abs() < _FARTHEST_PIXEL).all(-1)
+            & (distance > _NEAREST_DEPTH)
+            & torch.isfinite(distance)
+        )
+        if valid is not None:
+            usable = usable & valid
+        first, second, third = place[faces].unbind(1)
+        a, b = second - first, third - first
+        area = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+        drawn = torch.nonzero(usable[faces].all(-1) & (area.abs() > _LEAST_AREA))[:, 0]
+        return cls(place, distance, faces, area, drawn)
 
 
 def _nearest_faces(
-    place: Places,
-    distance: Float[Tensor, " v"],
-    faces: Faces,
-    drawn: Int[Tensor, " d"],
-    height: int,
-    width: int,
-    *,
-    pictures: int = 1,
+    triangles: _Triangles, height: int, width: int, *, pictures: int = 1
 ) -> Int[Tensor, " bhw"]:
-    """Index of the nearest of the `drawn` faces for every pixel, -1 where there is none.
+    """Index of the nearest of the drawn triangles for every pixel, -1 where there is none.
 
-    Of several pictures each has as many of the `faces`, one after the other.
+    Of several pictures each has as many of the triangles, one after the other.
     """
-    if compiler.COMPILED and place.device.type == "cpu" and not torch.compiler.is_compiling():
+    on_cpu = triangles.place.device.type == "cpu"
+    if compiler.COMPILED and on_cpu and not torch.compiler.is_compiling():
         from torchcss.vision.rasterise_kernels import draw  # compiled: only where it is used
 
         near = torch.full((pictures, height, width), -1, dtype=torch.float32)
         seen = torch.full_like(near, -1, dtype=torch.long)
-        corners, depths = place.contiguous().numpy(), distance.contiguous().numpy()
-        triangles, per_picture = faces.contiguous().numpy(), faces.shape[0] // pictures
-        draw(corners, depths, triangles, drawn.numpy(), per_picture, near.numpy(), seen.numpy())
+        place, distance, faces, _, drawn = (part.contiguous().numpy() for part in triangles)
+        draw(place, distance, faces, drawn, len(faces) // pictures, near.numpy(), seen.numpy())
         return seen.flatten()
-    return _by_spans(place, distance, faces, drawn, height, width, pictures=pictures)
+    return _by_spans(triangles, height, width, pictures=pictures)
 
 
 def _by_spans(
-    place: Places,
-    distance: Float[Tensor, " v"],
-    faces: Faces,
-    drawn: Int[Tensor, " d"],
-    height: int,
-    width: int,
-    *,
-    pictures: int = 1,
+    triangles: _Triangles, height: int, width: int, *, pictures: int = 1
 ) -> Int[Tensor, " bhw"]:
     """The same in torch: spans of all triangles, and the nearest of them on every pixel."""
+    place, distance, faces, _, drawn = triangles
     corner, inverse = place[faces[drawn]], 1 / distance[faces[drawn]]
     order = corner[..., 1].argsort(-1)
     inverse = inverse.gather(-1, order)
