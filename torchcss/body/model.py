@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchcss.body.catalog import BodySpecification, motion_rate
@@ -161,6 +161,16 @@ class BodyModel(nn.Module):
     def num_parts(self) -> int:
         """Number of superquadric parts."""
         return len(self.part_names)
+
+    @property
+    def touching(self) -> Bool[Tensor, "parts parts"]:
+        """Which parts touch in every pose; none touches itself."""
+        own = torch.eye(self.num_parts, dtype=torch.bool, device=self.tie.device)
+        touching = torch.zeros_like(own)
+        for pair in self.neighbours:
+            i, j = map(self.part_names.index, pair)
+            touching[i, j] = touching[j, i] = True
+        return touching & ~own
 
     @property
     def bounds(self) -> Bounds:

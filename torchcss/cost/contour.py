@@ -43,8 +43,8 @@ from torch import Tensor
 
 from torchcss.cost.context import FrameContext
 from torchcss.cost.interior import count_nodes
-from torchcss.cost.outline import ImageNodes, OutlineTerm
-from torchcss.cost.term import Need, OnPoints
+from torchcss.cost.outline import Derivatives, ImageNodes, OutlineTerm
+from torchcss.cost.term import Need, OnPoints, Values
 from torchcss.cost.visibility import places
 from torchcss.robust import Lorentzian, RobustPotential, RobustValue
 from torchcss.vision.sampling import inside_image, interpolate_bilinear
@@ -281,9 +281,7 @@ class ContourTerm(OutlineTerm):
         wells, _, _ = self._well(found, found.distance - moved.index_select(0, found.node))
         return torch.zeros_like(moved).index_add(0, found.node, wells)
 
-    def derivatives(
-        self, nodes: ImageNodes, image: Float[Tensor, "c h w"]
-    ) -> tuple[Float[Tensor, " k"], Float[Tensor, "k 2"], Float[Tensor, "k 2 2"]]:
+    def derivatives(self, nodes: ImageNodes, image: Float[Tensor, "c h w"]) -> Derivatives:
         """See `OutlineTerm.derivatives`."""
         depth, slope, curvature = self._wells(nodes.uv, nodes.normal, image)
         normal, weight = nodes.normal, nodes.weight
@@ -291,6 +289,6 @@ class ContourTerm(OutlineTerm):
         hessian = (weight * curvature)[:, None, None] * normal[:, :, None] * normal[:, None, :]
         return depth, gradient, hessian
 
-    def matched(self, match: Float[Tensor, "*batch p"]) -> Float[Tensor, "*batch p"]:
+    def matched(self, match: Values) -> Values:
         """See `OutlineTerm.matched`."""
         return self.unmatched - match

@@ -33,8 +33,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.cost.context import FrameContext
-from torchcss.cost.outline import ImageNodes, OutlineTerm
-from torchcss.cost.term import OnPoints
+from torchcss.cost.outline import Derivatives, ImageNodes, OutlineTerm
+from torchcss.cost.term import OnPoints, Values
 from torchcss.errors import ShapeError
 from torchcss.robust import Lorentzian, RobustPotential
 from torchcss.vision.sampling import gaussian_blur
@@ -112,9 +112,7 @@ class EdgeEnergyTerm(OutlineTerm):
         """The edge energy, see `OutlineTerm.match`."""
         return image.value(nodes.uv if at is None else at)
 
-    def derivatives(
-        self, nodes: ImageNodes, image: SplineField
-    ) -> tuple[Float[Tensor, " k"], Float[Tensor, "k 2"], Float[Tensor, "k 2 2"]]:
+    def derivatives(self, nodes: ImageNodes, image: SplineField) -> Derivatives:
         """See `OutlineTerm.derivatives`."""
         energy, slope, bend = image.sample(nodes.uv)
         _, first, second = self.potential((1 - energy).clamp(min=0))
@@ -123,6 +121,6 @@ class EdgeEnergyTerm(OutlineTerm):
         hessian = (weight * second)[..., None, None] * slope[..., :, None] * slope[..., None, :]
         return energy, gradient, hessian - (weight * first)[..., None, None] * bend
 
-    def matched(self, match: Float[Tensor, "*batch p"]) -> Float[Tensor, "*batch p"]:
+    def matched(self, match: Values) -> Values:
         """See `OutlineTerm.matched`."""
         return 0.5 * self.potential((1 - match).clamp(min=0)).rho

@@ -39,7 +39,7 @@ from torch import Tensor
 
 from torchcss.cost.context import FrameContext
 from torchcss.cost.interior import InteriorNodes, count_nodes, seen_interior
-from torchcss.cost.term import Need, OnPoints, Posed, Term
+from torchcss.cost.term import Need, OnPoints, Points, Posed, Term, Values
 from torchcss.cost.visibility import SeenNodes
 from torchcss.errors import ShapeError, check_shape
 from torchcss.robust import Lorentzian, RobustPotential, residual_cost
@@ -174,8 +174,8 @@ class FlowTerm(Term):
         nodes: SeenNodes,
         camera: Camera,
         targets: FlowTargets,
-        at: Float[Tensor, "*batch p 3"] | None = None,
-    ) -> Float[Tensor, "*batch p"]:
+        at: Points | None = None,
+    ) -> Values:
         """Cost of every node, in units of nu.
 
         Args:
@@ -212,7 +212,7 @@ class FlowTerm(Term):
 
     def _composed(
         self, cost: Tensor, nodes: SeenNodes, near: Tensor, camera: Camera, targets: FlowTargets
-    ) -> Float[Tensor, "*batch p"]:
+    ) -> Values:
         far = self.potential(targets.weight * math.hypot(*camera.image_size_wh) ** 2).rho
         back_facing = self.fitted_level * self.nu
         untold = (1 - targets.weight) * self.untold
@@ -220,6 +220,6 @@ class FlowTerm(Term):
         return near * in_front + (1 - near) * (0.5 * far + untold)
 
 
-def _in_front(depth: Tensor, valid: Tensor, camera: Camera) -> Float[Tensor, "*batch p"]:
+def _in_front(depth: Tensor, valid: Tensor, camera: Camera) -> Values:
     """1 where the camera can see the place, 0 behind its near plane, a ramp in front of that."""
     return ((depth - camera.near) / _NEAR_RAMP).clamp(0, 1) * valid

@@ -19,10 +19,17 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchcss.cost.context import FrameContext
-from torchcss.cost.term import OnPoints, Term
+from torchcss.cost.term import OnPoints, Points, Term, Values
 from torchcss.cost.visibility import ContourPredictor, SeenNodes, contour_nodes, places
 from torchcss.types import PointCost
 from torchcss.vision.camera import Camera, ProjectionModel
+
+Each = Float[Tensor, " k"]
+InImage = Float[Tensor, "k 2"]
+"""A number, or two, for each node that is seen."""
+
+Derivatives = tuple[Each, InImage, Float[Tensor, "k 2 2"]]
+"""Value, gradient and Hessian in the image."""
 
 
 class ImageNodes(NamedTuple):
@@ -36,9 +43,9 @@ class ImageNodes(NamedTuple):
     """
 
     place: Int[Tensor, " k"]
-    uv: Float[Tensor, "k 2"]
-    normal: Float[Tensor, "k 2"]
-    weight: Float[Tensor, " k"]
+    uv: InImage
+    normal: InImage
+    weight: Each
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,9 +72,7 @@ class OutlineTerm(Term):
     occlusion_factor: float = 1.1
 
     @abstractmethod
-    def match(
-        self, nodes: ImageNodes, image: Any, at: Float[Tensor, "k 2"] | None = None
-    ) -> Float[Tensor, " k"]:
+    def match(self, nodes: ImageNodes, image: Any, at: InImage | None = None) -> Each:
         """How well the image matches the nodes, zero if not at all.
 
         Args:
@@ -77,13 +82,11 @@ class OutlineTerm(Term):
         """
 
     @abstractmethod
-    def derivatives(
-        self, nodes: ImageNodes, image: Any
-    ) -> tuple[Float[Tensor, " k"], Float[Tensor, "k 2"], Float[Tensor, "k 2 2"]]:
+    def derivatives(self, nodes: ImageNodes, image: Any) -> Derivatives:
         """The match, and gradient and Hessian of the weighted cost in the nodes' pixels."""
 
     @abstractmethod
-    def matched(self, match: Float[Tensor, "*batch p"]) -> Float[Tensor, "*batch p"]:
+    def matched(self, match: Values) -> Values:
         """Cost of a node by its match, in units of nu."""
 
     def bind(self, context: FrameContext, image: Any, count: int | None = None) -> OnPoints:
@@ -110,8 +113,8 @@ class OutlineTerm(Term):
         nodes: SeenNodes,
         camera: Camera,
         image: Any,
-        at: Float[Tensor, "*batch p 3"] | None = None,
-    ) -> Float[Tensor, "*batch p"]:
+        at: Points | None = None,
+    ) -> Values:
         """Cost of every node, in units of nu.
 
         Args:
@@ -145,7 +148,7 @@ class OutlineTerm(Term):
         match, gradient, hessian = (_spread(part, seen.place, nodes) for part in cost)
         return PointCost(self._composed(nodes, match), gradient, hessian)
 
-    def _composed(self, nodes: SeenNodes, match: Tensor) -> Float[Tensor, "*batch p"]:
+    def _composed(self, nodes: SeenNodes, match: Tensor) -> Values:
         back_facing = self.fitted_level * self.nu
         return nodes.cost(self.matched(match), back_facing, self.occlusion_factor)
 

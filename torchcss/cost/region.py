@@ -35,9 +35,9 @@ from torch.nn import functional
 from torchcss.body.model import BodyModel
 from torchcss.body.root import has_root
 from torchcss.cost.context import FrameContext
-from torchcss.cost.outline import ImageNodes, OutlineTerm
+from torchcss.cost.outline import Derivatives, ImageNodes, OutlineTerm
 from torchcss.cost.part_map import grow, part_map
-from torchcss.cost.term import Need, OnPoints
+from torchcss.cost.term import Need, OnPoints, Values
 from torchcss.cost.visibility import ContourPredictor
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import Window
@@ -223,9 +223,7 @@ class RegionTerm(OutlineTerm):
         inside, outside, layer = self._sides(nodes, image, at)
         return image.field.value(inside, layer) - image.field.value(outside, layer)
 
-    def derivatives(
-        self, nodes: ImageNodes, image: RegionImages
-    ) -> tuple[Float[Tensor, " k"], Float[Tensor, "k 2"], Float[Tensor, "k 2 2"]]:
+    def derivatives(self, nodes: ImageNodes, image: RegionImages) -> Derivatives:
         """See `OutlineTerm.derivatives`."""
         *sides, layer = self._sides(nodes, image, None)
         inside, outside = (image.field.sample(side, layer) for side in sides)
@@ -234,7 +232,7 @@ class RegionTerm(OutlineTerm):
         hessian = weight[..., None, None] * (outside.hessian - inside.hessian)
         return inside.value - outside.value, gradient, hessian
 
-    def matched(self, match: Float[Tensor, "*batch p"]) -> Float[Tensor, "*batch p"]:
+    def matched(self, match: Values) -> Values:
         """See `OutlineTerm.matched`."""
         return 0.5 * self.nu * (1 - 0.5 * match)
 

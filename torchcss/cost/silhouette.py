@@ -39,7 +39,7 @@ from torch.nn import functional
 from torchcss.cost.context import FrameContext
 from torchcss.cost.interior import InteriorNodes, interior_nodes
 from torchcss.cost.part_map import grow, part_map
-from torchcss.cost.term import Need, OnPoints, Term
+from torchcss.cost.term import Need, OnPoints, Points, Term, Values
 from torchcss.types import PointCost
 from torchcss.vision.camera import Camera
 from torchcss.vision.spline import SplineField, spline_field
@@ -184,11 +184,11 @@ class SilhouetteTerm(Term):
 
     def value(
         self,
-        points: Float[Tensor, "*batch p 3"],
+        points: Points,
         camera: Camera,
         images: SilhouetteImages,
-        at: Float[Tensor, "*batch p 3"] | None = None,
-    ) -> Float[Tensor, "*batch p"]:
+        at: Points | None = None,
+    ) -> Values:
         """Cost in units of nu, shared out among the nodes: only the sum has a meaning.
 
         Args:
@@ -204,7 +204,7 @@ class SilhouetteTerm(Term):
 
     def point_cost(
         self,
-        points: Float[Tensor, "*batch p 3"],
+        points: Points,
         camera: Camera,
         images: SilhouetteImages,
         *,

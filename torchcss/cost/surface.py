@@ -29,6 +29,7 @@ from typing import NamedTuple
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchcss.cost.term import Values
 from torchcss.cost.visibility import SeenNodes
 from torchcss.robust import Leclerc, RobustPotential
 from torchcss.types import PointCost
@@ -89,7 +90,7 @@ class SurfaceTerm:
 
     def value(
         self, nodes: SeenNodes, camera: Camera, contrast: SplineField, targets: SurfaceTargets
-    ) -> Float[Tensor, "*batch p"]:
+    ) -> Values:
         """Cost of every node, in units of nu.
 
         Args:
@@ -119,8 +120,6 @@ class SurfaceTerm:
         value = self._composed(rho, nodes, targets)
         return camera.pull_back(model, value, gradient, hessian, gauss_newton=True)
 
-    def _composed(
-        self, rho: Tensor, nodes: SeenNodes, targets: SurfaceTargets
-    ) -> Float[Tensor, "*batch p"]:
+    def _composed(self, rho: Tensor, nodes: SeenNodes, targets: SurfaceTargets) -> Values:
         back_facing = self.fitted_level * self.nu
         return targets.weight * (nodes.exists * 0.5 * rho + (1 - nodes.exists) * back_facing)

@@ -36,6 +36,12 @@ Need = Literal["flow", "appearance", "background"]
 """What has to be computed or learnt from the pictures for a term: optical flow, the colours of the
 parts, or the picture behind the body."""
 
+Points = Float[Tensor, "*batch p 3"]
+"""Positions of the points of a term, metres."""
+
+Values = Float[Tensor, "*batch p"]
+"""A number for each of them."""
+
 _T = TypeVar("_T")
 
 
@@ -86,13 +92,11 @@ class BoundImage(Protocol):
         """Rows of memory that a sample takes, in points."""
         ...
 
-    def points(self, posed: Posed) -> Float[Tensor, "*batch p 3"]:
+    def points(self, posed: Posed) -> Points:
         """Positions of the points, metres."""
         ...
 
-    def value(
-        self, posed: Posed, at: Float[Tensor, "*batch p 3"] | None = None
-    ) -> Float[Tensor, "*batch p"]:
+    def value(self, posed: Posed, at: Points | None = None) -> Values:
         """Value of each point.
 
         Args:
@@ -210,14 +214,12 @@ class OnPoints:
     camera: Camera | None = None
     of_parents: Callable[[Posed, Any], Any] | None = None
 
-    def points(self, posed: Posed) -> Float[Tensor, "*batch p 3"]:
+    def points(self, posed: Posed) -> Points:
         """Positions of the points, metres."""
         found = posed.of(self.find)
         return found if isinstance(found, Tensor) else found.points
 
-    def value(
-        self, posed: Posed, at: Float[Tensor, "*batch p 3"] | None = None
-    ) -> Float[Tensor, "*batch p"]:
+    def value(self, posed: Posed, at: Points | None = None) -> Values:
         """Cost of every point."""
         return self.term.value(*self._seen(posed), at)
 

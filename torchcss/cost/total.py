@@ -298,7 +298,8 @@ class TrackingCost:
         """Whether a view says something to a term of a kind."""
         return any(True for view in self.views for _ in self._bound(kind, view))
 
-    def _timed(self, name: str) -> AbstractContextManager[Any]:
+    def timed(self, name: str) -> AbstractContextManager[Any]:
+        """Adds up the time that a term takes, if that is wanted."""
         return nullcontext() if self.stopwatch is None else self.stopwatch(name)
 
     def _bound(self, kind: Kind, context: FrameContext) -> Iterator[tuple[str, Any]]:
@@ -323,10 +324,10 @@ class _Part:
         """Cost of every prior and term."""
         pose, values = self._pose(), {}
         for name, weight, prior, posed in self._priors(pose):
-            with self.cost._timed(name):
+            with self.cost.timed(name):
                 values[name] = weight * prior.value(posed)
         for name, scale, term, posed in self._terms(pose):
-            with self.cost._timed(name):
+            with self.cost.timed(name):
                 value = scale * term.value(posed).sum(-1)
             values[name] = values.get(name, 0.0) + value
         return values or {"none": self.x.new_zeros(len(self.x))}
@@ -347,7 +348,7 @@ class _Part:
         body, total = body or self.past.body, {}
         pose = body.pose(self.x)
         for name, weight, term, posed in self._bound("weight-only", pose, body):
-            with self.cost._timed(name):
+            with self.cost.timed(name):
                 value = weight * term.scale * term.value(posed)
             total[name] = total.get(name, 0.0) + value
         return total
@@ -359,7 +360,7 @@ class _Part:
             return self._by_autograd()
         pose, points, links, costs = self._pose(), [], [], []
         for name, scale, term, posed in self._terms(pose):
-            with cost._timed(name):
+            with cost.timed(name):
                 part = term.point_cost(posed, gauss_newton=curvature is Curvature.GAUSS_NEWTON)
                 points.append(term.points(posed))
                 links.append(term.link)
@@ -369,12 +370,12 @@ class _Part:
             x.new_zeros(len(x)), torch.zeros_like(x), x.new_zeros(len(x), size, size)
         )
         if points:
-            with cost._timed("lift"):
+            with cost.timed("lift"):
                 every = PointCost(*(torch.cat(parts, dim=1) for parts in zip(*costs, strict=True)))
                 where, link = torch.cat(points, dim=1), torch.cat(links)
                 total = self.past.body.lift(pose, where, link, every, curvature=curvature)
         for name, weight, prior, posed in self._priors(pose):
-            with cost._timed(name):
+            with cost.timed(name):
                 model = prior.local_model(posed, curvature)
                 total = LocalModel(*(a + weight * b for a, b in zip(total, model, strict=True)))
         return total
@@ -394,13 +395,13 @@ class _Part:
             return differentiate_twice(total, leaf)
 
     def _pose(self) -> BodyPose:
-        with self.cost._timed("pose"):
+        with self.cost.timed("pose"):
             return self.past.body.pose(self.x)
 
     def _terms(self, pose: BodyPose) -> Iterator[tuple[str, float, BoundImage, Posed]]:
         """The image terms of all views with their weights, what they need of the poses found."""
         for name, weight, term, posed in self._bound("image", pose, self.past.body):
-            with self.cost._timed("visibility"):
+            with self.cost.timed("visibility"):
                 term.points(posed)
             yield name, weight * term.scale, term, posed
 

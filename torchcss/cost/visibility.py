@@ -55,6 +55,10 @@ _FAR = 1e6
 _GRAZING = 0.15
 """Sine of the angle by which a curve must turn through the line of sight to count fully."""
 
+RAMP, CLEARANCE = 0.010, 0.005
+"""Width of the transition between visible and hidden, and how far outside the surface a contour
+node must be free of neighbouring parts, metres."""
+
 BEHIND = 3.5
 """How far behind a contour a neighbouring part suppresses it, in mean radii of that part."""
 
@@ -113,8 +117,6 @@ class ContourPredictor(nn.Module):
             parts, so that its contour is as finely sampled as a large one's.
         meridians: Pole-to-pole curves per part, each with two nodes, of which one exists unless the
             part is seen from the side; by default about half as many.
-        ramp: Width of the transition between visible and occluded, metres.
-        clearance: How far outside the surface a node must be free of neighbouring parts, metres.
 
     Attributes:
         num_rings: Rings per part; a part's nodes are those of its rings, then of its meridians.
@@ -140,11 +142,8 @@ class ContourPredictor(nn.Module):
         *,
         rings: int | None = None,
         meridians: int | None = None,
-        ramp: float = 0.010,
-        clearance: float = 0.005,
     ) -> None:
         super().__init__()
-        self.ramp, self.clearance = ramp, clearance
         self.num_rings = rings = rings or max(7, min(18, 126 // max(body.num_parts, 1)))
         meridians = meridians or (rings + 1) // 2
         real, device = torch.float64, body.tie.device
@@ -163,17 +162,13 @@ class ContourPredictor(nn.Module):
         per_part = 2 * (rings + meridians)
         node_part = torch.arange(body.num_parts, device=device).repeat_interleave(per_part)
         own = torch.eye(body.num_parts, device=device)
-        touching = torch.zeros_like(own)
-        for first, second in body.neighbours:
-            i, j = body.part_names.index(first), body.part_names.index(second)
-            touching[i, j] = touching[j, i] = 1.0
         for name, value in (
             ("node_part", node_part),
             ("node_link", body.part_link.repeat_interleave(per_part)),
             ("rings", ring_curves),
             ("meridians", meridian_curves),
             ("other", (1 - own)[node_part]),
-            ("touching", (touching * (1 - own))[node_part]),
+            ("touching", body.touching.to(own)[node_part]),
         ):
             self.register_buffer(name, value, persistent=False)
 
@@ -193,9 +188,7 @@ class ContourPredictor(nn.Module):
         Returns:
             Nodes in the order of `node_part`.
         """
-        rotation, centre = body.part_poses(pose)
-        centre_world = centre_world.to(centre)
-        eye = ((centre_world - centre)[..., None, :] @ rotation)[..., 0, :]
+        rotation, centre, centre_world, eye = _seen_from(body, pose, centre_world)
         found = (
             _crossings(self.rings, eye, closed=True),
             _crossings(self.meridians, eye, closed=False),
@@ -215,13 +208,22 @@ class ContourPredictor(nn.Module):
             body.part_shape,
             rotation,
             eye,
-            torch.cat([rays, rays + self.clearance * normals], dim=-2),
+            torch.cat([rays, rays + CLEARANCE * normals], dim=-2),
             torch.cat([self.other, self.touching]) > 0,
             behind=torch.outer(beside.repeat_interleave(self.num_nodes), reach),
             wanted=torch.cat([exists, exists], dim=-1),
-            ramp=self.ramp,
         ).chunk(2, dim=-1)
         return SeenNodes(points, normals, exists * free, visible)
+
+
+def _seen_from(
+    body: BodyModel, pose: BodyPose, centre_world: Place
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Orientations and centres of the parts, and the camera's centre in the world and in them."""
+    rotation, centre = body.part_poses(pose)
+    centre_world = centre_world.to(centre)
+    eye = ((centre_world - centre)[..., None, :] @ rotation)[..., 0, :]
+    return rotation, centre, centre_world, eye
 
 
 def contour_nodes(posed: Posed) -> SeenNodes:
@@ -267,9 +269,7 @@ def visible_nodes(
         node_part: The part of each node.
         wanted: 0 where a node is not looked at, as it faces away, say; it counts as seen.
     """
-    rotation, centre = body.part_poses(pose)
-    centre_world = centre_world.to(centre)
-    eye = ((centre_world - centre)[..., None, :] @ rotation)[..., 0, :]
+    rotation, _, centre_world, eye = _seen_from(body, pose, centre_world)
     other = ~torch.eye(body.num_parts, dtype=torch.bool, device=points.device)[node_part]
     rays = points - centre_world
     return line_of_sight(body.part_shape, rotation, eye, rays, other, wanted=wanted)
@@ -320,7 +320,6 @@ def line_of_sight(
     *,
     behind: Float[Tensor, "p parts"] | None = None,
     wanted: Values | None = None,
-    ramp: float = 0.010,
 ) -> Values:
     """Visibility of points past parts: 1 where nothing is in front, 0 where a part is.
 
@@ -332,18 +331,17 @@ def line_of_sight(
         others: Which parts can hide a point.
         behind: How far behind the points a part still hides them, metres; None: not at all.
         wanted: 0 where a point is not looked at, as nothing depends on it, and gets 1.
-        ramp: Width of the transition between visible and hidden, metres.
     """
     if others.numel() == 0:
         return eye.new_ones(rays.shape[:-1])
-    parts = tabulate_parts(shape.to(eye), ramp)
+    parts = tabulate_parts(shape.to(eye))
     views = _Views.of(rotation, eye, rays)
     if wanted is not None:  # what is not wanted ends before it begins
         wanted = wanted.reshape(views.length.shape)
         views = views._replace(length=torch.where(wanted > 0, views.length, -torch.inf))
     behind = torch.zeros_like(others, dtype=eye.dtype) if behind is None else behind
     gaps = _sight_gaps(parts, views, others.T, behind.to(eye).T.contiguous())
-    return (0.5 + gaps.reshape(rays.shape[:-1]) / ramp).clamp(0, 1)
+    return (0.5 + gaps.reshape(rays.shape[:-1]) / RAMP).clamp(0, 1)
 
 
 class _Views(NamedTuple):
@@ -400,8 +398,8 @@ class _Parts(NamedTuple):
         return Superquadrics._make(self.table.index_select(1, part).unbind(0))
 
 
-def tabulate_parts(shape: Float[Tensor, "parts 9"], margin: float) -> _Parts:
-    """The shapes of all parts; outside `radius` and `around` a margin, metres, is left free."""
+def tabulate_parts(shape: Float[Tensor, "parts 9"]) -> _Parts:
+    """The shapes of all parts; outside `radius` and `around` the width of the ramp is left free."""
     axes, exponents = shape[:, :3], shape[:, 3:5].clamp(*EXPONENTS)
     e1, e2 = exponents.unbind(-1)
     rows = Superquadrics.of(shape)
@@ -412,14 +410,14 @@ def tabulate_parts(shape: Float[Tensor, "parts 9"], margin: float) -> _Parts:
     is_round = ((exponents > 0.65) & (exponents < 1.05)).all(-1)
     # A bent axis ends no farther out than a straight one, but the section may stand off its end.
     straight = _farthest(section, axes[:, 2], e1)
-    radius = torch.where(is_bent, section + axes[:, 2], straight) + margin
+    radius = torch.where(is_bent, section + axes[:, 2], straight) + RAMP
     plain = is_round & ~is_bent & (taper.abs() < 0.35).all(-1)
     # In two dimensions norms of order 2/e and 2 differ by no more than a factor 2^((1 - e) / 2).
     larger, smaller = (2 ** (0.5 * s * (1 - exponents)).clamp(min=0).sum(-1) for s in (1, -1))
-    around = larger[:, None] * torch.cat([widest, axes[:, 2:]], dim=-1) + margin
+    around = larger[:, None] * torch.cat([widest, axes[:, 2:]], dim=-1) + RAMP
     around = torch.where(is_bent[:, None], radius[:, None], around)
     narrowest = torch.cat([axes[:, :2] * (1 - taper.abs()), axes[:, 2:]], dim=-1).amin(-1)
-    within = (1 / smaller - margin / narrowest).clamp(min=0).square()
+    within = (1 / smaller - RAMP / narrowest).clamp(min=0).square()
     some = torch.stack([plain.any(), (~plain).any(), is_bent.any()]).tolist()  # one transfer
     kinds = tuple(kind for kind, there in zip((True, False), some, strict=False) if there)
     return _Parts(torch.stack(rows), radius, 1 / around.mT, within, plain, kinds, some[2])

@@ -399,24 +399,6 @@ class Camera(nn.Module):
         normal = torch.where(some, x / safe, 1.0), torch.where(some, y / safe, 0.0)
         return torch.stack(normal).movedim(0, -1)
 
-    def jacobian(self, model: ProjectionModel) -> Float[Tensor, "*batch p 2 3"]:
-        """Derivatives of the image points with respect to the 3D points, pixels per metre.
-
-        Args:
-            model: The points' projection.
-        """
-        rows = []
-        for focal, f_a, f_b in zip(
-            self._focal(model.a),
-            (model.lens_aa, model.lens_ab),
-            (model.lens_ab, model.lens_bb),
-            strict=True,
-        ):
-            first = focal * model.inverse_depth
-            row = [first * f_a, first * f_b, -first * (model.a * f_a + model.b * f_b)]
-            rows.append(_turned(self.R_camera_world.mT, torch.stack(row).movedim(0, -1)))
-        return torch.stack(rows, dim=-2)
-
     def inside_image(self, uv: Pixels) -> Bool[Tensor, "*batch"]:
         """Tell which image points lie on a pixel; a pixel reaches half its side each way."""
         check_shape("uv", uv, 2)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import warnings
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -157,14 +157,14 @@ class FusedEngine:
 
     def value(self, cost: TrackingCost, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
         """Cost in nats; see `TrackingCost.value`."""
-        with nullcontext() if cost.stopwatch is None else cost.stopwatch("fused"):
+        with cost.timed("fused"):
             result, others = self._evaluate(cost, x, slopes=False)
         value = torch.from_numpy(result.value).to(x).reshape(x.shape[:-1])
         return value if others is None else value + others.value(x)
 
     def local_model(self, cost: TrackingCost, x: Float[Tensor, "*batch n"]) -> LocalModel:
         """Cost, gradient and Hessian; see `TrackingCost.local_model`."""
-        with nullcontext() if cost.stopwatch is None else cost.stopwatch("fused"):
+        with cost.timed("fused"):
             result, others = self._evaluate(cost, x, slopes=True)
         shapes = (x.shape[:-1], x.shape, (*x.shape, x.shape[-1]))
         model = LocalModel(
@@ -255,7 +255,7 @@ class FusedEngine:
         self, cost: TrackingCost, term: Interpenetration, weight: float, past: FrameContext
     ) -> _Packed:
         tree, real = pack.pack_tree(past.body, past.camera), self.real
-        parts = pack.pack_parts(past.body, None, real)
+        parts = pack.pack_parts(past.body, real)
         repulsion = pack.pack_repulsion(term, past.tables.of(InterpenetrationPairs), weight, real)
         curves = pack.pack_curves(None, len(parts.row), real)
         interior, chain = repulsion.nodes.shape[2], repulsion.chain.shape[1]
@@ -288,7 +288,7 @@ class FusedEngine:
         predictor = None
         if "edges" in made or "colours" in made:
             predictor = context.tables.of(ContourPredictor)
-        tree, parts = pack.pack_tree(body, camera), pack.pack_parts(body, predictor, real)
+        tree, parts = pack.pack_tree(body, camera), pack.pack_parts(body, real)
         num, lens = len(parts.row), pack.pack_lens(camera)
         records = {
             field: pack.in_precision(record, np.float64 if field == "keypoints" else real)

@@ -55,7 +55,7 @@ from torchcss.cost.region import RegionTerm
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.temporal import MixturePrior, TemporalPrior
 from torchcss.cost.term import OnPoints
-from torchcss.cost.visibility import BEHIND, ContourPredictor, tabulate_parts
+from torchcss.cost.visibility import BEHIND, CLEARANCE, RAMP, ContourPredictor, tabulate_parts
 from torchcss.robust import RobustPotential
 from torchcss.vision.camera import GRAZING_RADIUS, Camera
 
@@ -126,18 +126,13 @@ def carried_markers(body: BodyModel, marker: Tensor) -> tuple[Array, Array]:
     return row, place[:, :, 0].copy()
 
 
-def pack_parts(body: BodyModel, predictor: ContourPredictor | None, real: Real) -> Parts:
+def pack_parts(body: BodyModel, real: Real) -> Parts:
     """A body's parts, and what they hide."""
     num, like = body.num_parts, body.tie
     own = torch.cat([body.part_rotation, body.part_translation[:, :, None]], dim=2)
     last = like.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(num, 1, 4)
     row, constant = carried(body, body.part_link, torch.cat([own, last], dim=1))
-    ramp = 0.010 if predictor is None else predictor.ramp
-    table = tabulate_parts(body.part_shape, ramp)
-    touching = np.zeros((num, num), bool)
-    for first, second in body.neighbours:
-        i, j = body.part_names.index(first), body.part_names.index(second)
-        touching[i, j] = touching[j, i] = i != j
+    table = tabulate_parts(body.part_shape)
     parts = Parts(
         row=row,
         constant=constant,
@@ -147,9 +142,9 @@ def pack_parts(body: BodyModel, predictor: ContourPredictor | None, real: Real) 
         within=table.within,
         behind=BEHIND * body.part_shape[:, :2].mean(-1),
         plain=table.plain.cpu().numpy(),
-        touching=touching,
-        ramp=ramp,
-        clearance=0.005 if predictor is None else predictor.clearance,
+        touching=body.touching.cpu().numpy(),
+        ramp=RAMP,
+        clearance=CLEARANCE,
     )
     return in_precision(parts, real)
 
