@@ -424,7 +424,5 @@ def test_bad_input_is_refused(generator: torch.Generator) -> None:
         flow_targets(seen(*nodes(body, body.pose(x)), None, camera), camera, flow[None])
     with pytest.raises(ShapeError, match="outlier: expected"):
         flow_targets(seen(*nodes(body, body.pose(x)), None, camera), camera, flow, outlier[:, 1:])
-    with pytest.raises(ConfigurationError, match="rings"):
-        InteriorNodes(body, rings=0)
     with pytest.raises(ConfigurationError, match="sigma"):
         _ = FlowTerm(sigma=0.0).potential

@@ -193,9 +193,7 @@ class BodyModel(nn.Module):
         Raises:
             BodyError: If the body has no such joint centre.
         """
-        if name not in self.joint_names:
-            raise BodyError(f"{self.name} has no joint {name!r}; it has {list(self.joint_names)}")
-        return self.joint_names.index(name)
+        return self._place("joint", name, self.joint_names)
 
     def state_index(self, name: str) -> int:
         """Position of a state parameter on axis `n`.
@@ -203,9 +201,12 @@ class BodyModel(nn.Module):
         Raises:
             BodyError: If the body has no such parameter.
         """
-        if name not in self.state_names:
-            raise BodyError(f"{self.name} has no parameter {name!r}; it has {self.state_names}")
-        return self.state_names.index(name)
+        return self._place("parameter", name, self.state_names)
+
+    def _place(self, kind: str, name: str, names: tuple[str, ...]) -> int:
+        if name not in names:
+            raise BodyError(f"{self.name} has no {kind} {name!r}; it has {list(names)}")
+        return names.index(name)
 
     def with_base(
         self, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]

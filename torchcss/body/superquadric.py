@@ -26,6 +26,7 @@ long.
 
 from __future__ import annotations
 
+from collections import namedtuple
 from typing import NamedTuple
 
 import torch
@@ -111,40 +112,21 @@ class Superquadrics(NamedTuple):
         return self.ia / (1 + self.taper_x * height), self.ib / (1 + self.taper_y * height)
 
 
-class _Bend(NamedTuple):
-    """Cosine and sine of the axis' turn at a point, and how far it is stretched there."""
-
-    cosine: Tensor
-    sine: Tensor
-    stretch: Tensor
+_Bend = namedtuple("_Bend", "cosine sine stretch")
+"""Cosine and sine of the axis' turn at a point, and how far it is stretched there."""
 
 
-class _Factors(NamedTuple):
-    """What value and derivatives of R^2 are made of.
+_Factors = namedtuple("_Factors", "u v w ix iy of_u of_v pu pv pw section total outer scale")
+"""What value and derivatives of R^2 are made of.
 
-    Attributes:
-        u, v, w: Coordinates in semi-axes.
-        ix, iy: Reciprocal semi-axes of the section there.
-        of_u, of_v: Shares of the section's power, pu u^2 and pv v^2.
-        pu, pv, pw: Powers of u^2, v^2 and w^2, each by its exponent.
-        section, total: Sums of powers.
-        outer, scale: Powers of these, the first times the second.
-    """
-
-    u: Tensor
-    v: Tensor
-    w: Tensor
-    ix: Tensor
-    iy: Tensor
-    of_u: Tensor
-    of_v: Tensor
-    pu: Tensor
-    pv: Tensor
-    pw: Tensor
-    section: Tensor
-    total: Tensor
-    outer: Tensor
-    scale: Tensor
+Attributes:
+    u, v, w: Coordinates in semi-axes.
+    ix, iy: Reciprocal semi-axes of the section there.
+    of_u, of_v: Shares of the section's power, pu u^2 and pv v^2.
+    pu, pv, pw: Powers of u^2, v^2 and w^2, each by its exponent.
+    section, total: Sums of powers.
+    outer, scale: Powers of these, the first times the second.
+"""
 
 
 def radial_square(

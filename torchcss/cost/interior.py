@@ -11,7 +11,6 @@ from torchcss.body.surface import SurfaceSample, surface_points
 from torchcss.cost.context import FrameContext
 from torchcss.cost.term import Posed
 from torchcss.cost.visibility import ContourPredictor, SeenNodes, seen_nodes
-from torchcss.errors import ConfigurationError
 
 
 class InteriorNodes(nn.Module):
@@ -36,10 +35,6 @@ class InteriorNodes(nn.Module):
 
     def __init__(self, body: BodyModel, *, rings: int = 4, meridians: int = 4) -> None:
         super().__init__()
-        if rings < 1 or meridians < 1:
-            raise ConfigurationError(
-                f"interior nodes: rings and meridians must be at least 1, got {rings}, {meridians}"
-            )
         real, device = torch.float64, body.tie.device
         heights = (torch.arange(rings, dtype=real, device=device) + 0.5) * (2 / rings) - 1
         around = torch.arange(meridians, dtype=real, device=device)

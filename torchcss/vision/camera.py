@@ -44,7 +44,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -55,6 +55,7 @@ from torchcss.errors import CameraError, check_shape
 from torchcss.types import PointCost
 from torchcss.vision.sampling import inside_image
 
+Numbers = Tensor | np.ndarray | Sequence[Any]
 Values = Float[Tensor, "*batch p"]
 Pixels = Float[Tensor, "*batch 2"]
 Matrix = Float[Tensor, "3 3"]
@@ -158,12 +159,12 @@ class Camera(nn.Module):
 
     def __init__(
         self,
-        K: Tensor | np.ndarray | Sequence[Sequence[float]],
+        K: Numbers,
         image_size_wh: Sequence[int],
         *,
-        distortion: Tensor | np.ndarray | Sequence[float] | None = None,
-        R_camera_world: Tensor | np.ndarray | Sequence[Sequence[float]] | None = None,
-        t_camera_world: Tensor | np.ndarray | Sequence[float] | None = None,
+        distortion: Numbers | None = None,
+        R_camera_world: Numbers | None = None,
+        t_camera_world: Numbers | None = None,
         name: str = "camera",
         near: float = 0.05,
     ) -> None:

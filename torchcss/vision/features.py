@@ -310,8 +310,11 @@ class FeatureExtractor(nn.Module):
             )
         planes = picture[None] if grey else picture[..., :3].permute(2, 0, 1)
         planes = planes.to(self.luma.device)
+        height, width = planes.shape[-2:]
+        new_width, new_height = self.working_shape(width, height)
+        size = None if (new_width, new_height) == (width, height) else (new_height, new_width)
         if picture.dtype in _WHITE:
-            small = self._resized_whole(planes)
+            small = _shrunk(planes, size)
             return (small.to(self.luma) / _WHITE[picture.dtype]).clamp(0.0, 1.0)
         planes = planes.to(self.luma).contiguous()
         least, greatest = (float(bound) for bound in planes.aminmax())
@@ -320,40 +323,32 @@ class FeatureExtractor(nn.Module):
                 f"{name}: expected floating-point levels in 0..1, got {least:g} to {greatest:g}; "
                 "divide by the value of white"
             )
-        return self._resized(planes.clamp(0.0, 1.0)).clamp(0.0, 1.0)
+        return _resized(planes.clamp(0.0, 1.0), size).clamp(0.0, 1.0)
 
-    def _resized_whole(self, planes: Int[Tensor, "c h w"]) -> Float[Tensor, "c y x"]:
-        """Planes of whole numbers at the working size, in single precision."""
-        height, width = planes.shape[-2:]
-        new_width, new_height = self.working_shape(width, height)
-        compiled = compiler.COMPILED and not torch.compiler.is_compiling()
-        if (
-            not compiled
-            or planes.device.type != "cpu"
-            or (new_width, new_height) == (width, height)
-        ):
-            return self._resized(planes.to(torch.float32, memory_format=torch.contiguous_format))
-        from torchcss.vision.shrink_kernels import shrink, triangles
 
-        small = torch.empty(len(planes), new_height, new_width, dtype=torch.float32)
-        pixels = planes.permute(1, 2, 0).contiguous().flatten(1).numpy()
-        row = np.empty(pixels.shape[1], np.float32)
-        rows, columns = triangles(height, new_height), triangles(width, new_width)
-        shrink(pixels, *rows, *columns, row, small.numpy())
-        return small
+def _shrunk(planes: Int[Tensor, "c h w"], size: tuple[int, int] | None) -> Float[Tensor, "c y x"]:
+    """Planes of whole numbers at another height and width, in single precision."""
+    compiled = compiler.COMPILED and not torch.compiler.is_compiling()
+    if size is None or not compiled or planes.device.type != "cpu":
+        planes = planes.to(torch.float32, memory_format=torch.contiguous_format)
+        return _resized(planes, size)
+    from torchcss.vision.shrink_kernels import shrink, triangles
 
-    def _resized(self, planes: Float[Tensor, "c h w"]) -> Float[Tensor, "c y x"]:
-        height, width = planes.shape[-2:]
-        new_width, new_height = self.working_shape(width, height)
-        if (new_width, new_height) == (width, height):
-            return planes
-        return functional.interpolate(
-            planes[None],
-            size=(new_height, new_width),
-            mode="bilinear",
-            align_corners=False,
-            antialias=True,
-        )[0]
+    small = torch.empty(len(planes), *size, dtype=torch.float32)
+    pixels = planes.permute(1, 2, 0).contiguous().flatten(1).numpy()
+    row = np.empty(pixels.shape[1], np.float32)
+    rows, columns = map(triangles, planes.shape[-2:], size)
+    shrink(pixels, *rows, *columns, row, small.numpy())
+    return small
+
+
+def _resized(planes: Float[Tensor, "c h w"], size: tuple[int, int] | None) -> Tensor:
+    """Planes at another height and width; None: as they are."""
+    if size is None:
+        return planes
+    return functional.interpolate(
+        planes[None], size=size, mode="bilinear", align_corners=False, antialias=True
+    )[0]
 
 
 def _within(

@@ -7,31 +7,23 @@ flow takes torch's way, as it does on a GPU and in double precision.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections import namedtuple
 
 import numpy as np
 
 from torchcss.kernels.compiler import entry, floor, inlined, kernel, sqrt
 
+Memory = namedtuple("Memory", "degree inverse x image residual conditioned")
+"""Memory for `solve`.
 
-class Memory(NamedTuple):
-    """Memory for `solve`.
-
-    Attributes:
-        degree: Sum of each pixel's links, `[h w]`.
-        inverse: Inverse of each pixel's block, `[3 h w]`.
-        x: A direction inside a border of zeros, `[2 h+2 w+2]`.
-        image: The matrix times it, `[2 h w]`.
-        residual: What is left.
-        conditioned: The same, preconditioned.
-    """
-
-    degree: np.ndarray[Any, Any]
-    inverse: np.ndarray[Any, Any]
-    x: np.ndarray[Any, Any]
-    image: np.ndarray[Any, Any]
-    residual: np.ndarray[Any, Any]
-    conditioned: np.ndarray[Any, Any]
+Attributes:
+    degree: Sum of each pixel's links, `[h w]`.
+    inverse: Inverse of each pixel's block, `[3 h w]`.
+    x: A direction inside a border of zeros, `[2 h+2 w+2]`.
+    image: The matrix times it, `[2 h w]`.
+    residual: What is left.
+    conditioned: The same, preconditioned.
+"""
 
 
 def make_memory(height: int, width: int) -> Memory:

@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import combinations
+from itertools import combinations, count
 
 import numpy as np
 import torch
@@ -135,7 +135,7 @@ def bone_parts(
         middle = 0.5 * (bone.above.position + bone.position) - poses[bone.carrier][:3, 3]
         parts.append(
             PartSpecification(
-                name=_unused(kinds[bone][0], [part.name for part in parts]),
+                name=unused(kinds[bone][0], [part.name for part in parts]),
                 link=bone.carrier,
                 translation=as_vector(turn.T @ middle),
                 rotation=as_rows(turn.T @ frame_along(bone.bone, side)),
@@ -275,7 +275,7 @@ def _capsule_exponent(radius: float, half: float) -> float:
     return 0.5 * (low + high)
 
 
-def _unused(name: str, used: Sequence[str]) -> str:
-    if name not in used:
-        return name
-    return next(f"{name}_{n}" for n in range(2, 10_000) if f"{name}_{n}" not in used)
+def unused(name: str, used: Sequence[str]) -> str:
+    """A name, or the first of that name with a number that is not used."""
+    names = (name if n == 1 else f"{name}_{n}" for n in count(1))
+    return next(each for each in names if each not in used)

@@ -23,7 +23,6 @@ import warnings
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,7 +32,7 @@ from jaxtyping import Float
 from torchcss.body.catalog import PartSpecification
 from torchcss.body.chain import JointSpecification
 from torchcss.body.files.bvh import BASE, Skeleton
-from torchcss.body.files.default_shape import solid_shape
+from torchcss.body.files.default_shape import solid_shape, unused
 from torchcss.body.files.xml import parse_xml
 from torchcss.body.rotations import as_rows, as_vector, from_quaternion
 from torchcss.errors import BodyError, MissingExtraError
@@ -308,11 +307,9 @@ class _Reader:
                 f"{self.path}: geom {own!r}: expected sizes above 1e-6 and below {_FAR:g} metres, "
                 f"found {size.tolist()}"
             )
-        used = {part.name for part in self.parts}
-        names = (own if n == 1 else f"{own}_{n}" for n in count(1))
         self.parts.append(
             PartSpecification(
-                name=next(name for name in names if name not in used),
+                name=unused(own, [part.name for part in self.parts]),
                 link=link,
                 translation=as_vector(place),
                 rotation=as_rows(from_quaternion(model.geom_quat[geom])),

@@ -466,11 +466,9 @@ def pack_priors(
             fields = (array(field) for field in density)
             mixture = Mixture(weight, term.height(size), far, *fields)
     modes = max((len(centre) for _, _, centre, _ in tails), default=1)
-    centre = np.zeros((len(tails), modes, size))
-    for row, (_, _, mean, _) in enumerate(tails):
-        centre[row] = mean
-    sharpness = np.array([row for *_, row in tails]).reshape(-1, size)
-    weight, nu = (np.array([tail[k] for tail in tails]) for k in (0, 1))
+    centres = [np.broadcast_to(centre, (modes, size)) for _, _, centre, _ in tails]
+    weight, nu, sharpness = (np.array([tail[k] for tail in tails]) for k in (0, 1, 3))
+    centre, sharpness = np.reshape(centres, (-1, modes, size)), sharpness.reshape(-1, size)
     return LongTails(weight, nu, centre, sharpness), gaussian, mixture
 
 
