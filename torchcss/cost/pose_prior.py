@@ -261,16 +261,13 @@ class PoseMixture(NamedTuple):
         both = PoseMixture(*(torch.cat(pair) for pair in pairs))
         return both._replace(weight=0.5 * both.weight)
 
-    def density(
-        self, group: str, known: tuple[int, ...], *, tilt: float = 0.0, share: float = UNIFORM_SHARE
-    ) -> Density:
+    def density(self, group: str, known: tuple[int, ...], *, tilt: float = 0.0) -> Density:
         """The density of some of the directions of a group.
 
         Args:
             group: The group.
             known: Which of its directions.
             tilt: How far off the direction of up may be, radians.
-            share: Share of the uniform density.
         """
         rows = [3 * direction + axis for direction in known for axis in range(3)]
         mean, covariance = self.mean[:, rows], self.covariance[:, rows][:, :, rows]
@@ -279,8 +276,8 @@ class PoseMixture(NamedTuple):
         flat = group == "trunk" and 0 in known
         root = torch.linalg.cholesky(covariance)
         on_spheres = _log_on_spheres(mean, covariance, flat=flat)
-        height = _log_peak(root) + self.weight.log() + math.log1p(-share) - on_spheres
-        uniform = math.log(share) - len(known) * math.log(4 * math.pi)
+        height = _log_peak(root) + self.weight.log() + math.log1p(-UNIFORM_SHARE) - on_spheres
+        uniform = math.log(UNIFORM_SHARE) - len(known) * math.log(4 * math.pi)
         uniform += math.log(2) if flat else 0.0  # a circle is half as long as a sphere is large
         return Density(mean, torch.cholesky_inverse(root), height, uniform)
 

@@ -46,7 +46,7 @@ from torch import Tensor
 from torchcss.body.model import BodyModel, BodyPose, differentiate_twice
 from torchcss.cost.choice import CostChoice
 from torchcss.cost.context import BodyTables, FrameContext
-from torchcss.cost.term import BoundImage, BoundPrior, Kind, Posed, Term
+from torchcss.cost.term import BoundImage, Kind, Posed, Term
 from torchcss.inference.mixture import GaussianMixture, Prior
 from torchcss.inference.problem import SearchProblem
 from torchcss.stopwatch import Stopwatch
@@ -284,7 +284,7 @@ class TrackingCost:
             views = [view for view in self.views if view.sequence == past.sequence]
             for some in items.split(self._chunk):
                 of = (None if each is None else each[some] for each in (self.parent, component))
-                found.append(evaluate(_Part(self, past, views, flat[some], *of)))
+                found.append(evaluate(_Part(self, past.body, past, views, flat[some], *of)))
                 order.append(some)
         names = dict.fromkeys(name for part in found for name in part)
         results = {name: _joined(name, found, order) for name in names}
@@ -314,6 +314,7 @@ class _Part:
     """Some samples of one sequence, few enough to be evaluated at once."""
 
     cost: TrackingCost
+    body: BodyModel
     past: FrameContext
     views: Sequence[FrameContext]
     x: Float[Tensor, "b n"]
@@ -323,7 +324,7 @@ class _Part:
     def values(self) -> dict[str, Tensor]:
         """Cost of every prior and term."""
         pose, values = self._pose(), {}
-        for name, weight, prior, posed in self._priors(pose):
+        for name, weight, prior, posed in self._bound("prior", pose):
             with self.cost.timed(name):
                 values[name] = weight * prior.value(posed)
         for name, scale, term, posed in self._terms(pose):
@@ -335,7 +336,7 @@ class _Part:
     def gradients(self) -> dict[str, Tensor]:
         """Gradient of every prior and term."""
         cost, pose = self.cost, self._pose()
-        bound = (self._bound(kind, pose, self.past.body) for kind in ("prior", "image"))
+        bound = (self._bound(kind, pose) for kind in ("prior", "image"))
         names = dict.fromkeys(name for every in bound for name, *_ in every)
         alone = {
             name: replace(cost, choice=replace(cost.choice.only([name]), curvature=Curvature.EXACT))
@@ -345,9 +346,10 @@ class _Part:
 
     def weights(self, body: BodyModel | None) -> dict[str, Tensor]:
         """Cost of every weight-only term."""
-        body, total = body or self.past.body, {}
-        pose = body.pose(self.x)
-        for name, weight, term, posed in self._bound("weight-only", pose, body):
+        if body is not None:
+            return replace(self, body=body).weights(None)
+        total: dict[str, Tensor] = {}
+        for name, weight, term, posed in self._bound("weight-only", self.body.pose(self.x)):
             with self.cost.timed(name):
                 value = weight * term.scale * term.value(posed)
             total[name] = total.get(name, 0.0) + value
@@ -373,8 +375,8 @@ class _Part:
             with cost.timed("lift"):
                 every = PointCost(*(torch.cat(parts, dim=1) for parts in zip(*costs, strict=True)))
                 where, link = torch.cat(points, dim=1), torch.cat(links)
-                total = self.past.body.lift(pose, where, link, every, curvature=curvature)
-        for name, weight, prior, posed in self._priors(pose):
+                total = self.body.lift(pose, where, link, every, curvature=curvature)
+        for name, weight, prior, posed in self._bound("prior", pose):
             with cost.timed(name):
                 model = prior.local_model(posed, curvature)
                 total = LocalModel(*(a + weight * b for a, b in zip(total, model, strict=True)))
@@ -382,40 +384,34 @@ class _Part:
 
     def _by_autograd(self) -> LocalModel:
         """The same by differentiating the cost as a function of x, with what was found held."""
-        body, found = self.past.body, self._pose()
+        found = self._pose()
         with torch.enable_grad():
             leaf = self.x.detach().requires_grad_()
-            pose = body.pose(leaf)
+            pose = self.body.pose(leaf)
             total = 0.0 * leaf.sum(-1)
             for _, scale, term, posed in self._terms(found):
                 at = _carried(found, pose, term.points(posed), term.link)
                 total = total + scale * term.value(posed, at).sum(-1)
-            for _, weight, prior, posed in self._priors(pose):
+            for _, weight, prior, posed in self._bound("prior", pose):
                 total = total + weight * prior.value(posed)
             return differentiate_twice(total, leaf)
 
     def _pose(self) -> BodyPose:
         with self.cost.timed("pose"):
-            return self.past.body.pose(self.x)
+            return self.body.pose(self.x)
 
     def _terms(self, pose: BodyPose) -> Iterator[tuple[str, float, BoundImage, Posed]]:
         """The image terms of all views with their weights, what they need of the poses found."""
-        for name, weight, term, posed in self._bound("image", pose, self.past.body):
+        for name, weight, term, posed in self._bound("image", pose):
             with self.cost.timed("visibility"):
                 term.points(posed)
             yield name, weight * term.scale, term, posed
 
-    def _priors(self, pose: BodyPose) -> Iterator[tuple[str, float, BoundPrior, Posed]]:
-        """The priors with their weights."""
-        return self._bound("prior", pose, self.past.body)
-
-    def _bound(
-        self, kind: Kind, pose: BodyPose, body: BodyModel
-    ) -> Iterator[tuple[str, float, Any, Posed]]:
+    def _bound(self, kind: Kind, pose: BodyPose) -> Iterator[tuple[str, float, Any, Posed]]:
         """The terms of a kind with their weights, and the poses before each camera."""
         prior = kind == "prior"
         for view in (self.past,) if prior else self.views:
-            posed = Posed(view, body, pose, self.component if prior else self.parent)
+            posed = Posed(view, self.body, pose, self.component if prior else self.parent)
             for name, bound in self.cost._bound(kind, view):
                 yield name, self.cost.choice.weight(name), bound, posed
 

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import numpy as np
+from torch import Tensor
 
 from torchcss.kernels import compiler
 
@@ -48,5 +49,6 @@ def checked(record: _Record) -> _Record:
 
 
 def run(kernel: Callable[..., None], *arguments: Any) -> None:
-    """Call a kernel; in the checked mode with arrays that check their indices."""
-    kernel(*(checked(argument) for argument in arguments) if compiler.CHECKED else arguments)
+    """Call a kernel, tensors as arrays, which check their indices in the checked mode."""
+    arrays = (a.numpy() if isinstance(a, Tensor) else a for a in arguments)
+    kernel(*map(checked, arrays) if compiler.CHECKED else arrays)

@@ -34,6 +34,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.errors import ShapeError
+from torchcss.kernels.checked import run
 from torchcss.vision.flow import OpticalFlow, has_kernels
 from torchcss.vision.sampling import gaussian_blur
 
@@ -106,9 +107,7 @@ def carried(
 
         arrived = marks.new_zeros(len(marks), 5, height, width)
         for mark, move, into in zip(marks, moves, arrived, strict=True):
-            flow_kernels.displace(
-                mark.numpy(), move.contiguous().numpy(), reach, _LEAST_OUTLIER, into.numpy()
-            )
+            run(flow_kernels.displace, mark, move.contiguous(), reach, _LEAST_OUTLIER, into)
         return arrived.amax(1).clamp(max=1.0).reshape(outlier.shape)
     found = torch.zeros_like(marks).flatten()
     image, row, column = torch.nonzero(marks > _LEAST_OUTLIER, as_tuple=True)

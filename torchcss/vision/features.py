@@ -31,6 +31,7 @@ from torch.nn import functional
 
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.kernels import compiler
+from torchcss.kernels.checked import run
 from torchcss.vision.boundaries import motion_boundaries
 from torchcss.vision.camera import Camera
 from torchcss.vision.edges import EdgeConfiguration, edge_features, foreground_weight
@@ -335,10 +336,9 @@ def _shrunk(planes: Int[Tensor, "c h w"], size: tuple[int, int] | None) -> Float
     from torchcss.vision.shrink_kernels import shrink, triangles
 
     small = torch.empty(len(planes), *size, dtype=torch.float32)
-    pixels = planes.permute(1, 2, 0).contiguous().flatten(1).numpy()
-    row = np.empty(pixels.shape[1], np.float32)
+    pixels = planes.permute(1, 2, 0).contiguous().flatten(1)
     rows, columns = map(triangles, planes.shape[-2:], size)
-    shrink(pixels, *rows, *columns, row, small.numpy())
+    run(shrink, pixels, *rows, *columns, small.new_empty(pixels.shape[1]), small)
     return small
 
 

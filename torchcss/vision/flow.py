@@ -47,6 +47,7 @@ from torch.nn import functional
 
 from torchcss.errors import ConfigurationError, FrameError, ShapeError
 from torchcss.kernels import compiler
+from torchcss.kernels.checked import run
 from torchcss.robust import Leclerc, Lorentzian, Quadratic
 
 Images = Float[Tensor, "b c h w"]
@@ -298,8 +299,8 @@ def _structure(images: Images) -> Images:
         structure, (height, width) = images.clone(), images.shape[-2:]
         for out, image in zip(structure.flatten(0, 1), images.flatten(0, 1), strict=True):
             links = images.new_zeros(height, width + 1), images.new_zeros(height + 1, width)
-            arrays = (memory.numpy() for memory in (*links, out))
-            flow_kernels.structure(image.numpy(), _STRUCTURE_SCALE, step, _STRUCTURE_STEPS, *arrays)
+            choice = _STRUCTURE_SCALE, step, _STRUCTURE_STEPS
+            run(flow_kernels.structure, image, *choice, *links, out)
         return structure
     dual_right = images.new_zeros(*images.shape[:-1], images.shape[-1] - 1)
     dual_down = images.new_zeros(*images.shape[:-2], images.shape[-2] - 1, images.shape[-1])
@@ -392,8 +393,7 @@ def _linearise(
         offset = torch.empty_like(gradient[:, :1])
         found = _Constancy(gradient, offset, torch.empty_like(offset))
         for x, one, two, to, (rest,), (seen,) in zip(flow, first, second, *found, strict=True):
-            x, one, two, to, rest, seen = (a.numpy() for a in (x, one, two, to, rest, seen))
-            flow_kernels.linearise(x, one, two, _ROUNDING**2, to, rest, seen)
+            run(flow_kernels.linearise, x, one, two, _ROUNDING**2, to, rest, seen)
         return found
     warped, visible = _sample(second, flow)
     gradient = 0.5 * (first[:, 1:] + warped[:, 1:])
@@ -453,8 +453,7 @@ def _solve(
         links = functional.pad(right, (1, 1)), functional.pad(down, (0, 0, 1, 1))
         memory = flow_kernels.make_memory(*flow.shape[-2:])
         for x, a, b, (across,), (along,) in zip(flow, q, target, *links, strict=True):
-            x, a, b, across, along = (array.numpy() for array in (x, a, b, across, along))
-            flow_kernels.solve(x, a, b, across, along, num_iterations, memory)
+            run(flow_kernels.solve, x, a, b, across, along, num_iterations, memory)
         return flow
     system = _NormalEquations.of(q, _degree(weight, right, down), right, down)
     flow = flow.clone()
@@ -551,7 +550,7 @@ def _median(images: Images, radius: int) -> Images:
         padded = functional.pad(images, (radius,) * 4, mode="replicate").flatten(0, 1)
         out = torch.empty_like(images)
         for plane, filtered in zip(padded, out.flatten(0, 1), strict=True):
-            flow_kernels.median(plane.numpy(), filtered.numpy())
+            run(flow_kernels.median, plane, filtered)
         return out
     rows = max(1, _STRIP_VALUES // (images.shape[0] * images.shape[1] * width))
     padded = functional.pad(images, (radius,) * 4, mode="replicate")

@@ -13,6 +13,7 @@ from torch.nn import functional
 
 from torchcss.errors import ShapeError, check_shape
 from torchcss.kernels import compiler
+from torchcss.kernels.checked import run
 
 Faces = Int[Tensor, "f 3"]
 """Corner indices of triangles."""
@@ -215,8 +216,8 @@ def _nearest_faces(
 
         near = torch.full((pictures, height, width), -1, dtype=torch.float32)
         seen = torch.full_like(near, -1, dtype=torch.long)
-        place, distance, faces, _, drawn = (part.contiguous().numpy() for part in triangles)
-        draw(place, distance, faces, drawn, len(faces) // pictures, near.numpy(), seen.numpy())
+        place, distance, faces, _, drawn = (part.contiguous() for part in triangles)
+        run(draw, place, distance, faces, drawn, len(faces) // pictures, near, seen)
         return seen.flatten()
     return _by_spans(triangles, height, width, pictures=pictures)
 
