@@ -39,6 +39,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchcss.body.model import BodyModel, BodyPose
+from torchcss.body.uncertainty import point_jacobian
 from torchcss.cost.context import FrameContext
 from torchcss.cost.term import OnStates, Term
 from torchcss.types import LocalModel
@@ -201,7 +202,8 @@ def direction_slopes(
     """
     points = pose.joints[..., which.joint, :]
     unit, length = _units(which.difference @ points + which.fixed)
-    slope = which.difference @ _point_slopes(body, pose, points, which)
+    moved = point_jacobian(body, pose.tree, points, body.marker_link[which.joint])
+    slope = which.difference @ moved.movedim(-1, -3)
     across = unit[..., None, :, :]
     slope = (slope - (slope * across).sum(-1, keepdim=True) * across) / length[..., None, :, :]
     turns = [_turned(unit, slope, line) for line in (0, 1)]
@@ -212,17 +214,6 @@ def direction_slopes(
             spin[..., None, :].expand_as(own), own, dim=-1
         )
         yield (moved @ axes[..., None, :, :].mT * side_of(group.name, unit)).flatten(-2).mT
-
-
-def _point_slopes(
-    body: BodyModel, pose: BodyPose, points: Tensor, which: Directions
-) -> Float[Tensor, "*batch n p 3"]:
-    """How the ends of segments move with each parameter."""
-    omega, velocity = pose.tree.omega[..., None, :], pose.tree.velocity[..., None, :]
-    at = points[..., None, :, :]
-    moved = torch.linalg.cross(omega.expand_as(omega + at), at.expand_as(omega + at), dim=-1)
-    moved = (moved + velocity) * body.tree.ancestors[:, body.marker_link[which.joint]][..., None]
-    return moved if body.is_untied else torch.einsum("...qpi,qn->...npi", moved, body.tie)
 
 
 def _turned(

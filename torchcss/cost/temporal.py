@@ -115,10 +115,7 @@ class MixturePrior(Term):
         Args:
             predicted: The previous posterior, one frame ahead (`Dynamics.predict`).
         """
-        size = predicted.mean.shape[-1]
-        identity = torch.eye(
-            size, dtype=predicted.covariance.dtype, device=predicted.covariance.device
-        )
+        identity = torch.eye(predicted.mean.shape[-1]).to(predicted.covariance)
         # A variance of zero (a frozen parameter) is as good as a very small one.
         variance = predicted.covariance.diagonal(dim1=-2, dim2=-1).amax(-1)[:, None, None]
         least = torch.finfo(identity.dtype).eps * variance.clamp(min=_LEAST_VARIANCE)

@@ -390,7 +390,10 @@ class _Part:
             pose = self.body.pose(leaf)
             total = 0.0 * leaf.sum(-1)
             for _, scale, term, posed in self._terms(found):
-                at = _carried(found, pose, term.points(posed), term.link)
+                link, points = term.link, term.points(posed)
+                away = points - found.tree.translation[..., link, :]
+                local = (found.tree.rotation[..., link, :, :] * away[..., :, None]).sum(-2)
+                at = self.body.points_on_links(pose.tree, link, local)
                 total = total + scale * term.value(posed, at).sum(-1)
             for _, weight, prior, posed in self._bound("prior", pose):
                 total = total + weight * prior.value(posed)
@@ -421,16 +424,6 @@ def _joined(name: str, parts: Sequence[Mapping[str, Tensor]], rows: Sequence[Ind
     like = next(part[name] for part in parts if name in part)
     none = (like.new_zeros(len(some), *like.shape[1:]) for some in rows)
     return torch.cat([part.get(name, zero) for part, zero in zip(parts, none, strict=True)])
-
-
-def _carried(
-    found: BodyPose, pose: BodyPose, points: Float[Tensor, "*b p 3"], link: Int[Tensor, " p"]
-) -> Float[Tensor, "*b p 3"]:
-    """Where points that lie on links at one pose are at another."""
-    away = points - found.tree.translation[..., link, :]
-    local = (found.tree.rotation[..., link, :, :] * away[..., :, None]).sum(-2)
-    moved = (pose.tree.rotation[..., link, :, :] * local[..., None, :]).sum(-1)
-    return moved + pose.tree.translation[..., link, :]
 
 
 def beside(costs: Iterable[TrackingCost]) -> TrackingCost:

@@ -472,8 +472,7 @@ class Camera(nn.Module):
         Raises:
             ShapeError: If the last dimension is not 2.
         """
-        normalised, _ = self.undistort(uv)
-        direction = torch.cat([normalised, torch.ones_like(normalised[..., :1])], dim=-1)
+        direction = self._at_unit_depth(uv)
         direction = direction / torch.linalg.vector_norm(direction, dim=-1, keepdim=True)
         return direction @ self.R_camera_world.to(uv)
 
@@ -487,10 +486,12 @@ class Camera(nn.Module):
         Raises:
             ShapeError: If the last dimension of `uv` is not 2.
         """
-        normalised, _ = self.undistort(uv)
-        direction = torch.cat([normalised, torch.ones_like(normalised[..., :1])], dim=-1)
-        point = direction * depth[..., None] - self.t_camera_world.to(uv)
+        point = self._at_unit_depth(uv) * depth[..., None] - self.t_camera_world.to(uv)
         return point @ self.R_camera_world.to(uv)
+
+    def _at_unit_depth(self, uv: Pixels) -> Vectors:
+        normalised, _ = self.undistort(uv)
+        return torch.cat([normalised, torch.ones_like(normalised[..., :1])], dim=-1)
 
     # Cameras made from this one.
 
