@@ -34,7 +34,6 @@ from torchcss.body.chain import (
 )
 from torchcss.body.rotations import frame_along
 from torchcss.errors import BodyError, ShapeError, check_shape
-from torchcss.types import Bounds
 
 if TYPE_CHECKING:
     from torchcss.body.chain import Chain
@@ -178,11 +177,6 @@ class KinematicTree(nn.Module):
     def num_joints(self) -> int:
         """Number of moving joints."""
         return len(self.joint_names)
-
-    @property
-    def bounds(self) -> Bounds:
-        """Joint limits; infinite where a joint has none."""
-        return Bounds(self.lower, self.upper)
 
     def link_index(self, name: str) -> int:
         """Position of a link on axis `l`.
