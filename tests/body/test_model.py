@@ -143,8 +143,8 @@ def test_another_base_moves_the_whole_body(generator: torch.Generator) -> None:
 def test_converting_a_rebased_body_leaves_the_first_alone() -> None:
     body = load_body("arm7")
     other = body.with_base(body.base_rotation, body.base_translation).to(torch.float32)
-    assert other.dtype == other.tree.axes.dtype == torch.float32
-    assert body.dtype == body.tree.axes.dtype == torch.float64
+    assert other.dtype == other.tree.lower.dtype == torch.float32
+    assert body.dtype == body.tree.lower.dtype == torch.float64
     body.pose(body.rest)
     other.pose(other.rest)
 

@@ -72,11 +72,9 @@ class KinematicTree(nn.Module):
         joint_ancestors: `[q q]`, True at (i, j) where joint i moves joint j or i is j.
     """
 
-    axes: Tensor
     is_revolute: Tensor
     lower: Tensor
     upper: Tensor
-    joint_link: Tensor
     ancestors: Tensor
     joint_ancestors: Tensor
     joint_constant: Tensor
@@ -104,13 +102,10 @@ class KinematicTree(nn.Module):
                     ancestors[row_of[above], column] = True
                 above = parents[above]
         links = torch.tensor([self.link_names.index(joint.link) for joint in moving]).long()
-        axes = torch.tensor([joint.axis for joint in moving], dtype=torch.float64).reshape(-1, 3)
-        self.register_buffer("axes", axes / axes.norm(dim=-1, keepdim=True))
         revolute = [joint.kind == "revolute" for joint in moving]
         self.register_buffer("is_revolute", torch.tensor(revolute, dtype=torch.bool))
         self.register_buffer("lower", torch.tensor([j.lower for j in moving], dtype=torch.float64))
         self.register_buffer("upper", torch.tensor([j.upper for j in moving], dtype=torch.float64))
-        self.register_buffer("joint_link", links)
         self.register_buffer("ancestors", ancestors)
         self.register_buffer("joint_ancestors", ancestors[:, links])
         self._lay_out_levels()
@@ -234,9 +229,9 @@ class KinematicTree(nn.Module):
         With `twists` and `points` this is what a cost of few points needs, without the poses of all
         links; the batch is innermost. For the arguments see `forward`.
         """
-        if q.dtype != self.axes.dtype:
+        if q.dtype != self.lower.dtype:
             raise ShapeError(
-                f"the state is {q.dtype} and the body {self.axes.dtype}: convert one, "
+                f"the state is {q.dtype} and the body {self.lower.dtype}: convert one, "
                 "for example with body.to(x.dtype)"
             )
         base = torch.eye(3, 4, dtype=q.dtype, device=q.device)
