@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from common import Table, start, write_report
-from common.flow_files import flow_discontinuities, read_flow
+from common.flow_files import flow_discontinuities, read_flow, with_potentials
 from torch import Tensor
 from torch.nn import functional
 
@@ -110,7 +110,7 @@ def ours() -> dict[str, Method]:
     choices = {
         "accurate": ACCURATE,
         "tracking": TRACKING,
-        "accurate-quadratic": ACCURATE.with_potentials(Quadratic),
+        "accurate-quadratic": with_potentials(ACCURATE, Quadratic),
     }
     return {
         name: lambda first, second, choice=choice: robust_flow(first, second, choice)

@@ -10,6 +10,7 @@ By default: `read_flow(path)` and `write_flow(path, flow)`; `flow_discontinuitie
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,6 +22,8 @@ from torch.nn import functional
 
 from torchcss.errors import FlowFileError, ShapeError, check_shape
 from torchcss.files import read_bytes, replace_file
+from torchcss.robust import Leclerc, Lorentzian, Quadratic
+from torchcss.vision.flow import FlowConfiguration
 
 _MAGIC = b"PIEH"
 _HEADER_BYTES = 12
@@ -154,3 +157,14 @@ def _filled(
         flow = torch.where(known, flow, mean)
         known = known | reached
     return flow
+
+
+def with_potentials(
+    configuration: FlowConfiguration, kind: type[Quadratic] | type[Lorentzian] | type[Leclerc]
+) -> FlowConfiguration:
+    """The same choices with both potentials of another kind, nu and sigma kept."""
+    data, smoothness = (
+        kind(nu=potential.nu, sigma=potential.sigma)
+        for potential in (configuration.data, configuration.smoothness)
+    )
+    return replace(configuration, data=data, smoothness=smoothness)

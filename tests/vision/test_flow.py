@@ -10,7 +10,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 import torch
-from common.flow_files import flow_discontinuities, read_flow
+from common.flow_files import flow_discontinuities, read_flow, with_potentials
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -204,7 +204,7 @@ def test_subpixel_translation(
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_potential_finds_the_motion(kind: type[Quadratic]) -> None:
     first, second = shifted(48, 64, 1.5, -2.0)
-    result = robust_flow(first, second, TRACKING.with_potentials(kind))
+    result = robust_flow(first, second, with_potentials(TRACKING, kind))
     error = end_point_error(result.flow, torch.tensor([1.5, -2.0]).view(2, 1, 1))
     assert error[6:-6, 6:-6].mean() < 0.03
 
@@ -215,7 +215,7 @@ def test_moving_disc(configuration: FlowConfiguration) -> None:
     boundary = flow_discontinuities(truth)
     near = functional.max_pool2d(boundary[None].float(), 11, 1, 5)[0] > 0.0
     robust = robust_flow(first, second, configuration)
-    quadratic = robust_flow(first, second, configuration.with_potentials(Quadratic))
+    quadratic = robust_flow(first, second, with_potentials(configuration, Quadratic))
     error, quadratic_error = (end_point_error(x.flow, truth) for x in (robust, quadratic))
     assert error[near].mean() < 0.75 * quadratic_error[near].mean()
     assert error[~near].mean() < 0.1
@@ -319,7 +319,7 @@ def test_robust_beats_quadratic_near_boundaries(pair: tuple[Tensor, ...]) -> Non
     near = known & (functional.max_pool2d(boundary[None].float(), 11, 1, 5)[0] > 0.0)
     robust, quadratic = (
         end_point_error(robust_flow(first, second, configuration).flow, truth)[near].mean()
-        for configuration in (TRACKING, TRACKING.with_potentials(Quadratic))
+        for configuration in (TRACKING, with_potentials(TRACKING, Quadratic))
     )
     assert robust < 0.97 * quadratic
 
@@ -342,7 +342,7 @@ def test_awkward_frames_give_finite_flow(
     )
     first = frames.repeat_interleave(len(frames), dim=0)
     second = frames.repeat(len(frames), 1, 1)
-    result = robust_flow(first, second, configuration.with_potentials(kind))
+    result = robust_flow(first, second, with_potentials(configuration, kind))
     assert_sound(result, (len(frames) ** 2, *size))
     flow = result.flow.view(len(frames), len(frames), 2, *size)
     assert flow.diagonal().abs().max() < 1e-4
@@ -363,7 +363,7 @@ def test_no_nan_leaves(height: int, width: int, seed: int, kind: type, coarse: b
     if coarse:  # large flat patches, black and white
         frames = (torch.rand(2, 1, 3, 3, generator=generator) > 0.5).float()
         frames = functional.interpolate(frames, size=(height, width))[:, 0]
-    assert_sound(robust_flow(*frames, ACCURATE.with_potentials(kind)), (height, width))
+    assert_sound(robust_flow(*frames, with_potentials(ACCURATE, kind)), (height, width))
 
 
 @pytest.mark.parametrize(

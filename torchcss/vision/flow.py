@@ -30,7 +30,7 @@ How it is minimised:
   the data term holds; motion boundaries then follow the outlines of objects.
 
 By default: `robust_flow(first, second)`; `configuration=TRACKING` when every frame of a video needs
-it. `configuration.with_potentials(Leclerc)` exchanges the potentials.
+it.
 """
 
 from __future__ import annotations
@@ -147,16 +147,6 @@ class FlowConfiguration:
                 f"flow: {len(self.sigma_factors)} sigma_factors need as many warps, "
                 f"got num_warps={self.num_warps}"
             )
-
-    def with_potentials(
-        self, kind: type[Quadratic] | type[Lorentzian] | type[Leclerc]
-    ) -> FlowConfiguration:
-        """Return the same choices with both potentials of another kind, nu and sigma kept."""
-        return dataclasses.replace(
-            self,
-            data=kind(nu=self.data.nu, sigma=self.data.sigma),
-            smoothness=kind(nu=self.smoothness.nu, sigma=self.smoothness.sigma),
-        )
 
 
 ACCURATE = FlowConfiguration()
