@@ -41,7 +41,6 @@ from torchcss.body.files.default_shape import bone_parts, rest_poses, touching_p
 from torchcss.body.files.mjcf import read_mjcf
 from torchcss.body.files.urdf import read_urdf
 from torchcss.body.files.xml import parse_xml
-from torchcss.body.kinematics import KinematicTree
 from torchcss.body.model import BodyModel
 from torchcss.body.root import has_root
 from torchcss.body.rotations import as_vector
@@ -211,13 +210,10 @@ def _read(
     root = parse_xml(path, data, "a URDF")
     if path.suffix.lower() != ".urdf" and root.tag in ("mujoco", "mujocoinclude"):
         return *read_mjcf(path), _Y_UP
-    read = read_urdf(path, root)
-    joints = read.joints
     try:
-        links = KinematicTree(joints).link_names
+        return *read_urdf(root), _Y_UP
     except BodyError as error:
         raise BodyError(f"{path}: {error}") from error
-    return Skeleton(joints, {}, read.notes, links, read.floats), read.solids, _Y_UP
 
 
 def _middle_of_hips(

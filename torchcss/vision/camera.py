@@ -282,10 +282,7 @@ class Camera(nn.Module):
         Raises:
             ShapeError: If the last dimension is not 3.
         """
-        a, b, _, depth, valid = self._normalise(points_world)
-        if self.has_distortion:
-            a, b = _Lens.at(a, b, self.distortion).distorted()
-        return Projection(self._to_pixels(a, b, valid), depth, valid)
+        return Projection(*self.project_with_derivatives(points_world)[:3])
 
     def project_with_derivatives(
         self, points_world: Float[Tensor, "*batch p 3"]

@@ -16,11 +16,10 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import count
-from pathlib import Path
-from typing import NamedTuple
 
 from torchcss.body.catalog import PartSpecification
-from torchcss.body.chain import JointSpecification, urdf_joints
+from torchcss.body.chain import JointSpecification, check_joints, link_order, urdf_joints
+from torchcss.body.files.bvh import Skeleton
 from torchcss.body.files.default_shape import solid_shape
 from torchcss.body.rotations import about_fixed_axes, as_rows
 from torchcss.errors import BodyError
@@ -35,39 +34,25 @@ _SIZES = {
 }
 
 
-class Urdf(NamedTuple):
-    """What a URDF says.
-
-    Attributes:
-        joints: Its joints, parents first.
-        solids: Parts of the links that have solids.
-        floats: Whether it moves freely.
-        notes: What was assumed, one line each.
-    """
-
-    joints: tuple[JointSpecification, ...]
-    solids: tuple[PartSpecification, ...]
-    floats: bool
-    notes: tuple[str, ...]
-
-
-def read_urdf(path: Path, robot: ElementTree.Element) -> Urdf:
-    """Joints and solids of a URDF.
+def read_urdf(robot: ElementTree.Element) -> tuple[Skeleton, tuple[PartSpecification, ...]]:
+    """Tree and solids of a URDF.
 
     Args:
-        path: The file, for messages.
         robot: Its root element.
+
+    Returns:
+        The tree, and the parts of the links that have solids.
 
     Raises:
         BodyError: If it is no URDF, has joints of more than one degree of freedom, repeats a name,
             is not one tree, or has a number that is none.
     """
     if robot.tag != "robot" or robot.find("link") is None:
-        raise BodyError(f"{path}: not a URDF, expected <robot> with links, found <{robot.tag}>")
+        raise BodyError(f"not a URDF, expected <robot> with links, found <{robot.tag}>")
     notes = ["limits, axes and solids: as the URDF says"]
-    floats = _take_off_the_world(path, robot, notes)
+    floats = _take_off_the_world(robot, notes)
     elements = {element.get("name", ""): element for element in robot.findall("joint")}
-    _check_tree(path, robot, elements)
+    _check_tree(robot, elements)
     for name, element in elements.items():
         mimic = element.find("mimic")
         if mimic is not None and mimic.get("joint") not in elements:
@@ -76,85 +61,86 @@ def read_urdf(path: Path, robot: ElementTree.Element) -> Urdf:
                 f"joint {name!r} mimics {mimic.get('joint')!r}, which is no joint: it is taken as "
                 "free"
             )
-    if not elements:
+    joints = [
+        joint if joint.parent is None else _completed(joint, elements[joint.name])
+        for joint in _bare_joints(robot)
+    ]
+    solids = _solids(robot)
+    check_joints(joints)
+    places = tuple(link_order(joints))
+    return Skeleton(tuple(joints), {}, tuple(notes), places, floats), solids
+
+
+def _bare_joints(robot: ElementTree.Element) -> list[JointSpecification]:
+    """Joints without limits."""
+    if robot.find("joint") is None:
         name = robot.findall("link")[0].get("name", "")
-        joints = [JointSpecification(name="root", link=name, parent=None)]
-    else:
-        try:
-            joints = urdf_joints(ElementTree.tostring(_kinematics_only(robot)))
-        except BodyError as error:
-            raise BodyError(f"{path}: {error}") from error
-    completed = (
-        joint if joint.parent is None else _completed(path, joint, elements[joint.name])
-        for joint in joints
-    )
-    return Urdf(tuple(completed), _solids(path, robot), floats, tuple(notes))
+        return [JointSpecification(name="root", link=name, parent=None)]
+    return urdf_joints(ElementTree.tostring(_kinematics_only(robot)))
 
 
-def _take_off_the_world(path: Path, robot: ElementTree.Element, notes: list[str]) -> bool:
+def _take_off_the_world(robot: ElementTree.Element, notes: list[str]) -> bool:
     """Keep only what hangs on a floating joint of the root link; whether there is one."""
     joints = robot.findall("joint")
-    children = {_link(path, joint, "child") for joint in joints}
+    children = {_link(joint, "child") for joint in joints}
     floating = [
         joint
         for joint in joints
-        if joint.get("type") == "floating" and _link(path, joint, "parent") not in children
+        if joint.get("type") == "floating" and _link(joint, "parent") not in children
     ]
     if len(floating) != 1:
         return False
-    kept = [_link(path, floating[0], "child")]
+    kept = [_link(floating[0], "child")]
     for link in kept:  # grows while it is walked
-        below = [_link(path, joint, "child") for joint in joints
-                 if _link(path, joint, "parent") == link]  # fmt: skip
+        below = [_link(joint, "child") for joint in joints
+                 if _link(joint, "parent") == link]  # fmt: skip
         kept += [child for child in below if child not in kept]
-    world = _link(path, floating[0], "parent")
+    world = _link(floating[0], "parent")
     others = [link for link in robot.findall("link") if link.get("name") not in (*kept, world)]
     if others:
         names = ", ".join(link.get("name", "") for link in others)
         notes.append(f"left out, as it hangs on {world!r} beside the body: {shortened(names)}")
     for element in [*joints, *robot.findall("link")]:
-        name = element.get("name") if element.tag == "link" else _link(path, element, "parent")
+        name = element.get("name") if element.tag == "link" else _link(element, "parent")
         if name not in kept:
             robot.remove(element)
     return True
 
 
-def _check_tree(
-    path: Path, robot: ElementTree.Element, joints: Mapping[str, ElementTree.Element]
-) -> None:
+def _check_tree(robot: ElementTree.Element, joints: Mapping[str, ElementTree.Element]) -> None:
     """Names, types, and that the links form one tree."""
     if len(joints) != len(robot.findall("joint")):
-        raise BodyError(f"{path}: two joints have the same name, or one has none")
+        raise BodyError("two joints have the same name, or one has none")
     for name, element in joints.items():
         if element.get("type") not in _TYPES:
             raise BodyError(
-                f"{path}: joint {name!r} is of type {element.get('type')!r}; supported are "
+                f"joint {name!r} is of type {element.get('type')!r}; supported are "
                 f"{', '.join(_TYPES)}, and floating at the root (split others into joints of one "
                 "axis)"
             )
     children, parents = (
-        [_link(path, element, tag) for element in joints.values()] for tag in ("child", "parent")
+        [_link(element, tag) for element in joints.values()] for tag in ("child", "parent")
     )
     links = [link.get("name", "") for link in robot.findall("link")]
     unknown = {*children, *parents} - set(links)
     if unknown:
-        raise BodyError(f"{path}: joints name links that do not exist: {sorted(unknown)}")
+        raise BodyError(f"joints name links that do not exist: {sorted(unknown)}")
     if len(set(children)) != len(children) or len(set(links)) != len(links):
-        raise BodyError(f"{path}: a link occurs twice, or hangs on two joints")
+        raise BodyError("a link occurs twice, or hangs on two joints")
     reached = [link for link in links if link not in children]
     if len(reached) != 1:
-        raise BodyError(f"{path}: expected exactly one root link, found {sorted(reached)}")
+        raise BodyError(f"expected exactly one root link, found {sorted(reached)}")
     for link in reached:  # grows while it is walked: breadth first
         reached += [below for below, above in zip(children, parents, strict=True) if above == link]
     if len(reached) != len(links):
-        raise BodyError(f"{path}: the links {sorted(set(links) - set(reached))} form a loop")
+        raise BodyError(f"the links {sorted(set(links) - set(reached))} form a loop")
 
 
-def _link(path: Path, element: ElementTree.Element, tag: str) -> str:
+def _link(element: ElementTree.Element, tag: str) -> str:
     """The link that a joint names as its child or parent."""
     child = element.find(tag)
     if child is None or not child.get("link"):
-        raise BodyError(f"{path}: joint {element.get('name')!r} has no <{tag} link=...>")
+        raise BodyError(f"joint {element.get('name')!r} has no <{tag} link=...>")
     return child.get("link", "")
 
 
@@ -173,11 +159,9 @@ def _kinematics_only(robot: ElementTree.Element) -> ElementTree.Element:
     return bare
 
 
-def _completed(
-    path: Path, joint: JointSpecification, element: ElementTree.Element
-) -> JointSpecification:
+def _completed(joint: JointSpecification, element: ElementTree.Element) -> JointSpecification:
     """A joint with its limits, with what it mimics, and with the axis that a URDF means by none."""
-    where = f"{path}: joint {joint.name!r}"
+    where = f"joint {joint.name!r}"
     if element.find("axis") is None:
         joint = replace(joint, axis=(1.0, 0.0, 0.0))  # pytorch-kinematics takes z
     limit, mimic = element.find("limit"), element.find("mimic")
@@ -202,7 +186,7 @@ def _completed(
     return replace(joint, mimic=(mimic.get("joint", ""), multiplier, offset))
 
 
-def _solids(path: Path, robot: ElementTree.Element) -> tuple[PartSpecification, ...]:
+def _solids(robot: ElementTree.Element) -> tuple[PartSpecification, ...]:
     """The simple solids of all links."""
     parts: list[PartSpecification] = []
     links = robot.findall("link")
@@ -212,7 +196,7 @@ def _solids(path: Path, robot: ElementTree.Element) -> tuple[PartSpecification, 
         name = link.get("name", "")
         free = (other for n in count(2) if (other := f"{name}_{n}") not in names)
         for number, (element, solid) in enumerate(_simple_solids(link), start=1):
-            where = f"{path}: link {name!r}: <{solid.tag}>"
+            where = f"link {name!r}: <{solid.tag}>"
             size: list[float] = []
             for key in _SIZES[solid.tag]:
                 size += _numbers(where, key, solid.get(key, ""), 3 if key == "size" else 1)
