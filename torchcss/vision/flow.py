@@ -66,6 +66,14 @@ Potential = Quadratic | Lorentzian | Leclerc
 _STRUCTURE_SCALE = 1.0 / 16.0
 """Weight of the total variation when structure is separated from texture, grey levels of 0..1."""
 _STRUCTURE_STEPS = 30
+_DATA_OUTLIER_SCALE, _SMOOTHNESS_OUTLIER_SCALE = 0.02, 0.25
+"""Sigmas of the outlier maps: of the data term, grey levels of 0..1, and of smoothness, pixels."""
+_SMALLEST_SIDE = 6
+"""No level has a shorter side than this, pixels, unless the frame has."""
+_NUM_ITERATIONS = 20
+"""Conjugate-gradient steps per solve."""
+_MEDIAN_RADIUS = 2
+"""Radius of the plain median's square window, pixels."""
 _ROUNDING = 1.0e-5
 """Gradients below this, grey levels per pixel, are rounding; they say nothing of the motion."""
 _WEAKEST_LINK = 1.0e-6
@@ -90,58 +98,37 @@ class FlowConfiguration:
     Attributes:
         data: Potential of brightness differences; sigma in grey levels of 0..1.
         smoothness: Potential of differences between neighbouring flows; sigma in pixels.
-        data_outlier_scale: Sigma of the outlier map of the data term, grey levels of 0..1.
-        smoothness_outlier_scale: Sigma of the outlier map of the smoothness term, pixels.
         texture: Share of the smooth structure that is taken out of the frames, 0 to 1.
         pyramid_factor: Size of a level relative to the finer one.
-        smallest_side: No level has a shorter side than this, pixels, unless the frame has.
         sigma_factors: The graduated non-convexity: what sigma is multiplied by, in order; the
             warps of each level are shared out evenly among them.
         num_warps: How often each level warps the second frame anew.
         num_reweightings: Solves with fresh robust weights per warp.
-        num_iterations: Conjugate-gradient steps per solve.
-        median_radius: Radius of the plain median's square window, pixels; 0 leaves it out.
         weighted_median_radius: Radius of the weighted median's window; 0 leaves it out.
     """
 
     data: Potential = field(default_factory=lambda: Lorentzian(nu=1.0, sigma=0.0033))
     smoothness: Potential = field(default_factory=lambda: Lorentzian(nu=0.06, sigma=0.042))
-    data_outlier_scale: float = 0.02
-    smoothness_outlier_scale: float = 0.25
     texture: float = 0.9
     pyramid_factor: float = 0.7
-    smallest_side: int = 6
     sigma_factors: tuple[float, ...] = (100.0, 10.0, 1.0)
     num_warps: int = 6
     num_reweightings: int = 2
-    num_iterations: int = 20
-    median_radius: int = 2
     weighted_median_radius: int = 5
 
     def __post_init__(self) -> None:
-        for names, bound, fits in (
-            (
-                ("smallest_side", "num_warps", "num_reweightings", "num_iterations"),
-                "at least 1",
-                lambda value: value >= 1,
-            ),
-            (("median_radius", "weighted_median_radius"), "at least 0", lambda value: value >= 0),
-            (
-                ("data_outlier_scale", "smoothness_outlier_scale"),
-                "positive and finite",
-                lambda value: 0.0 < value < math.inf,
-            ),
-            (
-                ("sigma_factors",),
-                "positive and finite",
-                lambda value: value and all(0.0 < factor < math.inf for factor in value),
-            ),
-            (("texture",), "in 0..1", lambda value: 0.0 <= value <= 1.0),
-            (("pyramid_factor",), "between 0 and 1", lambda value: 0.0 < value < 1.0),
+        factors = self.sigma_factors
+        for name, bound, fits in (
+            ("num_warps", "at least 1", self.num_warps >= 1),
+            ("num_reweightings", "at least 1", self.num_reweightings >= 1),
+            ("weighted_median_radius", "at least 0", self.weighted_median_radius >= 0),
+            ("sigma_factors", "given", factors),
+            ("sigma_factors", "positive and finite", all(0.0 < f < math.inf for f in factors)),
+            ("texture", "in 0..1", 0.0 <= self.texture <= 1.0),
+            ("pyramid_factor", "between 0 and 1", 0.0 < self.pyramid_factor < 1.0),
         ):
-            for name in names:
-                if not fits(value := getattr(self, name)):
-                    raise ConfigurationError(f"flow: {name} must be {bound}, got {value}")
+            if not fits:
+                raise ConfigurationError(f"flow: {name} must be {bound}, got {getattr(self, name)}")
         if len(self.sigma_factors) > self.num_warps:
             raise ConfigurationError(
                 f"flow: {len(self.sigma_factors)} sigma_factors need as many warps, "
@@ -218,8 +205,8 @@ def robust_flow(
         scale = flow.new_tensor([size[1] / flow.shape[-1], size[0] / flow.shape[-2]])
         flow = _resize(flow, size) * scale.view(1, 2, 1, 1)
         flow = _refine(flow, textured, grey[:, :1], configuration)
-    data = _of_scale(configuration.data, configuration.data_outlier_scale)
-    smoothness = _of_scale(configuration.smoothness, configuration.smoothness_outlier_scale)
+    data = _of_scale(configuration.data, _DATA_OUTLIER_SCALE)
+    smoothness = _of_scale(configuration.smoothness, _SMOOTHNESS_OUTLIER_SCALE)
     data_outlier = 1.0 - _data_held(flow, textured, data)
     right, down = (_relative_weight(smoothness, s) for s in _squared_differences(flow))
     smoothness_outlier = _largest_of_neighbours(1.0 - right, 1.0 - down)
@@ -259,7 +246,7 @@ def _pyramid_sizes(
     """Sizes of the levels, coarsest first; the last is the frame's own."""
     sizes = [(height, width)]
     scale = configuration.pyramid_factor
-    while min(height, width) * scale >= configuration.smallest_side:
+    while min(height, width) * scale >= _SMALLEST_SIDE:
         sizes.append((round(height * scale), round(width * scale)))
         scale *= configuration.pyramid_factor
     return sizes[::-1]
@@ -327,10 +314,9 @@ def _refine(flow: Field, frames: Field, guide: Plane, configuration: FlowConfigu
                 smoothness(squared).first.clamp(min=weakest)
                 for squared in _squared_differences(flow)
             )
-            flow = _solve(flow, constancy, weight, right, down, configuration.num_iterations)
+            flow = _solve(flow, constancy, weight, right, down, _NUM_ITERATIONS)
         unfiltered = flow
-        if configuration.median_radius:
-            flow = _median(flow, configuration.median_radius)
+        flow = _median(flow, _MEDIAN_RADIUS)
         if configuration.weighted_median_radius and warp + 1 == configuration.num_warps:
             held = _data_held(unfiltered, frames, configuration.data)
             radius = configuration.weighted_median_radius
