@@ -187,22 +187,24 @@ def pack_potential(potential: RobustPotential) -> Potential | None:
 
 def absent(num_parts: int) -> dict[str, Any]:
     """Records of image terms that are not there, by their fields in `View`; their scale is zero."""
-    zeros, whole = torch.zeros, np.zeros(num_parts, np.int64)
-    field, target, potential = zeros(2, 8, 8), zeros(1, 3, 0), Potential(np.int64(0), 1.0, 1.0)
-    corner, steps, kind = torch.ones(2), zeros(5), np.int64(0)
-    edges = dict(field=field, corner=corner, steps=steps, assignment=kind, strength=False)
-    nodes = dict(nodes=zeros(num_parts, 6, 0), target=zeros(1, 3, num_parts, 0))
-    joints = dict(row=whole[:0], place=np.zeros((0, 3)), target=target)
-    records: dict[str, tuple[Any, dict[str, Any]]] = {
-        "edges": (Edges, {**edges, "potential": potential}),
-        "colours": (Colours, dict(field=field, corner=corner, layer=whole)),
-        "flow": (Flow, {**nodes, "potential": potential}),
-        "keypoints": (PackedKeypoints, {**joints, "potential": potential}),
-    }
+    zeros, whole, kind = torch.zeros, np.zeros(num_parts, np.int64), np.int64(0)
+    image, compared = {"field": zeros(2, 8, 8), "corner": torch.ones(2)}, Potential(kind, 1.0, 1.0)
     return {
-        name: record(**{**dict.fromkeys(record._fields, 0.0), **given})
-        for name, (record, given) in records.items()
+        "edges": _zero(Edges)._replace(
+            **image, steps=zeros(5), assignment=kind, strength=False, potential=compared
+        ),
+        "colours": _zero(Colours)._replace(**image, layer=whole),
+        "flow": _zero(Flow)._replace(
+            nodes=zeros(num_parts, 6, 0), target=zeros(1, 3, num_parts, 0), potential=compared
+        ),
+        "keypoints": _zero(PackedKeypoints)._replace(
+            row=whole[:0], place=np.zeros((0, 3)), target=zeros(1, 3, 0), potential=compared
+        ),
     }
+
+
+def _zero(record: Any) -> Any:
+    return record._make([0.0] * len(record._fields))
 
 
 def pack_edges(
