@@ -49,6 +49,9 @@ from torchcss.cost.visibility import places
 from torchcss.robust import Lorentzian, RobustPotential, RobustValue
 from torchcss.vision.sampling import inside_image, interpolate_bilinear
 
+Pixels = Float[Tensor, "*batch p 2"]
+Channels = Float[Tensor, "c h w"]
+
 Each = Float[Tensor, " e"]
 """A number for each edge."""
 
@@ -146,12 +149,7 @@ class ContourTerm(OutlineTerm):
         field = context.weighed_edges(foreground=self.foreground)
         return None if field is None else self.bind(context, field, count_nodes(context))
 
-    def search(
-        self,
-        uv: Float[Tensor, "*batch p 2"],
-        normal_uv: Float[Tensor, "*batch p 2"],
-        edge_field: Float[Tensor, "c h w"],
-    ) -> EdgeAssignments:
+    def search(self, uv: Pixels, normal_uv: Pixels, edge_field: Channels) -> EdgeAssignments:
         """Search the image along the normals.
 
         Args:
@@ -177,12 +175,7 @@ class ContourTerm(OutlineTerm):
         weight = interpolate_bilinear(edge_field[2:], place)[:, 0]
         return EdgeAssignments(node, distance, weight * height if self.strength else weight)
 
-    def _maxima(
-        self,
-        uv: Float[Tensor, "*batch p 2"],
-        normal_uv: Float[Tensor, "*batch p 2"],
-        edge_field: Float[Tensor, "2 h w"],
-    ) -> _Maxima:
+    def _maxima(self, uv: Pixels, normal_uv: Pixels, edge_field: Float[Tensor, "2 h w"]) -> _Maxima:
         """All local maxima of the response on the search lines, and a little beyond."""
         # Samples run along the first axis in memory, so that neighbours on a line are whole rows.
         start, along = (v.detach().reshape(-1, 2).mT.contiguous() for v in (uv, normal_uv))
@@ -231,10 +224,7 @@ class ContourTerm(OutlineTerm):
         return EdgeAssignments(node, distance, weight)
 
     def _wells(
-        self,
-        uv: Float[Tensor, "p 2"],
-        normal_uv: Float[Tensor, "p 2"],
-        edge_field: Float[Tensor, "c h w"],
+        self, uv: Float[Tensor, "p 2"], normal_uv: Float[Tensor, "p 2"], edge_field: Channels
     ) -> tuple[Float[Tensor, " p"], Float[Tensor, " p"], Float[Tensor, " p"]]:
         """Depth of the wells of nodes, and the cost's derivatives in the distance moved."""
         # Both components of a pixel side by side: fewer misses of the cache.
@@ -268,10 +258,7 @@ class ContourTerm(OutlineTerm):
         return share - 0.5 * value.rho, squared, value
 
     def match(
-        self,
-        nodes: ImageNodes,
-        image: Float[Tensor, "c h w"],
-        at: Float[Tensor, "k 2"] | None = None,
+        self, nodes: ImageNodes, image: Channels, at: Float[Tensor, "k 2"] | None = None
     ) -> Float[Tensor, " k"]:
         """Depth of the nodes' wells below U, see `OutlineTerm.match`."""
         if at is None:
@@ -281,7 +268,7 @@ class ContourTerm(OutlineTerm):
         wells, _, _ = self._well(found, found.distance - moved.index_select(0, found.node))
         return torch.zeros_like(moved).index_add(0, found.node, wells)
 
-    def derivatives(self, nodes: ImageNodes, image: Float[Tensor, "c h w"]) -> Derivatives:
+    def derivatives(self, nodes: ImageNodes, image: Channels) -> Derivatives:
         """See `OutlineTerm.derivatives`."""
         depth, slope, curvature = self._wells(nodes.uv, nodes.normal, image)
         normal, weight = nodes.normal, nodes.weight

@@ -170,11 +170,7 @@ class FlowTerm(Term):
         return self.potential_kind(nu=self.nu, sigma=self.sigma)
 
     def value(
-        self,
-        nodes: SeenNodes,
-        camera: Camera,
-        targets: FlowTargets,
-        at: Points | None = None,
+        self, nodes: SeenNodes, camera: Camera, targets: FlowTargets, at: Points | None = None
     ) -> Values:
         """Cost of every node, in units of nu.
 

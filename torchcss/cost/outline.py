@@ -109,11 +109,7 @@ class OutlineTerm(Term):
         )
 
     def value(
-        self,
-        nodes: SeenNodes,
-        camera: Camera,
-        image: Any,
-        at: Points | None = None,
+        self, nodes: SeenNodes, camera: Camera, image: Any, at: Points | None = None
     ) -> Values:
         """Cost of every node, in units of nu.
 

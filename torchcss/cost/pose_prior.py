@@ -45,6 +45,11 @@ from torchcss.cost.term import OnStates, Term
 from torchcss.types import LocalModel
 from torchcss.vision.camera import Upright
 
+Each = Float[Tensor, " k"]
+"""A number for each Gaussian, and"""
+Square = Float[Tensor, "k d d"]
+"""a matrix."""
+
 Batch = Float[Tensor, "*batch d"]
 """Directions of a group, three numbers each."""
 
@@ -239,9 +244,9 @@ class PoseMixture(NamedTuple):
         covariance: Their covariances S_k.
     """
 
-    weight: Float[Tensor, " k"]
+    weight: Each
     mean: Float[Tensor, "k d"]
-    covariance: Float[Tensor, "k d d"]
+    covariance: Square
 
     def with_mirrored(self, group: str) -> PoseMixture:
         """With their mirror images, at half the weight each; arms have theirs on the other side."""
@@ -273,15 +278,13 @@ class PoseMixture(NamedTuple):
         return Density(mean, torch.cholesky_inverse(root), height, uniform)
 
 
-def _log_peak(root: Float[Tensor, "k d d"]) -> Float[Tensor, " k"]:
+def _log_peak(root: Square) -> Each:
     """Log density of Gaussians at their means, from the roots of their covariances."""
     volume = root.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     return -volume - 0.5 * root.shape[-1] * math.log(2 * math.pi)
 
 
-def _log_on_spheres(
-    mean: Float[Tensor, "k d"], covariance: Float[Tensor, "k d d"], *, flat: bool
-) -> Float[Tensor, " k"]:
+def _log_on_spheres(mean: Float[Tensor, "k d"], covariance: Square, *, flat: bool) -> Each:
     """Log of Z_k: the density of lengths one; if flat, of a first direction without front, too."""
     directions = torch.nn.functional.normalize(mean.unflatten(-1, (-1, 3)), dim=-1)
     across = torch.diag_embed(directions.mT).permute(0, 2, 1, 3).flatten(1, 2)
@@ -310,8 +313,8 @@ class Density(NamedTuple):
     """
 
     mean: Float[Tensor, "k d"]
-    precision: Float[Tensor, "k d d"]
-    height: Float[Tensor, " k"]
+    precision: Square
+    height: Each
     uniform: float
 
     def parts(

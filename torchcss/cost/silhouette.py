@@ -183,11 +183,7 @@ class SilhouetteTerm(Term):
         return SilhouetteImages(small, points, weight, bare, self.sigma * metre)
 
     def value(
-        self,
-        points: Points,
-        camera: Camera,
-        images: SilhouetteImages,
-        at: Points | None = None,
+        self, points: Points, camera: Camera, images: SilhouetteImages, at: Points | None = None
     ) -> Values:
         """Cost in units of nu, shared out among the nodes: only the sum has a meaning.
 

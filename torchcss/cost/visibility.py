@@ -137,11 +137,7 @@ class ContourPredictor(nn.Module):
     _MERIDIAN_STEPS = 12
 
     def __init__(
-        self,
-        body: BodyModel,
-        *,
-        rings: int | None = None,
-        meridians: int | None = None,
+        self, body: BodyModel, *, rings: int | None = None, meridians: int | None = None
     ) -> None:
         super().__init__()
         self.num_rings = rings = rings or max(7, min(18, 126 // max(body.num_parts, 1)))

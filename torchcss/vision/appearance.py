@@ -28,6 +28,8 @@ from torch.nn import functional
 
 from torchcss.vision.background import Background
 
+Histograms = Float[Tensor, "layers bins"]
+
 BINS = 12
 """Bins per colour channel."""
 
@@ -46,8 +48,8 @@ class Appearance(NamedTuple):
         outside: The same of its surroundings.
     """
 
-    inside: Float[Tensor, "layers bins"]
-    outside: Float[Tensor, "layers bins"]
+    inside: Histograms
+    outside: Histograms
 
     @classmethod
     def unknown(cls, num_layers: int, *, like: Tensor) -> Appearance:
@@ -137,7 +139,7 @@ def _mix(old: Tensor, bins: Tensor, masks: Tensor, rate: float) -> Tensor:
     return torch.stack(rows)
 
 
-def _smooth(histograms: Float[Tensor, "layers bins"]) -> Float[Tensor, "layers bins"]:
+def _smooth(histograms: Histograms) -> Histograms:
     """Spread each bin over its neighbours, by 1/4, 1/2, 1/4 along each channel."""
     cube = histograms.reshape(-1, 1, BINS, BINS, BINS)
     kernel = histograms.new_tensor([0.25, 0.5, 0.25])

@@ -38,6 +38,8 @@ from torchcss.kernels.checked import run
 from torchcss.vision.flow import OpticalFlow, has_kernels
 from torchcss.vision.sampling import gaussian_blur
 
+Images = Float[Tensor, "*batch h w"]
+
 _LEAST_OUTLIER = 1e-3
 """What is less of an outlier is none."""
 
@@ -50,8 +52,8 @@ class MotionBoundaries(NamedTuple):
         potential: S_p of section 3.1.2 [IJRR], one minus the strength.
     """
 
-    strength: Float[Tensor, "*batch h w"]
-    potential: Float[Tensor, "*batch h w"]
+    strength: Images
+    potential: Images
 
 
 def motion_boundaries(
@@ -86,9 +88,7 @@ def motion_boundaries(
     return MotionBoundaries(strength, 1.0 - strength)
 
 
-def carried(
-    outlier: Float[Tensor, "*batch h w"], flow: Float[Tensor, "*batch 2 h w"], *, reach: int
-) -> Float[Tensor, "*batch h w"]:
+def carried(outlier: Images, flow: Float[Tensor, "*batch 2 h w"], *, reach: int) -> Images:
     """Outliers of the flow's smoothness on the grid of the frame that the flow leads to.
 
     A boundary moves with what is in front, which the flow does not tell: each outlier goes where

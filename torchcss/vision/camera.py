@@ -55,6 +55,11 @@ from torchcss.errors import CameraError, check_shape
 from torchcss.types import PointCost
 from torchcss.vision.sampling import inside_image
 
+ImagePoints = Float[Tensor, "*batch p 2"]
+"""Image points, and"""
+Points = Float[Tensor, "*batch p 3"]
+"""those in space."""
+
 Numbers = Tensor | np.ndarray | Sequence[Any]
 Values = Float[Tensor, "*batch p"]
 Pixels = Float[Tensor, "*batch 2"]
@@ -86,7 +91,7 @@ class Projection(NamedTuple):
         valid: False where the camera cannot see the direction, whatever the size of its image.
     """
 
-    uv: Float[Tensor, "*batch p 2"]
+    uv: ImagePoints
     depth: Values
     valid: Bool[Tensor, "*batch p"]
 
@@ -106,7 +111,7 @@ class ProjectionModel(NamedTuple):
         lens_bb: First derivative of the distorted b in b.
     """
 
-    uv: Float[Tensor, "*batch p 2"]
+    uv: ImagePoints
     depth: Values
     valid: Bool[Tensor, "*batch p"]
     a: Values
@@ -273,7 +278,7 @@ class Camera(nn.Module):
         translation = self.t_camera_world.to(points_world)
         return _turned(self.R_camera_world, points_world) + translation
 
-    def project(self, points_world: Float[Tensor, "*batch p 3"]) -> Projection:
+    def project(self, points_world: Points) -> Projection:
         """Project points; autograd differentiates it as often as needed.
 
         Args:
@@ -284,9 +289,7 @@ class Camera(nn.Module):
         """
         return Projection(*self.project_with_derivatives(points_world)[:3])
 
-    def project_with_derivatives(
-        self, points_world: Float[Tensor, "*batch p 3"]
-    ) -> ProjectionModel:
+    def project_with_derivatives(self, points_world: Points) -> ProjectionModel:
         """Project points, ready for `pull_back` to differentiate with respect to the points.
 
         Args:
@@ -310,7 +313,7 @@ class Camera(nn.Module):
         self,
         model: ProjectionModel,
         value: Values,
-        gradient_uv: Float[Tensor, "*batch p 2"],
+        gradient_uv: ImagePoints,
         hessian_uv: Float[Tensor, "*batch p 2 2"],
         *,
         gauss_newton: bool = False,
@@ -362,9 +365,7 @@ class Camera(nn.Module):
             hessian.reshape(3, 3, *a.shape).movedim((0, 1), (-2, -1)),
         )
 
-    def image_normals(
-        self, model: ProjectionModel, normals_world: Float[Tensor, "*batch p 3"]
-    ) -> Float[Tensor, "*batch p 2"]:
+    def image_normals(self, model: ProjectionModel, normals_world: Points) -> ImagePoints:
         """Unit normals m, in the image, of surfaces that are seen edge on.
 
         With J the derivative of the image point, `J^T m` is parallel to the surface's normal n: a
@@ -538,9 +539,7 @@ class Camera(nn.Module):
         )
         return camera.to(device=self.K.device, dtype=self.K.dtype)
 
-    def _normalise(
-        self, points_world: Float[Tensor, "*batch p 3"]
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    def _normalise(self, points_world: Points) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Return a, b, 1 / depth (zero, zero and one where invalid), depth and valid."""
         x, y, depth = self.to_camera_frame(points_world).unbind(-1)
         limit = self.maximum_radius.to(depth).clamp(max=GRAZING_RADIUS)
@@ -555,7 +554,7 @@ class Camera(nn.Module):
         focal_u, focal_v = torch.diagonal(self.K)[:2].to(like).unbind()
         return focal_u, focal_v
 
-    def _to_pixels(self, a: Tensor, b: Tensor, valid: Tensor) -> Float[Tensor, "*batch p 2"]:
+    def _to_pixels(self, a: Tensor, b: Tensor, valid: Tensor) -> ImagePoints:
         K = self.K.to(a)
         width, height = self.image_size_wh
         u = torch.where(valid, K[0, 0] * a + K[0, 2], -float(width))

@@ -37,6 +37,8 @@ from torch.nn import functional
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.vision.sampling import gaussian_blur
 
+Image = Float[Tensor, "h w"]
+
 _ROUNDING = 1.0e-4
 """Gradients of the normalised image below this are rounding; a flat image has energy zero."""
 
@@ -75,14 +77,12 @@ class EdgeFeatures(NamedTuple):
             many local standard deviations high.
     """
 
-    energy: Float[Tensor, "h w"]
+    energy: Image
     direction: Float[Tensor, "2 h w"]
     gradient: Float[Tensor, "2 h w"]
 
 
-def edge_features(
-    grey: Float[Tensor, "h w"], configuration: EdgeConfiguration | None = None
-) -> EdgeFeatures:
+def edge_features(grey: Image, configuration: EdgeConfiguration | None = None) -> EdgeFeatures:
     """Find the edges of a grey image.
 
     Args:
@@ -132,9 +132,7 @@ def _check_image(name: str, image: Tensor) -> None:
         )
 
 
-def foreground_weight(
-    mask: Float[Tensor, "h w"], *, band: float = 8.0, background: float = 0.3
-) -> Float[Tensor, "h w"]:
+def foreground_weight(mask: Image, *, band: float = 8.0, background: float = 0.3) -> Image:
     """Turn a mask into the weight of the edges.
 
     Args:

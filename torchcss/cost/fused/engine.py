@@ -29,11 +29,7 @@ from torchcss.cost.flow import FlowTerm
 from torchcss.cost.fused import pack
 from torchcss.cost.fused.pose_prior import add_pose_prior
 from torchcss.cost.fused.priors import add_priors
-from torchcss.cost.fused.records import (
-    Array,
-    Result,
-    View,
-)
+from torchcss.cost.fused.records import Array, Result, View
 from torchcss.cost.fused.repulsion import add_repulsion
 from torchcss.cost.fused.view import add_view
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
