@@ -97,6 +97,12 @@ def cholesky_apply(factor: Matrices, vector: Vectors) -> Vectors:
     return torch.linalg.solve_triangular(factor.mT, lower, upper=True)[..., 0]
 
 
+def prior_units(prior_variance: Vector) -> Float[Tensor, "n n"]:
+    """What turns a Hessian into one in units of the prior's deviations, entry by entry."""
+    deviation = prior_variance.sqrt()
+    return torch.outer(deviation, deviation)
+
+
 def inverse_on_free(
     hessian: Matrices,
     free: Bool[Tensor, "*batch n"],
@@ -124,8 +130,7 @@ def inverse_on_free(
         Covariances in the Hessian's dtype.
     """
     batch, n = hessian.shape[:-2], hessian.shape[-1]
-    deviation = prior_variance.to(device=hessian.device, dtype=torch.float64).sqrt()
-    units = torch.outer(deviation, deviation)
+    units = prior_units(prior_variance.to(device=hessian.device, dtype=torch.float64))
     pairs = zip(
         hessian.detach().reshape(batch.numel(), n, n).split(CHUNK),
         free.expand(*batch, n).reshape(batch.numel(), n).split(CHUNK),
@@ -174,8 +179,7 @@ def constrained_inverse(
     Returns:
         Covariances in the Hessian's dtype, and for which of them the floor was needed.
     """
-    deviation = prior_variance.to(device=hessian.device, dtype=torch.float64).sqrt()
-    units = torch.outer(deviation, deviation)
+    units = prior_units(prior_variance.to(device=hessian.device, dtype=torch.float64))
     scaled = mask_free(symmetric_part(hessian.detach().double()) * units, free)
     values, vectors = torch.linalg.eigh(scaled)
     rounding = hessian.shape[-1] * torch.finfo(hessian.dtype).eps * values.abs().amax(-1)

@@ -26,6 +26,7 @@ from torchcss.linalg import (
     covariance_factor,
     log_determinant,
     multiply,
+    prior_units,
     squared_mahalanobis,
     symmetric_part,
     whitener,
@@ -279,8 +280,7 @@ def tempered(covariance: Matrices, power: float, prior_variance: Vector) -> Matr
     """
     if power == 1.0:
         return covariance
-    deviation = prior_variance.to(covariance).sqrt()
-    units = torch.outer(deviation, deviation)
+    units = prior_units(prior_variance.to(covariance))
     own = covariance / units
     one = torch.eye(own.shape[-1], dtype=own.dtype, device=own.device)
     return symmetric_part(torch.linalg.solve(power * (one - own) + own, own)) * units

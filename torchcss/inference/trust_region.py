@@ -291,7 +291,7 @@ class TrustRegionNewton:
         stays = state.predicted == 0
         ratio = decrease / torch.where(stays, 1.0, state.predicted)
         accepted = running & finite & (stays | ((decrease >= 0) & (ratio > LEAST_RATIO)))
-        length = (weight * state.step.square()).sum(-1).sqrt()
+        length = _norm(state.step, weight)
         radius = _next_radius(state.radius, length, ratio, accepted).clamp(max=greatest_radius)
         unusable = running & value.isinf() & ~accepted
         state = TrustRegionState(
@@ -495,10 +495,6 @@ class _Quadratic(NamedTuple):
         # As a row: twice as fast as a column on a CPU, and rounded alike in a batch of one.
         return (vector[:, None, :] @ self.hessian)[:, 0]
 
-    def norm(self, vector: Vectors) -> Numbers:
-        """Length in the metric `W`."""
-        return (self.weight * vector.square()).sum(-1).sqrt()
-
 
 def default_prior_variance(bounds: Bounds) -> Vector:
     """Square of a quarter of each parameter's range; 1 where a bound is infinite.
@@ -553,6 +549,11 @@ def _next_radius(radius: Tensor, length: Tensor, ratio: Tensor, accepted: Tensor
     )
 
 
+def _norm(vector: Vectors, weight: Vector) -> Numbers:
+    """Length in the metric `W`."""
+    return (weight * vector.square()).sum(-1).sqrt()
+
+
 def _change_of_damping(
     state: TrustRegionState, model: LocalModel, accepted: Tensor, weight: Tensor
 ) -> Numbers:
@@ -593,7 +594,7 @@ def _damped_step(
     lo, hi = torch.zeros_like(lam), torch.full_like(lam, torch.inf)
     for remaining in reversed(range(rounds)):
         d, slope, ok = _solve_damped(problem, todo, lam[:, None] * weight)
-        size = (weight * d.square()).sum(-1).sqrt()
+        size = _norm(d, weight)
         too_long, too_short = ok & (size > 1.25 * rad), ok & (size < 0.75 * rad) & (lam > floor)
         lo = torch.where(~ok | (size > rad), lam, lo)
         hi = torch.where(ok & (size <= rad), lam, hi)
@@ -650,10 +651,10 @@ def _along_negative_curvature(
     down = cholesky_apply(factor, torch.where(free, probe, 0.0))
     down = cholesky_apply(factor, weight * down / down.norm(dim=-1, keepdim=True))
     down = torch.where(free, down, 0.0)
-    down = down / part.norm(down)[:, None]
+    down = down / _norm(down, weight)[:, None]
     down = torch.where(((part.gradient * down).sum(-1) > 0)[:, None], -down, down)
     along = (weight * step * down).sum(-1)
-    rest = (radius.square() - part.norm(step).square()).clamp(min=0)
+    rest = (radius.square() - _norm(step, weight).square()).clamp(min=0)
     return step + ((along.square() + rest).sqrt() - along)[:, None] * down
 
 
