@@ -14,7 +14,7 @@ CHECK = """
 import numpy as np
 from torchcss.kernels import compiler
 from torchcss.kernels.checked import run
-from torchcss.vision import flow_kernels, rasterise_kernels, shrink_kernels
+from torchcss.vision import blur_kernels, flow_kernels, rasterise_kernels, shrink_kernels
 
 assert compiler.CHECKED
 rng, single = np.random.default_rng(0), np.float32
@@ -30,6 +30,10 @@ for height, width, y, x in ((7, 5, 3, 2), (9, 9, 8, 8), (50, 3, 7, 1), (33, 64, 
     weights = *shrink_kernels.triangles(height, y), *shrink_kernels.triangles(width, x)
     row, small = np.zeros(3 * width, single), np.zeros((3, y, x), single)
     run(shrink_kernels.shrink, pixels, *weights, row, small)
+
+for size in ((1, 1), (3, 4), (9, 1)):
+    image, blurred = rng.random((2, *size))
+    run(blur_kernels.blur, image, np.array([0.4, 0.2, 0.1]), np.zeros(size[1] + 4), blurred)
 
 place, distance = 40 * rng.random((30, 2)) - 10, rng.random(30) + 0.5
 near, seen = np.full((1, 17, 19), -1, single), np.full((1, 17, 19), -1)

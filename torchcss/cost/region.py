@@ -86,22 +86,18 @@ def layer_of_part(body: BodyModel) -> Int[Tensor, " parts"]:
 def region_field(
     ratio: Float[Tensor, "layers h w"], *, window: Window | None = None, smoothing: float = 3.0
 ) -> SplineField:
-    """Make the likenesses of a frame smooth functions.
+    """Make the likenesses of a frame, or of a window of it, smooth functions.
 
     Args:
         ratio: How much each pixel looks like each layer, in -1..1.
-        window: Outside it the ratio is zero; None: everywhere is looked at.
+        window: The part of the frame that the functions are of, outside of which they are zero;
+            None: all of it.
         smoothing: Standard deviation of the blur, pixels. On the beam clip 3 tells good poses from
             lost ones by a quarter more than 1 does; with more, thin limbs fade.
     """
     # Single precision is far finer than the colours, and twice as fast.
     seen = (ratio if window is None else ratio[window.pixels]).float()
-    blurred = gaussian_blur(seen, smoothing)
-    if window is None:
-        return spline_field(blurred)
-    whole = blurred.new_zeros(ratio.shape)
-    whole[window.pixels] = blurred
-    return spline_field(whole)
+    return spline_field(gaussian_blur(seen, smoothing))
 
 
 def region_masks(
@@ -178,10 +174,12 @@ class RegionImages(NamedTuple):
     Attributes:
         field: The likenesses as smooth functions, one a layer.
         layer: Layer of each contour node.
+        origin: Column and row of the frame where `field` begins.
     """
 
     field: SplineField
     layer: Int[Tensor, " p"]
+    origin: tuple[int, int] = (0, 0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,7 +212,9 @@ class RegionTerm(OutlineTerm):
         part = context.tables.of(ContourPredictor).node_part
         layer = context.tables.of(layer_of_part)[part]
         window = None if context.features is None else context.features.window
-        return self.bind(context, RegionImages(region_field(foreground, window=window), layer))
+        origin = (0, 0) if window is None else (window.left, window.top)
+        field = region_field(foreground, window=window)
+        return self.bind(context, RegionImages(field, layer, origin))
 
     def match(
         self, nodes: ImageNodes, image: RegionImages, at: Float[Tensor, "k 2"] | None = None
@@ -241,4 +241,5 @@ class RegionTerm(OutlineTerm):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """The places inside and outside of the nodes, and the layers that are looked at there."""
         uv, step = nodes.uv if at is None else at, self.offset * nodes.normal
-        return uv - step, uv + step, image.layer[nodes.place % len(image.layer)]
+        origin = uv.new_tensor(image.origin)
+        return uv - step - origin, uv + step - origin, image.layer[nodes.place % len(image.layer)]

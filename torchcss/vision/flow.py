@@ -46,9 +46,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchcss.errors import ConfigurationError, FrameError, ShapeError
-from torchcss.kernels import compiler
 from torchcss.kernels.checked import run
 from torchcss.robust import Leclerc, Lorentzian, Quadratic
+from torchcss.vision import sampling
 
 Images = Float[Tensor, "b c h w"]
 """Any images."""
@@ -263,8 +263,7 @@ def _resize(images: Images, size: tuple[int, int]) -> Float[Tensor, "b c y x"]:
 
 def has_kernels(images: Tensor) -> bool:
     """Whether the loops over these images have compiled twins."""
-    single = images.dtype == torch.float32 and images.device.type == "cpu"
-    return compiler.COMPILED and single and not torch.compiler.is_compiling()
+    return images.dtype == torch.float32 and sampling.has_kernels(images)
 
 
 def _structure(images: Images) -> Images:

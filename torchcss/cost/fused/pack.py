@@ -193,7 +193,7 @@ def absent(num_parts: int) -> dict[str, Any]:
         "edges": _zero(Edges)._replace(
             **image, steps=zeros(5), assignment=kind, strength=False, potential=compared
         ),
-        "colours": _zero(Colours)._replace(**image, layer=whole),
+        "colours": _zero(Colours)._replace(**image, origin=zeros(2), layer=whole),
         "flow": _zero(Flow)._replace(
             nodes=zeros(num_parts, 6, 0), target=zeros(1, 3, num_parts, 0), potential=compared
         ),
@@ -245,6 +245,7 @@ def pack_colours(
     return Colours(
         scale=weight * bound.scale,
         field=coefficients,
+        origin=torch.tensor(images.origin).to(coefficients),
         corner=torch.tensor([width - 6.5, height - 6.5]),
         layer=np.ascontiguousarray(layer.cpu().numpy()),
         offset=term.offset,

@@ -107,12 +107,13 @@ Attributes:
 """
 
 
-Colours = namedtuple("Colours", "scale field corner layer offset nu back_facing hidden")
+Colours = namedtuple("Colours", "scale field origin corner layer offset nu back_facing hidden")
 """The region term of a frame; see `torchcss.cost.region`.
 
 Attributes:
     scale: Nats per unit of a node's cost; zero: there is no such term.
     field: Coefficients of the splines, `[layers y x]`.
+    origin: Column and row of the picture where the field begins.
     corner: See `sample_spline`.
     layer: Layer of each part.
     offset: Distance of the two places from the contour, pixels.
