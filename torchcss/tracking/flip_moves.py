@@ -35,6 +35,9 @@ limits leave nearly no flip, what they leave looks different, and a descent from
 _ALL = 1_000_000
 """More combinations than any body has."""
 
+_AT_ONCE = 128
+"""Combinations that are posed at a time; the first few hundred of thousands mostly do."""
+
 APART = 0.15
 """Least distance of some joint, metres, at which two poses are two. A body has a thousand flips
 that differ by the tilt of a foot or of the trunk, and they are the most plausible."""
@@ -89,9 +92,15 @@ def flipped_poses(body: BodyModel, camera: Camera, x: Vector, *, num: int) -> Ve
         choice=CostChoice().without("contour", "temporal").having(JointTerm(sigma=sigma)),
         views=(FrameContext(body=body, camera=camera, keypoints=keypoints),),
     )
-    poses = flips(cost, segments, x[None], body.bounds, _ALL)
-    places = body.pose(poses).joints
-    missed = torch.where(valid, (camera.project(places).uv - uv).norm(dim=-1), 0.0).amax(-1)
-    differs = (places - joints).norm(dim=-1).amax(-1) >= APART
-    left = torch.nonzero((missed <= _MOST_NOISE * sigma) & differs)[:, 0]
-    return poses[left[separated(places[left], APART, num, fill=False)]]
+    kept, where = nothing, joints.new_zeros(0, *joints.shape)
+    for poses in flips(cost, segments, x[None], body.bounds, _ALL).split(_AT_ONCE):
+        places = body.pose(poses).joints
+        missed = torch.where(valid, (camera.project(places).uv - uv).norm(dim=-1), 0.0).amax(-1)
+        differs = (places - joints).norm(dim=-1).amax(-1) >= APART
+        left = torch.nonzero((missed <= _MOST_NOISE * sigma) & differs)[:, 0]
+        kept, where = torch.cat([kept, poses[left]]), torch.cat([where, places[left]])
+        chosen = separated(where, APART, num, fill=False)
+        kept, where = kept[chosen], where[chosen]
+        if len(kept) == num:
+            break
+    return kept
