@@ -30,7 +30,8 @@ def gaussian_blur(image: Float[Tensor, "*batch h w"], sigma: float) -> Float[Ten
         sigma: Standard deviation, pixels.
     """
     radius = math.ceil(3.0 * sigma)
-    weight = (-0.5 * (torch.arange(radius + 1).double() / sigma).square()).exp()
+    place = torch.arange(radius + 1, dtype=torch.float64, device=image.device)
+    weight = (-0.5 * (place / sigma).square()).exp()
     weight = (weight / (2 * weight.sum() - weight[0])).to(image)
     images = image.reshape(-1, *image.shape[-2:])
     if has_kernels(image):
