@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +71,22 @@ FILES: dict[str, tuple[str, str]] = {
     "a list of cameras": (
         "a.json",
         json.dumps({"cameras": [{"name": "a", "K": K, "distCoef": LENS, "size": [640, 480]}]}),
+    ),
+    "RealSense": (
+        "a.json",
+        json.dumps({"intrinsics": {"fx": FX, "fy": FY, "ppx": CX, "ppy": CY, "width": 640,
+                                   "height": 480, "coeffs": LENS}}),
+    ),
+    "number by number": (
+        "a.json",
+        json.dumps({"fx": FX, "fy": FY, "cx": CX, "cy": CY, "w": 640, "h": 480,
+                    **dict(zip(("k1", "k2", "p1", "p2", "k3"), LENS, strict=True))}),
+    ),
+    "MATLAB's numbers as JSON, which count from 1": (
+        "a.json",
+        json.dumps({"IntrinsicMatrix": [[FX, 0, 0], [0, FY, 0], [CX + 1, CY + 1, 1]],
+                    "RadialDistortion": [LENS[0], LENS[1], LENS[4]],
+                    "TangentialDistortion": LENS[2:4], "ImageSize": [480, 640]}),
     ),
 }  # fmt: skip
 
@@ -254,3 +271,58 @@ def test_bad_files(tmp_path: Path, name: str, text: str, words: str) -> None:
         load_camera(tmp_path / name)
     assert "\n" not in str(caught.value)
     assert str(tmp_path) in str(caught.value)
+
+
+def test_nerfstudio_counts_from_the_corner(tmp_path: Path) -> None:
+    path = tmp_path / "transforms.json"
+    values = {"fl_x": FX, "fl_y": FY, "cx": CX + 0.5, "cy": CY + 0.5, "w": 640, "h": 480}
+    lens = dict(zip(("k1", "k2", "p1", "p2"), LENS, strict=False))
+    path.write_text(json.dumps({**values, **lens, "camera_model": "OPENCV", "frames": []}))
+    check(path, LENS[:4])
+
+
+def test_a_pair_by_number(tmp_path: Path) -> None:
+    path = tmp_path / "intrinsics.yml"
+    matrices = (yaml_matrix("M1", K, 3), yaml_matrix("D1", LENS, 1), yaml_matrix("M2", K, 3))
+    path.write_text("%YAML:1.0\n---\nimage_size: [640, 480]\n" + "".join(matrices))
+    assert set(read_cameras(path)) == {"1", "2"}
+    np.testing.assert_allclose(load_camera(path, "1").camera.distortion, LENS)
+    assert not load_camera(path, "2").camera.has_distortion
+
+
+def test_cameras_by_name_alone(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    one = {"K": K, "dist": LENS, "image_size_wh": [640, 480]}
+    path.write_text(json.dumps({"left": one, "right": one}))
+    assert set(read_cameras(path)) == {"left", "right"}
+
+
+def test_a_matrix_as_text(tmp_path: Path) -> None:
+    path = tmp_path / "K.txt"
+    path.write_text("# K\n" + "\n".join(" ".join(map(str, row)) for row in K))
+    with pytest.raises(CameraError, match="does not say the image size"):
+        load_camera(path)
+
+
+def test_colmaps_binary(tmp_path: Path) -> None:
+    path = tmp_path / "cameras.bin"
+    numbers = (FX, FY, CX + 0.5, CY + 0.5, *LENS[:4])
+    head = struct.pack("<QiiQQ", 1, 3, 4, 640, 480)
+    path.write_bytes(head + struct.pack("<8d", *numbers))
+    for place in (path, tmp_path):
+        assert load_camera(place).camera.name == "3"
+        check(place, LENS[:4])
+    for data in (head, b"x", struct.pack("<QiiQQ", 1, 3, 99, 640, 480)):
+        path.write_bytes(data)
+        with pytest.raises(CameraError, match=r"COLMAP's cameras\.bin"):
+            load_camera(path)
+
+
+def test_a_folder_of_openposes(tmp_path: Path) -> None:
+    with pytest.raises(CameraError, match="no calibration in this folder"):
+        load_camera(tmp_path)
+    for name in ("1", "2"):
+        text = XML.replace("camera_matrix", "Intrinsics")
+        text = text.replace("distortion_coefficients", "Distortion")
+        (tmp_path / f"{name}.xml").write_text(text)
+    assert set(read_cameras(tmp_path)) == {"1", "2"}

@@ -2,14 +2,16 @@
 
 | format | recognised by |
 |---|---|
-| ours | JSON: `cameras`, by name or in a list |
+| ours | JSON: `cameras`, by name or in a list, or the cameras by name alone |
+| RealSense, Nerfstudio | JSON: `fx` or `fl_x` and the rest, number by number |
 | Pose2Sim, Anipose, FreeMoCap, Caliscope | `.toml`: a table for each camera |
 | EasyMocap | `intri.yml` with `names`, beside it `extri.yml` |
-| OpenCV, ROS | YAML, JSON or XML with `camera_matrix` |
+| OpenCV, ROS | YAML, JSON or XML with `camera_matrix`; `M1`, `D1`, `M2`, `D2` of a pair |
+| OpenPose | XML with `Intrinsics`, a file or a folder of them |
 | Kalibr | YAML: `cam0` with `intrinsics` |
-| COLMAP | `cameras.txt` |
-| MATLAB | `.mat`: `cameraParams` as a structure, or Bouguet's `fc`, `cc`, `kc` (needs SciPy) |
-| arrays | `.npz`: `mtx`, `dist`, and the like |
+| COLMAP | `cameras.txt` or `cameras.bin`, or their folder |
+| MATLAB | `.mat`: `cameraParams` as a structure, or Bouguet's `fc`, `cc`, `kc` (SciPy); JSON |
+| arrays | `.npz`: `mtx`, `dist`, and the like; `.txt`: the nine numbers of K |
 
 Most of them are the same few things in other words (`_WORDS`). COLMAP's principal point counts from
 the corner of the image, MATLAB's from 1; both are brought to pixel centres at integers.
@@ -25,7 +27,7 @@ import re
 import struct
 import tomllib
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -47,6 +49,7 @@ from torchcss.files import (
 from torchcss.joint_names import names_in
 
 INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
+_OF_COLMAP = "cameras.txt", "cameras.bin"
 
 
 class Entry(NamedTuple):
@@ -77,18 +80,29 @@ class Entry(NamedTuple):
 
 _WORDS = {
     "K": names_in(
-        "K camera_matrix matrix intrinsic_matrix cameraMatrix mtx k intrinsics camera_intrinsics "
-        "IntrinsicMatrix"
+        "K camera_matrix matrix intrinsic_matrix cameraMatrix mtx k M intrinsics "
+        "camera_intrinsics IntrinsicMatrix Intrinsics"
     ),
     "distortion": names_in(
         "distortion distortions distortion_coefficients distortion_coeffs dist_coeffs dist_coeff "
-        "distCoeffs distCoef dist D d"
+        "distCoeffs distCoef dist D d coeffs Distortion"
     ),
     "rotation": names_in("R rotation Rot rvec rotation_matrix"),
     "translation": names_in("t translation T tvec"),
     "image_size_wh": names_in("image_size_wh size resolution image_size img_size image_shape_wh"),
 }
 """What a camera's numbers are called, the first that is there."""
+
+_ONE_BY_ONE = (("fx", "fy", "cx", "cy"), ("fx", "fy", "ppx", "ppy"), ("fl_x", "fl_y", "cx", "cy"))
+"""What the numbers of K are called where each has a name; the last are Nerfstudio's."""
+
+_NUMBERED = names_in("M K camera_matrix cameraMatrix mtx")
+"""What a matrix is called that the number of its camera follows."""
+
+_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+
+_SHAPES = ("img_shape", "image_shape", "ImageSize")
+"""What height and width are called where they are given in this order."""
 
 _SIZES = (("image_width", "image_height"), ("width", "height"), ("w", "h"), ("W", "H"))
 _FISHEYE = names_in("equidistant fisheye kannala_brandt omni ds eucm fov")
@@ -106,6 +120,13 @@ _COLMAP = {
 }  # fmt: skip
 """The parameters of COLMAP's camera models."""
 
+_COLMAP_MODELS = (
+    ("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8),
+    ("OPENCV_FISHEYE", 8), ("FULL_OPENCV", 12), ("FOV", 5), ("SIMPLE_RADIAL_FISHEYE", 4),
+    ("RADIAL_FISHEYE", 5), ("THIN_PRISM_FISHEYE", 12),
+)  # fmt: skip
+"""The models by their number in a binary file, and how many parameters each has."""
+
 
 def read_entries(path: Path) -> dict[str, Entry]:
     """The cameras of a calibration file by name.
@@ -116,14 +137,20 @@ def read_entries(path: Path) -> dict[str, Entry]:
     """
     suffix = path.suffix.lower()
     if path.is_dir():
-        inner = next((path / n for n in (INTRINSICS, "cameras.txt") if (path / n).is_file()), path)
-        return _read_easymocap(inner) if inner.name == INTRINSICS else _read_colmap(inner)
+        inner = next((path / n for n in (INTRINSICS, *_OF_COLMAP) if (path / n).is_file()), None)
+        files = sorted(path.glob("*.xml")) if inner is None else [inner]
+        if not files:
+            names = ", ".join((INTRINSICS, *_OF_COLMAP))
+            raise CameraError(f"{path}: no calibration in this folder; expected {names} or .xml")
+        return {name: entry for file in files for name, entry in read_entries(file).items()}
     if suffix in (".yml", ".yaml"):
         return _read_yaml(path)
     if suffix == ".toml":
         return _read_toml(path)
+    if suffix == ".bin":
+        return _colmap_entries(_binary_colmap(path))
     if suffix == ".txt":
-        return _read_colmap(path)
+        return _read_text(path)
     if suffix == ".xml":
         return _alone(path, _opencv_xml(path))
     if suffix == ".npz":
@@ -139,6 +166,9 @@ def read_entries(path: Path) -> dict[str, Entry]:
 
 def _entry(values: Mapping[str, Any], units: Any = "metre") -> Entry:
     """A camera of a mapping, by whatever words it uses."""
+    inner = values.get("intrinsics")
+    if isinstance(inner, Mapping):  # a mapping of its own
+        values = {**values, "intrinsics": None, **inner}
     found = {
         key: next((_plain(values[w]) for w in words if values.get(w) is not None), None)
         for key, words in _WORDS.items()
@@ -146,6 +176,14 @@ def _entry(values: Mapping[str, Any], units: Any = "metre") -> Entry:
     for pair in _SIZES:
         if found["image_size_wh"] is None:
             found["image_size_wh"] = _size(*map(values.get, pair))
+    for word in _SHAPES:
+        if found["image_size_wh"] is None and isinstance(shape := values.get(word), list):
+            found["image_size_wh"] = shape[1::-1]
+    for names in _ONE_BY_ONE:
+        if found["K"] is None and None not in (numbers := [values.get(each) for each in names]):
+            found["K"] = numbers if names[0] == "fx" else _from_corner(numbers)
+    if found["distortion"] is None and any(each in values for each in _COEFFICIENTS):
+        found["distortion"] = [values.get(each, 0.0) for each in _COEFFICIENTS]
     model = str(values.get("distortion_model", values.get("camera_model", ""))).lower()
     fisheye = values.get("fisheye", False) or any(word in model.split("-") for word in _FISHEYE)
     return Entry(**found, units=units, video=values.get("video"), fisheye=fisheye)
@@ -166,12 +204,41 @@ def _plain(value: Any) -> Any:
     return value
 
 
+def _from_corner(numbers: Sequence[Any]) -> list[Any]:
+    """fx, fy, cx, cy of pixels that are squares from (0, 0) on, as of such with integer centres."""
+    try:
+        fx, fy, cx, cy = map(float, numbers)
+    except (TypeError, ValueError):
+        return list(numbers)  # what is no number is told where the camera is made
+    return [fx, fy, cx - 0.5, cy - 0.5]
+
+
 def _has_camera(values: object) -> bool:
-    return isinstance(values, Mapping) and any(word in values for word in _WORDS["K"])
+    return isinstance(values, Mapping) and (
+        any(word in values for word in _WORDS["K"])
+        or any(set(names) <= values.keys() for names in _ONE_BY_ONE)
+    )
+
+
+def _are_cameras(values: object) -> bool:
+    return isinstance(values, Mapping) and bool(values) and all(map(_has_camera, values.values()))
+
+
+def _numbered(values: object) -> dict[str, dict[str, Any]]:
+    """Cameras whose number ends the names of their numbers, as in `M1`, `D1`; none if not so."""
+    found: dict[str, dict[str, Any]] = {}
+    for key, value in values.items() if isinstance(values, Mapping) else ():
+        if named := re.fullmatch(r"([A-Za-z]\w*?)_?([0-9]+)", str(key)):
+            found.setdefault(named[2], {})[named[1]] = value
+    pair = {name: own for name, own in found.items() if any(word in own for word in _NUMBERED)}
+    return {name: {**values, **own} for name, own in pair.items()}  # type: ignore[dict-item]
 
 
 def _alone(path: Path, values: Mapping[str, Any]) -> dict[str, Entry]:
     """The one camera of a file without extrinsics: those of the board's pictures are none."""
+    if pair := _numbered(values):
+        entries = {name: _entry(own) for name, own in pair.items()}
+        return {n: e._replace(rotation=None, translation=None) for n, e in entries.items()}
     if not _has_camera(values):
         raise CameraError(
             f"{path}: expected a calibration with camera_matrix, found {shortened(list(values))}"
@@ -186,8 +253,12 @@ def _alone(path: Path, values: Mapping[str, Any]) -> dict[str, Entry]:
 def _read_json(path: Path) -> dict[str, Entry]:
     content = load_json(path, CameraError)
     cameras = content.get("cameras") if isinstance(content, dict) else None
-    if cameras is None and _has_camera(content):
+    if isinstance(content, dict) and "RadialDistortion" in content and _has_camera(content):
+        return {path.stem: _matlab_entry(path, content)}
+    if cameras is None and (_has_camera(content) or _numbered(content)):
         return _alone(path, content)
+    if cameras is None and _are_cameras(content):
+        cameras = content
     if isinstance(cameras, list) and all(isinstance(each, dict) for each in cameras):
         cameras = {str(each.get("name", index)): each for index, each in enumerate(cameras)}
     if not isinstance(cameras, dict):
@@ -249,34 +320,63 @@ def _in_metres(entries: dict[str, Entry], is_anipose: bool) -> dict[str, Entry]:
     return entries
 
 
-def _read_colmap(path: Path) -> dict[str, Entry]:
+def _read_text(path: Path) -> dict[str, Entry]:
+    """COLMAP's cameras, or the matrix K alone."""
+    rows = {
+        f"{path}: line {number}": line.split()
+        for number, line in enumerate(read_text(path, CameraError).splitlines(), start=1)
+        if line.strip() and not line.lstrip().startswith("#")
+    }
+    try:
+        numbers = [float(word) for row in rows.values() for word in row]
+    except ValueError:
+        numbers = []
+    return _alone(path, {"K": numbers}) if len(numbers) == 9 else _colmap_entries(rows)
+
+
+def _colmap_entries(rows: Mapping[str, Sequence[str]]) -> dict[str, Entry]:
+    """COLMAP's cameras, of the words of its text by where they stand."""
     entries: dict[str, Entry] = {}
-    for number, line in enumerate(read_text(path, CameraError).splitlines(), start=1):
-        words = line.split()
-        if not words or words[0].startswith("#"):
-            continue
-        where = f"{path}: line {number}"
-        model = words[1] if len(words) > 1 else ""
+    for where, row in rows.items():
+        model = row[1] if len(row) > 1 else ""
         try:
-            size, values = [int(each) for each in words[2:4]], [float(each) for each in words[4:]]
+            size, values = [int(each) for each in row[2:4]], [float(each) for each in row[4:]]
         except ValueError:
             size = values = []
         names = _COLMAP.get(model, "").split()
         if "FISHEYE" in model:
-            entries[words[0]] = Entry([], size, fisheye=True)
+            entries[row[0]] = Entry([], size, fisheye=True)
             continue
         if not names or len(values) != len(names) or len(size) != 2:
             raise CameraError(
                 f"{where}: expected COLMAP's camera, CAMERA_ID MODEL WIDTH HEIGHT and the "
-                f"parameters of {', '.join(_COLMAP)}; found {shortened(line)}"
+                f"parameters of {', '.join(_COLMAP)}; found {shortened(' '.join(row))}"
             )
         given = dict(zip(names, values, strict=True))
-        fx, fy = given.get("fx", given.get("f")), given.get("fy", given.get("f"))
+        focal = [given.get(each, given.get("f")) for each in ("fx", "fy")]
+        lens = [given.get(key, 0.0) for key in _COEFFICIENTS]
         # The corner of the image is (0, 0) there.
-        K = [[fx, 0.0, given["cx"] - 0.5], [0.0, fy, given["cy"] - 0.5], [0.0, 0.0, 1.0]]
-        lens = [given.get(key, 0.0) for key in names_in("k1 k2 p1 p2 k3 k4 k5 k6")]
-        entries[words[0]] = Entry(K, size, lens)
+        K = _from_corner([*focal, given["cx"], given["cy"]])
+        entries[row[0]] = Entry(K, size, lens)
     return entries
+
+
+def _binary_colmap(path: Path) -> dict[str, list[str]]:
+    """COLMAP's binary file as the words that its text has."""
+    data, at = read_bytes(path, CameraError), 8
+    rows: dict[str, list[str]] = {}
+    try:
+        (count,) = struct.unpack_from("<Q", data)
+        for _ in range(count):
+            number, model, *size = struct.unpack_from("<iiQQ", data, at)
+            name, length = _COLMAP_MODELS[model]
+            values = struct.unpack_from(f"<{length}d", data, at + 24)
+            words = [str(number), name, *map(str, size), *map(repr, values)]
+            rows[f"{path}: camera {number}"] = words
+            at += 24 + 8 * length
+    except (struct.error, IndexError) as error:
+        raise CameraError(f"{path}: expected COLMAP's cameras.bin: {one_line(error)}") from error
+    return rows
 
 
 def _read_yaml(path: Path) -> dict[str, Entry]:
@@ -287,10 +387,10 @@ def _read_yaml(path: Path) -> dict[str, Entry]:
     chain = {name: each for name, each in content.items() if re.fullmatch(r"cam[0-9]+", name)}
     if chain and all(map(_has_camera, chain.values())):
         return _kalibr(path, chain)
-    if _has_camera(content):
+    if _has_camera(content) or _numbered(content):
         return _alone(path, content)
-    cameras = content.get("cameras")
-    if isinstance(cameras, dict) and all(map(_has_camera, cameras.values())):
+    cameras = content.get("cameras", content)
+    if _are_cameras(cameras):
         return {str(name): _entry(each) for name, each in cameras.items()}
     raise CameraError(
         f"{path}: expected 'names', as EasyMocap writes them, 'camera_matrix' (OpenCV, ROS) or "
@@ -365,10 +465,7 @@ def _read_matlab(path: Path) -> dict[str, Entry]:
             f"{path}: expected toStruct(cameraParams) or Bouguet's fc and cc, found "
             f"{shortened(list(values))}"
         )
-    try:
-        return {path.stem: _matlab_entry(values)}
-    except (ValueError, TypeError, IndexError) as error:
-        raise CameraError(f"{path}: expected cameraParams, found {one_line(error)}") from error
+    return {path.stem: _matlab_entry(path, values)}
 
 
 def _check_matlab_size(path: Path) -> None:
@@ -389,17 +486,19 @@ def _check_matlab_size(path: Path) -> None:
             raise CameraError(f"{path}: more than {_MOST_MATLAB:,} bytes; not a calibration")
 
 
-def _matlab_entry(values: Mapping[str, Any]) -> Entry:
-    K = np.array(_entry(values).K, float)
-    K = K.T if K[2, 0] or K[2, 1] else K  # old ones have the principal point below
-    K[:2, 2] -= 1
-    radial = np.ravel(values.get("RadialDistortion", values.get("RDistort", [])))
-    tangential = np.ravel(values.get("TangentialDistortion", values.get("TDistort", [])))
-    k1, k2, k3 = [*radial.tolist(), 0.0, 0.0, 0.0][:3]
-    p1, p2 = [*tangential.tolist(), 0.0, 0.0][:2]
-    size = values.get("ImageSize")
-    wh = [int(size[1]), int(size[0])] if isinstance(size, list) and len(size) == 2 else None
-    return Entry(K.tolist(), wh, [k1, k2, p1, p2, k3])
+def _matlab_entry(path: Path, values: Mapping[str, Any]) -> Entry:
+    found = _entry(values)
+    try:
+        K = np.array(found.K, float)
+        K = K.T if K[2, 0] or K[2, 1] else K  # old ones have the principal point below
+        K[:2, 2] -= 1
+        radial = np.ravel(values.get("RadialDistortion", values.get("RDistort", [0, 0])))
+        tangential = np.ravel(values.get("TangentialDistortion", values.get("TDistort", [0, 0])))
+        k1, k2, k3 = [*radial.tolist(), 0.0, 0.0, 0.0][:3]
+        p1, p2 = [*tangential.tolist(), 0.0, 0.0][:2]
+    except (ValueError, TypeError, IndexError) as error:
+        raise CameraError(f"{path}: expected cameraParams, found {one_line(error)}") from error
+    return Entry(K.tolist(), found.image_size_wh, [k1, k2, p1, p2, k3])
 
 
 def _listed(value: Any) -> Any:

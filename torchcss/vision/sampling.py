@@ -13,6 +13,7 @@ channels, or a spline (`torchcss.vision.spline`).
 from __future__ import annotations
 
 import math
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -21,6 +22,7 @@ from torch.nn import functional
 from torchcss.errors import ShapeError, check_shape
 from torchcss.kernels import compiler
 from torchcss.kernels.checked import run
+
 
 def gaussian_blur(image: Float[Tensor, "*batch h w"], sigma: float) -> Float[Tensor, "*batch h w"]:
     """Blur with a Gaussian cut at three standard deviations, the border replicated.

@@ -489,3 +489,70 @@ def test_tracks_of_the_file_win_over_nearness(tmp_path: Path) -> None:
     u = found.positions[:, 0, 0]
     np.testing.assert_allclose(u, [120 + 83 * t for t in T])
     assert any("'7' of the file" in line for line in found.report)
+
+
+def cvat_point(name: str | None, row: np.ndarray, more: str = "") -> str:
+    u, v, _ = row
+    return f'<points label="{name}" points="{u:.2f},{v:.2f}" occluded="0" {more}/>'
+
+
+def test_cvat_of_a_video(tmp_path: Path) -> None:
+    text = ""
+    for t in range(FRAMES):
+        out = 'outside="1"' if t == 3 else 'outside="0"'
+        points = "".join(cvat_point(n, row, out) for n, row in zip(COCO, person(t), strict=True))
+        text += f'<skeleton frame="{t}" {out}>{points}</skeleton>'
+    text = f'<annotations><track id="4" label="person">{text}</track></annotations>'
+    check(read(write(tmp_path / "annotations.xml", text)), empty=(3,))
+
+
+def test_cvat_of_points_without_skeletons(tmp_path: Path) -> None:
+    tracks = []
+    for joint, name in enumerate(COCO):
+        lines = (
+            cvat_point(None, person(t)[joint], f'frame="{t}" outside="{int(t == 3)}"')
+            for t in range(FRAMES)
+        )
+        marks = "".join(lines).replace('label="None"', "")
+        tracks.append(f'<track id="{joint}" label="{name}">{marks}</track>')
+    text = f"<annotations>{''.join(tracks)}</annotations>"
+    check(read(write(tmp_path / "annotations.xml", text)), empty=(3,))
+
+
+def test_cvat_of_pictures(tmp_path: Path) -> None:
+    text = ""
+    for t in reversed(range(FRAMES)):
+        points = "".join(cvat_point(n, row) for n, row in zip(COCO, person(t), strict=True))
+        text += (
+            f'<image id="{t}" name="frame_{t:06d}.png">'
+            f'<skeleton label="person">{points}</skeleton></image>'
+        )
+    check(read(write(tmp_path / "annotations.xml", f"<annotations>{text}</annotations>")))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("<robot/>", "expected CVAT's annotations, found <robot>"),
+        ("<annotations><track><skeleton frame='x'/></track></annotations>", "a frame's number"),
+        ("<annotations><image id='0'><points points='1'/></image></annotations>", "one point"),
+        ("<annotations>", "does not parse"),
+    ],
+)
+def test_cvat_that_is_none(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(KeypointError, match=message):
+        read(write(tmp_path / "annotations.xml", text))
+
+
+def test_decimal_commas(tmp_path: Path) -> None:
+    heading = ";".join(["frame", *(f"{name}_{axis}" for name in COCO for axis in "xy")])
+    rows = [heading]
+    for t in range(FRAMES):
+        cells = (f"{value:.2f}".replace(".", ",") for value in person(t)[:, :2].ravel())
+        rows.append(";".join([str(t), *cells]))
+    check(read(write(tmp_path / "a.csv", "\n".join(rows))))
+
+
+def test_no_pickle_is_read(tmp_path: Path) -> None:
+    with pytest.raises(KeypointError, match=r"code may run.*numpy\.savez"):
+        read(write(tmp_path / "a.pkl", "x"))

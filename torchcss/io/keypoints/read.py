@@ -5,6 +5,7 @@
 | OpenPose, DWPose, Pose2Sim | a folder of JSON with `people`, a file per frame; or a list |
 | EasyMocap, labelme | a folder of JSON with `annots` or `shapes` |
 | YOLO | a folder of text labels; JSON of Ultralytics |
+| CVAT | its XML of pictures or a video, with skeletons or single points |
 | COCO, CVAT, AlphaPose | JSON: `annotations`, a list of `{image_id, keypoints}`, or by picture |
 | MMPose, openpifpaf, easy_ViTPose, TensorFlow.js | JSON, see `torchcss.io.keypoints.json_files` |
 | MediaPipe | 33 landmarks as JSON, CSV, NPY or NPZ |
@@ -39,6 +40,7 @@ import torch
 from torchcss.errors import KeypointError
 from torchcss.files import StrPath, load_array, load_arrays, naming, shortened
 from torchcss.io.keypoints.arrays import read_arrays
+from torchcss.io.keypoints.cvat import read_cvat
 from torchcss.io.keypoints.findings import findings
 from torchcss.io.keypoints.frames import Film, in_order, wrong_count
 from torchcss.io.keypoints.h36m import is_h36m, read_h36m
@@ -53,6 +55,8 @@ from torchcss.types import Keypoints
 
 Scale = Literal["pixels", "zero-one", "plus-minus-one"]
 """What the coordinates of a file count: pixels, or fractions of the image from 0 or -1 to 1."""
+
+_PICKLES = (".pkl", ".pickle", ".pt", ".pth", ".joblib")
 
 OWN_NAMES = "own"
 """The layout of files whose names are those of the body."""
@@ -221,6 +225,13 @@ def _read(path: Path, image_size_wh: Size, num_frames: int | None) -> People:
         return read_table(path)
     if suffix in (".h5", ".hdf5", ".slp"):
         return read_hdf5(path)
+    if suffix == ".xml":
+        return read_cvat(path)
+    if suffix in _PICKLES:
+        raise KeypointError(
+            "a pickle, from which code may run: not read; save the arrays with "
+            "numpy.savez(FILE, keypoints=..., confidence=..., joint_names=...)"
+        )
     return read_json(path, image_size_wh, num_frames)
 
 

@@ -56,6 +56,8 @@ _TIMES = {"timestamp_ms": 1e-3, "time_ms": 1e-3, "timestamp_s": 1.0, "time_s": 1
           "timestamp": 1.0}  # fmt: skip
 """Columns of times, in seconds unless the name says otherwise."""
 
+_DECIMAL = re.compile(r"^(-?[0-9]*),([0-9]+(?:[eE][-+]?[0-9]+)?)$")
+
 Row = tuple[int, list[str]]
 """A row's number in the file, from 1, and its cells."""
 
@@ -116,7 +118,7 @@ def table_rows(path: Path) -> list[Row]:
         KeypointError: If there are none, or it is none.
     """
     text = read_text(path, KeypointError)
-    comma = max(",;\t", key=text[:4096].count)
+    comma = max(",;\t", key=text.lstrip().partition("\n")[0].count)
     try:
         lines = list(csv.reader(io.StringIO(text, newline=""), delimiter=comma))
     except csv.Error as error:
@@ -124,7 +126,10 @@ def table_rows(path: Path) -> list[Row]:
     rows = [(n, [cell.strip() for cell in row]) for n, row in enumerate(lines, 1) if any(row)]
     if not rows:
         raise KeypointError(f"{path}: the file is empty")
-    return rows
+    if comma == ",":
+        return rows
+    # Whoever separates cells by something else may write decimals with a comma.
+    return [(n, [_DECIMAL.sub(r"\1.\2", cell) for cell in row]) for n, row in rows]
 
 
 def _headed(heading: Sequence[str]) -> _Columns:

@@ -1,0 +1,92 @@
+"""CVAT's own XML of pictures and of videos, in which people are skeletons or single points.
+
+A `skeleton` is a person, its `points` are the joints. Without skeletons a label is a joint of the
+only person there is. A video has a `track` for each of them, with a line for every frame, in which
+it may be `outside`; pictures have names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from torchcss.body.files.xml import parse_xml
+from torchcss.errors import BodyError, KeypointError
+from torchcss.files import read_bytes, shortened
+from torchcss.io.keypoints.frames import plain_name
+from torchcss.io.keypoints.people import Frames, Key, People, Person, united
+
+_HIDDEN = 0.5
+"""Confidence of a joint that is marked as occluded: where it is was guessed."""
+
+_ALONE = ""
+"""Who has the points that are in no skeleton."""
+
+
+def read_cvat(path: Path) -> People:
+    """Read annotations of pictures or of a video.
+
+    Raises:
+        KeypointError: If it is another XML, or a point is none.
+    """
+    try:
+        root = parse_xml(path, read_bytes(path, KeypointError), "CVAT's XML")
+    except BodyError as error:
+        raise KeypointError(str(error)) from error
+    if root.tag != "annotations":
+        raise KeypointError(f"expected CVAT's annotations, found <{root.tag}>")
+    size = root.find(".//original_size")
+    found: dict[Key, dict[str, dict[str, list[float]]]] = {}
+    for place, who, element, outside in _shapes(root):
+        people = found.setdefault(place, {})
+        points = element.findall("points") if element.tag == "skeleton" else [element]
+        for point in points:
+            name = point.get("label", element.get("label", ""))
+            if not outside and point.get("outside") != "1":
+                people.setdefault(who, {})[name] = _joint(point, name)
+    frames: Frames = {
+        place: [
+            Person(np.array(list(joints.values())), who or None, tuple(joints))
+            for who, joints in people.items()
+        ]
+        for place, people in found.items()
+    }
+    people, names = united(frames)
+    first = 0 if all(isinstance(place, int) for place in people) else None
+    wh = None if size is None else tuple(float(size.findtext(k, "0")) for k in ("width", "height"))
+    return People(
+        people, names, ["format: CVAT's XML"], first=first,
+        size_wh=(wh[0], wh[1]) if wh and min(wh) > 0 else None,
+    )  # fmt: skip
+
+
+def _shapes(root: Element) -> Iterator[tuple[Key, str, Element, bool]]:
+    """The frame, the person, the skeleton or point, and whether it is out of the picture."""
+    for image in root.iter("image"):
+        place = plain_name(image.get("name", image.get("id", "")))
+        for index, element in enumerate(image):
+            if element.tag in ("skeleton", "points"):
+                yield place, f"{index}" if element.tag == "skeleton" else _ALONE, element, False
+    for track in root.iter("track"):
+        for element in track:
+            if element.tag in ("skeleton", "points"):
+                if element.tag == "points" and "label" not in element.attrib:
+                    element.set("label", track.get("label", ""))
+                who = track.get("id", "0") if element.tag == "skeleton" else _ALONE
+                place = element.get("frame", "")
+                if not place.isdecimal():
+                    raise KeypointError(f"track {who}: expected a frame's number, found {place!r}")
+                yield int(place), who, element, element.get("outside") == "1"
+
+
+def _joint(point: Element, name: str) -> list[float]:
+    """u, v and confidence of a point."""
+    text = point.get("points", "")
+    try:
+        u, v = map(float, text.split(","))
+    except ValueError:
+        raise KeypointError(f"{name}: expected one point, u,v, found {shortened(text)}") from None
+    return [u, v, _HIDDEN if point.get("occluded") == "1" else 1.0]
