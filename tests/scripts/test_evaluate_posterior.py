@@ -33,9 +33,15 @@ def test_a_clip_is_tracked_and_measured(script: ModuleType, tmp_path: Path) -> N
     assert 0 < row["lag root"] < 400
     assert 1 <= row["rank"] <= 2
     assert 0 <= row["cal."] <= 1
+    assert row["cal."] == script.miss(row["inside"])
     assert math.isfinite(row["NLL"])
     written = json.loads((tmp_path / "J.json").read_text())
-    assert [cells[0] for cells in written["table"]["rows"]] == ["one", "median", "mean"]
+    assert [cells[0] for cells in written["table"]["rows"]] == [
+        "one",
+        "median",
+        "mean",
+        "all together",
+    ]
     # A run that is there is not made again.
     again = script.main(config)["rows"][0]
     assert again == {**row, "s": None}

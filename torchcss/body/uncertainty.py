@@ -9,6 +9,8 @@ Call `joint_covariance`; `joint_jacobian` gives J alone.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -46,7 +48,11 @@ def point_jacobian(
 
 
 def joint_covariance(
-    body: BodyModel, pose: BodyPose, covariance: Float[Tensor, "*batch n n"]
+    body: BodyModel,
+    pose: BodyPose,
+    covariance: Float[Tensor, "*batch n n"],
+    *,
+    about: Sequence[int] = (),
 ) -> Float[Tensor, "*batch j 3 3"]:
     """Covariances of the joint centres, square metres, to first order.
 
@@ -57,10 +63,14 @@ def joint_covariance(
         body: The body.
         pose: What `body.pose` gave for the means.
         covariance: Covariances of the states.
+        about: Joints from whose middle the places of all are told, such as the hips: where the
+            whole body is then does not count. Empty: places in the world.
 
     Raises:
         ShapeError: If the covariance has another size than the state.
     """
     check_shape("covariance", covariance, body.num_parameters, body.num_parameters)
     jacobian = joint_jacobian(body, pose)
+    if about:
+        jacobian = jacobian - jacobian[..., list(about), :, :].mean(-3, keepdim=True)
     return jacobian @ covariance[..., None, :, :] @ jacobian.mT

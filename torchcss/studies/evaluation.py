@@ -34,6 +34,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -48,6 +49,7 @@ from torchcss.body.uncertainty import joint_covariance
 from torchcss.cost.interpenetration import InterpenetrationPairs
 from torchcss.cost.part_map import part_map
 from torchcss.errors import ConfigurationError, TrackFileError
+from torchcss.files import load_arrays
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.tracker import TrackerInfo
 from torchcss.io.run import Run, as_run
@@ -630,8 +632,9 @@ class Evaluation(NamedTuple):
         left_out: Joints that were asked for and that run or reference lack.
         away_m: Offset of the best mode's compared joints when the roots are on each other, metres;
             NaN where the reference is unknown.
-        covariance: Covariances that the run states for these joints; None where it does not say
+        covariance: Covariances that the run states for these places; None where it does not say
             which body it was of.
+        deviation_m: Standard deviation of the reference per coordinate, metres.
     """
 
     frames: Int[np.ndarray, " t"]
@@ -640,14 +643,14 @@ class Evaluation(NamedTuple):
     left_out: tuple[str, ...]
     away_m: Float[np.ndarray, "t j 3"]
     covariance: Float[np.ndarray, "t j 3 3"] | None
+    deviation_m: float
 
-    def inside(
-        self, reference_m: float = Thresholds.reference_m, levels: Sequence[float] = LEVELS
-    ) -> dict[float, float]:
+    def inside(self, levels: Sequence[float] = LEVELS) -> dict[float, float]:
         """Calibration: share of the joints inside the stated regions of these probabilities.
 
+        The regions are those of places from the root, as the offsets are.
+
         Args:
-            reference_m: Standard deviation of the reference per coordinate, metres.
             levels: Probabilities of the regions.
 
         Returns:
@@ -656,7 +659,7 @@ class Evaluation(NamedTuple):
         if self.covariance is None:
             return {}
         known = np.isfinite(self.away_m).all(-1)
-        spread = torch.from_numpy(self.covariance[known] + reference_m**2 * np.eye(3))
+        spread = torch.from_numpy(self.covariance[known] + self.deviation_m**2 * np.eye(3))
         distance = squared_mahalanobis(torch.from_numpy(self.away_m[known]), spread)
         return coverage(probability_within(distance.numpy(), 3), levels)
 
@@ -668,6 +671,7 @@ def evaluate(
     joints: Sequence[str] = LIMB_JOINTS,
     root: str | None = None,
     array: str = "joints",
+    deviation_m: float | None = None,
 ) -> Evaluation:
     """Errors of a run against joints in space.
 
@@ -682,6 +686,8 @@ def evaluate(
         joints: Joints to compare; those that run or reference lack are left out.
         root: Joint that is aligned; None: the midpoint of the hips.
         array: Array of the reference that holds the positions.
+        deviation_m: Standard deviation of the reference per coordinate, metres; None: what the file
+            says in `deviation_m`, or 20 mm.
 
     Raises:
         TrackFileError: If a file is missing or malformed, or the run has no frames.
@@ -722,7 +728,8 @@ def evaluate(
         errors=errors,
         left_out=tuple(name for name in wanted if name not in common),
         away_m=away,
-        covariance=_stated(track, [column[i] for i in index]),
+        covariance=_stated(track, *([column[i] for i in some] for some in (index, middle))),
+        deviation_m=reference_deviation(reference) if deviation_m is None else deviation_m,
     )
 
 
@@ -747,8 +754,25 @@ def _check_names(
         )
 
 
-def _stated(track: Track, joints: Sequence[int]) -> Float[np.ndarray, "t j 3 3"] | None:
-    """Covariances of joints of the best modes; None where the body is not known."""
+def reference_deviation(path: str | os.PathLike[str]) -> float:
+    """What a reference file says of its own error, per coordinate and in metres; 20 mm if nothing.
+
+    No less than 5 mm: where a body's joints are is a matter of definition to that much.
+    """
+    arrays = load_arrays(Path(path), TrackFileError)
+    stated = arrays.get("deviation_m", np.array(Thresholds.reference_m))
+    if stated.shape != () or not 0 <= stated < np.inf:
+        raise TrackFileError(f"{path}: deviation_m: expected a number of metres, got {stated}")
+    return max(float(stated), _LEAST_DEVIATION)
+
+
+_LEAST_DEVIATION = 0.005
+
+
+def _stated(
+    track: Track, joints: Sequence[int], roots: Sequence[int]
+) -> Float[np.ndarray, "t j 3 3"] | None:
+    """Covariances of joints of the best modes, from the roots; None if the body is not known."""
     if track.body is None:
         return None
     state, base, spread = (
@@ -756,4 +780,4 @@ def _stated(track: Track, joints: Sequence[int]) -> Float[np.ndarray, "t j 3 3"]
         for part in (track.state[:, 0], track.base_transform, track.covariance[:, 0])
     )
     pose = pose_track(track.body, state, base)
-    return joint_covariance(track.body, pose, spread)[:, list(joints)].numpy()
+    return joint_covariance(track.body, pose, spread, about=roots)[:, list(joints)].numpy()

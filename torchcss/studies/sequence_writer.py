@@ -6,7 +6,7 @@
 | `cameras.json` | the camera `cam01`, metres, world-to-camera |
 | `keypoints2d.npz` | `keypoints [T J 2]`, projections with Gaussian noise of `noise_px`; |
 | | `keypoints_exact`, `confidence`, `visible`, `in_image`, `joint_names`, `frame_rate` |
-| `reference3d.npz` | `joints [T J 3]`, metres, world; `joint_names`, `frame_rate`, `time_s` |
+| `reference3d.npz` | `joints [T J 3]`, metres, exact; `joint_names`, `frame_rate`, `time_s` |
 | `mask.npz` | `mask [T H W]` |
 | `truth.npz` | `body`, `lengths` (JSON, metres), `base_transform [4 4]`, `state_names [n]`, |
 | | `states [T n]`, `frame_rate`, `seed`, `description` |
@@ -129,6 +129,7 @@ def _write_joints(folder: Path, shot: Shot, joints: list[Tensor], noise_px: floa
             "frame_rate": shot.frame_rate,
             "time_s": np.arange(len(places)) / shot.frame_rate,
             "units": "m",
+            "deviation_m": 0.0,
         },
     )
 
