@@ -86,9 +86,6 @@ class Preset:
         proposal_arm: Where samples go for an arm, if elsewhere than for a body.
         power_arm: `likelihood_power` for an arm, if other than for a body. Its modes cost the same
             for longer, since it has no `segmentation`: the rest of its person looks the same.
-        power_keypoints: `likelihood_power` of a body with keypoints in every frame, if other than
-            without: they tell in every frame anew which modes are wrong, and who was right for long
-            leads on less. (An arm does not gain.)
         persistence: Share of its last motion that a mode goes on with: 0 is driftless diffusion, 1
             constant velocity. The papers' trackers have 0. With 0.8 a mode does not lag behind a
             limb whose flow is underestimated: on the beam clip it doubles the time that limbs are
@@ -133,7 +130,6 @@ class Preset:
     survivors_body: int = 0
     proposal_arm: Proposal | None = None
     power_arm: float | None = None
-    power_keypoints: float | None = None
     persistence: float = 0.0
     noise: float = 1.0
     robust: bool = True
@@ -195,7 +191,6 @@ _CSS = Preset(
     forgetting=0.98,
     likelihood_power=0.1,
     power_arm=0.05,
-    power_keypoints=0.2,
     survivors_arm=20,
     survivors_body=15,
     persistence=0.8,

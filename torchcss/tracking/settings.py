@@ -461,13 +461,8 @@ def make_settings_tracker(
     )
     if not isinstance(tracker, Tracker):
         return tracker  # `Settings` has refused what follows
-    power = settings.likelihood_power
-    marked = not settings.keypoints_first_only and "joints" in settings.used_terms
-    moves = has_free_root(settings.body) if free_root is None else free_root
-    if power is None and marked and moves:
-        power = PRESETS[settings.preset].power_keypoints
-    if power is not None:
-        tracker = replace(tracker, likelihood_power=power)
+    if settings.likelihood_power is not None:
+        tracker = replace(tracker, likelihood_power=settings.likelihood_power)
     return replace(tracker, oversampling=settings.oversampling)
 
 
