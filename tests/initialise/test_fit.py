@@ -96,17 +96,19 @@ def test_a_person_is_found_among_the_hypotheses(found: Initialisation):
 
 
 def test_both_engines_find_the_same():
-    """The best fit to a thousandth of a nat, and the others but for those on a watershed.
+    """The same poses, to 2 cm of every joint, but for those on a watershed.
 
     Where a descent starts between two basins, or two fits are as far apart as distinct ones must
-    be, the last bit of a cost, and so the processor, says whether there is one fit or two.
+    be, the last bit of a cost, and so the processor, says whether there is one fit or two. Lengths
+    are those of the best fit: where two are about as good, all costs follow the one that leads.
     """
     fused, eager = (find(person(2), num_modes=None, engine=name) for name in ("fused", "eager"))
-    torch.testing.assert_close(eager.cost[0], fused.cost[0], atol=1e-3, rtol=0)
-    torch.testing.assert_close(eager.mixture.mean[0], fused.mixture.mean[0], atol=1e-3, rtol=0)
-    apart = (eager.cost[:, None] - fused.cost).abs()
-    for missed in (apart.amin(1) > 2e-3, apart.amin(0) > 2e-3):
-        assert missed.sum() <= 2, (eager.cost, fused.cost)
+    torch.testing.assert_close(eager.cost[0], fused.cost[0], atol=0.1, rtol=0)
+    joints = (each.body.pose(each.mixture.mean).joints for each in (fused, eager))
+    fused, eager = (places - places.mean(1, keepdim=True) for places in joints)
+    apart = (eager[:, None] - fused).norm(dim=-1).amax(-1)
+    for missed in (apart.amin(1) > 0.02, apart.amin(0) > 0.02):
+        assert missed.sum() <= 2, apart
 
 
 def test_limits_hold_and_lengths_stay_in_their_interval(found: Initialisation):
