@@ -115,7 +115,8 @@ class MixturePrior(Term):
         Args:
             predicted: The previous posterior, one frame ahead (`Dynamics.predict`).
         """
-        identity = torch.eye(predicted.mean.shape[-1]).to(predicted.covariance)
+        like = predicted.covariance
+        identity = torch.eye(like.shape[-1], dtype=like.dtype, device=like.device)
         # A variance of zero (a frozen parameter) is as good as a very small one.
         variance = predicted.covariance.diagonal(dim1=-2, dim2=-1).amax(-1)[:, None, None]
         least = torch.finfo(identity.dtype).eps * variance.clamp(min=_LEAST_VARIANCE)
