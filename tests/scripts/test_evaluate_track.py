@@ -267,3 +267,24 @@ def test_its_detector_is_a_peer(
     assert 0 < report["detector"]["root_aligned_mpjpe_mm"] < 40
     assert report["num_frames"] == 3
     assert "its detector" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("stated", "found"), [(None, 0.02), (np.array(0.0), 0.005), (np.array(0.03), 0.03)]
+)
+def test_references_say_how_far_they_are_off(
+    joints: np.ndarray, tmp_path: Path, stated: np.ndarray | None, found: float
+) -> None:
+    more = {} if stated is None else {"deviation_m": stated}
+    reference = write_reference(tmp_path / "r.npz", joints, list(LIMB_JOINTS), **more)
+    track = write_track(tmp_path / "run", joints[:, None], LIMB_JOINTS)
+    assert torchcss.evaluate(track, reference).deviation_m == found
+    assert torchcss.evaluate(track, reference, deviation_m=0.01).deviation_m == 0.01
+
+
+@pytest.mark.parametrize("stated", [np.array(-1.0), np.array(np.nan), np.zeros(3)])
+def test_no_deviation_is_refused(joints: np.ndarray, tmp_path: Path, stated: np.ndarray) -> None:
+    reference = write_reference(tmp_path / "r.npz", joints, list(LIMB_JOINTS), deviation_m=stated)
+    track = write_track(tmp_path / "run", joints[:, None], LIMB_JOINTS)
+    with pytest.raises(TrackFileError, match="deviation_m: expected a number of metres"):
+        torchcss.evaluate(track, reference)

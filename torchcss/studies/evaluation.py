@@ -84,6 +84,9 @@ ARM_LOST_MM = 150.0
 LOSSES = ("lost_s", "limb_lost_s", "limb_lost_of_modes_s")
 """Entries of a row that are times of a loss, NaN where there was none."""
 
+_LEAST_DEVIATION_M = 0.005
+"""Standard deviation of where a joint is, per coordinate, that is a matter of definition."""
+
 APART_M = 0.03
 """How far some joint of two modes is apart if they are two explanations, metres."""
 
@@ -687,7 +690,8 @@ def evaluate(
         root: Joint that is aligned; None: the midpoint of the hips.
         array: Array of the reference that holds the positions.
         deviation_m: Standard deviation of the reference per coordinate, metres; None: what the file
-            says in `deviation_m`, or 20 mm.
+            says in `deviation_m`, or 20 mm. It counts as 5 mm at least: to that much it is a matter
+            of definition where a joint is.
 
     Raises:
         TrackFileError: If a file is missing or malformed, or the run has no frames.
@@ -720,6 +724,8 @@ def evaluate(
         root=None if root is None else roots[0],
     )  # fmt: skip
     index, middle = ([common.index(name) for name in some] for some in (compared, roots))
+    if deviation_m is None:
+        deviation_m = reference_deviation(reference)
     away = tracked[:, 0] - true
     away = away[:, index] - away[:, middle].mean(1, keepdims=True)
     return Evaluation(
@@ -729,7 +735,7 @@ def evaluate(
         left_out=tuple(name for name in wanted if name not in common),
         away_m=away,
         covariance=_stated(track, *([column[i] for i in some] for some in (index, middle))),
-        deviation_m=reference_deviation(reference) if deviation_m is None else deviation_m,
+        deviation_m=max(deviation_m, _LEAST_DEVIATION_M),
     )
 
 
@@ -755,18 +761,12 @@ def _check_names(
 
 
 def reference_deviation(path: str | os.PathLike[str]) -> float:
-    """What a reference file says of its own error, per coordinate and in metres; 20 mm if nothing.
-
-    No less than 5 mm: where a body's joints are is a matter of definition to that much.
-    """
+    """What a reference file says of its own error, metres per coordinate; 20 mm if nothing."""
     arrays = load_arrays(Path(path), TrackFileError)
     stated = arrays.get("deviation_m", np.array(Thresholds.reference_m))
     if stated.shape != () or not 0 <= stated < np.inf:
         raise TrackFileError(f"{path}: deviation_m: expected a number of metres, got {stated}")
-    return max(float(stated), _LEAST_DEVIATION)
-
-
-_LEAST_DEVIATION = 0.005
+    return float(stated)
 
 
 def _stated(
