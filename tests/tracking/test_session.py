@@ -620,7 +620,7 @@ def test_awkward_frames_leave_no_nan_and_lose_nothing():
 @pytest.mark.parametrize(
     ("asked", "power"),
     [
-        ({}, 0.2),  # a body with keypoints in every frame
+        ({}, 0.1),
         ({"keypoints_use": "first"}, 0.1),
         ({"terms": ("contour", "temporal")}, 0.1),
         ({"body": "arm8"}, 0.05),
