@@ -15,12 +15,14 @@ nobody looks at, and publishes nothing. The same command goes on with an interru
 
 from __future__ import annotations
 
+import atexit
 import csv
 import html
 import json
 import multiprocessing
 import os
 import shutil
+import signal
 import sys
 import time
 import traceback
@@ -443,6 +445,8 @@ def _publish(place: Path, out: Path) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """One process of a batch, for `torchrun` and schedulers."""
+    # Once all is written, a request to end changes nothing: the process is about to.
+    atexit.register(signal.signal, signal.SIGTERM, signal.SIG_IGN)
     try:
         with ended_by_sigterm():
             tyro.cli(Batch, args=arguments, description=__doc__).run()
