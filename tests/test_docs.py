@@ -63,7 +63,7 @@ def test_api_page(site: Path) -> None:
     # Types that a dataclass has from a base in another module are known, too.
     assert 'href="../vision/camera.html#Camera"' in (site / "torchcss/cost/total.html").read_text()
     # The members of a private base class are explained where its public children point to.
-    assert 'id="_Scaled.sigma"' in (site / "torchcss" / "robust.html").read_text()
+    assert 'id="RobustPotential.sigma"' in (site / "torchcss" / "robust.html").read_text()
 
 
 def test_guide_pages(site: Path) -> None:
