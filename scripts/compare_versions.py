@@ -14,7 +14,9 @@ one thread; ratios are taken within a repeat. The clips:
 
 Seconds a frame are those of tracking, without what comes before the first frame; the seconds of a
 whole run have start, first pose and writing in them, and kernels are in the cache before the clock
-runs. With `--two` a third column is this version with two threads.
+runs. With `--two` a third row is this version with two threads. With `--samples` one clip, the beam
+or else the arm, is tracked with each of these numbers of samples instead, and `--plot` draws
+seconds a frame against samples.
 """
 
 from __future__ import annotations
@@ -33,8 +35,10 @@ from statistics import median
 from typing import Any, NamedTuple
 
 from common import REPOSITORY, Table, start, write_report
+from matplotlib.figure import Figure
 
 from torchcss.errors import ConfigurationError
+from torchcss.show.style import save_figure
 from torchcss.studies.demo import CLIP
 
 ENTRY = """
@@ -62,8 +66,12 @@ class Config:
     """Repeats."""
     two: bool = False
     """Measure this version with two threads, too."""
+    samples: tuple[int, ...] = ()
+    """Numbers of samples a frame to track one clip with."""
     out: Path | None = None
     """JSON file to write."""
+    plot: Path | None = None
+    """Picture of seconds a frame against `--samples` to write."""
 
 
 class Measured(NamedTuple):
@@ -110,6 +118,9 @@ def clips(config: Config) -> dict[str, list[str]]:
         ]
         found["beam"] = [*beam, *end]
         found["beam, first"] = [*beam, "--keypoints-use", "first", *end]
+    if config.samples:
+        words = found.get("beam", found["arm"])
+        found = {f"{num} samples": [*words, "--samples", str(num)] for num in config.samples}
     return found
 
 
@@ -173,9 +184,27 @@ def main(config: Config) -> dict[str, Any]:
     )
     table = Table(f"`torchcss track`, {config.frames} frames", columns, cells)
     table.print()
+    if config.plot is not None:
+        save_figure(seconds_figure(config, rows), config.plot)
     report = {"frames": config.frames, "repeats": config.repeats, "rows": rows}
     write_report(config.out, report, table)
     return report
+
+
+def seconds_figure(config: Config, rows: dict[str, dict[str, Any]]) -> Figure:
+    """Seconds a frame of each version against samples, on logarithmic axes."""
+    figure = Figure(figsize=(5.5, 4), layout="constrained")
+    axes = figure.subplots()
+    lines = {"other": config.against, "this": "this version", "two threads": "two threads"}
+    for way, label in lines.items():
+        points = [rows.get(f"{num} samples: {way}") for num in config.samples]
+        if all(points):
+            seconds = [point["seconds_per_frame"] for point in points if point]
+            axes.loglog(config.samples, seconds, "o-", label=label)
+    axes.set(xlabel="samples a frame", ylabel="seconds a frame, one core")
+    axes.grid(which="both", alpha=0.3)
+    axes.legend()
+    return figure
 
 
 if __name__ == "__main__":

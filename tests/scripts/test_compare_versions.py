@@ -41,3 +41,13 @@ def test_what_is_tracked(script: ModuleType, tmp_path: Path) -> None:
     found = script.clips(script.Config(against="v0.1", data=tmp_path, frames=7))
     assert list(found) == ["arm", "beam", "beam, first"]
     assert all(words[words.index("--stop") + 1] == "7" for words in found.values())
+
+
+def test_numbers_of_samples(script: ModuleType, tmp_path: Path) -> None:
+    config = script.Config(against="v0.1", data=tmp_path, samples=(10, 60))
+    found = script.clips(config)
+    assert list(found) == ["10 samples", "60 samples"]
+    assert all("cam01" in words for words in found.values())
+    rows = {f"{num} samples: this": {"seconds_per_frame": num} for num in config.samples}
+    (line,) = script.seconds_figure(config, rows).axes[0].lines
+    assert list(line.get_ydata()) == [10, 60]
