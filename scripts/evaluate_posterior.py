@@ -163,7 +163,8 @@ def compare(run: Run, reference: Path, deviation_m: float) -> Apart:
     base = torch.from_numpy(found.base_transform)[:, None]
     pose = pose_track(run.body, state, base.expand(-1, state.shape[1], -1, -1))
     hips_of_body = [here[index] for index in hips]
-    covariance = joint_covariance(run.body, pose, spread, about=hips_of_body)[:, :, here]
+    covariance = joint_covariance(run.body, pose, spread, about=hips_of_body, held=found.held)
+    covariance = covariance[:, :, here]
     own = deviation_m**2 * torch.eye(3).to(covariance)
     return Apart(offset, covariance + own, torch.from_numpy(found.log_weight))
 

@@ -7,7 +7,7 @@ import torch
 
 from torchcss import load_body
 from torchcss.body.catalog import BODY_NAMES
-from torchcss.body.uncertainty import joint_covariance, joint_jacobian
+from torchcss.body.uncertainty import Held, joint_covariance, joint_jacobian
 from torchcss.errors import ShapeError
 
 
@@ -53,3 +53,28 @@ def test_covariances_are_symmetric_and_not_negative(generator: torch.Generator):
     assert (torch.linalg.eigvalsh(found) > -1e-5).all()
     with pytest.raises(ShapeError, match="covariance"):
         joint_covariance(body, pose, factor[..., :7])
+
+
+def test_what_is_held_moves_the_joints_by_their_sensitivity(generator: torch.Generator):
+    body = load_body("body34", dtype=torch.float64)
+    pose = body.pose(body.rest)
+    none = torch.zeros(body.num_parameters, body.num_parameters, dtype=torch.float64)
+    axis = torch.nn.functional.normalize(
+        torch.randn(3, generator=generator, dtype=torch.float64), dim=0
+    )
+    eye = pose.joints.mean(0) - 4 * axis
+    held = Held(0.03, 0.1, eye, axis)
+    found = joint_covariance(body, pose, none, held=held)
+    # Bodies of other sizes at distances that look the same, and before other lenses.
+    num, joints = 100000, pose.joints
+    size, focal = torch.randn(2, num, 1, 1, generator=generator, dtype=torch.float64)
+    depth = ((joints.mean(0) - eye) @ axis) * axis
+    drawn = eye + (1 + 0.03 * size) * (joints - eye) + 0.1 * focal * depth
+    torch.testing.assert_close(found[5], torch.cov(drawn[:, 5].T), rtol=0.05, atol=2e-4)
+    hips = [body.joint_index(name) for name in ("l_hip", "r_hip")]
+    about = joint_covariance(body, pose, none, about=hips, held=held)
+    drawn = drawn - drawn[:, hips].mean(1, keepdim=True)
+    torch.testing.assert_close(about[5], torch.cov(drawn[:, 5].T), rtol=0.05, atol=1e-6)
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64)).Q
+    turned = held.turned(turn).covariance(pose.joints @ turn.T)
+    torch.testing.assert_close(turned, turn @ found @ turn.T)

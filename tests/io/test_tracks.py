@@ -104,7 +104,7 @@ def test_file_has_exactly_the_arrays_of_the_design(tmp_path: Path) -> None:
         "state": (3, 3, 3), "covariance": (3, 3, 3, 3), "log_weight": (3, 3), "cost": (3, 3),
         "parent": (3, 3), "joint_names": (2,), "joints_world": (3, 3, 2, 3),
         "base_transform": (3, 4, 4),
-        "evidence": (), "body": (), "cameras": (), "settings": (),
+        "evidence": (), "size_deviation": (), "body": (), "cameras": (), "settings": (),
     }  # fmt: skip
 
 

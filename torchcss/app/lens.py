@@ -16,7 +16,7 @@ import torch
 from torchcss.app.view_files import OpenView
 from torchcss.errors import CameraError
 from torchcss.initialise.fit import default_camera
-from torchcss.initialise.focal import fit_focal
+from torchcss.initialise.focal import DEVIATION, fit_focal
 from torchcss.initialise.options import InitialiseOptions
 from torchcss.io.cameras import LoadedCamera
 from torchcss.io.video import VideoReader, focal_length_35mm
@@ -24,9 +24,12 @@ from torchcss.tracking.settings import Settings
 from torchcss.vision.camera import Camera
 
 PERSONS = ("body30", "body32", "body34")
-"""Bodies to which a focal length is fitted."""
+"""Bodies of people: a focal length is fitted to them, and their size is not known."""
 
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
+
+_OF_FILE = 0.05
+"""Deviation of what a file says of its lens (ours): a film is often cropped, to steady it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,11 +40,13 @@ class Lens:
         focal: Focal length in pixels.
         fov: Angle between the left and the right border of the image, degrees.
         source: Who says so.
+        deviation: Standard deviation of its logarithm.
     """
 
     focal: float | None = None
     fov: float | None = None
     source: str = "as given"
+    deviation: float = 0.0
 
     def unless(self, calibration: Path) -> Path:
         """The calibration file, which says it all.
@@ -63,7 +68,8 @@ class Lens:
             return self
         info = VideoReader(video).info
         focal = equivalent * math.hypot(info.width, info.height) / _DIAGONAL_35MM
-        return Lens(focal=focal, source=f"from the file's own {equivalent:g} mm on 35 mm film")
+        source = f"from the file's own {equivalent:g} mm on 35 mm film"
+        return Lens(focal=focal, source=source, deviation=_OF_FILE)
 
     @property
     def is_known(self) -> bool:
@@ -82,7 +88,8 @@ class Lens:
             info.width, info.height, focal_px=self.focal, field_of_view_degrees=self.fov
         )
         note = note.replace("as given", self.source)
-        return LoadedCamera(camera, metric=False, units_note=note)
+        deviation = self.deviation if self.is_known else DEVIATION
+        return LoadedCamera(camera, False, note, deviation)
 
 
 def fitted(view: OpenView, settings: Settings) -> OpenView:
@@ -115,4 +122,4 @@ def fitted(view: OpenView, settings: Settings) -> OpenView:
         "say --focal or --fov if you know it"
     )
     camera = Camera.pinhole(*size, focal_px=found.pixels, name="fitted")
-    return view._replace(camera=view.camera._replace(camera=camera, units_note=note))
+    return view._replace(camera=LoadedCamera(camera, False, note, found.deviation))

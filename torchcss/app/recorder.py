@@ -29,7 +29,9 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchcss.app.claims import Claim
+from torchcss.app.lens import PERSONS
 from torchcss.app.smooth import SMOOTH_NAME
+from torchcss.cost.anthropometric import Anthropometric
 from torchcss.errors import OutputError
 from torchcss.files import output_error
 from torchcss.io.cameras import calibration
@@ -41,6 +43,7 @@ from torchcss.show.overlay import draw_poses
 from torchcss.show.track_pictures import caption
 from torchcss.tracking.checkpoint import state_tensors
 from torchcss.tracking.session import Posterior, TrackingSession
+from torchcss.tracking.settings import Settings
 from torchcss.types import Status
 from torchcss.vision.camera import Camera
 
@@ -84,6 +87,12 @@ class Sink(Protocol):
     def close(self) -> None:
         """The run is over, or was interrupted."""
         ...
+
+
+def _size_deviation(settings: Settings, num_cameras: int) -> float:
+    """What is not known of the body's size: of a person of any stature before one camera."""
+    known = settings.stature is not None or num_cameras > 1 or settings.body not in PERSONS
+    return 0.0 if known else Anthropometric().stature
 
 
 class Terminated(KeyboardInterrupt):
@@ -133,6 +142,7 @@ class Recorder:
                 body.state_names,
                 body.joint_names,
                 likelihood_power=session.plan.tracker.stated_power,
+                size_deviation=_size_deviation(session.settings, len(self.recorded)),
                 body=body,
                 cameras=self.recorded,
                 settings=asdict(session.settings),
@@ -206,7 +216,7 @@ class Recorder:
             **self._totals.summary(len(self._writer)),
             "notes": list(self.notes),
             # As in a camera file, so that this file is one.
-            **calibration(*((camera, files and files.video) for camera, files in self.recorded)),
+            **calibration(*((one.camera, one.files and one.files.video) for one in self.recorded)),
             **self.extra,
         }
 

@@ -55,7 +55,7 @@ class OpenView(NamedTuple):
     @property
     def recorded(self) -> RecordedCamera:
         """The camera with its files, as a run holds it."""
-        return RecordedCamera(self.camera.camera, self.files)
+        return RecordedCamera(self.camera.camera, self.files, self.camera.focal_deviation)
 
     @property
     def notes(self) -> list[str]:

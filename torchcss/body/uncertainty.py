@@ -4,12 +4,18 @@ A joint centre p moves with the state as `dp = J dx`; a state of covariance S le
 covariance `J S J^T` to first order. The Jacobian is read off the twists of the tree: a joint of
 the tree that carries p moves it with `omega x p + v`.
 
+What one camera does not show, the size of the body and its distance, is held while a body is
+tracked, and is in no state's covariance. `Held` says how little is known of it, and moves the
+joints by their sensitivity: a body that is larger by a share s and farther by the same share looks
+the same, and so does one that is farther by a share f before a lens that is longer by it.
+
 Call `joint_covariance`; `joint_jacobian` gives J alone.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -18,6 +24,39 @@ from torch import Tensor
 from torchcss.body.kinematics import TreePose
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.errors import check_shape
+
+
+class Held(NamedTuple):
+    """What a track holds and one camera does not show, and how little is known of it.
+
+    Attributes:
+        size: Standard deviation of the logarithm of the body's size.
+        focal: The same of the camera's focal length.
+        eye: The camera's centre, world, metres.
+        axis: The direction in which it looks, a unit vector.
+    """
+
+    size: float
+    focal: float
+    eye: Float[Tensor, "3"]
+    axis: Float[Tensor, "3"]
+
+    def turned(self, turn: Float[Tensor, "3 3"]) -> Held:
+        """The same in another frame of reference with the same origin."""
+        return self._replace(eye=turn @ self.eye, axis=turn @ self.axis)
+
+    def covariance(
+        self, joints: Float[Tensor, "*batch j 3"], about: Sequence[int] = ()
+    ) -> Float[Tensor, "*batch j 3 3"]:
+        """What it adds to the covariances of places; see `joint_covariance`."""
+        eye, axis = self.eye.to(joints), self.axis.to(joints)
+        origin = joints[..., list(about), :].mean(-2, keepdim=True) if about else eye
+        moved = self.size * (joints - origin)
+        found = moved[..., :, None] * moved[..., None, :]
+        if about:
+            return found
+        depth = ((joints.mean(-2) - eye) @ axis)[..., None, None, None]
+        return found + (self.focal * depth).square() * torch.outer(axis, axis)
 
 
 def joint_jacobian(body: BodyModel, pose: BodyPose) -> Float[Tensor, "*batch j 3 n"]:
@@ -53,6 +92,7 @@ def joint_covariance(
     covariance: Float[Tensor, "*batch n n"],
     *,
     about: Sequence[int] = (),
+    held: Held | None = None,
 ) -> Float[Tensor, "*batch j 3 3"]:
     """Covariances of the joint centres, square metres, to first order.
 
@@ -65,6 +105,7 @@ def joint_covariance(
         covariance: Covariances of the states.
         about: Joints from whose middle the places of all are told, such as the hips: where the
             whole body is then does not count. Empty: places in the world.
+        held: What the state does not hold and is not known either; None: all is known.
 
     Raises:
         ShapeError: If the covariance has another size than the state.
@@ -73,4 +114,5 @@ def joint_covariance(
     jacobian = joint_jacobian(body, pose)
     if about:
         jacobian = jacobian - jacobian[..., list(about), :, :].mean(-3, keepdim=True)
-    return jacobian @ covariance[..., None, :, :] @ jacobian.mT
+    found = jacobian @ covariance[..., None, :, :] @ jacobian.mT
+    return found if held is None else found + held.covariance(pose.joints, about)

@@ -41,11 +41,13 @@ class LoadedCamera(NamedTuple):
         camera: The camera; in its own frame unless `metric`.
         metric: Whether the world frame is the file's, in metres.
         units_note: Why the camera is in its own frame, or which unit was assumed, for the user.
+        focal_deviation: Standard deviation of the logarithm of the focal length; 0: it is known.
     """
 
     camera: Camera
     metric: bool
     units_note: str | None
+    focal_deviation: float = 0.0
 
 
 def read_camera(path: StrPath, name: str | None = None, *, video: StrPath | None = None) -> Camera:

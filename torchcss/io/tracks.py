@@ -18,12 +18,13 @@ J joints:
 | `joints_world` | T K J 3 | metres, world frame |
 | `base_transform` | T 4 4 | world from the frame in which the root moves (decision "root") |
 | `evidence` | | power with which the likelihood counts in the covariances |
+| `size_deviation` | | of the logarithm of the body's size, which the covariances hold for known |
 | `body` | | JSON: the body that was tracked, see `torchcss.io.track_body` |
 | `cameras` | | JSON: cameras and what they recorded, see `torchcss.io.view_files` |
 | `settings` | | JSON: what the tracker was told |
 
 The best mode of a frame is first. Absent modes hold zeros (parent -1, cost inf). Version 1 has the
-same without the last three, which may also be empty.
+same without the last four, of which three may also be empty.
 
 By default: a `TrackWriter` that is saved now and then, so that a stopped run keeps its frames, and
 `torchcss.io.run.Run.open`, or `load_track` for the file alone, to read back.
@@ -49,6 +50,7 @@ from torch import Tensor
 
 from torchcss.body.bases import on_origin
 from torchcss.body.model import BodyModel
+from torchcss.body.uncertainty import Held
 from torchcss.errors import ShapeError, TorchcssError, TrackFileError
 from torchcss.files import StrPath, load_arrays, load_json, one_line, save_arrays, write_text
 from torchcss.files import prepare_output_folder as prepare_output_folder
@@ -118,6 +120,8 @@ class Track(NamedTuple):
         joints_world: Joint centres of the modes, metres.
         base_transform: World from the frame in which the root moves.
         likelihood_power: Power with which the likelihood counts in the covariances.
+        size_deviation: Standard deviation of the logarithm of the body's size, which the
+            covariances hold for known; 0: it is.
         body: The body that was tracked, on the world's origin; None where the file does not say.
         cameras: What watched it, the first camera first; empty where the file does not say.
         settings: What the tracker was told, as plain data.
@@ -135,6 +139,7 @@ class Track(NamedTuple):
     joints_world: Float[np.ndarray, "t k j 3"]
     base_transform: Float[np.ndarray, "t 4 4"]
     likelihood_power: float = 1.0
+    size_deviation: float = 0.0
     body: BodyModel | None = None
     cameras: tuple[RecordedCamera, ...] = ()
     settings: Mapping[str, Any] = {}
@@ -146,6 +151,7 @@ class Track(NamedTuple):
         joint_names: Sequence[str],
         *,
         likelihood_power: float = 1.0,
+        size_deviation: float = 0.0,
         body: BodyModel | None = None,
         cameras: Sequence[RecordedCamera] = (),
         settings: Mapping[str, Any] | None = None,
@@ -156,6 +162,7 @@ class Track(NamedTuple):
             state_names: Names of the parameters.
             joint_names: Names of the joints.
             likelihood_power: Power with which the likelihood counts in the covariances.
+            size_deviation: Standard deviation of the logarithm of the body's size.
             body: The body that is tracked, on any base.
             cameras: What watches it.
             settings: What the tracker is told.
@@ -165,6 +172,7 @@ class Track(NamedTuple):
             state_names=tuple(state_names),
             joint_names=tuple(joint_names),
             likelihood_power=float(likelihood_power),
+            size_deviation=float(size_deviation),
             body=None if body is None else on_origin(body),
             cameras=tuple(cameras),
             settings=dict(settings or {}),
@@ -174,6 +182,19 @@ class Track(NamedTuple):
     def num_modes(self) -> Int[np.ndarray, " t"]:
         """How many modes each frame has."""
         return (self.log_weight > -np.inf).sum(axis=1)
+
+    @property
+    def held(self) -> Held | None:
+        """What the covariances hold for known and is not; None: all is, or the file has no camera.
+
+        Give it to `torchcss.body.uncertainty.joint_covariance`.
+        """
+        if not self.cameras:
+            return None
+        camera, _, focal = self.cameras[0]
+        if not (self.size_deviation or focal):
+            return None
+        return Held(self.size_deviation, focal, camera.centre_world, camera.R_camera_world[2])
 
     def first(self, num_frames: int) -> Track:
         """The same track up to a frame, as when no more had been tracked."""
@@ -355,12 +376,13 @@ def _checked_arrays(arrays: Mapping[str, np.ndarray], path: Path) -> dict[str, A
     n, j = arrays["state_names"].size, arrays["joint_names"].size
     shapes: dict[str, tuple[int, ...]] = {
         "frames": (t,), "times": (t,), "state_names": (n,), "joint_names": (j,),
-        "base_transform": (t, 4, 4), _POWER_KEY: (),
+        "base_transform": (t, 4, 4), _POWER_KEY: (), "size_deviation": (),
         **{name: (t, k, *shape) for name, shape in _shapes(n, j).items()},
     }  # fmt: skip
     # A track of somebody else's may be in the world frame, and of the cost as it is.
     standing = np.tile(np.eye(4), (max(t, 0), 1, 1))
-    arrays = {"base_transform": standing, _POWER_KEY: np.ones(()), **arrays}
+    told = {_POWER_KEY: np.ones(()), "size_deviation": np.zeros(())}
+    arrays = {"base_transform": standing, **told, **arrays}
     kinds = {"frames": "iu", "parent": "iu", "state_names": "U", "joint_names": "U"}
     values: dict[str, Any] = {}
     for name, shape in shapes.items():
@@ -379,6 +401,9 @@ def _checked_arrays(arrays: Mapping[str, np.ndarray], path: Path) -> dict[str, A
     power = float(values.pop(_POWER_KEY))
     if not 0 < power < np.inf:
         raise TrackFileError(f"{path}: {_POWER_KEY}: expected a positive power, got {power:g}")
+    values["size_deviation"] = float(values["size_deviation"])
+    if not 0 <= values["size_deviation"] < np.inf:
+        raise TrackFileError(f"{path}: size_deviation: expected a number that is not negative")
     return {**values, "likelihood_power": power}
 
 

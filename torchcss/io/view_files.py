@@ -56,10 +56,12 @@ class RecordedCamera(NamedTuple):
     Attributes:
         camera: The camera, of the size of its video.
         files: What it recorded; None where that was not read from files, or is not known.
+        focal_deviation: Standard deviation of the logarithm of its focal length; 0: it is known.
     """
 
     camera: Camera
     files: ViewFiles | None = None
+    focal_deviation: float = 0.0
 
 
 _PATHS = ("video", "keypoints", "masks")
@@ -67,8 +69,9 @@ _PATHS = ("video", "keypoints", "masks")
 
 def camera_to_plain(recorded: RecordedCamera) -> dict[str, Any]:
     """What JSON holds of a camera and its files, whose paths are made absolute."""
-    camera, files = recorded
+    camera, files, focal = recorded
     entry = {"name": camera.name, "near": camera.near, **camera_entry(camera)}
+    entry["focal_deviation"] = focal
     if files is None:
         return entry
     plain = asdict(files)
@@ -96,11 +99,12 @@ def camera_from_plain(entry: Mapping[str, Any], folder: Path) -> RecordedCamera:
         name=entry["name"],
         near=entry["near"],
     )
+    focal = float(entry.get("focal_deviation", 0.0))
     if entry.get("files") is None:
-        return RecordedCamera(camera)
+        return RecordedCamera(camera, focal_deviation=focal)
     files = ViewFiles(**entry["files"])
     places = {name: _place(getattr(files, name), folder) for name in _PATHS}
-    return RecordedCamera(camera, replace(files, **places))
+    return RecordedCamera(camera, replace(files, **places), focal)
 
 
 def _place(path: str | None, folder: Path) -> Path | None:

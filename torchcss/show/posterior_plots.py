@@ -141,7 +141,8 @@ def joints_figure(
     pose = pose_track(
         body, torch.from_numpy(track.state[rows, 0]), torch.from_numpy(track.base_transform[rows])
     )
-    spread = joint_covariance(body, pose, torch.from_numpy(track.covariance[rows, 0])).numpy()
+    covariance = torch.from_numpy(track.covariance[rows, 0])
+    spread = joint_covariance(body, pose, covariance, held=track.held).numpy()
     places, labels = track.joints_world[rows], ("world x", "world y", "world z")
     if camera is not None:
         # Up is minus the camera's y.

@@ -179,7 +179,7 @@ def _facts(run: Run) -> list[tuple[str, str]]:
 def _cameras(run: Run) -> list[tuple[str, str]]:
     """What the cameras are, a line each."""
     rows = []
-    for camera, _ in run.cameras:
+    for camera, *_ in run.cameras:
         width, height = camera.image_size_wh
         focal = float(camera.K[0, 0])
         angle = 2 * math.degrees(math.atan(0.5 * max(width, height) / focal))

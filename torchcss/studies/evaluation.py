@@ -780,4 +780,5 @@ def _stated(
         for part in (track.state[:, 0], track.base_transform, track.covariance[:, 0])
     )
     pose = pose_track(track.body, state, base)
-    return joint_covariance(track.body, pose, spread, about=roots)[:, list(joints)].numpy()
+    found = joint_covariance(track.body, pose, spread, about=roots, held=track.held)
+    return found[:, list(joints)].numpy()

@@ -18,8 +18,10 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 
+from torchcss.body.uncertainty import Held
 from torchcss.errors import ConfigurationError
 from torchcss.io.tracks import Track
 from torchcss.vision.camera import Camera
@@ -59,6 +61,7 @@ class Selection(NamedTuple):
         base: Base transforms that the states stand on.
         turn: The file's frame from the world's.
         upright: Orientation, in the file's frame, of a body that stands facing somewhere.
+        held: What the covariances hold for known and is not, in the file's frame.
         report: What was decided, one line each.
     """
 
@@ -78,6 +81,7 @@ class Selection(NamedTuple):
     base: Float[np.ndarray, "t m 4 4"]
     turn: Float[np.ndarray, "3 3"]
     upright: Float[np.ndarray, "3 3"]
+    held: Held | None
     report: tuple[str, ...]
 
     @property
@@ -136,7 +140,7 @@ def select(track: Track, choice: SelectionChoice | None = None, *, y_up: bool = 
     row = np.arange(len(kept))[:, None].repeat(len(wanted), axis=1)
     # Where each pose is from: its own frame, or the nearest that has the mode.
     source = _nearest_present(present)
-    held = (kept[source], ranks[source, np.arange(len(wanted))])
+    nearest = (kept[source], ranks[source, np.arange(len(wanted))])
     own = (kept[row], np.where(present, ranks, 0))
     change = np.eye(4)
     change[:3, :3] = turn
@@ -151,13 +155,14 @@ def select(track: Track, choice: SelectionChoice | None = None, *, y_up: bool = 
         cost=np.where(present, track.cost[own], np.inf),
         parent=np.where(present, track.parent[own], -1),
         state_names=track.state_names,
-        state=track.state[held],
+        state=track.state[nearest],
         covariance=np.where(present[..., None, None], track.covariance[own], 0.0),
         joint_names=track.joint_names,
         joints=joints @ turn.T,
-        base=change @ track.base_transform[held[0]],
+        base=change @ track.base_transform[nearest[0]],
         turn=turn,
         upright=upright,
+        held=track.held and track.held.turned(torch.from_numpy(turn)),
         report=tuple(report),
     )
 

@@ -56,7 +56,7 @@ def joint_covariances(selection: Selection, body: BodyModel) -> Float[np.ndarray
             for array in (selection.state, selection.base, selection.covariance)
         )
         pose = pose_track(body, state, base)
-        found[chosen] = joint_covariance(body, pose, covariance).numpy()
+        found[chosen] = joint_covariance(body, pose, covariance, held=selection.held).numpy()
     return found
 
 
