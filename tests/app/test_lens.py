@@ -8,10 +8,13 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+import torch
 from PIL import ExifTags, Image
 
 import torchcss
 from torchcss.app.lens import Lens
+from torchcss.body.bases import pose_track
+from torchcss.body.uncertainty import joint_covariance
 from torchcss.errors import CameraError
 from torchcss.io.video import VideoWriter, focal_length_35mm
 
@@ -40,6 +43,8 @@ def test_the_file_says_it(tmp_path: Path) -> None:
     assert focal(Lens(), path) == pytest.approx(26 * 80 / math.hypot(36, 24))
     assert "26 mm" in (Lens().of(path).camera(path).units_note or "")
     assert focal(Lens(focal=99.0), path) == 99  # the user knows better
+    doubts = [lens.of(path).camera(path).focal_deviation for lens in (Lens(focal=99.0), Lens())]
+    assert doubts[0] == 0 < doubts[1] < Lens().camera(path).focal_deviation
 
 
 @pytest.mark.parametrize("said", ["", "none", "0", "nan", "1e9", "-26"])
@@ -67,9 +72,8 @@ def test_a_camera_is_said_once() -> None:
         torchcss.Camera.pinhole(64, 48, focal_px=10.0, field_of_view_degrees=20.0)
 
 
-def test_what_is_unknown_is_fitted_and_said(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("stature", [1.9, None])
+def test_what_is_unknown_is_fitted_and_said(tmp_path: Path, stature: float | None) -> None:
     with VideoWriter(tmp_path / "video.mp4", 25) as film:
         for shade in (10, 20, 30, 40, 50):
             film.write(np.full((96, 128, 3), shade, dtype=np.uint8))
@@ -88,7 +92,7 @@ def test_what_is_unknown_is_fitted_and_said(
         tmp_path / "video.mp4",
         keypoints=tmp_path / "keypoints.npz",
         out=tmp_path / "out",
-        settings=torchcss.Settings(samples=3, modes=2, overlay=False, stature=1.9),
+        settings=torchcss.Settings(samples=3, modes=2, overlay=False, stature=stature),
         stop=1,
     )
     notes = "\n".join(run.summary["notes"])
@@ -97,4 +101,19 @@ def test_what_is_unknown_is_fitted_and_said(
     camera = run.cameras[0].camera
     assert camera.name == "fitted"
     assert 0.5 < float(camera.K[0, 0]) / 128 < 1.6
-    assert "1.9" in notes  # the stature, which sets the size
+    assert ("1.9" in notes) == (stature is not None)  # it sets the size
+    for track in (run.track, torchcss.Run.open(tmp_path / "out").track):
+        held = track.held
+        assert held is not None
+        assert (held.size > 0) == (stature is None)
+        assert 0.05 < held.focal < 0.3
+        assert track.body is not None
+        base = torch.from_numpy(track.base_transform[:1])
+        pose = pose_track(track.body, torch.from_numpy(track.state[:1, 0]), base)
+        spread = torch.from_numpy(track.covariance[:1, 0])
+        wider = joint_covariance(track.body, pose, spread, held=held)
+        added = wider - joint_covariance(track.body, pose, spread)
+        # Along the axis, by as much as the distance is uncertain.
+        distance = track.joints_world[0, 0].mean(0)[2]
+        deviation = distance * math.hypot(held.size, held.focal)
+        assert added[0].mean(0)[2, 2].sqrt() == pytest.approx(deviation, rel=0.05)

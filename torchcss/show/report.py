@@ -170,7 +170,8 @@ def _facts(run: Run) -> list[tuple[str, str]]:
     ]
     if "l_knee" in track.joint_names:
         stature = settings.get("stature")
-        ask = "not given; it would set the size: --stature METRES"
+        doubt = f" (known to {100 * track.size_deviation:.0f} %)" if track.size_deviation else ""
+        ask = f"not given; it would set the size{doubt}: --stature METRES"
         facts.append(("Stature", f"{stature:g} m, as given" if stature else ask))
         facts.append(("Followed", f"--person {files.person}" if files else "not known"))
     return facts
@@ -179,15 +180,16 @@ def _facts(run: Run) -> list[tuple[str, str]]:
 def _cameras(run: Run) -> list[tuple[str, str]]:
     """What the cameras are, a line each."""
     rows = []
-    for camera, *_ in run.cameras:
+    for camera, _, deviation in run.cameras:
         width, height = camera.image_size_wh
         focal = float(camera.K[0, 0])
         angle = 2 * math.degrees(math.atan(0.5 * max(width, height) / focal))
+        doubt = f", known to {100 * deviation:.0f} %" if deviation else ""
         rows.append(
             (
                 camera.name,
                 f"{width} x {height} pixels, focal length {focal:.0f} pixels ({angle:.0f} degrees "
-                "along the longer side)",
+                f"along the longer side){doubt}",
             )
         )
     if run.summary.get("world_is_metric") is False:

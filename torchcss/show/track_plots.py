@@ -99,7 +99,8 @@ def side_view_figure(
 
     In front they are in perspective, scaled to metres at the distance of the best mode; from the
     side, depth grows to the right. Opacity tells the weight. Ellipses are one standard deviation of
-    the joint centres, `J S J^T` to first order (`torchcss.body.uncertainty`).
+    the joint centres, `J S J^T` to first order (`torchcss.body.uncertainty`), of a body of known
+    size: else all would be the same long stroke.
 
     Args:
         track: The track.

@@ -19,7 +19,7 @@ several runs one of medians. What the words mean (the figures are those of `Thre
   the true angles lie within three standard deviations of any mode (root of the mean squared
   Mahalanobis distance per parameter).
 * *Calibration*: how often the true joints lie in the 50, 90, and 95 % regions of a mode, the
-  joint's covariance `J S J^T` (`torchcss.body.uncertainty`) enlarged by the reference's own.
+  joint's covariance (`torchcss.body.uncertainty`) enlarged by the reference's own.
 * *Along* and *across* are root mean square errors of the best mode's joints, roots on each other,
   in the direction of the camera's line of sight to the true body, and in the picture's plane.
 * A posterior is *multimodal* by the weight of the modes with a joint 3 cm from the best mode's.
