@@ -21,6 +21,9 @@ from torchcss.errors import OutputError, TorchcssError
 StrPath = str | os.PathLike[str]
 """A path in any form."""
 
+_ROWS = 64
+"""Rows of an array that are copied at a time."""
+
 _ADVICE = {
     errno.ENOSPC: "the disk is full; free some space or choose another folder with --out",
     errno.EDQUOT: "your disk quota is used up; free some space or choose another folder with --out",
@@ -92,6 +95,62 @@ def save_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
     plain: dict[str, Any] = {name: np.asarray(value) for name, value in arrays.items()}
     with replace_file(path) as partial:
         np.savez(partial, **plain)
+
+
+def extend_arrays(path: Path, arrays: Mapping[str, Any], fill: Mapping[str, float]) -> None:
+    """Write an NPZ file whole or not at all, in which some arrays go on from where they were.
+
+    The file is copied piece by piece, so that its size takes no memory.
+
+    Args:
+        path: The file, as `save_arrays` or this wrote it.
+        arrays: Arrays by name, or what NumPy makes arrays of.
+        fill: Those of them that are added to the file's own along the first axis, and what stands
+            where the one has a shorter second axis than the other. The rest is replaced.
+
+    Raises:
+        OutputError: If it cannot be written, or the file is no longer what it was.
+    """
+    with replace_file(path) as partial:
+        try:
+            with zipfile.ZipFile(path) as old, zipfile.ZipFile(partial, "w") as new:
+                for name, value in arrays.items():
+                    member = f"{name}.npy"
+                    with new.open(member, "w", force_zip64=True) as target:
+                        if name not in fill:
+                            np.lib.format.write_array(target, np.asarray(value), allow_pickle=False)
+                            continue
+                        with old.open(member) as source:
+                            _extend(source, np.asarray(value), fill[name], target)
+        except (zipfile.BadZipFile, KeyError, ValueError) as error:
+            raise OutputError(f"{path}: changed by somebody else: {one_line(error)}") from error
+
+
+def _extend(source: IO[bytes], rows: np.ndarray, fill: float, target: IO[bytes]) -> None:
+    """Copy the array of an NPY file and add rows to it."""
+    header = array_header(source)
+    if header is None or header[1] != rows.dtype or header[0][2:] != rows.shape[2:]:
+        raise ValueError(f"expected an array to which {rows.dtype} {list(rows.shape)} can be added")
+    num, *rest = header[0]
+    width = max([*rest[:1], *rows.shape[1:2]], default=0)
+    shape = (num + len(rows), *([width] if rest else []), *rest[1:])
+    plain = {"descr": np.lib.format.dtype_to_descr(rows.dtype), "fortran_order": False}
+    np.lib.format.write_array_header_1_0(target, {**plain, "shape": shape})
+    size = math.prod(rest) * rows.dtype.itemsize
+    for begin in range(0, num, _ROWS):
+        count = min(_ROWS, num - begin)
+        block = np.frombuffer(source.read(count * size), rows.dtype).reshape(count, *rest)
+        target.write(_widened(block, width, fill).tobytes())
+    target.write(_widened(rows, width, fill).tobytes())
+
+
+def _widened(rows: np.ndarray, width: int, fill: float) -> np.ndarray:
+    """Rows with a second axis of this length."""
+    if rows.ndim == 1 or rows.shape[1] == width:
+        return rows
+    wide = np.full((len(rows), width, *rows.shape[2:]), fill, dtype=rows.dtype)
+    wide[:, : rows.shape[1]] = rows
+    return wide
 
 
 def write_text(path: Path, text: str) -> None:

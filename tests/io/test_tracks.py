@@ -201,7 +201,7 @@ def test_refusals_keep_the_old_file(
         raise OSError(number, os.strerror(number))
 
     with monkeypatch.context() as patch:
-        patch.setattr(np, "savez", refuse)
+        patch.setattr(np.lib.format, "write_array", refuse)
         with pytest.raises(OutputError, match=words) as caught:
             writer.save()
     assert str(path) in str(caught.value)
@@ -263,7 +263,7 @@ def test_interrupt_in_mid_write_keeps_the_old_file(
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(np, "savez", interrupt)
+    monkeypatch.setattr(np.lib.format, "write_array", interrupt)
     with pytest.raises(KeyboardInterrupt):
         writer.save()
     assert path.read_bytes() == before
@@ -465,3 +465,33 @@ def test_bad_summaries(tmp_path: Path) -> None:
         read_summary(tmp_path)
     with pytest.raises(OutputError):
         write_summary(tmp_path / "none" / "summary.json", {})
+
+
+def test_what_was_written_stays_in_the_file(tmp_path: Path) -> None:
+    """Saved after every frame or once: the same arrays, whatever the numbers of modes."""
+    counts = (2, 1, 4, 3, 1, 5)
+    whole = write_track(tmp_path / "whole.npz", counts)
+    writer = new_writer(tmp_path / "pieces.npz")
+    for index, k in enumerate(counts):
+        writer.append(FrameModes(
+            frame=10 + 2 * index, time_s=index / 30, base_transform=torch.eye(4) * (index + 1),
+            **some_modes(k, index),
+        ))  # fmt: skip
+        writer.save()
+    assert len(writer) == 6
+    assert_same(load_track(writer.path), load_track(whole.path))
+    assert_same(writer.track(), whole.track())
+    for name, array in np.load(whole.path).items():
+        assert np.load(writer.path)[name].dtype == array.dtype
+    with pytest.raises(ShapeError, match="rising order"):
+        writer.append(FrameModes(frame=20, time_s=9.0, **some_modes(2)))
+
+
+@pytest.mark.parametrize("now", [b"", b"PK nothing", None])
+def test_a_file_that_somebody_changed_is_told(tmp_path: Path, now: bytes | None) -> None:
+    writer = write_track(tmp_path / "track.npz")
+    writer.append(FrameModes(frame=100, time_s=9.0, **some_modes(2)))
+    writer.path.unlink() if now is None else writer.path.write_bytes(now)
+    with pytest.raises(OutputError, match=r"track\.npz"):
+        writer.save()
+    assert len(writer) == 4

@@ -52,7 +52,15 @@ from torchcss.body.bases import on_origin
 from torchcss.body.model import BodyModel
 from torchcss.body.uncertainty import Held
 from torchcss.errors import ShapeError, TorchcssError, TrackFileError
-from torchcss.files import StrPath, load_arrays, load_json, one_line, save_arrays, write_text
+from torchcss.files import (
+    StrPath,
+    extend_arrays,
+    load_arrays,
+    load_json,
+    one_line,
+    save_arrays,
+    write_text,
+)
 from torchcss.files import prepare_output_folder as prepare_output_folder
 from torchcss.io.track_body import body_from_plain, body_to_plain
 from torchcss.io.view_files import RecordedCamera, camera_from_plain, camera_to_plain
@@ -96,6 +104,10 @@ class FrameModes(NamedTuple):
 
 _PER_MODE = FrameModes._fields[2:-1]
 """What a frame has of each mode."""
+
+
+_GROWING = dict.fromkeys(("frames", "times", "base_transform", *_PER_MODE), 0.0) | _ABSENT
+"""Arrays with a row for each frame, and what stands where there is no mode."""
 
 
 def _shapes(n: int, j: int) -> dict[str, tuple[int, ...]]:
@@ -239,6 +251,8 @@ def _stacked(rows: Sequence[FrameModes], n: int, j: int) -> dict[str, Any]:
 class TrackWriter:
     """Collects the frames of a track, and writes all that it has as often as it is asked to.
 
+    What was written stays in the file alone, so that a long track takes no memory.
+
     Args:
         path: The file, usually `track.npz` in the output folder.
         begun: What goes before: `Track.empty`, or the frames of a run that goes on.
@@ -246,12 +260,14 @@ class TrackWriter:
 
     def __init__(self, path: StrPath, begun: Track) -> None:
         self.path = Path(path)
-        self._begun = begun
+        self._begun = begun.first(0)
         self._rows = begun.rows()
+        self._num_written = 0
+        self._last = int(begun.frames[-1]) if self._rows else -1
         self._rank_of_parent = np.arange(begun.num_modes[-1] if self._rows else 0)
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return self._num_written + len(self._rows)
 
     def append(self, modes: FrameModes) -> None:
         """Add one frame; its modes may be in any order and of any number, but at least one.
@@ -283,7 +299,7 @@ class TrackWriter:
                 f"frame {frame}: cost: expected finite numbers, or inf for all modes of a frame "
                 f"that said nothing, got {cost.tolist()}"
             )
-        if not math.isfinite(modes.time_s) or (self._rows and frame <= self._rows[-1].frame):
+        if not math.isfinite(modes.time_s) or (len(self) and frame <= self._last):
             raise ShapeError(
                 f"frame {frame} at {modes.time_s} s: expected frames in rising order, at finite "
                 "times"
@@ -302,10 +318,16 @@ class TrackWriter:
         ordered = {name: torch.from_numpy(values[order]) for name, values in per_mode.items()}
         base = torch.from_numpy(base)
         self._rows.append(FrameModes(frame, float(modes.time_s), base_transform=base, **ordered))
+        self._last = frame
 
     def track(self) -> Track:
-        """Return all frames so far."""
-        return self._begun.of(self._rows)
+        """Return all frames so far.
+
+        Raises:
+            TrackFileError: If what was written is no longer there.
+        """
+        written = load_track(self.path).rows() if self._num_written else []
+        return self._begun.of([*written, *self._rows])
 
     def save(self) -> None:
         """Write all frames so far; the file is replaced in one step, or stays as it was.
@@ -313,7 +335,13 @@ class TrackWriter:
         Raises:
             OutputError: If the disk is full or does not let the file be written.
         """
-        save_track(self.path, self.track())
+        track = self._begun.of(self._rows)
+        if self._num_written:
+            extend_arrays(self.path, _arrays(track), _GROWING)
+        else:
+            save_track(self.path, track)
+        self._num_written += len(self._rows)
+        self._rows = []
 
 
 def save_track(path: StrPath, track: Track) -> None:
@@ -326,6 +354,11 @@ def save_track(path: StrPath, track: Track) -> None:
     Raises:
         OutputError: If the disk is full or does not let the file be written.
     """
+    save_arrays(Path(path), _arrays(track))
+
+
+def _arrays(track: Track) -> dict[str, Any]:
+    """What the file holds."""
     arrays = track._asdict()
     for name in ("state_names", "joint_names"):
         arrays[name] = np.array(arrays[name], dtype=np.str_)
@@ -336,7 +369,7 @@ def save_track(path: StrPath, track: Track) -> None:
         "settings": dict(track.settings),
     }
     arrays |= {name: json.dumps(value, default=str) for name, value in plain.items()}
-    save_arrays(Path(path), {"schema_version": SCHEMA_VERSION, **arrays})
+    return {"schema_version": SCHEMA_VERSION, **arrays}
 
 
 def load_track(path: StrPath) -> Track:
