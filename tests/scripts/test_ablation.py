@@ -1,53 +1,59 @@
-"""The ablation of the cost's terms, on a few frames."""
+"""The ablation: rows of settings, and how their errors are compared."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 
-import ablation as script
 import pytest
 
+from torchcss import Settings
 from torchcss.errors import ConfigurationError
-from torchcss.tracking.settings import TERMS, all_terms
+from torchcss.studies.render.sequences import shot
+from torchcss.studies.sequence_writer import write_sequence
+from torchcss.tracking.settings import all_terms
 
 
-def test_demo_in_small(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    out = tmp_path / "new" / "ablation.json"
-    rows = ("joints and priors only", "+ segmentation")
-    report = script.main(script.Config(rows=rows, small=True, out=out))
-    assert list(report["rows"]) == list(rows)
-    cells = [report["rows"][row]["demo"] for row in rows]
-    assert all(0 < cell["best_of_modes_mm"] < cell["best_mm"] + 1e-6 for cell in cells)
-    assert cells[1]["best_mm"] < 40  # all terms, four frames from a known start
-    assert json.loads(out.read_text())["rows"] == report["rows"]
-    printed = capsys.readouterr().out
-    assert all(row in printed for row in rows)
-
-
-def test_clip_in_small(shared_data: Path):
+def test_two_rows_of_a_clip(script: ModuleType, tmp_path: Path) -> None:
+    write_sequence(tmp_path / "clips" / "one", shot("body-clutter", num_frames=2, small=True))
     config = script.Config(
-        data=shared_data, sequences=("cam01:all",), rows=("+ segmentation",), small=True
+        data=tmp_path / "clips",
+        rows=("without flow",),
+        runs=tmp_path / "runs",
+        seeds=1,
+        tracking=replace(script.Config.tracking, samples=10, modes=2),
+        out=tmp_path / "ablation.json",
     )
-    cell = script.main(config)["rows"]["+ segmentation"]["cam01:all"]
-    assert cell["frames_lost"] == 0
-    assert cell["best_of_modes_mm"] <= cell["best_mm"] < 150
+    rows = script.main(config)["rows"]
+    assert list(rows) == ["the default", "without flow"]
+    table = json.loads((tmp_path / "ablation.json").read_text())["table"]["rows"]
+    assert table[0][1] == f"{rows['the default'][0]['PA']:.1f}"
+    apart = rows["without flow"][0]["PA"] - rows["the default"][0]["PA"]
+    assert f"({apart:+.1f} ± nan)" in table[1][1]
+    summary = json.loads((tmp_path / "runs/without-flow/one/0/summary.json").read_text())
+    assert "flow" not in summary["settings"]["terms"]
 
 
-def test_rows_are_of_known_terms_and_end_with_the_default():
-    assert all(set(terms) <= set(all_terms()) for terms in script.ROWS.values())
-    # Keypoints' lengths are fitted in the first pose; the prior on them is silent in a track.
-    assert set(script.ROWS["+ pose prior"]) == set(TERMS) - {"anthropometric"}
+def test_differences_are_paired_by_clip(script: ModuleType) -> None:
+    def rows(*values: float) -> list[dict[str, object]]:
+        inside = dict.fromkeys((0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95), 0.5)
+        named = ("PA", "best PA", "root", "best root", "NLL", "lost")
+        return [{**dict.fromkeys(named, value), "s": None, "inside": inside} for value in values]
+
+    found = script.row_of(rows(12.0, 14.0, 20.0, 22.0), rows(10.0, 12.0, 19.0, 19.0), 2)
+    assert found[0] == "17.0 (+2.0 ± 0.0)"
+    assert found[-1] is None
+    assert script.row_of(default := rows(10.0, 12.0), default, 1)[0] == "11.0"
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"rows": ("+ magic",)}, "no rows"),
-        ({"sequences": ("cam01",)}, "no sequences"),
-        ({"sequences": ("cam01:all",)}, "need --data"),
-    ],
-)
-def test_bad_choices_are_refused(change: dict[str, tuple[str, ...]], message: str):
-    with pytest.raises(ConfigurationError, match=message):
-        script.main(script.Config(**change))  # type: ignore[arg-type]
+def test_rows_are_settings(script: ModuleType) -> None:
+    base = Settings()
+    for name in script.ROWS:
+        settings = script.settings_of(name, base)
+        assert set(settings.used_terms) <= set(all_terms())
+        assert (settings == base) == (name == script.DEFAULT)
+    assert "contour" not in script.settings_of("without contour", base).used_terms
+    with pytest.raises(ConfigurationError, match="no rows"):
+        script.main(script.Config(data=Path(), rows=("+ magic",)))

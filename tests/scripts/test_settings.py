@@ -33,7 +33,7 @@ CHANGED: dict[str, Any] = {
 """Another value than the default for every setting."""
 
 VARIED = {
-    "ablation": {"body", "terms"},
+    "ablation": set(),
     "benchmark_batch": set(),
     "benchmark_engines": set(),
     "evaluate_posterior": set(),
@@ -65,7 +65,7 @@ def arguments(folder: Path, script: str) -> list[str]:
     if script in ("hypothesis_scores", "model_variations", "printed_and_ours"):
         write_arm(folder / "arm", 3)
         return ["--sequences", str(folder / "arm")]
-    if script == "evaluate_posterior":
+    if script in ("ablation", "evaluate_posterior"):
         for name in ("video.mp4", "cameras.json", "keypoints2d.npz", "reference3d.npz"):
             (folder / name).touch()
         return ["--data", str(folder), "--runs", str(folder / "runs")]
@@ -77,7 +77,6 @@ def arguments(folder: Path, script: str) -> list[str]:
         return ["--urdf", str(urdf), "--cameras", "1", "--frames", "1"]
     return {
         "benchmark_batch": ["--sequences", "1", "--frames", "1"],
-        "ablation": ["--rows", "+ region", "--frames", "2", "--seeds", "1"],
         "long_run": ["--frames", "2", "--opened", "2"],
         "learn_weights": ["--frames", "2", "--epochs", "1", "--starts", "1",
                           "--learnt", "contour", "region"],
@@ -120,8 +119,9 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Settings]:
         patch.setattr(TrackingSession, "__init__", catch)
         for name in VARIED:
             script = importlib.import_module(name)
-            if name in ("several_views", "evaluate_posterior"):  # whose films are none here
-                patch.setattr(script, "track_video", catch_video)
+            if name in ("ablation", "several_views", "evaluate_posterior"):  # whose films are none
+                tracks = script.posterior if name == "ablation" else script
+                patch.setattr(tracks, "track_video", catch_video)
             if name == "hypothesis_scores":  # which refuses this preset, later
                 patch.setattr(script, "plan_of", catch_plan)
             words = [*arguments(tmp_path_factory.mktemp(name), name), *options(CHANGED)]

@@ -62,12 +62,13 @@ class Init:
 
     def run(self) -> None:
         """Run the verb."""
-        from torchcss.show.click import click_joints, write_clicked
-
         files, keypoints = self.files, None
         if self.click == (files.joints is not None):
             raise KeypointError("give a file with --joints, or --click to mark the joints")
         if self.click:
+            # Matplotlib takes half a second to import.
+            from torchcss.show.click import click_joints, write_clicked
+
             picture = read_frame(self.image, files.frame)
             keypoints = click_joints(picture)
             prepare_output_folder(self.out)

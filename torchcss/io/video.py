@@ -535,6 +535,8 @@ def _decode(container: InputContainer) -> Iterator[VideoFrame]:
     decoder = stream.codec_context
     if decoder is None:
         raise _Damage("its codec is unknown")
+    # Decoding is a hundredth of a frame's work; threads of its own would each hold memory.
+    decoder.thread_count = 1
     damage: Exception | None = None
     packets = container.demux(stream)
     while damage is None:
