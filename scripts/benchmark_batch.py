@@ -2,15 +2,24 @@
 
     python scripts/benchmark_batch.py --sequences 4 --frames 10 --out benchmark_batch.json
     python scripts/benchmark_batch.py --data clips --body body34 --sequences 8 --device cuda
+    python scripts/benchmark_batch.py --workers 2 --sequences 8 --frames 25 --repeats 1
 
 Without `--data` every sequence is the shipped clip of an arm, each with a seed of its own; with it
 they are the folders there, as `scripts/make_clips.py` writes them, over and over if need be. First
 poses are found before the clock runs. Each repeat takes both ways in turn; ratios are taken within
 a repeat. The last lines say whether both ways found the same, bit for bit.
+
+With `--workers` it is `torchcss batch` instead, with one process and with so many, each of one
+thread: clips an hour, starts and first poses among the rest.
 """
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
@@ -50,6 +59,8 @@ class Config:
     """Frames of each."""
     repeats: int = 3
     """Repeats; in each both ways take turns."""
+    workers: int | None = None
+    """Processes of a batch, to compare with one."""
     out: Path | None = None
     """JSON file to write."""
 
@@ -68,16 +79,22 @@ class Film(NamedTuple):
         return TrackingSession(self.settings, self.first, [self.view], frame_interval=self.interval)
 
 
+def folders(config: Config) -> list[Path]:
+    """The clips."""
+    if config.data is None:
+        return [CLIP]
+    found = sorted(path.parent for path in config.data.glob("*/reference3d.npz"))
+    if not found:
+        raise ConfigurationError(f"{config.data}: no clip in it")
+    return found
+
+
 def films(config: Config) -> Iterator[Film]:
     """The sequences, over and over."""
     settings = config.settings
-    folders = [CLIP]
-    if config.data is not None:
-        folders = sorted(path.parent for path in config.data.glob("*/reference3d.npz"))
-        if not folders:
-            raise ConfigurationError(f"{config.data}: no clip in it")
+    clips = folders(config)
     for index in range(config.sequences):
-        folder = folders[index % len(folders)]
+        folder = clips[index % len(clips)]
         own = replace(settings, seed=settings.seed + index)
         video = folder / "video.mp4"
         if config.data is None:
@@ -110,8 +127,52 @@ def timed(config: Config, sequences: list[Film], *, beside: bool) -> tuple[float
     return time.perf_counter() - began, modes
 
 
+def clips_an_hour(config: Config, workers: int) -> float:
+    """How many clips a batch of the sequences tracks with so many processes."""
+    clips = folders(config)
+    with tempfile.TemporaryDirectory() as folder:
+        rows = []
+        for index in range(config.sequences):
+            clip = clips[index % len(clips)]
+            row = {
+                "name": str(index), "video": str(clip / "video.mp4"), "stop": config.frames,
+                "camera": str(clip / "cameras.json"), "seed": config.settings.seed + index,
+            }  # fmt: skip
+            if config.data is None:
+                row |= {"init": str(CLIP / "body.npz"), "body": DEMO_SETTINGS.body}
+            points = "keypoints.npz" if config.data is None else "keypoints2d.npz"
+            rows.append(json.dumps({**row, "keypoints": str(clip / points)}))
+        manifest = Path(folder) / "clips.jsonl"
+        manifest.write_text("\n".join(rows), encoding="utf-8")
+        words = ["batch", str(manifest), "--out", f"{folder}/out", "--workers", str(workers)]
+        began = time.perf_counter()
+        subprocess.run(
+            [sys.executable, "-m", "torchcss.cli.main", *words, "--no-overlay"], check=True,
+            stdout=subprocess.DEVNULL, env={**os.environ, "OMP_NUM_THREADS": "1"},
+        )  # fmt: skip
+        return 3600 * config.sequences / (time.perf_counter() - began)
+
+
+def batches(config: Config, workers: int) -> dict[str, Any]:
+    """One process against several."""
+    rounds = [
+        {num: clips_an_hour(config, num) for num in (1, workers)} for _ in range(config.repeats)
+    ]
+    rows = [
+        [f"{num} processes", float(np.median([each[num] for each in rounds]))]
+        for num in (1, workers)
+    ]
+    table = Table(f"`torchcss batch`, clips of {config.frames} frames", ("", "clips an hour"), rows)
+    table.print()
+    report = {"rounds": rounds}
+    write_report(config.out, report, table)
+    return report
+
+
 def main(config: Config) -> dict[str, Any]:
     """Measure, print, write; return what is written."""
+    if config.workers is not None:
+        return batches(config, config.workers)
     torch.set_num_threads(1)
     sequences = list(films(config))
     num = sum(len(film.frames) for film in sequences)

@@ -4,7 +4,8 @@
 
 The shipped clip is played forwards and backwards until the film is long enough, and tracked with
 `track_video`, keypoints in the first frame alone. Of every hundred frames the table has the memory
-of the process when they were done, the seconds that each took, and the size of the track's file.
+of the process when they were done, the processor's seconds that each took, and the size of the
+track's file.
 A film of `--opened` frames is opened besides, and the time until its first frame is there measured.
 """
 
@@ -76,7 +77,7 @@ class Watch:
     track: Path
     every: int
     rows: list[dict[str, float]] = field(default_factory=list)
-    began: float = field(default_factory=time.perf_counter)
+    began: float = field(default_factory=time.process_time)
     num_frames: int = 0
 
     def add(self, frame: Posterior, picture: Picture) -> None:
@@ -85,7 +86,7 @@ class Watch:
         self.num_frames += 1
         if self.num_frames % self.every:
             return
-        now = time.perf_counter()
+        now = time.process_time()
         size = self.track.stat().st_size / 1e6 if self.track.is_file() else 0.0
         self.rows.append({
             "frames": self.num_frames, "memory_mib": memory_mib(),

@@ -30,3 +30,14 @@ def test_both_ways_find_the_same(
 def test_a_folder_without_clips_is_refused(script: ModuleType, tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="no clip"):
         script.main(script.Config(data=tmp_path))
+
+
+def test_processes_of_a_batch(script: ModuleType, tmp_path: Path) -> None:
+    settings = replace(script.SETTINGS, samples=5, modes=2, working_size=160)
+    out = tmp_path / "J.json"
+    script.main(script.Config(
+        settings=settings, sequences=2, frames=2, repeats=1, workers=2, out=out
+    ))  # fmt: skip
+    one, two = json.loads(out.read_text())["table"]["rows"]
+    assert (one[0], two[0]) == ("1 processes", "2 processes")
+    assert min(one[1], two[1]) > 0
