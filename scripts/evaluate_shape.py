@@ -4,14 +4,15 @@
 
 Each DIR is a sequence folder with masks (`torchcss.studies.sequences`). In some of its frames
 `torchcss.initialise` fits pose, lengths and shape to the marked joints; then to edges too; then to
-the colours on either side of the outline as well. "overlap" is the share of the union of fitted and
-true silhouette that both have, "area" the fitted one's over the true one's, "root mm" the error of
-the best fit's joints with the mid-hips on each other (an arm's: the first joint), "of all" that of
-the nearest fit.
+the colours on either side of the outline as well; then with parts that bend. "overlap" is the share
+of the union of fitted and true silhouette that both have, "area" the fitted one's over the true
+one's, "root mm" the error of the best fit's joints with the mid-hips on each other (an arm's: the
+first joint), "of all" that of the nearest fit.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,8 +31,13 @@ from torchcss.studies.evaluation import silhouette
 from torchcss.studies.metrics import mask_overlap, root_aligned_mpjpe_mm
 from torchcss.studies.sequences import RecordedSequence, read_sequence
 
-COMPARED = {"joints": (False, False), "edges": (True, False), "edges, colours": (True, True)}
-"""Whether contours and colours are fitted."""
+COMPARED = {
+    "joints": {"contours": False, "colours": False},
+    "edges": {"colours": False},
+    "edges, colours": {},
+    "and bends": {"bends": True},
+}
+"""What is fitted, as options."""
 
 FEW = Search(num_starts=8, num_trunks=2, num_flips=8, num_samples=2)
 
@@ -64,8 +70,8 @@ def main(config: Config) -> dict[str, Any]:
             raise ConfigurationError(f"{folder}: no masks; give a sequence with a mask.npz")
         count = 1 if config.small else min(config.frames, sequence.num_frames)
         for index in np.linspace(0, sequence.num_frames, count, endpoint=False).astype(int):
-            for name, (contours, colours) in COMPARED.items():
-                row = fit(sequence, int(index), config, contours, colours)
+            for name, fitted in COMPARED.items():
+                row = fit(sequence, int(index), config, fitted)
                 report["rows"].append(
                     {"sequence": sequence.name, "frame": int(index), "by": name, **row}
                 )
@@ -78,7 +84,7 @@ def main(config: Config) -> dict[str, Any]:
 
 
 def fit(
-    sequence: RecordedSequence, index: int, config: Config, contours: bool, colours: bool
+    sequence: RecordedSequence, index: int, config: Config, fitted: Mapping[str, Any]
 ) -> dict[str, float]:
     """Fit one frame and measure."""
     (frame,) = VideoReader(sequence.video, start=index, stop=index + 1)
@@ -88,9 +94,7 @@ def fit(
         sequence.camera,
         config.body,
         generator=torch.Generator().manual_seed(config.seed),
-        options=InitialiseOptions(
-            search=FEW if config.small else Search(), contours=contours, colours=colours
-        ),
+        options=InitialiseOptions(search=FEW if config.small else Search(), **fitted),
     )
     assert sequence.mask is not None
     true = sequence.mask[index]

@@ -29,8 +29,8 @@ def randn(generator: torch.Generator, *shape: int) -> Tensor:
 
 def shapes(num: int, generator: torch.Generator, *, bent: bool = True) -> Tensor:
     """Random plausible shape numbers."""
-    low = torch.tensor([0.03, 0.03, 0.1, 0.4, 0.4, -0.3, -0.3, 0.2 if bent else 0.0, -3.0])
-    high = torch.tensor([0.15, 0.15, 0.3, 1.3, 1.3, 0.3, 0.3, 1.5 if bent else 0.0, 3.0])
+    low = torch.tensor([0.03, 0.03, 0.1, 0.4, 0.4, -0.3, -0.3, *[-1.0 * bent] * 2])
+    high = torch.tensor([0.15, 0.15, 0.3, 1.3, 1.3, 0.3, 0.3, *[1.0 * bent] * 2])
     share = torch.rand(num, 9, generator=generator, dtype=torch.float64)
     return low.double() + share * (high - low).double()
 
@@ -52,7 +52,7 @@ def test_angles_undo_the_surface(generator: torch.Generator, bent: bool):
 def test_surface_derivatives_are_finite_differences(generator: torch.Generator, bend: float | None):
     shape, (eta, omega) = shapes(20, generator), angles(20, generator)
     if bend is not None:
-        shape[:, 7] = bend
+        shape[:, 7], shape[:, 8] = bend, -bend
     along = randn(generator, 20, 3)
     local = surface_derivatives(shape, eta, omega, along)
     for k in range(9):
@@ -79,6 +79,33 @@ def test_left_and_right_share_their_parameters():
     assert (free.bounds.lower < 0).all()
     changed = (shape != body.part_shape).any(0)
     assert [SHAPE_NAMES[k] for k in torch.nonzero(changed)[:, 0].tolist()] == list(CROSS_SECTIONS)
+
+
+def test_left_and_right_bend_as_mirror_images():
+    body = load_body("body34")
+    free = ShapeParameters(body, SHAPE_NAMES)
+    z = torch.zeros(len(free.names), dtype=torch.float64)
+    for number, name in enumerate(free.names):
+        z[number] = (0.5 + 0.01 * number) * name.endswith(("_bend_x", "_bend_y"))
+    pose = body.pose(body.rest)
+    turns, centres = body.part_poses(pose)
+    # The tips of the parts alone: a mirrored surface has its longitudes elsewhere.
+    tips, _ = surface_points(
+        free.shape(z),
+        torch.full((body.num_parts,), torch.pi / 2, dtype=torch.float64),
+        torch.zeros(1, dtype=torch.float64),
+    )
+    tips = (turns @ tips[..., None])[..., 0] + centres
+    hips = [body.joint_index(name) for name in ("l_hip", "r_hip")]
+    across = pose.joints[hips[0]] - pose.joints[hips[1]]
+    across = across / across.norm()
+    middle = pose.joints[hips].mean(0)
+    for part, name in enumerate(body.part_names):
+        if not name.startswith("l_"):
+            continue
+        other = body.part_names.index(f"r_{name[2:]}")
+        mirrored = tips[part] - 2 * ((tips[part] - middle) @ across) * across
+        torch.testing.assert_close(tips[other], mirrored, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("free_proportions", [False, True])

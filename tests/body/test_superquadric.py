@@ -16,9 +16,9 @@ def random_shapes(number: int, generator: torch.Generator, *, bent: bool) -> Ten
             number, *size, generator=generator, dtype=torch.float64
         )
 
-    bend = uniform(-2, 2, 1) * bent
+    bends = uniform(-2, 2, 2) * bent
     parts = [uniform(0.05, 0.15, 2), uniform(0.1, 0.3, 1), uniform(0.3, 1.3, 2)]
-    return torch.cat([*parts, uniform(-0.6, 0.6, 2), bend, uniform(-3, 3, 1)], dim=-1)
+    return torch.cat([*parts, uniform(-0.6, 0.6, 2), bends], dim=-1)
 
 
 def by_autograd(shape: Tensor, points: Tensor, *, bent: bool) -> tuple[Tensor, Tensor, Tensor]:

@@ -23,16 +23,16 @@ OWN_MARGIN = 1e-5
 
 def shape_function(shape: Tensor, points: Tensor) -> Tensor:
     """Negative inside a part, positive outside: one shape `[9]`, points `[m 3]` in its frame."""
-    a1, a2, a3, e1, e2, taper_x, taper_y, bend, direction = shape.double().tolist()
+    a1, a2, a3, e1, e2, taper_x, taper_y, bend_x, bend_y = shape.double().tolist()
+    bend, direction = math.hypot(bend_x, bend_y), math.atan2(bend_y, bend_x)
     x, y, z = points.unbind(-1)
     if bend != 0:
         # The axis is a circle about a centre at 1 / bend along `direction`; the length of arc is z.
         c, s = math.cos(direction), math.sin(direction)
         towards, across = c * x + s * y, c * y - s * x
-        sign = math.copysign(1.0, bend)
-        to_axis = sign * (1 / bend - towards)
-        z_arc = torch.atan2(sign * z * sign, to_axis) / abs(bend)
-        towards = 1 / bend - sign * (to_axis.square() + z.square()).sqrt()
+        to_axis = 1 / bend - towards
+        z_arc = torch.atan2(z, to_axis) / bend
+        towards = 1 / bend - (to_axis.square() + z.square()).sqrt()
         x, y, z = c * towards - s * across, s * towards + c * across, z_arc
     height = (z / a3).clamp(-1, 1)
     u, v = x / (a1 * (1 + taper_x * height)), y / (a2 * (1 + taper_y * height))

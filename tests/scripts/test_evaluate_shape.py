@@ -19,7 +19,7 @@ def test_small_mode(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFi
     write_arm(arm, 2)
     script.main(script.Config(sequences=(arm,), body="arm8", small=True, out=out))
     rows = json.loads(out.read_text())["rows"]
-    assert [row["by"] for row in rows] == ["joints", "edges", "edges, colours"]
+    assert [row["by"] for row in rows] == ["joints", "edges", "edges, colours", "and bends"]
     for row in rows:
         assert (row["sequence"], row["frame"]) == ("arm", 0)
         assert 0 < row["overlap"] < 1

@@ -372,8 +372,7 @@ def scaled(body: BodySpecification, scale: float) -> BodySpecification:
                 shape=(
                     *(a * scale for a in part.shape[:3]),
                     *part.shape[3:7],
-                    part.shape[7] / scale,
-                    part.shape[8],
+                    *(bend / scale for bend in part.shape[7:]),
                 ),
             )
             for part in body.parts

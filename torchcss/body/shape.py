@@ -1,7 +1,8 @@
 """Shape parameters of a body as extra columns of the state: `x_d` of section 2 [IJRR].
 
 While a body is fitted, shape numbers of its parts (`torchcss.body.surface`) become parameters too,
-left and right tied: a part's numbers are `s = s0 + T z` with z the shape parameters. They deform
+left and right tied, as mirror images: a part's numbers are `s = s0 + T z` with z the shape
+parameters. They deform
 points inside a link, `p(x, z) = R_l(x) u(s) + t_l(x)`, with u the point's map in its part's frame,
 angles (eta, omega) held. With g and A the derivatives of a point's cost, `w_k = R_l du/ds_k`, and
 `S_j = (omega_j, v_j)` the twist of a joint above the point, the new columns are
@@ -39,10 +40,10 @@ CROSS_SECTIONS = ("a1", "a2", "taper_x", "taper_y")
 """The volumetric numbers of the second stage: cross-sections and their tapers."""
 
 WHOLE_SHAPE = ("a1", "a2", "a3", "e1", "e2", "taper_x", "taper_y")
-"""The numbers of the third stage: all but the bend, which is for parts that have one."""
+"""The numbers of the third stage; the papers' has the bend, too, which is all of `SHAPE_NAMES`."""
 
 _RANGE = {"a1": 0.35, "a2": 0.35, "a3": 0.15, "e1": 0.3, "e2": 0.3, "taper_x": 0.3, "taper_y": 0.3,
-          "bend": 3.0, "bend_direction": 3.15}  # fmt: skip
+          "bend_x": 3.0, "bend_y": 3.0}  # fmt: skip
 """How far a number may go from the catalogue's: semi-axes by a share of it, others by an amount."""
 
 
@@ -82,8 +83,9 @@ class ShapeParameters:
                 rows.append((9 * part + k, names.index(name)))
         self.names = tuple(names)
         tie = body.part_shape.new_zeros(9 * body.num_parts, len(names))
+        signs = _signs_of_mirrored_bends(body)
         for row, column in rows:
-            tie[row, column] = 1.0
+            tie[row, column] = signs.get(row, 1.0)
         self.tie: Float[Tensor, "s z"] = tie
         self.rest: Float[Tensor, "parts 9"] = body.part_shape.clone()
         span = torch.stack(spans) if spans else body.part_shape.new_zeros(0)
@@ -101,6 +103,23 @@ class ShapeParameters:
     def shape(self, z: Float[Tensor, "*batch z"]) -> Float[Tensor, "*batch parts 9"]:
         """The shape numbers of all parts."""
         return self.rest + (z @ self.tie.T).unflatten(-1, self.rest.shape)
+
+
+def _signs_of_mirrored_bends(body: BodyModel) -> dict[int, float]:
+    """Which bends of a part turn round in the mirror image of its other side's, by their number."""
+    turns, centres = body.part_poses(body.pose(body.rest))
+    first: dict[str, int] = {}
+    signs: dict[int, float] = {}
+    for part, name in enumerate(body.part_names):
+        other = first.setdefault(without_side(name), part)
+        across = centres[part] - centres[other]
+        if other == part or not float(length := across.norm()):
+            continue
+        across = across / length
+        mirror = torch.eye(3).to(across) - 2 * torch.outer(across, across)
+        kept = (turns[part].mT @ mirror @ turns[other]).diagonal()
+        signs |= {9 * part + 7 + axis: 1.0 if kept[axis] > 0 else -1.0 for axis in (0, 1)}
+    return signs
 
 
 def with_shape(body: BodyModel, shape: Float[Tensor, "parts 9"]) -> BodyModel:

@@ -90,14 +90,18 @@ class Superquadrics(NamedTuple):
             shape: Shape numbers.
             exponents: Least and greatest exponent; others count as these.
         """
-        a1, a2, a3, e1, e2, taper_x, taper_y, bend, direction = shape.unbind(-1)
+        a1, a2, a3, e1, e2, taper_x, taper_y, bend_x, bend_y = shape.unbind(-1)
         e1, e2 = e1.clamp(*exponents), e2.clamp(*exponents)
         taper_x, taper_y = (t.clamp(-_MOST_TAPER, _MOST_TAPER) for t in (taper_x, taper_y))
         # Short enough that the section stays positive.
         widest = torch.maximum(taper_x.abs(), taper_y.abs()).clamp(min=0.1)
         overhang = ((1 - widest) / (2 * widest)).clamp(max=_OVERHANG)
         exponent = (1 / e2 - 1, e2 / e1 - 1, 1 / e1 - 1, e1 - 1)
-        turn = (direction.cos(), direction.sin())
+        square = bend_x.square() + bend_y.square()
+        is_bent = square > 0
+        safe = torch.where(is_bent, square, 1.0).sqrt()
+        bend = torch.where(is_bent, safe, 0.0)
+        turn = (torch.where(is_bent, bend_x / safe, 1.0), bend_y / safe)
         return cls(1 / a1, 1 / a2, 1 / a3, *exponent, taper_x, taper_y, overhang, bend, *turn)
 
     def height(self, w: Tensor) -> Tensor:

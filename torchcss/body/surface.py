@@ -7,12 +7,12 @@ A part is described by nine numbers in its own frame, whose z axis runs along th
 | `a1 a2 a3` | semi-axes, metres |
 | `e1 e2` | exponents along and around the axis; 1 is an ellipsoid, towards 0 a box |
 | `taper_x taper_y` | relative change of the cross-section from the middle to the +z end |
-| `bend` | curvature of the axis, radians per metre |
-| `bend_direction` | direction in the x-y plane towards which the axis bends, radians |
+| `bend_x bend_y` | curvature of the axis, radians per metre, towards x and y |
 
 The map D of eq. 1 takes the angular coordinates (eta, omega) to a point: superquadric, then taper,
 then bend. Normals follow by the transformation rule `n' = det(J) J^-T n`, and the implicit function
-undoes bend and taper first. `surface_points` is what a body uses; `implicit` tells in from out.
+undoes bend and taper first. `surface_points` is what a body uses; `implicit` tells in from out. The
+bend is two curvatures and not one with a direction, which a straight part would not have.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from torchcss.body.superquadric import Superquadrics, radial_square, unbend
 
 Vectors = Float[Tensor, "*batch 3"]
 
-SHAPE_NAMES = ("a1", "a2", "a3", "e1", "e2", "taper_x", "taper_y", "bend", "bend_direction")
+SHAPE_NAMES = ("a1", "a2", "a3", "e1", "e2", "taper_x", "taper_y", "bend_x", "bend_y")
 
-_SMALL = 0.1
-"""Angle, radians, below which quotients by it are their series; these are then exact to 1e-13."""
+_SMALL = 0.01
+"""Square of an angle, radians, below which quotients by it are their series, exact to 1e-13."""
 
 
 class SurfaceSample(NamedTuple):
@@ -65,7 +65,7 @@ def surface_points(
     Returns:
         Points in metres and unit outward normals, in the part's frame.
     """
-    a1, a2, a3, e1, e2, taper_x, taper_y, bend, direction = shape.unbind(-1)
+    a1, a2, a3, e1, e2, taper_x, taper_y, bend_x, bend_y = shape.unbind(-1)
     cos_eta, sin_eta, cos_omega, sin_omega = eta.cos(), eta.sin(), omega.cos(), omega.sin()
     ring = _signed_power(cos_eta, e1)
     x = a1 * ring * _signed_power(cos_omega, e2)
@@ -85,7 +85,7 @@ def surface_points(
     )
     x, y = x * fx, y * fy
     points, normals = _bend(
-        torch.stack([x, y, z], -1), torch.stack([nx, ny, nz], -1), bend, direction
+        torch.stack([x, y, z], -1), torch.stack([nx, ny, nz], -1), bend_x, bend_y
     )
     length = normals.norm(dim=-1, keepdim=True)
     axis = torch.zeros_like(normals)
@@ -95,37 +95,44 @@ def surface_points(
     )
 
 
-def _bend(
-    points: Tensor, normals: Tensor, bend: Tensor, direction: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Circular bending of the z axis towards `direction`; volume preserving at the axis."""
-    c, s = direction.cos(), direction.sin()
+def _bend(points: Tensor, normals: Tensor, bend_x: Tensor, bend_y: Tensor) -> tuple[Tensor, Tensor]:
+    """Circular bending of the z axis; volume preserving at the axis."""
     x, y, z = points.unbind(-1)
-    r, across = c * x + s * y, c * y - s * x  # towards the bend, and beside it
-    angle = bend * z
-    # 1 / bend - cos(angle) (1 / bend - r), and sin(angle) (1 / bend - r), without the radius.
-    bent_r = angle.cos() * r + 0.5 * angle * z * _sinc(0.5 * angle).square()
-    bent_z = z * _sinc(angle) - angle.sin() * r
     nx, ny, nz = normals.unbind(-1)
-    nr, n_across = c * nx + s * ny, c * ny - s * nx
-    stretch = 1 - bend * r  # length of d(point)/dz
-    # J^-T det(J): the frame turns by `angle` about the axis beside the bend.
-    nr, n_across, nz = nr * stretch, n_across * stretch, nz
-    turned_r = angle.cos() * nr + angle.sin() * nz
-    turned_z = -angle.sin() * nr + angle.cos() * nz
+    # With the curvature k and the angle a = k z by which the axis turns: sin(a) / k, and
+    # (1 - cos(a)) / k^2, both smooth in the square of a.
+    square = (bend_x.square() + bend_y.square()) * z.square()
+    of_sine, of_versine = _turn(square)
+    sine, versine = z * of_sine, z.square() * of_versine
+    stretch = 1 - bend_x * x - bend_y * y  # length of d(point)/dz
+    bent = (x + bend_x * versine * stretch, y + bend_y * versine * stretch, sine * stretch)
+    # J^-T det(J): the frame turns by a about the axis beside the bend.
+    towards = (bend_x * nx + bend_y * ny) * stretch
+    turned = sine * nz - versine * towards
     return (
-        torch.stack([c * bent_r - s * across, s * bent_r + c * across, bent_z], -1),
-        torch.stack([c * turned_r - s * n_across, s * turned_r + c * n_across, turned_z], -1),
+        torch.stack(bent, -1),
+        torch.stack(
+            [
+                stretch * nx + bend_x * turned,
+                stretch * ny + bend_y * turned,
+                (1 - square * of_versine) * nz - sine * towards,
+            ],
+            -1,
+        ),
     )
 
 
-def _sinc(angle: Tensor) -> Tensor:
-    """`sin(a) / a`, with derivatives at zero."""
-    small = angle.abs() < _SMALL
-    square = angle.square()
-    safe = torch.where(small, torch.ones_like(angle), angle)
-    series = 1 - square / 6 * (1 - square / 20 * (1 - square / 42 * (1 - square / 72)))
-    return torch.where(small, series, safe.sin() / safe)
+def _turn(square: Tensor) -> tuple[Tensor, Tensor]:
+    """`sin(a) / a` and `(1 - cos(a)) / a^2` of the square of an angle, with derivatives at zero."""
+    small = square < _SMALL
+    safe = torch.where(small, torch.ones_like(square), square)
+    angle = safe.sqrt()
+    sine = 1 - square / 6 * (1 - square / 20 * (1 - square / 42 * (1 - square / 72)))
+    versine = 1 - square / 12 * (1 - square / 30 * (1 - square / 56 * (1 - square / 90)))
+    return (
+        torch.where(small, sine, angle.sin() / angle),
+        torch.where(small, 0.5 * versine, 2 * (0.5 * angle).sin().square() / safe),
+    )
 
 
 def straighten(shape: Float[Tensor, "*batch 9"], points: Vectors) -> Vectors:

@@ -25,6 +25,7 @@ from torch import Tensor
 from torchcss.body.model import BodyModel
 from torchcss.body.root import has_root
 from torchcss.body.shape import WHOLE_SHAPE, ShapeParameters, with_shape
+from torchcss.body.surface import SHAPE_NAMES
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.frame import FrameCosts
 from torchcss.cost.fused import threads_for
@@ -226,7 +227,7 @@ def _with_contours(
     load = partial(with_lengths, first.body, scale=first.scale, free_root=rooted)
     loose = load(first.lengths, free_proportions=True)
     rivals = first.mixture.mean[first.cost <= first.cost[0] + _RIVALS]
-    parameters = ShapeParameters(loose, WHOLE_SHAPE)
+    parameters = ShapeParameters(loose, SHAPE_NAMES if options.bends else WHOLE_SHAPE)
     bones = cost.choice.without("contour", "region")
     sections, whole = fit_shape(
         replace(cost, choice=bones).with_body(loose), spread_to(first.body, loose, rivals),

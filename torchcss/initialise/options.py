@@ -46,6 +46,7 @@ class InitialiseOptions:
             repulsion sees the parts as they were before; afterwards as they were found.
         contours: Run the second and third stage on the picture's contours.
         colours: Let them see the colours on either side too.
+        bends: Let the third stage bend the parts, too.
         working_size: Longer side of the picture on which contours are searched.
         search: How widely poses are looked for.
         potential_kind: Robust potential of the keypoints.
@@ -65,6 +66,7 @@ class InitialiseOptions:
     printed: bool = False
     contours: bool = True
     colours: bool = True
+    bends: bool = False
     working_size: int = 640
     search: Search = field(default_factory=Search)
     potential_kind: type = Lorentzian
@@ -88,7 +90,7 @@ class InitialiseOptions:
         search = replace(
             PAPERS, proportions=self.search.proportions, coarse_pose=self.search.coarse_pose
         )
-        return replace(self, search=search, num_modes=1, printed=True, colours=False)
+        return replace(self, search=search, num_modes=1, printed=True, colours=False, bends=True)
 
     @property
     def evaluator(self) -> Engine | None:
