@@ -44,6 +44,7 @@ VARIED = {
     "model_variations": {"body", "preset"},
     "printed_and_ours": {"body", "preset"},
     "several_views": set(),
+    "spectra": {"body"},
     "track_quadruped": {"body"},
     "track_robot": {"body", "seed"},
 }
@@ -62,7 +63,7 @@ def arguments(folder: Path, script: str) -> list[str]:
     if script == "failure_modes":
         write_arm(folder / "arm", 3)
         return ["--sequence", str(folder / "arm"), "--presets", "css"]
-    if script in ("hypothesis_scores", "model_variations", "printed_and_ours"):
+    if script in ("hypothesis_scores", "model_variations", "printed_and_ours", "spectra"):
         write_arm(folder / "arm", 3)
         return ["--sequences", str(folder / "arm")]
     if script in ("ablation", "evaluate_posterior"):
