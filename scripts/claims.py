@@ -35,6 +35,7 @@ from torchcss.studies.sequences import read_sequence
 ARM, CLUTTER, DARK = "arm", "body-clutter", "body-dark"
 FAILURES, TABLE1, SCORES = "failure_modes.py", "table1.py", "hypothesis_scores.py"
 VARIATIONS = "model_variations.py"
+SPECTRA = "spectra.py"
 MULTIMODAL = 0.1
 """Weight of the other explanations above which a frame counts as multimodal."""
 SOME = 0.05
@@ -55,6 +56,8 @@ class Config:
     """Report of `scripts/hypothesis_scores.py`."""
     variations: Path | None = None
     """Report of `scripts/model_variations.py`."""
+    spectra: Path | None = None
+    """Report of `scripts/spectra.py`."""
     sequences: tuple[Path, ...] = ()
     """Folders of the sequences, for when they move in depth."""
     out: Path | None = None
@@ -80,7 +83,8 @@ class Evidence:
         runs: Runs by sequence and preset.
         unweighted: The same of edges that nothing weighs.
         table1: Rows by method and scale.
-        ratio: Largest over smallest deviation of a mode, by body.
+        ratio: Largest over smallest deviation of a mode of the joints' cost, by body.
+        of_image: The same of the image's cost.
         scores: Rows by sequence and way to score.
         variations: Rows by sequence, and tracker with its variation.
         depth: Share of the joints' speed that is along the line of sight, by sequence and frame.
@@ -90,6 +94,7 @@ class Evidence:
     unweighted: Mapping[str, Mapping[str, list[dict[str, Any]]]]
     table1: Mapping[tuple[str, float], Mapping[str, Any]]
     ratio: Mapping[str, float]
+    of_image: Mapping[str, float]
     scores: Mapping[str, Mapping[str, Any]]
     variations: Mapping[str, Mapping[str, Any]]
     depth: Mapping[str, np.ndarray]
@@ -378,10 +383,16 @@ def spectrum_of(body: str, printed: float) -> Judge:
     """Largest over smallest deviation, within a factor of three of the paper's."""
 
     def judge(evidence: Evidence) -> Seen:
-        if body not in evidence.ratio:
-            raise Missing("no report of Table 1 is given")
-        value = evidence.ratio[body]
-        return Seen(f"{value:.0f}, of joints in one image", printed / 3 < value < 3 * printed)
+        seen = {
+            "the image's cost": evidence.of_image.get(body),
+            "joints in one image": evidence.ratio.get(body),
+        }
+        known = {of: value for of, value in seen.items() if value is not None}
+        if not known:
+            raise Missing("no report of Table 1 or of spectra is given")
+        words = "; ".join(f"{value:.0f}, of {of}" for of, value in known.items())
+        first = next(iter(known.values()))
+        return Seen(words, printed / 3 < first < 3 * printed)
 
     return judge
 
@@ -497,12 +508,16 @@ def read_evidence(config: Config) -> Evidence:
         rows = {(row["method"], row["scale"]): row for row in report["median"]}
         spectra = [run["spectrum_ratio"] for run in report["runs"]]
         ratio = {body: median(each[body] for each in spectra) for body in spectra[0]}
+    of_image: dict[str, float] = {}
+    for runs_of in rows_of(config.spectra, SPECTRA).values():
+        # Of several sequences of a body the first counts.
+        of_image.setdefault(runs_of[0]["body"], median(run["ratio"] for run in runs_of))
     depth = dict(map(depth_share, config.sequences))
     scores, variations = (
         rows_of(path, script)
         for path, script in ((config.scores, SCORES), (config.variations, VARIATIONS))
     )
-    return Evidence(runs, unweighted, rows, ratio, scores, variations, depth)
+    return Evidence(runs, unweighted, rows, ratio, of_image, scores, variations, depth)
 
 
 def rows_of(path: Path | None, script: str) -> Mapping[str, Any]:
