@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -112,9 +113,7 @@ def test_several_modes_while_the_body_moves_in_depth(script: ModuleType, tmp_pat
     )  # fmt: skip
     evidence = script.read_evidence(script.Config(failures=(path,), sequences=(folder,)))
     assert name in evidence.depth
-    seen = script.multimodal("arm", "ijrr_css")(
-        script.Evidence(evidence.runs, {}, {}, {}, {}, {}, {"arm": depth})
-    )
+    seen = script.multimodal("arm", "ijrr_css")(replace(evidence, depth={"arm": depth}))
     assert seen.holds
     assert "0.90 in the half" in seen.words
     assert not script.mostly_multimodal("arm", "ijrr_css")(evidence).holds
