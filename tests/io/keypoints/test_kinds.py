@@ -479,6 +479,18 @@ def test_findings(tmp_path: Path) -> None:
     assert any("left and right look exchanged: shoulders and hips" in line for line in found.report)
 
 
+def test_frames_along_the_second_axis(tmp_path: Path) -> None:
+    """What networks that lift joints to space take: a batch of one sequence."""
+    frames = np.stack([person(0, shift=t) for t in range(40)])
+    np.save(tmp_path / "a.npy", frames[None])
+    found = read(tmp_path / "a.npy", num_frames=40)
+    assert len(found.positions) == 40
+    np.testing.assert_allclose(found.positions[7], frames[7, :, :2], atol=1e-4)
+    assert any("one person in 40 frames" in line for line in found.report)
+    np.save(tmp_path / "b.npy", frames[None, :5])  # five people in a picture
+    assert len(read(tmp_path / "b.npy", num_frames=1).positions) == 1
+
+
 def test_tracks_of_the_file_win_over_nearness(tmp_path: Path) -> None:
     entries = []
     for t in T:

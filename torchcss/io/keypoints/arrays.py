@@ -26,6 +26,9 @@ from torchcss.types import Keypoints
 
 _PLACES = names_in("keypoints keypoints_2d keypoints2d joints_2d joints2d kps poses positions")
 _CONFIDENCES = names_in("confidence confidences scores score keypoint_scores conf likelihood")
+_MOST_PEOPLE = 30
+"""More people than this in a single frame are one person in so many frames: networks that lift
+joints to space take and give `[1 T J 3]`."""
 _COUNTS = {len(joints) for joints in ALIASES.values()}
 
 
@@ -47,6 +50,9 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
         )
     report = [f"format: {path.suffix[1:].upper()}"]
     values, is_movenet = _people(name, arrays[name]), arrays[name].ndim == 5
+    if len(values) == 1 and values.shape[1] > _MOST_PEOPLE:
+        values = values.swapaxes(0, 1)
+        report.append(f"{name}: one person in {len(values)} frames, which are the second axis")
     if is_movenet:
         values = values[..., [1, 0, 2]]
         report = ["format: MoveNet's arrays, y before x, fractions of the image"]
