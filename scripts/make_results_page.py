@@ -4,9 +4,9 @@
 
 Every JSON file there is a report as the scripts write them (`--out docs/results/NAME.json`): a
 `table` with `title`, `columns` and `rows`, and the `command`, `version` and `date` of the run. A
-table may also have `about`, a sentence or two that stand above it, and `order`, its place on the
-page. A row is a list of cells, or an object of `cells` with a `command`, `version` or `date` of
-its own.
+table may also have `about`, a sentence or two that stand above it, `picture`, a file of
+`notebooks/pictures` that stands below it, and `order`, its place on the page. A row is a list of
+cells, or an object of `cells` with a `command`, `version` or `date` of its own.
 """
 
 from __future__ import annotations
@@ -82,6 +82,8 @@ def section(path: Path, report: dict[str, Any]) -> str:
         cells = [cell_text(cell) for cell in row["cells"]]
         cells += [str(commands.index(how["command"]) + 1)] if several else []
         lines.append("| " + " | ".join([*cells, how["version"], how["date"]]) + " |")
+    if "picture" in table:
+        lines += ["", f"![{table['title']}](../notebooks/pictures/{table['picture']})"]
     return "\n".join([*lines, ""])
 
 

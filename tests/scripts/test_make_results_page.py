@@ -49,7 +49,8 @@ def test_trackers_go_by_their_present_names() -> None:
 
 
 def test_tables_come_in_their_order_with_their_commands(script: ModuleType, tmp_path: Path) -> None:
-    (tmp_path / "last.json").write_text(report(rows=[["turn", 12.345], ["beam", None]]))
+    last = report(rows=[["turn", 12.345], ["beam", None]], picture="a.png")
+    (tmp_path / "last.json").write_text(last)
     rows = [["turn", "x"], {"cells": ["beam", 2], "command": "python b.py", "version": "v2"}]
     (tmp_path / "other.json").write_text(report(title="B", order=1, about="Both.", rows=rows))
     (tmp_path / "none.json").write_text('{"rows": []}')
@@ -58,6 +59,7 @@ def test_tables_come_in_their_order_with_their_commands(script: ModuleType, tmp_
     assert "\nBoth.\n\n1. `python a.py`\n2. `python b.py`\n" in page
     assert "| beam | 2 | 2 | v2 | 2026-01-02 |" in page
     assert "\n`python a.py`\n" in page
+    assert page.endswith("\n\n![A](../notebooks/pictures/a.png)\n")
     assert "| turn | 12.3 | v1 | 2026-01-02 |\n| beam |  | v1 | 2026-01-02 |" in page
 
 
