@@ -10,7 +10,7 @@ Hessian is taken on the parameters that no limit holds, with no cap on its width
 |---|---|
 | largest over smallest | deviation along the widest eigen-direction over the narrowest's |
 | volume | the ball of the widest deviation over the ellipsoid, power of 10 |
-| floored | share of the frames whose Hessian was not definite, and given a least curvature |
+| floored | share of the frames in which some mode's Hessian was given a least curvature |
 
 Numbers are medians over the frames, then over the seeds. `scripts/table1.py` has the spectra of a
 cost of joints alone.
