@@ -2,10 +2,10 @@
 
 While a body is fitted, shape numbers of its parts (`torchcss.body.surface`) become parameters too,
 left and right tied, as mirror images: a part's numbers are `s = s0 + T z` with z the shape
-parameters. They deform
-points inside a link, `p(x, z) = R_l(x) u(s) + t_l(x)`, with u the point's map in its part's frame,
-angles (eta, omega) held. With g and A the derivatives of a point's cost, `w_k = R_l du/ds_k`, and
-`S_j = (omega_j, v_j)` the twist of a joint above the point, the new columns are
+parameters. They deform points inside a link, `p(x, z) = R_l(x) u(s) + t_l(x)`, with u the point's
+map in its part's frame, angles (eta, omega) held. With g and A the derivatives of a point's cost,
+`w_k = R_l du/ds_k`, and `S_j = (omega_j, v_j)` the twist of a joint above the point, the new
+columns are
 
     gradient_k = sum g . w_k
     hessian_kl = sum w_k . A w_l + g . R_l d2u/ds_k ds_l
