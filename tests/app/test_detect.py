@@ -127,7 +127,7 @@ def test_a_video_alone_is_tracked(
     out = files / "out"
     run = torchcss.track_video(files / "video.mp4", out=out, settings=settings, options=options)
     assert len(run.track.frames) == 3
-    camera, given = run.cameras[0]
+    camera, given, _ = run.cameras[0]
     assert float(camera.K[0, 0]) == pytest.approx(32 / np.tan(np.radians(30)))
     assert given is not None
     assert given.keypoints == out / "keypoints.npz"
