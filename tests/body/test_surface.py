@@ -164,6 +164,13 @@ def test_straightening_can_be_differentiated(generator: torch.Generator, bend: f
     assert torch.autograd.gradcheck(straight, (bends, points))
 
 
+def test_a_straight_part_is_straightened_with_derivatives(generator: torch.Generator) -> None:
+    shapes = random_shapes(8, generator)
+    shapes[:, 7:] = 0.0
+    points = surface_points(shapes, *random_angles(8, generator)).points.requires_grad_()
+    assert torch.autograd.gradcheck(lambda points: straighten(shapes, points), points)
+
+
 def test_a_small_bend_joins_none_smoothly(generator: torch.Generator) -> None:
     shapes = random_shapes(50, generator)
     eta, omega = random_angles(50, generator)

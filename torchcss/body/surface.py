@@ -138,6 +138,8 @@ def _turn(square: Tensor) -> tuple[Tensor, Tensor]:
 def straighten(shape: Float[Tensor, "*batch 9"], points: Vectors) -> Vectors:
     """Undo bend and taper: part frame to the frame of the plain superquadric.
 
+    It can be differentiated in the points, and in the shape of a part that is bent.
+
     Args:
         shape: The nine shape numbers.
         points: Points in the part's frame, metres.
