@@ -60,13 +60,15 @@ def test_several_views_and_sequences(generator: torch.Generator) -> None:
     assert_close(together([cost, numbered(other, 1)], sequence), x, "float64")
 
 
-def test_a_sample_does_not_depend_on_its_pool(generator: torch.Generator) -> None:
+@pytest.mark.parametrize("threads", [1, 2, 4])
+def test_a_sample_does_not_depend_on_its_pool(threads: int, generator: torch.Generator) -> None:
     cost = replace(make_full_cost("body34", own_parents=9), engine=FusedEngine())
     # Without what the eager engine adds, whose items agree to rounding.
     cost = replace(cost, choice=cost.choice.without("edge_energy", "temporal_mixture"))
     x = random_states(cost.body, 9, generator=generator)
     whole = cost.local_model(x)
-    order = torch.tensor([4, 8, 0])
+    cost = replace(cost, engine=FusedEngine(threads=threads))
+    order = torch.tensor([4, 8, 0, 2, 1])
     for got, expected in zip(cost.take(order).local_model(x[order]), whole, strict=True):
         torch.testing.assert_close(got, expected[order], rtol=0, atol=0)
 

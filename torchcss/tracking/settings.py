@@ -131,8 +131,8 @@ class Settings:
         engine: "fused": compiled kernels evaluate the cost, on a CPU where numba is installed;
             "eager": the terms as they are written, as everywhere else.
         engine_dtype: Precision of the kernels; sums are in double precision.
-        threads: With two or more, the next frame's features are found while this one is searched.
-            Nothing else changes.
+        threads: With two or more, compiled kernels share out the samples among so many, and the
+            next frame's features are found while this one is searched. Nothing else changes.
         overlay: Write `overlay.mp4` and `report.html`.
         recovery: Tell from the costs when the track is lost, and search more widely then; as the
             preset does by default.
@@ -468,7 +468,7 @@ def make_settings_tracker(
 
 def make_engine(settings: Settings) -> Engine | None:
     """What evaluates the cost; None: the terms as they are written."""
-    return engine_for(settings.engine, settings.device, settings.engine_dtype)
+    return engine_for(settings.engine, settings.device, settings.engine_dtype, settings.threads)
 
 
 class Plan(NamedTuple):

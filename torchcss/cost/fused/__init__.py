@@ -16,6 +16,7 @@ def engine_for(
     name: Literal["fused", "eager"],
     device: torch.device | str,
     dtype: Literal["float32", "float64"] = "float64",
+    threads: int = 1,
 ) -> Engine | None:
     """What evaluates costs on a device; None: the terms as they are written.
 
@@ -23,13 +24,14 @@ def engine_for(
         name: Which engine is wanted; the fused one works on a CPU where numba is installed.
         device: Where the states lie.
         dtype: Precision of the kernels.
+        threads: Among how many threads the kernels share out the states.
     """
     if name == "eager" or torch.device(device).type != "cpu":
         return None
     # Importing the kernels takes a third of a second.
     from torchcss.cost.fused.engine import fused_engine
 
-    return fused_engine(dtype)
+    return fused_engine(dtype, threads)
 
 
 @contextmanager

@@ -8,9 +8,11 @@ kernel stands in a file with the name of its twin.
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache, partial
@@ -128,10 +130,10 @@ _Found = tuple[list[_Packed], frozenset[str]]
 
 
 @cache
-def fused_engine(dtype: Literal["float32", "float64"]) -> FusedEngine | None:
+def fused_engine(dtype: Literal["float32", "float64"], threads: int = 1) -> FusedEngine | None:
     """The engine of a precision; None, with a warning, where numba cannot be imported."""
     if compiler.AVAILABLE:
-        return FusedEngine(dtype)
+        return FusedEngine(dtype, threads)
     warnings.warn(
         "numba is not installed, so that costs are evaluated ten times more slowly; "
         "install it with: pip install numba",
@@ -145,11 +147,15 @@ class FusedEngine:
 
     Args:
         dtype: Precision of the kernels; sums, priors and results are in double precision.
+        threads: Among how many threads states are shared out. Each state is evaluated by itself,
+            so that results are the same for any number.
     """
 
-    def __init__(self, dtype: Literal["float32", "float64"] = "float32") -> None:
+    def __init__(self, dtype: Literal["float32", "float64"] = "float32", threads: int = 1) -> None:
         self.real: Any = np.float32 if dtype == "float32" else np.float64
         self._views, self._priors = _Packs(), _Packs()
+        self._threads = threads
+        self._helpers = ThreadPoolExecutor(threads - 1) if threads > 1 else None
 
     def value(self, cost: TrackingCost, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
         """Cost in nats; see `TrackingCost.value`."""
@@ -195,17 +201,16 @@ class FusedEngine:
             part = states if items is None else np.ascontiguousarray(states[items])
             own = result if items is None else Result(*(np.zeros_like(p[items]) for p in result))
             packed, others = self._prior(cost, past)
-            found = [(packed, component)]
+            compared = component if component is None or items is None else component[items]
+            calls = [(each, compared) for each in packed]
             left_out |= others
+            compared = parent if parent is None or items is None else parent[items]
             for view in cost.views:
                 if view.sequence == past.sequence:
                     packed, others = self._view(cost, past, view)
-                    found.append((packed, parent))
+                    calls += [(each, compared) for each in packed]
                     left_out |= others
-            for packed, index in found:
-                mode = index if index is None or items is None else index[items]
-                for each in packed:
-                    each.add(part, mode, own)
+            self._share_out(calls, part, own)
             if items is not None:
                 for whole, some in zip(result, own, strict=True):
                     whole[items] = some
@@ -214,6 +219,32 @@ class FusedEngine:
         if not left_out:
             return result, None
         return result, replace(cost, engine=None, choice=cost.choice.only(left_out))
+
+    def _share_out(
+        self, calls: list[tuple[_Packed, Array | None]], x: Array, result: Result
+    ) -> None:
+        """Add the costs that kernels find for some states, shared out among the threads.
+
+        Args:
+            calls: Kernels, with the modes that the states are compared with.
+            x: States.
+            result: What the costs are added to.
+        """
+
+        def add(rows: slice) -> None:
+            part = Result(*(field[rows] for field in result))
+            for packed, mode in calls:
+                packed.add(x[rows], None if mode is None else mode[rows], part)
+
+        if self._helpers is None or len(x) < 2:
+            add(slice(None))
+            return
+        size = math.ceil(len(x) / self._threads)
+        others = [slice(i, i + size) for i in range(size, len(x), size)]
+        helped = [self._helpers.submit(add, rows) for rows in others]
+        add(slice(size))
+        for each in helped:
+            each.result()
 
     def _prior(self, cost: TrackingCost, past: FrameContext) -> _Found:
         return self._priors.of(past, (cost.choice,), lambda: self._pack_prior(cost, past))
