@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
@@ -221,7 +221,7 @@ class FusedEngine:
         return result, replace(cost, engine=None, choice=cost.choice.only(left_out))
 
     def _share_out(
-        self, calls: list[tuple[_Packed, Array | None]], x: Array, result: Result
+        self, calls: Sequence[tuple[_Packed, Array | None]], x: Array, result: Result
     ) -> None:
         """Add the costs that kernels find for some states, shared out among the threads.
 
