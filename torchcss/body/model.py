@@ -165,12 +165,12 @@ class BodyModel(nn.Module):
     @property
     def touching(self) -> Bool[Tensor, "parts parts"]:
         """Which parts touch in every pose; none touches itself."""
-        own = torch.eye(self.num_parts, dtype=torch.bool, device=self.tie.device)
-        touching = torch.zeros_like(own)
+        touching = [[False] * self.num_parts for _ in range(self.num_parts)]
         for pair in self.neighbours:
             i, j = map(self.part_names.index, pair)
-            touching[i, j] = touching[j, i] = True
-        return touching & ~own
+            touching[i][j] = touching[j][i] = i != j
+        rows = torch.tensor(touching, dtype=torch.bool, device=self.tie.device)
+        return rows.reshape(self.num_parts, self.num_parts)
 
     @property
     def bounds(self) -> Bounds:

@@ -407,8 +407,8 @@ class Tracker(SequenceTracker):
         samples, some = self._modes_among(samples, prior, bounds)
         coarse = problem.children(samples.parent, prior).take(some).coarse
         assert coarse is not None
-        rough = self.optimiser.minimise(coarse, samples.x[some], bounds)
-        return samples._replace(x=samples.x.index_copy(0, some, rough.mean))
+        rough = self.optimiser.ends(coarse, samples.x[some], bounds)
+        return samples._replace(x=samples.x.index_copy(0, some, rough))
 
     def _modes_among(self, samples: Samples, prior: Prior, bounds: Bounds) -> tuple[Samples, Items]:
         """Choose the samples that descend on the coarse cost, every mode's own copy among them.

@@ -350,6 +350,16 @@ class TrustRegionNewton:
         modes = self.modes(result, bounds, prior_variance=prior_variance)
         return Modes(*(field.reshape(batch + field.shape[1:]) for field in modes))
 
+    def ends(self, cost: CostFunction, x0: Vectors, bounds: Bounds) -> Vectors:
+        """Where descents end, as `minimise` finds it, without the covariances there.
+
+        Args:
+            cost: What to minimise, one item per start.
+            x0: Starts; those outside the bounds are projected onto them first.
+            bounds: Box limits.
+        """
+        return self.descend(cost, self.start(x0), bounds).x
+
     def descend(
         self,
         cost: CostFunction,

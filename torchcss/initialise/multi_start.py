@@ -291,9 +291,9 @@ def flips(cost: TrackingCost, segments: Segments, x: Vectors, bounds: Bounds, nu
         sigma=target.new_full(target.shape[-2:-1], _ON_PLACE),
     )
     start = x[:, None, None].expand(*shape, -1).flatten(0, 2)
-    solved = TrustRegionNewton(max_steps=15, tolerance=0.1).minimise(reach, start, bounds)
+    solved = TrustRegionNewton(max_steps=15, tolerance=0.1).ends(reach, start, bounds)
     return _best_combinations(
-        widened(cost, 1.5 * _MIDDLE), segments, solved.mean.unflatten(0, (-1, len(ways[1]))), num
+        widened(cost, 1.5 * _MIDDLE), segments, solved.unflatten(0, (-1, len(ways[1]))), num
     )
 
 
