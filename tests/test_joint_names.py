@@ -107,6 +107,8 @@ def test_names_of_the_real_file(shared_data) -> None:
         (("LeftHip", "LeftKnee", "LeftShoulder", "link3"),
          ("l_hip", "l_knee", "l_shoulder", None)),
         (("panda_link1", "panda_hand"), (None, None)),
+        (("hips_JNT", "l_upleg_JNT", "l_leg_JNT", "l_shoulder_JNT", "l_arm_JNT", "l_forearm_JNT"),
+         (None, "l_hip", "l_knee", None, "l_shoulder", "l_elbow")),
     ],
 )  # fmt: skip
 def test_skeletons_name_joints_by_what_they_move(

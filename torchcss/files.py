@@ -235,15 +235,16 @@ def read_bytes(path: Path, error_class: type[TorchcssError], size: int = -1) -> 
 
 
 def read_text(path: Path, error_class: type[TorchcssError]) -> str:
-    """The content of a text file in UTF-8, with or without the mark that Windows puts first.
+    """The content of a text file in UTF-8, or in what the mark says that Windows puts first.
 
     Raises:
         error_class: As `read_bytes`, or if it is no such text; the message names the line.
     """
     data = read_bytes(path, error_class)
-    bad = data.find(b"\0")
+    is_wide = data.startswith((b"\xff\xfe", b"\xfe\xff"))
+    bad = -1 if is_wide else data.find(b"\0")
     try:
-        text = data.decode("utf-8-sig")
+        text = data.decode("utf-16" if is_wide else "utf-8-sig")
     except UnicodeDecodeError as error:
         bad, text = error.start, ""
     if bad >= 0:

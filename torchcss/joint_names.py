@@ -128,10 +128,12 @@ _PLACES: Final[dict[str, str]] = {
     ),
 }
 _PAIRED_WORDS: Final = {word for word, place in _PLACES.items() if place in _PAIRED}
-_CASE: Final = r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])"
+CASE: Final = r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])"
 """Where a word begins by its case."""
 
-_SIDES: Final[dict[str, str]] = {"left": "l_", "right": "r_", "l": "l_", "r": "r_"}
+_SIDES: Final[dict[str, str]] = {
+    "left": "l_", "right": "r_", "l": "l_", "r": "r_", "lt": "l_", "rt": "r_"
+}  # fmt: skip
 
 
 def canonical_joint_name(name: str) -> str | None:
@@ -149,7 +151,7 @@ def canonical_joint_name(name: str) -> str | None:
     """
     # Words: at every change from lower to upper case, before the last capital of a run of them
     # (LBigToe is L Big Toe), and at everything that is neither letter nor digit.
-    spaced = re.sub(_CASE, " ", name)
+    spaced = re.sub(CASE, " ", name)
     words = [word for word in re.split(r"[^a-z0-9]+", spaced.lower()) if word]
     side = ""
     for end in (0, -1):
@@ -191,6 +193,9 @@ def layout_of_names(names: tuple[str, ...]) -> tuple[str | None, ...]:
     for name in names:
         canonical = canonical_joint_name(name) or _numbered_side(name, names)
         found.append(None if canonical in found else canonical)
+    if "l_knee" in found and not any(name and name.endswith("ankle") for name in found):
+        # MMPose's names of Human3.6M end the leg in its foot, which is the ankle.
+        return tuple(name.replace("midtarsal", "ankle") if name else None for name in found)
     return tuple(found)
 
 
@@ -214,10 +219,10 @@ def _of_limbs(*words: str) -> dict[str, tuple[str, ...]]:
 
 LIMB_WORDS: Final = _of_limbs(
     "upleg upperleg thigh thighbend hip",
-    "knee lowerleg leg calf shin",
+    "knee lowerleg leg calf shin shank",
     "ankle foot",
     "upperarm uarm arm shldr shldrbend shoulder",
-    "elbow forearm lowerarm farm forearmbend",
+    "elbow forearm lowerarm farm larm forearmbend",
     "wrist hand",
 )
 """What skeletons call the joint in which a limb's segment starts, without side and prefix; of
@@ -299,7 +304,7 @@ def _limbs(spelt: Sequence[tuple[str, str]], table: Mapping[str, Sequence[str]])
 
 
 def _spelt(names: Sequence[str]) -> list[tuple[str, str]]:
-    """Side and place of every name, in small letters, without what they begin with alike."""
+    """Side and place of every name, in small letters, without what they begin or end with."""
     known = {*_SKELETON_PLACES, *_PLACES}
     known.update(
         word for table in (LIMB_WORDS, _ACCLAIM, _ENDS) for ws in table.values() for word in ws
@@ -307,7 +312,7 @@ def _spelt(names: Sequence[str]) -> list[tuple[str, str]]:
     split: list[tuple[str, list[str]]] = []
     for name in names:
         # Changes of case and digits part words; what stands before a colon is a namespace.
-        spaced = re.sub(_CASE, " ", name.split(":")[-1])
+        spaced = re.sub(CASE, " ", name.split(":")[-1])
         words = [word for word in re.split(r"[^a-z]+", spaced.lower()) if word]
         sides = [index for index, word in enumerate(words) if word in _SIDES]
         split.append((_SIDES[words.pop(sides[0])] if len(sides) == 1 else "", words))
@@ -317,6 +322,8 @@ def _spelt(names: Sequence[str]) -> list[tuple[str, str]]:
     for side, words in split:
         while words and words[0] in common and "".join(words) not in known:
             words = words[1:]
+        while words and words[-1] in common and "".join(words) not in known:
+            words = words[:-1]
         place = "".join(words)
         if not side and place not in known:
             side, place = _unglued(place, known)

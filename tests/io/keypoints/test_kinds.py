@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from torchcss.errors import KeypointError
-from torchcss.io.keypoints.read import read_keypoints
+from torchcss.io.keypoints.frames import Film
+from torchcss.io.keypoints.one_person import Whom
+from torchcss.io.keypoints.read import read_keypoints, read_person
 from torchcss.joint_names import ALIASES
 from torchcss.types import Keypoints
 
@@ -568,3 +570,216 @@ def test_decimal_commas(tmp_path: Path) -> None:
 def test_no_pickle_is_read(tmp_path: Path) -> None:
     with pytest.raises(KeypointError, match=r"code may run.*numpy\.savez"):
         read(write(tmp_path / "a.pkl", "x"))
+
+
+# What files call things, and what they leave out.
+
+
+def wide(heads: list[str], rows: list[list[Any]]) -> str:
+    return "\n".join(",".join(map(str, row)) for row in [heads, *rows]) + "\n"
+
+
+def ends(*kinds: str) -> list[str]:
+    return [name + kind for name in TFJS for kind in kinds]
+
+
+@pytest.mark.parametrize(
+    "head", ["", "Unnamed: 0", "Frame #", "frameNumber", "fnum", "image_name", "file", "Time (s)"]
+)
+def test_columns_that_say_the_frame(tmp_path: Path, head: str) -> None:
+    """A frame that is left out does not move those behind it."""
+    say = "{}.png" if head in ("image_name", "file") else "{}"
+    rows = [[say.format(t / 25 if "Time" in head else t), *person(t).flat] for t in SEEN]
+    path = write(tmp_path / "a.csv", wide([head, *ends("_x", "_y", "_c")], rows))
+    names = [f"{t}.png" for t in T]
+    check(read(path, frame_names=names, frame_rate=25), (3,))
+
+
+def test_rows_without_a_frame_are_as_many_as_the_frames(tmp_path: Path) -> None:
+    path = write(
+        tmp_path / "a.csv", wide(ends("_x", "_y", "_c"), [[*person(t).flat] for t in SEEN])
+    )
+    with pytest.raises(KeypointError, match="expected 6 frames, as the video has, found 5"):
+        read(path)
+
+
+@pytest.mark.parametrize(
+    "kinds",
+    [("X", "Y", "Score"), (" (x)", " (y)", " (conf)"), ("_u", "_v", "_c"), (":x", ":y", ":p"),
+     ("_x_px", "_y_px", "_keypoint_score")],
+)  # fmt: skip
+def test_columns_of_joints(tmp_path: Path, kinds: tuple[str, ...]) -> None:
+    rows = [[t, *person(t).flat, ""] for t in T]  # and a comma at the end of the line
+    text = "# made by a program\n" + wide(["frame", *ends(*kinds)], rows)
+    path = tmp_path / "a.csv"
+    path.write_text(text, encoding="utf-16")
+    found = read(path)
+    check(found)
+    assert found.confidence[0, 0] == 0.6
+
+
+@pytest.mark.parametrize("heads", ["frame,body_part,x,y,score", "image,keypoint_name,u,v,conf"])
+def test_long_tables(tmp_path: Path, heads: str) -> None:
+    rows = [[t, name, *row] for t in SEEN for name, row in zip(TFJS, person(t), strict=True)]
+    check(read(write(tmp_path / "a.txt", wide(heads.split(","), rows))), (3,))
+
+
+def test_columns_left_out_are_told(tmp_path: Path) -> None:
+    rows = [[t, *person(t).flat] for t in T]
+    found = read(write(tmp_path / "a.csv", wide(["frame", *ends("_x", "_y", "_w")], rows)))
+    assert any("columns left out: 'nose_w" in line for line in found.report)
+
+
+@pytest.mark.parametrize("key", ["joint_names", "keypointNames", "names"])
+def test_names_that_a_file_says_win_over_their_number(tmp_path: Path, key: str) -> None:
+    layout = ALIASES["H36M-17"]
+    names = [name or f"spine{index}" for index, name in enumerate(layout)]
+    frames = [{"frame": t, "keypoints": person(t, layout).tolist()} for t in T]
+    where = ("l_wrist", "r_ankle", "l_hip")
+    check(read(write(tmp_path / "a.json", {key: names, "frames": frames})), names=where)
+    array = np.stack([person(t, layout) for t in SEEN])
+    np.savez(tmp_path / "a.npz", keypoints=array, frames=SEEN, **{key: np.array(names, "S")})
+    check(read(tmp_path / "a.npz"), (3,), names=where)
+
+
+def test_feet_of_human36m_are_ankles(tmp_path: Path) -> None:
+    layout = ALIASES["H36M-17"]
+    names = [(name or f"spine{i}").replace("ankle", "foot") for i, name in enumerate(layout)]
+    frames = [{"frame": t, "keypoints": person(t, layout).tolist()} for t in T]
+    path = write(tmp_path / "a.json", {"joint_names": names, "frames": frames})
+    check(read(path), names=("l_ankle", "r_ankle"))
+
+
+@pytest.mark.parametrize(
+    "head",
+    [{"videoWidth": 1280, "videoHeight": 960}, {"resolution": [1280, 960]},
+     {"metadata": {"width": 1280, "height": 960}}],
+)  # fmt: skip
+def test_the_size_that_a_file_says(tmp_path: Path, head: dict[str, Any]) -> None:
+    frames = [{"frame_id": float(t), "keypoints": (person(t) * (2, 2, 1)).tolist()} for t in SEEN]
+    check(read(write(tmp_path / "a.json", {**head, "frames": frames})), (3,))
+
+
+def test_people_by_float_numbers_and_confidences_beside(tmp_path: Path) -> None:
+    def entry(p: np.ndarray, number: float) -> dict[str, Any]:
+        return {"keypoints": p[:, :2].ravel().tolist(), "confidence": p[:, 2].tolist(),
+                "idx": number}  # fmt: skip
+
+    frames = [{"frame": t, "people": [entry(other(t), 1.0), entry(person(t), 2.0)]} for t in T]
+    path = write(tmp_path / "a.json", {"frames": frames})
+    whom = Whom(0, "2", SIZE)
+    found = read_person(path, film=Film(FRAMES), whom=whom)
+    check(found)
+    assert found.confidence[0, 0] == 0.6
+
+
+def test_pairs_in_a_row_and_what_is_minus_one(tmp_path: Path) -> None:
+    def pairs(t: int) -> list[float]:
+        return np.vstack([person(t)[:1, :2], [[-1, -1]], person(t)[2:, :2]]).ravel().tolist()
+
+    frames = [{"frame": t, "keypoints": pairs(t), "score": 0.9} for t in T]
+    found = read(write(tmp_path / "a.json", frames))
+    check(found)
+    assert (found.confidence[:, 1] == 0).all()
+
+
+@pytest.mark.parametrize("form", ["root", "movenet", "texts", "names and score"])
+def test_frames_in_json_otherwise(tmp_path: Path, form: str) -> None:
+    contents: dict[str, Any] = {
+        "root": {"fps": 30, "predictions": [[mmpose(t, person(t))] for t in T]},
+        "movenet": [[[(person(t) / (*SIZE, 1))[:, [1, 0, 2]].tolist()]] for t in T],
+        "texts": [json.dumps([columns(person(t))]) for t in T],
+        "names and score": [
+            {"score": 0.9, **dict(zip(TFJS, person(t).tolist(), strict=True))} for t in T
+        ],
+    }
+    check(read(write(tmp_path / "a.json", contents[form])))
+
+
+@pytest.mark.parametrize("form", ["x, y, z, confidence", "joints last", "movenet of many"])
+def test_arrays_otherwise(tmp_path: Path, form: str) -> None:
+    frames = np.stack([person(t) for t in T])
+    many = np.zeros((FRAMES, 1, 6, 56))
+    for place, of in ((0, other), (1, person)):
+        rows = [(of(t) / (*SIZE, 1))[:, [1, 0, 2]].ravel() for t in T]
+        many[:, 0, place, :51] = rows
+    array = {
+        "x, y, z, confidence": np.insert(frames, 2, 0.1, axis=2),
+        "joints last": frames.swapaxes(1, 2),
+        "movenet of many": many,
+    }[form]
+    np.save(tmp_path / "a.npy", array)
+    check(read(tmp_path / "a.npy"))
+
+
+def test_y_before_x_is_told(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.stack([person(t)[:, [1, 0, 2]] for t in T]))
+    assert any("y before x" in line for line in read(tmp_path / "a.npy").report)
+    np.save(tmp_path / "a.npy", np.stack([person(t) for t in T]))
+    assert not any("y before x" in line for line in read(tmp_path / "a.npy").report)
+
+
+def test_names_of_pictures_with_what_programs_add(tmp_path: Path) -> None:
+    codes = ("9f", "12", "e0", "77", "3b", "a4")
+    labelled = [
+        {"image_id": f"frame_{t:04d}_jpg.rf.{codes[t] * 8}.jpg", "keypoints": flat(t)} for t in T
+    ]
+    check(read(write(tmp_path / "a.json", labelled)))
+    numbered = [{"image_id": 300 + 9 * t, "keypoints": flat(t)} for t in SEEN]
+    names = [f"{300 + 9 * t:012d}.jpg" for t in T]
+    check(read(write(tmp_path / "b.json", numbered), frame_names=names), (3,))
+
+
+def test_labels_called_otherwise_than_their_pictures(tmp_path: Path) -> None:
+    (tmp_path / "._0.json").write_bytes(b"\0\5\x16\7")  # macOS adds such files
+    for t in T:
+        _, content = FOLDERS["labelme"](t)
+        write(tmp_path / f"{9 - t}.json", content)
+    check(read(tmp_path, frame_names=[f"p{t}.png" for t in T]))
+    write(tmp_path / "9.json", {**content, "imageWidth": 320})
+    with pytest.raises(KeypointError, match="several sizes"):
+        read(tmp_path)
+
+
+def test_cvat_of_larger_pictures_of_two_people_in_any_order(tmp_path: Path) -> None:
+    text = ""
+    for t in T:
+        people = ""
+        for of in (person, other)[:: 1 - 2 * (t % 2)]:
+            rows = zip(TFJS, of(t) * 2, strict=True)
+            people += f"<skeleton>{''.join(cvat_point(n, row) for n, row in rows)}</skeleton>"
+        text += f'<image id="{t}" name="{t}.png" width="1280" height="960">{people}</image>'
+    check(read(write(tmp_path / "a.xml", f"<annotations>{text}</annotations>")))
+
+
+def test_sleap_hdf5_that_ends_early_or_has_frames_first(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    points = np.stack([person(t)[:, :2] for t in T[:5]])[:, None]
+    for axes in ((0, 1, 2, 3), (1, 3, 2, 0)):
+        with h5py.File(tmp_path / "a.analysis.h5", "w") as file:
+            file["tracks"], file["node_names"] = points.transpose(axes), np.array(TFJS, "S")
+        check(read(tmp_path / "a.analysis.h5"), (5,))
+
+
+def test_deeplabcut_hdf5_of_labelled_pictures(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "CollectedData.h5", "w") as file:
+        group = file.create_group("df_with_missing")
+        group["block0_values"] = np.stack([person(t)[:, :2].ravel() for t in SEEN])
+        columns = [("me", name, kind) for name in TFJS for kind in "xy"]
+        rows = [("labeled-data", "clip", f"img{t:03d}.png") for t in SEEN]
+        for axis, labels in ((0, columns), (1, rows)):
+            for level, names in enumerate(zip(*labels, strict=True)):
+                known = sorted(set(names))
+                group[f"axis{axis}_level{level}"] = np.array(known, "S")
+                group[f"axis{axis}_label{level}"] = np.array([known.index(n) for n in names], "i1")
+    check(read(tmp_path / "CollectedData.h5"), (3,))
+
+
+def test_nobody_is_not_the_leftmost(tmp_path: Path) -> None:
+    people = np.stack(
+        [np.stack([person(t, shift=60), person(t) * (1, 1, 0), person(t)]) for t in T]
+    )
+    np.save(tmp_path / "a.npy", people)
+    whom = Whom(0, "leftmost", SIZE)
+    check(read_person(tmp_path / "a.npy", film=Film(FRAMES), whom=whom))

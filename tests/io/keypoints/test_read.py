@@ -479,7 +479,7 @@ def test_missing_and_foreign_files(tmp_path: Path) -> None:
     [
         {"joints": np.zeros((3, 17))},
         {"keypoints": np.zeros((3, 17))},
-        {"keypoints": np.zeros((3, 17, 4))},
+        {"keypoints": np.zeros((3, 17, 5))},
         {"keypoints": np.zeros((0, 17, 2))},
         {"keypoints": np.full((3, 17, 2), "a")},
         {"keypoints": np.zeros((3, 17, 2), complex)},

@@ -20,16 +20,23 @@ import torch
 from torchcss.errors import KeypointError
 from torchcss.files import load_arrays
 from torchcss.io.keypoints.mediapipe import is_landmark_array, read_landmark_array
-from torchcss.io.keypoints.people import Names, People, Person, is_there, screened
-from torchcss.joint_names import ALIASES, names_in
+from torchcss.io.keypoints.people import (
+    LAYOUT_SIZES,
+    Frames,
+    Names,
+    People,
+    Person,
+    is_there,
+    screened,
+)
+from torchcss.io.keypoints.words import FRAMES, NAMES, SCORES, SIZES, first_of
+from torchcss.joint_names import names_in
 from torchcss.types import Keypoints
 
-_PLACES = names_in("keypoints keypoints_2d keypoints2d joints_2d joints2d kps poses positions")
-_CONFIDENCES = names_in("confidence confidences scores score keypoint_scores conf likelihood")
+_PLACES = names_in("keypoints keypoints2d joints2d kps poses positions pose joints")
 _MOST_PEOPLE = 30
 """More people than this in a single frame are one person in so many frames: networks that lift
 joints to space take and give `[1 T J 3]`."""
-_COUNTS = {len(joints) for joints in ALIASES.values()}
 
 
 def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
@@ -38,7 +45,9 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
     Raises:
         KeypointError: If there are none of the shapes above.
     """
-    name = next((name for name in _PLACES if name in arrays), None)
+    texts = {key: each for key, each in arrays.items() if each.dtype.kind in "SU"}
+    numbers = {key: each for key, each in arrays.items() if key not in texts}
+    name = first_of({key: key for key in numbers}, _PLACES)
     if len(arrays) == 1:
         (name,) = arrays
         if is_landmark_array(arrays[name]):
@@ -49,16 +58,16 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
             f"found {', '.join(arrays) or 'none'}"
         )
     report = [f"format: {path.suffix[1:].upper()}"]
-    values, is_movenet = _people(name, arrays[name]), arrays[name].ndim == 5
+    values = _people(name, arrays[name])
+    is_movenet = arrays[name].ndim == 5 or arrays[name].shape[-1] == 56
     if len(values) == 1 and values.shape[1] > _MOST_PEOPLE:
         values = values.swapaxes(0, 1)
         report.append(f"{name}: one person in {len(values)} frames, which are the second axis")
     if is_movenet:
         values = values[..., [1, 0, 2]]
         report = ["format: MoveNet's arrays, y before x, fractions of the image"]
-    given = next((key for key in _CONFIDENCES if key in arrays), None)
-    if given is not None:
-        confidence = _confidence(given, arrays[given], values.shape[:3])
+    if (given := first_of(arrays, SCORES)) is not None:
+        confidence = _confidence(given, values.shape[:3])
         values = np.concatenate([values[..., :2], confidence[..., None]], -1)
     elif values.shape[-1] == 2:
         report.append("no confidence in the file: 1 for every joint that is a number")
@@ -74,15 +83,16 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
         ]
         for frame in values
     ]
-    size = _positive("image_size_wh", arrays, 2)
-    noise = _positive("relative_noise", arrays, 1) or [1.0]
+    size = _positive("image size", first_of(numbers, SIZES), 2)
+    noise = _positive("relative_noise", arrays.get("relative_noise"), 1)
+    names = arrays.get("joint_names", first_of(texts, NAMES))
     return People(
-        people,
-        _names(arrays.get("joint_names"), values.shape[2]),
+        _counted(people, first_of(numbers, FRAMES)),
+        _names(names, values.shape[2]),
         report,
         corner_fractions=is_movenet,
         size_wh=None if size is None else (size[0], size[1]),
-        relative_noise=noise[0],
+        relative_noise=noise[0] if noise else 1.0,
     )
 
 
@@ -106,6 +116,16 @@ def read_points(path: Path, keypoints: Keypoints) -> Keypoints:
     return keypoints._replace(points=points[torch.arange(len(gap)), gap.argmin(1)])
 
 
+def _counted(people: list[list[Person]], numbers: np.ndarray | None) -> list[list[Person]] | Frames:
+    """The people of every frame by its number, where the file has as many numbers as frames."""
+    if numbers is None or numbers.shape != (len(people),) or not np.isfinite(numbers).all():
+        return people
+    frames: Frames = {}
+    for number, frame in zip(numbers.tolist(), people, strict=True):
+        frames.setdefault(int(number), []).extend(frame)
+    return frames
+
+
 def _unfit(name: str, array: np.ndarray, expected: str) -> KeypointError:
     """The error for an array of another kind or shape."""
     got = f"{array.dtype} {list(array.shape)}"
@@ -120,9 +140,9 @@ def _tracks(ids: np.ndarray | None, count: int) -> list[str | None]:
     return [str(number) for number in ids]
 
 
-def _positive(name: str, arrays: Mapping[str, np.ndarray], count: int) -> list[float] | None:
+def _positive(name: str, array: np.ndarray | None, count: int) -> list[float] | None:
     """So many numbers, if the file has them."""
-    if (array := arrays.get(name)) is None:
+    if array is None:
         return None
     if array.size != count or array.dtype.kind not in "iuf" or not (array > 0).all():
         raise KeypointError(f"{name}: expected {count} positive numbers, got {array}")
@@ -134,10 +154,19 @@ def _people(name: str, array: np.ndarray) -> np.ndarray:
     shape: Sequence[int] = array.shape
     if array.dtype.kind in "iuf" and 0 not in shape:
         values = array.astype(np.float64)
-        if len(shape) == 2 and shape[1] in (2, 3) and shape[0] in _COUNTS:
+        if shape[-1] == 56 and len(shape) > 2:  # MoveNet's of several people
+            return values[..., :51].reshape(shape[0], -1, 17, 3)
+        if len(shape) > 2 and shape[-1] == 4:  # x, y, z, confidence
+            values = values[..., [0, 1, 3]]
+        elif len(shape) == 3 and shape[1] in (2, 3) and shape[2] in LAYOUT_SIZES:
+            values = values.swapaxes(1, 2)
+        shape = values.shape
+        if len(shape) == 2 and shape[1] in (2, 3) and shape[0] in LAYOUT_SIZES:
             return values[None, None]
         if len(shape) == 2:
-            size = next((n for n in (3, 2) if shape[1] % n == 0 and shape[1] // n in _COUNTS), 0)
+            size = next(
+                (n for n in (3, 2) if shape[1] % n == 0 and shape[1] // n in LAYOUT_SIZES), 0
+            )
             if size:
                 return values.reshape(shape[0], 1, -1, size)
         if len(shape) == 3 and shape[2] in (2, 3):
@@ -150,15 +179,15 @@ def _people(name: str, array: np.ndarray) -> np.ndarray:
     raise _unfit(name, array, expected)
 
 
-def _confidence(name: str, array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def _confidence(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     if array.dtype.kind not in "biuf" or array.size != math.prod(shape):
-        raise _unfit(name, array, f"numbers {[n for n in shape if n != 1]}")
+        raise _unfit("confidence", array, f"numbers {[n for n in shape if n != 1]}")
     return array.astype(np.float64).reshape(shape)
 
 
 def _names(names: np.ndarray | None, num_joints: int) -> Names | None:
     if names is None:
         return None
-    if names.shape != (num_joints,) or names.dtype.kind != "U":
+    if names.shape != (num_joints,) or names.dtype.kind not in "SU":
         raise _unfit("joint_names", names, f"{num_joints} names")
-    return tuple(map(str, names))
+    return tuple(str(name) for name in names.astype(str))

@@ -20,7 +20,7 @@ from torchcss.joint_names import JOINT_NAMES, canonical_joint_name
 
 def is_clicked(content: Mapping[str, Any]) -> bool:
     """Whether a file is of our own format: joints by name, of one frame or of some."""
-    if "joints" in content:
+    if isinstance(content.get("joints", []), dict):
         return True
     frames = content.get("frames")
     detected = {*PEOPLE, *JOINTS} - {"joints"}

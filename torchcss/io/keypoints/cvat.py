@@ -38,8 +38,8 @@ def read_cvat(path: Path) -> People:
         raise KeypointError(str(error)) from error
     if root.tag != "annotations":
         raise KeypointError(f"expected CVAT's annotations, found <{root.tag}>")
-    size = root.find(".//original_size")
-    found: dict[Key, dict[str, dict[str, list[float]]]] = {}
+    pictures = [*root.iter("image")]
+    found: dict[Key, dict[str, dict[str, list[float]]]] = {_name(each): {} for each in pictures}
     for place, who, element, outside in _shapes(root):
         people = found.setdefault(place, {})
         points = element.findall("points") if element.tag == "skeleton" else [element]
@@ -49,27 +49,42 @@ def read_cvat(path: Path) -> People:
                 people.setdefault(who, {})[name] = _joint(point, name)
     frames: Frames = {
         place: [
-            Person(np.array(list(joints.values())), who or None, tuple(joints))
+            Person(np.array(list(joints.values())), _track(who), tuple(joints))
             for who, joints in people.items()
         ]
         for place, people in found.items()
     }
     people, names = united(frames)
-    first = 0 if all(isinstance(place, int) for place in people) else None
-    wh = None if size is None else tuple(float(size.findtext(k, "0")) for k in ("width", "height"))
+    said = [
+        (each.findtext("width"), each.findtext("height")) for each in root.iter("original_size")
+    ]
+    sizes = {*said, *((each.get("width"), each.get("height")) for each in pictures)}
+    if len(sizes) > 1:
+        raise KeypointError("pictures of several sizes; expected those of one video")
+    width, height = (int(n) if n and n.isdecimal() else 0 for n in next(iter(sizes), ("", "")))
     return People(
-        people, names, ["format: CVAT's XML"], first=first,
-        size_wh=(wh[0], wh[1]) if wh and min(wh) > 0 else None,
+        people, names, ["format: CVAT's XML"], first=None if pictures else 0, whole=bool(pictures),
+        size_wh=(width, height) if width and height else None,
     )  # fmt: skip
+
+
+def _name(image: Element) -> str:
+    return plain_name(image.get("name", image.get("id", "")))
+
+
+def _track(who: str) -> str | None:
+    """A track's number; who is only counted in a picture may be another one in the next."""
+    return None if who.startswith("#") else who or None
 
 
 def _shapes(root: Element) -> Iterator[tuple[Key, str, Element, bool]]:
     """The frame, the person, the skeleton or point, and whether it is out of the picture."""
     for image in root.iter("image"):
-        place = plain_name(image.get("name", image.get("id", "")))
         for index, element in enumerate(image):
             if element.tag in ("skeleton", "points"):
-                yield place, f"{index}" if element.tag == "skeleton" else _ALONE, element, False
+                said = element.find("attribute[@name='track_id']")
+                who = f"#{index}" if said is None else said.text or f"#{index}"
+                yield _name(image), who if element.tag == "skeleton" else _ALONE, element, False
     for track in root.iter("track"):
         for element in track:
             if element.tag in ("skeleton", "points"):

@@ -32,7 +32,11 @@ def findings(
         image_size_wh: Size of the video.
         first_frame: Where tracking starts.
     """
-    return [*_outside(joints, image_size_wh, first_frame), *_sides(joints, names)]
+    return [
+        *_outside(joints, image_size_wh, first_frame),
+        *_sides(joints, names),
+        *_lying(joints, names),
+    ]
 
 
 def _outside(joints: np.ndarray, image_size_wh: Size, first_frame: int) -> list[str]:
@@ -76,3 +80,20 @@ def _sides(joints: np.ndarray, names: Sequence[str]) -> list[str]:
                     f"{against} of {known} frames; check the layout"
                 )
     return lines
+
+
+def _lying(joints: np.ndarray, names: Sequence[str]) -> list[str]:
+    """Whether shoulders and hips stand side by side, as where y comes before x."""
+    if not {"l_shoulder", "r_shoulder", "l_hip", "r_hip"} <= set(names):
+        return []
+    columns = [
+        list(names).index(f"{side}_{place}") for place in ("shoulder", "hip") for side in "lr"
+    ]
+    seen = joints[(joints[:, columns, 2] > _CONFIDENT).all(1)][:, columns, :2]
+    along = np.abs(seen[:, :2].mean(1) - seen[:, 2:].mean(1))
+    if not len(along) or (along[:, 0] > along[:, 1]).mean() < 0.9:
+        return []
+    return [
+        "shoulders and hips lie side by side, not one above the other: somebody lies, or the file "
+        "has y before x, or it is of a turned video"
+    ]

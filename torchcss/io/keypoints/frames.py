@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 import numpy as np
 
 from torchcss.errors import KeypointError
 from torchcss.files import shortened
-from torchcss.io.keypoints.people import Key, People, Person
+from torchcss.io.keypoints.people import Frames, Key, People, Person
 
 _MOST_FRAMES = 1_000_000
 
@@ -59,7 +59,12 @@ def in_order(people: People, film: Film, report: list[str]) -> list[list[Person]
     known = [(place, key) for place, key in zip(places, frames, strict=True) if place is not None]
     found = {place: frames[key] for place, key in known}
     if len(found) < len(known):
-        raise KeypointError("two entries of one frame; expected each frame once, numbered or named")
+        again = next(place for place, key in known if frames[key] is not found[place])
+        both = " and ".join(shortened(key) for place, key in known if place == again)
+        raise KeypointError(
+            f"two entries of one frame, {both}; expected one video, each frame once, numbered or "
+            "named"
+        )
     total = max(max(found, default=-1) + 1, film.num_frames or 0)
     if film.num_frames is not None and total > film.num_frames:
         raise wrong_count(film.num_frames, total)
@@ -78,11 +83,26 @@ def wrong_count(expected: int, found: int) -> KeypointError:
     )
 
 
+def files_of(folder: Path, suffix: str) -> list[Path]:
+    """The files of a kind in order; those that begin with a dot are the system's."""
+    named = (entry for entry in folder.iterdir() if not entry.name.startswith("."))
+    return sorted(entry for entry in named if entry.suffix.lower() == suffix)
+
+
+def in_seconds(unit: float | None, frames: Frames) -> Frames:
+    """The times of frames in seconds; where the unit is not known, no frame lasts a second."""
+    if unit is None:
+        gap = float(np.diff(np.sort(np.array(list(frames), float))).min(initial=np.inf))
+        unit = 1.0 if gap < 1 or not np.isfinite(gap) else 1e-3 if gap < 1000 else 1e-6
+    return {unit * float(key): people for key, people in frames.items()}
+
+
 def plain_name(name: str) -> str:
     """The name of a picture without folder, suffixes and what programs append to it."""
     last = PurePosixPath(name.replace("\\", "/")).name.lower()
     last = re.sub(r"\.(json|txt|predictions)$", "", last)
     last = re.sub(r"\.(jpe?g|png|bmp|tiff?|webp|pgm|ppm)$", "", last)
+    last = re.sub(r"_(jpe?g|png|bmp)\.rf\.[0-9a-z]+$", "", last)  # Roboflow's
     return re.sub(r"\.(json|predictions)$|_keypoints$|_pose$", "", last)
 
 
@@ -96,13 +116,25 @@ def _by_name(
     places = [names.get(plain_name(key)) if isinstance(key, str) else None for key in frames]
     known = sum(place is not None for place in places)
     if not known:
-        return None
+        # Whoever pads numbers otherwise, or says only the number, means the same picture if it
+        # cannot be the frame's place.
+        bare = {_unpadded(name): index for name, index in names.items()}
+        places = [bare.get(_unpadded(str(key))) for key in frames]
+        named = any(re.match(r"[^0-9]", plain_name(str(key))) for key in frames)
+        beyond = all(str(key).isdecimal() and int(key) >= len(names) for key in frames)
+        if len(bare) < len(names) or None in places or not (named or beyond):
+            return None
+        known = len(places)
     report.append("frames by the names of the pictures")
     if known < len(places):
         report.append(
             f"{len(places) - known} entries left out, whose pictures are not in the video"
         )
     return places
+
+
+def _unpadded(name: str) -> str:
+    return re.sub(r"0*([0-9]+)", r"\1", plain_name(name))
 
 
 def _by_number(people: People, keys: Sequence[Key], film: Film, report: list[str]) -> list[int]:

@@ -83,9 +83,12 @@ def _texts(path: Path, dataset: Any) -> list[str]:
 
 
 def _read_sleap(path: Path, file: Any) -> People:
-    """Read `tracks [people, 2, joints, frames]` and its scores."""
+    """Read `tracks [people, 2, joints, frames]` and its scores, or SLEAP-IO's with frames first."""
     names = _texts(path, file["node_names"])
     points = _array(path, file["tracks"]).astype(np.float64)
+    is_turned = points.ndim == 4 and points.shape[2:] == (len(names), 2)
+    if is_turned:
+        points = points.transpose(1, 3, 2, 0)
     if points.ndim != 4 or points.shape[1:3] != (2, len(names)):
         raise KeypointError(
             f"{path}: tracks: expected numbers [tracks, 2, {len(names)}, frames], got "
@@ -94,18 +97,21 @@ def _read_sleap(path: Path, file: Any) -> People:
     points = points.transpose(3, 0, 2, 1)
     scores = None
     if "point_scores" in file:
-        scores = _array(path, file["point_scores"]).astype(np.float64).transpose(2, 0, 1)
+        scores = _array(path, file["point_scores"]).astype(np.float64)
+        scores = scores if is_turned else scores.transpose(2, 0, 1)
     tracks = _texts(path, file["track_names"]) if "track_names" in file else []
     found = screened(points, scores)
-    frames = [
-        [
+    # From the video's first frame to the last one with somebody.
+    frames: Frames = {
+        place: [
             Person(joints, tracks[index] if index < len(tracks) else None)
             for index, joints in enumerate(people)
             if (joints[:, 2] > 0).any()
         ]
-        for people in found
-    ]
-    return People(frames, tuple(names), [f"format: SLEAP's analysis, {len(points[0])} tracks"])
+        for place, people in enumerate(found)
+    }
+    report = [f"format: SLEAP's analysis, {len(points[0])} tracks"]
+    return People(frames, tuple(names), report, first=0)
 
 
 def _read_pandas(path: Path, group: Any) -> People:
@@ -116,13 +122,12 @@ def _read_pandas(path: Path, group: Any) -> People:
         values = table[next(name for name in fields if name.startswith("values_block"))]
         axes = io.BytesIO(bytes(group.attrs["non_index_axes"]))  # a Python object
         columns = PlainUnpickler(axes, encoding="latin1").load()[0][1]
-        index = table["index"]
+        index = table["index"].tolist()
     else:
-        values, index = _array(path, group["block0_values"]), _array(path, group["axis1"])
-        levels = sorted(key for key in group if key.startswith("axis0_level"))
-        labels = (_array(path, group[key.replace("level", "label")]) for key in levels)
-        texts = (np.array(_texts(path, group[key])) for key in levels)
-        columns = zip(*(t[label] for t, label in zip(texts, labels, strict=True)), strict=True)
+        values, columns = _array(path, group["block0_values"]), _levels(path, group, "axis0")
+        # Of labelled pictures the last level is the name.
+        pictures = [row[-1] for row in _levels(path, group, "axis1")]
+        index = pictures or _array(path, group["axis1"]).tolist()
     # Scorer, individual where there are several, body part and kind.
     columns = [tuple(map(str, column)) for column in columns]
     several = len(columns[0]) > 3
@@ -135,8 +140,23 @@ def _read_pandas(path: Path, group: Any) -> People:
             joints[:, place, names.index(name), _KINDS.index(kind)] = values[:, number]
     found = screened(joints[..., :2], joints[..., 2])
     frames: Frames = {
-        int(key): [Person(p, w or None) for p, w in zip(people, who, strict=True) if is_there(p)]
-        for key, people in zip(index.tolist(), found, strict=True)
+        key: [Person(p, w or None) for p, w in zip(people, who, strict=True) if is_there(p)]
+        for key, people in zip(map(_key, index), found, strict=True)
     }
     report = [f"format: DeepLabCut, {len(who)} individual{'s' * (len(who) > 1)}"]
     return People(frames, tuple(names), report, first=0)
+
+
+def _levels(path: Path, group: Any, axis: str) -> list[tuple[str, ...]]:
+    """The names along an axis that has several levels; none where it has one."""
+    levels = sorted(key for key in group if key.startswith(f"{axis}_level"))
+    labels = (_array(path, group[key.replace("level", "label")]) for key in levels)
+    texts = (np.array(_texts(path, group[key])) for key in levels)
+    return [*zip(*(t[label] for t, label in zip(texts, labels, strict=True)), strict=True)]
+
+
+def _key(index: float | bytes | str) -> int | str:
+    """A frame's number, or the name of its picture."""
+    if isinstance(index, bytes):
+        return index.decode()
+    return index if isinstance(index, str) else int(index)

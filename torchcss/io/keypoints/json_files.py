@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +20,14 @@ import numpy as np
 
 from torchcss.errors import KeypointError
 from torchcss.files import load_json, read_text, shortened
+from torchcss.io.keypoints.arrays import read_arrays
 from torchcss.io.keypoints.clicked import is_clicked, read_clicked
 from torchcss.io.keypoints.coco import read_coco
-from torchcss.io.keypoints.frames import plain_name
+from torchcss.io.keypoints.frames import files_of, in_seconds, plain_name
 from torchcss.io.keypoints.json_people import (
     JOINTS,
     PEOPLE,
+    heads,
     is_joints,
     listed,
     people_of,
@@ -33,7 +35,6 @@ from torchcss.io.keypoints.json_people import (
 )
 from torchcss.io.keypoints.mediapipe import LAYOUT, NUM_LANDMARKS, landmark_order, reordered
 from torchcss.io.keypoints.people import (
-    FRAME_NAMES,
     Frames,
     Key,
     Names,
@@ -41,10 +42,11 @@ from torchcss.io.keypoints.people import (
     Person,
     Size,
     is_there,
+    numbers,
     united,
 )
+from torchcss.io.keypoints.words import FRAMES, NAMES, PICTURES, TIMES, first_of, plain_word
 from torchcss.io.video import natural_order
-from torchcss.joint_names import names_in
 
 _FORMATS = {
     "pose_keypoints_2d": "OpenPose", "pose_keypoints": "OpenPose", "bodies": "AlphaPose",
@@ -55,12 +57,6 @@ _FORMATS = {
 """Whose a file is, by a word in it."""
 
 _FRAMES = ("frames", "instance_info", "results", "data")
-_PICTURES = names_in(
-    "image_id file_name filename image image_name img_name image_path imagePath frame_name"
-)
-_TIMES = {"timestamp_ms": 1e-3, "time_ms": 1e-3, "timestamp_us": 1e-6, "time_s": 1.0,
-          "timestamp": None, "time": None, "t": None}  # fmt: skip
-"""Words for a time, and its unit in seconds, where the word says it."""
 
 
 def read_json(path: Path, image_size_wh: Size, num_frames: int | None) -> People:
@@ -75,6 +71,8 @@ def read_json(path: Path, image_size_wh: Size, num_frames: int | None) -> People
         KeypointError: If it is none of the formats; the message says where.
     """
     content = _load(path)
+    if (array := _five_deep(content)) is not None:
+        return read_arrays(path, {path.name: array})
     if isinstance(content, dict):
         if "annotations" in content:
             return read_coco(content)
@@ -97,21 +95,26 @@ def read_folder(path: Path) -> People:
     Raises:
         KeypointError: If there is none, or one is none of the formats.
     """
-    files = sorted(path.glob("*.json"), key=lambda entry: natural_order(entry.name))
+    files = sorted(files_of(path, ".json"), key=lambda entry: natural_order(entry.name))
+    contents = [_load(file) for file in files]
+    name = _format_of(contents[0])
+    sizes = {said_size(content) for content in contents}
+    if len(sizes - {None}) > 1:
+        raise KeypointError("pictures of several sizes; expected those of one video")
+    # Who labels pictures may call the files otherwise than the pictures.
+    said = [first_of(each, PICTURES) if isinstance(each, dict) else None for each in contents]
+    keys = [plain_name(each) for each in said if isinstance(each, str)]
+    if len(set(keys)) < len(files):
+        keys = [plain_name(file.name) for file in files]
     found: Frames = {}
-    size, name = None, "OpenPose"
-    for file in files:
-        content = _load(file)
-        name = _format_of(content) if file is files[0] else name
-        size = size or said_size(content)
-        key = plain_name(file.name)
+    for file, key, content in zip(files, keys, contents, strict=True):
         if key in found:
             raise KeypointError(f"{file}: a second file of the frame {key}; expected one for each")
         found[key] = people_of(str(file), content)
     frames, names = united(found)
     people = _people(f"{name}, {len(files)} files", frames, names)
     # A labelled picture has a file; of a video every frame has one.
-    return people._replace(whole=name != "labelme", size_wh=size)
+    return people._replace(whole=name != "labelme", size_wh=max(sizes, key=bool))
 
 
 def _people(name: str, frames: Frames, names: Names | None, *, in_order: bool = False) -> People:
@@ -130,15 +133,26 @@ def _people(name: str, frames: Frames, names: Names | None, *, in_order: bool = 
     return People(found, names, [f"format: {name}"])
 
 
+def _five_deep(content: object) -> np.ndarray | None:
+    """What MoveNet returns, `[T 1 1 17 3]`, if it is that."""
+    inner, depth = content, 0
+    while isinstance(inner, list) and inner and depth < 5:
+        inner, depth = inner[0], depth + 1
+    return numbers(content, "MoveNet's") if depth == 5 and isinstance(inner, float) else None
+
+
 def _load(path: Path) -> Any:
-    """The content of a JSON file, or of one object in every line."""
+    """The content of a JSON file, or of one object in every line or text."""
     try:
-        return load_json(path, KeypointError)
+        content = load_json(path, KeypointError)
+        if not isinstance(content, list) or not all(isinstance(each, str) for each in content):
+            return content
+        lines = content
     except KeypointError as error:
         if "Extra data" not in str(error):
             raise
-    try:
         lines = read_text(path, KeypointError).splitlines()
+    try:
         return [json.loads(line) for line in lines if line.strip()]
     except (ValueError, RecursionError) as error:
         raise KeypointError(f"{path}: not a JSON file, nor one object in every line") from error
@@ -163,12 +177,14 @@ def _format_of(content: object) -> str:
 
 
 def _said_names(content: object) -> Names | None:
-    """The joints' names that MMPose writes in the head."""
-    head = content.get("meta_info") if isinstance(content, dict) else None
-    names = head.get("keypoint_id2name") if isinstance(head, dict) else None
-    if not isinstance(names, dict) or not all(str(i) in names for i in range(len(names))):
-        return None
-    return tuple(str(names[str(i)]) for i in range(len(names)))
+    """The joints' names that stand in the head, as a list or by number, as MMPose writes them."""
+    for head in heads(content):
+        names = first_of(head, NAMES)
+        if isinstance(names, dict) and all(str(i) in names for i in range(len(names))):
+            names = [names[str(i)] for i in range(len(names))]
+        if isinstance(names, list) and names and all(isinstance(each, str) for each in names):
+            return tuple(names)
+    return None
 
 
 # Frames.
@@ -182,7 +198,10 @@ def _frames(path: Path, content: Any, num_frames: int | None) -> list[list[Perso
         )
         if inner is not None:
             return _frames(path, inner, num_frames)
-        if content.keys() & {*PEOPLE, *JOINTS, "shapes"}:
+        inner = next((content[k] for k in (*PEOPLE, *JOINTS) if k in content), None)
+        if isinstance(inner, list) and 1 < len(inner) == num_frames and not is_joints(inner):
+            return _frames(path, inner, num_frames)
+        if inner is not None or "shapes" in content:
             return [people_of(str(path), content)]
         if content and all(isinstance(value, (dict, list)) for value in content.values()):
             found = {key: people_of(f"{path}: {key}", value) for key, value in content.items()}
@@ -207,7 +226,10 @@ def _frames(path: Path, content: Any, num_frames: int | None) -> list[list[Perso
                 f"others have, found {shortened(entry)}"
             )
         found.setdefault(key, []).extend(people_of(f"{path}: {key!r}", entry, alone=True))
-    return _in_seconds(content, found)
+    if not all(isinstance(key, float) for key in found):
+        return found
+    words = {plain_word(key) for key in content[0]}
+    return in_seconds(next(TIMES[word] for word in TIMES if word in words), found)
 
 
 def _key_of(where: str, entry: object) -> Key | None:
@@ -216,29 +238,18 @@ def _key_of(where: str, entry: object) -> Key | None:
         return None
     if not isinstance(entry.get("image_id", 0), (int, str)):
         raise KeypointError(f"{where}: expected an image_id, found {shortened(entry['image_id'])}")
-    for name in FRAME_NAMES:
-        value = entry.get(name)
-        if isinstance(value, int) and not isinstance(value, bool):
-            return value
-        if isinstance(value, str) and re.fullmatch("[0-9]{1,9}", value):
-            return int(value)
-    for name in _TIMES:
-        value = entry.get(name)
-        if isinstance(value, (int, float)) and not isinstance(value, bool):
-            return float(value)
-    return next((entry[name] for name in _PICTURES if isinstance(entry.get(name), str)), None)
-
-
-def _in_seconds(entries: Sequence[Any], found: Frames) -> Frames:
-    """Times in seconds; where the word does not say the unit, no frame lasts a second."""
-    if not all(isinstance(key, float) for key in found):
-        return found
-    word = next(name for name in _TIMES if name in entries[0])
-    unit = _TIMES[word]
-    if unit is None:
-        gap = float(np.diff(np.sort(np.array(list(found), float))).min(initial=np.inf))
-        unit = 1.0 if gap < 1 or not np.isfinite(gap) else 1e-3 if gap < 1000 else 1e-6
-    return {unit * float(key): people for key, people in found.items()}
+    counts = {
+        k: v for k, v in entry.items() if isinstance(v, (int, float)) and not isinstance(v, bool)
+    }
+    texts = {k: v for k, v in entry.items() if isinstance(v, str)}
+    frame = first_of(counts, FRAMES)
+    if frame is not None and float(frame).is_integer():
+        return int(frame)
+    counted = first_of({k: v for k, v in texts.items() if re.fullmatch("[0-9]{1,9}", v)}, FRAMES)
+    if counted is not None:
+        return int(counted)
+    time = first_of(counts, tuple(TIMES))
+    return float(time) if time is not None else first_of(texts, PICTURES)
 
 
 def _read_vitpose(path: Path, content: Mapping[str, Any]) -> People:

@@ -17,20 +17,15 @@ import numpy as np
 
 from torchcss.errors import KeypointError
 from torchcss.files import shortened
-from torchcss.io.keypoints.people import CONFIDENCE_NAMES, Person, numbers, screened, track_of
+from torchcss.io.keypoints.people import LAYOUT_SIZES, Person, numbers, screened, track_of
+from torchcss.io.keypoints.words import CONFIDENCES, SCORES, SIDES, SIZES, first_of
 from torchcss.joint_names import names_in
 
 PEOPLE = names_in("people bodies instances predictions annots poses persons detections")
 JOINTS = names_in(
     "pose_keypoints_2d pose_keypoints keypoints pose_landmarks landmarks landmark joints pose kps"
 )
-_SCORES = names_in("keypoint_scores keypoints_scores scores confidences keypoints_conf")
-_SIZES = (
-    ("canvas_width", "canvas_height"),
-    ("imageWidth", "imageHeight"),
-    ("image_width", "image_height"),
-    ("width", "height"),
-)
+_HEADS = names_in("meta_info metadata meta info header video video_info image")
 
 
 def people_of(where: str, value: Any, *, alone: bool = False) -> list[Person]:
@@ -60,8 +55,10 @@ def people_of(where: str, value: Any, *, alone: bool = False) -> list[Person]:
             if isinstance(inner, list) and inner and not is_joints(inner) and not _flat(inner):
                 return people_of(f"{where}: {key}", inner)
             return one_person(f"{where}: {key}", inner, value)
-        if all(is_joints([each]) for each in value.values()):
-            return one_person(where, value)
+        named = {key: each for key, each in value.items() if is_joints([each])}
+        rest = [each for key, each in value.items() if key not in named]
+        if named and not any(isinstance(each, (list, dict)) for each in rest):
+            return one_person(where, named, value)
         if alone or not all(isinstance(each, (list, dict)) for each in value.values()):
             raise KeypointError(f"{where}: expected keypoints, found {shortened(list(value))}")
         # By the people's own numbers.
@@ -102,7 +99,8 @@ def one_person(where: str, value: Any, around: Mapping[str, Any] | None = None) 
     if isinstance(value, dict):
         if isinstance(value.get("x"), list):  # a list of x, of y, of confidences
             columns = [value["x"], value.get("y")]
-            columns += [value[key] for key in CONFIDENCE_NAMES if key in value][:1]
+            given = first_of(value, CONFIDENCES)
+            columns += [] if given is None else [given]
             value = [list(row) for row in zip(*map(listed, columns), strict=False)]
         else:
             names, value = list(value), list(value.values())
@@ -110,7 +108,7 @@ def one_person(where: str, value: Any, around: Mapping[str, Any] | None = None) 
         return []
     if not isinstance(value, list):
         raise KeypointError(f"{where}: expected numbers, found {shortened(value)}")
-    scores = next((around[key] for key in _SCORES if key in around), None)
+    scores = first_of({k: each for k, each in around.items() if isinstance(each, list)}, SCORES)
     while isinstance(scores, list) and scores and isinstance(scores[0], list):
         scores = [each[0] if isinstance(each, list) and each else each for each in scores]
     if _flat(value) or value[0] is None:
@@ -132,7 +130,9 @@ def listed(value: object) -> list[Any]:
 
 def _in_a_row(where: str, values: np.ndarray, scores: object) -> np.ndarray:
     """Joints from a row of triples, or of pairs with their confidences beside it."""
-    pairs = isinstance(scores, list) and values.size == 2 * len(scores)
+    triples = values.size % 3 == 0 and values.size // 3 in LAYOUT_SIZES
+    alone = not triples and values.size % 2 == 0 and values.size // 2 in LAYOUT_SIZES
+    pairs = values.size == 2 * len(scores) if isinstance(scores, list) else alone
     if not values.size or values.size % (2 if pairs else 3):
         raise KeypointError(
             f"{where}: expected x, y, confidence for every joint in one list, found "
@@ -162,7 +162,7 @@ def _row(where: str, row: Any) -> list[float]:
         place = row.get("position", row)
         if not isinstance(place, dict) or not {"x", "y"} <= place.keys():
             raise KeypointError(f"{where}: expected x, y and visibility, found {shortened(row)}")
-        given = next((row[key] for key in CONFIDENCE_NAMES if row.get(key) is not None), None)
+        given = first_of(row, CONFIDENCES)
         row = [place["x"], place["y"], given]
     elif isinstance(row, list) and len(row) == 4:
         row = [row[0], row[1], row[3]]  # x, y, z, visibility
@@ -193,14 +193,23 @@ def _labelme(where: str, shapes: object) -> list[Person]:
     ]
 
 
+def heads(content: object) -> list[dict[str, Any]]:
+    """What a file says of itself: in its outermost object, and in one that is called so."""
+    if not isinstance(content, dict) or "x" in content:  # a box
+        return []
+    inner = (each for key, each in content.items() if key in _HEADS)
+    return [content, *(each for each in inner if isinstance(each, dict))]
+
+
 def said_size(content: object) -> tuple[float, float] | None:
-    """The size of the image that a file names."""
+    """The size of the image that a file names, in its head or its first entry."""
     if isinstance(content, list) and content:
         content = content[0]
-    if not isinstance(content, dict) or "x" in content:  # of a box
-        return None
-    for keys in _SIZES:
-        width, height = (content.get(key) for key in keys)
-        if isinstance(width, int) and isinstance(height, int) and min(width, height) > 0:
-            return float(width), float(height)
+    for head in heads(content):
+        size = first_of(head, SIZES)
+        sizes = [size if isinstance(size, list) else []]
+        sizes += [[first_of(head, (side,)) for side in pair] for pair in SIDES]
+        for pair in sizes:
+            if len(pair) == 2 and all(isinstance(n, (int, float)) and n > 0 for n in pair):
+                return float(pair[0]), float(pair[1])
     return None

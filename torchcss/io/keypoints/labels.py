@@ -13,7 +13,7 @@ import numpy as np
 
 from torchcss.errors import KeypointError
 from torchcss.files import read_text, shortened
-from torchcss.io.keypoints.frames import plain_name
+from torchcss.io.keypoints.frames import files_of, plain_name
 from torchcss.io.keypoints.people import Frames, People, Person, Size, screened
 
 _BOX = 5
@@ -26,7 +26,7 @@ def read_labels(folder: Path, image_size_wh: Size) -> People:
     Raises:
         KeypointError: If a line is none; the message names it.
     """
-    files = [file for file in sorted(folder.glob("*.txt")) if file.name != "classes.txt"]
+    files = [file for file in files_of(folder, ".txt") if file.name != "classes.txt"]
     frames: Frames = {}
     for file in files:
         lines = read_text(file, KeypointError).splitlines() if file.stat().st_size else []

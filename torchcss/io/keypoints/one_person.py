@@ -32,7 +32,10 @@ class Whom(NamedTuple):
         Raises:
             KeypointError: If nobody is called so.
         """
-        middles = np.array([_middle(p) if p.any() else (0, 0) for p in people])
+        there = [(person[:, 2] > 0.0).any() for person in people]
+        middles = np.array(
+            [_middle(p) if seen else (np.inf,) * 2 for p, seen in zip(people, there, strict=True)]
+        )
         away = np.linalg.norm(middles - 0.5 * np.array(self.image_size_wh), axis=1)
         ranks = {
             "prominent": [-person[:, 2].sum() * size_of(person) for person in people],

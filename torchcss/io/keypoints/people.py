@@ -10,28 +10,17 @@ from jaxtyping import Float
 
 from torchcss.errors import KeypointError
 from torchcss.files import real_numbers, shortened
-from torchcss.joint_names import names_in
-
-FRAME_NAMES = names_in(
-    "frame frame_number frame_index frame_idx frame_id frame_no frame_num frameid image_id"
-)
-"""What files call the number of a frame."""
-
-CONFIDENCE_NAMES = names_in(
-    "confidence conf c score keypoint_score likelihood p prob probability visibility visible vis v "
-    "presence"
-)
-"""What files call the confidence of a joint, the best first where there are several."""
-
-TRACK_NAMES = names_in("track_id track idx id_ person_id personID person tracking_id individual id")
-"""What files call that by which a person is known again in another frame."""
+from torchcss.io.keypoints.words import TRACKS, first_of, track_text
+from torchcss.joint_names import ALIASES
 
 Key = int | float | str
 """The number of a frame, its time in seconds, or the name of its picture."""
 
-
 Names = tuple[str, ...]
 """Names of joints, in their order."""
+
+LAYOUT_SIZES = frozenset(map(len, ALIASES.values()))
+"""How many joints people have."""
 
 Size = tuple[int, int]
 """Width and height of an image in pixels."""
@@ -130,11 +119,11 @@ def screened(
 
     Args:
         places: u and v; NaN where there is none.
-        confidence: Of each; NaN or None where the file does not say: 1, but at (0, 0), which is
-            how many programs write what is not there, 0.
+        confidence: Of each; NaN or None where the file does not say: 1, but at (0, 0) or (-1, -1),
+            which is how many programs write what is not there, 0.
     """
     given = np.broadcast_to(np.nan if confidence is None else confidence, places.shape[:-1])
-    assumed = (places != 0).any(-1).astype(np.float64)
+    assumed = ((places != 0).any(-1) & (places != -1).any(-1)).astype(np.float64)
     given = np.where(np.isnan(given), assumed, given)[..., None]
     seen = ~np.isnan(places).any(-1, keepdims=True)
     return np.where(seen, np.concatenate([places, given], axis=-1), 0.0)
@@ -145,13 +134,11 @@ def is_there(joints: Float[np.ndarray, "j 3"]) -> bool:
     return bool((np.nan_to_num(joints[:, 2]) > 0).any() or np.isfinite(joints[:, :2]).any())
 
 
-def track_of(entry: Mapping[str, object], names: Sequence[str] = TRACK_NAMES) -> str | None:
+def track_of(entry: Mapping[str, object], names: Sequence[str] = TRACKS) -> str | None:
     """By what a file knows a person again, out of what it says of him."""
-    for name in names:
-        value = entry.get(name)
-        while isinstance(value, list) and len(value) == 1:
-            value = value[0]
-        if isinstance(value, (int, float, str)) and not isinstance(value, bool):
-            text = str(value)
-            return None if text in ("-1", "") else text
-    return None
+    value = first_of(entry, names)
+    while isinstance(value, list) and len(value) == 1:
+        value = value[0]
+    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
+        return None
+    return track_text(value)

@@ -38,11 +38,11 @@ import numpy as np
 import torch
 
 from torchcss.errors import KeypointError
-from torchcss.files import StrPath, load_array, load_arrays, naming, shortened
+from torchcss.files import StrPath, load_array, load_arrays, naming, read_text, shortened
 from torchcss.io.keypoints.arrays import read_arrays
 from torchcss.io.keypoints.cvat import read_cvat
 from torchcss.io.keypoints.findings import findings
-from torchcss.io.keypoints.frames import Film, in_order, wrong_count
+from torchcss.io.keypoints.frames import Film, files_of, in_order, wrong_count
 from torchcss.io.keypoints.h36m import is_h36m, read_h36m
 from torchcss.io.keypoints.hdf5 import read_hdf5
 from torchcss.io.keypoints.json_files import read_folder, read_json
@@ -221,7 +221,9 @@ def _read(path: Path, image_size_wh: Size, num_frames: int | None) -> People:
         return read_arrays(path, load_arrays(path, KeypointError))
     if suffix == ".npy":
         return read_arrays(path, {path.name: load_array(path, KeypointError)})
-    if suffix in (".csv", ".tsv"):
+    if suffix in (".csv", ".tsv") or (
+        suffix == ".txt" and read_text(path, KeypointError).lstrip()[:1] not in ("{", "[")
+    ):
         return read_table(path)
     if suffix in (".h5", ".hdf5", ".slp"):
         return read_hdf5(path)
@@ -237,9 +239,9 @@ def _read(path: Path, image_size_wh: Size, num_frames: int | None) -> People:
 
 def _read_folder(path: Path, image_size_wh: Size) -> People:
     """A file for every frame; or a folder of one camera's folder of them."""
-    if next(path.glob("*.json"), None) is not None:
+    if files_of(path, ".json"):
         return read_folder(path)
-    if next(path.glob("*.txt"), None) is not None:
+    if files_of(path, ".txt"):
         return read_labels(path, image_size_wh)
     folders = sorted(entry.name for entry in path.iterdir() if entry.is_dir())
     if len(folders) == 1:

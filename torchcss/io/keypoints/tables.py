@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -27,34 +28,36 @@ import numpy as np
 
 from torchcss.errors import KeypointError
 from torchcss.files import read_text, shortened
+from torchcss.io.keypoints.frames import in_seconds
 from torchcss.io.keypoints.mediapipe import LAYOUT, NUM_LANDMARKS, landmark_order, reordered
-from torchcss.io.keypoints.people import (
-    CONFIDENCE_NAMES,
-    FRAME_NAMES,
-    Frames,
-    Key,
-    People,
-    Person,
-    screened,
+from torchcss.io.keypoints.people import Frames, Key, People, Person, screened
+from torchcss.io.keypoints.words import (
+    CONFIDENCES,
+    FRAMES,
+    PICTURES,
+    TIMES,
+    TRACKS,
+    first_of,
+    plain_word,
+    track_text,
 )
-from torchcss.joint_names import names_in
+from torchcss.joint_names import CASE, names_in
 
 _PARTS = {
     **dict.fromkeys(("x", "u"), 0),
-    **dict.fromkeys(("y", "v_px"), 1),
-    **dict.fromkeys(CONFIDENCE_NAMES, 2),
+    "y": 1,
+    **dict.fromkeys(CONFIDENCES, 2),
     **dict.fromkeys(("z", "presence"), 3),
 }
 """What a column's name says that it is: 0, 1 coordinates, 2 confidence, 3 not used."""
 
-_JOINTS = names_in(
-    "landmark landmark_id landmark_name landmark_index joint joint_name joint_id bodypart keypoint "
-    "name id index"
-)
-_TRACKS = names_in("track track_id track_name person person_id individual individuals")
-_TIMES = {"timestamp_ms": 1e-3, "time_ms": 1e-3, "timestamp_s": 1.0, "time_s": 1.0, "time": 1.0,
-          "timestamp": 1.0}  # fmt: skip
-"""Columns of times, in seconds unless the name says otherwise."""
+_UNITS = frozenset(names_in("px pixel pixels pos position coord 2d"))
+_POINTS = r"((landmark|lm|joint|keypoint|kpt|kp|point|pose)(_|(?=[0-9])))+"
+_JOINTS = (
+    *(f"{of}{what}" for of in names_in("landmark joint keypoint kpt bodypart part node marker")
+      for what in ("", "id", "name", "index", "idx")),
+    *names_in("name label id index"),
+)  # fmt: skip
 
 _DECIMAL = re.compile(r"^(-?[0-9]*),([0-9]+(?:[eE][-+]?[0-9]+)?)$")
 
@@ -71,7 +74,7 @@ class _Columns(NamedTuple):
         frame: The column that numbers the frames; None: a frame is a row.
         joint: The column that names the joint, if the heading does not.
         track: The column that says who it is.
-        unit: Seconds, if the column `frame` holds times in that unit.
+        time: What the column `frame` is called, if it holds times.
     """
 
     parts: Mapping[tuple[str, str], Mapping[int, int]]
@@ -79,7 +82,7 @@ class _Columns(NamedTuple):
     frame: int | None
     joint: int | None = None
     track: int | None = None
-    unit: float | None = None
+    time: str | None = None
 
 
 def read_table(path: Path) -> People:
@@ -96,19 +99,33 @@ def read_table(path: Path) -> People:
         return People(frames, tuple(joints), report, first=0)
     if len(rows) == 1:
         raise KeypointError("row 1: a heading and nothing below it; get a complete copy")
-    columns = _headed(rows[0][1])
-    found = [rows[0][1][parts[2]] for parts in columns.parts.values() if 2 in parts]
+    heading = rows[0][1]
+    columns = _headed(heading)
+    if columns.frame is None and columns.joint is None and _counts(rows):
+        columns = columns._replace(frame=0)
+    used = {each for parts in columns.parts.values() for each in parts.values()}
+    found = [heading[parts[2]] for parts in columns.parts.values() if 2 in parts]
     report = ["no confidence in the file: 1 for every joint that has a place other than (0, 0)"]
     if found:
         report = [f"confidence: columns such as {found[0]}"]
+    others = {*range(columns.size)} - used - {columns.frame, columns.joint, columns.track}
+    if left := [heading[index] for index in sorted(others) if heading[index]]:
+        report.append(f"columns left out: {shortened(', '.join(left))}")
     joints, frames = _read_rows(columns, rows[1:])
+    if columns.time is not None:
+        frames = in_seconds(TIMES[columns.time], frames)
     order = landmark_order(joints)
-    if order is not None and len(joints) == NUM_LANDMARKS:
+    is_mediapipe = order is not None and len(joints) == NUM_LANDMARKS
+    if order is not None and is_mediapipe:
+        frames = reordered(frames, order)
+    in_order = columns.frame is None and columns.joint is None
+    people = list(frames.values()) if in_order else frames
+    if is_mediapipe:
         report.insert(0, "format: CSV of MediaPipe's landmarks")
-        return People(reordered(frames, order), None, report, LAYOUT, corner_fractions=True)
+        return People(people, None, report, LAYOUT, corner_fractions=True)
     report.insert(0, "format: CSV, a heading per column")
-    first = 0 if any(cell.lower() == "frame_idx" for cell in rows[0][1]) else None  # SLEAP's
-    return People(frames, None if order is not None else tuple(joints), report, first=first)
+    first = 0 if any(cell.lower() == "frame_idx" for cell in heading) else None  # SLEAP's
+    return People(people, None if order is not None else tuple(joints), report, first=first)
 
 
 def table_rows(path: Path) -> list[Row]:
@@ -118,12 +135,17 @@ def table_rows(path: Path) -> list[Row]:
         KeypointError: If there are none, or it is none.
     """
     text = read_text(path, KeypointError)
-    comma = max(",;\t", key=text.lstrip().partition("\n")[0].count)
+    text = re.sub(r"^sep=.\r?\n", "", text)  # for Excel
+    comma = max(",;\t", key=re.sub(r"\A(\s*# .*\n)*", "", text).lstrip().partition("\n")[0].count)
     try:
         lines = list(csv.reader(io.StringIO(text, newline=""), delimiter=comma))
     except csv.Error as error:
         raise KeypointError(f"{path}: cannot be read as CSV: {error}") from error
-    rows = [(n, [cell.strip() for cell in row]) for n, row in enumerate(lines, 1) if any(row)]
+    rows = [
+        (number, [cell.strip() for cell in row])
+        for number, row in enumerate(lines, start=1)
+        if any(row) and not row[0].startswith("# ")
+    ]
     if not rows:
         raise KeypointError(f"{path}: the file is empty")
     if comma == ",":
@@ -132,40 +154,60 @@ def table_rows(path: Path) -> list[Row]:
     return [(n, [_DECIMAL.sub(r"\1.\2", cell) for cell in row]) for n, row in rows]
 
 
+def _counts(rows: Sequence[Row]) -> bool:
+    """Whether the first column has no name and counts the rows, as pandas writes it."""
+    cells = [row[0] for _, row in rows[1:]]
+    if plain_word(rows[0][1][0]) not in ("", "unnamed0", "index") or not all(
+        re.fullmatch("[0-9]{1,9}", cell) for cell in cells
+    ):
+        return False
+    numbers = [int(cell) for cell in cells]
+    return all(one < other for one, other in itertools.pairwise(numbers))
+
+
 def _headed(heading: Sequence[str]) -> _Columns:
     """The columns of a table with one heading, long or wide."""
-    names = [re.sub(r"[\s.\-]+", "_", cell.lower()) for cell in heading]
-    frame, unit = _first_of(FRAME_NAMES, names), None
-    if frame is None and (frame := _first_of(tuple(_TIMES), names)) is not None:
-        unit = _TIMES[names[frame]]
-    joint, track = _first_of(_JOINTS, names), _first_of(_TRACKS, names)
-    if joint is not None and {"x", "y"} <= set(names):
-        parts = {_PARTS[name]: index for index, name in enumerate(names) if name in _PARTS}
-        return _Columns({("", ""): parts}, len(names), frame, joint, track, unit)
+    places = {cell: index for index, cell in reversed([*enumerate(heading)])}
+    words = {plain_word(cell) for cell in heading}
+    frame, time = first_of(places, FRAMES), None
+    if frame is None:
+        time = next((word for word in TIMES if word in words), None)
+        frame = first_of(places, PICTURES if time is None else (time,))
+    joint, track = first_of(places, _JOINTS), first_of(places, TRACKS)
+    split = [_split(cell) for cell in heading]
+    if not any(each is not None and each[1] == 1 for each in split):  # u and v
+        split = [_split(cell, {**_PARTS, "v": 1}) for cell in heading]
     columns: dict[tuple[str, str], dict[int, int]] = {}
-    for index, name in enumerate(names):
-        if (split := _split(name)) is not None:
-            own = columns.setdefault(("", split[0]), {})
-            if split[1] in own and split[1] != 3:
+    for index, each in enumerate(split):
+        if each is not None:
+            own = columns.setdefault(("", each[0]), {})
+            if each[1] in own and each[1] != 3 and each[0]:
                 raise KeypointError(f"row 1: column {heading[index]!r} is there twice")
-            own[split[1]] = index
+            own.setdefault(each[1], index)
     columns = {joint: parts for joint, parts in columns.items() if {0, 1} <= set(parts)}
+    if joint is not None and ("", "") in columns:
+        track = None if track == joint else track
+        return _Columns({("", ""): columns["", ""]}, len(heading), frame, joint, track, time)
+    columns.pop(("", ""), None)
     if not columns:
         raise KeypointError(
             f"row 1: expected DeepLabCut's headings, or columns such as nose_x and nose_y, "
             f"found {shortened(', '.join(heading))}"
         )
-    return _Columns(columns, len(names), frame, None, track, unit)
+    return _Columns(columns, len(heading), frame, None, track, time)
 
 
-def _split(name: str) -> tuple[str, int] | None:
+def _split(cell: str, kinds: Mapping[str, int] = _PARTS) -> tuple[str, int] | None:
     """Joint and kind of number of a column, whichever comes first in its name."""
-    if match := re.fullmatch(r"([a-z]+)_?([0-9]+)", name):  # x1, v33
-        return (match[2], _PARTS[match[1]]) if match[1] in _PARTS else None
-    for joint, part in (name.rpartition("_")[::2], name.partition("_")[::-2]):
-        if part in _PARTS and joint:
-            number = re.fullmatch(r"(?:landmark|lm|joint|keypoint|kp|point|pose)_?([0-9]+)", joint)
-            return (number[1] if number else joint), _PARTS[part]
+    words = [word for word in re.split(r"[^a-z0-9]+", re.sub(CASE, " ", cell).lower()) if word]
+    words = [word for word in words if word not in _UNITS]
+    if match := re.fullmatch(r"([a-z]+)_?([0-9]+)", "_".join(words)):  # x1, v33
+        return (match[2], kinds[match[1]]) if match[1] in kinds else None
+    for part, joint in (
+        (words[-2:], words[:-2]), (words[-1:], words[:-1]), (words[:1], words[1:])
+    ):  # fmt: skip
+        if "".join(part) in kinds:
+            return re.sub(f"^{_POINTS}(?=.)", "", "_".join(joint)), kinds["".join(part)]
     return None
 
 
@@ -206,13 +248,15 @@ def _read_rows(columns: _Columns, body: Sequence[Row]) -> tuple[list[str], Frame
     found: dict[Key, dict[str, dict[str, list[float]]]] = {}
     for index, (row, cells) in enumerate(body):
         where = f"row {row}"
+        if not any(cells[columns.size :]):
+            cells = cells[: columns.size]
         if len(cells) != columns.size:
             raise KeypointError(
                 f"{where}: expected {columns.size} columns, as the heading has, found "
                 f"{len(cells)}; get a complete copy"
             )
         place = _place(where, columns, cells, index)
-        track = "" if columns.track is None else cells[columns.track]
+        track = "" if columns.track is None else track_text(cells[columns.track]) or ""
         for (person, joint), parts in columns.parts.items():
             # Of a wide table every row is a person of its own.
             person = person or track or ("" if columns.joint is not None else f"row {row}")
@@ -242,8 +286,8 @@ def _place(where: str, columns: _Columns, cells: Sequence[str], index: int) -> K
     if columns.frame is None:
         return index if columns.joint is None else 0
     cell = cells[columns.frame]
-    if columns.unit is not None:
-        return columns.unit * _number(where, cell)
+    if columns.time is not None:
+        return _number(where, cell)
     if not re.fullmatch(r"[0-9.-]*", cell):
         return cell  # of labelled frames the picture's name
     match = re.fullmatch(r"(?:.*\.)?([0-9]{1,9})(?:\.0*)?", cell)
@@ -262,8 +306,3 @@ def _number(where: str, cell: str) -> float:
     except ValueError:
         pass
     raise KeypointError(f"{where}: expected a number, found {shortened(cell)}")
-
-
-def _first_of(wanted: Sequence[str], names: Sequence[str]) -> int | None:
-    """Where the first of some words stands among the columns."""
-    return next((names.index(name) for name in wanted if name in names), None)

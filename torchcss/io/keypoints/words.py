@@ -1,0 +1,89 @@
+"""What files of 2D joints call things: one table for tables, JSON and arrays.
+
+Words are compared without case and separators: `Frame Idx`, `frame_idx` and `frameIdx` are one.
+Call `first_of`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from typing import TypeVar
+
+from torchcss.joint_names import names_in
+
+Value = TypeVar("Value")
+
+FRAMES = names_in(
+    "frame framenumber frameindex frameidx frameid frameno framenum framenr frames fnum nframe "
+    "frameids frameindices framenumbers videoframe frame# # imageid imgid"
+)
+"""The number of a frame."""
+
+TIMES: dict[str, float | None] = {
+    **dict.fromkeys(("timestampms", "timems", "ms", "milliseconds"), 1e-3),
+    **dict.fromkeys(("timestampus", "timeus"), 1e-6),
+    **dict.fromkeys(("timestamps", "times", "timesec", "timeseconds", "seconds", "sec"), 1.0),
+    **dict.fromkeys(("timestamp", "time", "t"), None),
+}
+"""A time, and its unit in seconds, where the word says it."""
+
+PICTURES = names_in(
+    "imageid filename image imagename imgname imagepath imagefile img file framename path picture"
+)
+"""The name of a frame's picture."""
+
+TRACKS = names_in(
+    "trackid track trackname tracking trackingid idx personid person personidx personname "
+    "individual individuals instanceid instance objectid subjectid subject playerid player pid tid "
+    "id"
+)
+"""That by which a person is known again in another frame."""
+
+CONFIDENCES = names_in(
+    "confidence conf confidencescore c score keypointscore kptscore likelihood p prob probability "
+    "certainty visibility visible vis v presence"
+)
+"""The confidence of a joint, the best first where there are several."""
+
+SCORES = (
+    *names_in("keypointscores keypointsscores scores confidences keypointsconf keypointconfidences "
+              "keypointsconfidence keypointconfidence keypointscore likelihoods"),
+    *CONFIDENCES,
+)  # fmt: skip
+"""The confidences of all joints together."""
+
+NAMES = names_in(
+    "jointnames keypointnames keypointid2name keypointsnames nodenames landmarknames bodyparts "
+    "names labels joints keypoints"
+)
+"""The names of the joints in their order."""
+
+SIZES = names_in("imagesizewh imagesize imgsize resolution videosize framesize")
+"""Width and height in this order."""
+
+SIDES = tuple(
+    (f"{of}width", f"{of}height")
+    for of in ("canvas", "image", "video", "frame", "img", "original", "")
+)
+"""Width and height by themselves."""
+
+
+@lru_cache(4096)
+def plain_word(word: str) -> str:
+    """A word in small letters, without what parts it."""
+    return re.sub(r"[^a-z0-9#]", "", word.lower())
+
+
+def first_of(entry: Mapping[str, Value], words: Sequence[str]) -> Value | None:
+    """What stands under the first of some words that is there, and is not None."""
+    known = [(plain_word(key), value) for key, value in entry.items() if value is not None]
+    found = dict(reversed(known))
+    return next((found[word] for word in words if word in found), None)
+
+
+def track_text(value: float | str) -> str | None:
+    """By what a person is known again, as text; None: the file does not know him."""
+    text = re.sub(r"\.0*$", "", str(value))
+    return None if text in ("-1", "", "nan") else text
