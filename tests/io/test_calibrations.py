@@ -213,6 +213,7 @@ def table(name: str, t: list[float], more: str = "") -> str:
         ([-790.0, 155.0, 2510.0], True, 0.001, "millimetres"),
         ([-0.79, 0.155, 2.51], True, 1.0, None),
         ([-7.9, 1.55, 25.1], False, None, "unknown unit"),
+        ([-79.0, 15.5, 251.0], False, None, "unknown unit"),
     ],
 )
 def test_unit_of_anipose(
@@ -326,3 +327,73 @@ def test_a_folder_of_openposes(tmp_path: Path) -> None:
         text = text.replace("distortion_coefficients", "Distortion")
         (tmp_path / f"{name}.xml").write_text(text)
     assert set(read_cameras(tmp_path)) == {"1", "2"}
+
+
+@pytest.mark.parametrize("key", ["dist_coefs", "distCoeffs", "Distortion_Coefficients", "kc"])
+def test_coefficients_by_any_usual_name(tmp_path: Path, key: str) -> None:
+    """Tutorials and versions spell them in many ways; a lens is never left out for it."""
+    np.savez(tmp_path / "a.npz", mtx=K, image_size=SIZE, rvecs=np.zeros(3), **{key: [LENS]})
+    check(tmp_path / "a.npz")
+    content = {"Camera_Matrix": K, key: LENS, "image_Width": 640, "image_Height": 480}
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    check(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize(
+    "size",
+    [{"imageSize": [640, 480]}, {"resolution": {"width": 640, "height": 480}}, {"cols": 640,
+     "rows": 480}, {"image_shape": [480, 640, 3]}, {"resolution": "640x480"}],
+)  # fmt: skip
+def test_sizes_by_any_usual_name(tmp_path: Path, size: dict[str, Any]) -> None:
+    cameras = [{"camera_id": name, "K": K, "dist": LENS, **size} for name in "ab"]
+    (tmp_path / "a.json").write_text(json.dumps(cameras))
+    check(tmp_path / "a.json", name="b")
+    (tmp_path / "a.json").write_text(json.dumps([cameras[0]] * 2))
+    with pytest.raises(CameraError, match="two cameras of one name"):
+        load_camera(tmp_path / "a.json", "a")
+
+
+@pytest.mark.parametrize(
+    "model",
+    [{"model": "fisheye"}, {"camera_model": "OPENCV_FISHEYE"}, {"distortion_type": "KannalaBrandt"},
+     {"camera_model": "omni", "distortion_model": "radtan"}],
+)  # fmt: skip
+def test_fisheye_by_any_usual_name(tmp_path: Path, model: dict[str, Any]) -> None:
+    content = {"K": K, "D": LENS[:4], "width": 640, "height": 480, **model}
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    with pytest.raises(CameraError, match="fisheye"):
+        load_camera(tmp_path / "a.json")
+
+
+def test_sides_of_a_pair(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", mtxL=K, distL=LENS, mtxR=K, distR=[0] * 5, imageSize=SIZE)
+    check(tmp_path / "a.npz", name="L")
+
+
+def test_a_message_of_ros_ends_by_a_line(tmp_path: Path) -> None:
+    text = f"width: 640\nheight: 480\nk: {np.ravel(K).tolist()}\nd: {LENS}\n---\n"
+    (tmp_path / "a.yaml").write_text(2 * text)
+    check(tmp_path / "a.yaml")
+
+
+def test_colmaps_folders_and_matrices_in_other_files(tmp_path: Path) -> None:
+    folder = tmp_path / "sparse" / "0"
+    folder.mkdir(parents=True)
+    (folder / "cameras.txt").write_text(f"1 PINHOLE 640 480 {FX} {FY} {CX + 0.5} {CY + 0.5}\n")
+    check(tmp_path, lens=[0.0] * 5)
+    with VideoWriter(tmp_path / "a.mp4", 25) as film:
+        film.write(np.zeros((480, 640, 3), np.uint8))
+    np.save(tmp_path / "K.npy", K)
+    (tmp_path / "K.csv").write_text("\n".join(",".join(map(str, row)) for row in K))
+    for name in ("K.npy", "K.csv"):
+        check(tmp_path / name, lens=[0.0] * 5, video=tmp_path / "a.mp4")
+
+
+def test_pair_of_matlabs(tmp_path: Path) -> None:
+    matlab = pytest.importorskip("scipy.io")
+    camera = {"K": np.add(K, [[0, 0, 1], [0, 0, 1], [0, 0, 0]]), "ImageSize": [480, 640],
+              "RadialDistortion": [LENS[0], LENS[1], LENS[4]],
+              "TangentialDistortion": LENS[2:4]}  # fmt: skip
+    pair = {"CameraParameters1": camera, "CameraParameters2": camera}
+    matlab.savemat(tmp_path / "a.mat", {"errors": {"mean": 0.3}, "stereoParams": pair})
+    check(tmp_path / "a.mat", name="2")

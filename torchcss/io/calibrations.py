@@ -38,6 +38,7 @@ import yaml
 from torchcss.body.files.xml import parse_xml
 from torchcss.errors import BodyError, CameraError, MissingExtraError
 from torchcss.files import (
+    load_array,
     load_arrays,
     load_json,
     one_line,
@@ -46,6 +47,7 @@ from torchcss.files import (
     real_numbers,
     shortened,
 )
+from torchcss.io.keypoints.words import SIDES, SIZES, first_of, plain_word
 from torchcss.joint_names import names_in
 
 INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
@@ -80,32 +82,33 @@ class Entry(NamedTuple):
 
 _WORDS = {
     "K": names_in(
-        "K camera_matrix matrix intrinsic_matrix cameraMatrix mtx k M intrinsics "
-        "camera_intrinsics IntrinsicMatrix Intrinsics"
+        "k matrix cameramatrix cammatrix camatrix mtx cammtx cameramtx kmatrix intrinsicmatrix "
+        "intrinsicsmatrix m intrinsic intrinsics cameraintrinsic cameraintrinsics "
+        "cameraintrinsicmatrix calibrationmatrix"
     ),
-    "distortion": names_in(
-        "distortion distortions distortion_coefficients distortion_coeffs dist_coeffs dist_coeff "
-        "distCoeffs distCoef dist D d coeffs Distortion"
-    ),
-    "rotation": names_in("R rotation Rot rvec rotation_matrix"),
-    "translation": names_in("t translation T tvec"),
-    "image_size_wh": names_in("image_size_wh size resolution image_size img_size image_shape_wh"),
-}
-"""What a camera's numbers are called, the first that is there."""
+    "rotation": names_in("r rotation rot rvec rotationmatrix rotationvector"),
+    "translation": names_in("t translation tvec translationvector"),
+}  # fmt: skip
+"""What a camera's numbers are called (`torchcss.io.keypoints.words`), the first that is there."""
+
+_DISTORTION = re.compile("(lens)?dist(?!ance)|(d|kc|coeffs)$")
+"""How the name of a lens's coefficients begins, or all of it."""
 
 _ONE_BY_ONE = (("fx", "fy", "cx", "cy"), ("fx", "fy", "ppx", "ppy"), ("fl_x", "fl_y", "cx", "cy"))
 """What the numbers of K are called where each has a name; the last are Nerfstudio's."""
 
-_NUMBERED = names_in("M K camera_matrix cameraMatrix mtx")
-"""What a matrix is called that the number of its camera follows."""
-
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
-_SHAPES = ("img_shape", "image_shape", "ImageSize")
-"""What height and width are called where they are given in this order."""
+_SHAPES = ("img_shape", "image_shape", "ImageSize", "shape")
+"""What height and width are called where they are given in this order; the third is MATLAB's."""
 
-_SIZES = (("image_width", "image_height"), ("width", "height"), ("w", "h"), ("W", "H"))
-_FISHEYE = names_in("equidistant fisheye kannala_brandt omni ds eucm fov")
+_SIDES = (*SIDES, ("w", "h"), ("cols", "rows"))
+_NAMES = names_in("name cameraname cameraid camid id serial serialnumber")
+_MODELS = names_in(
+    "distortionmodel cameramodel model cameratype distortiontype lensmodel lens lenstype "
+    "projection type"
+)
+_FISHEYE = re.compile("equidist|fish_?eye|kannala|omni|eucm|fov|^ds$|^ds-|-ds$", re.IGNORECASE)
 
 _MOST_MATLAB = 2**26
 """Bytes of the largest calibration of MATLAB's, unpacked; they hold the pictures' corners too."""
@@ -137,7 +140,9 @@ def read_entries(path: Path) -> dict[str, Entry]:
     """
     suffix = path.suffix.lower()
     if path.is_dir():
-        inner = next((path / n for n in (INTRINSICS, *_OF_COLMAP) if (path / n).is_file()), None)
+        places = [path / n for n in (INTRINSICS, *_OF_COLMAP)]
+        places += [path / inner / n for inner in ("sparse/0", "0", "sparse") for n in _OF_COLMAP]
+        inner = next((place for place in places if place.is_file()), None)
         files = sorted(path.glob("*.xml")) if inner is None else [inner]
         if not files:
             names = ", ".join((INTRINSICS, *_OF_COLMAP))
@@ -149,8 +154,10 @@ def read_entries(path: Path) -> dict[str, Entry]:
         return _read_toml(path)
     if suffix == ".bin":
         return _colmap_entries(_binary_colmap(path))
-    if suffix == ".txt":
+    if suffix in (".txt", ".csv"):
         return _read_text(path)
+    if suffix == ".npy":
+        return _alone(path, {"K": load_array(path, CameraError).tolist()})
     if suffix == ".xml":
         return _alone(path, _opencv_xml(path))
     if suffix == ".npz":
@@ -166,27 +173,41 @@ def read_entries(path: Path) -> dict[str, Entry]:
 
 def _entry(values: Mapping[str, Any], units: Any = "metre") -> Entry:
     """A camera of a mapping, by whatever words it uses."""
-    inner = values.get("intrinsics")
+    inner = first_of(values, ("intrinsics", "intrinsic"))
     if isinstance(inner, Mapping):  # a mapping of its own
-        values = {**values, "intrinsics": None, **inner}
-    found = {
-        key: next((_plain(values[w]) for w in words if values.get(w) is not None), None)
-        for key, words in _WORDS.items()
-    }
-    for pair in _SIZES:
-        if found["image_size_wh"] is None:
-            found["image_size_wh"] = _size(*map(values.get, pair))
-    for word in _SHAPES:
-        if found["image_size_wh"] is None and isinstance(shape := values.get(word), list):
-            found["image_size_wh"] = shape[1::-1]
+        values = {**values, "intrinsics": None, "intrinsic": None, **inner}
+    found = {key: _plain(first_of(values, words)) for key, words in _WORDS.items()}
+    named = {key: value for key, value in values.items() if plain_word(key) not in _MODELS}
+    lenses = [_plain(named[key]) for key in named if _DISTORTION.match(plain_word(key))]
+    lens = next((each for each in lenses if each is not None), None)
+    if isinstance(lens, Mapping):
+        values, lens = {**values, **lens}, None
     for names in _ONE_BY_ONE:
         if found["K"] is None and None not in (numbers := [values.get(each) for each in names]):
             found["K"] = numbers if names[0] == "fx" else _from_corner(numbers)
-    if found["distortion"] is None and any(each in values for each in _COEFFICIENTS):
-        found["distortion"] = [values.get(each, 0.0) for each in _COEFFICIENTS]
-    model = str(values.get("distortion_model", values.get("camera_model", ""))).lower()
-    fisheye = values.get("fisheye", False) or any(word in model.split("-") for word in _FISHEYE)
-    return Entry(**found, units=units, video=values.get("video"), fisheye=fisheye)
+    if lens is None and any(each in values for each in _COEFFICIENTS):
+        lens = [values.get(each, 0.0) for each in _COEFFICIENTS]
+    models = [str(first_of(values, (word,))) for word in _MODELS]
+    fisheye = values.get("fisheye", False) or any(map(_FISHEYE.search, models))
+    size, video = _said_size(values), values.get("video")
+    return Entry(**found, image_size_wh=size, distortion=lens, units=units, video=video,
+                 fisheye=fisheye)  # fmt: skip
+
+
+def _said_size(values: Mapping[str, Any]) -> Any:
+    """The image size, of height and width or width and height."""
+    shape = next((values[word] for word in _SHAPES if isinstance(values.get(word), list)), None)
+    if shape is not None:
+        return shape[1::-1]
+    size = first_of(values, (*SIZES, "size", "imageresolution"))
+    if isinstance(size, Mapping):
+        values = size
+    elif isinstance(size, str):
+        return [int(n) if n.isdecimal() else n for n in re.split("[^0-9]+", size)]
+    elif size is not None:
+        return _plain(size)
+    sizes = (_size(first_of(values, (w,)), first_of(values, (h,))) for w, h in _SIDES)
+    return next((size for size in sizes if size is not None), None)
 
 
 def _size(width: Any, height: Any) -> list[Any] | None:
@@ -215,7 +236,7 @@ def _from_corner(numbers: Sequence[Any]) -> list[Any]:
 
 def _has_camera(values: object) -> bool:
     return isinstance(values, Mapping) and (
-        any(word in values for word in _WORDS["K"])
+        first_of(values, _WORDS["K"]) is not None
         or any(set(names) <= values.keys() for names in _ONE_BY_ONE)
     )
 
@@ -225,12 +246,16 @@ def _are_cameras(values: object) -> bool:
 
 
 def _numbered(values: object) -> dict[str, dict[str, Any]]:
-    """Cameras whose number ends the names of their numbers, as in `M1`, `D1`; none if not so."""
+    """Cameras whose number or side ends the names of their numbers, as in `M1`, `distL`."""
     found: dict[str, dict[str, Any]] = {}
     for key, value in values.items() if isinstance(values, Mapping) else ():
-        if named := re.fullmatch(r"([A-Za-z]\w*?)_?([0-9]+)", str(key)):
+        if named := re.fullmatch(r"([A-Za-z]\w*?)_?([0-9]+|[LR]|(?<=_)left|(?<=_)right)", str(key)):
             found.setdefault(named[2], {})[named[1]] = value
-    pair = {name: own for name, own in found.items() if any(word in own for word in _NUMBERED)}
+    pair = {
+        name: own
+        for name, own in found.items()
+        if isinstance(first_of(own, _WORDS["K"]), (list, dict))
+    }
     return {name: {**values, **own} for name, own in pair.items()}  # type: ignore[dict-item]
 
 
@@ -252,6 +277,8 @@ def _alone(path: Path, values: Mapping[str, Any]) -> dict[str, Entry]:
 
 def _read_json(path: Path) -> dict[str, Entry]:
     content = load_json(path, CameraError)
+    if isinstance(content, list):
+        content = dict[str, Any](cameras=content)
     cameras = content.get("cameras") if isinstance(content, dict) else None
     if isinstance(content, dict) and "RadialDistortion" in content and _has_camera(content):
         return {path.stem: _matlab_entry(path, content)}
@@ -260,7 +287,10 @@ def _read_json(path: Path) -> dict[str, Entry]:
     if cameras is None and _are_cameras(content):
         cameras = content
     if isinstance(cameras, list) and all(isinstance(each, dict) for each in cameras):
-        cameras = {str(each.get("name", index)): each for index, each in enumerate(cameras)}
+        names = [str(first_of({**each, "#": n}, (*_NAMES, "#"))) for n, each in enumerate(cameras)]
+        if len(set(names)) < len(names):
+            raise CameraError(f"{path}: two cameras of one name among {', '.join(names)}")
+        cameras = dict(zip(names, cameras, strict=True))
     if not isinstance(cameras, dict):
         raise CameraError(
             f"{path}: expected an object 'cameras' with a camera under each name, "
@@ -301,13 +331,13 @@ def _read_toml(path: Path) -> dict[str, Entry]:
 
 
 def _in_metres(entries: dict[str, Entry], is_anipose: bool) -> dict[str, Entry]:
-    """Millimetres where the cameras would stand hundreds of metres away, else as they are."""
+    """Millimetres where the cameras would stand a kilometre away, else as they are, or unknown."""
     places: dict[str, np.ndarray] = {}
     for name, entry in entries.items():
         with suppress(CameraError):  # said to whoever wants that camera
             places[name] = real_numbers(entry.translation, name, CameraError).ravel()
     farthest = max((float(np.linalg.norm(place)) for place in places.values()), default=0.0)
-    if farthest >= 100:
+    if farthest >= 1000:
         note = (
             f"its world is taken to be in millimetres: in metres a camera would stand "
             f"{farthest:.0f} m from the origin"
@@ -315,7 +345,7 @@ def _in_metres(entries: dict[str, Entry], is_anipose: bool) -> dict[str, Entry]:
         for name, place in places.items():
             metres = (0.001 * place).tolist()
             entries[name] = entries[name]._replace(translation=metres, note=note)
-    elif is_anipose and farthest > 12:
+    elif farthest > (12 if is_anipose else 100):  # centimetres, or a desk in millimetres
         return {name: entry._replace(units=None) for name, entry in entries.items()}
     return entries
 
@@ -323,7 +353,7 @@ def _in_metres(entries: dict[str, Entry], is_anipose: bool) -> dict[str, Entry]:
 def _read_text(path: Path) -> dict[str, Entry]:
     """COLMAP's cameras, or the matrix K alone."""
     rows = {
-        f"{path}: line {number}": line.split()
+        f"{path}: line {number}": re.split(r"[\s,;]+", line.strip(" \t,;[]"))
         for number, line in enumerate(read_text(path, CameraError).splitlines(), start=1)
         if line.strip() and not line.lstrip().startswith("#")
     }
@@ -456,7 +486,11 @@ def _read_matlab(path: Path) -> dict[str, Entry]:
     except Exception as error:  # SciPy raises whatever the damage leads to
         raise CameraError(f"{path}: cannot be read as MATLAB's: {one_line(error)}") from error
     values = {key: _listed(each) for key, each in content.items() if not key.startswith("__")}
-    values = next((each for each in values.values() if isinstance(each, dict)), values)
+    for each in [each for each in values.values() if isinstance(each, dict)]:
+        pair = {n: each.get(f"CameraParameters{n}") for n in "12"}
+        if _are_cameras(pair):
+            return {n: _matlab_entry(path, each) for n, each in pair.items() if each is not None}
+        values = each if _has_camera(each) else values
     if {"fc", "cc"} <= values.keys():  # Bouguet's toolbox, whose pixels count from 0
         K, size = [*values["fc"], *values["cc"]], _size(values.get("nx"), values.get("ny"))
         return {path.stem: Entry(K, size, values.get("kc"))}
@@ -575,7 +609,7 @@ def _load(path: Path) -> dict[str, Any]:
     if text.startswith("%YAML:1.0"):
         text = text.partition("\n")[2]
     try:
-        content = yaml.load(text, Loader=_Loader)
+        content = next(yaml.load_all(text, Loader=_Loader), None)  # ROS ends messages by ---
     except (yaml.YAMLError, ValueError, TypeError, RecursionError, OverflowError) as error:
         raise CameraError(f"{path}: cannot be read as YAML: {one_line(error)}") from error
     if not isinstance(content, dict):

@@ -124,11 +124,12 @@ def _make_camera(entry: Entry, name: str, path: Path) -> Camera:
         rotation = rotation.ravel()
         is_matrix = rotation.size == 9
         rotation = rotation.reshape(3, 3) if is_matrix else rotation_matrix(rotation, where)
+    lens = None if distortion is None else _five(distortion.ravel(), where)
     try:
         return Camera(
             K.reshape(3, 3) if K.shape == (9,) else K,
             (int(size[0]), int(size[1])),
-            distortion=None if distortion is None else _five(distortion.ravel(), where),
+            distortion=lens,
             R_camera_world=rotation,
             t_camera_world=None if translation is None else translation.ravel(),
             name=name,
