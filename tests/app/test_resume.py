@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -232,3 +233,17 @@ def test_other_settings_are_refused(clip: Path, whole: Run) -> None:
         follow(clip, whole.folder, replace(SETTINGS, samples=5), resume=True)
     with pytest.raises(ConfigurationError, match="stride 1, now 2"):
         follow(clip, whole.folder, stride=2, resume=True)
+
+
+def test_other_files_are_refused(clip: Path, whole: Run, tmp_path: Path) -> None:
+    """Not the old track told as that of another video."""
+    for name in ("video.mp4", "keypoints2d.npz", "cameras.json"):
+        shutil.copy(clip / name, tmp_path / name)
+    files = {"video": clip / "video.mp4", "keypoints": clip / "keypoints2d.npz"}
+    for name, path in files.items():
+        other = {**files, name: tmp_path / path.name}
+        with pytest.raises(ConfigurationError, match=f"begun with the {name} .* --out"):
+            track_video(
+                other["video"], camera=clip / "cameras.json", keypoints=other["keypoints"],
+                out=whole.folder, settings=SETTINGS, options=TrackOptions(resume=True),
+            )  # fmt: skip

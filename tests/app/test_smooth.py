@@ -14,7 +14,7 @@ from made_clip import track
 from made_tracks import make_track
 
 from torchcss import load_body, load_track
-from torchcss.app.smooth import smooth, smooth_track
+from torchcss.app.smooth import report, smooth, smooth_track
 from torchcss.body.model import BodyModel
 from torchcss.body.root import move_base
 from torchcss.cli import main as cli
@@ -129,6 +129,15 @@ def test_smoothing_takes_the_other_mode_and_the_noise_away(body: BodyModel):
     values = np.linalg.eigvalsh(done.track.covariance[:, 0])
     assert values.min() > 0
     assert np.median(values) < DEVIATION**2
+
+
+def test_the_report_of_two_frames_has_no_jitter(body: BodyModel):
+    track, _ = noisy_track(body)
+    for num_frames, told in ((30, True), (2, False)):
+        done = smooth_track(track.first(num_frames), Smoothing())
+        effect = {**done.effect, "file": "smooth.npz"}
+        assert ("jitter" in report(effect)) is told
+        assert "nan" not in report(effect)
 
 
 def test_the_acceleration_ratio_and_the_persistence_do_what_they_say(body: BodyModel):

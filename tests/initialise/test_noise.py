@@ -73,3 +73,17 @@ def test_it_is_learnt_where_it_is_not_given() -> None:
     assert noises[2.5].noise > 1.0
     assert noises[None].noise != 1.0
     assert any("noise of a wrist" in line for line in noises[None].report)
+    assert not any("fit no pose" in line for line in noises[None].report)
+
+
+def test_marks_that_fit_no_pose_are_told() -> None:
+    person, keypoints = seen(60.0, 1)
+    few = Search(num_starts=4, num_flips=0, num_samples=0, leave_out=False)
+    found = initialise(
+        None,
+        keypoints,
+        person.camera,
+        generator=torch.Generator().manual_seed(0),
+        options=InitialiseOptions(sigma=2.0, learn_noise=True, search=few),
+    )
+    assert any("they fit no pose before this camera well" in line for line in found.report)

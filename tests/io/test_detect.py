@@ -79,7 +79,9 @@ def mediapipe(marks: list[list[tuple[float, float, float]]]) -> dict[str, Any]:
             belief[height // 2] = 1.0
             masks = [SimpleNamespace(numpy_view=lambda: belief) for _ in marks]
             return SimpleNamespace(
-                pose_landmarks=people, pose_world_landmarks=space, segmentation_masks=masks
+                pose_landmarks=people,
+                pose_world_landmarks=space,
+                segmentation_masks=masks or None,  # as MediaPipe has it where nobody is
             )
 
         def close(self) -> None:

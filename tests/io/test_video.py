@@ -22,7 +22,13 @@ from PIL import Image
 
 from torchcss.errors import ConfigurationError, OutputError, ShapeError, VideoError
 from torchcss.io import video
-from torchcss.io.video import VideoReader, VideoWriter, natural_order, read_image
+from torchcss.io.video import (
+    VideoReader,
+    VideoWriter,
+    missing_numbers,
+    natural_order,
+    read_image,
+)
 from torchcss.types import Frame
 
 
@@ -384,6 +390,15 @@ def test_truncated_avi(tmp_path: Path) -> None:
     assert f"{len(frames)} of 60 frames" in str(error)
 
 
+def test_truncated_where_only_the_length_is_stated(tmp_path: Path) -> None:
+    whole = noisy_film(tmp_path / "a.mkv")
+    frames, error = read_until_error(VideoReader(whole))
+    assert (len(frames), error) == (60, None)
+    frames, error = read_until_error(VideoReader(cut(whole, 0.5)))
+    assert 10 < len(frames) < 45
+    assert f"{len(frames)} frames could be read (of 2 s, as the file says)" in str(error)
+
+
 def test_truncated_before_the_index_is_refused(tmp_path: Path) -> None:
     with pytest.raises(VideoError, match="not a video"):
         VideoReader(cut(noisy_film(tmp_path / "a.mp4"), 0.6))
@@ -457,6 +472,15 @@ def test_folder_is_sorted_naturally(tmp_path: Path) -> None:
     assert reader.info == (10, 8, 6, 12)
     assert [int(frame.image[0, 0, 0]) for frame in reader] == [grey_level(i) for i in range(12)]
     assert [frame.time_s for frame in reader] == pytest.approx(np.arange(12) / 10)
+
+
+def test_numbers_that_are_missing() -> None:
+    names = [f"clip2_{number:03d}.png" for number in (7, 8, 9, 12, 13, 15)]
+    assert "3 pictures are missing" in (missing_numbers(names) or "")
+    assert "behind clip2_009.png" in (missing_numbers(names) or "")
+    assert missing_numbers(names[:3]) is None
+    assert missing_numbers(["a.png", "b.png", *names]) is None
+    assert missing_numbers([f"{number}.png" for number in (0, 40, 83, 121, 160)]) is None
 
 
 def test_natural_order() -> None:

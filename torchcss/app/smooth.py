@@ -264,9 +264,11 @@ def report(effect: Mapping[str, Any]) -> str:
         effect: `summary["smoothed"]` of a smoothed run.
     """
     late = "" if effect.get("lag") is None else f" (with {effect['lag']} frames after each in view)"
+    before, after = effect["jitter_before_m_per_s2"], effect["jitter_after_m_per_s2"]
+    has_jitter = before is not None and not math.isnan(before)  # two frames have none
     lines = [
-        f"jitter {effect['jitter_before_m_per_s2']:.1f} to {effect['jitter_after_m_per_s2']:.1f} "
-        f"m/s^2, joints moved by {effect['mean_change_mm']:.0f} mm in the mean{late}",
+        (f"jitter {before:.1f} to {after:.1f} m/s^2, " if has_jitter else "")
+        + f"joints moved by {effect['mean_change_mm']:.0f} mm in the mean{late}",
         f"{effect['frames_not_the_trackers_best']} frames take another mode than the tracker's "
         f"best, {effect['path_switches']} switches between modes are left",
     ]

@@ -139,6 +139,7 @@ def track_video(
         if options.resume and (out / TRACK_NAME).is_file():
             begun = Run.open(out)
             if begun.checkpoint is not None:
+                _check_files(begun, Path(video), keypoints)
                 return _go_on(begun, settings, selection, options, lock)
         files = _files_of(Path(video), keypoints, out, selection, options)
         views = _all_views(files, camera, selection, settings, options)
@@ -343,6 +344,19 @@ def _check_same(run: Run, settings: Settings, selection: Selection, known: dict[
             f"{run.folder}: the run was begun with {'; '.join(other)}; give the same, or leave "
             "--resume out to start anew"
         )
+
+
+def _check_files(run: Run, video: Path, keypoints: StrPath | None) -> None:
+    """Refuse to go on with other files than a run was begun with."""
+    before = run.cameras[0].files
+    given = {"video": video, "keypoints": None if keypoints is None else Path(keypoints)}
+    for name, path in given.items():
+        known: Path | None = getattr(before, name, None)
+        if path is not None and known is not None and path.resolve() != known.resolve():
+            raise ConfigurationError(
+                f"{run.folder}: the run was begun with the {name} {known}, now {path}; give the "
+                "same, choose another folder with --out, or leave --resume out to start anew"
+            )
 
 
 def _first_pose(

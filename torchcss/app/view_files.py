@@ -6,20 +6,22 @@
 from __future__ import annotations
 
 from collections.abc import Container, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
 from torch import Tensor
 
-from torchcss.errors import VideoError
+from torchcss.errors import CameraError, VideoError
+from torchcss.files import naming
 from torchcss.initialise.keypoint_checks import typical_sigma
-from torchcss.io.cameras import LoadedCamera, check_image_size, load_camera
+from torchcss.io.cameras import LoadedCamera, camera_findings, check_image_size, load_camera
 from torchcss.io.keypoints.arrays import read_points
 from torchcss.io.keypoints.frames import Film
 from torchcss.io.keypoints.one_person import Whom
 from torchcss.io.keypoints.read import read_person
-from torchcss.io.video import VideoReader
+from torchcss.io.video import VideoReader, missing_numbers
 from torchcss.io.view_files import RecordedCamera, ViewFiles
 from torchcss.tracking.view import CameraView
 from torchcss.types import Frame, Keypoints
@@ -60,10 +62,11 @@ class OpenView(NamedTuple):
     @property
     def notes(self) -> list[str]:
         """What the files' readers have to say, for the user."""
-        notes = [self.camera.units_note]
+        notes = [self.camera.units_note, *camera_findings(self.camera.camera)]
         if self.reader.image_names is not None:
             given = "as given" if self.files.frame_rate else "assumed: say it with --frame-rate"
             notes.insert(0, f"{float(self.reader.info.frame_rate):g} images a second, {given}")
+            notes.append(missing_numbers(self.reader.image_names))
         if self.keypoints is not None:
             notes += self.keypoints.report
         return [note for note in notes if note]
@@ -171,7 +174,8 @@ def open_view(
         loaded = camera
     else:
         loaded = load_camera(camera, files.camera_name, video=files.video)
-    check_image_size(loaded.camera, width, height)
+    with naming(camera, CameraError) if isinstance(camera, Path) else nullcontext():
+        check_image_size(loaded.camera, width, height)
     if files.keypoints is None:
         return OpenView(files, reader, masks, loaded, None, 1.0)
     rate = None if reader.image_names else float(reader.info.frame_rate)

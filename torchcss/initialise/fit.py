@@ -72,6 +72,9 @@ Clothes have edges all over, the outline is in one place, and edges draw limbs t
 tell nothing, edges still lead. On a walker of 160 pixels the silhouettes overlap by 0.63 with edges
 alone; beside colours by 0.72 at full weight, 0.77 at a quarter, and 0.78 without edges."""
 
+_POOR_FIT = 3.0
+"""How many times as noisy as expected keypoints are where the user is told."""
+
 _RIVALS = 3.0
 """By how much more than the best a pose may cost the joints, nats, and be given a shape of its
 own: odds of twenty to one. A shape takes time, and changes what poses cost by less."""
@@ -123,7 +126,13 @@ def initialise(
             rough = fit_joints(body, view, generator=generator, options=brief, others=others)
             noise = _noise(rough, view, others, options)
             options = replace(options, sigma=noise * sigma)
-            notes.append(f"keypoints: noise of a wrist {noise * sigma:.1f} px, from the best fit")
+            line = f"keypoints: noise of a wrist {noise * sigma:.1f} px, from the best fit"
+            if noise > _POOR_FIT:
+                line += (
+                    f", {noise:.1f} times what detectors have: they fit no pose before this camera "
+                    "well; look at the first frame's keypoints, or start at another frame"
+                )
+            notes.append(line)
         first = fit_joints(body, view, generator=generator, options=options, others=others)
         first = first._replace(noise=noise)
         given = keypoints.only(first.body.joint_names).to(first.body.tie)

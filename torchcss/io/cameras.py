@@ -15,12 +15,14 @@ By default: `read_camera(path, name)` or `read_cameras(path)`; for a video
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 
 from torchcss.body.rotations import from_axis_angle
 from torchcss.errors import CameraError
@@ -32,6 +34,15 @@ from torchcss.vision.camera import Camera
 _METRES = frozenset({"m", "metre", "metres", "meter", "meters"})
 _NUMBERS = ("K", "image size", "distortion", "rotation", "translation")
 """What messages call the first fields of an `Entry`."""
+
+_NARROWEST, _WIDEST = 2.0, 140.0
+"""Fields of view of lenses that follow the pinhole model, degrees."""
+
+_REACHED = 0.9
+"""Share of the image that the distortion of a usable calibration can be undone in."""
+
+_FAR = 1000.0
+"""No camera sees a person from so many metres away."""
 
 
 class LoadedCamera(NamedTuple):
@@ -205,9 +216,11 @@ def check_image_size(camera: Camera, width: int, height: int) -> None:
     )
     # Half a pixel of rounding in either side is what resizing to whole pixels leaves.
     if abs(width * expected[1] - height * expected[0]) <= max(expected):
+        factor = max(width, height) / max(expected)
         why = (
             "the same shape at another scale; if the images were only resized, scale the "
-            f"calibration: camera.resized({width}, {height})"
+            f"calibration: camera.resized({width}, {height}), or in the file multiply K's first "
+            f"two rows by {factor:.6g} and give the new size"
         )
     elif (height, width) == expected:
         why = "turned by a right angle; calibrate the video as it is shown upright"
@@ -215,6 +228,32 @@ def check_image_size(camera: Camera, width: int, height: int) -> None:
         f"camera {camera.name!r} belongs to images of {expected[0]} x {expected[1]} pixels, "
         f"these have {width} x {height}: {why}"
     )
+
+
+def camera_findings(camera: Camera) -> list[str]:
+    """Lines about what looks odd of a camera; nothing is refused, all of it can be right.
+
+    Args:
+        camera: The camera.
+    """
+    size = camera.K.new_tensor(camera.image_size_wh)
+    (fx, fy), (cx, cy) = camera.K.diagonal()[:2].tolist(), camera.K[:2, 2].tolist()
+    wide = 2 * math.degrees(math.atan(0.5 * max(size[0].item() / fx, size[1].item() / fy)))
+    lines = []
+    if not _NARROWEST <= wide <= _WIDEST:
+        lines.append(f"it sees {wide:.3g} degrees: is its focal length in pixels of this video?")
+    if not (0 <= cx <= size[0] and 0 <= cy <= size[1]):
+        lines.append(f"its principal point ({cx:.0f}, {cy:.0f}) lies outside the image")
+    share = torch.linspace(0.0, 1.0, 9).to(camera.K)
+    _, reached = camera.undistort(torch.cartesian_prod(share, share) * (size - 1))
+    if reached.double().mean() < _REACHED:  # the utmost corners often are beyond
+        lines.append(
+            f"its distortion reaches {int(100 * reached.double().mean())} % of the image; nothing "
+            "is seen elsewhere: calibrate with views up to the borders"
+        )
+    if (away := float(camera.centre_world.norm())) > _FAR:
+        lines.append(f"it stands {away:.0f} m from the world's origin: is t in metres?")
+    return [f"camera {camera.name!r} looks odd: {line}" for line in lines]
 
 
 def _own_frame_note(name: str, entry: Entry) -> str | None:

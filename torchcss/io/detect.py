@@ -136,8 +136,9 @@ class MediaPipe:
         sure = joints[..., 2:] > _LEAST_VISIBILITY
         joints[..., 2] **= 2
         points = [[(m.x, m.y, m.z) for m in person] for person in found.pose_world_landmarks]
-        # Where nobody is found anybody may be anywhere.
-        masks = [mask.numpy_view().reshape(pixels.shape[:2]) for mask in found.segmentation_masks]
+        # Where nobody is found, it says None, and anybody may be anywhere.
+        given = found.segmentation_masks or ()
+        masks = [mask.numpy_view().reshape(pixels.shape[:2]) for mask in given]
         mask = np.max(masks, axis=0) if masks else np.ones(pixels.shape[:2])
         return Detected(
             np.where(sure, joints, 0.0),

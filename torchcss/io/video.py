@@ -16,9 +16,10 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import suppress
 from fractions import Fraction
+from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
@@ -45,6 +46,9 @@ IMAGE_SUFFIXES = names_in(".jpg .jpeg .png .bmp .tif .tiff .webp .pgm .ppm")
 _NOT_VIDEOS = {*names_in("tty ansi bin xbin adf idf rawvideo subviewer")}
 
 _SECONDS_BETWEEN_KEY_FRAMES = 1
+
+_LAST_SHOWN_S = 0.2
+"""How long before its end, by what the file says, a video may have its last picture."""
 
 _FOCAL_35MM = ("focal_length.35mm_equivalent", "focallengthin35mmfilm", "focallength35efl")
 """How the keys end under which cameras write the focal length as of 35 mm film."""
@@ -232,6 +236,11 @@ class VideoReader:
                 # An MP4 may hide frames by its edit list: there a smaller count is no damage.
                 if num_read < (promised or 0) and "mp4" not in container.format.name:
                     damage = "the file ends early"
+                elif promised is None and (length := _stated_length(container)) is not None:
+                    # The last picture is shown for a while.
+                    shown = max(_LAST_SHOWN_S, 2 / float(self.info.frame_rate))
+                    shown += (origin or 0.0) + (time or 0.0)
+                    damage = f"of {length:g} s, as the file says" if shown < length else ""
         except VideoError:
             raise
         except (*_av_errors(), ValueError, _Damage) as error:
@@ -518,6 +527,25 @@ def natural_order(name: str) -> tuple[tuple[int, int | str], ...]:
     )
 
 
+def missing_numbers(names: Sequence[str]) -> str | None:
+    """A line about numbers that are missing between those of a folder's pictures, if there are any.
+
+    Args:
+        names: The pictures in order, most of them numbered one after another.
+    """
+    found = [re.findall(r"[0-9]+", Path(name).stem)[-1:] for name in names]
+    numbers = [int(number) for of in found for number in of]
+    steps = [after - before for before, after in pairwise(numbers)]
+    gaps = [place for place, step in enumerate(steps) if step != 1]
+    # Pictures numbered in another way, such as by time, have no gaps to tell.
+    if len(numbers) < len(names) or not gaps or len(gaps) > 0.5 * len(steps) or min(steps) < 1:
+        return None
+    return (
+        f"{sum(steps) - len(steps)} pictures are missing by their numbers, the first behind "
+        f"{names[gaps[0]]}: those beside a gap are taken to follow one another"
+    )
+
+
 def _av_errors() -> tuple[type[Exception], ...]:
     """What PyAV raises where a file is at fault."""
     from av.error import FFmpegError
@@ -558,6 +586,16 @@ def _decode(container: InputContainer) -> Iterator[VideoFrame]:
         pictures = decoder.decode(None)
     yield from (picture for picture in pictures if not picture.is_corrupt)
     raise damage
+
+
+def _stated_length(container: InputContainer) -> float | None:
+    """Seconds that a Matroska file says its pictures last; None where it does not say."""
+    said = container.streams.video[0].metadata.get("DURATION", "")
+    parts = re.fullmatch(r"([0-9]+):([0-9]+):([0-9.]+)", said)
+    if parts is None:
+        return None
+    hours, minutes, seconds = parts.groups()
+    return 3600 * int(hours) + 60 * int(minutes) + float(seconds)
 
 
 def _upright(picture: VideoFrame, stream: VideoStream) -> UInt8[np.ndarray, "h w 3"]:

@@ -481,6 +481,29 @@ def test_findings(tmp_path: Path) -> None:
     assert any("left and right look exchanged: shoulders and hips" in line for line in found.report)
 
 
+def test_sides_that_change_places_in_time(tmp_path: Path) -> None:
+    frames = np.stack([person(t) for t in T])
+    np.save(tmp_path / "a.npy", frames)
+    assert not any("change places" in line for line in read(tmp_path / "a.npy").report)
+    order = np.arange(17)
+    order[5:] = order[5:].reshape(-1, 2)[:, ::-1].ravel()
+    frames[2:4] = frames[2:4, order]
+    np.save(tmp_path / "b.npy", frames)
+    found = read(tmp_path / "b.npy")
+    assert any("the next before frames 2, 4:" in line for line in found.report)
+
+
+def test_a_start_that_the_detector_doubts(tmp_path: Path) -> None:
+    frames = np.stack([person(t) for t in T])
+    frames[:2, :, 2] *= 0.1
+    np.save(tmp_path / "a.npy", frames)
+    found = read(tmp_path / "a.npy")
+    assert any("frame 0, where tracking starts, has" in line for line in found.report)
+    assert any(line.endswith("start at frame 2") for line in found.report)
+    found = read(tmp_path / "a.npy", first_frame=2)
+    assert not any("where tracking starts" in line for line in found.report)
+
+
 def test_frames_along_the_second_axis(tmp_path: Path) -> None:
     """What networks that lift joints to space take: a batch of one sequence."""
     frames = np.stack([person(0, shift=t) for t in range(40)])

@@ -234,8 +234,12 @@ def test_a_bystander_does_not_take_over(tmp_path: Path) -> None:
     frames = [[person, bystander] for person in actor]
     frames[3] = frames[4] = [bystander]
     frames[5] = []
+    frames += [[], []]  # where nobody was looked for
     found = read(write_openpose(tmp_path / "pose", frames))
-    assert found.confidence.bool().any(1).tolist() == [True] * 3 + [False] * 3 + [True] * 2
+    assert (
+        found.confidence.bool().any(1).tolist()
+        == [True] * 3 + [False] * 3 + [True] * 2 + [False] * 2
+    )
     torch.testing.assert_close(found.positions[7], torch.from_numpy(actor[7][:, :2]))
     assert any("3 frames" in line for line in found.report)
 

@@ -17,6 +17,11 @@ _CONFIDENT = 0.3
 _APART = 0.05
 """Share of a person's size that two joints must stand apart for their order to say anything."""
 
+_DOUBTFUL = 0.3
+"""Share of the usual confidence below which the first frame's keypoints are doubted."""
+
+_LIMBS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+
 
 def findings(
     joints: Float[np.ndarray, "t j 3"],
@@ -24,7 +29,7 @@ def findings(
     image_size_wh: Size,
     first_frame: int,
 ) -> list[str]:
-    """Lines about joints outside the image, and about sides that look exchanged.
+    """Lines about joints outside the image, sides that look exchanged, and a doubtful start.
 
     Args:
         joints: The person in every frame, pixels and confidence.
@@ -36,6 +41,8 @@ def findings(
         *_outside(joints, image_size_wh, first_frame),
         *_sides(joints, names),
         *_lying(joints, names),
+        *_turnabouts(joints, names),
+        *_doubtful_start(joints, first_frame),
     ]
 
 
@@ -96,4 +103,47 @@ def _lying(joints: np.ndarray, names: Sequence[str]) -> list[str]:
     return [
         "shoulders and hips lie side by side, not one above the other: somebody lies, or the file "
         "has y before x, or it is of a turned video"
+    ]
+
+
+def _turnabouts(joints: np.ndarray, names: Sequence[str]) -> list[str]:
+    """Whether left and right change places from one frame to the next."""
+    column = {name: index for index, name in enumerate(names)}
+    left = [name for name in names if name.startswith("l_") and f"r_{name[2:]}" in column]
+    left = [name for name in left if name[2:] in _LIMBS]
+    if not left:
+        return []
+    one, other = ([column[f"{side}{name[1:]}"] for name in left] for side in "lr")
+    here, there = joints[:, one + other], joints[:, other + one]
+    seen = (here[1:, :, 2] > _CONFIDENT) & (here[:-1, :, 2] > _CONFIDENT)
+    seen &= np.roll(seen, len(left), axis=1)  # both sides
+    size = np.array([size_of(person) for person in joints[1:]])
+    kept, exchanged = (
+        np.where(seen, np.linalg.norm(now[1:, :, :2] - here[:-1, :, :2], axis=-1), 0.0).sum(1)
+        for now in (here, there)
+    )
+    jumps = (kept > _APART * size * seen.sum(1)) & (exchanged < 0.5 * kept)
+    frames = [int(frame) + 1 for frame in np.flatnonzero(jumps)]
+    if not frames:
+        return []
+    more = f" and {len(frames) - 6} more" if len(frames) > 6 else ""
+    return [
+        f"left and right change places from one frame to the next before frames "
+        f"{', '.join(map(str, frames[:6]))}{more}: they are used as given, so exchange them back "
+        "if the pictures agree"
+    ]
+
+
+def _doubtful_start(joints: np.ndarray, first_frame: int) -> list[str]:
+    """Whether the frame from which tracking starts is believed much less than the others."""
+    belief = joints[..., 2].sum(axis=1)
+    typical = float(np.median(belief[belief > 0.0])) if (belief > 0.0).any() else 0.0
+    if belief[first_frame] >= _DOUBTFUL * typical:
+        return []
+    better = np.flatnonzero(belief[first_frame:] >= typical)
+    advice = f"; start at frame {first_frame + better[0]}" if len(better) else ""
+    return [
+        f"frame {first_frame}, where tracking starts, has keypoints of little confidence, "
+        f"{belief[first_frame]:.2g} in all where others have {typical:.2g}: its pose may be "
+        f"wrong{advice}"
     ]

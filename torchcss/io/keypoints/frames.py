@@ -77,9 +77,10 @@ def in_order(people: People, film: Film, report: list[str]) -> list[list[Person]
 
 def wrong_count(expected: int, found: int) -> KeypointError:
     """The error for a file that has other frames than the video."""
+    cut_off = ", or get a complete copy of it if it is cut off" if found > expected else ""
     return KeypointError(
         f"expected {expected} frames, as the video has, found {found}; "
-        "make the keypoints from this very video"
+        f"make the keypoints from this very video{cut_off}"
     )
 
 

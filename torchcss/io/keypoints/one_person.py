@@ -127,7 +127,8 @@ def follow(
         + ("continuity" if own is None else "the file's tracks")
         + (f"; --person {' or '.join(rest)} follows another" if rest else "")
     )
-    if lost:
+    looked_at = [index for index, frame in enumerate(frames) if len(frame)]
+    if lost := [index for index in lost if looked_at[0] <= index <= looked_at[-1]]:
         report.append(
             f"in {len(lost)} frames (first: {min(lost)}) nobody was near enough to be that person"
         )
