@@ -806,3 +806,15 @@ def test_nobody_is_not_the_leftmost(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", people)
     whom = Whom(0, "leftmost", SIZE)
     check(read_person(tmp_path / "a.npy", film=Film(FRAMES), whom=whom))
+
+
+def test_words_that_mean_something_else(tmp_path: Path) -> None:
+    """Labels of classes are no joints' names, a video's name no picture's, a box no joint."""
+    frames = [{"file": "clip.mp4", "keypoints": person(t).tolist()} for t in T]
+    path = write(tmp_path / "a.json", {"labels": ["person"], "frames": frames})
+    check(read(path))
+    np.savez(tmp_path / "a.npz", keypoints=[person(t) for t in T], labels=np.array(["person"]))
+    check(read(tmp_path / "a.npz"))
+    rows = [["clip.mp4", 1, 5, 5, 9, 9, *person(t).flat] for t in T]
+    heads = ["file", "id", "x", "y", "w", "h", *ends("_x", "_y", "_c")]
+    check(read(write(tmp_path / "a.csv", wide(heads, rows))))

@@ -85,10 +85,10 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
     ]
     size = _positive("image size", first_of(numbers, SIZES), 2)
     noise = _positive("relative_noise", arrays.get("relative_noise"), 1)
-    names = arrays.get("joint_names", first_of(texts, NAMES))
+    texts = {key: each for key, each in texts.items() if each.shape == values.shape[2:3]}
     return People(
         _counted(people, first_of(numbers, FRAMES)),
-        _names(names, values.shape[2]),
+        _names(arrays.get("joint_names", first_of(texts, NAMES)), values.shape[2]),
         report,
         corner_fractions=is_movenet,
         size_wh=None if size is None else (size[0], size[1]),

@@ -33,7 +33,7 @@ def read_coco(content: Mapping[str, Any]) -> People:
         # COCO also annotates things that have no joints, and other skeletons.
         if "keypoints" in entry and category in (None, entry.get("category_id")):
             about = entry.get("attributes")
-            track = track_of({**entry, **(about if isinstance(about, dict) else {})}, ("track_id",))
+            track = track_of({**entry, **(about if isinstance(about, dict) else {})}, ("trackid",))
             people = one_person(where, entry["keypoints"], entry)
             found.setdefault(image, []).extend(person._replace(track=track) for person in people)
     values = {value for people in found.values() for p in people for value in p.joints[:, 2]}

@@ -85,7 +85,7 @@ def read_json(path: Path, image_size_wh: Size, num_frames: int | None) -> People
     frames = _frames(path, content, num_frames)
     in_order = isinstance(frames, list)
     found, own = united(dict(enumerate(frames)) if in_order else frames)
-    people = _people(name, found, own or _said_names(content), in_order=in_order)
+    people = _people(name, found, own or _said_names(content, found), in_order=in_order)
     return people._replace(first=1 if from_one else None, size_wh=said_size(content))
 
 
@@ -112,6 +112,7 @@ def read_folder(path: Path) -> People:
             raise KeypointError(f"{file}: a second file of the frame {key}; expected one for each")
         found[key] = people_of(str(file), content)
     frames, names = united(found)
+    names = names or _said_names(contents[0], frames)
     people = _people(f"{name}, {len(files)} files", frames, names)
     # A labelled picture has a file; of a video every frame has one.
     return people._replace(whole=name != "labelme", size_wh=max(sizes, key=bool))
@@ -176,14 +177,15 @@ def _format_of(content: object) -> str:
     return next((name for word, name in _FORMATS.items() if word in words), "JSON")
 
 
-def _said_names(content: object) -> Names | None:
-    """The joints' names that stand in the head, as a list or by number, as MMPose writes them."""
+def _said_names(content: object, frames: Frames) -> Names | None:
+    """As many names as joints that stand in the head, as a list or by number (MMPose's)."""
+    counts = {len(person.joints) for people in frames.values() for person in people}
     for head in heads(content):
         names = first_of(head, NAMES)
         if isinstance(names, dict) and all(str(i) in names for i in range(len(names))):
             names = [names[str(i)] for i in range(len(names))]
-        if isinstance(names, list) and names and all(isinstance(each, str) for each in names):
-            return tuple(names)
+        if isinstance(names, list) and {len(names)} == counts and isinstance(names[0], str):
+            return tuple(map(str, names))
     return None
 
 
@@ -213,6 +215,8 @@ def _frames(path: Path, content: Any, num_frames: int | None) -> list[list[Perso
             f"the formats), found {shortened(content)}"
         )
     keys = [_key_of(f"{path}: detection {i}", entry) for i, entry in enumerate(content)]
+    if len(set(keys)) == 1 < len(keys) == num_frames:  # such as the name of the video
+        keys = [None] * len(keys)
     if all(key is None for key in keys):
         one = num_frames == 1 or is_joints(content)
         if one or not content:

@@ -101,8 +101,12 @@ def read_table(path: Path) -> People:
         raise KeypointError("row 1: a heading and nothing below it; get a complete copy")
     heading = rows[0][1]
     columns = _headed(heading)
-    if columns.frame is None and columns.joint is None and _counts(rows):
+    said = [n for n in (columns.frame, columns.track) if n is not None]
+    who = {tuple("".join(row[n : n + 1]) for n in said) for _, row in rows[1:]}
+    if not said and columns.joint is None and _counts(rows):
         columns = columns._replace(frame=0)
+    elif len(who) == 1 < len(rows) - 1 and said and not "".join(*who)[:1].isdecimal():
+        columns = columns._replace(frame=None, time=None)  # the name of the video
     used = {each for parts in columns.parts.values() for each in parts.values()}
     found = [heading[parts[2]] for parts in columns.parts.values() if 2 in parts]
     report = ["no confidence in the file: 1 for every joint that has a place other than (0, 0)"]
@@ -185,7 +189,7 @@ def _headed(heading: Sequence[str]) -> _Columns:
                 raise KeypointError(f"row 1: column {heading[index]!r} is there twice")
             own.setdefault(each[1], index)
     columns = {joint: parts for joint, parts in columns.items() if {0, 1} <= set(parts)}
-    if joint is not None and ("", "") in columns:
+    if joint is not None and set(columns) == {("", "")}:
         track = None if track == joint else track
         return _Columns({("", ""): columns["", ""]}, len(heading), frame, joint, track, time)
     columns.pop(("", ""), None)

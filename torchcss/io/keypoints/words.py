@@ -22,15 +22,15 @@ FRAMES = names_in(
 """The number of a frame."""
 
 TIMES: dict[str, float | None] = {
-    **dict.fromkeys(("timestampms", "timems", "ms", "milliseconds"), 1e-3),
+    **dict.fromkeys(("timestampms", "timems", "milliseconds"), 1e-3),
     **dict.fromkeys(("timestampus", "timeus"), 1e-6),
-    **dict.fromkeys(("timestamps", "times", "timesec", "timeseconds", "seconds", "sec"), 1.0),
+    **dict.fromkeys(("timestamps", "times", "timesec", "timeseconds", "seconds"), 1.0),
     **dict.fromkeys(("timestamp", "time", "t"), None),
 }
 """A time, and its unit in seconds, where the word says it."""
 
 PICTURES = names_in(
-    "imageid filename image imagename imgname imagepath imagefile img file framename path picture"
+    "imageid filename image imagename imgname imagepath imagefile img file framename picture"
 )
 """The name of a frame's picture."""
 
