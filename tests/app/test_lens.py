@@ -67,6 +67,11 @@ def test_pictures_say_it_by_exif(tmp_path: Path) -> None:
 def test_a_camera_is_said_once() -> None:
     with pytest.raises(CameraError, match="not several"):
         Lens(fov=60.0).unless(Path("cameras.json"))
+    for bad in (0.0, -5.0, math.nan):
+        with pytest.raises(CameraError, match="--focal: expected"):
+            Lens(focal=bad)
+    with pytest.raises(CameraError, match="--fov: expected .* got 400"):
+        Lens(fov=400.0)
     assert Lens().unless(Path("cameras.json")) == Path("cameras.json")
     with pytest.raises(CameraError):
         torchcss.Camera.pinhole(64, 48, focal_px=10.0, field_of_view_degrees=20.0)

@@ -41,12 +41,21 @@ class Lens:
         fov: Angle between the left and the right border of the image, degrees.
         source: Who says so.
         deviation: Standard deviation of its logarithm.
+
+    Raises:
+        CameraError: If focal length or angle make no sense.
     """
 
     focal: float | None = None
     fov: float | None = None
     source: str = "as given"
     deviation: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.focal is not None and not 0 < self.focal < math.inf:
+            raise CameraError(f"--focal: expected a positive number of pixels, got {self.focal:g}")
+        if self.fov is not None and not 0 < self.fov < 180:
+            raise CameraError(f"--fov: expected degrees between 0 and 180, got {self.fov:g}")
 
     def unless(self, calibration: Path) -> Path:
         """The calibration file, which says it all.
@@ -80,7 +89,6 @@ class Lens:
         """The camera of a video, in its own frame, and what was assumed.
 
         Raises:
-            CameraError: If focal length or angle make no sense.
             VideoError: If the video cannot be read.
         """
         info = VideoReader(video).info
