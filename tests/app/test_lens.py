@@ -70,7 +70,7 @@ def test_a_camera_is_said_once() -> None:
     for bad in (0.0, -5.0, math.nan):
         with pytest.raises(CameraError, match="--focal: expected"):
             Lens(focal=bad)
-    with pytest.raises(CameraError, match="--fov: expected .* got 400"):
+    with pytest.raises(CameraError, match=r"--fov: expected .* got 400"):
         Lens(fov=400.0)
     assert Lens().unless(Path("cameras.json")) == Path("cameras.json")
     with pytest.raises(CameraError):

@@ -397,7 +397,10 @@ def test_masks_are_read_along_with_the_video(clip: Path, tmp_path: Path):
     )
     for masks, message in (
         (write_masks(tmp_path / "small.mp4", 64, 48), "video's size 640 x 480, these have 64 x 48"),
-        (write_masks(tmp_path / "short.mp4", 640, 480, 2), "masks end before frame 2"),
+        (
+            write_masks(tmp_path / "short.mp4", 640, 480, 2),
+            r"short.mp4: the masks end before frame 2",
+        ),
     ):
         with pytest.raises(VideoError, match=message):
             track_video(

@@ -92,7 +92,8 @@ class OpenView(NamedTuple):
                 yield frame
             elif (mask := next(masks, None)) is None:
                 raise VideoError(
-                    f"the masks end before frame {frame.index}; give one for every frame"
+                    f"{self.files.masks}: the masks end before frame {frame.index}; give one for "
+                    "every frame"
                 )
             else:
                 height, width = frame.image.shape[:2]
