@@ -28,25 +28,16 @@ import numpy as np
 
 from torchcss.errors import KeypointError
 from torchcss.files import read_text, shortened
+from torchcss.io.keypoints import words
 from torchcss.io.keypoints.frames import in_seconds
 from torchcss.io.keypoints.mediapipe import LAYOUT, NUM_LANDMARKS, landmark_order, reordered
 from torchcss.io.keypoints.people import Frames, Key, People, Person, screened
-from torchcss.io.keypoints.words import (
-    CONFIDENCES,
-    FRAMES,
-    PICTURES,
-    TIMES,
-    TRACKS,
-    first_of,
-    plain_word,
-    track_text,
-)
 from torchcss.joint_names import CASE, names_in
 
 _PARTS = {
     **dict.fromkeys(("x", "u"), 0),
     "y": 1,
-    **dict.fromkeys(CONFIDENCES, 2),
+    **dict.fromkeys(words.CONFIDENCES, 2),
     **dict.fromkeys(("z", "presence"), 3),
 }
 """What a column's name says that it is: 0, 1 coordinates, 2 confidence, 3 not used."""
@@ -117,7 +108,7 @@ def read_table(path: Path) -> People:
         report.append(f"columns left out: {shortened(', '.join(left))}")
     joints, frames = _read_rows(columns, rows[1:])
     if columns.time is not None:
-        frames = in_seconds(TIMES[columns.time], frames)
+        frames = in_seconds(words.TIMES[columns.time], frames)
     order = landmark_order(joints)
     is_mediapipe = order is not None and len(joints) == NUM_LANDMARKS
     if order is not None and is_mediapipe:
@@ -161,7 +152,7 @@ def table_rows(path: Path) -> list[Row]:
 def _counts(rows: Sequence[Row]) -> bool:
     """Whether the first column has no name and counts the rows, as pandas writes it."""
     cells = [row[0] for _, row in rows[1:]]
-    if plain_word(rows[0][1][0]) not in ("", "unnamed0", "index") or not all(
+    if words.plain_word(rows[0][1][0]) not in ("", "unnamed0", "index") or not all(
         re.fullmatch("[0-9]{1,9}", cell) for cell in cells
     ):
         return False
@@ -172,12 +163,12 @@ def _counts(rows: Sequence[Row]) -> bool:
 def _headed(heading: Sequence[str]) -> _Columns:
     """The columns of a table with one heading, long or wide."""
     places = {cell: index for index, cell in reversed([*enumerate(heading)])}
-    words = {plain_word(cell) for cell in heading}
-    frame, time = first_of(places, FRAMES), None
+    plain = {words.plain_word(cell) for cell in heading}
+    frame, time = words.first_of(places, words.FRAMES), None
     if frame is None:
-        time = next((word for word in TIMES if word in words), None)
-        frame = first_of(places, PICTURES if time is None else (time,))
-    joint, track = first_of(places, _JOINTS), first_of(places, TRACKS)
+        time = next((word for word in words.TIMES if word in plain), None)
+        frame = words.first_of(places, words.PICTURES if time is None else (time,))
+    joint, track = words.first_of(places, _JOINTS), words.first_of(places, words.TRACKS)
     split = [_split(cell) for cell in heading]
     if not any(each is not None and each[1] == 1 for each in split):  # u and v
         split = [_split(cell, {**_PARTS, "v": 1}) for cell in heading]
@@ -203,12 +194,12 @@ def _headed(heading: Sequence[str]) -> _Columns:
 
 def _split(cell: str, kinds: Mapping[str, int] = _PARTS) -> tuple[str, int] | None:
     """Joint and kind of number of a column, whichever comes first in its name."""
-    words = [word for word in re.split(r"[^a-z0-9]+", re.sub(CASE, " ", cell).lower()) if word]
-    words = [word for word in words if word not in _UNITS]
-    if match := re.fullmatch(r"([a-z]+)_?([0-9]+)", "_".join(words)):  # x1, v33
+    parted = [word for word in re.split(r"[^a-z0-9]+", re.sub(CASE, " ", cell).lower()) if word]
+    parted = [word for word in parted if word not in _UNITS]
+    if match := re.fullmatch(r"([a-z]+)_?([0-9]+)", "_".join(parted)):  # x1, v33
         return (match[2], kinds[match[1]]) if match[1] in kinds else None
     for part, joint in (
-        (words[-2:], words[:-2]), (words[-1:], words[:-1]), (words[:1], words[1:])
+        (parted[-2:], parted[:-2]), (parted[-1:], parted[:-1]), (parted[:1], parted[1:])
     ):  # fmt: skip
         if "".join(part) in kinds:
             return re.sub(f"^{_POINTS}(?=.)", "", "_".join(joint)), kinds["".join(part)]
@@ -260,7 +251,7 @@ def _read_rows(columns: _Columns, body: Sequence[Row]) -> tuple[list[str], Frame
                 f"{len(cells)}; get a complete copy"
             )
         place = _place(where, columns, cells, index)
-        track = "" if columns.track is None else track_text(cells[columns.track]) or ""
+        track = "" if columns.track is None else words.track_text(cells[columns.track]) or ""
         for (person, joint), parts in columns.parts.items():
             # Of a wide table every row is a person of its own.
             person = person or track or ("" if columns.joint is not None else f"row {row}")
