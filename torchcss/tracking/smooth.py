@@ -44,6 +44,7 @@ class Smoothing:
     Attributes:
         likelihood_power: Power of each frame's likelihood when modes of several frames are weighed
             against the motion between them; below 1 because errors of images persist over frames.
+            None: that of the track.
         acceleration_ratio: Expected accelerations over expected velocities, 1/s; lower is smoother.
             For the modes of a tracker 10 is good, for images 20.
         persistence: How many frames say as much, in the covariances, as one that is independent.
@@ -52,7 +53,7 @@ class Smoothing:
         lag: How many frames after each may say something of it; None: all.
     """
 
-    likelihood_power: float = 0.2
+    likelihood_power: float | None = None
     acceleration_ratio: float = 10.0
     persistence: float = 20.0
     lag: int | None = None
@@ -61,10 +62,9 @@ class Smoothing:
         if self.lag is not None and self.lag < 0:
             raise ConfigurationError(f"lag: expected at least 0 frames, got {self.lag}")
         for name in ("likelihood_power", "acceleration_ratio", "persistence"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ConfigurationError(
-                    f"{name}: expected a positive number, got {getattr(self, name)}"
-                )
+            number = getattr(self, name)
+            if number is not None and not 0 < number < math.inf:
+                raise ConfigurationError(f"{name}: expected a positive number, got {number}")
 
 
 class TrackedModes(NamedTuple):
@@ -176,7 +176,7 @@ def _all_in_view(body: BodyModel, track: TrackedModes, choice: Smoothing) -> Smo
         node,
         track.times,
         Transition(velocity=tuple(body.motion_rate.tolist())),
-        evidence=choice.likelihood_power,
+        evidence=choice.likelihood_power or track.likelihood_power,
         changes=changes,
         period=period,
     )

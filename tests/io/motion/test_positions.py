@@ -569,7 +569,7 @@ def test_bad_files(tmp_path: Path, suffix: str) -> None:
 
     path.write_bytes(b" \n")
     check("empty")
-    path.write_text(text, encoding="utf-16")
+    path.write_bytes(b"\xe4" + text.encode())
     check("line 1: not text in UTF-8")
     path.write_bytes(text.encode()[:30] + b"\0" + text.encode()[30:])
     check("not text in UTF-8")
