@@ -29,7 +29,7 @@ from jaxtyping import UInt8
 from PIL import ExifTags, Image, ImageOps
 
 from torchcss.errors import ConfigurationError, ShapeError, VideoError
-from torchcss.files import StrPath, one_line, output_error, temporary_name
+from torchcss.files import StrPath, naming, one_line, output_error, temporary_name
 from torchcss.io.high_dynamic_range import table
 from torchcss.joint_names import names_in
 from torchcss.types import Frame
@@ -107,19 +107,16 @@ class VideoReader:
         self._start, self._stop, self._stride = start, stop, stride
         rate = 30 if image_frame_rate is None else image_frame_rate
         self._image_frame_rate = Fraction(rate).limit_denominator(1001)
-        if stride < 1:
-            raise VideoError(f"{self.path}: stride must be at least 1, got {stride}")
-        if start < 0:
-            raise VideoError(f"{self.path}: start must be at least 0, got {start}")
-        if stop is not None and stop <= start:
-            raise VideoError(
-                f"{self.path}: stop must be greater than start, got start {start}, stop {stop}"
-            )
-        if self._image_frame_rate <= 0:
-            raise VideoError(
-                f"{self.path}: frames per second must be positive, got {image_frame_rate}"
-            )
-        self._images = self._find_images()
+        with naming(self.path, VideoError):
+            if stride < 1:
+                raise VideoError(f"stride must be at least 1, got {stride}")
+            if start < 0:
+                raise VideoError(f"start must be at least 0, got {start}")
+            if stop is not None and stop <= start:
+                raise VideoError(f"stop must be greater than start, got start {start}, stop {stop}")
+            if self._image_frame_rate <= 0:
+                raise VideoError(f"frames per second must be positive, got {image_frame_rate}")
+            self._images = self._find_images()
         if self._images is None:
             self.info = self._probe_container()
         else:
@@ -279,19 +276,17 @@ class VideoReader:
                     if entry.suffix.lower() in IMAGE_SUFFIXES and not entry.name.startswith(".")
                 ]
                 if not images:
+                    suffixes = ", ".join(IMAGE_SUFFIXES)
                     raise VideoError(
-                        f"{self.path}: no images in this folder; expected files that end in "
-                        + ", ".join(IMAGE_SUFFIXES)
+                        f"no images in this folder; expected files that end in {suffixes}"
                     )
                 return sorted(images, key=lambda entry: natural_order(entry.name))
             if not self.path.exists():
-                raise VideoError(
-                    f"{self.path}: there is no such file or folder; check the path of the video"
-                )
+                raise VideoError("there is no such file or folder; check the path of the video")
             if not self.path.is_file():
-                raise VideoError(f"{self.path}: expected a file or a folder, found a device")
+                raise VideoError("expected a file or a folder, found a device")
             if self.path.stat().st_size == 0:
-                raise VideoError(f"{self.path}: the file is empty; get a complete copy")
+                raise VideoError("the file is empty; get a complete copy")
         except VideoError:
             raise
         except (OSError, ValueError) as error:  # ValueError: a null character in the name
