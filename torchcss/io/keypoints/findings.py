@@ -64,14 +64,21 @@ def _outside(joints: np.ndarray, image_size_wh: Size, first_frame: int) -> list[
     return [line]
 
 
+def _columns(names: Sequence[str], place: str) -> list[int]:
+    """Where the left and the right joint of a place stand; empty: one of them is missing."""
+    pair = [f"{side}_{place}" for side in "lr"]
+    return [list(names).index(name) for name in pair] if {*pair} <= {*names} else []
+
+
 def _sides(joints: np.ndarray, names: Sequence[str]) -> list[str]:
     """Whether left and right of the parts of a body contradict each other."""
     sizes = np.array([size_of(person) for person in joints])
     facing: dict[str, np.ndarray] = {}  # 1 where the left one is on the right, as of who faces us
     for place in ("shoulder", "hip", "eye"):
-        if not {f"l_{place}", f"r_{place}"} <= set(names):
+        columns = _columns(names, place)
+        if not columns:
             continue
-        left, right = (joints[:, list(names).index(f"{side}_{place}")] for side in "lr")
+        left, right = joints[:, columns].swapaxes(0, 1)
         seen = (left[:, 2] > _CONFIDENT) & (right[:, 2] > _CONFIDENT)
         gap = (left[:, 0] - right[:, 0]) / sizes
         far = np.abs(gap) > (_APART if place != "eye" else 0.2 * _APART)
@@ -91,11 +98,9 @@ def _sides(joints: np.ndarray, names: Sequence[str]) -> list[str]:
 
 def _lying(joints: np.ndarray, names: Sequence[str]) -> list[str]:
     """Whether shoulders and hips stand side by side, as where y comes before x."""
-    if not {"l_shoulder", "r_shoulder", "l_hip", "r_hip"} <= set(names):
+    columns = _columns(names, "shoulder") + _columns(names, "hip")
+    if len(columns) < 4:
         return []
-    columns = [
-        list(names).index(f"{side}_{place}") for place in ("shoulder", "hip") for side in "lr"
-    ]
     seen = joints[(joints[:, columns, 2] > _CONFIDENT).all(1)][:, columns, :2]
     along = np.abs(seen[:, :2].mean(1) - seen[:, 2:].mean(1))
     if not len(along) or (along[:, 0] > along[:, 1]).mean() < 0.9:
@@ -108,15 +113,13 @@ def _lying(joints: np.ndarray, names: Sequence[str]) -> list[str]:
 
 def _turnabouts(joints: np.ndarray, names: Sequence[str]) -> list[str]:
     """Whether left and right change places from one frame to the next."""
-    column = {name: index for index, name in enumerate(names)}
-    left = [name for name in names if name.startswith("l_") and f"r_{name[2:]}" in column]
-    left = [name for name in left if name[2:] in _LIMBS]
-    if not left:
+    pairs = [columns for place in _LIMBS if (columns := _columns(names, place))]
+    if not pairs:
         return []
-    one, other = ([column[f"{side}{name[1:]}"] for name in left] for side in "lr")
+    one, other = map(list, zip(*pairs, strict=True))
     here, there = joints[:, one + other], joints[:, other + one]
     seen = (here[1:, :, 2] > _CONFIDENT) & (here[:-1, :, 2] > _CONFIDENT)
-    seen &= np.roll(seen, len(left), axis=1)  # both sides
+    seen &= np.roll(seen, len(pairs), axis=1)  # both sides
     size = np.array([size_of(person) for person in joints[1:]])
     kept, exchanged = (
         np.where(seen, np.linalg.norm(now[1:, :, :2] - here[:-1, :, :2], axis=-1), 0.0).sum(1)
