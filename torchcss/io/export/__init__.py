@@ -134,22 +134,19 @@ def _write_modes(
     paths: Sequence[Path], to: str, selection: Selection, track: Track, style: BvhStyle
 ) -> list[str]:
     """Write a file for every mode; returns what to report."""
-    if to in ("c3d", "trc"):  # formats of places, which need no body
-        for index, path in enumerate(paths):
-            if to == "trc":
-                write_text(path, trc_text(selection, index, path.name))
-            else:
-                with replace_file(path) as partial:
-                    write_c3d(partial, selection, index)
-        return []
-    body, report = body_of_track(track), []
-    if not selection.present.all():
+    report: list[str] = []
+    if to in ("bvh", "mot") and not selection.present.all():
         report.append(f"{to} cannot leave frames out: there the mode's nearest pose stands")
     for index, path in enumerate(paths):
-        if to == "mot":
-            write_text(path, mot_text(selection, index, body))
+        if to == "c3d":  # this format and the next are of places, which need no body
+            with replace_file(path) as partial:
+                write_c3d(partial, selection, index)
+        elif to == "trc":
+            write_text(path, trc_text(selection, index, path.name))
+        elif to == "mot":
+            write_text(path, mot_text(selection, index, body_of_track(track)))
         else:
-            text, notes = bvh_text(selection, index, body, style)
+            text, notes = bvh_text(selection, index, body_of_track(track), style)
             report += [note for note in notes if note not in report]
             write_text(path, text)
     return report
