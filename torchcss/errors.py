@@ -9,6 +9,9 @@ Numerical trouble is not an error: it is data (see `torchcss.types.Status`).
 
 from __future__ import annotations
 
+import importlib
+from typing import Any
+
 from torch import Tensor
 
 
@@ -66,6 +69,22 @@ class DetectorError(TorchcssError, ValueError):
 
 class MissingExtraError(TorchcssError, ImportError):
     """An optional package is needed; the message says which extra installs it."""
+
+
+def optional_package(name: str, message: str) -> Any:
+    """A package that not every installation has.
+
+    Args:
+        name: The module to import.
+        message: Who needs it, and how it is installed.
+
+    Raises:
+        MissingExtraError: With that message, if it is not installed.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise MissingExtraError(message) from error
 
 
 def check_positive(choice: object, *names: str, hint: str = "") -> None:

@@ -280,6 +280,42 @@ def naming(path: object, error_class: type[TorchcssError]) -> Iterator[None]:
         raise error_class(f"{path}: {error}") from error
 
 
+@contextmanager
+def refusing(error_class: type[TorchcssError], what: str, *, advice: str = "") -> Iterator[None]:
+    """Say in one typed error of one line whatever a library raises for a damaged file.
+
+    Args:
+        error_class: The error; those of this class pass as they are.
+        what: The file, and what it is not, before the library's reason.
+        advice: What to do, after it.
+
+    Raises:
+        error_class: If the body raises anything.
+    """
+    try:
+        yield
+    except error_class:
+        raise
+    except Exception as error:
+        advised = f"; {advice}" if advice else ""
+        raise error_class(f"{what}: {one_line(error)}{advised}") from error
+
+
+def unexpected(
+    error_class: type[TorchcssError], where: object, expected: str, found: object
+) -> TorchcssError:
+    """The error for a place in a file that holds something else than it should.
+
+    Args:
+        error_class: The error.
+        where: The place; empty: the whole file, whose name is put before the message elsewhere.
+        expected: What should be there.
+        found: What is there.
+    """
+    place = f"{where}: " if where else ""
+    return error_class(f"{place}expected {expected}, found {shortened(found)}")
+
+
 def one_line(error: BaseException | str) -> str:
     """What an exception says, in one short line."""
     return " ".join(str(error).split())[:120] or type(error).__name__
@@ -303,10 +339,8 @@ def load_json(path: Path, error_class: type[TorchcssError]) -> Any:
         error_class: If the file is missing, empty, unreadable or not JSON.
     """
     data = read_bytes(path, error_class)
-    try:
+    with refusing(error_class, f"{path}: not a JSON file"):
         return json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise error_class(f"{path}: not a JSON file: {one_line(error)}") from error
 
 
 def load_arrays(path: Path, error_class: type[TorchcssError]) -> Mapping[str, np.ndarray]:
@@ -377,13 +411,11 @@ def load_array(path: Path, error_class: type[TorchcssError]) -> np.ndarray:
     """
     if not read_bytes(path, error_class, 6).startswith(b"\x93NUMPY"):
         raise error_class(f"{path}: not an NPY file; expected what numpy.save writes")
-    try:
-        with path.open("rb") as stream:
-            _check_header(stream, path.stat().st_size)
-            stream.seek(0)
-            return np.load(stream, allow_pickle=False)
-    except Exception as error:  # what a damaged header leads to
-        raise error_class(f"{path}: cannot be read as an NPY file: {one_line(error)}") from error
+    damaged = refusing(error_class, f"{path}: cannot be read as an NPY file")
+    with damaged, path.open("rb") as stream:
+        _check_header(stream, path.stat().st_size)
+        stream.seek(0)
+        return np.load(stream, allow_pickle=False)
 
 
 def real_numbers(value: object, where: str, error_class: type[TorchcssError]) -> np.ndarray:
@@ -402,7 +434,7 @@ def real_numbers(value: object, where: str, error_class: type[TorchcssError]) ->
             return np.asarray(value, dtype=np.float64)
     except (ValueError, TypeError, OverflowError, RecursionError):
         pass  # ragged, beyond the range of float64, or nested without end
-    raise error_class(f"{where}: expected numbers, found {shortened(value)}")
+    raise unexpected(error_class, where, "numbers", value)
 
 
 def _only_numbers(value: object) -> bool:

@@ -358,7 +358,7 @@ def test_nan_is_refused(tmp_path: Path) -> None:
 
 def test_the_power_of_the_covariances_is_kept(tmp_path: Path) -> None:
     path = tmp_path / "track.npz"
-    writer = TrackWriter(path, Track.empty(("a",), ("b",), likelihood_power=0.1))
+    writer = TrackWriter(path, Track.empty(("a",), ("b",))._replace(likelihood_power=0.1))
     writer.append(FrameModes(
         frame=0, time_s=0.0, state=[[0.0]], covariance=[[[1.0]]], log_weight=[0.0], cost=[1.0],
         parent=[-1], joints_world=[[[0.0, 0.0, 0.0]]],

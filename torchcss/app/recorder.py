@@ -138,13 +138,10 @@ class Recorder:
         self._state = session.checkpoint()
         if self.begun is None or going_on is None:
             body = session.state.body
-            track = Track.empty(
-                body.state_names,
-                body.joint_names,
-                likelihood_power=session.plan.tracker.stated_power,
-                size_deviation=_size_deviation(session.settings, len(self.recorded)),
-                body=body,
-                cameras=self.recorded,
+            track = Track.empty(body.state_names, body.joint_names, body)._replace(
+                likelihood_power=float(session.plan.tracker.stated_power),
+                size_deviation=float(_size_deviation(session.settings, len(self.recorded))),
+                cameras=tuple(self.recorded),
                 settings=asdict(session.settings),
             )
         else:

@@ -45,7 +45,7 @@ from torchcss.body.model import BodyModel
 from torchcss.body.root import has_root
 from torchcss.body.rotations import as_vector
 from torchcss.errors import BodyError, ConfigurationError, MotionCaptureError
-from torchcss.files import one_line, read_bytes
+from torchcss.files import one_line
 from torchcss.joint_names import skeleton_joint_names
 
 BODY_SUFFIXES = (".urdf", ".xml", ".mjcf", ".bvh")
@@ -206,8 +206,7 @@ def _read(
         return skeleton, (), _BVH_Y_UP if skeleton.is_z_up else _AS_IT_IS
     if units is not None:
         raise BodyError(f"{path}: units are for BVH files; this format is in metres (see scale)")
-    data = read_bytes(path, BodyError)
-    root = parse_xml(path, data, "a URDF")
+    root = parse_xml(path, "a URDF")
     if path.suffix.lower() != ".urdf" and root.tag in ("mujoco", "mujocoinclude"):
         return *read_mjcf(path), _Y_UP
     try:

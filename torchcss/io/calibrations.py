@@ -21,7 +21,6 @@ Call `read_entries`.
 
 from __future__ import annotations
 
-import importlib
 import json
 import re
 import struct
@@ -36,7 +35,7 @@ import numpy as np
 import yaml
 
 from torchcss.body.files.xml import parse_xml
-from torchcss.errors import BodyError, CameraError, MissingExtraError
+from torchcss.errors import CameraError, optional_package
 from torchcss.files import (
     load_array,
     load_arrays,
@@ -45,7 +44,9 @@ from torchcss.files import (
     read_bytes,
     read_text,
     real_numbers,
+    refusing,
     shortened,
+    unexpected,
 )
 from torchcss.io.keypoints.words import SIDES, SIZES, first_of, plain_word
 from torchcss.joint_names import names_in
@@ -265,9 +266,7 @@ def _alone(path: Path, values: Mapping[str, Any]) -> dict[str, Entry]:
         entries = {name: _entry(own) for name, own in pair.items()}
         return {n: e._replace(rotation=None, translation=None) for n, e in entries.items()}
     if not _has_camera(values):
-        raise CameraError(
-            f"{path}: expected a calibration with camera_matrix, found {shortened(list(values))}"
-        )
+        raise unexpected(CameraError, path, "a calibration with camera_matrix", list(values))
     name = str(values.get("camera_name", values.get("name", path.stem)))
     return {name: _entry(values)._replace(rotation=None, translation=None)}
 
@@ -292,25 +291,20 @@ def _read_json(path: Path) -> dict[str, Entry]:
             raise CameraError(f"{path}: two cameras of one name among {', '.join(names)}")
         cameras = dict(zip(names, cameras, strict=True))
     if not isinstance(cameras, dict):
-        raise CameraError(
-            f"{path}: expected an object 'cameras' with a camera under each name, "
-            f"found {shortened(content)}"
+        raise unexpected(
+            CameraError, path, "an object 'cameras' with a camera under each name", content
         )
     for name, values in cameras.items():
         if not isinstance(values, dict):
-            raise CameraError(
-                f"{path}: camera {name!r}: expected an object, found {shortened(values)}"
-            )
+            raise unexpected(CameraError, f"{path}: camera {name!r}", "an object", values)
     return {name: _entry(values, content.get("units")) for name, values in cameras.items()}
 
 
 def _read_toml(path: Path) -> dict[str, Entry]:
     """Pose2Sim's metres, Caliscope's, or Anipose's unit, which is that of the board."""
     text = read_text(path, CameraError)
-    try:
+    with refusing(CameraError, f"{path}: cannot be read as TOML"):
         content = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise CameraError(f"{path}: cannot be read as TOML: {one_line(error)}") from error
     tables = content["cameras"] if isinstance(content.get("cameras"), dict) else content
     tables = {
         name: each
@@ -323,9 +317,7 @@ def _read_toml(path: Path) -> dict[str, Entry]:
     for table, values in tables.items():
         name = values.get("name", table)
         if not isinstance(name, str) or name in entries:
-            raise CameraError(
-                f"{path}: table {table!r}: expected a name of its own, found {shortened(name)}"
-            )
+            raise unexpected(CameraError, f"{path}: table {table!r}", "a name of its own", name)
         entries[name] = _entry(values)
     return _in_metres(entries, "metadata" in content)
 
@@ -395,7 +387,7 @@ def _binary_colmap(path: Path) -> dict[str, list[str]]:
     """COLMAP's binary file as the words that its text has."""
     data, at = read_bytes(path, CameraError), 8
     rows: dict[str, list[str]] = {}
-    try:
+    with refusing(CameraError, f"{path}: expected COLMAP's cameras.bin"):
         (count,) = struct.unpack_from("<Q", data)
         for _ in range(count):
             number, model, *size = struct.unpack_from("<iiQQ", data, at)
@@ -404,8 +396,6 @@ def _binary_colmap(path: Path) -> dict[str, list[str]]:
             words = [str(number), name, *map(str, size), *map(repr, values)]
             rows[f"{path}: camera {number}"] = words
             at += 24 + 8 * length
-    except (struct.error, IndexError) as error:
-        raise CameraError(f"{path}: expected COLMAP's cameras.bin: {one_line(error)}") from error
     return rows
 
 
@@ -439,9 +429,8 @@ def _kalibr(path: Path, chain: Mapping[str, Mapping[str, Any]]) -> dict[str, Ent
             try:
                 pose = np.asarray(step, float) @ pose if step is not None else pose
             except (ValueError, TypeError) as error:
-                raise CameraError(
-                    f"{path}: {name}: T_cn_cnm1: expected 4 rows of 4 numbers, found "
-                    f"{shortened(step)}"
+                raise unexpected(
+                    CameraError, f"{path}: {name}: T_cn_cnm1", "4 rows of 4 numbers", step
                 ) from error
             entry = entry._replace(rotation=pose[:3, :3].tolist(), translation=pose[:3, 3].tolist())
         entries[name] = entry
@@ -456,9 +445,7 @@ def _read_easymocap(path: Path) -> dict[str, Entry]:
     second = _load(extrinsics) if extrinsics.is_file() else {}
     names = first.get("names")
     if not isinstance(names, list) or not all(isinstance(name, (str, int)) for name in names):
-        raise CameraError(
-            f"{intrinsics}: expected 'names', as EasyMocap writes them, found {shortened(names)}"
-        )
+        raise unexpected(CameraError, intrinsics, "'names', as EasyMocap writes them", names)
     cameras = {}
     for name in map(str, names):
         cameras[name] = Entry(
@@ -476,15 +463,11 @@ def _read_matlab(path: Path) -> dict[str, Entry]:
     data = read_bytes(path, CameraError, 128)
     if b"HDF" in data[:16] or data.startswith(b"MATLAB 7.3"):
         raise CameraError(f"{path}: of version 7.3; save it with save('-v7')")
-    try:
-        matlab: Any = importlib.import_module("scipy.io")
-    except ImportError as error:
-        raise MissingExtraError(f"{path}: a .mat is read by SciPy; pip install scipy") from error
+    scipy_io = optional_package("scipy.io", f"{path}: a .mat is read by SciPy; pip install scipy")
     _check_matlab_size(path)
-    try:
-        content = matlab.loadmat(path, simplify_cells=True)
-    except Exception as error:  # SciPy raises whatever the damage leads to
-        raise CameraError(f"{path}: cannot be read as MATLAB's: {one_line(error)}") from error
+    # SciPy raises whatever the damage leads to.
+    with refusing(CameraError, f"{path}: cannot be read as MATLAB's"):
+        content = scipy_io.loadmat(path, simplify_cells=True)
     values = {key: _listed(each) for key, each in content.items() if not key.startswith("__")}
     for each in [each for each in values.values() if isinstance(each, dict)]:
         pair = {n: each.get(f"CameraParameters{n}") for n in "12"}
@@ -495,9 +478,8 @@ def _read_matlab(path: Path) -> dict[str, Entry]:
         K, size = [*values["fc"], *values["cc"]], _size(values.get("nx"), values.get("ny"))
         return {path.stem: Entry(K, size, values.get("kc"))}
     if not _has_camera(values):
-        raise CameraError(
-            f"{path}: expected toStruct(cameraParams) or Bouguet's fc and cc, found "
-            f"{shortened(list(values))}"
+        raise unexpected(
+            CameraError, f"{path}", "toStruct(cameraParams) or Bouguet's fc and cc", list(values)
         )
     return {path.stem: _matlab_entry(path, values)}
 
@@ -509,13 +491,10 @@ def _check_matlab_size(path: Path) -> None:
     while at + 8 <= len(data):
         kind, size = struct.unpack_from(f"{order}II", data, at)
         packed, at = data[at + 8 : at + 8 + size], at + 8 + size
-        try:
-            unpacked = (
-                zlib.decompressobj().decompress(packed, _MOST_MATLAB) if kind == 15 else packed
-            )
-        except zlib.error as error:
-            raise CameraError(f"{path}: damaged: {error}; get a complete copy") from error
-        total += len(unpacked)
+        if kind == 15:
+            with refusing(CameraError, f"{path}: damaged", advice="get a complete copy"):
+                packed = zlib.decompressobj().decompress(packed, _MOST_MATLAB)
+        total += len(packed)
         if total >= _MOST_MATLAB:
             raise CameraError(f"{path}: more than {_MOST_MATLAB:,} bytes; not a calibration")
 
@@ -544,10 +523,7 @@ def _listed(value: Any) -> Any:
 
 def _opencv_xml(path: Path) -> dict[str, Any]:
     """What OpenCV stores as XML."""
-    try:
-        root = parse_xml(path, read_bytes(path, CameraError), "OpenCV's XML")
-    except BodyError as error:
-        raise CameraError(str(error)) from error
+    root = parse_xml(path, "OpenCV's XML", CameraError)
     found: dict[str, Any] = {}
     for element in root:
         parts = {part.tag: (part.text or "").split() for part in element}
@@ -608,10 +584,8 @@ def _load(path: Path) -> dict[str, Any]:
     text = read_text(path, CameraError)
     if text.startswith("%YAML:1.0"):
         text = text.partition("\n")[2]
-    try:
+    with refusing(CameraError, f"{path}: cannot be read as YAML"):
         content = next(yaml.load_all(text, Loader=_Loader), None)  # ROS ends messages by ---
-    except (yaml.YAMLError, ValueError, TypeError, RecursionError, OverflowError) as error:
-        raise CameraError(f"{path}: cannot be read as YAML: {one_line(error)}") from error
     if not isinstance(content, dict):
         raise CameraError(
             f"{path}: no calibration; expected names, camera_matrix or cam0, found "

@@ -26,7 +26,7 @@ import torch
 
 from torchcss.body.rotations import from_axis_angle
 from torchcss.errors import CameraError
-from torchcss.files import StrPath, real_numbers, shortened
+from torchcss.files import StrPath, real_numbers, shortened, unexpected
 from torchcss.io.calibrations import Entry, read_entries
 from torchcss.io.video import VideoReader
 from torchcss.vision.camera import Camera
@@ -311,9 +311,7 @@ def rotation_matrix(vector: np.ndarray, where: str = "rotation") -> np.ndarray:
         CameraError: If it has another shape, is not finite, or seems to be in degrees.
     """
     if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise CameraError(
-            f"{where}: expected a rotation vector of 3 numbers, found {shortened(vector.tolist())}"
-        )
+        raise unexpected(CameraError, where, "a rotation vector of 3 numbers", vector.tolist())
     if np.abs(vector).max() > 4 * np.pi:
         raise CameraError(
             f"{where}: a rotation vector of {shortened(vector.tolist())} turns more than twice "

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from torchcss.errors import TrackFileError
-from torchcss.files import load_arrays, one_line, output_error, save_arrays
+from torchcss.files import load_arrays, output_error, refusing, save_arrays
 
 CHECKPOINT_NAME = "checkpoint.npz"
 SCHEMA_VERSION = 1
@@ -68,11 +68,9 @@ def read_checkpoint(folder: Path) -> Checkpoint | None:
     if not path.is_file():
         return None
     arrays = dict(load_arrays(path, TrackFileError))
-    try:
+    with refusing(TrackFileError, f"{path}: not a checkpoint"):
         version = int(arrays["schema_version"])
         num_frames, notes = int(arrays["num_frames"]), json.loads(str(arrays["notes"]))
-    except (KeyError, TypeError, ValueError) as error:
-        raise TrackFileError(f"{path}: not a checkpoint: {one_line(error)}") from error
     if version != SCHEMA_VERSION:
         raise TrackFileError(
             f"{path}: has schema version {version}, this program reads {SCHEMA_VERSION}; go on "

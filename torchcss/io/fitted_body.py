@@ -39,7 +39,7 @@ from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES
 from torchcss.body.shape import with_shape
 from torchcss.errors import BodyError
-from torchcss.files import StrPath, load_arrays, save_arrays
+from torchcss.files import StrPath, load_arrays, naming, save_arrays
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.initialise.result import Initialisation
 from torchcss.io.track_body import PARAMETER_NUMBERS, set_numbers
@@ -131,9 +131,9 @@ def read_fitted_body(
             f"{path}: not a fitted body: {error.args[0]} is missing; expected what torchcss init "
             "writes"
         ) from error
+    except BodyError:
+        raise
     except (ValueError, TypeError) as error:
-        if isinstance(error, BodyError):
-            raise
         raise BodyError(f"{path}: not a fitted body: {error}") from error
     rotation, translation = tensors["base_rotation"], tensors["base_translation"]
     if camera is not None:
@@ -172,10 +172,8 @@ def _load_body(
         for key in PARAMETER_NUMBERS
         if key in arrays
     }
-    try:
+    with naming(path, BodyError):
         set_numbers(body, numbers)
-    except BodyError as error:
-        raise BodyError(f"{path}: {error}") from error
     return body
 
 

@@ -51,13 +51,13 @@ from torch import Tensor
 from torchcss.body.bases import on_origin
 from torchcss.body.model import BodyModel
 from torchcss.body.uncertainty import Held
-from torchcss.errors import ShapeError, TorchcssError, TrackFileError
+from torchcss.errors import ShapeError, TrackFileError
 from torchcss.files import (
     StrPath,
     extend_arrays,
     load_arrays,
     load_json,
-    one_line,
+    refusing,
     save_arrays,
     write_text,
 )
@@ -158,36 +158,20 @@ class Track(NamedTuple):
 
     @classmethod
     def empty(
-        cls,
-        state_names: Sequence[str],
-        joint_names: Sequence[str],
-        *,
-        likelihood_power: float = 1.0,
-        size_deviation: float = 0.0,
-        body: BodyModel | None = None,
-        cameras: Sequence[RecordedCamera] = (),
-        settings: Mapping[str, Any] | None = None,
+        cls, state_names: Sequence[str], joint_names: Sequence[str], body: BodyModel | None = None
     ) -> Track:
-        """A track of no frames, for a `TrackWriter` to begin with.
+        """A track of no frames, for a `TrackWriter` to begin with; what else is known is replaced.
 
         Args:
             state_names: Names of the parameters.
             joint_names: Names of the joints.
-            likelihood_power: Power with which the likelihood counts in the covariances.
-            size_deviation: Standard deviation of the logarithm of the body's size.
             body: The body that is tracked, on any base.
-            cameras: What watches it.
-            settings: What the tracker is told.
         """
         return cls(
             **_stacked([], len(state_names), len(joint_names)),
             state_names=tuple(state_names),
             joint_names=tuple(joint_names),
-            likelihood_power=float(likelihood_power),
-            size_deviation=float(size_deviation),
             body=None if body is None else on_origin(body),
-            cameras=tuple(cameras),
-            settings=dict(settings or {}),
         )
 
     @property
@@ -440,29 +424,20 @@ def _checked_arrays(arrays: Mapping[str, np.ndarray], path: Path) -> dict[str, A
     return {**values, "likelihood_power": power}
 
 
-_DAMAGE = (TorchcssError, ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError,
-           ValueError)  # fmt: skip
-"""What comes of building a body or a camera from any JSON."""
-
 _DESCRIBED = ("body", "cameras", "settings")
 
 
 def _described(arrays: Mapping[str, np.ndarray], path: Path) -> dict[str, Any]:
     """What the numbers are modes of, as far as the file says it."""
-    try:
+    # Building a body or a camera of any JSON raises whatever the damage leads to.
+    with refusing(TrackFileError, f"{path}: its body, cameras or settings are damaged"):
         plain = {name: json.loads(str(arrays[name])) for name in _DESCRIBED if name in arrays}
-        body, settings = plain.get("body"), plain.get("settings", {})
+        body, cameras = plain.get("body"), plain.get("cameras", [])
         return {
             "body": None if body is None else body_from_plain(body),
-            "cameras": tuple(
-                camera_from_plain(entry, path.parent) for entry in plain.get("cameras", [])
-            ),
-            "settings": dict(settings),
+            "cameras": tuple(camera_from_plain(entry, path.parent) for entry in cameras),
+            "settings": dict(plain.get("settings", {})),
         }
-    except _DAMAGE as error:
-        raise TrackFileError(
-            f"{path}: its body, cameras or settings are damaged: {one_line(error)}"
-        ) from error
 
 
 def write_summary(path: StrPath, summary: Mapping[str, Any]) -> None:

@@ -16,7 +16,6 @@ Call `read_mjcf`; `torchcss.load_body("x.xml")` does.
 
 from __future__ import annotations
 
-import importlib
 import math
 import re
 import warnings
@@ -35,8 +34,8 @@ from torchcss.body.files.bvh import BASE, Skeleton
 from torchcss.body.files.default_shape import solid_shape, unused
 from torchcss.body.files.xml import parse_xml
 from torchcss.body.rotations import as_rows, as_vector, from_quaternion
-from torchcss.errors import BodyError, MissingExtraError
-from torchcss.files import one_line, read_bytes, shortened
+from torchcss.errors import BodyError, optional_package
+from torchcss.files import one_line, shortened
 
 _SOLIDS = {2: ("sphere", 1), 3: ("capsule", 2), 4: ("ellipsoid", 3), 5: ("cylinder", 2),
            6: ("box", 3)}  # fmt: skip
@@ -102,7 +101,7 @@ class _Screen:
             raise BodyError(f"{self.path}: more than {_MOST_FILES} includes: do they loop?")
         if not path.resolve().is_relative_to(self.path.parent.resolve()):
             raise BodyError(f"{self.path}: names {name!r}, which is not in its folder; move it")
-        root = parse_xml(path, read_bytes(path, BodyError), "an MJCF")
+        root = parse_xml(path, "an MJCF")
         if root.tag not in ("mujoco", "mujocoinclude"):
             raise BodyError(f"{path}: not an MJCF, expected <mujoco>, found <{root.tag}>")
         root.tag, root.attrib = "mujoco", {}
@@ -167,12 +166,10 @@ def _product(words: str) -> float:
 
 def _compiled(path: Path) -> Any:
     """The file as MuJoCo compiles it, meshes left out."""
-    try:
-        mujoco: Any = importlib.import_module("mujoco")
-    except ImportError as error:
-        raise MissingExtraError(
-            f"{path}: an MJCF file is read by MuJoCo; install it: pip install 'torchcss[mjcf]'"
-        ) from error
+    mujoco = optional_package(
+        "mujoco",
+        f"{path}: an MJCF file is read by MuJoCo; install it: pip install 'torchcss[mjcf]'",
+    )
     screen = _Screen(path)
     root = screen.read(path.name)
     if not screen.num_bodies(root) <= _MOST_BODIES:

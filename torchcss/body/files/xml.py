@@ -9,28 +9,33 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from xml.parsers import expat
 
-from torchcss.errors import BodyError
-from torchcss.files import one_line
+from torchcss.errors import BodyError, TorchcssError
+from torchcss.files import one_line, read_bytes
 
 _MOST_BYTES = 50_000_000
 
 
-def parse_xml(path: Path, data: bytes, what: str) -> ElementTree.Element:
+def parse_xml(
+    path: Path, what: str, error_class: type[TorchcssError] = BodyError
+) -> ElementTree.Element:
     """The root element of an XML file.
 
     Args:
-        path: The file, for messages.
-        data: Its content.
+        path: The file.
         what: What the file should be, for messages.
+        error_class: What to raise.
 
     Raises:
-        BodyError: If it is very large, declares entities, or does not parse.
+        error_class: If it cannot be read, is very large, declares entities, or does not parse.
     """
+    data = read_bytes(path, error_class)
     if len(data) > _MOST_BYTES:
-        raise BodyError(f"{path}: {len(data):,} bytes; expected {what} of {_MOST_BYTES:,} at most")
+        raise error_class(
+            f"{path}: {len(data):,} bytes; expected {what} of {_MOST_BYTES:,} at most"
+        )
 
     def refuse(*_: object) -> None:
-        raise BodyError(f"{path}: declares XML entities, which {what} does not need; remove them")
+        raise error_class(f"{path}: declares XML entities, which {what} does not need; remove them")
 
     # Without name spaces, so that prefixes which nobody declares are part of the name.
     parser, tree = expat.ParserCreate(), ElementTree.TreeBuilder()
@@ -42,8 +47,8 @@ def parse_xml(path: Path, data: bytes, what: str) -> ElementTree.Element:
         parser.Parse(data, True)
         return tree.close()
     except (expat.ExpatError, ValueError, LookupError) as error:
-        if isinstance(error, BodyError):
+        if isinstance(error, error_class):
             raise
-        raise BodyError(
+        raise error_class(
             f"{path}: not {what}, the XML does not parse ({one_line(error)})"
         ) from error

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchcss.errors import MissingExtraError
+from torchcss.errors import optional_package
 from torchcss.io.export.selection import Selection
 
 
@@ -27,12 +27,7 @@ def write_c3d(path: Path, selection: Selection, mode: int) -> None:
     Raises:
         MissingExtraError: If ezc3d is not installed.
     """
-    try:
-        import ezc3d  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise MissingExtraError(
-            'C3D needs the package ezc3d: pip install "torchcss[c3d]"'
-        ) from error
+    ezc3d = optional_package("ezc3d", 'C3D needs the package ezc3d: pip install "torchcss[c3d]"')
     file = ezc3d.c3d()
     point = file["parameters"]["POINT"]
     point["RATE"]["value"] = [selection.rate]

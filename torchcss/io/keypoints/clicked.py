@@ -9,13 +9,24 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from torchcss.errors import KeypointError
-from torchcss.files import real_numbers, shortened
+from torchcss.files import real_numbers, shortened, unexpected
 from torchcss.io.keypoints.json_people import JOINTS, PEOPLE
 from torchcss.io.keypoints.people import Frames, People, Person, Size, united
 from torchcss.joint_names import JOINT_NAMES, canonical_joint_name
+
+
+def known_joint(where: str, name: str) -> str:
+    """The catalogue's name of a joint.
+
+    Raises:
+        KeypointError: If it has none.
+    """
+    if (known := canonical_joint_name(name)) is None:
+        raise KeypointError(
+            f"{where}: unknown joint {name!r}; the known ones are {', '.join(JOINT_NAMES)}"
+        )
+    return known
 
 
 def is_clicked(content: Mapping[str, Any]) -> bool:
@@ -42,14 +53,13 @@ def read_clicked(content: Mapping[str, Any], image_size_wh: Size) -> People:
         )
     frames = content.get("frames", {"0": content.get("joints")})
     if not isinstance(frames, dict) or not frames:
-        raise KeypointError(f"expected 'frames' to name frames, found {shortened(frames)}")
+        raise unexpected(KeypointError, "", "'frames' to name frames", frames)
     clicked: Frames = {}
     for key, joints in frames.items():
         if not re.fullmatch(r"[0-9]{1,6}", key):
-            raise KeypointError(f"expected a frame number, found {shortened(key)}")
+            raise unexpected(KeypointError, "", "a frame number", key)
         named = _clicked_joints(f"frame {key}", joints)
-        rows = np.array(list(named.values())).reshape(-1, 3)
-        clicked[int(key)] = [Person(rows, names=tuple(named))] if named else []
+        clicked[int(key)] = [Person.by_name(named)] if named else []
     found, names = united(clicked)
     return People(found, names, ["format: clicked joints"], first=0)
 
@@ -59,7 +69,7 @@ def _clicked_joints(where: str, joints: object) -> dict[str, list[float]]:
     if isinstance(joints, dict) and isinstance(joints.get("joints"), dict):
         joints = joints["joints"]
     if not isinstance(joints, dict):
-        raise KeypointError(f"{where}: expected joints by name, found {shortened(joints)}")
+        raise unexpected(KeypointError, where, "joints by name", joints)
     found = {}
     for name, place in joints.items():
         values = real_numbers(place, f"{where}: {name}", KeypointError)
@@ -67,9 +77,6 @@ def _clicked_joints(where: str, joints: object) -> dict[str, list[float]]:
             raise KeypointError(
                 f"{where}: {name}: expected [u, v] or [u, v, confidence], found {shortened(place)}"
             )
-        if canonical_joint_name(name) is None:
-            raise KeypointError(
-                f"{where}: unknown joint {name!r}; the known ones are {', '.join(JOINT_NAMES)}"
-            )
+        known_joint(where, name)
         found[name] = [*values.tolist(), 1.0][:3]
     return found

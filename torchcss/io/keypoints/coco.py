@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from torchcss.errors import KeypointError
-from torchcss.files import shortened
+from torchcss.files import unexpected
 from torchcss.io.keypoints.json_people import listed, one_person, said_size
 from torchcss.io.keypoints.people import Frames, Key, Names, People, Person, track_of
 from torchcss.io.video import natural_order
@@ -21,7 +21,7 @@ def read_coco(content: Mapping[str, Any]) -> People:
     """Read annotations, as COCO, CVAT and their like have them."""
     entries = content["annotations"]
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise KeypointError(f"expected a list of detections, found {shortened(entries)}")
+        raise unexpected(KeypointError, "", "a list of detections", entries)
     report = ["format: COCO"]
     names, category = _coco_names(content, entries, report)
     found: Frames = {}
@@ -29,7 +29,7 @@ def read_coco(content: Mapping[str, Any]) -> People:
         where = f"detection {index}"
         image = entry.get("image_id")
         if not isinstance(image, (int, str)) or isinstance(image, bool):
-            raise KeypointError(f"{where}: expected an image_id, found {shortened(image)}")
+            raise unexpected(KeypointError, where, "an image_id", image)
         # COCO also annotates things that have no joints, and other skeletons.
         if "keypoints" in entry and category in (None, entry.get("category_id")):
             about = entry.get("attributes")

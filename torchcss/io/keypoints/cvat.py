@@ -11,11 +11,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
-import numpy as np
-
 from torchcss.body.files.xml import parse_xml
-from torchcss.errors import BodyError, KeypointError
-from torchcss.files import read_bytes, shortened
+from torchcss.errors import KeypointError
+from torchcss.files import unexpected
 from torchcss.io.keypoints.frames import plain_name
 from torchcss.io.keypoints.people import Frames, Key, People, Person, united
 
@@ -32,10 +30,7 @@ def read_cvat(path: Path) -> People:
     Raises:
         KeypointError: If it is another XML, or a point is none.
     """
-    try:
-        root = parse_xml(path, read_bytes(path, KeypointError), "CVAT's XML")
-    except BodyError as error:
-        raise KeypointError(str(error)) from error
+    root = parse_xml(path, "CVAT's XML", KeypointError)
     if root.tag != "annotations":
         raise KeypointError(f"expected CVAT's annotations, found <{root.tag}>")
     pictures = [*root.iter("image")]
@@ -48,10 +43,7 @@ def read_cvat(path: Path) -> People:
             if not outside and point.get("outside") != "1":
                 people.setdefault(who, {})[name] = _joint(point, name)
     frames: Frames = {
-        place: [
-            Person(np.array(list(joints.values())), _track(who), tuple(joints))
-            for who, joints in people.items()
-        ]
+        place: [Person.by_name(joints, _track(who)) for who, joints in people.items()]
         for place, people in found.items()
     }
     people, names = united(frames)
@@ -103,5 +95,5 @@ def _joint(point: Element, name: str) -> list[float]:
     try:
         u, v = map(float, text.split(","))
     except ValueError:
-        raise KeypointError(f"{name}: expected one point, u,v, found {shortened(text)}") from None
+        raise unexpected(KeypointError, name, "one point, u,v", text) from None
     return [u, v, _HIDDEN if point.get("occluded") == "1" else 1.0]

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from torchcss.errors import KeypointError
-from torchcss.files import array_header, one_line, shortened
+from torchcss.files import array_header, refusing, unexpected
 from torchcss.io.keypoints.people import People, Person, screened
 from torchcss.joint_names import names_in
 
@@ -166,24 +166,18 @@ def _options(value: Any, kind: str) -> dict[str, Any]:
     else:
         found = {str(key): item for key, item in value.items()} if isinstance(value, dict) else {}
     if not found:
-        raise KeypointError(
-            f"positions_2d: expected recordings by {kind}, found {shortened(value)}"
-        )
+        raise unexpected(KeypointError, "positions_2d", f"recordings by {kind}", value)
     return found
 
 
 def _object(path: Path, name: str) -> Any:
     """The Python object in an archive."""
-    try:
+    # zipfile, pickle and NumPy raise whatever the damage leads to.
+    with refusing(KeypointError, f"{name}: cannot be read", advice="get a complete copy"):
         with zipfile.ZipFile(path) as archive, archive.open(f"{name}.npy") as stream:
-            data = stream.read(_MOST_BYTES)
-        source = io.BytesIO(data)
+            source = io.BytesIO(stream.read(_MOST_BYTES))
         header = array_header(source)
         if header is None or not header[1].hasobject:
             raise ValueError(f"expected objects, got {header}")
         content = PlainUnpickler(source, encoding="latin1").load()
-    except Exception as error:  # zipfile, pickle and NumPy raise whatever the damage leads to
-        raise KeypointError(
-            f"{name}: cannot be read: {one_line(error)}; get a complete copy"
-        ) from error
     return content.item() if isinstance(content, np.ndarray) and content.shape == () else content

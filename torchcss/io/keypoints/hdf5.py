@@ -9,15 +9,14 @@ Call `read_hdf5`.
 
 from __future__ import annotations
 
-import importlib
 import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from torchcss.errors import KeypointError, MissingExtraError
-from torchcss.files import one_line, read_bytes
+from torchcss.errors import KeypointError, optional_package
+from torchcss.files import read_bytes, refusing
 from torchcss.io.keypoints.h36m import PlainUnpickler
 from torchcss.io.keypoints.people import Frames, People, Person, is_there, screened
 
@@ -44,25 +43,18 @@ def read_hdf5(path: Path) -> People:
         raise KeypointError(f"{path}: not an HDF5 file; {advice}")
     if path.suffix.lower() == ".slp":
         raise KeypointError(f"{path}: SLEAP's project or predictions; {advice}")
-    try:
-        h5py: Any = importlib.import_module("h5py")
-    except ImportError as error:
-        raise MissingExtraError(
-            f"{path}: HDF5 is read by h5py; install it: pip install 'torchcss[hdf5]', or {advice}"
-        ) from error
-    try:
-        with h5py.File(path, "r") as file:
-            if "tracks" in file and "node_names" in file:
-                return _read_sleap(path, file)
-            group = next((each for each in file.values() if hasattr(each, "keys")), None)
-            if group is not None and ("table" in group or "block0_values" in group):
-                return _read_pandas(path, group)
-    except KeypointError:
-        raise
-    except Exception as error:  # h5py and pickle raise whatever the damage leads to
-        raise KeypointError(
-            f"{path}: cannot be read as HDF5: {one_line(error)}; {advice}"
-        ) from error
+    h5py = optional_package(
+        "h5py",
+        f"{path}: HDF5 is read by h5py; install it: pip install 'torchcss[hdf5]', or {advice}",
+    )
+    # h5py and pickle raise whatever the damage leads to.
+    damaged = refusing(KeypointError, f"{path}: cannot be read as HDF5", advice=advice)
+    with damaged, h5py.File(path, "r") as file:
+        if "tracks" in file and "node_names" in file:
+            return _read_sleap(path, file)
+        group = next((each for each in file.values() if hasattr(each, "keys")), None)
+        if group is not None and ("table" in group or "block0_values" in group):
+            return _read_pandas(path, group)
     raise KeypointError(f"{path}: neither SLEAP's analysis nor DeepLabCut's table; {advice}")
 
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from torchcss.errors import KeypointError
-from torchcss.files import load_json, read_text, shortened
+from torchcss.files import load_json, read_text, shortened, unexpected
 from torchcss.io.keypoints.arrays import read_arrays
 from torchcss.io.keypoints.clicked import is_clicked, read_clicked
 from torchcss.io.keypoints.coco import read_coco
@@ -241,7 +241,7 @@ def _key_of(where: str, entry: object) -> Key | None:
     if not isinstance(entry, dict):
         return None
     if not isinstance(entry.get("image_id", 0), (int, str)):
-        raise KeypointError(f"{where}: expected an image_id, found {shortened(entry['image_id'])}")
+        raise unexpected(KeypointError, where, "an image_id", entry["image_id"])
     counts = {
         k: v for k, v in entry.items() if isinstance(v, (int, float)) and not isinstance(v, bool)
     }

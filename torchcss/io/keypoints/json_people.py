@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from torchcss.errors import KeypointError
-from torchcss.files import shortened
+from torchcss.files import unexpected
 from torchcss.io.keypoints.people import LAYOUT_SIZES, Person, numbers, screened, track_of
 from torchcss.io.keypoints.words import CONFIDENCES, SCORES, SIDES, SIZES, first_of
 from torchcss.joint_names import names_in
@@ -60,7 +60,7 @@ def people_of(where: str, value: Any, *, alone: bool = False) -> list[Person]:
         if named and not any(isinstance(each, (list, dict)) for each in rest):
             return one_person(where, named, value)
         if alone or not all(isinstance(each, (list, dict)) for each in value.values()):
-            raise KeypointError(f"{where}: expected keypoints, found {shortened(list(value))}")
+            raise unexpected(KeypointError, where, "keypoints", list(value))
         # By the people's own numbers.
         return [
             person._replace(track=person.track or key)
@@ -75,7 +75,7 @@ def people_of(where: str, value: Any, *, alone: bool = False) -> list[Person]:
             for index, each in enumerate(value)
             for person in people_of(f"{where}[{index}]", each)
         ]
-    raise KeypointError(f"{where}: expected people with keypoints, found {shortened(value)}")
+    raise unexpected(KeypointError, where, "people with keypoints", value)
 
 
 def _flat(value: list[Any]) -> bool:
@@ -107,7 +107,7 @@ def one_person(where: str, value: Any, around: Mapping[str, Any] | None = None) 
     if value is None or value == []:
         return []
     if not isinstance(value, list):
-        raise KeypointError(f"{where}: expected numbers, found {shortened(value)}")
+        raise unexpected(KeypointError, where, "numbers", value)
     scores = first_of({k: each for k, each in around.items() if isinstance(each, list)}, SCORES)
     while isinstance(scores, list) and scores and isinstance(scores[0], list):
         scores = [each[0] if isinstance(each, list) and each else each for each in scores]
@@ -161,14 +161,14 @@ def _row(where: str, row: Any) -> list[float]:
     if isinstance(row, dict):
         place = row.get("position", row)
         if not isinstance(place, dict) or not {"x", "y"} <= place.keys():
-            raise KeypointError(f"{where}: expected x, y and visibility, found {shortened(row)}")
+            raise unexpected(KeypointError, where, "x, y and visibility", row)
         given = first_of(row, CONFIDENCES)
         row = [place["x"], place["y"], given]
     elif isinstance(row, list) and len(row) == 4:
         row = [row[0], row[1], row[3]]  # x, y, z, visibility
     values = numbers(row, where)
     if values.shape not in ((2,), (3,)):
-        raise KeypointError(f"{where}: expected x, y[, confidence], found {shortened(row)}")
+        raise unexpected(KeypointError, where, "x, y[, confidence]", row)
     return [*values.tolist(), np.nan][:3]
 
 
@@ -181,15 +181,14 @@ def _labelme(where: str, shapes: object) -> list[Person]:
         place = f"{where}: shape {index}"
         point = numbers(shape.get("points"), place)
         if point.shape != (1, 2):
-            raise KeypointError(f"{place}: expected one point, found {shortened(point.tolist())}")
+            raise unexpected(KeypointError, place, "one point", point.tolist())
         group = people.setdefault(str(shape.get("group_id")), {})
         label = str(shape.get("label"))
         if label in group:
             raise KeypointError(f"{place}: {label!r} twice; give people a group_id of their own")
         group[label] = [*point[0].tolist(), 1.0]
     return [
-        Person(np.array(list(joints.values())), None if key == "None" else key, tuple(joints))
-        for key, joints in people.items()
+        Person.by_name(joints, None if key == "None" else key) for key, joints in people.items()
     ]
 
 

@@ -19,10 +19,11 @@ import torch
 
 from torchcss.errors import KeypointError
 from torchcss.files import StrPath, load_json
+from torchcss.io.keypoints.clicked import known_joint
 from torchcss.io.keypoints.people import Size
 from torchcss.io.keypoints.read import Scale, read_keypoints
 from torchcss.io.keypoints.tables import Row, table_rows
-from torchcss.joint_names import JOINT_NAMES, canonical_joint_name
+from torchcss.joint_names import canonical_joint_name
 from torchcss.types import Keypoints
 
 
@@ -105,14 +106,11 @@ def _read_csv(path: Path, rows: list[Row]) -> Keypoints:
     table: dict[str, list[float]] = {}
     for number, cells in rows[_is_heading(rows[0][1]) :]:
         where = f"{path}: row {number}"
-        name, values = canonical_joint_name(cells[0]), _values(cells)
-        if values is not None and name is None:
-            raise KeypointError(
-                f"{where}: unknown joint {cells[0]!r}; the known ones are {', '.join(JOINT_NAMES)}"
-            )
-        if name is not None and values == []:
+        values = _values(cells)
+        name = "" if values is None else known_joint(where, cells[0])
+        if values == []:
             continue  # a joint without a place is missing
-        if not name or not values or len(values) == 1 or not all(map(math.isfinite, values)):
+        if not values or len(values) == 1 or not all(map(math.isfinite, values)):
             raise KeypointError(f"{where}: expected joint, u, v[, confidence], found {cells}")
         if name in table:
             raise KeypointError(f"{where}: {name} is marked twice; leave one of the rows out")

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from torchcss.errors import KeypointError
-from torchcss.files import real_numbers, shortened
+from torchcss.files import real_numbers, unexpected
 from torchcss.io.keypoints.words import TRACKS, first_of, track_text
 from torchcss.joint_names import ALIASES
 
@@ -38,6 +38,11 @@ class Person(NamedTuple):
     joints: Float[np.ndarray, "j 3"]
     track: str | None = None
     names: Names | None = None
+
+    @classmethod
+    def by_name(cls, joints: Mapping[str, Sequence[float]], track: str | None = None) -> Person:
+        """A person of u, v and confidence of every joint by its name."""
+        return cls(np.array(list(joints.values())).reshape(-1, 3), track, tuple(joints))
 
 
 Frames = dict[Key, list[Person]]
@@ -87,9 +92,8 @@ def united(frames: Frames) -> tuple[Frames, Names | None]:
     for key, people in frames.items():
         for person in people:
             if person.names is None or len(set(person.names)) < len(person.joints):
-                raise KeypointError(
-                    f"{key}: expected a name of its own for every joint, found "
-                    f"{shortened(person.names)}"
+                raise unexpected(
+                    KeypointError, f"{key}", "a name of its own for every joint", person.names
                 )
             joints = np.zeros((len(names), 3))
             joints[[place[name] for name in person.names]] = person.joints

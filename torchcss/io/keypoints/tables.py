@@ -27,7 +27,7 @@ from typing import NamedTuple
 import numpy as np
 
 from torchcss.errors import KeypointError
-from torchcss.files import read_text, shortened
+from torchcss.files import read_text, refusing, shortened, unexpected
 from torchcss.io.keypoints import words
 from torchcss.io.keypoints.frames import in_seconds
 from torchcss.io.keypoints.mediapipe import LAYOUT, NUM_LANDMARKS, landmark_order, reordered
@@ -132,10 +132,8 @@ def table_rows(path: Path) -> list[Row]:
     text = read_text(path, KeypointError)
     text = re.sub(r"^sep=.\r?\n", "", text)  # for Excel
     comma = max(",;\t", key=re.sub(r"\A(\s*# .*\n)*", "", text).lstrip().partition("\n")[0].count)
-    try:
+    with refusing(KeypointError, f"{path}: cannot be read as CSV"):
         lines = list(csv.reader(io.StringIO(text, newline=""), delimiter=comma))
-    except csv.Error as error:
-        raise KeypointError(f"{path}: cannot be read as CSV: {error}") from error
     rows = [
         (number, [cell.strip() for cell in row])
         for number, row in enumerate(lines, start=1)
@@ -287,7 +285,7 @@ def _place(where: str, columns: _Columns, cells: Sequence[str], index: int) -> K
         return cell  # of labelled frames the picture's name
     match = re.fullmatch(r"(?:.*\.)?([0-9]{1,9})(?:\.0*)?", cell)
     if match is None:
-        raise KeypointError(f"{where}: expected a frame number, found {shortened(cell)}")
+        raise unexpected(KeypointError, where, "a frame number", cell)
     return int(match[1])
 
 
@@ -300,4 +298,4 @@ def _number(where: str, cell: str) -> float:
             return float(cell)
     except ValueError:
         pass
-    raise KeypointError(f"{where}: expected a number, found {shortened(cell)}")
+    raise unexpected(KeypointError, where, "a number", cell)
