@@ -118,11 +118,12 @@ _DEEPEST = 50
 """Brackets in brackets of a calibration in YAML."""
 
 _COLMAP = {
-    "SIMPLE_PINHOLE": "f cx cy", "PINHOLE": "fx fy cx cy", "SIMPLE_RADIAL": "f cx cy k1",
-    "RADIAL": "f cx cy k1 k2", "OPENCV": "fx fy cx cy k1 k2 p1 p2",
-    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    "SIMPLE_PINHOLE": "f cx cy", "PINHOLE": "fl_x fl_y cx cy", "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2", "OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2",
+    "FULL_OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2 k3 k4 k5 k6",
 }  # fmt: skip
-"""The parameters of COLMAP's camera models."""
+"""The parameters of COLMAP's camera models, in the words of Nerfstudio, which counts from the same
+corner; f is both focal lengths."""
 
 _COLMAP_MODELS = (
     ("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8),
@@ -139,7 +140,6 @@ def read_entries(path: Path) -> dict[str, Entry]:
         CameraError: If the file is missing, damaged or none of the formats.
         MissingExtraError: If SciPy is needed and not installed.
     """
-    suffix = path.suffix.lower()
     if path.is_dir():
         places = [path / n for n in (INTRINSICS, *_OF_COLMAP)]
         places += [path / inner / n for inner in ("sparse/0", "0", "sparse") for n in _OF_COLMAP]
@@ -149,24 +149,7 @@ def read_entries(path: Path) -> dict[str, Entry]:
             names = ", ".join((INTRINSICS, *_OF_COLMAP))
             raise CameraError(f"{path}: no calibration in this folder; expected {names} or .xml")
         return {name: entry for file in files for name, entry in read_entries(file).items()}
-    if suffix in (".yml", ".yaml"):
-        return _read_yaml(path)
-    if suffix == ".toml":
-        return _read_toml(path)
-    if suffix == ".bin":
-        return _colmap_entries(_binary_colmap(path))
-    if suffix in (".txt", ".csv"):
-        return _read_text(path)
-    if suffix == ".npy":
-        return _alone(path, {"K": load_array(path, CameraError).tolist()})
-    if suffix == ".xml":
-        return _alone(path, _opencv_xml(path))
-    if suffix == ".npz":
-        arrays = load_arrays(path, CameraError)
-        return _alone(path, {name: array.tolist() for name, array in arrays.items()})
-    if suffix == ".mat":
-        return _read_matlab(path)
-    return _read_json(path)
+    return _READERS.get(path.suffix.lower(), _read_json)(path)
 
 
 # The same things in other words.
@@ -375,16 +358,13 @@ def _colmap_entries(rows: Mapping[str, Sequence[str]]) -> dict[str, Entry]:
                 f"parameters of {', '.join(_COLMAP)}; found {shortened(' '.join(row))}"
             )
         given = dict(zip(names, values, strict=True))
-        focal = [given.get(each, given.get("f")) for each in ("fx", "fy")]
-        lens = [given.get(key, 0.0) for key in _COEFFICIENTS]
-        # The corner of the image is (0, 0) there.
-        K = _from_corner([*focal, given["cx"], given["cy"]])
-        entries[row[0]] = Entry(K, size, lens)
+        focal = {word: given["f"] for word in ("fl_x", "fl_y") if "f" in given}
+        entries[row[0]] = _entry({**given, **focal, "image_size_wh": size})
     return entries
 
 
-def _binary_colmap(path: Path) -> dict[str, list[str]]:
-    """COLMAP's binary file as the words that its text has."""
+def _read_binary(path: Path) -> dict[str, Entry]:
+    """COLMAP's binary file, by the words that its text has."""
     data, at = read_bytes(path, CameraError), 8
     rows: dict[str, list[str]] = {}
     with refusing(CameraError, f"{path}: expected COLMAP's cameras.bin"):
@@ -396,7 +376,7 @@ def _binary_colmap(path: Path) -> dict[str, list[str]]:
             words = [str(number), name, *map(str, size), *map(repr, values)]
             rows[f"{path}: camera {number}"] = words
             at += 24 + 8 * length
-    return rows
+    return _colmap_entries(rows)
 
 
 def _read_yaml(path: Path) -> dict[str, Entry]:
@@ -521,8 +501,8 @@ def _listed(value: Any) -> Any:
     return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
 
 
-def _opencv_xml(path: Path) -> dict[str, Any]:
-    """What OpenCV stores as XML."""
+def _read_xml(path: Path) -> dict[str, Entry]:
+    """What OpenCV and OpenPose store as XML."""
     root = parse_xml(path, "OpenCV's XML", CameraError)
     found: dict[str, Any] = {}
     for element in root:
@@ -537,7 +517,15 @@ def _opencv_xml(path: Path) -> dict[str, Any]:
                 found[element.tag] = json.loads((element.text or "").strip() or "null")
         except (ValueError, IndexError):
             found[element.tag] = (element.text or "").strip()
-    return found
+    return _alone(path, found)
+
+
+def _read_arrays(path: Path) -> dict[str, Entry]:
+    """Arrays by the usual words, or K alone."""
+    if path.suffix.lower() == ".npy":
+        return _alone(path, {"K": load_array(path, CameraError).tolist()})
+    arrays = load_arrays(path, CameraError)
+    return _alone(path, {name: array.tolist() for name, array in arrays.items()})
 
 
 # YAML.
@@ -592,3 +580,12 @@ def _load(path: Path) -> dict[str, Any]:
             f"{shortened(content)}"
         )
     return {str(key): value for key, value in content.items()}
+
+
+_READERS = {
+    **dict.fromkeys((".yml", ".yaml"), _read_yaml),
+    **dict.fromkeys((".txt", ".csv"), _read_text),
+    **dict.fromkeys((".npy", ".npz"), _read_arrays),
+    **{".bin": _read_binary, ".mat": _read_matlab, ".toml": _read_toml, ".xml": _read_xml},
+}
+"""By the suffix; everything else is JSON."""
