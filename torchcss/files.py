@@ -38,16 +38,16 @@ _ADVICE = {
 }
 
 
-def output_error(path: Path, error: OSError) -> OutputError:
+def output_error(path: Path, error: Exception) -> OutputError:
     """Return the `OutputError` that tells a user why `path` could not be written.
 
     Args:
         path: The file or folder that was wanted.
         error: What the operating system, or FFmpeg on its behalf, reported.
     """
-    advice = _ADVICE.get(
-        error.errno or 0, f"{error.strerror or error}; choose another folder with --out"
-    )
+    reason = one_line(getattr(error, "strerror", None) or error)
+    other = f"{reason}; choose another folder with --out"
+    advice = _ADVICE.get(getattr(error, "errno", None) or 0, other)
     return OutputError(f"{path}: cannot be written: {advice}")
 
 

@@ -370,7 +370,7 @@ class VideoWriter:
             picture.pts = self.num_frames
             self._container.mux(self._stream.encode(picture))
         except _av_errors() as error:
-            raise output_error(self.path, _as_os_error(error)) from error
+            raise output_error(self.path, error) from error
         self.num_frames += 1
 
     def _open(self, width: int, height: int) -> None:
@@ -411,7 +411,7 @@ class VideoWriter:
             if self.num_frames and not self.path.exists():
                 with suppress(OSError):
                     os.replace(self._partial, self.path)
-            raise output_error(self.path, _as_os_error(error)) from error
+            raise output_error(self.path, error) from error
         finally:
             with suppress(OSError):
                 self._partial.unlink(missing_ok=True)
@@ -607,9 +607,3 @@ def _upright(picture: VideoFrame, stream: VideoStream) -> UInt8[np.ndarray, "h w
 def _reason(error: Exception) -> str:
     """One short line of what a library said."""
     return one_line(getattr(error, "strerror", None) or error)
-
-
-def _as_os_error(error: Exception) -> OSError:
-    if isinstance(error, OSError):
-        return error
-    return OSError(getattr(error, "errno", 0) or 0, _reason(error))
