@@ -245,13 +245,12 @@ def _numbered(values: object) -> dict[str, dict[str, Any]]:
 
 def _alone(path: Path, values: Mapping[str, Any]) -> dict[str, Entry]:
     """The one camera of a file without extrinsics: those of the board's pictures are none."""
-    if pair := _numbered(values):
-        entries = {name: _entry(own) for name, own in pair.items()}
-        return {n: e._replace(rotation=None, translation=None) for n, e in entries.items()}
-    if not _has_camera(values):
+    cameras: Mapping[str, Mapping[str, Any]] = _numbered(values)
+    if not cameras and not _has_camera(values):
         raise unexpected(CameraError, path, "a calibration with camera_matrix", list(values))
     name = str(values.get("camera_name", values.get("name", path.stem)))
-    return {name: _entry(values)._replace(rotation=None, translation=None)}
+    entries = {name: _entry(own) for name, own in (cameras or {name: values}).items()}
+    return {n: entry._replace(rotation=None, translation=None) for n, entry in entries.items()}
 
 
 # Formats.

@@ -18,6 +18,7 @@ import numpy as np
 from torchcss.errors import KeypointError
 from torchcss.files import shortened
 from torchcss.io.keypoints.people import Frames, Key, People, Person
+from torchcss.io.keypoints.words import TIMES
 
 _MOST_FRAMES = 1_000_000
 
@@ -90,8 +91,9 @@ def files_of(folder: Path, suffix: str) -> list[Path]:
     return sorted(entry for entry in named if entry.suffix.lower() == suffix)
 
 
-def in_seconds(unit: float | None, frames: Frames) -> Frames:
-    """The times of frames in seconds; where the unit is not known, no frame lasts a second."""
+def in_seconds(time: str, frames: Frames) -> Frames:
+    """The times of frames in seconds; where the word says no unit, no frame lasts a second."""
+    unit = TIMES[time]
     if unit is None:
         gap = float(np.diff(np.sort(np.array(list(frames), float))).min(initial=np.inf))
         unit = 1.0 if gap < 1 or not np.isfinite(gap) else 1e-3 if gap < 1000 else 1e-6

@@ -15,7 +15,6 @@ from __future__ import annotations
 import io
 import pickle
 import zipfile
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -100,10 +99,7 @@ def read_h36m(path: Path, selection: str) -> People:
     if rest:
         raise KeypointError(f"expected SUBJECT/ACTION/CAMERA, found {selection!r}")
     where = "/".join(steps)
-    try:
-        points = np.asarray(chosen, dtype=np.float64)
-    except (ValueError, TypeError) as error:
-        raise KeypointError(f"{where}: expected numbers [frames, joints, 2]") from error
+    points = _numbers(chosen)
     if points.ndim != 3 or points.shape[2] not in (2, 3) or 0 in points.shape:
         raise KeypointError(
             f"{where}: expected numbers [frames, joints, 2], got {list(points.shape)}"
@@ -124,12 +120,8 @@ def _read_detections(path: Path) -> People:
     frames: list[list[Person]] = []
     for index, entry in enumerate(entries):
         person = entry[-1] if isinstance(entry, (list, np.ndarray)) and len(entry) else ()
-        try:
-            found = np.asarray(person, dtype=np.float64)
-        except (ValueError, TypeError):
-            found = np.zeros(1)
-        shape: Sequence[int] = found.shape
-        if found.size and (len(shape) != 3 or shape[1] not in (3, 4)):
+        found = _numbers(person)
+        if found.size and (found.ndim != 3 or found.shape[1] not in (3, 4)):
             raise KeypointError(
                 f"frame {index}: expected numbers [people, 4, joints], got {list(found.shape)}"
             )
@@ -137,6 +129,14 @@ def _read_detections(path: Path) -> People:
         frames.append([Person(joints) for joints in rows])
     size = _size(_metadata(path))
     return People(frames, None, ["format: VideoPose3D's detections"], size_wh=size)
+
+
+def _numbers(value: Any) -> np.ndarray:
+    """An array of numbers; of what is none, or ragged, one of a shape that nobody expects."""
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (ValueError, TypeError):
+        return np.zeros(1)
 
 
 def _metadata(path: Path) -> dict[str, Any]:

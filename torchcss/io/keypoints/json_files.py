@@ -45,7 +45,7 @@ from torchcss.io.keypoints.people import (
     numbers,
     united,
 )
-from torchcss.io.keypoints.words import FRAMES, NAMES, PICTURES, TIMES, first_of, plain_word
+from torchcss.io.keypoints.words import FRAMES, NAMES, PICTURES, TIMES, first_of, time_word
 from torchcss.io.video import natural_order
 
 _FORMATS = {
@@ -230,10 +230,8 @@ def _frames(path: Path, content: Any, num_frames: int | None) -> list[list[Perso
                 f"others have, found {shortened(entry)}"
             )
         found.setdefault(key, []).extend(people_of(f"{path}: {key!r}", entry, alone=True))
-    if not all(isinstance(key, float) for key in found):
-        return found
-    words = {plain_word(key) for key in content[0]}
-    return in_seconds(next(TIMES[word] for word in TIMES if word in words), found)
+    time = time_word(content[0]) if all(isinstance(key, float) for key in found) else None
+    return found if time is None else in_seconds(time, found)
 
 
 def _key_of(where: str, entry: object) -> Key | None:

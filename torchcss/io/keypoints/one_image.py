@@ -118,9 +118,5 @@ def _read_csv(path: Path, rows: list[Row]) -> Keypoints:
     if not table:
         raise KeypointError(f"{path}: no joints; expected rows joint, u, v[, confidence]")
     numbers = torch.tensor(list(table.values()), dtype=torch.float64)
-    return Keypoints(
-        numbers[:, :2],
-        numbers[:, 2].clamp(0, 1),
-        tuple(table),
-        report=(f"format: CSV, {len(table)} joints",),
-    )
+    report = (f"format: CSV, {len(table)} joints",)
+    return Keypoints(numbers[:, :2], numbers[:, 2].clamp(0, 1), tuple(table), report=report)

@@ -161,7 +161,7 @@ def _person(
     everyone = in_order(people, film, report)
     everyone = [[p for p in frame if is_there(p.joints)] for frame in everyone]
     frames = _stacked(everyone)
-    _check_counts(frames, people.names, film.num_frames, first_frame)
+    _check_counts(frames, people.names, film, first_frame)
     frames = _checked_numbers(frames, people.names, report)
     _check_somebody(frames, first_frame)
     points = np.concatenate([frame[frame[..., 2] > 0.0][:, :2] for frame in frames])
@@ -257,14 +257,11 @@ def _read_folder(path: Path, image_size_wh: Size) -> People:
 
 
 def _check_counts(
-    frames: list[np.ndarray],
-    names: Names | None,
-    num_frames: int | None,
-    first_frame: int,
+    frames: list[np.ndarray], names: Names | None, film: Film, first_frame: int
 ) -> None:
     """Refuse another number of frames than the video's, and of names than joints."""
-    if num_frames is not None and len(frames) != num_frames:
-        raise wrong_count(num_frames, len(frames))
+    if film.num_frames is not None and len(frames) != film.num_frames:
+        raise wrong_count(film.num_frames, len(frames))
     if not 0 <= first_frame < max(1, len(frames)):
         raise KeypointError(
             f"the first frame {first_frame} is beyond the file, which has {len(frames)} frames"

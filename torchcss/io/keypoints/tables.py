@@ -108,7 +108,7 @@ def read_table(path: Path) -> People:
         report.append(f"columns left out: {shortened(', '.join(left))}")
     joints, frames = _read_rows(columns, rows[1:])
     if columns.time is not None:
-        frames = in_seconds(words.TIMES[columns.time], frames)
+        frames = in_seconds(columns.time, frames)
     order = landmark_order(joints)
     is_mediapipe = order is not None and len(joints) == NUM_LANDMARKS
     if order is not None and is_mediapipe:
@@ -161,10 +161,9 @@ def _counts(rows: Sequence[Row]) -> bool:
 def _headed(heading: Sequence[str]) -> _Columns:
     """The columns of a table with one heading, long or wide."""
     places = {cell: index for index, cell in reversed([*enumerate(heading)])}
-    plain = {words.plain_word(cell) for cell in heading}
     frame, time = words.first_of(places, words.FRAMES), None
     if frame is None:
-        time = next((word for word in words.TIMES if word in plain), None)
+        time = words.time_word(heading)
         frame = words.first_of(places, words.PICTURES if time is None else (time,))
     joint, track = words.first_of(places, _JOINTS), words.first_of(places, words.TRACKS)
     split = [_split(cell) for cell in heading]

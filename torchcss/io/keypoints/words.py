@@ -7,7 +7,7 @@ Call `first_of`.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import TypeVar
 
@@ -81,6 +81,12 @@ def first_of(entry: Mapping[str, Value], words: Sequence[str]) -> Value | None:
     known = [(plain_word(key), value) for key, value in entry.items() if value is not None]
     found = dict(reversed(known))
     return next((found[word] for word in words if word in found), None)
+
+
+def time_word(words: Iterable[str]) -> str | None:
+    """Which of the words is a time's, the one that says most if there are several."""
+    plain = {plain_word(word) for word in words}
+    return next((word for word in TIMES if word in plain), None)
 
 
 def track_text(value: float | str) -> str | None:
