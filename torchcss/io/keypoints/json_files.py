@@ -33,7 +33,7 @@ from torchcss.io.keypoints.json_people import (
     people_of,
     said_size,
 )
-from torchcss.io.keypoints.mediapipe import LAYOUT, NUM_LANDMARKS, landmark_order, reordered
+from torchcss.io.keypoints.mediapipe import LAYOUT, NUM_LANDMARKS, reordered
 from torchcss.io.keypoints.people import (
     Frames,
     Key,
@@ -125,9 +125,7 @@ def _people(name: str, frames: Frames, names: Names | None, *, in_order: bool = 
         # Who is not in a frame keeps his place there (Pose2Sim's): the place says who it is.
         for people in frames.values():
             people[:] = [p._replace(track=p.track or f"{n}") for n, p in enumerate(people)]
-    order = landmark_order(names or ())
-    if order is not None:
-        names, frames = None, reordered(frames, order)
+    frames, names = reordered(frames, names or ())
     found = list(frames.values()) if in_order else frames
     if names is None and everyone and len(everyone[0].joints) == NUM_LANDMARKS:
         return People(found, None, ["format: MediaPipe landmarks"], LAYOUT, corner_fractions=True)

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from torchcss.io.keypoints.people import Frames, People, Person, screened
+from torchcss.io.keypoints.people import Frames, Names, People, Person, screened
 from torchcss.joint_names import ALIASES, names_in
 
 LAYOUT = "MediaPipe-33"
@@ -29,20 +29,24 @@ NAMES = names_in(
 """MediaPipe's own names, in its order."""
 
 
-def landmark_order(names: Sequence[str]) -> list[int] | None:
-    """Where the joints stand in their order, if they are numbered, or MediaPipe's landmarks."""
+def reordered(frames: Frames, names: Sequence[str]) -> tuple[Frames, Names | None]:
+    """The people and the names of their joints; numbered joints and MediaPipe's in their order.
+
+    Args:
+        frames: The people.
+        names: Names of their joints, or none; what comes in an order has none any more.
+    """
     plain = [re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_") for name in names]
     if plain and all(map(str.isdigit, plain)):
-        return sorted(range(len(plain)), key=lambda index: int(plain[index]))
-    return [plain.index(name) for name in NAMES] if set(plain) == set(NAMES) else None
-
-
-def reordered(frames: Frames, order: list[int]) -> Frames:
-    """The people with their joints in that order."""
+        order = sorted(range(len(plain)), key=lambda index: int(plain[index]))
+    elif set(plain) == set(NAMES):
+        order = [plain.index(name) for name in NAMES]
+    else:
+        return frames, tuple(names) or None
     return {
         key: [person._replace(joints=person.joints[order]) for person in people]
         for key, people in frames.items()
-    }
+    }, None
 
 
 def read_landmark_array(name: str, array: np.ndarray) -> People:

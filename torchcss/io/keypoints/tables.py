@@ -30,7 +30,7 @@ from torchcss.errors import KeypointError
 from torchcss.files import read_text, refusing, shortened, unexpected
 from torchcss.io.keypoints import words
 from torchcss.io.keypoints.frames import in_seconds
-from torchcss.io.keypoints.mediapipe import LAYOUT, NUM_LANDMARKS, landmark_order, reordered
+from torchcss.io.keypoints.mediapipe import LAYOUT, NUM_LANDMARKS, reordered
 from torchcss.io.keypoints.people import Frames, Key, People, Person, screened
 from torchcss.joint_names import CASE, names_in
 
@@ -109,18 +109,15 @@ def read_table(path: Path) -> People:
     joints, frames = _read_rows(columns, rows[1:])
     if columns.time is not None:
         frames = in_seconds(columns.time, frames)
-    order = landmark_order(joints)
-    is_mediapipe = order is not None and len(joints) == NUM_LANDMARKS
-    if order is not None and is_mediapipe:
-        frames = reordered(frames, order)
+    frames, names = reordered(frames, joints)
     in_order = columns.frame is None and columns.joint is None
     people = list(frames.values()) if in_order else frames
-    if is_mediapipe:
+    if names is None and len(joints) == NUM_LANDMARKS:
         report.insert(0, "format: CSV of MediaPipe's landmarks")
         return People(people, None, report, LAYOUT, corner_fractions=True)
     report.insert(0, "format: CSV, a heading per column")
     first = 0 if any(cell.lower() == "frame_idx" for cell in heading) else None  # SLEAP's
-    return People(people, None if order is not None else tuple(joints), report, first=first)
+    return People(people, names, report, first=first)
 
 
 def table_rows(path: Path) -> list[Row]:
