@@ -280,7 +280,7 @@ def prior_at_one_by_one(posterior: GaussianMixture, prior: GaussianMixture) -> l
         for pi, centre, spread in zip(prior.weight, prior.mean, prior.covariance, strict=True):
             apart = mean - centre
             squared = float(apart @ torch.linalg.solve(covariance + spread, apart))
-            total += float(pi) * math.exp(-min(squared / 2, n, 10))
+            total += float(pi) * math.exp(-3.4 * min(squared / (2 * n), 1))
         logs.append(math.log(total))
     return logs
 
@@ -321,11 +321,11 @@ def test_prior_at_of_what_goes_on_and_of_what_is_new(dtype):
     assert past.parent.tolist() == [0, 0, 1, 2, -1]
     expected = torch.stack(
         [
-            torch.tensor([0.0, -5.0], dtype=dtype).logsumexp(0),
-            torch.tensor([0.0, -5.0], dtype=dtype).logsumexp(0),
-            torch.tensor([-2.0, -3.0], dtype=dtype).logsumexp(0),
-            log_total - 2,  # who has no weight gives none
-            log_total - 2,
+            torch.tensor([0.0, -6.4], dtype=dtype).logsumexp(0),
+            torch.tensor([0.0, -6.4], dtype=dtype).logsumexp(0),
+            torch.tensor([-3.4, -3.0], dtype=dtype).logsumexp(0),
+            log_total - 3.4,  # who has no weight gives none
+            log_total - 3.4,
         ]
     )
     torch.testing.assert_close(past.log_weight, expected - log_total)

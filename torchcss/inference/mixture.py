@@ -34,10 +34,10 @@ from torchcss.linalg import (
 )
 from torchcss.types import Items, Matrices, Numbers, Vector, Vectors
 
-_UNEXPECTED = 10.0
-"""Most that it costs a mode to be far from all that was expected, nats: one pose in 22,000 comes as
-no motion of the modes explains. With n nats, 34 for a person, what is found again after a loss
-could not lead for many frames, however much better it fits."""
+_UNEXPECTED = 3.4
+"""What it costs a mode to be new, nats: one frame in thirty has a pose that no motion of the modes
+explains. More lets a track that was lost, or has taken the wrong one of two poses, stay so for many
+frames, however much better another fits."""
 
 _STATES_AT_ONCE = 1024
 """States whose differences from all components are held in memory together."""
@@ -416,12 +416,13 @@ def prior_at(posterior: GaussianMixture, prior: GaussianMixture) -> Past:
 
     A mode (mu, Sigma) inherits from every prior component (pi_j, mu_j, Sigma_j), by how near it is,
 
-        sum_j  pi_j exp(-min(d_j, c)),    d_j = (mu - mu_j)^T (Sigma + Sigma_j)^-1 (mu - mu_j) / 2,
+        sum_j  pi_j exp(-c min(d_j, 1)),    d_j = (mu - mu_j)^T (Sigma + Sigma_j)^-1 (mu - mu_j) / 2n,
 
-    which for small d is p(x_t | R_{t-1}) of eq. 10 [IJRR] smoothed by the mode, but for the
-    components' volumes. In n dimensions d is n / 2 on average for a mode that moved as the prior
-    expects. What is farther than c from all components is new and has no parent; with c = n, but
-    at most 10 nats, it is unlikely and not impossible.
+    p(x_t | R_{t-1}) of eq. 10 [IJRR] smoothed by the mode, but for the components' volumes and to a
+    power. In n dimensions d is 1/2 on average for a mode that moved as the prior expects. What is
+    twice as far from all components is new and has no parent; it is unlikely, at c = 3.4 nats, and
+    not impossible. The power is that of what frames say (`Tracker.likelihood_power`) for a person:
+    what the prior on motion lacks is wrong for many frames too, as an acceleration is.
     Other than in `match_to_prior`, no mode can take a component's weight from another, and none is
     handed the weight of a component that merely was left over.
 
@@ -435,10 +436,9 @@ def prior_at(posterior: GaussianMixture, prior: GaussianMixture) -> Past:
     n = _same_state("prior_at", posterior, prior)
     apart = posterior.mean[:, None] - prior.mean[None, :]
     both = posterior.covariance[:, None] + prior.covariance[None, :]
-    most = min(float(n), _UNEXPECTED)
-    distance = (0.5 * squared_mahalanobis(apart, both)).clamp(max=most)
+    distance = (squared_mahalanobis(apart, both) / (2 * n)).clamp(max=1.0)
     nearest = distance.min(-1)
     return Past(
-        (prior.normalise().log_weight - distance).logsumexp(-1),
-        torch.where(nearest.values < most, nearest.indices, -1),
+        (prior.normalise().log_weight - _UNEXPECTED * distance).logsumexp(-1),
+        torch.where(nearest.values < 1, nearest.indices, -1),
     )
