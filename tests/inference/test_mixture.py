@@ -271,7 +271,9 @@ def test_tempered_is_the_mode_of_a_tempered_likelihood(power, seed):
     torch.testing.assert_close(tempered(prior_alone, power, prior), prior_alone)
 
 
-def prior_at_one_by_one(posterior: GaussianMixture, prior: GaussianMixture) -> list[float]:
+def prior_at_one_by_one(
+    posterior: GaussianMixture, prior: GaussianMixture, surprise: float
+) -> list[float]:
     """The definition, mode by mode."""
     n = posterior.mean.shape[-1]
     logs = []
@@ -280,23 +282,29 @@ def prior_at_one_by_one(posterior: GaussianMixture, prior: GaussianMixture) -> l
         for pi, centre, spread in zip(prior.weight, prior.mean, prior.covariance, strict=True):
             apart = mean - centre
             squared = float(apart @ torch.linalg.solve(covariance + spread, apart))
-            total += float(pi) * math.exp(-3.4 * min(squared / (2 * n), 1))
+            total += float(pi) * math.exp(-min(n, surprise) * min(squared / (2 * n), 1))
         logs.append(math.log(total))
     return logs
 
 
 @settings(max_examples=40, deadline=None)
-@given(k=st.integers(1, 6), m=st.integers(1, 6), n=st.integers(1, 14), seed=st.integers(0, 2**31))
-def test_prior_at_is_its_definition(k, m, n, seed):
+@given(
+    k=st.integers(1, 6),
+    m=st.integers(1, 6),
+    n=st.integers(1, 8),
+    surprise=st.sampled_from([0.5, 3.4, math.inf]),
+    seed=st.integers(0, 2**31),
+)
+def test_prior_at_is_its_definition(k, m, n, surprise, seed):
     drawn = torch.Generator().manual_seed(seed)
     posterior = random_mixture(k, n, generator=drawn)
     prior = random_mixture(m, n, generator=drawn)
-    past = prior_at(posterior, prior)
-    expected = torch.tensor(prior_at_one_by_one(posterior, prior)).double()
+    past = prior_at(posterior, prior, surprise)
+    expected = torch.tensor(prior_at_one_by_one(posterior, prior, surprise)).double()
     torch.testing.assert_close(past.log_weight, expected, rtol=1e-6, atol=1e-6)
     # Modes do not compete: what one inherits does not depend on the others, or on any order.
     order = torch.randperm(k, generator=drawn)
-    again = prior_at(posterior.take(order), prior.take(torch.arange(m).flip(0)))
+    again = prior_at(posterior.take(order), prior.take(torch.arange(m).flip(0)), surprise)
     torch.testing.assert_close(again.log_weight, past.log_weight[order])
     near = past.parent[order] >= 0
     assert torch.equal(again.parent >= 0, near)
@@ -321,11 +329,11 @@ def test_prior_at_of_what_goes_on_and_of_what_is_new(dtype):
     assert past.parent.tolist() == [0, 0, 1, 2, -1]
     expected = torch.stack(
         [
-            torch.tensor([0.0, -6.4], dtype=dtype).logsumexp(0),
-            torch.tensor([0.0, -6.4], dtype=dtype).logsumexp(0),
-            torch.tensor([-3.4, -3.0], dtype=dtype).logsumexp(0),
-            log_total - 3.4,  # who has no weight gives none
-            log_total - 3.4,
+            torch.tensor([0.0, -5.0], dtype=dtype).logsumexp(0),
+            torch.tensor([0.0, -5.0], dtype=dtype).logsumexp(0),
+            torch.tensor([-2.0, -3.0], dtype=dtype).logsumexp(0),
+            log_total - 2,  # who has no weight gives none
+            log_total - 2,
         ]
     )
     torch.testing.assert_close(past.log_weight, expected - log_total)

@@ -34,11 +34,6 @@ from torchcss.linalg import (
 )
 from torchcss.types import Items, Matrices, Numbers, Vector, Vectors
 
-_UNEXPECTED = 3.4
-"""What it costs a mode to be new, nats: one frame in thirty has a pose that no motion of the modes
-explains. More lets a track that was lost, or has taken the wrong one of two poses, stay so for many
-frames, however much better another fits."""
-
 _STATES_AT_ONCE = 1024
 """States whose differences from all components are held in memory together."""
 
@@ -411,24 +406,27 @@ def match_to_prior(
     return Past(factor, parent)
 
 
-def prior_at(posterior: GaussianMixture, prior: GaussianMixture) -> Past:
+def prior_at(
+    posterior: GaussianMixture, prior: GaussianMixture, surprise: float = math.inf
+) -> Past:
     """The prior's weight at the place of each mode: Fig. 6 step 5, without a choice.
 
     A mode (mu, Sigma) inherits from every prior component (pi_j, mu_j, Sigma_j), by how near it is,
 
-        sum_j  pi_j exp(-c min(d_j, 1)),    d_j = (mu - mu_j)^T (Sigma + Sigma_j)^-1 (mu - mu_j) / 2n,
+        sum_j  pi_j exp(-c min(d_j, 1)),   d_j = (mu - mu_j)^T (Sigma + Sigma_j)^-1 (mu - mu_j) / 2n
 
-    p(x_t | R_{t-1}) of eq. 10 [IJRR] smoothed by the mode, but for the components' volumes and to a
-    power. In n dimensions d is 1/2 on average for a mode that moved as the prior expects. What is
-    twice as far from all components is new and has no parent; it is unlikely, at c = 3.4 nats, and
-    not impossible. The power is that of what frames say (`Tracker.likelihood_power`) for a person:
-    what the prior on motion lacks is wrong for many frames too, as an acceleration is.
+    with c = n: for small d_j p(x_t | R_{t-1}) of eq. 10 [IJRR] smoothed by the mode, but for the
+    components' volumes. In n dimensions d_j is 1/2 on average for a mode that moved as the prior
+    expects. What is twice as far from all components is new and has no parent; it is unlikely, not
+    impossible. A smaller c takes p(x_t | R_{t-1}) to the power c / n: what the prior on motion
+    lacks is wrong for many frames, as an acceleration is.
     Other than in `match_to_prior`, no mode can take a component's weight from another, and none is
     handed the weight of a component that merely was left over.
 
     Args:
         posterior: The modes of this frame.
         prior: The modes of the frame before, one frame ahead.
+        surprise: c, nats, where that is less than n.
 
     Raises:
         ShapeError: If the mixtures are over different states.
@@ -439,6 +437,6 @@ def prior_at(posterior: GaussianMixture, prior: GaussianMixture) -> Past:
     distance = (squared_mahalanobis(apart, both) / (2 * n)).clamp(max=1.0)
     nearest = distance.min(-1)
     return Past(
-        (prior.normalise().log_weight - _UNEXPECTED * distance).logsumexp(-1),
+        (prior.normalise().log_weight - min(n, surprise) * distance).logsumexp(-1),
         torch.where(nearest.values < 1, nearest.indices, -1),
     )

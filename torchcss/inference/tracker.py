@@ -22,6 +22,7 @@ exactly as one that was never interrupted.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import field, replace
 from typing import NamedTuple
@@ -285,6 +286,7 @@ class Tracker(SequenceTracker):
             only: a mode far from all of the prior may then be handed the best past there is, and
             the pose that had it goes on with another's. Step 4 then keeps the mode that weighs most
             after step 5, however many are cheaper in this frame, if there is a `separation`.
+        surprise: What it costs a mode then to be where no motion leads, nats, see `prior_at`.
         separation: Modes of which no landmark is this far apart are one explanation, of which one
             alone is kept as long as there are others. Zero: the K best modes are kept however
             alike they are, as in Fig. 6. Clutter makes many minima within a hand's breadth, which
@@ -308,6 +310,7 @@ class Tracker(SequenceTracker):
     survivors: int = 0
     standard_bhattacharyya: bool = False
     soft_matching: bool = False
+    surprise: float = math.inf
     separation: float = 0.0
     keep_alike: bool = True
     converged_only: bool = False
@@ -318,6 +321,7 @@ class Tracker(SequenceTracker):
         check_positive(self, "oversampling")
         if not 0 <= self.forgetting <= 1:
             raise ConfigurationError(f"Tracker.forgetting: expected 0 to 1, got {self.forgetting}")
+        check_positive(self, "surprise")
 
     @property
     def stated_power(self) -> float:
@@ -492,7 +496,7 @@ class Tracker(SequenceTracker):
         unpruned = GaussianMixture(modes.mean, modes.covariance, log_weight).normalise()
         remembered = self.forgetting * prior.mixture.normalise().log_weight
         tempered = prior.mixture._replace(log_weight=remembered)
-        past = prior_at(unpruned, tempered) if self.soft_matching else None
+        past = prior_at(unpruned, tempered, self.surprise) if self.soft_matching else None
         kept = self._explanations(problem, unpruned, volume - cost, past)
         pruned = unpruned.take(kept).normalise()
         if past is None:
