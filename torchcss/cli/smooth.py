@@ -29,8 +29,8 @@ class Smooth:
     """Folder for smooth.npz and summary.json; by default the run's folder."""
     images: bool = False
     """Fit the trajectory to the images of the run's cameras again; implied by --video."""
-    likelihood_power: float | None = Smoothing.likelihood_power
-    """Power of each frame's likelihood when modes are chosen; by default that of the track."""
+    likelihood_power: float = Smoothing.likelihood_power
+    """Power of each frame's likelihood over that of the motion, when modes are chosen."""
     persistence: float = Smoothing.persistence
     """How many frames say as much, in the covariances, as one that is independent."""
     acceleration_ratio: float | None = None

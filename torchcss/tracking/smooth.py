@@ -42,9 +42,9 @@ class Smoothing:
     """How to smooth.
 
     Attributes:
-        likelihood_power: Power of each frame's likelihood when modes of several frames are weighed
-            against the motion between them; below 1 because errors of images persist over frames.
-            None: that of the track.
+        likelihood_power: Power of each frame's likelihood over that of the motion between frames,
+            when modes are chosen. One: both count alike, as in `Tracker.surprise`; what model and
+            motion lack persists over frames.
         acceleration_ratio: Expected accelerations over expected velocities, 1/s; lower is smoother.
             For the modes of a tracker 10 is good, for images 20.
         persistence: How many frames say as much, in the covariances, as one that is independent.
@@ -53,7 +53,7 @@ class Smoothing:
         lag: How many frames after each may say something of it; None: all.
     """
 
-    likelihood_power: float | None = None
+    likelihood_power: float = 1.0
     acceleration_ratio: float = 10.0
     persistence: float = 20.0
     lag: int | None = None
@@ -62,8 +62,7 @@ class Smoothing:
         if self.lag is not None and self.lag < 0:
             raise ConfigurationError(f"lag: expected at least 0 frames, got {self.lag}")
         for name in ("likelihood_power", "acceleration_ratio", "persistence"):
-            number = getattr(self, name)
-            if number is not None and not 0 < number < math.inf:
+            if not 0 < (number := getattr(self, name)) < math.inf:
                 raise ConfigurationError(f"{name}: expected a positive number, got {number}")
 
 
@@ -176,7 +175,7 @@ def _all_in_view(body: BodyModel, track: TrackedModes, choice: Smoothing) -> Smo
         node,
         track.times,
         Transition(velocity=tuple(body.motion_rate.tolist())),
-        evidence=choice.likelihood_power or track.likelihood_power,
+        evidence=choice.likelihood_power,
         changes=changes,
         period=period,
     )
