@@ -61,6 +61,12 @@ def test_bowl_in_one_step_with_its_covariance(batch, dtype, generator):
     assert not bool(modes.active.any())
 
 
+def test_ends_are_those_of_a_descent_with_covariances(generator):
+    cost, x0 = problems.Rosenbrock(), 3 * randn(9, 5, generator=generator)
+    bounds = Bounds(torch.full((5,), -1.0).double(), torch.full((5,), 0.8).double())
+    assert torch.equal(NEWTON.ends(cost, x0, bounds), NEWTON.minimise(cost, x0, bounds).mean)
+
+
 def test_rosenbrock_valley(generator):
     modes = NEWTON.minimise(
         problems.Rosenbrock(), randn(20, 2, generator=generator), problems.unbounded(2)

@@ -1,3 +1,4 @@
+import math
 from dataclasses import replace
 
 import problems
@@ -98,6 +99,7 @@ def test_numbers_and_noise_reach_the_tracker():
 def test_weights_of_css_and_of_figure_6():
     """An arm may count evidence otherwise than a body; as printed there is no such choice."""
     arm, body = (make_tracker("css", name) for name in ("arm8", "body34"))
+    assert (arm.surprise, body.surprise) == (math.inf, 3.4)
     assert isinstance(arm, Tracker)
     assert isinstance(body, Tracker)
     assert (arm.likelihood_power, body.likelihood_power) == (0.05, 0.1)

@@ -102,10 +102,9 @@ class Preset:
             the mean distance an arm that is flipped hardly counts: on the rendered body-clutter
             the best of the modes is at 78 mm with this, and was at 101 with a mean of 5 cm.
         soft_matching: See `Tracker`.
-        surprise_body: `Tracker.surprise` for a body. With n = 34 nats what is found after a loss,
-            or the right one of two poses, cannot lead for many frames, however much better it fits:
-            3.4, the power 0.1, took the best mode's PA error on 24 rendered clips from 53 to 47 mm.
-            An arm keeps n: nothing tells it from its mirror image but where it was.
+        surprise_body: `Tracker.surprise` for a body: a tenth of its n = 34 nats, as a frame's
+            likelihood counts a tenth. An arm keeps n: nothing tells it from its mirror image but
+            where it was.
         jumps_every: Every how many frames the flips of the best mode join the search, see
             `torchcss.tracking.flip_moves`; 0, as in the papers: never.
         keep_alike: See `Tracker`.
