@@ -23,6 +23,7 @@ Files that name their joints are read by name; the others by layout, which their
 tells (25 is BODY_25 or BODY_25B: the places of the points decide). Out come the catalogue's names
 (`torchcss.joint_names`); a joint that has none keeps its own. A missing joint has confidence 0 and
 stands at (0, 0). Of several people, one is followed, by the file's own tracks where it has them.
+Left and right that change places for some frames are put back (`torchcss.io.keypoints.sides`).
 Every such choice, and whatever looks odd, is a line of `Keypoints.report`.
 
 By default: `read_keypoints(path, image_size_wh=(w, h), num_frames=t)`.
@@ -49,6 +50,7 @@ from torchcss.io.keypoints.json_files import read_folder, read_json
 from torchcss.io.keypoints.labels import read_labels
 from torchcss.io.keypoints.one_person import Whom, follow, size_of
 from torchcss.io.keypoints.people import Names, People, Person, Size, is_there
+from torchcss.io.keypoints.sides import with_sides_put_back
 from torchcss.io.keypoints.tables import read_table
 from torchcss.joint_names import ALIASES, JOINT_NAMES, layout_of_names
 from torchcss.types import Keypoints
@@ -178,6 +180,7 @@ def _person(
     tracks = [[person.track for person in frame] for frame in everyone]
     chosen = follow(frames, tracks, whom, report)
     names = _joint_names(people, chosen, layout, report)
+    chosen = with_sides_put_back(chosen, names, report)
     report += findings(chosen, names, image_size_wh, first_frame)
     positions = np.where(chosen[..., 2:] > 0.0, chosen[..., :2], 0.0)
     confidence = torch.from_numpy(chosen[..., 2].copy())
