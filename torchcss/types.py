@@ -134,8 +134,8 @@ class Status(IntEnum):
         return {
             Status.RUNNING: "still running",
             Status.CONVERGED: "the projected gradient is below the tolerance",
-            Status.SMALL_STEP: "no step within the numerical resolution lowers the cost; "
-            "use float64 if the gradient matters",
+            Status.SMALL_STEP: "short steps lower the cost by less than the tolerance, as where it "
+            "jumps or has a kink; use float64 if the gradient matters",
             Status.STEP_LIMIT: "the step limit was reached; raise max_steps",
             Status.NON_FINITE: "the cost is not finite at the start; check the input",
         }[self]

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from torchcss.inference.trust_region import FUTILE, GOOD_ERROR, LEAST_RATIO, PLEASANT
+from torchcss.inference.trust_region import GOOD_ERROR, LEAST_RATIO, PLEASANT
 from torchcss.kernels.compiler import by_precision, entry, inlined, kernel, sqrt
 from torchcss.types import Status
 
@@ -124,9 +124,9 @@ def advance(
         accepted[b] = False
         if items.status[b] == _RUNNING:
             accepted[b] = finite and _accepts(decrease[b], items.predicted[b])
-            _judge(items, trial, b, space, rules, accepted[b], decrease[b])
-        if items.status[b] == _RUNNING:
-            _plan(items, b, space, rules, memory, accepted[b])
+            fell_short = _judge(items, trial, b, space, rules, accepted[b], decrease[b])
+            if items.status[b] == _RUNNING:
+                _plan(items, b, space, rules, memory, fell_short)
 
 
 @kernel
@@ -155,14 +155,19 @@ def _judge(
     rules: Rules,
     accepted: bool,
     decrease: float,
-) -> None:
-    """Radius, damping and status after a trial; take its place if it is accepted."""
-    predicted, at = items.predicted[b], items.at
+) -> bool:
+    """Radius, damping and status after a trial; take its place if it is accepted.
+
+    Returns whether the step promised less than the tolerance, and fell short even of that.
+    """
+    predicted, at, fell_short = items.predicted[b], items.at, False
     items.num_steps[b] += 1
     if predicted != 0.0:
         length = _norm(items.step[b], space.weight)
         after = _next_radius(items.radius[b], length, decrease / predicted, accepted)
         items.radius[b] = min(after, rules.greatest_radius)
+        shrinks = not accepted or items.radius[b] < length
+        fell_short = shrinks and predicted < rules.tolerance
     if accepted:
         before = _norm(at.gradient[b], space.inverse)
         after = _norm(trial.gradient[b], space.inverse)
@@ -175,6 +180,7 @@ def _judge(
                 at.hessian[b, i, j] = trial.hessian[b, i, j]
     elif math.isinf(at.value[b]):
         items.status[b] = _NON_FINITE
+    return fell_short
 
 
 @kernel
@@ -211,7 +217,9 @@ def _times(matrix: Array, vector: Array, product: Array) -> None:
 
 
 @kernel
-def _plan(items: Items, b: int, space: Space, rules: Rules, memory: Memory, accepted: bool) -> None:
+def _plan(
+    items: Items, b: int, space: Space, rules: Rules, memory: Memory, fell_short: bool
+) -> None:
     """Find the next step of an item, or stop it if there is nothing to gain."""
     at, step, floor = items.at, memory.step, 2.0 * rules.tolerance
     x, hessian = at.x[b], at.hessian[b]
@@ -225,8 +233,7 @@ def _plan(items: Items, b: int, space: Space, rules: Rules, memory: Memory, acce
     _times(hessian, step, memory.product)
     predicted = -_dot(step, memory.gradient) - 0.5 * _dot(step, memory.product)
     converged = predicted < rules.tolerance and damping <= floor
-    futile = not accepted and predicted < FUTILE * rules.tolerance
-    ends = converged or futile or predicted <= 4.0 * _epsilon(damping) * abs(at.value[b])
+    ends = converged or fell_short or predicted <= 4.0 * _epsilon(damping) * abs(at.value[b])
     items.damping[b] = damping
     share = 0.0 if ends and at.share[b] != 1.0 else 1.0
     items.predicted[b] = share * predicted

@@ -28,9 +28,10 @@ An item stops as
 
 * `CONVERGED` when the undamped Newton step, on a positive definite model, promises less than
   `tolerance` nats: half the squared Newton decrement, in which the units of the state cancel;
-* `SMALL_STEP` when steps are rejected until even a very short one promises next to nothing, or when
-  the promise is below the rounding of the cost. A cost that jumps (its matches are found fresh at
-  each state) ends here; a short step that succeeds, along a curved valley, is no reason to stop;
+* `SMALL_STEP` when a damped step promised less than `tolerance` and fell so far short of that that
+  the trust radius shrinks, or when the promise is below the rounding of the cost. A cost that jumps
+  or has kinks (matches and what is hidden are found fresh at each state) ends here; a short step
+  that does as it promised, along a curved valley, is no reason to stop;
 * `STEP_LIMIT`, or `NON_FINITE` if the cost is not finite at the start; that item is returned as it
   came.
 
@@ -74,9 +75,6 @@ from torchcss.types import (
 
 LEAST_RATIO = 1e-4
 """Share of the predicted decrease below which a step is not worth taking."""
-FUTILE = 1e-3
-"""Share of the tolerance that a damped step after a rejection must promise. At 1, items stop
-halfway along curved valleys; towards 0, a cost that jumps takes more steps to stop."""
 PLEASANT = 0.25
 """Weight of the prediction's error where the cost falls by more than was predicted."""
 GOOD_ERROR = 0.25
@@ -294,6 +292,7 @@ class TrustRegionNewton:
         length = _norm(state.step, weight)
         radius = _next_radius(state.radius, length, ratio, accepted).clamp(max=greatest_radius)
         unusable = running & value.isinf() & ~accepted
+        fell_short = ~stays & (~accepted | (radius < length)) & (state.predicted < self.tolerance)
         state = TrustRegionState(
             x=torch.where(accepted[:, None], candidate, state.x),
             model=LocalModel(
@@ -309,7 +308,7 @@ class TrustRegionNewton:
             status=torch.where(unusable, int(Status.NON_FINITE), state.status),
             num_steps=state.num_steps + running,
         )
-        state = self._plan(state, bounds, weight, accepted)
+        state = self._plan(state, bounds, weight, fell_short)
         spent = (state.status == Status.RUNNING) & (state.num_steps >= self.max_steps)
         status = torch.where(spent, int(Status.STEP_LIMIT), state.status)
         return state._replace(status=status), TrustRegionInfo(accepted, decrease)
@@ -431,11 +430,16 @@ class TrustRegionNewton:
         return self.modes(state._replace(x=ends, model=model), bounds)
 
     def _plan(
-        self, state: TrustRegionState, bounds: Bounds, weight: Vector, accepted: Bool[Tensor, " b"]
+        self,
+        state: TrustRegionState,
+        bounds: Bounds,
+        weight: Vector,
+        fell_short: Bool[Tensor, " b"],
     ) -> TrustRegionState:
         """Find the next step of every running item, and stop those with nothing to gain.
 
-        `accepted` says which items got where they are by their last step.
+        `fell_short` says of which items the last step promised less than the tolerance, and did not
+        keep even that.
         """
         x, model = state.x, state.model
         running = state.status == Status.RUNNING
@@ -449,9 +453,8 @@ class TrustRegionNewton:
         step = _step_in_box(problem, damping, x, step, bounds, 0.1 * self.tolerance)
         predicted = -(step * (problem.gradient + 0.5 * problem.times(step))).sum(-1)
         converged = (predicted < self.tolerance) & (damping <= floor)
-        # A short damped step that succeeds is progress along a curved valley, not an end.
-        resolution = 4 * torch.finfo(x.dtype).eps * model.value.abs()
-        futile = (~accepted & (predicted < FUTILE * self.tolerance)) | (predicted <= resolution)
+        # A short damped step that keeps its promise is progress along a curved valley, not an end.
+        futile = fell_short | (predicted <= 4 * torch.finfo(x.dtype).eps * model.value.abs())
         # No item ends on a model that is not exact: it is evaluated once more where it stands.
         ends = running & (converged | futile)
         exact = state.share == 1
