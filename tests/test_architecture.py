@@ -19,7 +19,7 @@ GROUND = {"types", "errors", "joint_names", "linalg", "robust", "files", "stopwa
 ALLOWED: dict[str, set[str]] = {
     "kernels": set(),
     "inference": {"kernels"},
-    "body": set(),
+    "body": {"kernels"},
     "vision": {"kernels"},
     "cost": {"kernels", "inference", "body", "vision"},
     "initialise": {"inference", "body", "vision", "cost"},

@@ -12,6 +12,7 @@ import pytorch_kinematics as pk
 import torch
 from reference import kinematics as reference
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from torchcss.body.catalog import BODY_NAMES
 from torchcss.body.chain import JointSpecification
@@ -156,6 +157,41 @@ def test_second_derivatives_are_those_of_finite_differences(
     shifts = step * torch.eye(len(q), dtype=torch.float64)
     differences = torch.stack([(gradient(q + s) - gradient(q - s)) / (2 * step) for s in shifts])
     torch.testing.assert_close(hessian, differences, rtol=1e-7, atol=1e-7)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("name", [*BODY_NAMES, "awkward"])
+def test_one_compiled_call_is_the_same(
+    name: str, dtype: torch.dtype, generator: torch.Generator
+) -> None:
+    """Tensors that want a derivative take the other way, and so do those of `torch.func`."""
+    tree = (awkward_tree() if name == "awkward" else load_body(name).tree).to(dtype)
+    turn = torch.linalg.matrix_exp(reference.skew(torch.tensor([0.3, 1.0, -2.0]).double()))
+    base = turn.to(dtype), torch.tensor([1.0, 2.0, 3.0], dtype=dtype)
+    for batch in ((), (0,), (1,), (3, 2)):
+        q = torch.randn(*batch, tree.num_joints, generator=generator, dtype=torch.float64)
+        q = q.to(dtype)
+        compiled, plain = tree(q, *base), tree(q.clone().requires_grad_(), *base)
+        assert plain.rotation.requires_grad
+        for one, other in zip(compiled, plain, strict=True):
+            torch.testing.assert_close(
+                one, other.detach(), rtol=0, atol=2e-5 if dtype == torch.float32 else 1e-12
+            )
+
+
+def test_poses_inside_transforms(generator: torch.Generator) -> None:
+    tree = awkward_tree()
+    q = torch.randn(4, tree.num_joints, generator=generator, dtype=torch.float64)
+
+    def places(q: Tensor) -> Tensor:
+        return tree(q).translation
+
+    torch.testing.assert_close(torch.func.vmap(places)(q), places(q))
+    backward = torch.func.jacrev(places)(q[0])
+    torch.testing.assert_close(torch.func.jacfwd(places)(q[0]), backward)
+    with forward_ad.dual_level():
+        dual = places(forward_ad.make_dual(q[0], torch.ones_like(q[0])))
+        torch.testing.assert_close(forward_ad.unpack_dual(dual).tangent, backward.sum(-1))
 
 
 @pytest.mark.parametrize("batch", [(), (5,), (2, 3), (0,)])

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchcss.body.catalog import BODY_NAMES, specification
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel, differentiate_twice
+from torchcss.body.shape import with_shape
 from torchcss.errors import BodyError, ShapeError
 
 
@@ -126,6 +127,16 @@ def test_surface_is_the_posed_mesh(generator: torch.Generator) -> None:
     torch.testing.assert_close(surface.normals.norm(dim=-1), torch.ones(96, dtype=torch.float64))
     assert body.mesh(3).points.shape == (4, 3, 6, 3)
     assert body.mesh(3, 5).points.shape == (4, 3, 5, 3)
+
+
+def test_a_mesh_is_that_of_the_present_shape() -> None:
+    body = load_body("arm8")
+    before = body.mesh(6, 10)
+    assert body.mesh(6, 10) is before
+    thick = with_shape(body, 2 * body.part_shape)
+    assert float(thick.mesh(6, 10).points.abs().max()) > 1.5 * float(before.points.abs().max())
+    torch.testing.assert_close(body.mesh(6, 10).points, before.points)
+    assert body.to(torch.float32).mesh(6, 10).points.dtype == torch.float32
 
 
 def test_another_base_moves_the_whole_body(generator: torch.Generator) -> None:

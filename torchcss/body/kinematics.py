@@ -9,7 +9,8 @@ pytorch-kinematics owns the chain (`torchcss.body.chain`): joints and links are 
 is the faster twin that the cost is evaluated with, tested against it on every body. Joints at the
 same depth of the tree are turned together, in frames whose z axis is the joint's, so that a turn
 mixes two columns. Numbers are laid out with the batch innermost, as runs that a processor streams
-through; what is returned are views of that memory.
+through; what is returned are views of that memory. Where no derivative is wanted, on a CPU, it is
+one compiled call (`torchcss.body.kinematics_kernels`).
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
+from torch.autograd.forward_ad import unpack_dual
 
 from torchcss.body.chain import (
     JointSpecification,
@@ -34,6 +36,8 @@ from torchcss.body.chain import (
 )
 from torchcss.body.rotations import frame_along
 from torchcss.errors import BodyError, ShapeError, check_shape
+from torchcss.kernels import compiler
+from torchcss.kernels.checked import run
 
 if TYPE_CHECKING:
     from torchcss.body.chain import Chain
@@ -81,6 +85,7 @@ class KinematicTree(nn.Module):
     joint_order: Tensor
     joint_place: Tensor
     parent_place: Tensor
+    joint_above: Tensor
     link_constant: Tensor
     link_place: Tensor
 
@@ -158,6 +163,8 @@ class KinematicTree(nn.Module):
         self.register_buffer("joint_order", indices([self.joint_names.index(n) for n in order]))
         self.register_buffer("joint_place", indices([place[name] for name in self.joint_names]))
         self.register_buffer("parent_place", indices([within[parent[name]] for name in order]))
+        above = indices([place[parent[name]] for name in order])
+        self.register_buffer("joint_above", above, persistent=False)
         self.register_buffer("link_constant", matrices([fixed[name] for name in self.link_names]))
         self.register_buffer(
             "link_place", indices([place[carrier[name]] for name in self.link_names])
@@ -211,12 +218,37 @@ class KinematicTree(nn.Module):
         check_shape("q", q, self.num_joints)
         batch = q.shape[:-1]
         flat = q.reshape(batch.numel(), self.num_joints)
+        if (values := _plain(flat)) is not None:
+            self._check_type(q)
+            posed = self._pose_links(values, _base(q, base_rotation, base_translation))
+            return TreePose(*(torch.from_numpy(p.reshape(*batch, *p.shape[1:])) for p in posed))
         frames = self.frames(flat, base_rotation, base_translation)
         links = _followed_by(frames[self.link_place], self.link_constant)
         parts = (links[:, :, :3], links[:, :, 3], *self.twists(frames))
         return TreePose(
             *(p.movedim(-1, 0).unflatten(0, batch) if batch else p[..., 0] for p in parts)
         )
+
+    def _check_type(self, q: Tensor) -> None:
+        if q.dtype != self.lower.dtype:
+            raise ShapeError(
+                f"the state is {q.dtype} and the body {self.lower.dtype}: convert one, "
+                "for example with body.to(x.dtype)"
+            )
+
+    def _pose_links(self, q: np.ndarray, base: Tensor) -> tuple[np.ndarray, ...]:
+        """What `TreePose` holds, by the compiled twin."""
+        from torchcss.body.kinematics_kernels import Joints, pose_links
+
+        turns = self.is_revolute[self.joint_order]
+        constants = base, self.joint_constant, self.joint_above, self.joint_order, turns
+        joints = (*constants, self.link_place, self.link_constant)
+        (b, n), num_links = q.shape, len(self.link_names)
+        shapes = (b, num_links, 3, 3), (b, num_links, 3), (b, n, 3), (b, n, 3)
+        parts = tuple(np.empty(shape, q.dtype) for shape in shapes)
+        arrays = Joints(*(part.contiguous().numpy() for part in joints))
+        run(pose_links, q, arrays, np.empty((1 + n, 3, 4), q.dtype), *parts)
+        return parts
 
     def frames(
         self,
@@ -229,16 +261,8 @@ class KinematicTree(nn.Module):
         With `twists` and `points` this is what a cost of few points needs, without the poses of all
         links; the batch is innermost. For the arguments see `forward`.
         """
-        if q.dtype != self.lower.dtype:
-            raise ShapeError(
-                f"the state is {q.dtype} and the body {self.lower.dtype}: convert one, "
-                "for example with body.to(x.dtype)"
-            )
-        base = torch.eye(3, 4, dtype=q.dtype, device=q.device)
-        if base_rotation is not None:
-            base = torch.cat([base_rotation.to(q), base[:, 3:]], dim=1)
-        if base_translation is not None:
-            base = torch.cat([base[:, :3], base_translation.to(q)[:, None]], dim=1)
+        self._check_type(q)
+        base = _base(q, base_rotation, base_translation)
         q = q.T[self.joint_order].contiguous()
         revolute = self.is_revolute[self.joint_order, None]
         angle, slide = torch.where(revolute, q, 0.0), torch.where(revolute, 0.0, q)[:, None, None]
@@ -287,6 +311,28 @@ class KinematicTree(nn.Module):
         constant = self.link_constant[link]
         place = (constant[:, :, :3] * offset[:, None, :]).sum(-1) + constant[:, :, 3]
         return _followed_by(frames[self.link_place[link]], place[:, :, None])[:, :, 0]
+
+
+def _plain(q: Tensor) -> np.ndarray | None:
+    """The numbers of a tensor for compiled code; None where its operations are to be followed."""
+    if not compiler.COMPILED or q.device.type != "cpu" or torch.compiler.is_compiling():
+        return None
+    if (q.requires_grad and torch.is_grad_enabled()) or unpack_dual(q).tangent is not None:
+        return None
+    try:
+        return q.detach().contiguous().numpy()
+    except RuntimeError:  # a tensor inside a transform of torch.func has no memory
+        return None
+
+
+def _base(q: Tensor, rotation: Tensor | None, translation: Tensor | None) -> Tensor:
+    """Axes and origin of the root link's frame, `[3 4]`."""
+    base = torch.eye(3, 4, dtype=q.dtype, device=q.device)
+    if rotation is not None:
+        base = torch.cat([rotation.to(q), base[:, 3:]], dim=1)
+    if translation is not None:
+        base = torch.cat([base[:, :3], translation.to(q)[:, None]], dim=1)
+    return base
 
 
 class _Level(NamedTuple):

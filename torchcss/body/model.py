@@ -103,6 +103,8 @@ class BodyModel(nn.Module):
         self.register_buffer("omega", omega)
         self.register_buffer("base_rotation", torch.eye(3, dtype=torch.float64))
         self.register_buffer("base_translation", torch.zeros(3, dtype=torch.float64))
+        # By their sizes, with the shape that they are of: copies on other bases share them.
+        self._meshes: dict[tuple[int | None, int | None], tuple[Tensor, SurfaceSample]] = {}
 
     def _register(self, name: str, rows: Sequence[Any], *shape: int) -> None:
         """Keep rows of numbers, of which there may be none, as a tensor."""
@@ -287,6 +289,10 @@ class BodyModel(nn.Module):
             rings: Latitudes; the model's own by default.
             meridians: Longitudes; the model's own by default.
         """
+        size, shape = (rings, meridians), self.part_shape
+        known = self._meshes.get(size)
+        if known is not None and known[0] is shape:
+            return known[1]
         eta, omega = self.eta, self.omega
         if rings is not None or meridians is not None:
             eta, omega = angular_grid(
@@ -295,9 +301,11 @@ class BodyModel(nn.Module):
                 dtype=self.dtype,
                 device=eta.device,
             )
-        shape = self.part_shape[:, None, None, :]
         full = (self.num_parts, *eta.shape)
-        return surface_points(shape, eta.expand(full), omega.expand(full))
+        mesh = surface_points(shape[:, None, None, :], eta.expand(full), omega.expand(full))
+        if not shape.requires_grad:
+            self._meshes[size] = shape, mesh
+        return mesh
 
     def surface(self, pose: BodyPose) -> SurfaceSample:
         """World positions and unit outward normals of the mesh nodes.

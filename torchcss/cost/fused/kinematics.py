@@ -6,8 +6,7 @@ it, eq. 1 [IJRR].
 
 from __future__ import annotations
 
-import math
-
+from torchcss.body.kinematics_kernels import follow, move
 from torchcss.cost.fused.records import Array, Parts, Tree
 from torchcss.kernels.compiler import kernel
 
@@ -22,24 +21,7 @@ def pose_tree(x: Array, tree: Tree, frames: Array) -> None:
         above, constant, frame = frames[tree.parent[j]], tree.constant[j], frames[1 + j]
         follow(above, constant, frame)
         q = tree.factor[j] * x[tree.column[j]] + tree.offset[j]
-        if tree.revolute[j]:
-            c, s = math.cos(q), math.sin(q)
-            for i in range(3):
-                a, b = frame[i, 0], frame[i, 1]
-                frame[i, 0], frame[i, 1] = c * a + s * b, c * b - s * a
-        else:
-            for i in range(3):
-                frame[i, 3] += q * frame[i, 2]
-
-
-@kernel
-def follow(above: Array, constant: Array, frame: Array) -> None:
-    """A frame that is given in another one."""
-    for i in range(3):
-        a, b, c = above[i, 0], above[i, 1], above[i, 2]
-        for k in range(4):
-            frame[i, k] = a * constant[0, k] + b * constant[1, k] + c * constant[2, k]
-        frame[i, 3] += above[i, 3]
+        move(frame, q, tree.revolute[j])
 
 
 @kernel
