@@ -115,8 +115,8 @@ class SegmentationTerm(Term):
         """
         small = camera.scaled(1 / self.reduction)
         width, height = small.image_size_wh
-        reduced = functional.adaptive_avg_pool2d(ratio[None].to(body.tie), (height, width))[0]
-        padded = functional.pad(reduced, (0, 0, 0, 0, 0, 1))
+        reduced = functional.adaptive_avg_pool2d(ratio[None], (height, width))[0]
+        padded = functional.pad(reduced.to(body.tie), (0, 0, 0, 0, 0, 1))
         layer = functional.pad(layer_of_part, (0, 1), value=len(ratio))
         area = int((self._parts(body, expected, small) >= 0).sum())
         return SegmentationImages(small, padded, layer, float(max(area, _FEWEST_PIXELS)))
