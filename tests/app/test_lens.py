@@ -17,6 +17,7 @@ from torchcss.body.bases import pose_track
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.errors import CameraError
 from torchcss.io.video import VideoWriter, focal_length_35mm
+from torchcss.studies.sequence_writer import write_camera
 
 KEY = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
 
@@ -122,3 +123,15 @@ def test_what_is_unknown_is_fitted_and_said(tmp_path: Path, stature: float | Non
         distance = track.joints_world[0, 0].mean(0)[2]
         deviation = distance * math.hypot(held.size, held.focal)
         assert added[0].mean(0)[2, 2].sqrt() == pytest.approx(deviation, rel=0.05)
+    write_camera(tmp_path / "cameras.json", camera)
+    # The body that was found knows whether its size is known.
+    again = torchcss.track_video(
+        tmp_path / "video.mp4",
+        camera=tmp_path / "cameras.json",
+        keypoints=tmp_path / "keypoints.npz",
+        out=tmp_path / "again",
+        settings=torchcss.Settings(samples=3, modes=2, overlay=False),
+        options=torchcss.TrackOptions(init=run.folder / "body.npz"),
+        stop=1,
+    )
+    assert (again.track.size_deviation > 0) == (stature is None)

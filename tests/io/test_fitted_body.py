@@ -44,6 +44,19 @@ def camera(generator: torch.Generator) -> Camera:
     )  # fmt: skip
 
 
+def test_a_known_size_stays_known(
+    found: Initialisation, generator: torch.Generator, tmp_path: Path
+) -> None:
+    for known in (True, False):
+        some = found._replace(size_known=known)
+        write_fitted_body(tmp_path / "body.npz", some, camera(generator))
+        assert read_fitted_body(tmp_path).size_known == known
+    arrays = dict(np.load(tmp_path / "body.npz"))
+    del arrays["size_known"]
+    np.savez(tmp_path / "earlier.npz", **arrays)
+    assert not read_fitted_body(tmp_path / "earlier.npz").size_known
+
+
 def test_round_trip(found: Initialisation, generator: torch.Generator, tmp_path: Path):
     write_fitted_body(tmp_path / "body.npz", found, camera(generator))
     for path in (tmp_path, tmp_path / "body.npz"):

@@ -29,9 +29,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchcss.app.claims import Claim
-from torchcss.app.lens import PERSONS
 from torchcss.app.smooth import SMOOTH_NAME
-from torchcss.cost.anthropometric import Anthropometric
 from torchcss.errors import OutputError
 from torchcss.files import output_error
 from torchcss.io.cameras import calibration
@@ -43,7 +41,6 @@ from torchcss.show.overlay import draw_poses
 from torchcss.show.track_pictures import caption
 from torchcss.tracking.checkpoint import state_tensors
 from torchcss.tracking.session import Posterior, TrackingSession
-from torchcss.tracking.settings import Settings
 from torchcss.types import Status
 from torchcss.vision.camera import Camera
 
@@ -89,12 +86,6 @@ class Sink(Protocol):
         ...
 
 
-def _size_deviation(settings: Settings, num_cameras: int) -> float:
-    """What is not known of the body's size: of a person of any stature before one camera."""
-    known = settings.stature is not None or num_cameras > 1 or settings.body not in PERSONS
-    return 0.0 if known else Anthropometric().stature
-
-
 class Terminated(KeyboardInterrupt):
     """The process was asked to end (SIGTERM)."""
 
@@ -108,6 +99,7 @@ class Recorder:
         session: What is run.
         recorded: The cameras with their files.
         frame_interval: Seconds between frames.
+        size_deviation: What is not known of the body's size, see `Track`.
         notes: Lines for the user, also in the summary.
         extra: Further entries of the summary, which a resumed run keeps.
         sinks: What sees the frames besides; closed at the end of the run.
@@ -122,6 +114,7 @@ class Recorder:
     session: TrackingSession
     recorded: Sequence[RecordedCamera]
     frame_interval: float
+    size_deviation: float = 0.0
     notes: Sequence[str] = ()
     extra: Mapping[str, Any] = field(default_factory=dict)
     sinks: Sequence[Sink] = ()
@@ -140,7 +133,7 @@ class Recorder:
             body = session.state.body
             track = Track.empty(body.state_names, body.joint_names, body)._replace(
                 likelihood_power=float(session.plan.tracker.stated_power),
-                size_deviation=float(_size_deviation(session.settings, len(self.recorded))),
+                size_deviation=self.size_deviation,
                 cameras=tuple(self.recorded),
                 settings=asdict(session.settings),
             )

@@ -21,10 +21,11 @@ from tqdm import tqdm
 from torchcss.app.claims import Claim
 from torchcss.app.detect import DetectOptions, detect_video, is_detected, masks_of
 from torchcss.app.init import initialise_video
-from torchcss.app.lens import Lens, fitted
+from torchcss.app.lens import PERSONS, Lens, fitted
 from torchcss.app.lock import locked
 from torchcss.app.recorder import CHECKPOINT_EVERY, Recorder, Sink
 from torchcss.app.view_files import OpenView, Selection, moments, open_view
+from torchcss.cost.anthropometric import Anthropometric
 from torchcss.cost.view import View
 from torchcss.errors import CameraError, ConfigurationError, TrackFileError
 from torchcss.files import StrPath
@@ -176,6 +177,7 @@ def _begin(
         session=session,
         recorded=[opened.recorded for opened in views],
         frame_interval=interval,
+        size_deviation=_size_deviation(settings, first, len(views)),
         notes=notes,
         extra=_description(views, first, selection),
         sinks=() if options.live is None else (options.live,),
@@ -184,6 +186,13 @@ def _begin(
         lock=lock,
     )
     return _record(recorder, views)
+
+
+def _size_deviation(settings: Settings, first: Initialisation, num_cameras: int) -> float:
+    """What is not known of the body's size: of a person of any stature before one camera."""
+    given = first.size_known or settings.stature is not None
+    known = given or num_cameras > 1 or settings.body not in PERSONS
+    return 0.0 if known else Anthropometric().stature
 
 
 _KEYPOINTS_NAME = "keypoints.npz"

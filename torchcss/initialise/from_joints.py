@@ -127,6 +127,7 @@ def _with_lengths_fitted(
         left_out=left_out,
         free_body=free,
         free_mixture=mixture_of(fits),
+        size_known=options.stature is not None or len(cost.views) > 1,
     )
 
 

@@ -69,6 +69,7 @@ class Initialisation(NamedTuple):
         free_mixture: The fits of pose and lengths together, best first, on `free_body`.
         left_out: Joints whose keypoints fit no pose and were left out.
         noise: How many times as noisy as was assumed keypoints were found to be.
+        size_known: Whether the person's stature was given, or several cameras looked on.
     """
 
     body: BodyModel
@@ -82,6 +83,7 @@ class Initialisation(NamedTuple):
     free_mixture: GaussianMixture | None = None
     left_out: tuple[str, ...] = ()
     noise: float = 1.0
+    size_known: bool = False
 
     def hypotheses(self, num: int, *, generator: torch.Generator) -> Vectors:
         """The first `num` states to believe in: the fits, then samples of their mixture.

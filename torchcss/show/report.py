@@ -170,9 +170,11 @@ def _facts(run: Run) -> list[tuple[str, str]]:
     ]
     if "l_knee" in track.joint_names:
         stature = settings.get("stature")
-        doubt = f" (known to {100 * track.size_deviation:.0f} %)" if track.size_deviation else ""
-        ask = f"not given; it would set the size{doubt}: --stature METRES"
-        facts.append(("Stature", f"{stature:g} m, as given" if stature else ask))
+        told = f"{stature:g} m, as given" if stature else "not given; the size is known otherwise"
+        if track.size_deviation:
+            doubt = f"known to {100 * track.size_deviation:.0f} %"
+            told = f"not given; it would set the size ({doubt}): --stature METRES"
+        facts.append(("Stature", told))
         facts.append(("Followed", f"--person {files.person}" if files else "not known"))
     return facts
 
