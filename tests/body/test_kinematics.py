@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +23,7 @@ from torchcss.body.kinematics import KinematicTree
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.errors import BodyError, ShapeError
+from torchcss.kernels import compiler
 
 ROBOTS = {"panda": 9, "iiwa7": 7, "ur5": 6, "anymal_b": 12, "poppy_torso": 13}
 """Moving joints of the robots in the shared data."""
@@ -177,6 +181,18 @@ def test_one_compiled_call_is_the_same(
             torch.testing.assert_close(
                 one, other.detach(), rtol=0, atol=2e-5 if dtype == torch.float32 else 1e-12
             )
+
+
+@pytest.mark.skipif(not compiler.AVAILABLE, reason="numba is not installed")
+def test_no_index_of_the_compiled_call_is_out_of_range() -> None:
+    program = (
+        "import torch; from torchcss.body.load import load_body\n"
+        "body = load_body('body34'); body.pose(torch.zeros(2, 34).double()); print('checked')"
+    )
+    environment = {**os.environ, "TORCHCSS_CHECK_KERNELS": "1"}
+    run = [sys.executable, "-c", program]
+    done = subprocess.run(run, env=environment, capture_output=True, text=True, check=False)
+    assert done.stdout == "checked\n", done.stderr
 
 
 def test_poses_inside_transforms(generator: torch.Generator) -> None:

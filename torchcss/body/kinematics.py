@@ -315,7 +315,7 @@ class KinematicTree(nn.Module):
 
 def _plain(q: Tensor) -> np.ndarray | None:
     """The numbers of a tensor for compiled code; None where its operations are to be followed."""
-    if not compiler.COMPILED or q.device.type != "cpu" or torch.compiler.is_compiling():
+    if not compiler.AVAILABLE or q.device.type != "cpu" or torch.compiler.is_compiling():
         return None
     if (q.requires_grad and torch.is_grad_enabled()) or unpack_dual(q).tangent is not None:
         return None
