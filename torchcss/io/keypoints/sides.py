@@ -120,13 +120,14 @@ def _most_probable(nats: Float[np.ndarray, "t 2 2"]) -> Bool[np.ndarray, " t"]:
     # `least[b, c]`: of all ways to label the frames so far, of which the last two have b and c.
     least = own[:, None] + own + change + change[:, :1]
     came_from = np.zeros((len(nats), 2, 2), dtype=int)
+    a, b, c = np.indices((2, 2, 2))
+    by_labels, more = nats[:, a ^ c, b ^ c], change + own
     for t in range(2, len(nats)):
-        by = np.array([[[nats[t, a ^ c, b ^ c] for c in (0, 1)] for b in (0, 1)] for a in (0, 1)])
-        ways = least[:, :, None] + by
+        ways = least[:, :, None] + by_labels[t]
         came_from[t] = ways.argmin(0)
-        least = ways.min(0) + change + own
-    b, c = np.unravel_index((least + change[0]).argmin(), (2, 2))
-    labels = [int(c), int(b)]
+        least = ways.min(0) + more
+    before, last = np.unravel_index((least + change[0]).argmin(), (2, 2))
+    labels = [int(last), int(before)]
     for t in range(len(nats) - 1, 1, -1):
         labels.append(int(came_from[t, labels[-1], labels[-2]]))
     return np.array(labels[::-1], dtype=bool)
