@@ -129,7 +129,7 @@ def test_agrees_for_parts_of_any_shape(name: str, kind: str, generator: torch.Ge
     body = before_camera(name)
     shape, parts = body.part_shape.clone(), body.num_parts
     low, high = {"boxes": (0.2, 1.0), "diamonds": (1.0, 1.8), "all": (0.2, 1.0)}.get(
-        kind, (0.66, 1.0)
+        kind, (0.6, 1.2)
     )
     shape[:, 3:5] = uniform(low, high, parts, 2, generator=generator)
     taper = 0.7 if kind in ("tapered", "all") else 0.34

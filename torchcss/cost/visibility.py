@@ -65,6 +65,11 @@ BEHIND = 3.5
 _PAIRS_AT_ONCE = 2**20
 """Pairs of node and part tested together on a CPU, so that memory does not grow with the batch."""
 
+_ROUND = (0.6, 1.2)
+"""Exponents with which a part is round enough for the few steps: over random lines of sight the
+share that is seen errs by less than 0.005 in 99 of 100 of those that graze a part (at 0.5 and 1.3
+by up to 0.05 and 0.03). The samples take five times as long."""
+
 _STEPS, _SAMPLED_STEPS, _SAMPLES = 3, 4, 12
 """Steps to the nearest point of a plain part and of any other, and samples before the latter."""
 
@@ -403,7 +408,7 @@ def tabulate_parts(shape: Float[Tensor, "parts 9"]) -> _Parts:
     widest = axes[:, :2] * (1 + taper.abs())
     section = _farthest(widest[:, 0], widest[:, 1], e2)
     is_bent = rows.bend.abs() >= _LEAST_BEND
-    is_round = ((exponents > 0.65) & (exponents < 1.05)).all(-1)
+    is_round = ((exponents >= _ROUND[0]) & (exponents <= _ROUND[1])).all(-1)
     # A bent axis ends no farther out than a straight one, but the section may stand off its end.
     straight = _farthest(section, axes[:, 2], e1)
     radius = torch.where(is_bent, section + axes[:, 2], straight) + RAMP
