@@ -14,6 +14,7 @@ from torchcss.body.catalog import BODY_NAMES
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.surface import surface_points
+from torchcss.cost import visibility
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.interior import InteriorNodes
 from torchcss.cost.visibility import (
@@ -129,7 +130,7 @@ def test_agrees_for_parts_of_any_shape(name: str, kind: str, generator: torch.Ge
     body = before_camera(name)
     shape, parts = body.part_shape.clone(), body.num_parts
     low, high = {"boxes": (0.2, 1.0), "diamonds": (1.0, 1.8), "all": (0.2, 1.0)}.get(
-        kind, (0.6, 1.2)
+        kind, (0.65, 1.2)
     )
     shape[:, 3:5] = uniform(low, high, parts, 2, generator=generator)
     taper = 0.7 if kind in ("tapered", "all") else 0.34
@@ -140,6 +141,34 @@ def test_agrees_for_parts_of_any_shape(name: str, kind: str, generator: torch.Ge
         shape[:, 7], shape[:, 8] = bend * direction.cos(), bend * direction.sin()
     body = with_shapes(body, shape)
     check_against_rays(body, any_poses(body, 16, generator=generator))
+
+
+@pytest.mark.parametrize("taper", [-0.34, 0.0])
+@pytest.mark.parametrize("exponents", [(0.65, 0.65), (0.65, 1.2), (1.2, 1.2), (0.7, 1.0)])
+def test_a_few_steps_find_where_a_line_is_nearest_to_a_round_part(
+    exponents: tuple[float, float], taper: float, generator: torch.Generator
+) -> None:
+    """Against two thousand points of each line; of what grazes a part 99 % err by below 0.01."""
+    numbers = [0.04, 0.045, 0.16, *exponents, taper, taper, 0.0, 0.0]
+    shape = torch.tensor([numbers], dtype=torch.float64)
+    parts = visibility.tabulate_parts(shape)
+    assert bool(parts.plain.all())
+    place, along = torch.randn(2, 3000, 3, generator=generator, dtype=torch.float64)
+    along, place = along / along.norm(dim=-1, keepdim=True), 0.7 * shape[0, :3] * place
+    foot = place - (place * along).sum(-1, keepdim=True) * along
+    half = (parts.radius.square() - foot.square().sum(-1)).clamp(min=0).sqrt()
+    number, part = torch.arange(len(foot)), torch.zeros(len(foot), dtype=torch.long)
+    (x, y, z), (u, v, w) = foot.unbind(-1), along.unbind(-1)
+    lines = visibility._Stretches(number, part, x, y, z, u, v, w, -half, half)
+    found = visibility._least_gap(parts, lines, len(foot), plain=True)
+    s = torch.lerp(-half, half, torch.linspace(0, 1, 2001, dtype=torch.float64)[:, None])
+    square, slope = visibility.radial_square(parts.shapes(part), *lines.point(s), bent=False)
+    radial, steepness = square.sqrt(), torch.stack(slope).norm(dim=0)
+    nearest = radial.argmin(0, keepdim=True)
+    truth = ((radial - 1) * radial / steepness).gather(0, nearest)[0]
+    graze = (half > 0) & (truth.abs() < visibility.RAMP) & found.isfinite()
+    assert int(graze.sum()) > 300
+    assert float(((found - truth)[graze] / visibility.RAMP).abs().quantile(0.99)) < 0.01
 
 
 def test_the_reference_knows_the_surface(generator: torch.Generator) -> None:

@@ -65,10 +65,10 @@ BEHIND = 3.5
 _PAIRS_AT_ONCE = 2**20
 """Pairs of node and part tested together on a CPU, so that memory does not grow with the batch."""
 
-_ROUND = (0.6, 1.2)
-"""Exponents with which a part is round enough for the few steps: over random lines of sight the
-share that is seen errs by less than 0.005 in 99 of 100 of those that graze a part (at 0.5 and 1.3
-by up to 0.05 and 0.03). The samples take five times as long."""
+_ROUND = (0.65, 1.2)
+"""Exponents with which a part is round enough for the few steps: the share that is seen errs by
+less than 0.01 for 99 of 100 lines of sight that graze a part. The samples take five times as
+long."""
 
 _STEPS, _SAMPLED_STEPS, _SAMPLES = 3, 4, 12
 """Steps to the nearest point of a plain part and of any other, and samples before the latter."""

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchcss.body.kinematics import KinematicTree
 from torchcss.body.model import BodyModel
 from torchcss.cost.anthropometric import Anthropometric, proportion_columns
 from torchcss.cost.context import FrameContext
@@ -87,12 +88,6 @@ def in_precision(record: _Record, real: Real) -> _Record:
 def pack_tree(body: BodyModel, camera: Camera) -> Tree:
     """A body's tree before a camera."""
     tree = body.tree
-    above = tree.joint_ancestors.cpu().numpy()
-    depth = above.sum(0)
-    parent = np.zeros(len(depth), np.int64)
-    for joint in range(len(depth)):
-        row = np.flatnonzero(above[:, joint] & (depth == depth[joint] - 1))
-        parent[joint] = 1 + row[0] if len(row) else 0
     tie = array(body.tie)
     column = np.abs(tie).argmax(1)
     turn = array(camera.R_camera_world)
@@ -103,7 +98,7 @@ def pack_tree(body: BodyModel, camera: Camera) -> Tree:
         column=column,
         factor=tie[np.arange(len(column)), column],
         offset=array(body.offset),
-        parent=parent,
+        parent=_row(tree, tree.joint_above[tree.joint_place - 1]),
         constant=array(tree.joint_constant[tree.joint_place - 1][:, :3]),
         revolute=tree.is_revolute.cpu().numpy(),
         base=base,
@@ -113,9 +108,13 @@ def pack_tree(body: BodyModel, camera: Camera) -> Tree:
 def carried(body: BodyModel, link: Tensor, own: Tensor) -> tuple[Array, Array]:
     """Rows of the frames that carry some links, and what is fixed in the links in these frames."""
     tree = body.tree
-    place = tree.link_place[link]
+    return _row(tree, tree.link_place[link]), array(tree.link_constant[link][:, :3] @ own)
+
+
+def _row(tree: KinematicTree, place: Tensor) -> Array:
+    """Row of the kernels' frames, which are in the order of the state, of frames by depth."""
     row = torch.where(place > 0, 1 + tree.joint_order[(place - 1).clamp(min=0)], 0)
-    return row.cpu().numpy(), array(tree.link_constant[link][:, :3] @ own)
+    return row.cpu().numpy()
 
 
 def carried_markers(body: BodyModel, marker: Tensor) -> tuple[Array, Array]:
