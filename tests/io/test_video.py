@@ -390,13 +390,36 @@ def test_truncated_avi(tmp_path: Path) -> None:
     assert f"{len(frames)} of 60 frames" in str(error)
 
 
-def test_truncated_where_only_the_length_is_stated(tmp_path: Path) -> None:
-    whole = noisy_film(tmp_path / "a.mkv")
+@pytest.mark.parametrize("suffix", [".mkv", ".ts", ".m2ts"])
+@pytest.mark.parametrize("share", [0.51, 0.987])
+def test_truncated_where_no_number_of_frames_is_stated(
+    tmp_path: Path, suffix: str, share: float
+) -> None:
+    whole = noisy_film(tmp_path / f"a{suffix}")
     frames, error = read_until_error(VideoReader(whole))
     assert (len(frames), error) == (60, None)
-    frames, error = read_until_error(VideoReader(cut(whole, 0.5)))
-    assert 10 < len(frames) < 45
-    assert f"{len(frames)} frames could be read (of 2 s, as the file says)" in str(error)
+    frames, error = read_until_error(VideoReader(cut(whole, share)))
+    assert share - 0.2 < len(frames) / 60 <= 1
+    assert f"{len(frames)} frames could be read (the file is cut off)" in str(error)
+
+
+def test_a_last_picture_that_is_held_is_no_damage(tmp_path: Path) -> None:
+    """A screen's film shows its last picture until something moves."""
+    path = tmp_path / "a.mkv"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=30, options={"bf": "0"})
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for index in range(4):
+            picture = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), format="rgb24")
+            picture.pts, picture.time_base = index, Fraction(1, 30)
+            for packet in stream.encode(picture):
+                packet.duration = 300 if index == 3 else 1
+                container.mux(packet)
+        for packet in stream.encode(None):
+            packet.duration = 300
+            container.mux(packet)
+    frames, error = read_until_error(VideoReader(path))
+    assert (len(frames), error) == (4, None)
 
 
 def test_truncated_before_the_index_is_refused(tmp_path: Path) -> None:

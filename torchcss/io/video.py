@@ -47,8 +47,11 @@ _NOT_VIDEOS = {*names_in("tty ansi bin xbin adf idf rawvideo subviewer")}
 
 _SECONDS_BETWEEN_KEY_FRAMES = 1
 
-_LAST_SHOWN_S = 0.2
-"""How long before its end, by what the file says, a video may have its last picture."""
+_SEGMENT = b"\x18\x53\x80\x67"
+"""What stands before the size of a Matroska file's only large part."""
+
+_PACKETS = (188, 192, 204)
+"""Bytes of the packets of which an MPEG transport stream is made."""
 
 _FOCAL_35MM = ("focal_length.35mm_equivalent", "focallengthin35mmfilm", "focallength35efl")
 """How the keys end under which cameras write the focal length as of 35 mm film."""
@@ -233,11 +236,8 @@ class VideoReader:
                 # An MP4 may hide frames by its edit list: there a smaller count is no damage.
                 if num_read < (promised or 0) and "mp4" not in container.format.name:
                     damage = "the file ends early"
-                elif promised is None and (length := _stated_length(container)) is not None:
-                    # The last picture is shown for a while.
-                    shown = max(_LAST_SHOWN_S, 2 / float(self.info.frame_rate))
-                    shown += (origin or 0.0) + (time or 0.0)
-                    damage = f"of {length:g} s, as the file says" if shown < length else ""
+                elif promised is None and _is_cut_off(self.path, container.format.name):
+                    damage = "the file is cut off"
         except VideoError:
             raise
         except (*_av_errors(), ValueError, _Damage) as error:
@@ -583,14 +583,20 @@ def _decode(container: InputContainer) -> Iterator[VideoFrame]:
     raise damage
 
 
-def _stated_length(container: InputContainer) -> float | None:
-    """Seconds that a Matroska file says its pictures last; None where it does not say."""
-    said = container.streams.video[0].metadata.get("DURATION", "")
-    parts = re.fullmatch(r"([0-9]+):([0-9]+):([0-9.]+)", said)
-    if parts is None:
-        return None
-    hours, minutes, seconds = parts.groups()
-    return 3600 * int(hours) + 60 * int(minutes) + float(seconds)
+def _is_cut_off(path: Path, container: str) -> bool:
+    """Whether a file of such a container is shorter than it says, or ends within a packet."""
+    size = path.stat().st_size
+    if container == "mpegts":
+        return all(size % packet for packet in _PACKETS)
+    if "matroska" not in container:
+        return False
+    with path.open("rb") as file:
+        _, found, rest = file.read(4096).partition(_SEGMENT)
+        # As many bytes as the first one has leading zeros say the size, and one more.
+        count = 9 - rest[0].bit_length() if found and rest else 0
+        stated = int.from_bytes(rest[:count]) - (1 << 7 * count)
+        is_known = 0 < count < 9 and stated != (1 << 7 * count) - 1
+        return is_known and size < file.tell() - len(rest) + count + stated
 
 
 def _upright(picture: VideoFrame, stream: VideoStream) -> UInt8[np.ndarray, "h w 3"]:
