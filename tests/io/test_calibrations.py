@@ -119,17 +119,25 @@ def test_arrays_take_the_size_of_the_video(tmp_path: Path, shape: tuple[int, ...
     check(path, video=tmp_path / "a.mp4")
 
 
-@pytest.mark.parametrize("is_new", [True, False])
-def test_matlab(tmp_path: Path, is_new: bool) -> None:
+@pytest.mark.parametrize("form", ["new", "old", "intrinsics"])
+def test_matlab(tmp_path: Path, form: str) -> None:
     scipy_io = pytest.importorskip("scipy.io")
     one_based = np.array(K) + np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]])
     values = {
         "ImageSize": [480, 640], "RadialDistortion": [0.11, -0.24, 0.07],
         "TangentialDistortion": [0.0012, -0.0021],
-        **({"K": one_based} if is_new else {"IntrinsicMatrix": one_based.T}),
+        **{
+            "new": {"K": one_based},
+            "old": {"IntrinsicMatrix": one_based.T},
+            "intrinsics": {"FocalLength": [FX, FY], "PrincipalPoint": [CX + 1, CY + 1]},
+        }[form],
     }  # fmt: skip
-    scipy_io.savemat(tmp_path / "a.mat", {"cameraParams": values} if is_new else values)
+    content = {"new": {"cameraParams": values}, "old": values, "intrinsics": {form: values}}[form]
+    scipy_io.savemat(tmp_path / "a.mat", content)
     check(tmp_path / "a.mat")
+    plain = {key: np.asarray(each).tolist() for key, each in values.items()}
+    (tmp_path / "a.json").write_text(json.dumps(plain))
+    check(tmp_path / "a.json")
 
 
 def test_bouguets_toolbox(tmp_path: Path) -> None:

@@ -261,7 +261,7 @@ def _read_json(path: Path) -> dict[str, Entry]:
     if isinstance(content, list):
         content = dict[str, Any](cameras=content)
     cameras = content.get("cameras") if isinstance(content, dict) else None
-    if isinstance(content, dict) and "RadialDistortion" in content and _has_camera(content):
+    if isinstance(content, dict) and "RadialDistortion" in content and _is_matlabs(content):
         return {path.stem: _matlab_entry(path, content)}
     if cameras is None and (_has_camera(content) or _numbered(content)):
         return _alone(path, content)
@@ -452,11 +452,11 @@ def _read_matlab(path: Path) -> dict[str, Entry]:
         pair = {n: each.get(f"CameraParameters{n}") for n in "12"}
         if _are_cameras(pair):
             return {n: _matlab_entry(path, each) for n, each in pair.items() if each is not None}
-        values = each if _has_camera(each) else values
+        values = each if _is_matlabs(each) else values
     if {"fc", "cc"} <= values.keys():  # Bouguet's toolbox, whose pixels count from 0
         K, size = [*values["fc"], *values["cc"]], _size(values.get("nx"), values.get("ny"))
         return {path.stem: Entry(K, size, values.get("kc"))}
-    if not _has_camera(values):
+    if not _is_matlabs(values):
         raise unexpected(
             CameraError, f"{path}", "toStruct(cameraParams) or Bouguet's fc and cc", list(values)
         )
@@ -478,9 +478,17 @@ def _check_matlab_size(path: Path) -> None:
             raise CameraError(f"{path}: more than {_MOST_MATLAB:,} bytes; not a calibration")
 
 
+def _is_matlabs(values: Mapping[str, Any]) -> bool:
+    """Whether these are cameraParameters or cameraIntrinsics."""
+    return _has_camera(values) or {"FocalLength", "PrincipalPoint"} <= values.keys()
+
+
 def _matlab_entry(path: Path, values: Mapping[str, Any]) -> Entry:
     found = _entry(values)
     try:
+        if found.K is None:
+            (fx, fy), (cx, cy) = values["FocalLength"], values["PrincipalPoint"]
+            found = found._replace(K=[[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
         K = np.array(found.K, float)
         K = K.T if K[2, 0] or K[2, 1] else K  # old ones have the principal point below
         K[:2, 2] -= 1
@@ -488,7 +496,7 @@ def _matlab_entry(path: Path, values: Mapping[str, Any]) -> Entry:
         tangential = np.ravel(values.get("TangentialDistortion", values.get("TDistort", [0, 0])))
         k1, k2, k3 = [*radial.tolist(), 0.0, 0.0, 0.0][:3]
         p1, p2 = [*tangential.tolist(), 0.0, 0.0][:2]
-    except (ValueError, TypeError, IndexError) as error:
+    except (ValueError, TypeError, IndexError, KeyError) as error:
         raise CameraError(f"{path}: expected cameraParams, found {one_line(error)}") from error
     return Entry(K.tolist(), found.image_size_wh, [k1, k2, p1, p2, k3])
 

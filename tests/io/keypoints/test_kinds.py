@@ -382,7 +382,7 @@ def test_sleap_csv_of_two_tracks(tmp_path: Path) -> None:
 
 
 def test_deeplabcut_with_columns_of_a_smoother(tmp_path: Path) -> None:
-    kinds = ("x", "y", "likelihood", "x_ens_median", "y_posterior_var")
+    kinds = ("x_ens_median", "x", "y", "likelihood", "y_posterior_var")
     head = [
         [title, *cells]
         for title, cells in (
@@ -391,7 +391,7 @@ def test_deeplabcut_with_columns_of_a_smoother(tmp_path: Path) -> None:
             ("coords", list(kinds) * 17),
         )
     ]
-    body = [[str(t), *(f"{v}" for row in person(t) for v in (*row, 7, 8))] for t in T]
+    body = [[str(t), *(f"{v}" for row in person(t) for v in (7, *row, 8))] for t in T]
     text = "\n".join(",".join(row) for row in [*head, *body])
     found = read(write(tmp_path / "eks.csv", text))
     check(found)
@@ -683,6 +683,18 @@ def test_the_size_that_a_file_says(tmp_path: Path, head: dict[str, Any]) -> None
     check(read(write(tmp_path / "a.json", {**head, "frames": frames})), (3,))
 
 
+def test_fractions_of_a_canvas_whose_size_is_said(tmp_path: Path) -> None:
+    """DWPose in ComfyUI: not a person of one pixel."""
+    canvas = {"canvas_width": 1280, "canvas_height": 960}
+    people = [
+        [{"pose_keypoints_2d": (person(t, OPENPOSE) / (639, 479, 1)).ravel().tolist()}] for t in T
+    ]
+    path = write(tmp_path / "a.json", [{"people": each, **canvas} for each in people])
+    with pytest.raises(KeypointError, match="zero-one"):
+        read(path)
+    check(read(path, normalised="zero-one"))
+
+
 def test_people_by_float_numbers_and_confidences_beside(tmp_path: Path) -> None:
     def entry(p: np.ndarray, number: float) -> dict[str, Any]:
         return {"keypoints": p[:, :2].ravel().tolist(), "confidence": p[:, 2].tolist(),
@@ -761,6 +773,18 @@ def test_labels_called_otherwise_than_their_pictures(tmp_path: Path) -> None:
     check(read(tmp_path, frame_names=[f"p{t}.png" for t in T]))
     write(tmp_path / "9.json", {**content, "imageWidth": 320})
     with pytest.raises(KeypointError, match="several sizes"):
+        read(tmp_path)
+
+
+def test_labels_of_pictures_that_are_numbered_by_the_camera(tmp_path: Path) -> None:
+    for t in T:
+        joints = " ".join(f"{u / 640} {v / 480} {c}" for u, v, c in person(t))
+        write(tmp_path / f"IMG_{2000 + t}.txt", f"0 0.5 0.5 0.3 0.8 {joints}")
+    check(read(tmp_path))
+    (tmp_path / "IMG_2003.txt").unlink()
+    check(read(tmp_path, frame_names=[f"IMG_{2000 + t}.JPG" for t in T]), (3,))
+    (tmp_path / "IMG_2000.txt").unlink()
+    with pytest.raises(KeypointError, match="give the folder of pictures as the video"):
         read(tmp_path)
 
 

@@ -161,22 +161,18 @@ def _by_number(people: People, keys: Sequence[Key], film: Film, report: list[str
 def _first(people: People, places: Sequence[int], num_frames: int | None) -> int:
     """Which number the first frame has."""
     low, high = min(places, default=0), max(places, default=0)
-    if people.first is not None:
-        return min(people.first, low)
     if people.whole or not places:
         return low
-    if low == 0 or num_frames is None or high < num_frames:
-        return 0
-    if high == num_frames:
-        return 1
-    if high - low + 1 == num_frames:
+    if num_frames is not None and high - low + 1 == num_frames and low > 1:
         return low
-    if low > num_frames:
+    if num_frames is not None and low > num_frames:
         raise KeypointError(
             f"frames {low} to {high} for a video of {num_frames}: which of them is the "
             "first is not known; number them from 0, or give the folder of pictures as the video"
         )
-    return 0
+    if people.first is not None:
+        return min(people.first, low)
+    return 1 if low and high == num_frames else 0
 
 
 def _number(text: str) -> int | None:

@@ -169,7 +169,7 @@ def _person(
     points = np.concatenate([frame[frame[..., 2] > 0.0][:, :2] for frame in frames])
     if people.corner_fractions:
         scale, shift, note = _from_corner(points, image_size_wh)
-    elif people.size_wh is not None:
+    elif people.size_wh is not None and _are_pixels(points, normalised):
         scale, shift, note = _from_other_size(people.size_wh, image_size_wh)
     else:
         scale, shift, note = _from_border_pixels(points, image_size_wh, normalised)
@@ -355,11 +355,20 @@ def _from_other_size(size_wh: tuple[float, float], image_size_wh: Size) -> Chang
     return scale, 0.0, [note]
 
 
+def _are_fractions(points: np.ndarray) -> bool:
+    return bool((np.abs(points) <= _NORMALISED_EXTENT).all())
+
+
+def _are_pixels(points: np.ndarray, normalised: bool | Scale) -> bool:
+    """Whether coordinates are pixels as the caller says, and can be."""
+    return normalised in (False, "pixels") and not _are_fractions(points)
+
+
 def _from_border_pixels(
     points: np.ndarray, image_size_wh: Size, normalised: bool | Scale
 ) -> Change:
     """Pixels, or fractions from the centres of border pixels, as the caller says."""
-    fractions = bool((np.abs(points) <= _NORMALISED_EXTENT).all())
+    fractions = _are_fractions(points)
     if normalised is False or normalised == "pixels":
         if fractions:
             raise KeypointError(

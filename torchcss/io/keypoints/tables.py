@@ -205,10 +205,10 @@ def _deeplabcut(rows: Sequence[Row]) -> tuple[_Columns, Sequence[Row], list[str]
     headings = {row[0].lower(): row for _, row in rows[:4]}
     coords, joints = headings["coords"], headings["bodyparts"]
     kinds = ("x", "y", "likelihood")
-    start = next((index for index, cell in enumerate(coords) if cell in kinds), None)
+    start = next((index for index, cell in enumerate(joints) if index and cell), None)
     size = len(coords)
     animals = headings.get("individuals", ["one"] * size)
-    if start is None or not len(joints) == len(animals) == size:
+    if start is None or not len(joints) == len(animals) == size or not {*kinds} & {*coords}:
         raise KeypointError(
             f"expected x, y, likelihood under every body part, found {shortened(', '.join(coords))}"
         )
