@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import torch
 from made_sequences import write_arm
+from PIL import Image
 
 from torchcss.app.claims import Claims
 from torchcss.app.lock import LOCK_NAME
@@ -25,6 +26,7 @@ from torchcss.app.track import TrackOptions, resume, track_video
 from torchcss.cli import main as cli
 from torchcss.errors import ConfigurationError, OutputError, TrackFileError
 from torchcss.io.run import Run
+from torchcss.io.video import VideoReader
 from torchcss.tracking.session import Posterior
 from torchcss.tracking.settings import Settings
 
@@ -237,13 +239,48 @@ def test_other_settings_are_refused(clip: Path, whole: Run) -> None:
 
 def test_other_files_are_refused(clip: Path, whole: Run, tmp_path: Path) -> None:
     """Not the old track told as that of another video."""
-    for name in ("video.mp4", "keypoints2d.npz", "cameras.json"):
-        shutil.copy(clip / name, tmp_path / name)
     files = {"video": clip / "video.mp4", "keypoints": clip / "keypoints2d.npz"}
     for name, path in files.items():
+        data = path.read_bytes()
+        (tmp_path / path.name).write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
         other = {**files, name: tmp_path / path.name}
         with pytest.raises(ConfigurationError, match=f"begun with the {name} .* --out"):
             track_video(
                 other["video"], camera=clip / "cameras.json", keypoints=other["keypoints"],
                 out=whole.folder, settings=SETTINGS, options=TrackOptions(resume=True),
             )  # fmt: skip
+
+
+@pytest.mark.parametrize("of_pictures", [False, True])
+def test_files_that_were_moved_are_known_again(
+    clip: Path, whole: Run, tmp_path: Path, of_pictures: bool
+) -> None:
+    before, after = tmp_path / "before", tmp_path / "after"
+    before.mkdir()
+    shutil.copy(clip / "cameras.json", tmp_path)
+    shutil.copy(clip / "keypoints2d.npz", before)
+    if of_pictures:
+        (before / "film").mkdir()
+        for frame in VideoReader(clip / "video.mp4"):
+            Image.fromarray(frame.image).save(before / "film" / f"{frame.index}.png")
+    else:
+        shutil.copy(clip / "video.mp4", before / "film")
+
+    def track(folder: Path, **options: Any) -> Run:
+        return track_video(
+            folder / "film", camera=tmp_path / "cameras.json",
+            keypoints=folder / "keypoints2d.npz", out=tmp_path / "out", settings=SETTINGS,
+            options=TrackOptions(init=clip / "first" / "body.npz", **options),
+        )  # fmt: skip
+
+    with pytest.raises(KeyboardInterrupt):
+        track(before, live=Stumbling(5, KeyboardInterrupt()))
+    before.rename(after)
+    run = track(after, resume=True)
+    assert (run.summary["ended"], len(run.track.frames)) == ("complete", FRAMES)
+    assert run.summary["video"] == str(after / "film")
+    files = run.cameras[0].files
+    assert files is not None
+    assert (files.video, files.keypoints) == (after / "film", after / "keypoints2d.npz")
+    if not of_pictures:
+        np.testing.assert_array_equal(run.track.state, whole.track.state)

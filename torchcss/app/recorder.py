@@ -101,7 +101,7 @@ class Recorder:
         frame_interval: Seconds between frames.
         size_deviation: What is not known of the body's size, see `Track`.
         notes: Lines for the user, also in the summary.
-        extra: Further entries of the summary, which a resumed run keeps.
+        extra: Further entries of the summary; a resumed run keeps those that it is not given.
         sinks: What sees the frames besides; closed at the end of the run.
         on_first_frame: Writes what else belongs to the run, when its first frame is saved.
         checkpoint_every: Seconds of wall time between checkpoints.
@@ -141,7 +141,7 @@ class Recorder:
             track, notes = self.begun.track.first(going_on.num_frames), going_on.notes
             self._wall, totals = notes["wall_s"], notes["totals"]
             self._totals = _Totals(**{**totals, "statuses": torch.tensor(totals["statuses"])})
-            self.notes, self.extra = notes["notes"], notes["extra"]
+            self.notes, self.extra = notes["notes"], {**notes["extra"], **self.extra}
         self.num_done = len(track.frames)
         self._writer = TrackWriter(self.folder / TRACK_NAME, track)
 

@@ -28,7 +28,7 @@ from torchcss.app.view_files import OpenView, Selection, moments, open_view
 from torchcss.cost.anthropometric import Anthropometric
 from torchcss.cost.view import View
 from torchcss.errors import CameraError, ConfigurationError, TrackFileError
-from torchcss.files import StrPath
+from torchcss.files import StrPath, naming
 from torchcss.initialise.noise import Noise
 from torchcss.initialise.result import Initialisation
 from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body, write_fitted_body
@@ -140,7 +140,7 @@ def track_video(
         if options.resume and (out / TRACK_NAME).is_file():
             begun = Run.open(out)
             if begun.checkpoint is not None:
-                _check_files(begun, Path(video), keypoints)
+                begun = _with_files(begun, Path(video), keypoints, options)
                 return _go_on(begun, settings, selection, options, lock)
         files = _files_of(Path(video), keypoints, out, selection, options)
         views = _all_views(files, camera, selection, settings, options)
@@ -318,6 +318,7 @@ def _go_on(
         recorded=run.cameras,
         frame_interval=interval,
         sinks=() if options.live is None else (options.live,),
+        extra=_files_seen(views),
         checkpoint_every=options.checkpoint_every,
         begun=run,
         lock=lock,
@@ -355,17 +356,20 @@ def _check_same(run: Run, settings: Settings, selection: Selection, known: dict[
         )
 
 
-def _check_files(run: Run, video: Path, keypoints: StrPath | None) -> None:
-    """Refuse to go on with other files than a run was begun with."""
-    before = run.cameras[0].files
-    given = {"video": video, "keypoints": None if keypoints is None else Path(keypoints)}
-    for name, path in given.items():
-        known: Path | None = getattr(before, name, None)
-        if path is not None and known is not None and path.resolve() != known.resolve():
-            raise ConfigurationError(
-                f"{run.folder}: the run was begun with the {name} {known}, now {path}; give the "
-                "same, choose another folder with --out, or leave --resume out to start anew"
-            )
+def _with_files(run: Run, video: Path, keypoints: StrPath | None, options: TrackOptions) -> Run:
+    """The run with its files where they are now; others than it was begun with are refused."""
+    assert run.checkpoint is not None
+    known = run.checkpoint.notes["extra"].get("fingerprints", ())
+    keypoints = None if keypoints is None else Path(keypoints)
+    own = ViewFiles(video=video, keypoints=keypoints, masks=options.masks)
+    cameras = list(run.cameras)
+    with naming(run.folder, ConfigurationError):
+        for place, given in enumerate((own, *options.others)[: len(cameras)]):
+            camera = cameras[place]
+            if camera.files is not None:
+                prints = known[place] if place < len(known) else {}
+                cameras[place] = camera._replace(files=camera.files.moved(given, prints))
+    return replace(run, track=run.track._replace(cameras=tuple(cameras)))
 
 
 def _first_pose(
@@ -427,13 +431,18 @@ def _description(
     views: Sequence[OpenView], first: Initialisation, selection: Selection
 ) -> dict[str, Any]:
     """Entries of the summary about the files."""
-    seen, *others = (
-        {"video": str(opened.files.video), "camera": opened.camera.camera.name} for opened in views
-    )
     return {
-        **seen,
-        "other_views": others,
+        **_files_seen(views),
         "world_is_metric": views[0].camera.metric,
         "body_lengths_m": dict(first.body.lengths),
         "frames_selected": asdict(selection),
+        "fingerprints": [opened.files.fingerprints() for opened in views],
     }
+
+
+def _files_seen(views: Sequence[OpenView]) -> dict[str, Any]:
+    """Entries of the summary about where the files are."""
+    seen, *others = (
+        {"video": str(opened.files.video), "camera": opened.camera.camera.name} for opened in views
+    )
+    return {**seen, "other_views": others}

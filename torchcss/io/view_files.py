@@ -6,15 +6,20 @@ with its files.
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from torchcss.errors import ConfigurationError
 from torchcss.io.cameras import camera_entry
 from torchcss.io.keypoints.read import Scale
 from torchcss.vision.camera import Camera
+
+_PATHS = ("video", "keypoints", "masks")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +54,58 @@ class ViewFiles:
     person: str = "prominent"
     sigma: float | None = None
 
+    def fingerprints(self) -> dict[str, str]:
+        """What tells each of its files from others, wherever it lies."""
+        paths = {name: getattr(self, name) for name in _PATHS}
+        return {name: _fingerprint(path) for name, path in paths.items() if path is not None}
+
+    def moved(self, given: ViewFiles, fingerprints: Mapping[str, str]) -> ViewFiles:
+        """The same files where they are now.
+
+        Args:
+            given: Where they are said to be.
+            fingerprints: From `fingerprints`, when they were read; empty: they have not moved.
+
+        Raises:
+            ConfigurationError: If one of them is another file.
+        """
+        now: dict[str, Path] = {}
+        for name in _PATHS:
+            path, known = getattr(given, name), getattr(self, name)
+            if None in (path, known) or path.resolve() == known.resolve():
+                continue
+            if name not in fingerprints or _fingerprint(path) != fingerprints[name]:
+                raise ConfigurationError(
+                    f"the run was begun with the {name} {known}, now {path} is another one; give "
+                    "the same, choose another folder with --out, or leave --resume out to start "
+                    "anew"
+                )
+            now[name] = path
+        return replace(self, **now)
+
+
+_MOST_READ = 2**25
+"""Bytes of a file, or of all files of a folder, that tell it from others."""
+
+
+def _fingerprint(path: Path) -> str:
+    """A hash of a file's size, beginning and end; of a folder's files with their names."""
+    archive, _, selection = str(path).rpartition("#")
+    if not path.exists():
+        path = Path(archive)
+    found = hashlib.sha256((selection if str(path) == archive else "").encode())
+    with suppress(OSError):  # whoever reads it says so
+        files = sorted(each for each in path.rglob("*") if each.is_file()) or [path]
+        share = _MOST_READ // (2 * len(files))
+        for file in files:
+            size = file.stat().st_size
+            found.update(f"{file.relative_to(path)}\0{size}\0".encode())
+            with file.open("rb") as stream:
+                found.update(stream.read(share))
+                stream.seek(max(stream.tell(), size - share))
+                found.update(stream.read(share))
+    return found.hexdigest()
+
 
 class RecordedCamera(NamedTuple):
     """A camera of a run.
@@ -62,9 +119,6 @@ class RecordedCamera(NamedTuple):
     camera: Camera
     files: ViewFiles | None = None
     focal_deviation: float = 0.0
-
-
-_PATHS = ("video", "keypoints", "masks")
 
 
 def camera_to_plain(recorded: RecordedCamera) -> dict[str, Any]:
