@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ import pytest
 import torchcss
 from torchcss.app.detect import detect_video, is_detected, masks_of
 from torchcss.app.view_files import Selection, open_view
-from torchcss.errors import KeypointError
+from torchcss.errors import KeypointError, TorchcssError
 from torchcss.io.detect import Detected
 from torchcss.io.keypoints.frames import Film
 from torchcss.io.keypoints.one_person import Whom
@@ -136,6 +137,26 @@ def test_a_video_alone_is_tracked(
     notes = "\n".join(run.summary["notes"])
     assert "followed the leftmost one of frame 0" in notes
     assert "as given" in notes
+
+
+@pytest.mark.parametrize(
+    ("options", "settings", "words"),
+    [({"fov": 200.0}, {}, "--fov"), ({"masks": Path("none.mp4")}, {}, "none.mp4"),
+     ({}, {"stature": 180.0}, "stature")],
+)  # fmt: skip
+def test_what_is_wrong_is_told_before_the_detector_runs(
+    files: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    options: dict[str, Any],
+    settings: dict[str, Any],
+    words: str,
+) -> None:
+    monkeypatch.setattr("torchcss.app.detect.open_detector", None)
+    with pytest.raises(TorchcssError, match=words):
+        torchcss.track_video(
+            files / "video.mp4", out=files / "out", settings=torchcss.Settings(**settings),
+            options=torchcss.TrackOptions(**options),
+        )  # fmt: skip
 
 
 def test_frames_that_nobody_asks_for_are_not_detected(files: Path, crowd: Crowd) -> None:

@@ -68,6 +68,8 @@ def test_pictures_say_it_by_exif(tmp_path: Path) -> None:
 def test_a_camera_is_said_once() -> None:
     with pytest.raises(CameraError, match="not several"):
         Lens(fov=60.0).unless(Path("cameras.json"))
+    with pytest.raises(CameraError, match="not both"):
+        Lens(fov=60.0, focal=900.0)
     for bad in (0.0, -5.0, math.nan):
         with pytest.raises(CameraError, match="--focal: expected"):
             Lens(focal=bad)

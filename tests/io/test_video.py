@@ -28,6 +28,7 @@ from torchcss.io.video import (
     missing_numbers,
     natural_order,
     read_image,
+    several_kinds,
 )
 from torchcss.types import Frame
 
@@ -504,6 +505,13 @@ def test_numbers_that_are_missing() -> None:
     assert missing_numbers(names[:3]) is None
     assert missing_numbers(["a.png", "b.png", *names]) is None
     assert missing_numbers([f"{number}.png" for number in (0, 40, 83, 121, 160)]) is None
+
+
+def test_pictures_of_several_kinds_are_told() -> None:
+    assert several_kinds(["a.jpg", "b.JPG"]) is None
+    told = several_kinds(["a.png", "a.jpg", "b.png"])
+    assert told is not None
+    assert "1 .jpg and 2 .png" in told
 
 
 def test_natural_order() -> None:

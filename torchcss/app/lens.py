@@ -52,6 +52,8 @@ class Lens:
     deviation: float = 0.0
 
     def __post_init__(self) -> None:
+        if None not in (self.focal, self.fov):
+            raise CameraError("give --focal or --fov, not both")
         if self.focal is not None and not 0 < self.focal < math.inf:
             raise CameraError(f"--focal: expected a positive number of pixels, got {self.focal:g}")
         if self.fov is not None and not 0 < self.fov < 180:

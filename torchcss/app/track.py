@@ -30,7 +30,8 @@ from torchcss.cost.view import View
 from torchcss.errors import CameraError, ConfigurationError, TrackFileError
 from torchcss.files import StrPath, naming
 from torchcss.initialise.noise import Noise
-from torchcss.initialise.result import Initialisation
+from torchcss.initialise.result import Initialisation, scale_of
+from torchcss.io.cameras import LoadedCamera
 from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body, write_fitted_body
 from torchcss.io.keypoints.read import Scale
 from torchcss.io.run import Run, as_run
@@ -142,8 +143,15 @@ def track_video(
             if begun.checkpoint is not None:
                 begun = _with_files(begun, Path(video), keypoints, options)
                 return _go_on(begun, settings, selection, options, lock)
-        files = _files_of(Path(video), keypoints, out, selection, options)
-        views = _all_views(files, camera, selection, settings, options)
+        # What is wrong is told before the detector runs, which may take long.
+        scale_of(settings.stature)
+        source, is_known = _camera_of(Path(video), camera, options)
+        files = _files_of(Path(video), keypoints, options)
+        files = _with_keypoints(files, source, out, selection, options)
+        views = _all_views(files, source, selection, options)
+        if not is_known:
+            _now("fitting the focal length to the keypoints")
+            views = [fitted(views[0], settings)]
         return _begin(views, out, settings, selection, options, lock)
 
 
@@ -199,27 +207,38 @@ _KEYPOINTS_NAME = "keypoints.npz"
 """Where keypoints that are detected lie in the folder of a run."""
 
 
-def _files_of(
-    video: Path, keypoints: StrPath | None, out: Path, selection: Selection, options: TrackOptions
-) -> ViewFiles:
-    """The first camera's files; keypoints that are not given are detected."""
-    masks = options.masks
-    if keypoints is None:
-        keypoints = out / _KEYPOINTS_NAME
-        _detect(video, keypoints, selection, options)
-        if masks is None and masks_of(keypoints).is_file():
-            masks = masks_of(keypoints)
+def _files_of(video: Path, keypoints: StrPath | None, options: TrackOptions) -> ViewFiles:
+    """The first camera's files, as they are given."""
     return ViewFiles(
         video=video,
-        keypoints=Path(keypoints),
+        keypoints=None if keypoints is None else Path(keypoints),
         camera_name=options.camera_name,
-        masks=masks,
+        masks=options.masks,
         layout=options.layout,
         normalised=options.normalised,
         frame_rate=options.frame_rate,
         person=options.person,
         sigma=options.sigma,
     )
+
+
+def _with_keypoints(
+    files: ViewFiles,
+    source: Path | LoadedCamera,
+    out: Path,
+    selection: Selection,
+    options: TrackOptions,
+) -> ViewFiles:
+    """The files with keypoints, which are detected where none are given, and their masks."""
+    if files.keypoints is not None:
+        return files
+    open_view(files, source, selection)
+    keypoints = out / _KEYPOINTS_NAME
+    _detect(files.video, keypoints, selection, options)
+    masks = files.masks
+    if masks is None and masks_of(keypoints).is_file():
+        masks = masks_of(keypoints)
+    return replace(files, keypoints=keypoints, masks=masks)
 
 
 def _detect(video: Path, keypoints: Path, selection: Selection, options: TrackOptions) -> None:
@@ -240,20 +259,24 @@ def _detect_further(run: Run, selection: Selection, options: TrackOptions) -> No
         _detect(own.video, own.keypoints, selection, replace(options, frame_rate=own.frame_rate))
 
 
-def _all_views(
-    own: ViewFiles,
-    camera: StrPath | None,
-    selection: Selection,
-    settings: Settings,
-    options: TrackOptions,
-) -> list[OpenView]:
-    """The files of all cameras opened, with a focal length that is fitted if nothing tells it."""
+def _camera_of(
+    video: Path, camera: StrPath | None, options: TrackOptions
+) -> tuple[Path | LoadedCamera, bool]:
+    """The calibration file or the camera, and whether its focal length is known."""
     lens = Lens(focal=options.focal, fov=options.fov)
     if camera is not None:
-        source = lens.unless(Path(camera))
-    else:
-        lens = lens.of(own.video)
-        source = lens.camera(own.video)
+        return lens.unless(Path(camera)), True
+    lens = lens.of(video)
+    return lens.camera(video), lens.is_known
+
+
+def _all_views(
+    own: ViewFiles,
+    source: Path | LoadedCamera,
+    selection: Selection,
+    options: TrackOptions,
+) -> list[OpenView]:
+    """The files of all cameras opened."""
     views = [open_view(each, source, selection) for each in (own, *options.others)]
     for opened in views:
         if len(views) > 1 and not opened.camera.metric:
@@ -261,10 +284,7 @@ def _all_views(
                 f"{own.video}: several cameras need their places in one world, in metres; "
                 f"that of {opened.files.video} is not known so: give R and t"
             )
-    if camera is not None or lens.is_known:
-        return views
-    _now("fitting the focal length to the keypoints")
-    return [fitted(views[0], settings)]
+    return views
 
 
 def _now(what: str) -> None:
@@ -360,8 +380,7 @@ def _with_files(run: Run, video: Path, keypoints: StrPath | None, options: Track
     """The run with its files where they are now; others than it was begun with are refused."""
     assert run.checkpoint is not None
     known = run.checkpoint.notes["extra"].get("fingerprints", ())
-    keypoints = None if keypoints is None else Path(keypoints)
-    own = ViewFiles(video=video, keypoints=keypoints, masks=options.masks)
+    own = _files_of(video, keypoints, options)
     cameras = list(run.cameras)
     with naming(run.folder, ConfigurationError):
         for place, given in enumerate((own, *options.others)[: len(cameras)]):

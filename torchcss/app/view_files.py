@@ -21,7 +21,7 @@ from torchcss.io.keypoints.arrays import read_points
 from torchcss.io.keypoints.frames import Film
 from torchcss.io.keypoints.one_person import Whom
 from torchcss.io.keypoints.read import read_person
-from torchcss.io.video import VideoReader, missing_numbers
+from torchcss.io.video import VideoReader, missing_numbers, several_kinds
 from torchcss.io.view_files import RecordedCamera, ViewFiles
 from torchcss.tracking.view import CameraView
 from torchcss.types import Frame, Keypoints
@@ -66,7 +66,8 @@ class OpenView(NamedTuple):
         if self.reader.image_names is not None:
             given = "as given" if self.files.frame_rate else "assumed: say it with --frame-rate"
             notes.insert(0, f"{float(self.reader.info.frame_rate):g} images a second, {given}")
-            notes.append(missing_numbers(self.reader.image_names))
+            notes += [several_kinds(self.reader.image_names)]
+            notes += [missing_numbers(self.reader.image_names)]
         if self.keypoints is not None:
             notes += self.keypoints.report
         return [note for note in notes if note]

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections import Counter
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import suppress
 from fractions import Fraction
@@ -539,6 +540,15 @@ def missing_numbers(names: Sequence[str]) -> str | None:
         f"{sum(steps) - len(steps)} pictures are missing by their numbers, the first behind "
         f"{names[gaps[0]]}: those beside a gap are taken to follow one another"
     )
+
+
+def several_kinds(names: Sequence[str]) -> str | None:
+    """A line about a folder that holds pictures of several kinds; they may be the same twice."""
+    kinds = Counter(Path(name).suffix.lower() for name in names)
+    if len(kinds) < 2:
+        return None
+    told = " and ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
+    return f"pictures of several kinds, {told}: all are taken, in the order of their names"
 
 
 def _av_errors() -> tuple[type[Exception], ...]:
