@@ -14,6 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pytest
 
@@ -23,6 +24,8 @@ from torchcss.files import shortened
 from torchcss.io.cameras import load_camera
 from torchcss.io.keypoints.read import read_keypoints
 from torchcss.io.tracks import load_track
+from torchcss.io.video import VideoReader
+from torchcss.studies.demo import CLIP
 
 MOST_MEGABYTES = 60
 
@@ -198,6 +201,30 @@ def test_hdf5_that_claims_much_or_links_elsewhere(tmp_path: Path) -> None:
         file["node_names"] = np.array(["nose"], "S")
         file["tracks"] = h5py.ExternalLink(str(other), "tracks")
     assert "another file" in refused(keypoints, path)
+
+
+def test_playlists_open_no_other_file(tmp_path: Path) -> None:
+    clip = CLIP / "video.mp4"
+    with av.open(str(clip)) as source, av.open(str(tmp_path / "a.ts"), "w") as target:
+        stream = target.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(video=0):
+            packet.stream = stream
+            target.mux([packet] if packet.dts is not None else [])
+    folder = tmp_path / "list"
+    folder.mkdir()
+    listed = "#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:2.0,\n{}\n#EXT-X-ENDLIST\n"
+    for number, place in enumerate(("../a.ts", tmp_path / "a.ts")):
+        (folder / f"{number}.m3u8").write_text(listed.format(place))
+        assert "playlist" in refused(VideoReader, folder / f"{number}.m3u8")
+    (folder / "b.ffconcat").write_text("ffconcat version 1.0\nfile '../a.ts'\n")
+    assert "playlist" in refused(VideoReader, folder / "b.ffconcat")
+
+
+def test_pictures_that_a_small_video_makes_large(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torchcss.io.video._MOST_PIXELS", 640 * 480 - 1)
+    assert "640 x 480 pixels" in refused(VideoReader, CLIP / "video.mp4")
 
 
 def test_meshes_and_includes_stay_in_the_folder(tmp_path: Path) -> None:

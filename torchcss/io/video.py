@@ -43,8 +43,15 @@ if TYPE_CHECKING:  # PyAV takes long to import: only where a video is read or wr
 IMAGE_SUFFIXES = names_in(".jpg .jpeg .png .bmp .tif .tiff .webp .pgm .ppm")
 """What counts as a frame in a folder of images."""
 
-# Demuxers that make pictures out of text or of anything at all: no video comes in them.
-_NOT_VIDEOS = {*names_in("tty ansi bin xbin adf idf rawvideo subviewer")}
+# Demuxers that make pictures out of text or of anything at all: no video comes in them. Below,
+# those of playlists, which name other files.
+_NOT_VIDEOS = {
+    *names_in("tty ansi bin xbin adf idf rawvideo subviewer"),
+    *names_in("hls applehttp concat dash imf vobsub"),
+}
+
+_MOST_PIXELS = 2**27
+"""Of a video's picture, which a small file may make large; Pillow refuses large images itself."""
 
 _SECONDS_BETWEEN_KEY_FRAMES = 1
 
@@ -175,9 +182,16 @@ class VideoReader:
     def opened(self) -> InputContainer:
         """The video's container, to be closed by the caller."""
         import av
+        from av.error import ArgumentError
 
-        # Only this file: playlists that name other files or addresses are refused.
-        return av.open(f"file:{self.path}", container_options={"protocol_whitelist": "file"})
+        # Only this file: playlists that name other files or addresses are refused before those are
+        # opened.
+        kinds = ",".join(sorted(av.formats_available - _NOT_VIDEOS))
+        options = {"protocol_whitelist": "file", "format_whitelist": kinds}
+        try:
+            return av.open(f"file:{self.path}", container_options=options)
+        except ArgumentError as error:  # as PyAV calls what is not among these kinds
+            raise self._not_a_video("it holds text, raw bytes or a playlist") from error
 
     def _not_a_video(self, reason: str) -> VideoError:
         return VideoError(
@@ -188,8 +202,6 @@ class VideoReader:
     def _probe_container(self) -> VideoInfo:
         try:
             with self.opened() as container:
-                if _NOT_VIDEOS.intersection(container.format.name.split(",")):
-                    raise self._not_a_video("it holds text or raw bytes")
                 if not container.streams.video:
                     raise self._not_a_video("it holds no pictures")
                 stream = container.streams.video[0]
@@ -570,6 +582,9 @@ def _decode(container: InputContainer) -> Iterator[VideoFrame]:
         raise _Damage("its codec is unknown")
     # Decoding is a hundredth of a frame's work; threads of its own would each hold memory.
     decoder.thread_count = 1
+    decoder.options = {"max_pixels": str(_MOST_PIXELS)}  # also for what grows on the way
+    if decoder.width * decoder.height > _MOST_PIXELS:
+        raise _Damage(f"{decoder.width} x {decoder.height} pixels, more than {_MOST_PIXELS:,}")
     damage: Exception | None = None
     packets = container.demux(stream)
     while damage is None:
