@@ -273,8 +273,12 @@ def test_truncated_video_keeps_the_frames(clip: Path, tmp_path: Path):
 
 @pytest.mark.parametrize(
     "bad",
-    [{"terms": ("contour", "magic")}, {"samples": 0}, {"working_size": 0}, {"device": "cuda:99"}],
-)
+    [
+        {"terms": ("contour", "magic")}, {"samples": 0}, {"working_size": 0}, {"device": "cuda:99"},
+        {"keypoints_use": "frist"}, {"engine": "none"}, {"dtype": "float16"}, {"dtype": None},
+        {"curvature": "some"}, {"prediction": "none"},
+    ],
+)  # fmt: skip
 def test_bad_settings(bad: dict):
     with pytest.raises(ConfigurationError):
         Settings(**bad)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import field, fields, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 import torch
 
@@ -191,16 +191,19 @@ class Settings:
             ) from error
 
     def _check_names(self) -> None:
-        """Weights and predictions are known."""
+        """Weights and choices are known."""
         if not isinstance(self.weights, Mapping):
             raise ConfigurationError(f"weights: expected factors by name, got {self.weights!r}")
         if strange := sorted(set(self.weights) - set(TERM_TABLE)):
             known = ", ".join(TERM_TABLE)
             raise ConfigurationError(f"weights: no terms {strange}; there are {known}")
-        if self.prediction not in ("velocity", "surface"):
-            raise ConfigurationError(
-                f"prediction must be velocity or surface, got {self.prediction!r}"
-            )
+        for name, kind in get_type_hints(Settings).items():
+            value, parts = getattr(self, name), (kind, *get_args(kind))
+            choices = [c for part in parts if get_origin(part) is Literal for c in get_args(part)]
+            if choices and value not in choices and value != getattr(Settings, name):
+                raise ConfigurationError(
+                    f"{name} must be one of {', '.join(choices)}, got {value!r}"
+                )
 
     def _check_numbers(self) -> None:
         """Numbers lie where they may."""
