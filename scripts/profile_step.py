@@ -45,7 +45,9 @@ from common import Table, start, write_report
 from matplotlib.figure import Figure
 from peers.tracker_step import Step, Work, compile_step, make_frames, profiled, tracker_step
 
+from torchcss.errors import ConfigurationError
 from torchcss.io.tracks import prepare_output_folder
+from torchcss.tracking.settings import Settings
 
 QUARTILES = {"lower_quartile": 0.25, "median": 0.5, "upper_quartile": 0.75}
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
@@ -64,7 +66,7 @@ class Config:
     dtype: Literal["float32", "float64"] = "float32"
     """Floating type; the search needs no more than float32."""
     device: str = "cpu"
-    """Where to compute: cpu or cuda."""
+    """Where to compute: cpu or cuda, whose times and memory can be told."""
     covariance_scale: float = 8.0
     """Factor on the modes' covariances when drawing."""
     repeats: int = 5
@@ -83,6 +85,11 @@ class Config:
     """JSON file to write."""
     folder: Path | None = None
     """Folder for the figure, the tables and the traces."""
+
+    def __post_init__(self) -> None:
+        if self.device.partition(":")[0] not in ("cpu", "cuda"):
+            raise ConfigurationError(f"device: expected cpu or cuda, got {self.device!r}")
+        Settings(device=self.device)  # refuses one that is not here
 
 
 def seconds_of(config: Config, work: Work, step: Step) -> float:

@@ -79,6 +79,8 @@ def test_a_report_says_how_it_was_made(
         ("compare_solvers", {"solvers": ("scipy trf",)}, "all are compared with torchcss"),
         ("benchmark", {"frames": (NOWHERE / "a.png", NOWHERE / "b.png")}, "a.png: not an image"),
         ("evaluate_flow", {"data": NOWHERE}, "no folder in it holds flow10.flo"),
+        ("profile_step", {"device": "mps"}, "expected cpu or cuda, got 'mps'"),
+        ("profile_step", {"device": "cuda:99"}, "'cuda:99' is not available here"),
     ],
 )
 def test_bad_choices_are_refused(
