@@ -174,7 +174,7 @@ class Round:
 
     def is_tracking(self) -> bool:
         """Whether some frames of a clip are in a checkpoint."""
-        return any((self.out / ".batch" / "work").glob("*/checkpoint.npz"))
+        return any((self.out / ".batch" / "work").glob("*/*/checkpoint.npz"))
 
     def catch(self, process: subprocess.Popen[bytes]) -> None:
         """Wait until it tracks, and a random while longer."""

@@ -8,6 +8,7 @@ import math
 import os
 import reprlib
 import tempfile
+import uuid
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -164,8 +165,8 @@ def write_text(path: Path, text: str) -> None:
 
 
 def temporary_name(path: Path) -> Path:
-    """Return the name beside `path` under which this process writes before it moves the file."""
-    return path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    """A new name beside `path` to write under; two machines may have processes of one number."""
+    return path.with_name(f".{path.stem}.{uuid.uuid4().hex}.partial{path.suffix}")
 
 
 def prepare_output_folder(path: StrPath) -> Path:

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 import shutil
+import subprocess
+import sys
+import time
 from dataclasses import replace
 from pathlib import Path
+from urllib.parse import unquote
 
 import pytest
 
-from torchcss.app.batch import Batch, Job, read_manifest
+from torchcss.app.batch import Batch, Job, _go_on_from, _track, read_manifest
+from torchcss.app.claims import Claims
 from torchcss.errors import ConfigurationError
 from torchcss.io.run import Run
 from torchcss.studies.demo import CLIP
@@ -65,6 +72,78 @@ def test_a_folder_holds_one_batch(tmp_path: Path) -> None:
         Job.begin(batch)
 
 
+def test_names_of_any_signs(tmp_path: Path) -> None:
+    """They are neither patterns of other files nor parts of the page."""
+    names = ["a", "a.1", "clip [1] #?%", "javascript:alert(1)", "<script>'&"]
+    manifest = write_manifest(tmp_path, *({"name": name} for name in names))
+    out = tmp_path / "out"
+    Batch(manifest=manifest, out=out, settings=SETTINGS).run()
+    assert {path.name for path in out.iterdir() if path.is_dir()} == {".batch", *names}
+    page = (out / "batch.html").read_text()
+    links = re.findall("href='([^']*)'", page)
+    assert [unquote(link) for link in links] == [f"{name}/" for name in names]
+    assert not any(sign in link for link in links for sign in ":#?<")
+    assert "<script>" not in page
+
+
+def test_what_is_half_written_is_not_gone_on_from(tmp_path: Path) -> None:
+    """A process may be killed while it copies, and a disk may be full then."""
+    place = tmp_path / "4"
+    for name, files in {
+        "1": ["old"],
+        "2": ["track.npz", ".track.x.partial.npz"],
+        ".3": ["t"],
+    }.items():
+        (tmp_path / name / ".lock").mkdir(parents=True)
+        for file in files:
+            (tmp_path / name / file).write_text(name)
+    _go_on_from(place)
+    assert [(file.name, file.read_text()) for file in place.iterdir()] == [("track.npz", "2")]
+    (place / "summary.json").mkdir()
+    with pytest.raises(OSError, match="directory"):
+        _go_on_from(tmp_path / "5")
+    assert not (tmp_path / "5").exists()
+
+
+def test_who_was_taken_over_says_nothing_of_the_clip(tmp_path: Path) -> None:
+    manifest = write_manifest(tmp_path, {"name": "a", "video": "none.mp4"})
+    job = Job.begin(Batch(manifest=manifest, out=tmp_path / "out", settings=SETTINGS))
+    claim, (clip,) = job.claims.take("a"), job.clips
+    assert claim is not None
+    assert job.claims.take("a") is None
+    claim.release()
+    assert job.claims.take("a") is not None
+    _track(job, clip, claim)
+    assert job.failure(clip) is None
+
+
+def test_other_results_are_not_taken_for_the_batch_s(tmp_path: Path) -> None:
+    manifest = write_manifest(tmp_path, {"name": "a"})
+    (tmp_path / "out" / "a").mkdir(parents=True)
+    with pytest.raises(ConfigurationError, match="in the way"):
+        Job.begin(Batch(manifest=manifest, out=tmp_path / "out", settings=SETTINGS))
+
+
+def test_states_are_shown_and_a_request_to_end_ends_all_processes(tmp_path: Path) -> None:
+    manifest = write_manifest(tmp_path, *({"name": name, "stop": 50} for name in "ab"))
+    words = ["--body=arm8", "--keypoints-use=first", "--no-overlay", "--workers=2"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    command = [sys.executable, "-m", "torchcss.app.batch", str(manifest), *words]
+    with subprocess.Popen(
+        [*command, f"--out={tmp_path / 'out'}"], env=environment, text=True, stdout=subprocess.PIPE
+    ) as process:
+        work = tmp_path / "out" / ".batch" / "work"
+        while process.poll() is None and not list(work.glob("*/1/checkpoint.npz")):
+            time.sleep(0.05)
+        process.terminate()
+        printed, _ = process.communicate(timeout=30)
+    assert process.returncode == 0
+    assert "a: tracking" in printed
+    claims = Claims(tmp_path / "out" / ".batch" / "claims")
+    seen = [claims.sight(name) for name in "ab"]
+    assert all(each is None or each.released for each in seen), seen
+
+
 def test_a_csv_and_folders(tmp_path: Path) -> None:
     table = tmp_path / "clips.csv"
     table.write_text(
@@ -94,7 +173,14 @@ def test_a_csv_and_folders(tmp_path: Path) -> None:
         ('{"video": "v", "camra": "c"}', "unknown column 'camra'"),
         ('{"video": "v", "start": "soon"}', "start: expected a number"),
         ('{"video": "v"}\n{"video": "w/v"}', "two clips are called v"),
-        ('{"video": "v", "name": "../v"}', "cannot be the name of a folder"),
+        ('{"video": "v", "start": Infinity}', "start: expected a number"),
+        ('{"video": "v", "seed": 1.5}', "seed: expected a number"),
+        ('{"video": ["v"]}', "video: expected a text"),
+        ("[" * 100_000, "line 1: no JSON"),
+        *(
+            (json.dumps({"video": "v", "name": name}), "cannot be the name of a folder")
+            for name in ("../v", "batch.json", "a\0b", "\udce9", "x" * 201, ".v")
+        ),
     ],
 )
 def test_bad_manifests(tmp_path: Path, text: str, message: str) -> None:

@@ -36,6 +36,22 @@ def test_one_of_several_gets_it(tmp_path: Path) -> None:
     assert (seen.counter, seen.progress) == (2, "40 %")
 
 
+def test_names_may_hold_any_sign(tmp_path: Path) -> None:
+    for name in ("clip [1]", "a*", "a?", "!"):
+        claim = Claims(tmp_path).take(name)
+        assert claim is not None
+        assert claim.holds
+        assert Claims(tmp_path).take(name) is None
+
+
+def test_a_claim_that_lost_its_content_can_be_taken_over(tmp_path: Path) -> None:
+    assert Claims(tmp_path).take("a") is not None
+    (tmp_path / "a" / "1").write_bytes(b"")
+    other = Claims(tmp_path, patience_s=1e-9)
+    assert other.take("a") is None
+    assert other.take("a") is not None
+
+
 def test_who_lives_keeps_it_and_who_stands_still_is_taken_over(tmp_path: Path) -> None:
     clock = Clock()
     claim, other = Claims(tmp_path).take("a"), Claims(tmp_path, patience_s=10, clock=clock)

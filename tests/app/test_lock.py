@@ -38,7 +38,7 @@ def begin(folder: Path) -> subprocess.Popen[str]:
 def of_another_machine(folder: Path) -> Path:
     """A lock that a machine has left that is not this one."""
     (folder / LOCK_NAME).mkdir()
-    path = folder / LOCK_NAME / "run.1"
+    path = folder / LOCK_NAME / "1"
     path.write_text("elsewhere process 17\nwriting\n")
     return path
 
@@ -78,6 +78,14 @@ def test_another_machine_is_watched_by_its_counter(tmp_path: Path) -> None:
 
 def test_who_was_taken_over_holds_no_more(tmp_path: Path) -> None:
     with locked(tmp_path) as claim:
-        assert Claims(tmp_path / LOCK_NAME).take("run", gone=True) is not None
+        assert Claims(tmp_path).take(LOCK_NAME, gone=True) is not None
         assert not claim.holds
-    assert (tmp_path / LOCK_NAME / "run.2").exists()
+    assert (tmp_path / LOCK_NAME / "2").exists()
+
+
+def test_a_number_that_another_process_has_now_holds_nothing(tmp_path: Path) -> None:
+    (tmp_path / LOCK_NAME).mkdir()
+    owner = f"{socket.gethostname()} process {os.getpid()}"
+    (tmp_path / LOCK_NAME / "1").write_text(f"{owner}\nwriting\n")
+    with locked(tmp_path, patience_s=0.2) as claim:
+        assert claim.generation == 2

@@ -21,7 +21,7 @@ from PIL import Image
 
 from torchcss.app.claims import Claims
 from torchcss.app.lock import LOCK_NAME
-from torchcss.app.recorder import Picture
+from torchcss.app.recorder import Picture, Terminated, ended_by_sigterm
 from torchcss.app.track import TrackOptions, resume, track_video
 from torchcss.cli import main as cli
 from torchcss.errors import ConfigurationError, OutputError, TrackFileError
@@ -199,12 +199,28 @@ def test_a_run_that_was_taken_over_writes_nothing_more(clip: Path, tmp_path: Pat
     class Taking(Stumbling):
         def add(self, frame: Posterior, picture: Picture) -> None:
             if frame.frame.index == 2:
-                assert Claims(tmp_path / LOCK_NAME).take("run", gone=True) is not None
+                assert Claims(tmp_path).take(LOCK_NAME, gone=True) is not None
 
     few = replace(SETTINGS, samples=1, modes=1, terms=("joints",), overlay=False)
     with pytest.raises(OutputError, match="another process has taken over"):
         follow(clip, tmp_path, few, live=Taking(0, KeyboardInterrupt()), checkpoint_every=0)
     assert len(Run.open(tmp_path).track.frames) == 2
+
+
+def test_a_second_request_to_end_does_not_interrupt_what_the_first_leaves_to_write() -> None:
+    written = []
+
+    @ended_by_sigterm()
+    def run() -> None:
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        finally:
+            signal.raise_signal(signal.SIGTERM)
+            written.append("checkpoint")
+
+    with pytest.raises(Terminated):
+        run()
+    assert written
 
 
 def test_a_complete_run_stays_as_it_is(clip: Path, whole: Run) -> None:

@@ -10,7 +10,7 @@ nobody looks at, and publishes nothing. The same command goes on with an interru
 
     OUT/NAME/                a clip that is done, as `torchcss track` leaves it
     OUT/batch.json, .html    the state of every clip
-    OUT/.batch/              the manifest, claims, work, and what failed why
+    OUT/.batch/              the manifest, claims, work/NAME/GENERATION, and what failed why
 """
 
 from __future__ import annotations
@@ -18,19 +18,23 @@ from __future__ import annotations
 import atexit
 import csv
 import html
+import io
 import json
 import multiprocessing
 import os
+import re
 import shutil
 import signal
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import redirect_stderr, redirect_stdout, suppress
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
+from urllib.parse import quote
 
 import tyro
 
@@ -38,7 +42,15 @@ from torchcss.app.claims import Claim, Claims
 from torchcss.app.recorder import Picture, ended_by_sigterm
 from torchcss.app.track import TrackOptions, track_video
 from torchcss.errors import ConfigurationError, OutputError, TorchcssError
-from torchcss.files import load_json, one_line, prepare_output_folder, read_text, write_text
+from torchcss.files import (
+    load_json,
+    one_line,
+    prepare_output_folder,
+    read_text,
+    refusing,
+    unexpected,
+    write_text,
+)
 from torchcss.io.checkpoint import CHECKPOINT_NAME
 from torchcss.io.tracks import TRACK_NAME
 from torchcss.io.video import VideoReader
@@ -60,6 +72,9 @@ _NUMBERS = {
     **dict.fromkeys(names_in("frame_rate sigma focal fov"), float),
 }
 _COLUMNS = ("name", "start", "stop", *FILES, *OPTIONS, *SETTINGS)
+_FOLDER = re.compile(r"(?!\.|batch\.(json|html)$)[^\0-\x1f\ud800-\udfff]+")
+"""Names of clips: not hidden, not the batch's own files, and of signs that can be written."""
+
 _POLL_S = 0.5
 
 
@@ -95,38 +110,63 @@ class Batch:
             TorchcssError: If the manifest or the folder is of no use. What is wrong with a clip is
                 its own failure.
         """
-        job = Job.begin(self)
-        if self.workers > 1 and "RANK" not in os.environ:
-            self._with_workers(job)
-        else:
-            work(job)
-        print(job.report())
+        with ended_by_sigterm():
+            job = Job.begin(self)
+            with _shown(job):
+                if self.workers > 1 and "RANK" not in os.environ:
+                    self._with_workers(job)
+                else:
+                    work(job)
+            print(job.report())
 
     def _with_workers(self, job: Job) -> None:
-        """Start processes, and show how far they are."""
+        """Start processes, and wait for them."""
         os.environ["OMP_NUM_THREADS"] = "1"  # for those that start now
         spawn = multiprocessing.get_context("spawn")
         workers = [spawn.Process(target=_worker, args=(job,)) for _ in range(self.workers)]
-        shown: dict[str, State] = {}
         try:
             for worker in workers:
                 worker.start()
-            while any(worker.is_alive() for worker in workers):
-                states = job.states()
-                for name, state in states.items():
-                    if shown.get(name) != state:
-                        print(f"{name}: {state.text}", flush=True)
-                shown = states
-                time.sleep(_POLL_S)
+            for worker in workers:
+                worker.join()
         finally:
             for worker in workers:
                 worker.terminate()
+            for worker in workers:
                 worker.join()
 
 
 def _worker(job: Job) -> None:
     with ended_by_sigterm(), suppress(KeyboardInterrupt):
-        work(job)
+        try:
+            work(job)
+        except TorchcssError as error:
+            sys.exit(f"torchcss: {error}")
+
+
+@contextmanager
+def _shown(job: Job) -> Iterator[None]:
+    """Print what becomes of the clips while the body runs; of torchrun's processes one does."""
+    over, to = threading.Event(), sys.stdout
+    if os.environ.get("RANK", "0") != "0":
+        over.set()
+
+    def show() -> None:
+        shown: dict[str, State] = {}
+        while not over.wait(_POLL_S):
+            states = job.states()
+            for name, state in states.items():
+                if shown.get(name) != state:
+                    print(f"{name}: {state.text}", file=to, flush=True)
+            shown = states
+
+    thread = threading.Thread(target=show, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
 
 
 class Clip(NamedTuple):
@@ -160,14 +200,14 @@ def read_manifest(path: Path) -> list[Clip]:
     if path.is_dir():
         rows = list(_rows_of_folder(path))
     elif path.suffix.lower() == ".csv":
-        rows = list(csv.DictReader(read_text(path, ConfigurationError).splitlines()))
+        text = read_text(path, ConfigurationError)
+        with refusing(ConfigurationError, f"{path}: not a table"):
+            rows = list(csv.DictReader(io.StringIO(text, newline="")))
     else:
         rows = []
-        for number, line in enumerate(read_text(path, ConfigurationError).splitlines(), 1):
-            try:
+        for number, line in enumerate(read_text(path, ConfigurationError).split("\n"), 1):
+            with refusing(ConfigurationError, f"{path}: line {number}: no JSON"):
                 rows += [json.loads(line)] if line.strip() else []
-            except ValueError as error:
-                raise ConfigurationError(f"{path}: line {number}: no JSON: {error}") from error
     folder = path if path.is_dir() else path.parent
     clips = [_clip(row, f"{path}: row {number}", folder) for number, row in enumerate(rows, 1)]
     if not clips:
@@ -195,21 +235,22 @@ def _clip(row: object, where: str, folder: Path) -> Clip:
         raise ConfigurationError(
             f"{where}: unknown column {unknown[0]!r}; there are {', '.join(_COLUMNS)}"
         )
-    given = {name: value for name, value in row.items() if value not in (None, "")}
-    for name, kind in _NUMBERS.items():
-        if name in given:
-            try:
-                given[name] = kind(given[name])
-            except (TypeError, ValueError) as error:
-                raise ConfigurationError(
-                    f"{where}: {name}: expected a number, got {given[name]!r}"
-                ) from error
-    for name in FILES:
-        if name in given:
-            given[name] = os.path.abspath(folder / str(given[name]))
-    name = str(given.pop("name", Path(given["video"]).stem))
-    if name.startswith(".") or name != Path(name).name:
-        raise ConfigurationError(f"{where}: {name!r} cannot be the name of a folder")
+    given: dict[str, Any] = {}
+    for name, value in row.items():
+        if value in (None, ""):
+            continue
+        what = "a number" if name in _NUMBERS else "a text"
+        if not isinstance(value, (str, int, float)):
+            raise unexpected(ConfigurationError, f"{where}: {name}", what, value)
+        try:
+            given[name] = _NUMBERS.get(name, str)(str(value))
+        except ValueError as error:
+            raise unexpected(ConfigurationError, f"{where}: {name}", what, value) from error
+        if name in FILES:
+            given[name] = os.path.abspath(folder / given[name])
+    name = given.pop("name", Path(given["video"]).stem)
+    if name != Path(name).name or not _FOLDER.fullmatch(name) or len(name.encode()) > 200:
+        raise ConfigurationError(f"{where}: {name!r} cannot be the name of a folder; give another")
     return Clip(name, given)
 
 
@@ -254,6 +295,12 @@ class Job(NamedTuple):
         about = json.loads(json.dumps(plain))
         path = out / ".batch" / "manifest.json"
         if not path.exists():
+            if other := next(
+                (out / clip.name for clip in clips if (out / clip.name).exists()), None
+            ):
+                raise ConfigurationError(
+                    f"{other}: is in the way of a clip; move it, or give another --out"
+                )
             write_text(path, json.dumps(about, indent=1))
         elif (before := load_json(path, ConfigurationError)) != about:
             what = "settings" if before.get("settings") != about["settings"] else "clips"
@@ -275,12 +322,18 @@ class Job(NamedTuple):
 
     def failure(self, clip: Clip) -> dict[str, Any] | None:
         """Why a clip failed; None if it did not."""
-        path = self._failed(clip)
-        return load_json(path, ConfigurationError) if path.exists() else None
+        try:
+            return json.loads(self._failed(clip).read_bytes())
+        except (OSError, ValueError):  # none, or removed or damaged: the clip is tried again
+            return None
 
     def is_done(self, clip: Clip) -> bool:
         """Whether a clip was published."""
         return (self.out / clip.name / TRACK_NAME).is_file()
+
+    def is_left(self, clip: Clip) -> bool:
+        """Whether a clip is to be tracked."""
+        return not self.is_done(clip) and self.failure(clip) is None
 
     def states(self) -> dict[str, State]:
         """How far every clip is."""
@@ -315,7 +368,7 @@ class Job(NamedTuple):
         plain = {name: state._asdict() for name, state in states.items()}
         write_text(self.out / "batch.json", json.dumps({**counts, "clips": plain}, indent=1))
         rows = "".join(
-            f"<tr><td><a href='{html.escape(name)}/'>{html.escape(name)}</a></td>"
+            f"<tr><td><a href='{quote(name)}/'>{html.escape(name)}</a></td>"
             f"<td>{state.kind}</td><td>{html.escape(state.about)}</td></tr>\n"
             for name, state in states.items()
         )
@@ -333,17 +386,12 @@ def work(job: Job) -> None:
     Raises:
         KeyboardInterrupt: If the process was asked to end; what was tracked is on disk.
     """
-    while True:
-        left = [c for c in job.clips if not job.is_done(c) and job.failure(c) is None]
-        if not left:
-            return
+    while left := [clip for clip in job.clips if job.is_left(clip)]:
         for clip in left:
-            claim = job.claims.take(clip.name)
-            if claim is not None:
+            # The pass may take long; others go on meanwhile.
+            if job.is_left(clip) and (claim := job.claims.take(clip.name)) is not None:
                 _track(job, clip, claim)
-                break
-        else:
-            time.sleep(_POLL_S)  # others have them all; one of them may die
+        time.sleep(_POLL_S)  # others have what is left; one of them may die
 
 
 class TakenOver(Exception):
@@ -373,9 +421,11 @@ class _Watch:
 
 def _track(job: Job, clip: Clip, claim: Claim) -> None:
     """Track a claimed clip and publish it, or say why it failed."""
-    place = job.out / ".batch" / "work" / f"{clip.name}.{claim.generation}"
+    place = job.out / ".batch" / "work" / clip.name / str(claim.generation)
     watch = _Watch(claim)
     try:
+        if not job.is_left(clip):  # done just before it was claimed
+            return
         with claim.alive(watch.progress):
             _go_on_from(place)
             with (
@@ -393,8 +443,11 @@ def _track(job: Job, clip: Clip, claim: Claim) -> None:
     except TakenOver:
         return
     except Exception as error:
-        job.fail(clip, error)
+        if claim.holds:
+            job.fail(clip, error)
     finally:
+        if job.is_done(clip):
+            shutil.rmtree(place.parent, ignore_errors=True)
         claim.release()
 
 
@@ -419,28 +472,28 @@ def _track_into(place: Path, job: Job, clip: Clip, watch: _Watch) -> None:
 
 
 def _go_on_from(place: Path) -> None:
-    """Copy what the claim before has left; its owner may still write into its own folder."""
-    name, _, generation = place.name.rpartition(".")
-    before = place.with_name(f"{name}.{int(generation) - 1}")
-    shutil.rmtree(place, ignore_errors=True)
-    place.mkdir(parents=True)
-    if before.is_dir():
+    """Copy what the last claim has left; its owner may still write into its own folder."""
+    draft = place.with_name(f".{place.name}")
+    shutil.rmtree(draft, ignore_errors=True)
+    draft.mkdir(parents=True)
+    left = [folder for folder in place.parent.iterdir() if folder.name.isdigit()]
+    for before in sorted(left, key=lambda folder: int(folder.name))[-1:]:
         # The checkpoint first: the track may be newer than that, but not older.
         for file in sorted(before.iterdir(), key=lambda file: file.name != CHECKPOINT_NAME):
-            with suppress(OSError):
-                shutil.copy2(file, place / file.name)
+            if not file.name.startswith("."):  # locks, and what is half written
+                with suppress(FileNotFoundError):  # as its owner may remove it
+                    shutil.copy2(file, draft / file.name)
+    shutil.rmtree(place, ignore_errors=True)
+    draft.rename(place)
 
 
 def _publish(place: Path, out: Path) -> None:
     """Give the folder its final name; whoever comes second leaves it."""
-    with suppress(FileExistsError, NotADirectoryError):
-        try:
-            os.rename(place, out)
-        except OSError as error:
-            if not (out / TRACK_NAME).is_file():
-                raise OutputError(f"{out}: is in the way of the result; move it") from error
-    for old in place.parent.glob(f"{out.name}.*"):
-        shutil.rmtree(old, ignore_errors=True)
+    try:
+        os.rename(place, out)
+    except OSError as error:
+        if not (out / TRACK_NAME).is_file():
+            raise OutputError(f"{out}: is in the way of the result; move it") from error
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

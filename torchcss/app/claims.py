@@ -1,6 +1,6 @@
 """Who works on what, told by files alone: for processes of many machines that share a folder.
 
-A claim is a file `NAME.GENERATION`, made by one exclusive act (a hard link of a file that is
+A claim is a file `NAME/GENERATION`, made by one exclusive act (a hard link of a file that is
 complete, which network file systems honour): of several that try, one succeeds. Its owner shows
 that it lives by adding lines; their number is a counter, and the last one says how far it is. A
 claim whose counter stands still, as long as another process watches it by a clock of its own, may
@@ -56,7 +56,7 @@ class Claim:
 
     def __init__(self, claims: Claims, name: str, generation: int) -> None:
         self.name, self.generation = name, generation
-        self._claims, self._path = claims, claims.folder / f"{name}.{generation}"
+        self._claims, self._path = claims, claims.folder / name / str(generation)
 
     @property
     def holds(self) -> bool:
@@ -109,15 +109,15 @@ class Claims:
 
     def sight(self, name: str) -> Sight | None:
         """The newest claim to something; None: nobody has claimed it."""
-        claims = [path for path in self.folder.glob(f"{name}.*") if path.stem == name]
-        found = [int(path.suffix[1:]) for path in claims if path.suffix[1:].isdigit()]
-        if not found:
-            return None
         try:
-            lines = (self.folder / f"{name}.{max(found)}").read_text(encoding="utf-8").splitlines()
-        except FileNotFoundError:  # removed just now, as that of a lock is
+            found = [int(file) for file in os.listdir(self.folder / name) if file.isdigit()]
+            newest = self.folder / name / str(max(found, default=0))
+            lines = newest.read_text(encoding="utf-8").splitlines()
+        except FileNotFoundError:  # or removed just now, as that of a lock is
             return None
-        return Sight(max(found), lines[0], len(lines), lines[-1] if len(lines) > 1 else "")
+        # A machine that lost its power may leave an empty file.
+        owner = lines[0] if lines else "unknown"
+        return Sight(max(found), owner, len(lines), lines[-1] if len(lines) > 1 else "")
 
     def take(self, name: str, *, gone: bool = False) -> Claim | None:
         """Claim something; None where somebody else has it, or was faster.
@@ -133,16 +133,19 @@ class Claims:
         if seen is not None and not (gone or seen.released or self._stands_still(name, seen)):
             return None
         generation = 1 if seen is None else seen.generation + 1
-        draft = self.folder / f".{uuid.uuid4().hex}"
+        place = self.folder / name
+        draft = place / f".{uuid.uuid4().hex}"
         try:
+            place.mkdir(exist_ok=True)
             draft.write_text(f"{socket.gethostname()} process {os.getpid()}\n", encoding="utf-8")
-            os.link(draft, self.folder / f"{name}.{generation}")
+            os.link(draft, place / str(generation))
         except FileExistsError:
             return None
         except OSError as error:
-            raise output_error(self.folder, error) from error
+            raise output_error(place, error) from error
         finally:
-            draft.unlink(missing_ok=True)
+            with suppress(OSError):
+                draft.unlink(missing_ok=True)
         return Claim(self, name, generation)
 
     def _stands_still(self, name: str, seen: Sight) -> bool:

@@ -2,8 +2,9 @@
 
 The lock is a claim (`torchcss.app.claims`) under `FOLDER/.lock`, which tells machine and process of
 its owner, and a counter that shows that it lives. A lock whose process has ended is taken over at
-once on the same machine, and on another when its counter has stood still for `PATIENCE_S`. Whoever
-was taken over and wakes up writes nothing more.
+once on the same machine; one of another machine, or whose number belongs to another process by now,
+when its counter has stood still for `PATIENCE_S`. Whoever was taken over and wakes up writes
+nothing more.
 """
 
 from __future__ import annotations
@@ -21,9 +22,7 @@ from torchcss.files import prepare_output_folder
 
 LOCK_NAME = ".lock"
 PATIENCE_S = 20.0
-"""Seconds without a sign of life after which the lock of another machine is taken over."""
-
-_RUN = "run"
+"""Seconds without a sign of life after which a lock is taken over."""
 
 
 @contextmanager
@@ -40,8 +39,7 @@ def locked(folder: Path, *, patience_s: float = PATIENCE_S) -> Iterator[Claim]:
     Raises:
         OutputError: If another process holds it, or the folder cannot be written.
     """
-    place = folder / LOCK_NAME
-    claim = _claimed(folder, Claims(place, patience_s=patience_s))
+    claim = _claimed(Claims(folder, patience_s=patience_s))
     try:
         with claim.alive(lambda: "writing"):
             yield claim
@@ -49,45 +47,44 @@ def locked(folder: Path, *, patience_s: float = PATIENCE_S) -> Iterator[Claim]:
         claim.release()
         with suppress(OSError):
             for generation in range(1, claim.generation + 1):
-                (place / f"{_RUN}.{generation}").unlink(missing_ok=True)
-            place.rmdir()
+                (folder / LOCK_NAME / str(generation)).unlink(missing_ok=True)
+            (folder / LOCK_NAME).rmdir()
 
 
-def _claimed(folder: Path, claims: Claims) -> Claim:
+def _claimed(claims: Claims) -> Claim:
     first: Sight | None = None
     while True:
-        seen = claims.sight(_RUN)
-        runs = None if seen is None else _runs(seen.owner)
-        prepare_output_folder(claims.folder)
+        seen = claims.sight(LOCK_NAME)
+        gone = seen is not None and _has_ended(seen.owner)
+        place = prepare_output_folder(claims.folder / LOCK_NAME)
         try:
-            claim = claims.take(_RUN, gone=runs is False)
+            claim = claims.take(LOCK_NAME, gone=gone)
         except OutputError:
-            if claims.folder.is_dir():
+            if place.is_dir():
                 raise
             continue  # whoever had it has just removed it
         if claim is not None:
             return claim
-        seen = claims.sight(_RUN)
+        seen = claims.sight(LOCK_NAME)
         if seen is None:
             continue
         first = first or seen
-        if runs or (seen.generation, seen.counter) != (first.generation, first.counter):
+        if (seen.generation, seen.counter) != (first.generation, first.counter):
             raise OutputError(
-                f"{folder}: {seen.owner} writes into it ({seen.counter} signs of life); wait until "
-                "it has ended, or give another folder"
+                f"{claims.folder}: {seen.owner} writes into it ({seen.counter} signs of life); "
+                "wait until it has ended, or give another folder"
             )
         time.sleep(claims.beat_s / 2)
 
 
-def _runs(owner: str) -> bool | None:
-    """Whether the process of a claim runs; None: it is of another machine."""
+def _has_ended(owner: str) -> bool:
+    """Whether a claim is of this machine, and its process runs no more."""
     machine, _, number = owner.partition(" process ")
     if machine != socket.gethostname() or not number.isdigit() or os.name != "posix":
-        return None
-    try:
-        os.kill(int(number), 0)
-    except ProcessLookupError:
         return False
-    except OSError:
-        return True
-    return True
+    with suppress(PermissionError):
+        try:
+            os.kill(int(number), 0)
+        except ProcessLookupError:
+            return True
+    return False

@@ -279,6 +279,7 @@ def ended_by_sigterm() -> Iterator[None]:
         return
 
     def end(*_: object) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # what is being written is finished
         raise Terminated
 
     before = signal.signal(signal.SIGTERM, end)
