@@ -291,6 +291,7 @@ def test_variable_frame_rates(tmp_path: Path) -> None:
     reader = VideoReader(path)
     assert reader.num_selected == len(ticks)
     assert [frame.time_s * 30 for frame in reader] == pytest.approx(ticks)
+    assert reader.frame_times() == pytest.approx(ticks / 30)
     means = [round(frame.image.mean()) for frame in reader]
     assert means == pytest.approx([grey_level(index) for index in range(30)], abs=3)
     assert float(reader.info.frame_rate) == pytest.approx(30 * 30 / ticks[-1], rel=0.1)
@@ -319,6 +320,7 @@ def test_an_edit_list_hides_frames(tmp_path: Path) -> None:
     frames = list(reader)
     assert reader.count_frames() == reader.num_selected == len(frames) == 12 - hidden
     assert [frame.index for frame in frames] == list(range(8))
+    assert [frame.time_s for frame in frames] == pytest.approx(reader.frame_times() or [])
     assert frames[0].time_s == 0.0
     assert frames[0].image.mean() == pytest.approx(grey_level(hidden), abs=3)
 

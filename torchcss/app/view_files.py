@@ -181,7 +181,8 @@ def open_view(
     if files.keypoints is None:
         return OpenView(files, reader, masks, loaded, None, 1.0)
     rate = None if reader.image_names else float(reader.info.frame_rate)
-    film = Film(reader.info.num_frames or reader.count_frames(), reader.image_names, rate)
+    count = reader.info.num_frames or reader.count_frames()
+    film = Film(count, reader.image_names, rate, reader.frame_times)
     keypoints = read_person(
         files.keypoints,
         film=film,

@@ -157,16 +157,28 @@ class VideoReader:
 
     def count_frames(self) -> int:
         """Count the frames without decoding them; those before the damage, if there is any."""
+        return len(self._images or self._shown_at())
+
+    def frame_times(self) -> list[float] | None:
+        """Seconds from the first frame to each, without decoding; None: a file does not say it."""
         if self._images is not None:
-            return len(self._images)
-        count = 0
+            return [float(index / self.info.frame_rate) for index in range(len(self._images))]
+        times = [time for time in self._shown_at() if time is not None]
+        begin = min(times, default=0.0)
+        return sorted(time - begin for time in times) if self.count_frames() == len(times) else None
+
+    def _shown_at(self) -> list[float | None]:
+        """When each frame of a container is shown, in the order in which they are stored."""
+        times: list[float | None] = []
         # What cannot be demuxed ends the count, as it ends the reading.
         with suppress(*_av_errors()), self.opened() as container:
             for packet in container.demux(video=0):
                 if packet.is_corrupt:
                     break
-                count += bool(packet.size) and not packet.is_discard
-        return count
+                if packet.size and not packet.is_discard:
+                    at, base = packet.pts, packet.time_base
+                    times.append(None if at is None or base is None else float(at * base))
+        return times
 
     def __iter__(self) -> Iterator[Frame]:
         return self._read_container() if self._images is None else self._read_images()

@@ -695,6 +695,16 @@ def test_fractions_of_a_canvas_whose_size_is_said(tmp_path: Path) -> None:
     check(read(path, normalised="zero-one"))
 
 
+@pytest.mark.parametrize("tell", ["true", "counted"])
+def test_times_of_a_film_whose_rate_varies(tmp_path: Path, tell: str) -> None:
+    shown = [0.0, 0.03, 0.06, 0.15, 0.24, 0.27]
+    times = shown if tell == "true" else [t * 0.054 for t in T]
+    entries = [{"timestamp_ms": 1000 * times[t], "keypoints": flat(t)} for t in SEEN]
+    path = write(tmp_path / "a.json", entries)
+    film = Film(FRAMES, rate=1 / 0.054, times=lambda: shown)
+    check(read_person(path, film=film, whom=Whom(0, "largest", SIZE)), (3,))
+
+
 def test_people_by_float_numbers_and_confidences_beside(tmp_path: Path) -> None:
     def entry(p: np.ndarray, number: float) -> dict[str, Any]:
         return {"keypoints": p[:, :2].ravel().tolist(), "confidence": p[:, 2].tolist(),

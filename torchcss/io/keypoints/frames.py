@@ -9,7 +9,7 @@ Call `in_order`.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
@@ -30,11 +30,13 @@ class Film(NamedTuple):
         num_frames: Its number of frames; None: as many as the file has.
         names: Names of the pictures, if it is a folder of them.
         rate: Frames per second.
+        times: Tells when each frame is shown, seconds from the first; None: it does not know.
     """
 
     num_frames: int | None = None
     names: Sequence[str] | None = None
     rate: float | None = None
+    times: Callable[[], Sequence[float] | None] = lambda: None
 
 
 def in_order(people: People, film: Film, report: list[str]) -> list[list[Person]]:
@@ -200,14 +202,21 @@ def _by_time(times: Sequence[float], film: Film, report: list[str]) -> list[int]
         start = 0.0
         if film.num_frames is not None and sorted_times[-1] > (film.num_frames - 0.5) * interval:
             start = float(sorted_times[0])
-        found = np.round((sorted_times - start) / interval)
+        since = sorted_times - start
+        found, grid = np.round(since / interval), f"one every {interval:.4g} s"
+        if (shown := film.times()) is not None and len(shown) > 1:
+            # Of a film whose rate varies: programs tell the true time, or count by the mean rate.
+            true = np.array(shown)
+            nearest = np.searchsorted(0.5 * (true[1:] + true[:-1]), since)
+            if np.abs(true[nearest] - since).max() < np.abs(found * interval - since).max():
+                found, grid = nearest, "as the video shows them"
     if not ((found >= 0) & (found < _MOST_FRAMES)).all():
         raise KeypointError(
             f"times from {sorted_times[0]:.4g} to {sorted_times[-1]:.4g} s, one every "
             f"{interval:.3g} s, are no video's; number the frames"
         )
     places[order] = found
-    report.append(f"frames by their times, one every {interval:.4g} s, the first at {start:.4g} s")
+    report.append(f"frames by their times, {grid}, the first at {start:.4g} s")
     return places.tolist()
 
 
