@@ -18,6 +18,7 @@ class C3dFile(NamedTuple):
     units: str
     rate: float
     points: np.ndarray  # frames, points, 3; NaN where invalid
+    screen: tuple[str, str]  # the axes to the right and up
 
 
 def read_c3d(data: bytes) -> C3dFile:
@@ -59,4 +60,5 @@ def read_c3d(data: bytes) -> C3dFile:
     table = np.frombuffer(data, "<f4", frames * num_points * 4, (data_at - 1) * 512)
     table = table.reshape(frames, num_points, 4).astype(np.float64)
     points = np.where(table[..., 3:] < 0, np.nan, table[..., :3])
-    return C3dFile(tuple(text("LABELS")), text("UNITS")[0], rate, points)
+    screen = (text("X_SCREEN")[0], text("Y_SCREEN")[0])
+    return C3dFile(tuple(text("LABELS")), text("UNITS")[0], rate, points, screen)

@@ -108,18 +108,23 @@ def test_mot(name: str, tmp_path: Path):
     np.testing.assert_allclose(joints[:, pelvis[1]] - joints[:, pelvis[0]], above, atol=1e-7)
 
 
-def test_c3d(tmp_path: Path):
+@pytest.mark.parametrize(
+    ("frame", "screen", "turn"),
+    [("world", ("+X", "+Y"), np.eye(3)), ("y-up", ("+X", "+Y"), np.eye(3)),
+     (None, ("+Y", "+Z"), UP_OF_FILE.T)],
+)  # fmt: skip
+def test_c3d(tmp_path: Path, frame: str | None, screen: tuple[str, str], turn: np.ndarray):
+    """By default Z is up, as in laboratories; the file says its axes."""
     pytest.importorskip("ezc3d")
     track = make_track(body_named("body34"), first_frame=3)
     for mode in (0, 2):
-        done = export_as(track, to="c3d", out=tmp_path, mode=mode)
+        done = export_as(track, to="c3d", out=tmp_path, mode=mode, frame=frame, world_up="y")
         file = read_c3d(done.paths[0].read_bytes())
         assert file.labels == track.joint_names
-        assert (file.units, file.rate) == ("m", 60.0)
+        assert (file.units, file.rate, file.screen) == ("m", 60.0, screen)
         present = track.num_modes > mode
-        np.testing.assert_allclose(
-            file.points[present], track.joints_world[present, mode], rtol=1e-6, atol=1e-7
-        )
+        places = track.joints_world[present, mode] @ turn.T
+        np.testing.assert_allclose(file.points[present], places, rtol=1e-6, atol=1e-7)
         assert np.isnan(file.points[~present]).all()
 
 

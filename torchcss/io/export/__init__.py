@@ -26,7 +26,7 @@ from torchcss.files import StrPath, prepare_output_folder, replace_file, save_ar
 from torchcss.io.export.bvh import BvhStyle, bvh_text
 from torchcss.io.export.c3d import write_c3d
 from torchcss.io.export.mot import mot_text
-from torchcss.io.export.selection import Selection, SelectionChoice, select
+from torchcss.io.export.selection import FrameOfFile, Selection, SelectionChoice, select
 from torchcss.io.export.smpl import smpl_arrays
 from torchcss.io.export.tables import csv_text, joint_covariances, npz_arrays
 from torchcss.io.export.trc import trc_text
@@ -37,7 +37,8 @@ Format = Literal["bvh", "trc", "c3d", "mot", "csv", "npz", "npz-smpl"]
 FORMATS: tuple[str, ...] = get_args(Format)
 
 _NAMES = {"csv": "track_joints.csv", "npz": "track_joints.npz", "npz-smpl": "track_smpl.npz"}
-_Y_UP = ("bvh", "trc", "mot")  # formats whose readers take Y for up
+_UP: dict[str, FrameOfFile] = {**dict.fromkeys(("bvh", "trc", "mot"), "y-up"), "c3d": "z-up"}
+"""What the readers of a format take for up."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,13 +47,13 @@ class ExportOptions:
 
     Attributes:
         selection: Which modes and frames.
-        frame: "world", the track's world as it is, or "y-up", turned so that Y is up; by default
-            y-up for BVH, TRC and MOT.
+        frame: "world", the track's world as it is, or turned so that Y or Z is up; by default y-up
+            for BVH, TRC and MOT, z-up for C3D.
         bvh: How a BVH is written; only for that format.
     """
 
     selection: SelectionChoice = field(default_factory=SelectionChoice)
-    frame: Literal["world", "y-up"] | None = None
+    frame: FrameOfFile | None = None
     bvh: BvhStyle = field(default_factory=BvhStyle)
 
 
@@ -97,8 +98,8 @@ def export(
     to = to or ("" if path is None else Path(path).suffix.removeprefix("."))
     if to not in FORMATS:
         raise ConfigurationError(f"to: expected {', '.join(FORMATS)}, got {to!r}")
-    if options.frame not in (None, "world", "y-up"):
-        raise ConfigurationError(f"frame: expected world or y-up, got {options.frame!r}")
+    if options.frame not in (None, *get_args(FrameOfFile)):
+        raise ConfigurationError(f"frame: expected world, y-up or z-up, got {options.frame!r}")
     plain = asdict(BvhStyle())
     idle = [name for name, value in asdict(options.bvh).items() if value != plain[name]]
     if idle and to != "bvh":
@@ -108,11 +109,8 @@ def export(
     else:
         run = as_run(run)
         track, source = run.track, run.path
-    selection = select(
-        track,
-        options.selection,
-        y_up=options.frame == "y-up" or (options.frame is None and to in _Y_UP),
-    )
+    frame = options.frame or _UP.get(to, "world")
+    selection = select(track, options.selection, frame=frame)
     one_file = to in _NAMES
     labels = [""] if one_file and options.selection.mode == "all" else selection.labels
     paths = _paths(source, to, labels, path)

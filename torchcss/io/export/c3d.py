@@ -1,7 +1,8 @@
 """C3D: the joints as points, for the programs of gait laboratories.
 
 Written by ezc3d, an optional package. Points are in metres; a point that a frame lacks is marked as
-invalid (residual -1), as the format wants it.
+invalid (residual -1), as the format wants it. `X_SCREEN` and `Y_SCREEN` say which axes point to the
+right and up on the screen of who looks at a standing body from the front.
 
 Call `write_c3d`.
 """
@@ -34,6 +35,9 @@ def write_c3d(path: Path, selection: Selection, mode: int) -> None:
     point["LABELS"]["value"] = tuple(selection.joint_names)
     point["DESCRIPTIONS"]["value"] = tuple("" for _ in selection.joint_names)
     file.add_parameter("POINT", "UNITS", ["m"])
+    for screen, axis in zip(("X_SCREEN", "Y_SCREEN"), selection.upright.T[:2], strict=True):
+        name = "XYZ"[int(np.abs(axis).argmax())]
+        file.add_parameter("POINT", screen, ["+" + name if axis.sum() > 0 else "-" + name])
     points = selection.joints[:, mode].transpose(2, 1, 0)
     file["data"]["points"] = np.concatenate([points, np.ones_like(points[:1])])
     file.write(str(path))

@@ -6,7 +6,7 @@ stands there: nothing where that can be said, else the pose of the frame before.
 
 The world of a track is that of its camera file, whatever its up axis. Formats of animation and
 biomechanics want Y up: the world is then turned by quarter turns, so that the body's mean upward
-direction, or the axis that the caller names, becomes Y.
+direction, or the axis that the caller names, becomes Y; or Z, for the laboratories of C3D.
 
 Call `select`.
 """
@@ -39,6 +39,9 @@ _TO_Y_UP: dict[str, tuple[tuple[int, int, int], ...]] = {
     "-x": ((0, 1, 0), (-1, 0, 0), (0, 0, 1)),
 }
 UP_AXES = ("x", "y", "z", "-x", "-y", "-z")
+
+FrameOfFile = Literal["world", "y-up", "z-up"]
+"""The track's world as it is, or turned so that this axis is up."""
 
 
 class Selection(NamedTuple):
@@ -112,13 +115,15 @@ class SelectionChoice:
     world_up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
 
 
-def select(track: Track, choice: SelectionChoice | None = None, *, y_up: bool = False) -> Selection:
+def select(
+    track: Track, choice: SelectionChoice | None = None, *, frame: FrameOfFile = "world"
+) -> Selection:
     """Choose modes and frames, and turn them into the file's frame of reference.
 
     Args:
         track: The track.
         choice: Which of its modes and frames.
-        y_up: Turn the world so that Y is up.
+        frame: The file's frame of reference.
 
     Raises:
         ConfigurationError: If the choice makes no sense, or no frame or mode is left.
@@ -133,7 +138,7 @@ def select(track: Track, choice: SelectionChoice | None = None, *, y_up: bool = 
     for label, missing in zip(labels, (ranks < 0).sum(axis=0), strict=True):
         if missing:
             report.append(f"{label or 'best mode'}: absent in {missing} of {len(kept)} frames")
-    turn, upright = _frame_of_file(track, kept, y_up, choice.world_up, report)
+    turn, upright = _frame_of_file(track, kept, frame, choice.world_up, report)
     rate = _rate(track.times[kept], report)
 
     present = ranks >= 0
@@ -234,7 +239,7 @@ def _nearest_present(present: np.ndarray) -> np.ndarray:
 
 
 def _frame_of_file(
-    track: Track, kept: np.ndarray, y_up: bool, world_up: str, report: list[str]
+    track: Track, kept: np.ndarray, frame: FrameOfFile, world_up: str, report: list[str]
 ) -> tuple[np.ndarray, np.ndarray]:
     """The file's frame from the world's, and a standing body's orientation in it."""
     axis = world_up
@@ -246,13 +251,14 @@ def _frame_of_file(
         tells = set(_UPRIGHT) <= set(track.joint_names)
         what = "body's mean" if tells else "base's" if picture_up is None else "picture's upward"
         angle = np.degrees(np.arccos(min(agreement, 1.0)))
-        if y_up:
+        if frame != "world":
             report.append(
                 f"the world's {axis} axis is taken for up (the {what} direction is "
                 f"{angle:.0f} degrees from it); set the axis with --world-up (world_up)"
             )
-    matrix = np.array(_TO_Y_UP[axis], dtype=np.float64)
-    return (matrix, np.eye(3)) if y_up else (np.eye(3), matrix.T)
+    to_y_up = np.array(_TO_Y_UP[axis], dtype=np.float64)
+    from_y_up = np.array(_TO_Y_UP[{"y-up": "y", "z-up": "z", "world": axis}[frame]]).T
+    return from_y_up @ to_y_up, from_y_up
 
 
 _UPRIGHT = ("HumanoidRoot", "skull_tip")
