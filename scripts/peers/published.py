@@ -1,4 +1,4 @@
-"""When trackers failed in the experiments of section 6 [IJRR], on the paper's own sequences.
+"""When trackers failed in section 6 of [IJRR] and of [RR], on the papers' own sequences.
 
 The sequences are lost; ours of the same names stand for them, other motions in front of other
 rooms. Figures that can be compared are therefore the order of the trackers and what becomes of
@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 
 class Published(NamedTuple):
-    """What the paper says of a tracker on one of its sequences.
+    """What a paper says of a tracker on one of its sequences.
 
     Attributes:
         sequence: Ours that stands for the paper's.
@@ -56,6 +56,10 @@ PUBLISHED: tuple[Published, ...] = (
     Published("body-clutter", "ijrr_cham_rehg", (0.7,), "[IJRR] 6.1", "lost further into the turn"),
     Published(
         "body-clutter", "ijrr_css", (), "[IJRR] 6.1", "3.5 s without failure, seven modes", False
+    ),
+    Published("arm", "rr_multiple_hypothesis", (), "[RR] 6", "8 s, three hypotheses", False),
+    Published(
+        "body-clutter", "rr_multiple_hypothesis", (), "[RR] 6", "1.2 s, seven hypotheses", False
     ),
     Published("body-dark", "ijrr_gaussian_single", (0.5,), "[IJRR] 6.2", "loses track"),
     Published("body-dark", "ijrr_robust_single", (1.0,), "[IJRR] 6.2", _DEPTH),

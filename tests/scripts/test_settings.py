@@ -26,9 +26,9 @@ CHANGED: dict[str, Any] = {
     "prediction": "surface", "oversampling": 2, "likelihood_power": 0.3, "limb_jumps": 1,
     "keypoints_use": "first", "terms": ("contour", "region", "segmentation"),
     "curvature": "gauss-newton", "working_size": 160, "contour_weight": 120.0,
-    "weights": {"region": 0.5}, "boundary_emphasis": 0.2, "seed": 3, "device": "cpu:0",
-    "dtype": "float32", "engine": "eager", "engine_dtype": "float32", "threads": 2,
-    "overlay": False, "recovery": False, "stature": 1.6,
+    "weights": {"region": 0.5}, "boundary_emphasis": 0.2, "potential": "leclerc", "seed": 3,
+    "device": "cpu:0", "dtype": "float32", "engine": "eager", "engine_dtype": "float32",
+    "threads": 2, "overlay": False, "recovery": False, "stature": 1.6,
 }  # fmt: skip
 """Another value than the default for every setting."""
 

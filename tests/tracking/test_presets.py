@@ -9,6 +9,7 @@ from made_costs import make_full_cost, printed_cost
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.flow import FlowTerm
 from torchcss.cost.interior import InteriorNodes
+from torchcss.cost.joints import JointTerm
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.term import OnPoints
 from torchcss.cost.visibility import ContourPredictor
@@ -28,6 +29,7 @@ from torchcss.inference.proposals import (
     Spherical,
 )
 from torchcss.inference.tracker import Tracker
+from torchcss.robust import Leclerc, Lorentzian
 from torchcss.tracking.presets import ALIASES, PRESETS, Preset, make_tracker
 from torchcss.tracking.settings import (
     PAPER_TERMS,
@@ -293,6 +295,31 @@ def test_what_is_given_beside_a_preset_wins_and_is_recorded():
     assert repelling.changed() == ("terms",)
     assert "interpenetration" in repelling.used_terms
     assert "interpenetration" not in Settings(preset="ijrr_gaussian_single").used_terms
+    cost = {"contour_weight": 100.0, "boundary_emphasis": 0.2, "potential": "leclerc"}
+    assert set(Settings(preset="ijrr_css", **cost).changed()) == set(cost)
+
+
+def test_either_potential_of_the_papers_can_be_chosen():
+    """Section 3.1.1 [IJRR], eq. 2 and 3 [RR]."""
+    for name, kind in (("lorentzian", Lorentzian), ("leclerc", Leclerc)):
+        choice = make_choice(Settings(preset="rr_multiple_hypothesis", potential=name), 2.0)
+        for term in (choice.find(ContourTerm), choice.find(FlowTerm)):
+            assert term is not None
+            assert term.potential_kind is kind
+            # Nothing that is matched costs more than what is hidden or faces away.
+            worst = float(term.potential(torch.tensor(1e9)).rho) / 2
+            assert kind is Lorentzian or worst < term.occlusion_factor * term.fitted_level
+    ours = make_choice(Settings(potential="leclerc"), 2.0)
+    contour, joints = ours.find(ContourTerm), ours.find(JointTerm)
+    assert contour is not None
+    assert joints is not None
+    assert joints.potential_kind is Lorentzian
+    hidden = contour.occlusion_factor * contour.fitted_level
+    assert contour.fitted_level < hidden < contour.unmatched < 0.5
+    gaussian = make_choice(Settings(preset="ijrr_gaussian_single", potential="leclerc"), 2.0)
+    assert gaussian == make_choice(Settings(preset="ijrr_gaussian_single"), 2.0)
+    with pytest.raises(ConfigurationError, match="potential must be one of lorentzian, leclerc"):
+        Settings(preset="ijrr_css", potential="huber")  # type: ignore[arg-type]
 
 
 def test_old_names_and_old_runs_still_open():
