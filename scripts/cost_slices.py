@@ -1,12 +1,14 @@
 """Slices through the cost of a frame, by terms: how many minima, how continuous (Fig. 4, 7, 8).
 
-    python scripts/cost_slices.py --data DIR --out out/slices
+    python scripts/cost_slices.py --sequence CLUTTER --data DIR --out out/slices
 
-The frames are one of the rendered arm before clutter and, with `--data`, one of
-DIR/balance_beam_4cam. Lines go through the mode at which the optimiser arrives
-from the truth (for the clip, from the fit to the keypoints that is nearest the 3D reference), along
-joints and along eigenvectors of its covariance, close (a few standard deviations) and as far as the
-joint limits admit. How minima and jumps are counted is in `torchcss.studies.slices`.
+The cost is that of a preset, by default the one printed in [IJRR]. The frames are one of the
+rendered arm before clutter; with `--sequence`, those of a rendered sequence at 0.8 and 0.9 s, where
+both papers have two minima; with `--data`, one of DIR/balance_beam_4cam. Lines go through the mode
+at which the optimiser arrives from the truth (for the clip, from the fit to the keypoints that is
+nearest the 3D reference), along joints and along eigenvectors of its covariance, close (a few
+standard deviations) and as far as the joint limits admit. How minima and jumps are
+counted is in `torchcss.studies.slices`.
 
 Printed and written to the folder `--out`: a table by terms, the slices as figures, and, as Fig. 4
 [IJRR], a minimum that a joint limit displaced. `scripts/cost_minima.py` goes on from here: what
@@ -27,16 +29,16 @@ from common import Table, start, write_report
 from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 
+from torchcss.body.root import ROOT_NAMES
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.io.tracks import prepare_output_folder
 from torchcss.show.style import OKABE_ITO, save_figure
 from torchcss.studies import plots
-from torchcss.studies.scenes import Scene, arm_scenes, clip_scenes
+from torchcss.studies.scenes import Scene, arm_scenes, clip_scenes, sequence_scenes
+from torchcss.studies.sequences import read_sequence
 from torchcss.studies.slices import PROMINENCE, Line, Slice, sample_slice
 from torchcss.tracking.settings import Settings
 
-# As in [IJRR]: keypoints only say where to start, and so does the frame before.
-TERMS = ("contour", "motion_boundaries", "flow", "stabiliser", "interpenetration")
 # Of a body the lines that are looked at; of an arm all of them are.
 ON_BODY = (
     *("root_x", "root_y", "root_z", "root_yaw", "lumbar_flexion", "neck_flexion"),
@@ -46,6 +48,7 @@ ON_BODY = (
 )
 DRAWN = ("root_z", "r_shoulder_swing", "r_elbow_flexion", "r_knee_flexion", "eigen 0", "eigen 1")
 DRAWN += ("eigen 7", "eigen 33")  # the most certain of arm8 and body34
+LEAST_CERTAIN = ("eigen 0", "eigen 1", "eigen 2")
 NEAR = 0.35  # radians or metres to either side of a limit
 
 
@@ -55,6 +58,10 @@ class Config:
 
     data: Path | None = None
     """Folder that holds balance_beam_4cam; without it only the arm is looked at."""
+    sequence: Path | None = None
+    """Folder of a rendered body before clutter; without it none is looked at."""
+    times: tuple[float, ...] = (0.8, 0.9)
+    """Seconds of that, as in Fig. 7 [IJRR] and Fig. 5 [RR]."""
     frame: int = 15
     """Frame of the arm's sequence."""
     clip_frame: int = 30
@@ -69,8 +76,10 @@ class Config:
     """Half length of a close slice, standard deviations."""
     prominence: float = PROMINENCE
     """Least prominence of a minimum that counts, share of the slice's range."""
-    terms: tuple[str, ...] = TERMS
-    """Terms of the cost, see `torchcss.tracking.settings.all_terms`."""
+    preset: str = "ijrr_css"
+    """Whose cost it is."""
+    terms: tuple[str, ...] | None = None
+    """Terms of the cost, see `torchcss.tracking.settings.all_terms`; the preset's by default."""
     small: bool = False
     """The arm alone, few lines and samples: for tests."""
     out: Path | None = None
@@ -82,7 +91,7 @@ class Config:
 def main(config: Config) -> dict[str, Any]:
     """Look at the frames, print, draw; return what is written."""
     if config.small:
-        config = replace(config, data=None, frame=3, samples=51)
+        config = replace(config, data=None, sequence=None, frame=3, samples=51)
     if config.out is not None:
         prepare_output_folder(config.out)
     report: dict[str, Any] = {"settings": config, "frames": {}}
@@ -101,8 +110,12 @@ def main(config: Config) -> dict[str, Any]:
 
 def scenes(config: Config) -> Iterator[Scene]:
     generator = torch.Generator().manual_seed(config.seed)
-    settings = Settings(body="arm8", terms=config.terms)
+    settings = Settings(body="arm8", preset=config.preset, terms=config.terms)
     yield from arm_scenes([config.frame], generator=generator, settings=settings)
+    if config.sequence is not None:
+        sequence = read_sequence(config.sequence)
+        frames = [round(time * sequence.frame_rate) for time in config.times]
+        yield from sequence_scenes(sequence, frames, settings=settings)
     if config.data is not None:
         folder, settings = config.data / "balance_beam_4cam", replace(settings, body="body34")
         yield from clip_scenes(
@@ -151,19 +164,25 @@ def summarise(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def table_of(frames: dict[str, Any]) -> Table:
-    """The counts of all frames for the page of results."""
-    cells = [
-        [
-            f"{name}, {entry['term']}, {entry['scale']}",
-            entry["num_minima_raw"],
-            entry["num_minima"],
-            *(100 * entry[key] for key in ("largest_jump", "discontinuity")),
-        ]
-        for name, frame in frames.items()
-        for entry in frame["table"]
-    ]
-    columns = ("frame, term, slices", "all minima", "counted", "largest jump %", "bisected %")
+    """Minima of the whole cost on all lines of a frame, and on the least certain ones."""
+    cells = []
+    for name, frame in frames.items():
+        of_all = {row["scale"]: row for row in frame["table"] if row["term"] == "sum"}
+        cells.append([f"{name}, mean of all lines", *_counts(of_all)])
+        for line in LEAST_CERTAIN:
+            own = [row for row in frame["slices"] if row["line"] == line]
+            if own:
+                counts = _counts({row["scale"]: row["terms"]["sum"] for row in own})
+                cells.append([f"{name}, {line}", *counts])
+    columns = ("frame, line", "close: all", "counted", "far: all", "counted", "largest jump %")
     return Table("Minima and jumps of the cost along lines", columns, cells)
+
+
+def _counts(by_scale: dict[str, Any]) -> list[float]:
+    """Minima close to the mode and as far as the limits, and the largest jump."""
+    close, far = by_scale["close"], by_scale["far"]
+    minima = [row[key] for row in (close, far) for key in ("num_minima_raw", "num_minima")]
+    return [*minima, 100 * max(row["discontinuity"] for row in (close, far))]
 
 
 def print_table(name: str, table: list[dict[str, Any]], rows: list[dict[str, Any]]) -> None:
@@ -181,16 +200,18 @@ def print_table(name: str, table: list[dict[str, Any]], rows: list[dict[str, Any
 def displaced_minimum(scene: Scene, config: Config) -> dict[str, Any] | None:
     """The mode that presses hardest against a joint limit: Fig. 4 (a) [IJRR].
 
-    It is searched from the frame's mode with one joint after the other put at its limits.
+    It is searched from the frame's mode with one joint after the other put at its limits. The
+    root's are no joint's.
     """
     cost, (lower, upper) = scene.cost, scene.cost.body.bounds
     at_limit = [torch.diag_embed(limit) for limit in (lower, upper)]
-    mask = torch.eye(len(lower), dtype=torch.bool)
-    starts = torch.cat([torch.where(mask, limit, scene.mode.mean) for limit in at_limit])
+    joints = torch.tensor([name not in ROOT_NAMES for name in cost.body.state_names])
+    mask = torch.diag_embed(joints)
+    starts = torch.cat([torch.where(mask, limit, scene.mode.mean)[joints] for limit in at_limit])
     starts = starts[starts.isfinite().all(dim=1)]
     modes = TrustRegionNewton(max_steps=40).minimise(cost, starts, cost.body.bounds)
     model = cost.local_model(modes.mean)
-    slope = torch.where(modes.active.bool(), model.gradient, 0.0)
+    slope = torch.where(modes.active.bool() & joints, model.gradient, 0.0)
     mode, joint = divmod(int(slope.abs().argmax()), slope.shape[1])
     if float(slope[mode, joint]) == 0:
         return None

@@ -201,7 +201,7 @@ def run_seed(config: Config, seed: int) -> dict[str, Any]:
                 )  # fmt: skip
             rows.append(row)
     last = {method: found[method, config.scales[-1]] for method in ("CSS", "SS")}
-    starts = {"arm8": make_problem(config, seed, "arm8").start, config.body: problem.start}
+    starts = {name: make_problem(config, seed, name).start for name in ("arm8", "body32")}
     spectra = {name: spectrum(start.covariance).tolist() for name, start in starts.items()}
     if config.figures is not None:
         folder = prepare_output_folder(config.figures)

@@ -412,6 +412,21 @@ def test_an_arm_that_shall_move_about(generator: torch.Generator):
     assert found.body.num_parameters == body.num_parameters + 6
 
 
+def test_terms_of_the_first_stage_can_be_weighed(generator):
+    body = load_body("body34", free_proportions=True)
+    drawn = torch.randn(2, body.num_parameters, generator=generator).double()
+    x = body.bounds.project(0.05 * drawn)
+    with_all, without = (
+        InitialiseOptions(sigma=1.0, weights=weights).joint_cost(
+            body, [View(camera=person().camera, keypoints=None)]
+        )
+        for weights in ({}, {"anthropometric": 0.0})
+    )
+    told = with_all.terms(x)["anthropometric"]
+    assert float(told.min()) > 0
+    torch.testing.assert_close(without.value(x), with_all.value(x) - told)
+
+
 def test_only_the_papers_proportions_if_asked():
     search = replace(SMALL, proportions=PAPER_PROPORTIONS)
     found = find(person(), search, num_modes=1)

@@ -9,6 +9,9 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from made_sequences import write_arm
+
+from torchcss.studies.sequences import read_sequence
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "cost_slices.py"
 
@@ -40,6 +43,9 @@ def test_small_mode(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFi
         assert table[name, "far"]["discontinuity"] < 1e-3
     # The mode is a minimum of the sum, and the slices are no noise.
     assert 1 <= table["sum", "close"]["num_minima"] < 5
+    first, *lines = report["table"]["rows"]
+    assert first[:2] == ["arm, frame 3, mean of all lines", table["sum", "close"]["num_minima_raw"]]
+    assert [row[0] for row in lines] == [f"arm, frame 3, eigen {k}" for k in (0, 1)]
     printed = capsys.readouterr().out
     assert all(name in printed for name in names)
 
@@ -47,6 +53,17 @@ def test_small_mode(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFi
 def test_real_frames_are_left_out_without_data(script: ModuleType) -> None:
     assert script.Config().data is None
     assert script.Config(small=True, data=Path("absent")).small
+
+
+def test_frames_are_those_at_the_papers_times(
+    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_arm(tmp_path, 4)
+    monkeypatch.setattr(script, "arm_scenes", lambda *_, **__: iter(()))
+    rate = read_sequence(tmp_path).frame_rate
+    config = script.Config(sequence=tmp_path, times=(1 / rate, 3 / rate))
+    names = [scene.name for scene in script.scenes(config)]
+    assert names == [f"{tmp_path.name}, frame {frame}" for frame in (1, 3)]
 
 
 def test_bad_frame_is_one_line() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -10,6 +11,8 @@ from types import ModuleType
 import pytest
 import torch
 from made_sequences import write_arm
+
+from torchcss.body.load import load_body
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "spectra.py"
 
@@ -19,14 +22,20 @@ def test_two_frames(script: ModuleType, tmp_path: Path) -> None:
     out = tmp_path / "J.json"
     tracking = replace(script.TRACKING, samples=4, modes=2, working_size=160)
     config = script.Config(
-        sequences=(tmp_path / "arm",), frames=2, seeds=1, tracking=tracking, out=out
+        sequences=(tmp_path / "arm",), frames=2, seeds=1, poses=1, tracking=tracking, out=out
     )
-    (run,) = script.main(config)["by_sequence"]["arm"]
+    report = script.main(config)
+    (run,) = report["by_sequence"]["arm"]
     assert run["body"] == "arm8"
     assert len(run["ratio_by_frame"]) == 2
     assert run["ratio"] > 1
     assert 0 <= run["floored"] <= 1
     assert json.loads(out.read_text())["table"]["rows"][0][1] == run["ratio"]
+    for body, size in (("arm8", 8), ("body32", 32)):  # as in Fig. 5
+        (pose,) = report["by_sequence"][f"joints of {body}"]
+        assert load_body(pose["body"]).num_parameters == size
+        assert pose["ratio"] > 100
+        assert pose["volume"] < size * math.log10(pose["ratio"])
 
 
 def test_a_known_covariance(script: ModuleType, generator: torch.Generator) -> None:

@@ -41,7 +41,7 @@ def test_small_mode(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFi
     for scale in (1.0, 8.0):
         assert 0 <= rows["SS", scale]["shared"] <= rows["SS", scale]["minima"]
     assert sum(rows["CSS", 8.0]["flips"].values()) > 0
-    assert run["spectrum_ratio"]["body34"] > 300
+    assert run["spectrum_ratio"]["body32"] > 300
     assert {path.name for path in figures.iterdir()} == {
         "fig1_seed1.png", "fig5_seed1.png", "fig13_seed1.png",
     }  # fmt: skip

@@ -8,14 +8,17 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from made_sequences import write_arm
 from made_sessions import seen_by, session_at
 
+from torchcss.cost.contour import ContourTerm
 from torchcss.cost.region import RegionTerm
 from torchcss.cost.total import TrackingCost
 from torchcss.errors import ConfigurationError
 from torchcss.inference.mixture import GaussianMixture, Prior
 from torchcss.studies.render.sequences import arm_sequence
-from torchcss.studies.scenes import Scene, arm_scenes, clip_scenes
+from torchcss.studies.scenes import Scene, arm_scenes, clip_scenes, sequence_scenes
+from torchcss.studies.sequences import read_sequence
 from torchcss.tracking.session import TrackingSession
 from torchcss.tracking.settings import (
     Settings,
@@ -168,3 +171,21 @@ def test_a_real_frame(shared_data: Path, generator: torch.Generator) -> None:
     # No limit ends the way in depth; the reach of a slice does.
     low, high = real.lines(real.truth)[2].interval(real.limits(real.truth))
     assert (low, high) == pytest.approx((-0.5, 0.5))
+
+
+def test_a_sequences_states_are_the_truth(tmp_path: Path) -> None:
+    write_arm(tmp_path, 3)
+    sequence = read_sequence(tmp_path)
+    assert sequence.truth is not None
+    settings = replace(SETTINGS, preset="ijrr_css", terms=None)
+    (one,) = sequence_scenes(sequence, [2], settings=settings)
+    assert one.name == f"{tmp_path.name}, frame 2"
+    torch.testing.assert_close(one.truth, sequence.truth.states[2].to(one.truth))
+    assert float(one.mode.cost) <= float(one.cost.value(one.truth[None])[0])
+    contour = one.cost.choice.find(ContourTerm)
+    assert contour is not None
+    assert contour.assignment == "sum"
+    with pytest.raises(ConfigurationError, match="frame before it"):
+        next(sequence_scenes(sequence, [0], settings=settings))
+    with pytest.raises(ConfigurationError, match=r"truth\.npz"):
+        next(sequence_scenes(sequence._replace(truth=None), [1], settings=settings))

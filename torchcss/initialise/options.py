@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import field, replace
 from typing import Literal
 
@@ -50,6 +50,7 @@ class InitialiseOptions:
         working_size: Longer side of the picture on which contours are searched.
         search: How widely poses are looked for.
         potential_kind: Robust potential of the keypoints.
+        weights: Further factors on terms by name, as in `CostChoice`.
         dtype: Type of the body.
         device: Where to compute.
         free_root: Let a body move about that by itself stands in one place.
@@ -70,6 +71,7 @@ class InitialiseOptions:
     working_size: int = 640
     search: Search = field(default_factory=Search)
     potential_kind: type = Lorentzian
+    weights: Mapping[str, float] = field(default_factory=dict)
     dtype: torch.dtype = torch.float64
     device: torch.device | str = "cpu"
     free_root: bool = False
@@ -109,7 +111,8 @@ class InitialiseOptions:
                 Anthropometric(stature=0.0) if known else Anthropometric(),
                 *((PosePrior(),) if self.pose_prior and not self.printed else ()),
                 *((Interpenetration(),) if self.printed else ()),
-            )
+            ),
+            weights=self.weights,
         )
 
     def joint_cost(self, body: BodyModel, views: Iterable[View]) -> TrackingCost:

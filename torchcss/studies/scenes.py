@@ -6,9 +6,10 @@ frame alone. A `Scene` adds the truth and the
 mode that the optimiser reaches from there, whose covariance says along which lines the cost is
 worth a look (`torchcss.studies.slices`).
 
-By default: `arm_scenes` for frames of the rendered arm, whose truth is exact, or `clip_scenes` for
-those of a recording with keypoints, where the fit to them that is nearest a 3D reference stands for
-the truth; then `Scene.lines` and `Scene.limits`.
+By default: `arm_scenes` for frames of the rendered arm, whose truth is exact, `sequence_scenes` for
+those of a sequence whose states are known, or `clip_scenes` for those of a recording with
+keypoints, where the fit to them that is nearest a 3D reference stands for the truth; then
+`Scene.lines` and `Scene.limits`.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from torchcss.io.keypoints.read import read_keypoints
 from torchcss.io.video import VideoReader
 from torchcss.studies.metrics import LIMB_JOINTS, root_aligned_mpjpe_mm
 from torchcss.studies.render.sequences import arm_sequence
-from torchcss.studies.sequences import read_reference
+from torchcss.studies.sequences import RecordedSequence, read_reference
 from torchcss.studies.slices import Line, eigen_lines, joint_lines
 from torchcss.tracking.settings import Settings, make_choice, make_plan
 from torchcss.tracking.view import NOTHING_KNOWN, NOTHING_SEEN, CameraView
@@ -117,6 +118,30 @@ def arm_scenes(
     for index in frames:
         pair, known = moments[index - 1 : index + 1], states[index - 1 : index + 1].unbind()
         yield _scene(f"{name}, frame {index}", pair, known, body, view, settings)
+
+
+def sequence_scenes(
+    sequence: RecordedSequence, frames: Sequence[int], *, settings: Settings
+) -> Iterator[Scene]:
+    """Frames of a sequence whose states are known.
+
+    Args:
+        sequence: The sequence.
+        frames: Which frames, none of them the first.
+        settings: Terms of the cost.
+
+    Raises:
+        ConfigurationError: If a frame has none before it, or no states are known.
+    """
+    _check_frames(frames)
+    if sequence.truth is None:
+        raise ConfigurationError(f"{sequence.name}: expected a sequence with the states, truth.npz")
+    body = sequence.truth.body.to(dtype=settings.torch_dtype)
+    view, states = CameraView(sequence.camera.to(settings.torch_dtype)), sequence.truth.states
+    for index in frames:
+        pair = tuple(VideoReader(sequence.video, start=index - 1, stop=index + 1))
+        known = states[index - 1 : index + 1].to(body.tie).unbind()
+        yield _scene(f"{sequence.name}, frame {index}", pair, known, body, view, settings)
 
 
 def clip_scenes(
