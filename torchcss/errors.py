@@ -12,6 +12,7 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
+import torch
 from torch import Tensor
 
 
@@ -114,8 +115,13 @@ def check_shape(name: str, tensor: Tensor, *trailing: int | None) -> None:
         trailing: The sizes of the last dimensions.
 
     Raises:
-        ShapeError: If the number or the size of the trailing dimensions differs.
+        ShapeError: If the number or the size of the trailing dimensions differs, or it is no
+            tensor.
     """
+    if not isinstance(tensor, Tensor):
+        raise ShapeError(
+            f"{name}: expected a tensor, got {type(tensor).__name__}; use torch.as_tensor"
+        )
     got = tuple(tensor.shape)
     tail = got[len(got) - len(trailing) :] if len(got) >= len(trailing) else None
     if tail is None or any(
@@ -123,3 +129,17 @@ def check_shape(name: str, tensor: Tensor, *trailing: int | None) -> None:
     ):
         wanted = ", ".join("any" if want is None else str(want) for want in trailing)
         raise ShapeError(f"{name}: expected a shape [..., {wanted}], got {list(got)}")
+
+
+def check_floating(name: str, tensor: Tensor) -> None:
+    """Check that a tensor holds numbers of single or double precision.
+
+    Args:
+        name: How the caller calls the tensor, for the message.
+        tensor: The tensor to check.
+
+    Raises:
+        ShapeError: If it is of another type.
+    """
+    if tensor.dtype not in (torch.float32, torch.float64):
+        raise ShapeError(f"{name}: expected float32 or float64, got {tensor.dtype}")

@@ -69,6 +69,11 @@ class LocalModel(NamedTuple):
     gradient: Vectors
     hessian: Matrices
 
+    def at(self, step: Vectors) -> Numbers:
+        """What the quadratic model says of the cost a step away."""
+        curved = (self.hessian @ step[..., None])[..., 0]
+        return self.value + (step * (self.gradient + 0.5 * curved)).sum(-1)
+
 
 class PointCost(NamedTuple):
     """A cost per 3D point with its derivatives with respect to that point, world frame.

@@ -60,6 +60,13 @@ def test_wrong_states_are_refused() -> None:
         with pytest.raises(ShapeError, match="convert one") as caught:
             body.pose(torch.zeros(7, dtype=dtype))
         assert "\n" not in str(caught.value)
+    for other, message in (
+        (torch.zeros(7, dtype=torch.long), "expected float32 or float64, got torch.int64"),
+        (torch.zeros(7).numpy(), "expected a tensor, got ndarray"),
+        (torch.zeros(6), r"expected a shape \[\.\.\., 7\], got \[6\]"),
+    ):
+        with pytest.raises(ShapeError, match=message):
+            body.forward_kinematics(other)  # type: ignore[arg-type]
 
 
 def test_ties_move_both_sides(generator: torch.Generator) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import pytest
 import torch
@@ -30,17 +31,24 @@ from torchcss.cost.choice import CostChoice
 from torchcss.cost.context import BodyTables
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.frame import FrameCosts
+from torchcss.cost.fused import engine_for
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.total import TrackingCost
 from torchcss.cost.visibility import ContourPredictor
+from torchcss.errors import ShapeError
 from torchcss.inference.mixture import GaussianMixture, Prior
+from torchcss.kernels import compiler
 from torchcss.stopwatch import Stopwatch
 from torchcss.types import CostFunction, Curvature, LocalModel
 from torchcss.vision.camera import Camera
 
 CONTOUR_ONLY = CostChoice(terms=(ContourTerm(),))
 NOTHING = CostChoice(terms=())
+ENGINES = (
+    "eager",
+    pytest.param("fused", marks=pytest.mark.skipif(not compiler.AVAILABLE, reason="needs numba")),
+)
 FULL_NAMES = {
     *("contour", "edge_energy", "flow", "joints"),
     *("stabiliser", "temporal", "temporal_mixture", "interpenetration"),
@@ -144,13 +152,43 @@ def test_items_of_a_batch_do_not_meet(generator: torch.Generator) -> None:
 
 
 @pytest.mark.parametrize("name", ["arm8", "body34"])
-def test_without_image_search_the_model_is_that_of_autograd(
+def test_without_image_search_the_model_is_that_of_differences(
     name: str, generator: torch.Generator
 ) -> None:
     cost = make_cost(name, EVERYTHING.without("contour"))
-    x = random_states(cost.body, 3, generator=generator).requires_grad_()
-    expected = differentiate_twice(cost.value(x), x)
-    assert_same(cost.local_model(x.detach()), expected, 1e-10)
+    x = random_states(cost.body, generator=generator)
+    model, step = cost.local_model(x), 1e-6
+    moves = step * torch.eye(len(x)).to(x)
+    after, before = cost.local_model(x + moves), cost.local_model(x - moves)
+    slope, bend = ((a - b) / (2 * step) for a, b in zip(after[:2], before[:2], strict=True))
+    assert_same(model, LocalModel(cost.value(x), slope, bend), 1e-6)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_autograd_gets_the_derivatives_of_the_model(
+    engine: Literal["eager", "fused"], generator: torch.Generator
+) -> None:
+    """All of them, whatever evaluates the cost: also where a term has no compiled twin."""
+    cost = replace(make_full_cost(), engine=engine_for(engine, "cpu"))
+    x = random_states(cost.body, 2, 3, generator=generator).requires_grad_()
+    model = cost.local_model(x)
+    assert not any(part.requires_grad for part in model)
+    assert not any(term.requires_grad for term in cost.terms(x).values())
+    assert_same(differentiate_twice(cost.value(x), x), model, 1e-12)
+    with torch.no_grad():
+        assert not cost.value(x).requires_grad
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_states_of_another_size_or_type_are_refused(engine: Literal["eager", "fused"]) -> None:
+    """Before compiled code reads beyond their end."""
+    cost = replace(make_cost(), engine=engine_for(engine, "cpu"))
+    rest = cost.body.rest.expand(5, -1)
+    bad = (rest[:, :-1], torch.cat([rest, rest], -1), rest[0, 0], rest.float(), rest.long())
+    for x in (*bad, rest.numpy(), rest.tolist()):
+        for evaluate in (cost.value, cost.local_model):
+            with pytest.raises(ShapeError, match=r"^x: "):
+                evaluate(x)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("name", ["arm8", "body34"])

@@ -21,8 +21,8 @@ from torchcss.body.catalog import BodySpecification, motion_rate
 from torchcss.body.kinematics import KinematicTree, TreePose
 from torchcss.body.lift import lift_to_joints
 from torchcss.body.surface import SurfaceSample, angular_grid, surface_points
-from torchcss.errors import BodyError, ShapeError, check_shape
-from torchcss.types import Bounds, Curvature, LocalModel, PointCost
+from torchcss.errors import BodyError, ShapeError, check_floating, check_shape
+from torchcss.types import Bounds, Curvature, LocalModel, PointCost, Vectors
 
 
 class BodyPose(NamedTuple):
@@ -210,6 +210,22 @@ class BodyModel(nn.Module):
             raise BodyError(f"{self.name} has no {kind} {name!r}; it has {list(names)}")
         return names.index(name)
 
+    def check_state(self, x: Vectors) -> None:
+        """Check that states are this body's.
+
+        Args:
+            x: State, radians and metres.
+
+        Raises:
+            ShapeError: If the state has another size or type than the body.
+        """
+        check_shape("x", x, self.num_parameters)
+        if x.dtype != self.dtype:
+            raise ShapeError(
+                f"x: the state is {x.dtype} and the body {self.dtype}; convert one, for example "
+                "with body.to(x.dtype)"
+            )
+
     def with_base(
         self, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]
     ) -> BodyModel:
@@ -231,9 +247,13 @@ class BodyModel(nn.Module):
         """Pose of every link in the world, by pytorch-kinematics; in the order `tree.link_names`.
 
         Args:
-            x: State, radians and metres.
+            x: State, radians and metres, of any floating type: the poses have it too.
+
+        Raises:
+            ShapeError: If the state has another size than the body's, or no floating type.
         """
         check_shape("x", x, self.num_parameters)
+        check_floating("x", x)
         base = torch.eye(4, dtype=x.dtype, device=x.device)
         base[:3, :3], base[:3, 3] = self.base_rotation.to(x), self.base_translation.to(x)
         return base @ self.tree.link_poses(x @ self.tie.T.to(x) + self.offset.to(x))
@@ -252,12 +272,7 @@ class BodyModel(nn.Module):
         Raises:
             ShapeError: If the state has another size or type than the body.
         """
-        check_shape("x", x, self.num_parameters)
-        if x.dtype != self.dtype:
-            raise ShapeError(
-                f"x: the state is {x.dtype} and the body {self.dtype}; convert one, for example "
-                "with body.to(x.dtype)"
-            )
+        self.check_state(x)
         tree = self.tree(x @ self.tie.T + self.offset, self.base_rotation, self.base_translation)
         return BodyPose(x, tree, self.points_on_links(tree, self.marker_link, self.marker_offset))
 

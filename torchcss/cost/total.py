@@ -211,7 +211,13 @@ class TrackingCost:
         return self.body.pose(x).joints
 
     def value(self, x: States) -> Costs:
-        """Cost in nats, visibility and assignments found fresh at x."""
+        """Cost in nats, visibility and assignments found fresh at x.
+
+        Where x requires it, autograd gets the derivatives of `local_model`, first and second.
+        """
+        self.body.check_state(x)
+        if x.requires_grad and torch.is_grad_enabled():
+            return self.local_model(x.detach()).at(x - x.detach())
         if self.engine is not None:
             return self.engine.value(self, x)
         return self._evaluated(
@@ -228,6 +234,7 @@ class TrackingCost:
 
     def local_model(self, x: States) -> LocalModel:
         """Cost, gradient and Hessian, visibility and assignments found at x and held fixed."""
+        self.body.check_state(x)
         if self.engine is not None and self.choice.curvature is not Curvature.AUTOGRAD:
             return self.engine.local_model(self, x)
         return LocalModel(**self._evaluated(lambda part: part.local_model()._asdict(), x))
@@ -273,7 +280,7 @@ class TrackingCost:
         self, evaluate: Callable[[_Part], dict[str, Tensor]], x: States
     ) -> dict[str, Tensor]:
         """Evaluate sequence by sequence, a chunk at a time, and put the results together."""
-        flat, found, order = x.reshape(-1, x.shape[-1]), [], []
+        flat, found, order = x.detach().reshape(-1, x.shape[-1]), [], []
         component = self.parent if self.component is None else self.component
         for past in self.past:
             items = torch.arange(len(flat), device=x.device)
