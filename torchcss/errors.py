@@ -106,6 +106,22 @@ def check_positive(choice: object, *names: str, hint: str = "") -> None:
             raise ConfigurationError(f"{where}: expected a positive number, got {value}{hint}")
 
 
+def check_device(device: torch.device | str) -> None:
+    """Check that there is a device.
+
+    Args:
+        device: Its name.
+
+    Raises:
+        ConfigurationError: If there is none.
+    """
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:  # the latter without CUDA
+        name = str(device)
+        raise ConfigurationError(f"device {name!r} is not available here; use cpu") from error
+
+
 def check_shape(name: str, tensor: Tensor, *trailing: int | None) -> None:
     """Check that `tensor` ends in the dimensions `trailing`; `None` stands for any size.
 

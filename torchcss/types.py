@@ -151,7 +151,8 @@ class Modes(NamedTuple):
 
     Attributes:
         mean: The states reached.
-        covariance: Inverse Hessian on the free variables (decision "active bounds").
+        covariance: Inverse Hessian on the free variables (decision "active bounds"), no direction
+            wider than the prior: `prior_variance` of `TrustRegionNewton.minimise`.
         cost: Cost at `mean`, nats.
         active: True where a variable ended at a bound that holds it.
         status: A `Status` per item.

@@ -352,8 +352,8 @@ THREE = LINKS + "<link name='c'/>" + joint("<limit lower='-1' upper='2'/>")
         pytest.param(robot(LINKS + joint("<axis xyz='0 0 0'/>")), "axis not zero", id="zero axis"),
         pytest.param(robot(LINKS + joint("<axis xyz='0 1'/>")), "vector length", id="short axis"),
         pytest.param(robot(LINKS + joint("<axis xyz='x y z'/>")), "'x'", id="axis not a number"),
-        pytest.param(robot(LINKS + joint("<axis xyz='inf 0 1'/>")), "finite", id="infinite axis"),
-        pytest.param(robot(LINKS + joint("<origin xyz='nan 0 0'/>")), "finite", id="origin NaN"),
+        pytest.param(robot(LINKS + joint("<axis xyz='inf 0 1'/>")), "'inf 0", id="infinite axis"),
+        pytest.param(robot(LINKS + joint("<origin xyz='nan 0 0'/>")), "'nan 0 0'", id="origin NaN"),
         pytest.param(robot(LINKS + joint("<origin rpy='1 2'/>")), "vector length", id="origin"),
         pytest.param(robot(LINKS + joint("<limit lower='low'/>")), "'low'", id="limit"),
         pytest.param(robot(LINKS + joint("<limit lower='nan'/>")), "lower limit", id="limit NaN"),
@@ -384,6 +384,16 @@ def test_bad_files_are_refused_in_one_line(tmp_path: Path, text: str, message: s
     with pytest.raises(BodyError, match=message) as caught:
         load(tmp_path, text)
     assert "\n" not in str(caught.value)
+
+
+def test_numbers_of_a_urdf_keep_all_their_digits(tmp_path: Path) -> None:
+    text = "<origin xyz='0.1 -0.2 0.3' rpy='0.3 0 0'/><axis xyz='0 0.6 0.8'/>"
+    (_, turned) = load(tmp_path, robot(LINKS + joint(text))).tree.specifications
+    assert turned.translation == (0.1, -0.2, 0.3)
+    assert turned.axis == (0.0, 0.6, 0.8)
+    assert turned.rotation[1:] == (
+        (0.0, math.cos(0.3), -math.sin(0.3)), (0.0, math.sin(0.3), math.cos(0.3))
+    )  # fmt: skip
 
 
 def test_a_joint_that_mimics_none_is_free_and_said(tmp_path: Path) -> None:

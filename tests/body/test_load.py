@@ -20,7 +20,7 @@ from torchcss.body.root import ROOT_NAMES, has_root
 from torchcss.body.rotations import root_angles
 from torchcss.body.surface import implicit
 from torchcss.cost.visibility import ContourPredictor
-from torchcss.errors import BodyError, MissingExtraError
+from torchcss.errors import BodyError, ConfigurationError, MissingExtraError
 from torchcss.io.motion.positions import read_motion_capture
 from torchcss.types import PointCost
 
@@ -557,5 +557,10 @@ def test_bad_requests(tmp_path: Path) -> None:
         load_body(path, file=FileOptions(units="cm"))
     with pytest.raises(BodyError, match="own lengths"):
         load_body(path, lengths={"thigh": 0.4})
+    for dtype in (torch.float16, torch.int32, "float32"):
+        with pytest.raises(ConfigurationError, match=r"dtype: expected torch\.float32"):
+            load_body(path, dtype=dtype)  # type: ignore[arg-type]
+    with pytest.raises(ConfigurationError, match="device 'nope' is not available"):
+        load_body(path, device="nope")
     path.write_bytes(MJCF.encode("utf-16"))
     assert load_body(path).num_parameters == 11  # XML says its encoding itself

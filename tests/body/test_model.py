@@ -14,7 +14,7 @@ from torchcss.body.catalog import BODY_NAMES, specification
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel, differentiate_twice
 from torchcss.body.shape import with_shape
-from torchcss.errors import BodyError, ShapeError
+from torchcss.errors import BodyError, ConfigurationError, ShapeError
 
 
 def random_states(body: BodyModel, *batch: int, generator: torch.Generator) -> Tensor:
@@ -156,6 +156,18 @@ def test_another_base_moves_the_whole_body(generator: torch.Generator) -> None:
     other = body.with_base(turn, shift)
     torch.testing.assert_close(other.pose(x).joints, body.pose(x).joints @ turn.T + shift)
     assert torch.equal(body.base_rotation, torch.eye(3, dtype=torch.float64))
+    for bad in (2 * turn, -turn, turn * torch.nan):
+        with pytest.raises(ConfigurationError, match="rotation: expected a rotation"):
+            body.with_base(bad, shift)
+    with pytest.raises(ShapeError, match="translation: expected a tensor, got list"):
+        body.with_base(turn, [0.0, 0.0, 0.0])  # type: ignore[arg-type]
+
+
+def test_a_pose_can_be_differentiated_in_the_base() -> None:
+    body, place = load_body("arm8"), torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    joints = body.with_base(torch.eye(3), place).pose(body.rest).joints
+    (slope,) = torch.autograd.grad(joints.sum(), place)
+    assert slope.tolist() == [len(joints)] * 3
 
 
 def test_converting_a_rebased_body_leaves_the_first_alone() -> None:

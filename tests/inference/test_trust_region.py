@@ -1,3 +1,4 @@
+import re
 from dataclasses import replace
 
 import problems
@@ -428,6 +429,29 @@ def test_nothing_to_do_and_bad_input():
         NEWTON.minimise(cost, torch.zeros(3), problems.box(3, 1, -1))
     with pytest.raises(ConfigurationError, match="max_steps"):
         TrustRegionNewton(max_steps=0)
+    with pytest.raises(ShapeError, match="x0: expected float32 or float64"):
+        NEWTON.minimise(cost, torch.zeros(3).long(), problems.unbounded(3))
+    for name in ("scale", "prior_variance"):
+        for bad in (0.0, -1.0, torch.nan):
+            given = {name: torch.tensor([1.0, bad, 1.0])}
+            with pytest.raises(ConfigurationError, match=f"{name}: expected positive"):
+                NEWTON.minimise(cost, torch.zeros(3), problems.unbounded(3), **given)
+
+
+@pytest.mark.parametrize(
+    ("part", "shape"),
+    [("value", ()), ("value", (5,)), ("gradient", (4, 2)), ("hessian", (4, 2, 2))],
+)
+def test_answers_of_another_shape_are_refused(part, shape):
+    """Before compiled code reads beyond their end."""
+
+    class Wrong(problems.Bowl):
+        def local_model(self, x):
+            return super().local_model(x)._replace(**{part: torch.zeros(shape).double()})
+
+    cost = Wrong(torch.eye(3).double(), torch.zeros(3).double())
+    with pytest.raises(ShapeError, match=rf"{part}: expected \[4.*got {re.escape(str([*shape]))}"):
+        NEWTON.minimise(cost, torch.zeros(4, 3).double(), problems.unbounded(3))
 
 
 def test_the_costs_own_tensors_are_left_alone(generator):

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.cost.targets import pose_targets
-from torchcss.errors import BodyError, ConfigurationError
+from torchcss.errors import BodyError, ConfigurationError, ShapeError
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.solve.inverse_kinematics import Search, inverse_kinematics, pose_errors
 
@@ -193,3 +193,20 @@ def test_bad_questions_are_told(tmp_path: Path, generator: torch.Generator) -> N
         inverse_kinematics(human, "l_wrist_link", pose, generator=generator)
     with pytest.raises(ConfigurationError, match=r"Search\.spacing"):
         Search(spacing=0)
+    with pytest.raises(ConfigurationError, match="no free parameter of the body moves 'link0'"):
+        inverse_kinematics(body, "link0", pose, generator=generator)
+    for bad, message in ((pose * torch.nan, "finite"), (2 * pose, "a rotation")):
+        with pytest.raises(ConfigurationError, match=f"pose: expected {message}"):
+            inverse_kinematics(body, "tip", bad, generator=generator)
+    with pytest.raises(ShapeError, match="pose: expected a tensor, got ndarray"):
+        inverse_kinematics(body, "tip", pose.numpy(), generator=generator)  # type: ignore[arg-type]
+
+
+def test_a_frame_in_single_precision_is_reached(tmp_path: Path, generator: torch.Generator) -> None:
+    """Its rotation is none to 1e-7, which no arm could reach to 1e-11."""
+    body = load_body(write_arm(tmp_path / "six.urdf", SIX))
+    truth = torch.tensor([0.4, -0.8, 1.1, 0.5, -0.9, 0.3], dtype=torch.float64)
+    found = inverse_kinematics(
+        body, "tip", pose_of(body, "tip", truth).float(), generator=generator
+    )
+    assert float((found.x - truth).abs().amax(-1).min()) < 1e-5

@@ -131,7 +131,9 @@ def offset_matrix(joint: JointSpecification) -> Float[np.ndarray, "4 4"]:
 
 
 def urdf_joints(data: bytes) -> list[JointSpecification]:
-    """Joints of a URDF of one tree, depth first, without limits and without what they mimic.
+    """Joints of a URDF of one tree, depth first: names and kinds, no numbers.
+
+    The library keeps seven digits of origins and axes, and no limits.
 
     Args:
         data: The file, of links and joints alone: what else it holds the library may stumble over.
@@ -149,21 +151,8 @@ def urdf_joints(data: bytes) -> list[JointSpecification]:
     joints: list[JointSpecification] = []
 
     def visit(frame: pk.Frame, parent: str | None) -> None:
-        matrix = torch.eye(4, dtype=torch.float64)
-        for offset in (frame.link.offset, frame.joint.offset):
-            if offset is not None:
-                matrix = matrix @ offset.get_matrix()[0].double()
-        joints.append(
-            JointSpecification(
-                name=frame.joint.name or "root",
-                link=frame.name,
-                parent=parent,
-                kind=frame.joint.joint_type,
-                translation=tuple(matrix[:3, 3].tolist()),
-                rotation=tuple(tuple(row) for row in matrix[:3, :3].tolist()),
-                axis=tuple(frame.joint.axis.double().tolist()),
-            )
-        )
+        name, kind = frame.joint.name or "root", frame.joint.joint_type
+        joints.append(JointSpecification(name=name, link=frame.name, parent=parent, kind=kind))
         for child in frame.children:
             visit(child, frame.name)
 

@@ -218,9 +218,10 @@ class KinematicTree(nn.Module):
         check_shape("q", q, self.num_joints)
         batch = q.shape[:-1]
         flat = q.reshape(batch.numel(), self.num_joints)
-        if (values := _plain(flat)) is not None:
+        base = _base(q, base_rotation, base_translation)
+        if _plain(base) is not None and (values := _plain(flat)) is not None:
             self._check_type(q)
-            posed = self._pose_links(values, _base(q, base_rotation, base_translation))
+            posed = self._pose_links(values, base)
             return TreePose(*(torch.from_numpy(p.reshape(*batch, *p.shape[1:])) for p in posed))
         frames = self.frames(flat, base_rotation, base_translation)
         links = _followed_by(frames[self.link_place], self.link_constant)

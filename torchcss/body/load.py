@@ -44,7 +44,7 @@ from torchcss.body.files.xml import parse_xml
 from torchcss.body.model import BodyModel
 from torchcss.body.root import has_root
 from torchcss.body.rotations import as_vector
-from torchcss.errors import BodyError, ConfigurationError, MotionCaptureError
+from torchcss.errors import BodyError, ConfigurationError, MotionCaptureError, check_device
 from torchcss.files import one_line
 from torchcss.joint_names import skeleton_joint_names
 
@@ -90,7 +90,7 @@ def load_body(
 
     Args:
         name_or_path: "arm7", "arm8", "body30", "body32", "body34", or the path of a file.
-        dtype: Floating type.
+        dtype: torch.float64 or torch.float32.
         device: Where its tensors live.
         lengths: Lengths that differ from the standard humanoid's, metres; not for files.
         scale: Overall scale of the standard humanoid (stature 1.75 m), or of the file.
@@ -102,8 +102,12 @@ def load_body(
 
     Raises:
         BodyError: If there is no such body, or the file cannot be used.
+        ConfigurationError: If there is no such type or device.
         MissingExtraError: If the file is an MJCF and MuJoCo is not installed.
     """
+    if dtype not in (torch.float32, torch.float64):
+        raise ConfigurationError(f"dtype: expected torch.float32 or torch.float64, got {dtype!r}")
+    check_device(device)
     path = Path(name_or_path)
     try:
         if str(name_or_path) in BODY_NAMES:

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from torchcss.body.catalog import BodySpecification, motion_rate
 from torchcss.body.kinematics import KinematicTree, TreePose
 from torchcss.body.lift import lift_to_joints
+from torchcss.body.rotations import check_rotation
 from torchcss.body.surface import SurfaceSample, angular_grid, surface_points
 from torchcss.errors import BodyError, ShapeError, check_floating, check_shape
 from torchcss.types import Bounds, Curvature, LocalModel, PointCost, Vectors
@@ -234,7 +235,12 @@ class BodyModel(nn.Module):
         Args:
             rotation: Orientation of the root link's frame in the world.
             translation: Its origin in the world, metres.
+
+        Raises:
+            ConfigurationError: If the orientation is no rotation.
         """
+        check_rotation("rotation", rotation)
+        check_shape("translation", translation, 3)
         other, tree = copy.copy(self), copy.copy(self.tree)
         # Own tables of tensors, so that converting one body leaves the other as it is.
         other._buffers, tree._buffers = dict(self._buffers), dict(self.tree._buffers)

@@ -7,6 +7,7 @@
 | `axis_angle`, `from_axis_angle` | rotation vectors: SMPL, OpenCV |
 | `from_quaternion` | quaternions: MJCF |
 | `root_rotation`, `root_angles` | yaw, pitch, roll of a body's root, as tensors |
+| `check_rotation` | matrices that users give |
 | `frame_along` | a frame whose z axis has a direction |
 | `as_vector`, `as_rows` | plain numbers, as specifications hold them |
 """
@@ -21,9 +22,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchcss.errors import ConfigurationError, check_shape
+
 Matrix = Float[np.ndarray, "3 3"]
 
 Vector = tuple[float, float, float]
+
+ROUNDING = 1e-4
+"""What is rounding in a rotation that was written down, in the entries of `R R^T`."""
 
 ROTATION_ORDERS = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
 
@@ -65,6 +71,26 @@ def from_quaternion(quaternion: Float[np.ndarray, "4"]) -> Matrix:
     length = float(np.linalg.norm(vector))
     angle = 2 * math.atan2(length, quaternion[0])
     return from_axis_angle(vector * (angle / length if length else 0.0))
+
+
+def check_rotation(name: str, matrix: Float[Tensor, "3 3"]) -> None:
+    """Check that a matrix is a rotation, to `ROUNDING`.
+
+    Args:
+        name: How the caller calls it, for the message.
+        matrix: The matrix.
+
+    Raises:
+        ShapeError: If it is not 3 x 3.
+        ConfigurationError: If it is no rotation.
+    """
+    check_shape(name, matrix, 3, 3)
+    error = float((matrix @ matrix.mT - torch.eye(3).to(matrix)).abs().max())
+    if not error < ROUNDING or float(torch.linalg.det(matrix)) < 0:
+        raise ConfigurationError(
+            f"{name}: expected a rotation, got a matrix whose R R^T differs from the identity by "
+            f"{error:.2g} and whose determinant is {float(torch.linalg.det(matrix)):.4g}"
+        )
 
 
 def frame_along(

@@ -40,7 +40,7 @@ Call `TrustRegionNewton().minimise(cost, x0, bounds)`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -48,7 +48,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchcss.errors import ConfigurationError, ShapeError, check_positive, check_shape
+from torchcss.errors import (
+    ConfigurationError,
+    ShapeError,
+    check_floating,
+    check_positive,
+    check_shape,
+)
 from torchcss.kernels import compiler
 from torchcss.kernels.checked import run
 from torchcss.linalg import (
@@ -242,8 +248,7 @@ class TrustRegionNewton:
         else:
             share = torch.ones_like(state.radius)
             model = cost.local_model(candidate)
-        # Contiguous, because sums over other layouts round differently in other batches.
-        model = LocalModel(*(part.detach().contiguous() for part in model))
+        model = _checked(model, candidate)
         trial = _Trial(candidate, model, share, greatest_radius)
         if _is_compiled(candidate):
             return self._advance_compiled(state, trial, bounds, weight)
@@ -337,13 +342,18 @@ class TrustRegionNewton:
             One mode per start; no cost exceeds that of the (projected) start.
 
         Raises:
-            ShapeError: If the shapes of `x0`, `bounds`, `scale` and `prior_variance` do not agree.
-            ConfigurationError: If a lower bound exceeds the upper one.
+            ShapeError: If the shapes of `x0`, `bounds`, `scale` and `prior_variance` do not agree,
+                `x0` is neither float32 nor float64, or the cost answers in other shapes.
+            ConfigurationError: If a lower bound exceeds the upper one, or `scale` or
+                `prior_variance` is not positive.
         """
         check_shape("x0", x0, None)
+        check_floating("x0", x0)
         batch, n = x0.shape[:-1], x0.shape[-1]
         check_bounds(bounds, n)
-        _check_vectors(n, {"scale": scale, "prior_variance": prior_variance})
+        for name, vector in (("scale", scale), ("prior_variance", prior_variance)):
+            if vector is not None:
+                _check_positive(name, vector, n)
         starts = self.start(x0.reshape(batch.numel(), n))
         result = self.descend(cost, starts, bounds, scale=scale)
         modes = self.modes(result, bounds, prior_variance=prior_variance)
@@ -526,7 +536,8 @@ def check_bounds(bounds: Bounds, n: int) -> None:
         ShapeError: If a bound does not have one number per parameter.
         ConfigurationError: If a lower bound exceeds the upper one, or either is not a number.
     """
-    _check_vectors(n, {"bounds.lower": bounds.lower, "bounds.upper": bounds.upper})
+    for name, bound in zip(Bounds._fields, bounds, strict=True):
+        _check_vector(f"bounds.{name}", bound, n)
     wrong = ~(bounds.lower <= bounds.upper)
     if bool(wrong.any()):
         first = int(torch.nonzero(wrong)[0, 0])
@@ -536,12 +547,18 @@ def check_bounds(bounds: Bounds, n: int) -> None:
         )
 
 
-def _check_vectors(n: int, vectors: Mapping[str, Tensor | None]) -> None:
-    for name, vector in vectors.items():
-        if vector is not None and vector.shape != (n,):
-            raise ShapeError(
-                f"{name}: expected one number per parameter, shape [{n}], got {list(vector.shape)}"
-            )
+def _check_vector(name: str, vector: Tensor, n: int) -> None:
+    check_shape(name, vector)
+    if vector.shape != (n,):
+        raise ShapeError(
+            f"{name}: expected one number per parameter, shape [{n}], got {list(vector.shape)}"
+        )
+
+
+def _check_positive(name: str, vector: Tensor, n: int) -> None:
+    _check_vector(name, vector, n)
+    if not bool((vector > 0).all()):
+        raise ConfigurationError(f"{name}: expected positive numbers, got {vector.tolist()}")
 
 
 def _next_radius(radius: Tensor, length: Tensor, ratio: Tensor, accepted: Tensor) -> Tensor:
@@ -720,6 +737,21 @@ def _step_in_box(
         damping[todo] += rows
         step[todo] = -part.gradient / part.weight / damping[todo, None]
     return bounds.project(x + step) - x
+
+
+def _checked(model: LocalModel, x: Vectors) -> LocalModel:
+    """A cost's answer, which compiled code may read: a number, a slope and a curvature a state.
+
+    Contiguous, because sums over other layouts round differently in other batches.
+    """
+    b, n = x.shape
+    for name, part, shape in zip(LocalModel._fields, model, ((b,), (b, n), (b, n, n)), strict=True):
+        if part.shape != shape:
+            raise ShapeError(
+                f"cost.local_model: {name}: expected {list(shape)} for states {[b, n]}, got "
+                f"{list(part.shape)}"
+            )
+    return LocalModel(*(part.detach().to(x).contiguous() for part in model))
 
 
 def _is_finite(model: LocalModel) -> Bool[Tensor, " b"]:

@@ -38,8 +38,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchcss.body.model import BodyModel
+from torchcss.body.rotations import check_rotation
 from torchcss.cost.targets import pose_targets
-from torchcss.errors import ConfigurationError, check_positive
+from torchcss.errors import ConfigurationError, check_positive, check_shape
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.proposals import CovarianceScaled
 from torchcss.inference.trust_region import TrustRegionNewton, default_prior_variance
@@ -137,7 +138,8 @@ def inverse_kinematics(
     Args:
         body: The body on its base; float64 for errors of 1e-11, float32 has some 1e-6.
         link: The link.
-        pose: Its frame in the world, or the place of its origin alone, metres.
+        pose: Its frame in the world, or the place of its origin alone, metres. Fewer than six free
+            joints reach few frames, and those to `Search.tolerance` alone: give it in float64.
         generator: Source of the samples, on the CPU.
         fixed: Parameters that keep a value. Those that do not move the link rest.
         search: How widely to look.
@@ -148,10 +150,11 @@ def inverse_kinematics(
     Raises:
         BodyError: If there is no such link or parameter.
         ShapeError: If the pose is neither a frame nor a place.
-        ConfigurationError: If a fixed value is outside its limits, more than one free joint is
-            redundant, or a free length has no limits.
+        ConfigurationError: If the pose is not finite or its orientation no rotation, a fixed value
+            is outside its limits, no free joint moves the link, more than one is redundant, or a
+            free length has no limits.
     """
-    search = search or Search()
+    search, pose = search or Search(), _checked_pose(body, pose)
     problem = _Problem.of(body, link, pose, dict(fixed or {}), search)
     found = _Found(problem, isolated=problem.redundancy(generator) == 0)
     quiet = rounds = descents = 0
@@ -192,6 +195,19 @@ def pose_errors(
     return position, 2 * (apart / 8**0.5).clamp(max=1).asin()
 
 
+def _checked_pose(body: BodyModel, pose: Tensor) -> Tensor:
+    """A pose in the body's type, its orientation freed of the rounding that it came with."""
+    check_shape("pose", pose)
+    if not bool(pose.isfinite().all()):
+        raise ConfigurationError("pose: expected finite numbers")
+    pose = pose.to(body.tie, copy=True)
+    if pose.shape == (4, 4):
+        check_rotation("pose", pose[:3, :3])
+        left, _, right = torch.linalg.svd(pose[:3, :3])
+        pose[:3, :3] = left @ right
+    return pose
+
+
 class _Problem(NamedTuple):
     """The cost over the free parameters, their limits, and where samples start."""
 
@@ -217,6 +233,8 @@ class _Problem(NamedTuple):
                 )
             held[index], moves[index] = value, False
         columns = torch.nonzero(moves)[:, 0]
+        if not len(columns):
+            raise ConfigurationError(f"no free parameter of the body moves {link!r}")
         cost = pose_targets(body, link, pose, columns=columns, held=held, sigma=search.sigma)
         bounds = Bounds(body.lower[columns], body.upper[columns])
         endless = ~(bounds.lower.isfinite() & bounds.upper.isfinite())

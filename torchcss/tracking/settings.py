@@ -27,7 +27,7 @@ from torchcss.cost.region import RegionTerm
 from torchcss.cost.segmentation import SegmentationTerm
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.total import Engine
-from torchcss.errors import ConfigurationError
+from torchcss.errors import ConfigurationError, check_device
 from torchcss.inference.tracker import SequenceTracker, Tracker
 from torchcss.robust import Leclerc, Lorentzian, Quadratic
 from torchcss.tracking.presets import PRESETS, Preset, make_tracker, preset_name
@@ -191,12 +191,7 @@ class Settings:
                     raise ConfigurationError(
                         f"{name}: {self.preset} does not descend from samples; leave it out"
                     )
-        try:
-            torch.empty(0, device=self.device)
-        except (RuntimeError, AssertionError) as error:  # the latter without CUDA
-            raise ConfigurationError(
-                f"device {self.device!r} is not available here; use cpu"
-            ) from error
+        check_device(self.device)
 
     def _check_names(self) -> None:
         """Weights and choices are known."""

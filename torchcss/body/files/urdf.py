@@ -1,7 +1,8 @@
 """A body from a URDF file: its tree, limits and simple solids; meshes and inertias are ignored.
 
-pytorch-kinematics reads the joints (`torchcss.body.chain.urdf_joints`). Limits and mimic joints,
-which it leaves out, are read here, and the file is screened before it sees it. A floating joint of
+pytorch-kinematics reads the tree (`torchcss.body.chain.urdf_joints`). Limits and mimic joints,
+which it leaves out, and origins and axes, of which it keeps seven digits, are read here, and the
+file is screened before it sees it. A floating joint of
 the root link is a free root, and what hangs on that link beside it is left out. Solids are boxes,
 cylinders, spheres and capsules: the visual ones of a link, or where it has none those for
 collisions.
@@ -21,7 +22,7 @@ from torchcss.body.catalog import PartSpecification
 from torchcss.body.chain import JointSpecification, check_joints, link_order, urdf_joints
 from torchcss.body.files.bvh import Skeleton
 from torchcss.body.files.default_shape import solid_shape
-from torchcss.body.rotations import about_fixed_axes, as_rows
+from torchcss.body.rotations import Vector, about_fixed_axes, as_rows
 from torchcss.errors import BodyError
 from torchcss.files import shortened
 
@@ -72,7 +73,7 @@ def read_urdf(robot: ElementTree.Element) -> tuple[Skeleton, tuple[PartSpecifica
 
 
 def _bare_joints(robot: ElementTree.Element) -> list[JointSpecification]:
-    """Joints without limits."""
+    """Joints without numbers."""
     if robot.find("joint") is None:
         name = robot.findall("link")[0].get("name", "")
         return [JointSpecification(name="root", link=name, parent=None)]
@@ -160,10 +161,14 @@ def _kinematics_only(robot: ElementTree.Element) -> ElementTree.Element:
 
 
 def _completed(joint: JointSpecification, element: ElementTree.Element) -> JointSpecification:
-    """A joint with its limits, with what it mimics, and with the axis that a URDF means by none."""
-    where = f"joint {joint.name!r}"
-    if element.find("axis") is None:
-        joint = replace(joint, axis=(1.0, 0.0, 0.0))  # pytorch-kinematics takes z
+    """A joint with its numbers and with what it mimics."""
+    where, axis = f"joint {joint.name!r}", element.find("axis")
+    translation, rotation = _origin(where, element)
+    joint = replace(joint, translation=translation, rotation=rotation)
+    if joint.kind != "fixed":
+        text = "1 0 0" if axis is None else axis.get("xyz", "1 0 0")
+        x, y, z = _numbers(where, "axis", text, 3)
+        joint = replace(joint, axis=(x, y, z))
     limit, mimic = element.find("limit"), element.find("mimic")
     try:
         if (
@@ -206,16 +211,13 @@ def _solids(robot: ElementTree.Element) -> tuple[PartSpecification, ...]:
                 size = [0.5 * side for side in size]
             elif len(size) == 2:
                 size[1] *= 0.5
-            origin = element.find("origin")
-            values = {} if origin is None else origin.attrib
-            x, y, z = _numbers(where, "xyz", values.get("xyz", "0 0 0"), 3)
-            turn = about_fixed_axes(_numbers(where, "rpy", values.get("rpy", "0 0 0"), 3), "XYZ")
+            translation, rotation = _origin(where, element)
             parts.append(
                 PartSpecification(
                     name=name if number == 1 else next(free),
                     link=name,
-                    translation=(x, y, z),
-                    rotation=as_rows(turn),
+                    translation=translation,
+                    rotation=rotation,
                     shape=solid_shape(solid.tag, size),
                 )
             )
@@ -237,6 +239,17 @@ def _simple_solids(
         if found:
             return found
     return []
+
+
+def _origin(
+    where: str, element: ElementTree.Element
+) -> tuple[Vector, tuple[Vector, Vector, Vector]]:
+    """Where a joint or a solid sits, and how it is turned."""
+    origin = element.find("origin")
+    values = {} if origin is None else origin.attrib
+    x, y, z = _numbers(where, "xyz", values.get("xyz", "0 0 0"), 3)
+    turn = about_fixed_axes(_numbers(where, "rpy", values.get("rpy", "0 0 0"), 3), "XYZ")
+    return (x, y, z), as_rows(turn)
 
 
 def _numbers(where: str, key: str, text: str, size: int) -> list[float]:
