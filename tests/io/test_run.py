@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -24,7 +25,12 @@ from torchcss.io.cameras import calibration
 from torchcss.io.fitted_body import write_fitted_body
 from torchcss.io.run import Given, GivenKeypoints
 from torchcss.io.tracks import Track, save_track, write_summary
-from torchcss.io.view_files import RecordedCamera, ViewFiles
+from torchcss.io.view_files import (
+    RecordedCamera,
+    ViewFiles,
+    camera_from_plain,
+    camera_to_plain,
+)
 from torchcss.show.posterior_plots import plot_track
 from torchcss.show.viewer import view_track
 from torchcss.vision.camera import Camera
@@ -99,7 +105,9 @@ def test_a_robot_with_its_shape_and_two_cameras_survives(track: Track, tmp_path:
         for one in (run, again):
             assert torchcss.export(one, tmp_path / to, to=to).paths[0].stat().st_size > 100
     assert torchcss.export(tmp_path, tmp_path / "own.bvh").paths == (tmp_path / "own.bvh",)
-    assert {path.stem for path in plot_track(again)} >= {"modes", "joints", "side_view"}
+    drawn = plot_track(again)
+    assert {path.stem for path in drawn} >= {"modes", "joints", "side_view"}
+    assert drawn[0].parent.name == "smooth_plots"
 
 
 @needs_viewer
@@ -108,6 +116,20 @@ def test_a_robot_with_its_shape_and_two_cameras_is_viewed(track: Track, tmp_path
     write_summary(tmp_path, {"ended": "complete"})
     view_track(Run.open(tmp_path), save=tmp_path / "track.rrd")
     assert (tmp_path / "track.rrd").stat().st_size > 1000
+
+
+def test_a_camera_is_read_back_bit_for_bit(tmp_path: Path) -> None:
+    """A resumed run goes on with it: a last bit is another track after a second."""
+    draw = np.random.default_rng(0)
+    for _ in range(20):
+        turn, _ = np.linalg.qr(draw.normal(size=(3, 3)))
+        turn *= np.linalg.det(turn)
+        turned = Camera(
+            [[900.0, 0, 320], [0, 900, 240], [0, 0, 1]], (640, 480), R_camera_world=turn.round(9)
+        )
+        entry = json.loads(json.dumps(camera_to_plain(RecordedCamera(turned))))
+        found = camera_from_plain(entry, tmp_path).camera.state_dict()
+        assert all(torch.equal(found[name], value) for name, value in turned.state_dict().items())
 
 
 def assert_same_body(one: BodyModel, other: BodyModel) -> None:

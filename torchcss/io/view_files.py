@@ -153,6 +153,8 @@ def camera_from_plain(entry: Mapping[str, Any], folder: Path) -> RecordedCamera:
         name=entry["name"],
         near=entry["near"],
     )
+    # Made orthonormal once more it would differ in its last bits, and a resumed run with it.
+    camera.R_camera_world = camera.R_camera_world.new_tensor(entry["R"])
     focal = float(entry.get("focal_deviation", 0.0))
     if entry.get("files") is None:
         return RecordedCamera(camera, focal_deviation=focal)
