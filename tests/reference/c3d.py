@@ -17,6 +17,7 @@ class C3dFile(NamedTuple):
     labels: tuple[str, ...]
     units: str
     rate: float
+    first: int  # the number of the first frame, counted from 1
     points: np.ndarray  # frames, points, 3; NaN where invalid
     screen: tuple[str, str]  # the axes to the right and up
 
@@ -61,4 +62,4 @@ def read_c3d(data: bytes) -> C3dFile:
     table = table.reshape(frames, num_points, 4).astype(np.float64)
     points = np.where(table[..., 3:] < 0, np.nan, table[..., :3])
     screen = (text("X_SCREEN")[0], text("Y_SCREEN")[0])
-    return C3dFile(tuple(text("LABELS")), text("UNITS")[0], rate, points, screen)
+    return C3dFile(tuple(text("LABELS")), text("UNITS")[0], rate, first, points, screen)

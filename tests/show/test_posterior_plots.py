@@ -69,7 +69,8 @@ def test_joints_in_the_world_and_as_the_camera_sees_them(track: Track, body: Bod
     world = joints_figure(track, joints=["r_elbow", "r_wrist"]).axes
     seen = joints_figure(track, camera=camera, joints=["r_elbow", "r_wrist"]).axes
     assert [axes.get_title() for axes in seen[:3]] == [
-        "to the right (metres)", "up (metres)", "away from the camera (metres)"
+        "right in the picture (metres)", "up in the picture (metres)",
+        "away from the camera (metres)",
     ]  # fmt: skip
     np.testing.assert_allclose(lines(world[0])[0], best[:, elbow, 0])
     np.testing.assert_allclose(lines(world[5])[0], best[:, wrist, 2])

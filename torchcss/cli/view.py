@@ -41,7 +41,7 @@ class Plot:
     track: PathArgument
     """The run's folder, or a track's file in it (track.npz, smooth.npz)."""
     out: Path | None = None
-    """Folder for the figures; by default `plots` in the run's folder."""
+    """Folder for the figures; by default `plots` (`smooth_plots`) in the run's folder."""
     frame: int | None = None
     """Frame that is seen from the side; by default the one with the most explanations."""
     given: GivenOptions = field(default_factory=Given)

@@ -27,12 +27,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from torchcss.body.bases import pose_track
-from torchcss.body.root import ROOT_NAMES
+from torchcss.body.root import ROOT_NAMES, has_root
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.errors import ConfigurationError
 from torchcss.files import prepare_output_folder
 from torchcss.io.run import Run, body_of_track
-from torchcss.io.tracks import Track
+from torchcss.io.tracks import TRACK_NAME, Track
 from torchcss.show.style import OKABE_ITO, save_figure
 from torchcss.show.track_pictures import has_pictures, pictures_of, rows_with_modes
 from torchcss.show.track_plots import (
@@ -79,7 +79,8 @@ def plot_track(
 
     Args:
         run: The run.
-        out: Folder for the files; by default `plots` in the run's.
+        out: Folder for the files; by default `plots` in the run's, of a smoothed track
+            `smooth_plots`.
         frame: Which frame of the video is seen from the side; by default the one whose weight is
             spread over most modes.
         anew: Whether to draw over the video even where the tracker left an overlay.
@@ -92,7 +93,8 @@ def plot_track(
             be read.
     """
     track, rows = run.track._replace(body=run.body), rows_with_modes(run)
-    out = prepare_output_folder(run.folder / "plots" if out is None else out)
+    usual = "plots" if run.path.name == TRACK_NAME else f"{run.path.stem}_plots"
+    out = prepare_output_folder(run.folder / usual if out is None else out)
     camera = run.cameras[0].camera if run.cameras else None
     if frame is None:
         frame = int(track.frames[rows[effective_number(track)[rows].argmax()]])
@@ -150,7 +152,7 @@ def joints_figure(
         shift = camera.t_camera_world.double().cpu().numpy() * [1, -1, 1]
         places = places @ turn.T + shift
         spread = turn @ spread @ turn.T
-        labels = ("to the right", "up", "away from the camera")
+        labels = ("right in the picture", "up in the picture", "away from the camera")
     deviation = np.sqrt(np.diagonal(spread, axis1=-2, axis2=-1).clip(min=0))
 
     figure = Figure(figsize=(11.0, 1.0 + 1.15 * len(names)), layout="constrained")
@@ -211,7 +213,8 @@ def angles_figure(track: Track) -> Figure:
         shown = [axes for axes in grid[:, column] if axes.get_visible()]
         shown[-1].set_xlabel("seconds", fontsize=9)
         shown[-1].tick_params(labelbottom=True)
-    figure.suptitle(f"{_caption('parameters')}; dotted: joint limits", fontsize=10)
+    root = "; root: from its first place, anew after a gap" if has_root(body) else ""
+    figure.suptitle(f"{_caption('parameters')}; dotted: joint limits{root}", fontsize=10)
     return figure
 
 

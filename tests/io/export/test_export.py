@@ -15,6 +15,7 @@ from torchcss.io.cameras import camera_entry
 from torchcss.io.export import FORMATS
 from torchcss.io.export.selection import DEFAULT_RATE, UP_AXES, SelectionChoice, select
 from torchcss.io.tracks import save_track, write_summary
+from torchcss.io.view_files import RecordedCamera
 from torchcss.vision.camera import Camera
 
 BODY = load_body("arm8")
@@ -111,6 +112,26 @@ def test_the_up_axis_is_found(axis: str):
         select(upright, SelectionChoice(world_up="up"))
 
 
+def test_who_bends_over_stands_as_the_pictures_do():
+    track = make_track(PERSON, counts=(1, 1))
+    hips, head = (track.joint_names.index(name) for name in ("HumanoidRoot", "skull_tip"))
+    track.joints_world[:, 0, hips] = 0.0
+    track.joints_world[:, 0, head] = [[0, 1, 0], [0, 0.1, 0.9]]
+
+    def up(track: Track, **choice: int) -> str:
+        return select(track, SelectionChoice(**choice), frame="y-up").report[0]
+
+    assert "the world's y axis" in up(track)
+    assert "the world's y axis" in up(track, start=1)  # a part stands as the whole
+    track.joints_world[0, 0, head] = [0, 0.8, 0.9]
+    assert "the world's z axis" in up(track)
+    camera = Camera(
+        [[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], (640, 480),
+        R_camera_world=np.diag([1.0, -1, -1]),
+    )  # fmt: skip
+    assert "the world's y axis" in up(track._replace(cameras=(RecordedCamera(camera),)))
+
+
 def test_rates(track: Track):
     assert select(track).rate == 60.0
     assert select(track._replace(times=np.arange(4) * 1001 / 30000)).rate == pytest.approx(29.97003)
@@ -147,6 +168,10 @@ def test_names(folder: Path, track: Track):
     assert (folder / "new" / "folder" / "track_joints.csv").is_file()
     with pytest.raises(ConfigurationError, match="give a file or a folder"):
         export_as(track, to="trc")
+    # What is made of a smoothed track does not replace what was made of the track.
+    save_track(folder / "smooth.npz", track)
+    found = [export_as(folder / "smooth.npz", to=to).paths[0].name for to in ("trc", "csv")]
+    assert found == ["smooth.trc", "smooth_joints.csv"]
 
 
 @pytest.mark.parametrize(

@@ -122,6 +122,7 @@ def test_c3d(tmp_path: Path, frame: str | None, screen: tuple[str, str], turn: n
         file = read_c3d(done.paths[0].read_bytes())
         assert file.labels == track.joint_names
         assert (file.units, file.rate, file.screen) == ("m", 60.0, screen)
+        assert (file.first - 1) / file.rate == track.times[0]
         present = track.num_modes > mode
         places = track.joints_world[present, mode] @ turn.T
         np.testing.assert_allclose(file.points[present], places, rtol=1e-6, atol=1e-7)

@@ -10,6 +10,8 @@
 | `npz` | `track_joints.npz` | the same as arrays | one file |
 | `npz-smpl` | `track_smpl.npz` | SMPL's pose parameters, joints and covariances | one file |
 
+Files are named after the track's: those of `smooth.npz` are `smooth.bvh` and so on.
+
 Each format is a module of its own that makes the content; only this one touches the disk. Call
 `export`.
 """
@@ -36,7 +38,7 @@ from torchcss.io.tracks import Track
 Format = Literal["bvh", "trc", "c3d", "mot", "csv", "npz", "npz-smpl"]
 FORMATS: tuple[str, ...] = get_args(Format)
 
-_NAMES = {"csv": "track_joints.csv", "npz": "track_joints.npz", "npz-smpl": "track_smpl.npz"}
+_ENDINGS = {"csv": "_joints.csv", "npz": "_joints.npz", "npz-smpl": "_smpl.npz"}
 _UP: dict[str, FrameOfFile] = {**dict.fromkeys(("bvh", "trc", "mot"), "y-up"), "c3d": "z-up"}
 """What the readers of a format take for up."""
 
@@ -111,7 +113,7 @@ def export(
         track, source = run.track, run.path
     frame = options.frame or _UP.get(to, "world")
     selection = select(track, options.selection, frame=frame)
-    one_file = to in _NAMES
+    one_file = to in _ENDINGS
     labels = [""] if one_file and options.selection.mode == "all" else selection.labels
     paths = _paths(source, to, labels, path)
     report = list(selection.report)
@@ -152,7 +154,7 @@ def _write_modes(
 
 def _paths(source: Path | None, to: str, labels: Sequence[str], out: StrPath | None) -> list[Path]:
     """The files to write, one per label, in a folder that can be written."""
-    usual = Path(_NAMES.get(to, f"track.{to}"))
+    usual = Path(("track" if source is None else source.stem) + _ENDINGS.get(to, f".{to}"))
     if out is None:
         if source is None:
             raise ConfigurationError(

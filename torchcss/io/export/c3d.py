@@ -2,7 +2,8 @@
 
 Written by ezc3d, an optional package. Points are in metres; a point that a frame lacks is marked as
 invalid (residual -1), as the format wants it. `X_SCREEN` and `Y_SCREEN` say which axes point to the
-right and up on the screen of who looks at a standing body from the front.
+right and up on the screen of who looks at a standing body from the front. Frames are counted from
+the video's first, as far as the format can count, so that times are those of the video.
 
 Call `write_c3d`.
 """
@@ -15,6 +16,9 @@ import numpy as np
 
 from torchcss.errors import optional_package
 from torchcss.io.export.selection import Selection
+
+_MOST_FRAMES = 65535
+"""The header has 16 bits for the number of a frame."""
 
 
 def write_c3d(path: Path, selection: Selection, mode: int) -> None:
@@ -39,5 +43,8 @@ def write_c3d(path: Path, selection: Selection, mode: int) -> None:
         name = "XYZ"[int(np.abs(axis).argmax())]
         file.add_parameter("POINT", screen, ["+" + name if axis.sum() > 0 else "-" + name])
     points = selection.joints[:, mode].transpose(2, 1, 0)
+    first = round(float(selection.times[0]) * selection.rate)
+    if first + len(selection.times) <= _MOST_FRAMES:
+        file["header"]["points"]["first_frame"] = first
     file["data"]["points"] = np.concatenate([points, np.ones_like(points[:1])])
     file.write(str(path))

@@ -6,7 +6,8 @@ stands there: nothing where that can be said, else the pose of the frame before.
 
 The world of a track is that of its camera file, whatever its up axis. Formats of animation and
 biomechanics want Y up: the world is then turned by quarter turns, so that the body's mean upward
-direction, or the axis that the caller names, becomes Y; or Z, for the laboratories of C3D.
+direction (beside that of the picture), or the axis that the caller names, becomes Y; or Z, for the
+laboratories of C3D.
 
 Call `select`.
 """
@@ -103,8 +104,8 @@ class SelectionChoice:
         start: First frame, counted as in the video.
         stop: Frame before which to end.
         stride: Take every so many of the track's frames.
-        world_up: Which axis of the world is up; auto: the one nearest to the body's mean upward
-            direction, or, for an arm or a robot, to that of the pictures.
+        world_up: Which axis of the world is up; auto: the one nearest to the mean upward direction
+            of the body and the pictures, or, for an arm or a robot, of the pictures.
     """
 
     mode: Literal["best", "all"] | int = "best"
@@ -138,7 +139,7 @@ def select(
     for label, missing in zip(labels, (ranks < 0).sum(axis=0), strict=True):
         if missing:
             report.append(f"{label or 'best mode'}: absent in {missing} of {len(kept)} frames")
-    turn, upright = _frame_of_file(track, kept, frame, choice.world_up, report)
+    turn, upright = _frame_of_file(track, frame, choice.world_up, report)
     rate = _rate(track.times[kept], report)
 
     present = ranks >= 0
@@ -239,14 +240,15 @@ def _nearest_present(present: np.ndarray) -> np.ndarray:
 
 
 def _frame_of_file(
-    track: Track, kept: np.ndarray, frame: FrameOfFile, world_up: str, report: list[str]
+    track: Track, frame: FrameOfFile, world_up: str, report: list[str]
 ) -> tuple[np.ndarray, np.ndarray]:
     """The file's frame from the world's, and a standing body's orientation in it."""
     axis = world_up
     if world_up == "auto":
         picture_up = camera_up(track.cameras[0].camera if track.cameras else None)
+        seen = track.num_modes > 0  # all of them: parts of one track stand in one frame
         axis, agreement = up_axis(
-            track.joint_names, track.joints_world[kept, 0], track.base_transform[kept], picture_up
+            track.joint_names, track.joints_world[seen, 0], track.base_transform[seen], picture_up
         )
         tells = set(_UPRIGHT) <= set(track.joint_names)
         what = "body's mean" if tells else "base's" if picture_up is None else "picture's upward"
@@ -269,29 +271,31 @@ def up_axis(
     joint_names: Sequence[str],
     joints: Float[np.ndarray, "t j 3"],
     base: Float[np.ndarray, "t 4 4"],
-    otherwise: Float[np.ndarray, "3"] | None = None,
+    picture_up: Float[np.ndarray, "3"] | None = None,
 ) -> tuple[str, float]:
     """Which axis of the world is up, and the cosine of its angle to the body's upward direction.
 
-    That is the mean direction from the hips to the head, or, for a body without, the one given.
+    That is the mean direction from the hips to the head, or, for a body without, the one given. A
+    body that bends over does not tell alone: what is up in the picture counts half as much.
 
     Args:
         joint_names: Names of the joints.
         joints: Joint centres, world frame.
         base: World from the frame in which the root moves.
-        otherwise: What is up where the body does not tell, world frame; None: up the base.
+        picture_up: What is up in the picture, world frame; None: not known. Where neither body nor
+            picture tells, it is up the base.
     """
     names = list(joint_names)
     low, high = _UPRIGHT
     if low in names and high in names:
         up = (joints[:, names.index(high)] - joints[:, names.index(low)]).mean(0)
     else:
-        up = base[:, :3, 1].mean(0) if otherwise is None else otherwise
+        up = base[:, :3, 1].mean(0) if picture_up is None else picture_up
     length = float(np.linalg.norm(up))
     up = up / length if length > 0 else np.array([0.0, 1.0, 0.0])
-    values = {name: float(np.array(_TO_Y_UP[name][1]) @ up) for name in UP_AXES}
-    axis = max(values, key=lambda name: values[name])
-    return axis, values[axis]
+    both = up if picture_up is None else up + 0.5 * picture_up
+    axis = max(UP_AXES, key=lambda name: float(np.array(_TO_Y_UP[name][1]) @ both))
+    return axis, float(np.array(_TO_Y_UP[axis][1]) @ up)
 
 
 def _rate(times: np.ndarray, report: list[str]) -> float:
