@@ -211,6 +211,11 @@ FOLDERS: dict[str, Callable[[int], tuple[str, Any]]] = {
     ),
     "openpifpaf": lambda t: (f"{t:03d}.jpg.predictions.json", [{"keypoints": flat(t), "bbox": []}]),
     "mmpose": lambda t: (f"{t:03d}.json", [mmpose(t, person(t)), mmpose(t, other(t))]),
+    "mmpose demo": lambda t: (
+        f"results_{t:03d}.json",
+        {"meta_info": {"keypoint_id2name": {str(i): n for i, n in enumerate(TFJS)}},
+         "instance_info": [mmpose(t, other(t)), mmpose(t, person(t))]},
+    ),
     "easymocap": lambda t: (
         f"cam1/{t:06d}.json",
         {"filename": f"{t:06d}.jpg", "height": 480, "width": 640,

@@ -235,7 +235,7 @@ class _Reader:
                 continue
             offset, factor, *higher = model.eq_data[index][:5].tolist()
             if second not in self.names or not factor or any(higher) or not model.eq_active0[index]:
-                yield f"joint {self.names[first]!r}: its equality is left out, which is not linear"
+                yield f"joint {self.names[first]!r}: its equality is left out, off or not linear"
             else:
                 mimics[self.names[first]] = (self.names[second], factor, offset)
         self.joints = [replace(each, mimic=mimics.get(each.name)) for each in self.joints]

@@ -21,7 +21,9 @@ from torchcss.io.keypoints.people import LAYOUT_SIZES, Person, numbers, screened
 from torchcss.io.keypoints.words import CONFIDENCES, SCORES, SIDES, SIZES, first_of
 from torchcss.joint_names import names_in
 
-PEOPLE = names_in("people bodies instances predictions annots poses persons detections")
+PEOPLE = names_in(
+    "people bodies instances instance_info predictions annots poses persons detections"
+)
 JOINTS = names_in(
     "pose_keypoints_2d pose_keypoints keypoints pose_landmarks landmarks landmark joints pose kps"
 )
