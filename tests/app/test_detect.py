@@ -178,6 +178,12 @@ def test_frames_that_nobody_asks_for_are_not_detected(files: Path, crowd: Crowd)
         assert is_detected(path, None)
 
 
+def test_a_rate_that_a_film_does_not_need_is_told(files: Path) -> None:
+    given = ViewFiles(video=files / "video.mp4", keypoints=None, frame_rate=120)
+    view = open_view(given, Camera.pinhole(*SIZE, focal_px=60.0))
+    assert any("as the video says: --frame-rate is of pictures" in note for note in view.notes)
+
+
 def test_who_goes_on_further_looks_further(
     files: Path, crowd: Crowd, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -68,6 +68,11 @@ class OpenView(NamedTuple):
             notes.insert(0, f"{float(self.reader.info.frame_rate):g} images a second, {given}")
             notes += [several_kinds(self.reader.image_names)]
             notes += [missing_numbers(self.reader.image_names)]
+        elif self.files.frame_rate is not None:
+            rate = float(self.reader.info.frame_rate)
+            notes.append(
+                f"{rate:g} images a second, as the video says: --frame-rate is of pictures"
+            )
         if self.keypoints is not None:
             notes += self.keypoints.report
         return [note for note in notes if note]
