@@ -26,8 +26,9 @@ from torchcss.studies.evaluation import Evaluation, evaluate
 from torchcss.studies.metrics import LIMB_JOINTS, LOST_MM
 
 FRAMES_NOTE = (
-    "MPJPE means something only if track and reference share one world frame, root-aligned MPJPE "
-    "only if their axes agree; PA-MPJPE needs neither."
+    "MPJPE means something only if track and reference share one world frame; root-aligned MPJPE, "
+    "losses and regions only if their axes agree (a camera file without R and t gives the camera's "
+    "axes); PA-MPJPE needs neither."
 )
 KINDS = {
     "mpjpe": "absolute",

@@ -82,6 +82,15 @@ def test_angles_turn_the_way_their_names_say() -> None:
         ("l_clavicle_elevation", "l_shoulder", 1, 1),
         ("r_clavicle_protraction", "r_shoulder", 2, 1),
         ("l_shoulder_raising", "l_elbow", 0, 1),
+        ("root_yaw", "nose", 0, 1),
+        ("root_pitch", "skull_tip", 2, 1),
+        ("root_roll", "skull_tip", 0, -1),
+        ("lumbar_bending", "skull_tip", 0, -1),
+        ("lumbar_twist", "nose", 0, 1),
+        ("neck_bending", "skull_tip", 0, -1),
+        ("neck_twist", "nose", 0, 1),
+        ("l_hip_twist", "l_toe", 0, 1),
+        ("r_hip_twist", "r_toe", 0, -1),
     ):
         moved = at(body, state(body, **{parameter: 20.0}), joint) - at(body, rest, joint)
         assert sign * float(moved[axis]) > 0.01, parameter

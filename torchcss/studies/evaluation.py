@@ -679,7 +679,7 @@ def evaluate(
     """Errors of a run against joints in space.
 
     Absolute errors mean something only if run and reference share one world frame, root-aligned
-    ones only if their axes agree; Procrustes errors need neither.
+    ones, losses and regions only if their axes agree; Procrustes errors need neither.
 
     Args:
         run: The run, its folder, or its track's file.
