@@ -16,7 +16,7 @@ clip:
 | join | a second torchrun joins the first, which starts all processes again |
 | clock | the clock of a process jumps by hours with every look at it |
 | disk | no file may be larger than a part of the track |
-| video | a video is cut off, and whole again later |
+| video | a video is cut off, mostly while it is read, and whole again later |
 | folder | the folder cannot be written (left out for root, who may) |
 
 When the cause is gone, the same command is given again. A round is lost if a clip is missing, or
@@ -220,11 +220,13 @@ def disk(batch: Round) -> None:
 
 
 def video(batch: Round) -> None:
-    """A video is cut off."""
+    """A video is cut off before it is opened, or while it is read."""
     whole = batch.video.read_bytes()
-    batch.video.write_bytes(whole[: len(whole) // 3])
-    _expect(batch.begin().wait(_LATE_S) == 0, "a damaged video ended a process")
-    _expect("1 failed" in batch.printed, "a damaged video: no clip failed")
+    process = batch.begin()
+    batch.wait_for(lambda: any((batch.out / ".batch" / "work").glob("clip0/*")), process)
+    time.sleep(batch.moment.uniform(0, 1.0))
+    os.truncate(batch.video, int(batch.moment.uniform(0.02, 0.2) * len(whole)))
+    _expect(process.wait(_LATE_S) == 0, "a damaged video ended a process")
     batch.video.write_bytes(whole)
 
 

@@ -30,6 +30,7 @@ from torchcss.io.video import (
     read_image,
     several_kinds,
 )
+from torchcss.studies.demo import CLIP
 from torchcss.types import Frame
 
 
@@ -384,6 +385,35 @@ def test_truncated_with_index_at_the_front_yields_what_is_whole(tmp_path: Path) 
     assert all(
         np.array_equal(frame.image, image) for frame, image in zip(frames, whole, strict=True)
     )
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mkv", ".ts"])
+@pytest.mark.parametrize("at_once", [True, False])
+def test_what_is_read_before_the_damage_are_the_right_frames(
+    tmp_path: Path, suffix: str, at_once: bool
+) -> None:
+    """Frames are decoded in another order than they are shown in, and some were lost between."""
+    path = tmp_path / f"a{suffix}"
+    options = {"movflags": "faststart"} if suffix == ".mp4" else {}
+    with av.open(str(CLIP / "video.mp4")) as source, av.open(str(path), "w", options=options) as to:
+        stream = to.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(video=0):
+            packet.stream = stream
+            to.mux([packet] if packet.dts is not None else [])
+    whole, expected = path.read_bytes(), [frame.image for frame in VideoReader(path)]
+    # Odd: whole packets of MPEG-TS, of 188 bytes, do not tell that others are missing.
+    for size in (int(share * len(whole)) | 1 for share in (0.2, 0.48, 0.5)):
+        path.write_bytes(whole[:size] if at_once else whole)
+        reader = VideoReader(path)
+        read = iter(reader)
+        frames = [next(read)]
+        path.write_bytes(whole[:size])
+        with pytest.raises(VideoError, match="cut off"):
+            frames.extend(read)
+        for frame in frames:
+            np.testing.assert_array_equal(frame.image, expected[frame.index])
+        if at_once:  # else the beginning was read ahead
+            assert reader.count_frames() == len(frames) >= 50 * size / len(whole) - 8
 
 
 def test_truncated_avi(tmp_path: Path) -> None:

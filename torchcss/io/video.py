@@ -20,7 +20,7 @@ from collections import Counter
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import suppress
 from fractions import Fraction
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
@@ -170,15 +170,22 @@ class VideoReader:
     def _shown_at(self) -> list[float | None]:
         """When each frame of a container is shown, in the order in which they are stored."""
         times: list[float | None] = []
-        # What cannot be demuxed ends the count, as it ends the reading.
+        whole, sent = None, None
+        # What cannot be demuxed ends the count, as it ends the reading: see `_decode`.
         with suppress(*_av_errors()), self.opened() as container:
             for packet in container.demux(video=0):
-                if packet.is_corrupt:
+                if not packet.size and not _is_cut_off(container):
+                    return times
+                if packet.is_corrupt or not packet.size:
+                    sent = sent if packet.size else whole
                     break
-                if packet.size and not packet.is_discard:
-                    at, base = packet.pts, packet.time_base
-                    times.append(None if at is None or base is None else float(at * base))
-        return times
+                shown, decoded = (
+                    None if at is None else float(at * (packet.time_base or 1))
+                    for at in (packet.pts, packet.dts)
+                )
+                times += [] if packet.is_discard else [shown]
+                whole, sent = sent, decoded
+        return [time for time in times if _is_shown_by(time, sent)]
 
     def __iter__(self) -> Iterator[Frame]:
         return self._read_container() if self._images is None else self._read_images()
@@ -261,8 +268,6 @@ class VideoReader:
                 # An MP4 may hide frames by its edit list: there a smaller count is no damage.
                 if num_read < (promised or 0) and "mp4" not in container.format.name:
                     damage = "the file ends early"
-                elif promised is None and _is_cut_off(self.path, container.format.name):
-                    damage = "the file is cut off"
         except VideoError:
             raise
         except (*_av_errors(), ValueError, _Damage) as error:
@@ -597,35 +602,41 @@ def _decode(container: InputContainer) -> Iterator[VideoFrame]:
     decoder.options = {"max_pixels": str(_MOST_PIXELS)}  # also for what grows on the way
     if decoder.width * decoder.height > _MOST_PIXELS:
         raise _Damage(f"{decoder.width} x {decoder.height} pixels, more than {_MOST_PIXELS:,}")
-    damage: Exception | None = None
+    held: list[VideoFrame] = []
+    whole, sent = None, None  # when the last packets but one and but none were to be decoded
     packets = container.demux(stream)
-    while damage is None:
-        try:
-            packet = next(packets, None)
-            if packet is None:
-                return
+    try:
+        while (packet := next(packets, None)) is not None:
             if packet.is_corrupt:
-                damage = _Damage("the file is cut off or damaged")
-                break
+                raise _Damage("the file is cut off or damaged")
+            if not packet.size and _is_cut_off(container):
+                sent = whole  # half of the last one may be missing
+                raise _Damage("the file is cut off")
             pictures = packet.decode()
-        except _av_errors() as error:
-            damage = error
-            break
-        yield from pictures
-    # Frames that the decoder holds back to reorder them are whole.
-    pictures = []
-    with suppress(*_av_errors()):
-        pictures = decoder.decode(None)
-    yield from (picture for picture in pictures if not picture.is_corrupt)
-    raise damage
+            yield from held
+            held, whole, sent = pictures, sent, packet.dts
+        yield from held
+    except (*_av_errors(), _Damage):
+        # What the decoder holds back is whole, but pictures shown before it may be lost: those that
+        # were to be decoded later, so that they are shown later than that.
+        with suppress(*_av_errors()):
+            held += decoder.decode(None)
+        yield from takewhile(lambda picture: _is_shown_by(picture.pts, sent), held)
+        raise
 
 
-def _is_cut_off(path: Path, container: str) -> bool:
-    """Whether a file of such a container is shorter than it says, or ends within a packet."""
+def _is_shown_by(time: float | None, sent: float | None) -> bool:
+    """Whether a picture is shown when a packet was to be decoded, or before, or has no time."""
+    return time is None or (sent is not None and time <= sent)
+
+
+def _is_cut_off(container: InputContainer) -> bool:
+    """Whether a file is shorter than it says, or ends within a packet."""
+    path = Path(container.name.removeprefix("file:"))
     size = path.stat().st_size
-    if container == "mpegts":
+    if container.format.name == "mpegts":
         return all(size % packet for packet in _PACKETS)
-    if "matroska" not in container:
+    if "matroska" not in container.format.name:
         return False
     with path.open("rb") as file:
         _, found, rest = file.read(4096).partition(_SEGMENT)
