@@ -310,7 +310,10 @@ def _check_somebody(frames: list[np.ndarray], first_frame: int) -> None:
     later = next((index for index in seen if index >= first_frame), None)
     if later == first_frame:
         return
-    advice = f"the first frame with somebody is {later}: start there"
+    advice = (
+        f"the first frame with somebody is {later}: start there (--start {later}), or mark the "
+        "joints of the first one (torchcss init --click)"
+    )
     if later is None:
         advice = "there is none later either"
     if first_frame == 0 and later == 1:
