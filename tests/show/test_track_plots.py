@@ -117,7 +117,7 @@ def test_modes_over_time(track: Track, tmp_path: Path) -> None:
     assert marks["told lost"] == pytest.approx([11 / 60])
     assert marks["told found"] == pytest.approx([12 / 60])
     shown = costs.get_lines()[0].get_ydata()
-    assert np.isnan(shown).tolist() == [False, True, False]
+    assert np.isnan(shown).tolist() == [True, True, False]
     counts = {line.get_label(): line.get_ydata() for line in number.get_lines()}
     assert counts["modes"].tolist() == [2, 3, 2]
     assert save_figure(figure, tmp_path / "modes.png").stat().st_size > 5000

@@ -213,6 +213,8 @@ def effective_number(track: Track) -> Float[np.ndarray, " t"]:
 def modes_figure(track: Track, summary: Mapping[str, Any] | None = None) -> Figure:
     """Weights of the modes, number of explanations and cost of the best mode over time.
 
+    The cost is that of the frames after the first.
+
     Args:
         track: The track.
         summary: Its `summary.json` (`torchcss.io.tracks.read_summary`), for the events: from a
@@ -247,8 +249,10 @@ def modes_figure(track: Track, summary: Mapping[str, Any] | None = None) -> Figu
     number.set_ylim(0, 1.15 * max(int(track.num_modes.max()), 1))
     number.yaxis.get_major_locator().set_params(integer=True)
     number.legend(**_BESIDE)
-    # A frame in which nothing was seen has no cost, and leaves a gap.
+    # A frame in which nothing was seen has no cost, and leaves a gap. The first frame, without flow
+    # and learnt colours, costs so much less that nothing else would be seen.
     shown = np.where(np.isfinite(track.cost[:, 0]), track.cost[:, 0], np.nan)
+    shown[: len(times) > 2] = np.nan
     cost.plot(times, shown, ".-", color=OKABE_ITO["blue"], lw=1.3, ms=4)
     label(weights, y="weight, best\nmode first")
     label(number, y="explanations")
