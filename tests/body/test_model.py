@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import pickle
 from dataclasses import replace
 
@@ -10,11 +11,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchcss.body.catalog import BODY_NAMES, specification
+from torchcss.body.catalog import BODY_NAMES, LENGTHS, PLACES, specification
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel, differentiate_twice
 from torchcss.body.shape import with_shape
 from torchcss.errors import BodyError, ConfigurationError, ShapeError
+from torchcss.initialise.multi_start import PAPER_PROPORTIONS
 
 
 def random_states(body: BodyModel, *batch: int, generator: torch.Generator) -> Tensor:
@@ -93,6 +95,46 @@ def test_free_proportions_reach_what_lengths_set() -> None:
     torch.testing.assert_close(
         free.pose(x).joints, built.pose(torch.zeros(32, dtype=torch.float64)).joints
     )
+
+
+def test_the_papers_eight_move_hips_clavicles_and_skull_tip() -> None:
+    """x_i of section 2 [IJRR]; left and right mirror each other, limbs keep their lengths."""
+    free, rest = load_body("body32", free_proportions=PAPER_PROPORTIONS), load_body("body32")
+    assert free.num_parameters == 32 + 8
+    x = free.rest.clone()
+    moves = dict(zip(PAPER_PROPORTIONS, torch.linspace(-0.008, 0.008, 8).tolist(), strict=True))
+    for name, metres in moves.items():
+        x[free.state_index(f"{name}_length")] += metres
+    moved = free.pose(x).joints
+    shift = moved - rest.pose(rest.rest).joints
+    expected = {
+        "hip": [moves["hip_width"], moves["hip_height"], moves["hip_depth"]],
+        "shoulder": [moves[f"clavicle_{axis}"] for axis in ("width", "height", "depth")],
+        "skull_tip": [0.0, moves["head"], moves["skull_depth"]],
+    }
+    pairs = {"hip": ("hip", "knee", "ankle"), "shoulder": ("shoulder", "elbow", "wrist")}
+    for name, by in expected.items():
+        for joint in pairs.get(name, ()):
+            for side, mirror in (("l", 1.0), ("r", -1.0)):
+                own = shift[free.joint_index(f"{side}_{joint}")]
+                torch.testing.assert_close(own, torch.tensor([mirror * by[0], *by[1:]]).to(own))
+    own = shift[free.joint_index("skull_tip")]
+    torch.testing.assert_close(own, torch.tensor(expected["skull_tip"]).to(own))
+    # A body that is built so stands as the parameters say.
+    lengths = {name: free.lengths.get(name, 0.0) + metres for name, metres in moves.items()}
+    built = load_body("body32", lengths=lengths)
+    face = ("skullbase", "nose", "l_eye", "r_eye", "l_ear", "r_ear")  # grow with the head
+    others = [k for k, name in enumerate(built.joint_names) if name not in face]
+    torch.testing.assert_close(built.pose(built.rest).joints[others], moved[others])
+    again = load_body("body32", lengths=lengths, free_proportions=PAPER_PROPORTIONS)
+    for name, length in PLACES.items():
+        row = again.state_index(f"{name}_length")
+        ends = lengths[name] + torch.stack([again.lower[row], again.upper[row]])
+        torch.testing.assert_close(ends, 0.1 * LENGTHS[length] * torch.tensor([-1.0, 1.0]).to(ends))
+    with pytest.raises(BodyError, match="unknown lengths"):
+        load_body("body32", free_proportions=("tail",))
+    with pytest.raises(BodyError, match="finite"):
+        load_body("body32", lengths={"hip_depth": math.nan})
 
 
 @pytest.mark.parametrize("batch", [(), (5,), (2, 3), (0,)])

@@ -18,6 +18,7 @@ from torchcss.body.shape import (
     with_shape,
 )
 from torchcss.body.surface import SHAPE_NAMES, surface_points
+from torchcss.initialise.multi_start import PAPER_PROPORTIONS
 from torchcss.types import PointCost
 
 NUM_POINTS = 25
@@ -108,9 +109,11 @@ def test_left_and_right_bend_as_mirror_images():
         torch.testing.assert_close(tips[other], mirrored, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("free_proportions", [False, True])
+@pytest.mark.parametrize("free_proportions", [False, True, PAPER_PROPORTIONS])
 @pytest.mark.parametrize("name", BODY_NAMES)
-def test_columns_are_exact(name: str, free_proportions: bool, generator: torch.Generator):
+def test_columns_are_exact(
+    name: str, free_proportions: bool | tuple[str, ...], generator: torch.Generator
+):
     """Value, gradient and Hessian in pose and shape against double backward through both."""
     body = load_body(name, free_proportions=free_proportions)
     turn, _ = torch.linalg.qr(randn(generator, 3, 3))

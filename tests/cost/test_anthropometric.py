@@ -9,11 +9,12 @@ import torch
 from reference import anthropometric as reference
 from torch import Tensor
 
-from torchcss.body.catalog import BODY_NAMES, LENGTHS, PROPORTIONS
+from torchcss.body.catalog import BODY_NAMES, LENGTHS, PLACES, PROPORTIONS
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel, differentiate_twice
 from torchcss.cost.anthropometric import INDIVIDUAL, Anthropometric, proportion_columns
 from torchcss.errors import ConfigurationError
+from torchcss.initialise.multi_start import PAPER_PROPORTIONS
 from torchcss.types import LocalModel
 
 PRIOR = Anthropometric()
@@ -55,10 +56,27 @@ def test_it_is_the_gaussian_of_its_docstring(
         torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-11 * most)
 
 
-def test_covariance_is_the_inverse_of_the_hessian() -> None:
-    body = load_body("body34", free_proportions=True)
+@pytest.mark.parametrize("scale", [1.0, 1.1])
+def test_places_vary_by_themselves(scale: float) -> None:
+    """By 5 % of their lengths, half of the papers' interval, and not with stature."""
+    body = load_body("body34", free_proportions=PAPER_PROPORTIONS, scale=scale)
+    columns, covariance = proportion_columns(body), PRIOR.covariance(body)
+    for row, name in enumerate(columns):
+        if name in PLACES:
+            deviation = 0.05 * scale * LENGTHS[PLACES[name]]
+            assert float(covariance[row, row].sqrt()) == pytest.approx(deviation)
+            assert float(covariance[row].abs().sum()) == pytest.approx(deviation**2)
+    assert set(columns) == set(PAPER_PROPORTIONS)
+    x = body.rest.clone()[None]
+    x[0, columns["hip_depth"]] += 0.05 * scale * LENGTHS["hip_width"]
+    torch.testing.assert_close(PRIOR.local_model(x, body).value, torch.tensor([0.5]).to(x))
+
+
+@pytest.mark.parametrize("free", [True, PAPER_PROPORTIONS])
+def test_covariance_is_the_inverse_of_the_hessian(free: bool | tuple[str, ...]) -> None:
+    body = load_body("body34", free_proportions=free)
     columns = list(proportion_columns(body).values())
-    assert len(columns) == 9
+    assert len(columns) == (9 if free is True else 8)
     hessian = PRIOR.local_model(body.rest, body).hessian[columns][:, columns]
     covariance = PRIOR.covariance(body)
     identity = torch.eye(len(columns), dtype=torch.float64)

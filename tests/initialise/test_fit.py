@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import torchcss
-from torchcss.body.catalog import LENGTHS
+from torchcss.body.catalog import LENGTHS, PLACES, PROPORTIONS
 from torchcss.body.load import load_body
 from torchcss.body.root import has_root
 from torchcss.cost.anthropometric import Anthropometric
@@ -28,6 +28,7 @@ from torchcss.initialise.fit import DEFAULT_VIEW_DEGREES, default_camera, initia
 from torchcss.initialise.from_joints import hang_before_camera
 from torchcss.initialise.keypoint_checks import default_sigma, typical_sigma
 from torchcss.initialise.multi_start import (
+    PAPER_LENGTHS,
     PAPER_PROPORTIONS,
     PAPERS,
     SINGLE_START,
@@ -36,6 +37,7 @@ from torchcss.initialise.multi_start import (
 )
 from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
 from torchcss.initialise.result import Initialisation, hang_on_best, stature_of
+from torchcss.show.initialisation_views import proportion_table
 from torchcss.studies.metrics import LIMB_JOINTS, mask_overlap, pa_mpjpe_mm
 from torchcss.studies.random_person import Person, coverage, random_person
 from torchcss.studies.render.clutter import clutter_background
@@ -428,10 +430,24 @@ def test_terms_of_the_first_stage_can_be_weighed(generator):
 
 
 def test_only_the_papers_proportions_if_asked():
-    search = replace(SMALL, proportions=PAPER_PROPORTIONS)
+    search = replace(SMALL, proportions=PAPER_LENGTHS)
     found = find(person(), search, num_modes=1)
-    fitted = {name for name, length in found.lengths.items() if length != LENGTHS[name]}
-    assert fitted == set(PAPER_PROPORTIONS)
+    assert set(found.lengths) == set(PAPER_LENGTHS)
+    assert len(PAPER_PROPORTIONS) == 8
+    assert all(found.lengths[name] != LENGTHS.get(name, 0.0) for name in PAPER_PROPORTIONS)
+    for name, length in PLACES.items():
+        assert abs(found.lengths[name]) <= 0.1 * LENGTHS[length]
+        assert found.body.lengths[name] == found.lengths[name]
+    fixed = {"shoulder_width", "neck", "hand", "foot"}
+    assert set(PROPORTIONS) - set(PAPER_LENGTHS) == fixed
+    neck = {"neck": LENGTHS["neck"]}  # not fitted
+    assert stature_of(found.lengths) == pytest.approx(stature_of({**found.lengths, **neck}))
+    rows = {row["name"]: row for row in proportion_table(found.lengths)}
+    hip = rows["hip_depth"]
+    assert hip["standard_m"] == 0
+    assert hip["difference_percent"] == pytest.approx(
+        100 * found.lengths["hip_depth"] / LENGTHS["hip_width"]
+    )
     with pytest.raises(ConfigurationError, match="tail"):
         Search(proportions=("tail",))
 
@@ -454,6 +470,7 @@ def test_a_coarse_pose_leads_a_single_start_to_the_fit(found: Initialisation):
     someone = person()
     names = found.free_body.state_names
     coarse = dict(zip(names, found.free_mixture.mean[0].tolist(), strict=True))
+    coarse = {name: value for name, value in coarse.items() if not name.endswith("_length")}
     near = find(someone, replace(PAPERS, coarse_pose=coarse), num_modes=1, printed=True)
     assert len(near.cost) == 1
     assert abs(error_mm(near, someone)[0] - error_mm(found, someone)[0]) < 5

@@ -2,8 +2,8 @@
 
 The table holds lengths, joints with their limits and habits, parts and landmarks, and says where
 its numbers come from. Internal proportions `x_i` (section 2 [IJRR]) are prismatic joints of the
-same tree, free only while a body is fitted; `PROPORTIONS` names them. Left and right share one
-parameter.
+same tree, free only while a body is fitted; `PROPORTIONS` names our choice of them, `PLACES` those
+that the papers have besides. Left and right share one parameter.
 
 | body | parameters |
 |---|---|
@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -40,8 +40,15 @@ LENGTHS: dict[str, float] = _TABLE["lengths"]
 PROPORTIONS = tuple(LENGTHS)
 """The lengths that may be fitted, each a parameter of a body with free proportions."""
 
+PLACES: dict[str, str] = _TABLE["places"]
+"""Places of joints that may be fitted, zero in the standard humanoid, and the length of each."""
+
 PROPORTION_RANGE = 0.10
-"""Fitted lengths stay within this fraction of the standard humanoid (section 3.2.3 [IJRR])."""
+"""Fitted lengths stay within this fraction of the standard humanoid (section 3.2.3 [IJRR]), and
+fitted places within this fraction of their length."""
+
+Proportions = bool | Collection[str]
+"""Which lengths and places are parameters: all `PROPORTIONS` or none, or those named."""
 
 BODY_NAMES = ("arm7", "arm8", "body30", "body32", "body34")
 ARM_NAMES = tuple(name for name in BODY_NAMES if name.startswith("arm"))
@@ -167,9 +174,10 @@ _ROWS = {limb: [_Row(**row) for row in rows] for limb, rows in _TABLE["rows"].it
 class _Builder:
     """Collects what the rows of the table say, one after the other."""
 
-    def __init__(self, lengths: Mapping[str, float], free_proportions: bool) -> None:
-        self.lengths = lengths
-        self.free = free_proportions
+    def __init__(self, lengths: Mapping[str, float], free_proportions: Proportions) -> None:
+        self.lengths = {**dict.fromkeys(PLACES, 0.0), **lengths}
+        every = PROPORTIONS if free_proportions else ()
+        self.free = every if isinstance(free_proportions, bool) else tuple(free_proportions)
         self.joints: list[JointSpecification] = []
         self.parts: list[PartSpecification] = []
         self.markers: list[MarkerSpecification] = []
@@ -197,7 +205,7 @@ class _Builder:
         place = as_vector(mirror * [self._metres(number) for number in row.at])
         if row.joint:
             self._joint(named(row.joint), row, place, mirror)
-        elif row.length and self.free:
+        elif without_side(row.length) in self.free:
             self._length(named(row.length), mirror * row.slide)
         elif row.part:
             square = (*row.square, *row.taper, 0.0, 0.0)
@@ -222,8 +230,8 @@ class _Builder:
         """A number, or a sum of products of numbers and lengths: "0.5 * trunk - 0.1"."""
         total = 0.0
         for term in str(number).replace("- ", "+ -").split(" + "):
-            factors = [self.lengths.get(word) or float(word) for word in term.split(" * ")]
-            total += math.prod(factors)
+            words = term.split(" * ")
+            total += math.prod(self.lengths[w] if w in self.lengths else float(w) for w in words)
         return total
 
     def _joint(self, name: str, row: _Row, place: Vector, mirror: np.ndarray) -> None:
@@ -240,9 +248,9 @@ class _Builder:
     def _length(self, name: str, axis: np.ndarray) -> None:
         """Add the prismatic joint of a proportion."""
         length = without_side(name)
-        margin = PROPORTION_RANGE * LENGTHS[length]
+        margin = PROPORTION_RANGE * LENGTHS[PLACES.get(length, length)]
         # Limits are absolute: a body that is already fitted may not drift further.
-        offset = LENGTHS[length] - self.lengths[length]
+        offset = LENGTHS.get(length, 0.0) - self.lengths[length]
         if length != name:
             self.ties[f"{name}_length"] = (f"{length}_length", 1.0)
         self.sticky[f"{length}_length"] = (offset, 0.5 * margin)
@@ -276,16 +284,18 @@ def specification(
     *,
     lengths: Mapping[str, float] | None = None,
     scale: float = 1.0,
-    free_proportions: bool = False,
+    free_proportions: Proportions = False,
     free_root: bool | None = None,
 ) -> BodySpecification:
     """Rows of the table for one of the bodies that ship.
 
     Args:
         name: One of `BODY_NAMES`.
-        lengths: Lengths that differ from `LENGTHS`, metres (before `scale`).
+        lengths: Lengths that differ from `LENGTHS`, and `PLACES` that are not zero, metres (before
+            `scale`).
         scale: Overall scale; stature is 1.75 m times this.
-        free_proportions: Make the lengths parameters of the body (for fitting).
+        free_proportions: Make the lengths parameters of the body (for fitting), or the lengths and
+            places that are named.
         free_root: Give the body six root parameters; by default the bodies have them and the arms
             do not.
 
@@ -294,12 +304,15 @@ def specification(
     """
     if name not in BODY_NAMES:
         raise BodyError(f"no body {name!r}; the bodies are {', '.join(BODY_NAMES)}")
-    unknown = set(lengths or {}) - set(LENGTHS)
-    if unknown:
-        raise BodyError(f"unknown lengths {sorted(unknown)}; known are {', '.join(LENGTHS)}")
     size = {**LENGTHS, **(lengths or {})}
-    if not all(0 < value < math.inf for value in (*size.values(), scale)):
+    named = size if isinstance(free_proportions, bool) else {*size, *free_proportions}
+    known = (*LENGTHS, *PLACES)
+    if unknown := set(named) - set(known):
+        raise BodyError(f"unknown lengths {sorted(unknown)}; known are {', '.join(known)}")
+    if not all(0 < size[name] < math.inf for name in LENGTHS) or not 0 < scale < math.inf:
         raise BodyError("lengths and scale must be positive and finite")
+    if not all(map(math.isfinite, size.values())):
+        raise BodyError("places must be finite")
     is_arm = name in ARM_NAMES
     build = _Builder(size, free_proportions)
     moves = not is_arm if free_root is None else free_root

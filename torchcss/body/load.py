@@ -31,6 +31,7 @@ from torchcss.body.catalog import (
     BodySpecification,
     MarkerSpecification,
     PartSpecification,
+    Proportions,
     root_joints,
     scaled,
     specification,
@@ -82,7 +83,7 @@ def load_body(
     device: torch.device | str = "cpu",
     lengths: Mapping[str, float] | None = None,
     scale: float = 1.0,
-    free_proportions: bool = False,
+    free_proportions: Proportions = False,
     free_root: bool | None = None,
     file: FileOptions | None = None,
 ) -> BodyModel:
@@ -94,8 +95,8 @@ def load_body(
         device: Where its tensors live.
         lengths: Lengths that differ from the standard humanoid's, metres; not for files.
         scale: Overall scale of the standard humanoid (stature 1.75 m), or of the file.
-        free_proportions: Make the lengths parameters too (for fitting). The lengths of a file stay
-            as they are.
+        free_proportions: Make the lengths parameters too, or the lengths and places that are named
+            (for fitting). The lengths of a file stay as they are.
         free_root: Six root parameters or none; by default bodies have them and arms do not, and
             bodies from files if the file lets them move freely.
         file: How a file is read.

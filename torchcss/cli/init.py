@@ -15,7 +15,7 @@ from torchcss.body.catalog import PROPORTIONS
 from torchcss.cli.options import PathArgument
 from torchcss.errors import ConfigurationError, KeypointError
 from torchcss.files import load_json, prepare_output_folder
-from torchcss.initialise.multi_start import PAPER_PROPORTIONS, Search
+from torchcss.initialise.multi_start import PAPER_LENGTHS, Search
 from torchcss.initialise.options import InitialiseOptions
 from torchcss.io.video import read_frame
 
@@ -37,7 +37,8 @@ class Init:
     stature: float | None = None
     """Height of the standing person, metres; by default the prior sets the scale."""
     proportions: Literal["all", "papers"] = "all"
-    """Lengths to fit: all, or the papers' (hips, clavicles, neck and skull)."""
+    """All lengths, or the papers' eight (places of hips, clavicles and skull tip) beside those of
+    trunk and limbs."""
     initialisation: Literal["ours", "papers"] = "ours"
     """From many starts, or the papers' three stages: one fit from a coarse pose, no colours."""
     coarse_pose: Path | None = None
@@ -74,7 +75,7 @@ class Init:
             prepare_output_folder(self.out)
             size = (picture.shape[1], picture.shape[0])
             write_clicked(self.out / "joints.json", keypoints, size, frame=files.frame)
-        proportions = PAPER_PROPORTIONS if self.proportions == "papers" else PROPORTIONS
+        proportions = PAPER_LENGTHS if self.proportions == "papers" else PROPORTIONS
         options = InitialiseOptions(
             sigma=self.sigma,
             stature=self.stature,

@@ -25,7 +25,8 @@ segments of a limb also go together beyond stature (the height of the hip is lef
 than independent segments would add up to), so the prior is a little tight on whole limbs. That
 joint centres vary as the landmarks on the skin do. The remainders that the above does not give,
 which are guesses of that order: thigh 4 %, trunk, hand and foot 3.5 %, head 3 %, the short neck
-8 %. Women's means differ; give `scale` or `lengths` to `load_body`.
+8 %. Women's means differ; give `scale` or `lengths` to `load_body`. A place of a joint
+(`torchcss.body.catalog.PLACES`) is off by 5 % of its length, each by itself: half of its interval.
 
 Call `Anthropometric().local_model(x, body)`. It replaces the stabiliser of the lengths, which would
 otherwise count twice: `proportion_columns(body)` says which parameters those are.
@@ -40,7 +41,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchcss.body.catalog import PROPORTIONS
+from torchcss.body.catalog import PLACES, PROPORTIONS
 from torchcss.body.model import BodyModel
 from torchcss.cost.context import FrameContext
 from torchcss.cost.term import OnStates, Term
@@ -62,10 +63,13 @@ INDIVIDUAL: dict[str, float] = {
 }
 """Relative deviation of each length among people of one stature; see the module."""
 
+_OF_PLACES = 0.05
+"""Deviation of a joint's place, as a share of its length."""
+
 
 def proportion_columns(body: BodyModel) -> dict[str, int]:
-    """Free lengths of a body by name, and the state parameter that changes each."""
-    names = {f"{length}_length": length for length in PROPORTIONS}
+    """Free lengths and places of a body by name, and the state parameter that changes each."""
+    names = {f"{length}_length": length for length in (*PROPORTIONS, *PLACES)}
     return {names[name]: i for i, name in enumerate(body.state_names) if name in names}
 
 
@@ -131,7 +135,10 @@ class Anthropometric(Term):
         """Standard deviations that stature gives to every length, and those of its own, metres."""
         columns = proportion_columns(body)
         # The parameters count from the body's lengths, and the standard rests at `sticky_mean`.
-        built = body.tie.new_tensor([body.lengths[name] for name in columns])
+        built = body.tie.new_tensor([body.lengths.get(name, 0.0) for name in columns])
         standard = built + body.sticky_mean[list(columns.values())]
-        own = body.tie.new_tensor([INDIVIDUAL[name] for name in columns])
-        return self.stature * standard, self.individual * own * standard
+        lengths = body.tie.new_tensor([body.lengths[PLACES.get(name, name)] for name in columns])
+        places = torch.tensor([name in PLACES for name in columns]).to(lengths.device, torch.bool)
+        own = body.tie.new_tensor([INDIVIDUAL.get(name, _OF_PLACES) for name in columns])
+        extent = torch.where(places, lengths, standard)
+        return self.stature * standard, self.individual * own * extent

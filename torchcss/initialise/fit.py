@@ -234,7 +234,7 @@ def _with_contours(
     """The second and the third stage, and the hypotheses refined on the body that they find."""
     search, rooted = options.search, has_root(first.body)
     load = partial(with_lengths, first.body, scale=first.scale, free_root=rooted)
-    loose = load(first.lengths, free_proportions=True)
+    loose = load(first.lengths, free_proportions=search.parameters)
     rivals = first.mixture.mean[first.cost <= first.cost[0] + _RIVALS]
     parameters = ShapeParameters(loose, SHAPE_NAMES if options.bends else WHOLE_SHAPE)
     bones = cost.choice.without("contour", "region")
@@ -255,7 +255,7 @@ def _with_contours(
     kept = best_distinct(fits, options.num_modes)
     if rooted:
         body, kept = hang_on_best(body, kept)
-        free = shaped(load(lengths, free_proportions=True), whole)
+        free = shaped(load(lengths, free_proportions=search.parameters), whole)
         free = free.with_base(body.base_rotation, body.base_translation)
         kept = with_unknown_lengths(cost.with_body(free), body, kept, search)
     result = as_initialisation(body, kept, first.report)

@@ -79,8 +79,8 @@ def fit_joints(
         body
         if isinstance(body, BodyModel)
         else load_body(
-            body, dtype=options.dtype, device=options.device, scale=scale, free_proportions=True,
-            free_root=True,
+            body, dtype=options.dtype, device=options.device, scale=scale,
+            free_proportions=options.search.parameters, free_root=True,
         )
     )  # fmt: skip
     assert view.keypoints is not None
@@ -156,7 +156,8 @@ def _with_lengths_held(
     if not has_root(body):
         return body, kept
     body, kept = hang_on_best(body, kept)
-    loose = with_lengths(body, lengths, scale, free_root=True, free_proportions=True)
+    parameters = options.search.parameters
+    loose = with_lengths(body, lengths, scale, free_root=True, free_proportions=parameters)
     return body, with_unknown_lengths(cost.with_body(loose), body, kept, options.search)
 
 

@@ -31,7 +31,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchcss.body.catalog import PROPORTIONS
+from torchcss.body.catalog import PLACES, PROPORTIONS, Proportions
 from torchcss.body.flips import Segments
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, has_root
@@ -75,8 +75,8 @@ class Search:
         leave_out: Leave keypoints out that fit no pose (False only for comparison); see
             `torchcss.initialise.outliers`.
         max_steps: Iterations of the last descent.
-        proportions: Which lengths are fitted, all by default; the others stay the standard
-            humanoid's.
+        proportions: Which lengths and places are fitted, all lengths by default; the others stay
+            the standard humanoid's.
         coarse_pose: The first start, radians by parameter; the others are at rest (`sticky_mean`).
         turn: Turn the first start about the vertical to where the keypoints cost least, unless it
             says `root_yaw`.
@@ -102,11 +102,16 @@ class Search:
                 raise ConfigurationError(
                     f"Search.{name}: expected at least {least}, got {getattr(self, name)}"
                 )
-        if unknown := sorted(set(self.proportions) - set(PROPORTIONS)):
+        known = (*PROPORTIONS, *PLACES)
+        if unknown := sorted(set(self.proportions) - set(known)):
             raise ConfigurationError(
-                f"Search.proportions: unknown {', '.join(unknown)}; there are "
-                f"{', '.join(PROPORTIONS)}"
+                f"Search.proportions: unknown {', '.join(unknown)}; there are {', '.join(known)}"
             )
+
+    @property
+    def parameters(self) -> Proportions:
+        """What the body that is fitted has as parameters: no places if none are fitted."""
+        return self.proportions if set(self.proportions) & set(PLACES) else True
 
     def bounds(self, body: BodyModel) -> Bounds:
         """The joint limits; only the lengths' without `limits`."""
@@ -121,16 +126,20 @@ class Search:
         return Bounds(lower, upper)
 
 
-PAPER_PROPORTIONS = ("hip_width", "shoulder_width", "neck", "head")
-"""The papers' eight internal proportions, which place hips, clavicles and the tip of the skull;
-left and right are one here."""
+PAPER_PROPORTIONS = ("hip_width", "head", *PLACES)
+"""The papers' eight internal proportions, x_i of section 2 [IJRR]: three of the hip joint, three of
+the clavicle and two of the skull's tip, which is on the midline; left and right are one."""
+
+PAPER_LENGTHS = (*PAPER_PROPORTIONS, "trunk", "upper_arm", "forearm", "thigh", "shank")
+"""What the first stage of section 5 [IJRR] fits: x_i, and the sizes of parts as lengths of bones.
+Shoulder width and neck stay the standard humanoid's."""
 
 SINGLE_START = Search(
     num_starts=1, num_flips=0, num_samples=0, anneal=False, leave_out=False, max_steps=100
 )
 """One descent from the rest pose: what a local fit without search does."""
 
-PAPERS = replace(SINGLE_START, turn=True)
+PAPERS = replace(SINGLE_START, turn=True, proportions=PAPER_LENGTHS)
 """Section 5 [IJRR]: one descent from a coarse pose, else from rest, turned as the joints say."""
 
 _TURNS = 8

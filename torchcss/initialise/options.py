@@ -89,9 +89,7 @@ class InitialiseOptions:
         One fit from a coarse pose to joints and edges, with limits, stabilisers, proportions and
         repulsion.
         """
-        search = replace(
-            PAPERS, proportions=self.search.proportions, coarse_pose=self.search.coarse_pose
-        )
+        search = replace(PAPERS, coarse_pose=self.search.coarse_pose)
         return replace(self, search=search, num_modes=1, printed=True, colours=False, bends=True)
 
     @property

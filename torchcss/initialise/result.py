@@ -16,10 +16,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchcss.body.catalog import LENGTHS, PROPORTION_RANGE, PROPORTIONS
+from torchcss.body.catalog import LENGTHS, PROPORTION_RANGE, Proportions
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, move_base, root_pose
+from torchcss.cost.anthropometric import proportion_columns
 from torchcss.cost.total import TrackingCost
 from torchcss.errors import BodyError
 from torchcss.inference.mixture import GaussianMixture
@@ -143,7 +144,7 @@ def with_lengths(
     scale: float,
     *,
     free_root: bool | None,
-    free_proportions: bool = False,
+    free_proportions: Proportions = False,
 ) -> BodyModel:
     """The body of the same name with other lengths, on the same base.
 
@@ -152,7 +153,7 @@ def with_lengths(
         lengths: Its lengths, metres.
         scale: Its overall scale.
         free_root: Whether it has root parameters; None: as it is by itself.
-        free_proportions: Whether the lengths are parameters.
+        free_proportions: Which lengths and places are parameters.
     """
     other = load_body(
         body.name,
@@ -191,9 +192,9 @@ def with_unknown_lengths(cost: TrackingCost, body: BodyModel, fits: Modes, searc
 
 
 def stature_of(lengths: Mapping[str, float], scale: float = 1.0) -> float:
-    """Height of the standing body, metres; its overall scale tells the height of the ankle."""
+    """Height of the standing body, metres; its overall scale tells what was not fitted."""
     names = ("shank", "thigh", "trunk", "neck", "head")
-    return scale * _SOLE + sum(lengths[name] for name in names)
+    return scale * _SOLE + sum(lengths.get(name, scale * LENGTHS[name]) for name in names)
 
 
 def scale_of(stature: float | None) -> float:
@@ -210,17 +211,18 @@ def scale_of(stature: float | None) -> float:
 
 
 def fitted_lengths(body: BodyModel, x: Vector, stature: float | None) -> dict[str, float]:
-    """Fitted lengths; with known stature made to add up to it, as far as their interval allows."""
+    """Fitted lengths and places; with known stature lengths that add up to it, in their limits."""
     lengths = {
-        name: body.lengths[name] + float(x[body.state_index(f"{name}_length")])
-        for name in PROPORTIONS
-        if f"{name}_length" in body.state_names
+        name: body.lengths.get(name, 0.0) + float(x[column])
+        for name, column in proportion_columns(body).items()
     }
     if stature is None or "shank" not in lengths:
         return lengths
     scale = scale_of(stature)
     factor = (stature - scale * _SOLE) / (stature_of(lengths, scale) - scale * _SOLE)
     for name, length in lengths.items():
+        if name not in LENGTHS:
+            continue
         middle, margin = scale * LENGTHS[name], scale * LENGTHS[name] * PROPORTION_RANGE
         lengths[name] = min(max(length * factor, middle - margin), middle + margin)
     return lengths

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from torchcss.body.catalog import LENGTHS
+from torchcss.body.catalog import LENGTHS, PLACES
 from torchcss.body.model import BodyModel
 from torchcss.show.style import save_figure
 from torchcss.show.track_plots import bones_of, draw_bones, in_perspective, mode_colour
@@ -73,15 +73,15 @@ def proportion_table(lengths: Mapping[str, float], scale: float = 1.0) -> list[d
     """Rows `name`, `fitted_m`, `standard_m`, `difference_percent`.
 
     Args:
-        lengths: Fitted lengths, metres.
+        lengths: Fitted lengths and places, metres; the differences of places are in percent of the
+            length of each.
         scale: Scale of the standard humanoid.
     """
-    return [
-        {
-            "name": name,
-            "fitted_m": length,
-            "standard_m": scale * LENGTHS[name],
-            "difference_percent": 100 * (length / (scale * LENGTHS[name]) - 1),
-        }
-        for name, length in lengths.items()
-    ]
+    rows: list[dict[str, object]] = []
+    for name, length in lengths.items():
+        standard = scale * LENGTHS.get(name, 0.0)
+        whole = scale * LENGTHS[PLACES.get(name, name)]
+        difference = 100 * (length - standard) / whole
+        rows.append({"name": name, "fitted_m": length, "standard_m": standard,
+                     "difference_percent": difference})  # fmt: skip
+    return rows
