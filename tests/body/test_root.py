@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 import torch
+from made_robots import planar_arm
 from torch import Tensor
 
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
-from torchcss.body.root import ROOT_NAMES, has_root, move_base, root_pose
+from torchcss.body.root import ROOT_NAMES, base_without_root, has_root, move_base, root_pose
 from torchcss.body.rotations import root_angles, root_rotation
 
 
@@ -142,3 +144,15 @@ def test_covariance_follows_samples(generator: torch.Generator) -> None:
     variance = covariance.diagonal()
     error = ((covariance.square() + torch.outer(variance, variance)) / num).sqrt()
     assert ((found - covariance).abs() < 5 * error + 0.02 * variance.max()).all()
+
+
+def test_without_its_root_a_body_stands_where_it_stood(
+    tmp_path: Path, generator: torch.Generator
+) -> None:
+    """Also one of a file, which hangs on its root turned to Y up."""
+    for name in ("arm8", planar_arm(tmp_path / "arm.urdf", 0.5, 0.4)):
+        rooted, fixed = based_body(str(name)), load_body(name, free_root=False)
+        x = random_states(rooted, generator=generator)
+        fixed = fixed.with_base(*base_without_root(rooted, fixed, x))
+        own = x[[rooted.state_index(name) for name in fixed.state_names]]
+        torch.testing.assert_close(fixed.pose(own).joints, rooted.pose(x).joints)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from made_robots import planar_arm
 
 import torchcss
 from torchcss.body.catalog import LENGTHS, PLACES, PROPORTIONS
@@ -42,6 +44,7 @@ from torchcss.studies.metrics import LIMB_JOINTS, mask_overlap, pa_mpjpe_mm
 from torchcss.studies.random_person import Person, coverage, random_person
 from torchcss.studies.render.clutter import clutter_background
 from torchcss.studies.render.renderer import Mesh, render_meshes
+from torchcss.studies.render.scene import look_at
 from torchcss.types import Keypoints, Modes
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import grid_faces
@@ -355,6 +358,33 @@ def test_odd_marks_are_named_and_gross_ones_move_little():
 def test_marks_from_which_nothing_follows(given: dict, message: str, generator: torch.Generator):
     with pytest.raises(KeypointError, match=message):
         initialise(None, given, person().camera, generator=generator)
+
+
+def test_keypoints_are_those_of_one_image(generator: torch.Generator):
+    someone = person()
+    known = Keypoints(someone.keypoints[None], someone.confidence[None], someone.joint_names)
+    with pytest.raises(KeypointError, match=r"one image, \[j 2\]: use keypoints\.at"):
+        initialise(None, known, someone.camera, generator=generator)
+    with pytest.raises(KeypointError, match="expected one of each"):
+        initialise(
+            None, known.at(0)._replace(confidence=known.confidence), someone.camera,
+            generator=generator,
+        )  # fmt: skip
+
+
+def test_joints_of_a_robot_have_its_own_names(tmp_path: Path, generator: torch.Generator):
+    path = planar_arm(tmp_path / "arm.urdf", 0.5, 0.4, limit=1.5)
+    body = load_body(path)
+    x = torch.tensor([0.3, 0.8], dtype=torch.float64)
+    camera = look_at([0.0, 0.0, 3.0], [0.0, 0.0, 0.0], focal_px=700.0, name="above")
+    places = camera.project(body.pose(x).joints).uv
+    marked = dict(zip(body.joint_names, places.tolist(), strict=True))
+    for given in (body, str(path)):
+        found = initialise(None, marked, camera, given, generator=generator)
+        joints = found.body.pose(found.mixture.mean[0]).joints
+        torch.testing.assert_close(camera.project(joints).uv, places, rtol=0, atol=1.0)
+    with pytest.raises(KeypointError, match=f"unknown joint 'tap'.* {body.joint_names[-1]}"):
+        initialise(None, {"tap": (1.0, 2.0)}, camera, body, generator=generator)
 
 
 def test_cameras(generator: torch.Generator):

@@ -16,7 +16,7 @@ from made_sessions import seen_by, session_at
 import torchcss
 from torchcss.body.load import load_body
 from torchcss.cost.total import TrackingCost
-from torchcss.errors import TorchcssError, VideoError
+from torchcss.errors import ConfigurationError, TorchcssError, VideoError
 from torchcss.kernels import compiler
 from torchcss.studies.render.sequences import SyntheticSequence
 from torchcss.tracking import batch
@@ -174,6 +174,12 @@ def test_what_fails_in_an_evaluation_is_told_to_those_who_asked(
     monkeypatch.setattr(TrackingCost, "_evaluated", fails)
     with pytest.raises(VideoError, match="no more"):
         next(torchcss.track_batch(pairs))
+
+
+def test_a_session_is_tracked_once_at_a_time(films: list[SyntheticSequence]) -> None:
+    session = session_of(films[0], 0)
+    with pytest.raises(ConfigurationError, match="one is given twice"):
+        next(torchcss.track_batch([(session, films[0].frames)] * 2))
 
 
 def test_no_sequence_at_all() -> None:

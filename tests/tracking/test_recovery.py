@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import islice, pairwise
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
 import torch
 from made_sequences import rendered_arm
-from made_sessions import seen_by, session_at
+from made_sessions import seen_by, session_at, start_at
 
 import torchcss
 from torchcss.app.recorder import Recorder
+from torchcss.cost.context import FrameContext
+from torchcss.cost.term import Kind, OnStates, Posed, Term
 from torchcss.inference.loss_monitor import LossMonitor
 from torchcss.io.view_files import RecordedCamera
 from torchcss.studies.render.sequences import SyntheticSequence
 from torchcss.tracking.recovery import Recovery
-from torchcss.tracking.session import Posterior
-from torchcss.tracking.settings import Settings, watched_terms
-from torchcss.types import Frame
+from torchcss.tracking.session import Posterior, TrackingSession
+from torchcss.tracking.settings import Settings, make_plan, watched_terms
+from torchcss.types import Curvature, Frame, LocalModel
 
 ELSEWHERE = range(6, 8)
 """Frames that show a wall. It has some grain: a picture of a single colour is a camera that is out,
@@ -128,19 +131,33 @@ def test_without_recovery_nothing_is_told_and_nothing_changes(
     assert {int(frame.info.num_samples) for frame in plain} == {4}
 
 
-def test_only_what_compares_with_the_image_is_judged():
-    recovery, priors = Recovery(), {"stabiliser": 1.0, "temporal": 2.0, "interpenetration": 0.0}
-    state = recovery.monitor.init()
-    for _ in range(10):
-        state, lost = recovery.judge(state, {"contour": 100.0, **priors})
-        assert not lost
-    assert set(state.history) == {"contour"}
-    for _ in range(5):
-        state, lost = recovery.judge(state, {"contour": 100.0, **dict.fromkeys(priors, 1e6)})
-        assert not lost
-    for _ in range(2):
-        state, _ = recovery.judge(state, {"contour": 200.0, **priors})
-    assert recovery.judge(state, {"contour": 200.0, **priors})[1]
+@dataclass(frozen=True, kw_only=True)
+class Constant(Term):
+    """A term that the table of terms does not have."""
+
+    name: ClassVar[str] = "constant"
+    kind: ClassVar[Kind] = "prior"
+
+    def prepare(self, context: FrameContext) -> OnStates:
+        def model(posed: Posed, curvature: Curvature) -> LocalModel:
+            x = posed.x
+            slope = torch.zeros_like(x)
+            return LocalModel(slope.sum(-1) + 1, slope, torch.diag_embed(slope))
+
+        return OnStates(model)
+
+
+def test_only_what_compares_with_the_image_is_judged(sequence: SyntheticSequence):
+    """And what the plan of a session alone knows may be among the terms, as `watched` says."""
+    settings = replace(SETTINGS, terms=("contour", "stabiliser", "interpenetration"))
+    first, view = start_at(sequence.body, sequence.states[0]), seen_by(sequence.camera)
+    plan = make_plan(settings, sequence.body, view, 1 / 25)
+    plan = plan._replace(choice=plan.choice.having(Constant()))
+    session = TrackingSession(settings, first, view, plan=plan)
+    (posterior,) = session.track(sequence.frames[:1])
+    assert posterior.terms["constant"] == 1.0
+    assert session.state.monitor is not None
+    assert set(session.state.monitor.history) == {"contour"}
 
 
 def test_every_term_of_the_images_is_judged():

@@ -45,6 +45,7 @@ from torchcss.tracking.settings import (
     Settings,
     all_terms,
     make_choice,
+    make_plan,
     make_settings_tracker,
     named_terms,
 )
@@ -727,3 +728,65 @@ def test_pixels_alone_are_the_next_frame():
         assert (one.frame.index, one.frame.time_s) == (other.frame.index, other.frame.time_s)
     with pytest.raises(ConfigurationError, match="one of each of the 1 views"):
         plain.observe([sequence.frames[0], sequence.frames[1]])
+
+
+def test_a_session_with_parts_of_its_own_is_resumed_with_them():
+    sequence = rendered_arm(0, 3)
+    settings = Settings(body="arm8", working_size=160, samples=4, modes=2, terms=("contour",))
+    first, view = start_at(sequence.body, sequence.states[0]), seen_by(sequence.camera)
+    plan = make_plan(settings, sequence.body, view, 1 / 25)
+    assert isinstance(plan.tracker, Tracker)
+    plan = plan._replace(tracker=replace(plan.tracker, num_modes=1))
+    session = TrackingSession(settings, first, [view], plan=plan)
+    next(session.track(sequence.frames))
+    state = session.checkpoint()
+    resumed, other = (
+        TrackingSession.resume(state, settings, view, plan=parts) for parts in (plan, None)
+    )
+    ends = [list(each.track(sequence.frames[1:]))[-1] for each in (session, resumed, other)]
+    means = [end.state.mixture.mean for end in ends]
+    assert torch.equal(means[0], means[1])
+    assert [len(mean) for mean in means] == [1, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (np.zeros((5, 7, 3), np.uint8), r"belongs to images of \(640, 480\).* has \(7, 5\)"),
+        (torch.zeros(480, 640, 3), "as a NumPy array, or a Frame of them, got a Tensor"),
+        ("frame.png", "got a str"),
+        ([None], "the first view has none"),
+        ([], "the first view has none"),
+    ],
+)
+def test_images_that_are_none_are_told(image: Any, message: str):
+    sequence = rendered_arm(0, 1)
+    settings = Settings(body="arm8", working_size=160, samples=4, modes=2)
+    session = session_at(settings, sequence.body, sequence.states[0], seen_by(sequence.camera))
+    with pytest.raises(TorchcssError, match=message):
+        session.observe(image)
+
+
+def test_views_that_say_nothing_of_the_body_are_told():
+    sequence = rendered_arm(0, 2)
+    first = start_at(sequence.body, sequence.states[0])
+    view = seen_by(sequence.camera, sequence.joints_world, sequence.body.joint_names)
+    known = view.keypoints
+    assert known is not None
+    names = tuple(f"{name}_" for name in known.names)
+    for keypoints, message in (
+        (known._replace(names=names), r"arm8 has none of the joints .* its own are"),
+        (known.at(0), "expected those of all frames"),
+        (known._replace(positions=known.positions[:, :2]), "keypoints.positions: expected a shape"),
+        (known._replace(confidence=known.confidence[0]), "expected one of each"),
+    ):
+        with pytest.raises(TorchcssError, match=message):
+            TrackingSession(Settings(body="arm8"), first, view._replace(keypoints=keypoints))
+    with pytest.raises(ConfigurationError, match="sigma: expected a number of pixels"):
+        TrackingSession(Settings(body="arm8"), first, view._replace(sigma=0.0))
+    for interval in (0.0, -1.0, math.nan):
+        with pytest.raises(ConfigurationError, match="frame_interval: expected seconds"):
+            TrackingSession(Settings(body="arm8"), first, view, frame_interval=interval)
+    lost = first.mixture._replace(mean=first.mixture.mean * math.nan)
+    with pytest.raises(ConfigurationError, match="mixture: expected finite means"):
+        TrackingSession(Settings(body="arm8"), first._replace(mixture=lost), view)

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchcss.body.chain import offset_matrix
 from torchcss.body.model import BodyModel
 from torchcss.body.rotations import root_angles, root_rotation
 from torchcss.types import Bounds
@@ -42,6 +44,27 @@ def root_pose(
     root = x[..., index]
     rotation = body.base_rotation @ root_rotation(root[..., 3:])
     return rotation, root[..., :3] @ body.base_rotation.T + body.base_translation
+
+
+def base_without_root(
+    rooted: BodyModel, fixed: BodyModel, x: Float[Tensor, " n"]
+) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
+    """Base on which a body without a root stands where it stands with one.
+
+    A body of a file hangs on its root turned to Y up, and by the place of its first link.
+
+    Args:
+        rooted: The body with root parameters.
+        fixed: The same body without.
+        x: State of the first one.
+    """
+    rotation, translation = root_pose(rooted, x)
+    hung, own = (
+        next(joint for joint in body.tree.specifications if joint.link == fixed.tree.link_names[0])
+        for body in (rooted, fixed)
+    )
+    offset = torch.from_numpy(offset_matrix(hung) @ np.linalg.inv(offset_matrix(own))).to(x)
+    return rotation @ offset[:3, :3], translation + rotation @ offset[:3, 3]
 
 
 def move_base(

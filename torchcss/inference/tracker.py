@@ -166,7 +166,8 @@ class SequenceTracker(ABC):
             generator: On the CPU, so that every device sees the same samples. Its state is copied.
 
         Raises:
-            ConfigurationError: If the generator is on another device.
+            ConfigurationError: If the generator is on another device, or means or covariances are
+                not finite.
             ShapeError: If the mixture's tensors do not agree.
         """
         if generator.device.type != "cpu":
@@ -178,6 +179,8 @@ class SequenceTracker(ABC):
         k, n = mixture.mean.shape
         check_shape("mixture.covariance", mixture.covariance, k, n, n)
         check_shape("mixture.log_weight", mixture.log_weight, k)
+        if not all(bool(part.isfinite().all()) for part in mixture[:2]):
+            raise ConfigurationError("mixture: expected finite means and covariances")
         return TrackerState(
             mixture=mixture.prune(k),
             velocity=torch.zeros_like(mixture.mean),

@@ -22,6 +22,8 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
+from torchcss.body.catalog import BODY_NAMES
+from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.root import has_root
 from torchcss.body.shape import WHOLE_SHAPE, ShapeParameters, with_shape
@@ -37,7 +39,12 @@ from torchcss.cost.total import TrackingCost
 from torchcss.cost.view import View
 from torchcss.errors import CameraError
 from torchcss.initialise.from_joints import fit_joints
-from torchcss.initialise.keypoint_checks import default_sigma, keypoints_by_name, swapped_sides
+from torchcss.initialise.keypoint_checks import (
+    check_numbers,
+    default_sigma,
+    keypoints_by_name,
+    swapped_sides,
+)
 from torchcss.initialise.multi_start import optimise
 from torchcss.initialise.noise import briefly, noise_factor
 from torchcss.initialise.options import InitialiseOptions
@@ -94,7 +101,8 @@ def initialise(
 
     Args:
         image: Red, green, blue; None where only its joints are known (then `camera` is needed).
-        keypoints: The joints, or pixels by joint name, `(u, v)` or `(u, v, confidence)`.
+        keypoints: The joints, or pixels by joint name, `(u, v)` or `(u, v, confidence)`. A body
+            from a file has joints under its own names too (`BodyModel.joint_names`).
         camera: The camera of the picture, such as `Camera.pinhole`. None: a pinhole camera with a
             field of view of `DEFAULT_VIEW_DEGREES` along the longer side.
         body: Name of a body that ships, or the path of a URDF, MJCF or BVH file; or a body whose
@@ -105,15 +113,16 @@ def initialise(
             are used.
 
     Raises:
-        KeypointError: If fewer joints of the body are known than asked for, or all are at one
-            place.
+        KeypointError: If fewer joints of the body are known than asked for, all are at one place,
+            or the keypoints are not those of one image.
         CameraError: If the camera is of another image size or looks away from a placed body, or
             there is neither picture nor camera.
         BodyError: If the stature is no person's.
     """
     options, others = options or InitialiseOptions(), tuple(others)
     if not isinstance(keypoints, Keypoints):
-        keypoints = keypoints_by_name(keypoints)
+        keypoints = keypoints_by_name(keypoints, own=_own_joints(body))
+    check_numbers(keypoints, frames=False)
     camera, notes = _camera_of(image, camera)
     view = View(camera=camera.to(dtype=options.dtype, device=options.device), keypoints=keypoints)
     with threads_for(options.evaluator):
@@ -144,6 +153,13 @@ def initialise(
         return _to_the_picture(first, image, view._replace(keypoints=given), others, options)
 
 
+def _own_joints(body: str | BodyModel) -> tuple[str, ...]:
+    """Joints of a body under its file's names."""
+    if body in BODY_NAMES:
+        return ()
+    return (body if isinstance(body, BodyModel) else load_body(body)).joint_names
+
+
 def _camera_of(image: Picture | None, camera: Camera | None) -> tuple[Camera, list[str]]:
     """The camera, checked or assumed, and what to say of it."""
     if camera is None:
@@ -151,11 +167,8 @@ def _camera_of(image: Picture | None, camera: Camera | None) -> tuple[Camera, li
             raise CameraError("neither picture nor camera is given; give one, for the image's size")
         camera, note = default_camera(image.shape[1], image.shape[0])
         return camera, [note]
-    if image is not None and tuple(image.shape[1::-1]) != camera.image_size_wh:
-        raise CameraError(
-            f"camera {camera.name!r} belongs to images of {camera.image_size_wh} pixels, this one "
-            f"has {tuple(image.shape[1::-1])}; use camera.resized if it was only resized"
-        )
+    if image is not None:
+        camera.check_size(image.shape[1], image.shape[0])
     return camera, []
 
 

@@ -22,7 +22,7 @@ import torch
 
 from torchcss.body.load import has_free_root, load_body
 from torchcss.body.model import BodyModel
-from torchcss.body.root import has_root, move_base, root_pose
+from torchcss.body.root import base_without_root, has_root, move_base, root_pose
 from torchcss.cost.joints import JointTargets, match_joints
 from torchcss.cost.total import TrackingCost
 from torchcss.cost.view import View
@@ -149,7 +149,8 @@ def _with_lengths_held(
     if not (options.free_root or has_free_root(free.name)):
         # The root of the best fit becomes the arm's base, and only its angles are searched.
         best = refined.mean[int(refined.cost.nan_to_num(math.inf).argmin())]
-        arm = with_lengths(free, lengths, scale, free_root=None).with_base(*root_pose(body, best))
+        arm = with_lengths(free, lengths, scale, free_root=None)
+        arm = arm.with_base(*base_without_root(body, arm, best))
         starts = columns_of(body, arm, refined.mean)
         body, refined = arm, refine(cost.with_body(arm), starts, options.search)
     kept = best_distinct(refined, num)

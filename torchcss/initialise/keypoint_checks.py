@@ -13,7 +13,7 @@ import torch
 
 from torchcss.body.root import has_root
 from torchcss.cost.total import TrackingCost
-from torchcss.errors import KeypointError
+from torchcss.errors import KeypointError, check_shape
 from torchcss.initialise.multi_start import Search, multi_start_fits
 from torchcss.initialise.outliers import capped_cost
 from torchcss.joint_names import JOINT_NAMES, canonical_joint_name
@@ -35,23 +35,54 @@ _SIDED = {
 }
 
 
-def keypoints_by_name(places: Mapping[str, Sequence[float]]) -> Keypoints:
+def keypoints_by_name(
+    places: Mapping[str, Sequence[float]], *, own: tuple[str, ...] = ()
+) -> Keypoints:
     """Keypoints of one image from pixels by joint name, `(u, v)` or `(u, v, confidence)`.
+
+    Args:
+        places: The pixels.
+        own: Names that the body has for joints, besides the catalogue's.
 
     Raises:
         KeypointError: If a joint is unknown, or a place has other numbers.
     """
-    names = tuple(canonical_joint_name(name) or "" for name in places)
+    names = tuple(name if name in own else canonical_joint_name(name) or "" for name in places)
     if "" in names:
         unknown = list(places)[names.index("")]
         raise KeypointError(
-            f"unknown joint {unknown!r}; the known ones are {', '.join(JOINT_NAMES)}"
+            f"unknown joint {unknown!r}; the known ones are {', '.join(own or JOINT_NAMES)}"
         )
     rows = [[*(float(number) for number in place), 1.0][:3] for place in places.values()]
     if any(len(row) != 3 for row in rows):
         raise KeypointError("expected (u, v) or (u, v, confidence) for every joint")
     table = torch.tensor(rows, dtype=torch.float64).reshape(-1, 3)
     return Keypoints(table[:, :2], table[:, 2], names)
+
+
+def check_numbers(keypoints: Keypoints, *, frames: bool) -> None:
+    """Refuse keypoints whose places, confidences and names do not agree.
+
+    Args:
+        keypoints: Those of an image, `[j 2]`, or of all frames, `[t j 2]`.
+        frames: Whether they are to be of all frames.
+
+    Raises:
+        ShapeError: If they are no tensors, or not pairs of a joint each.
+        KeypointError: If the confidences are of another shape, or it is one image instead of all
+            frames or the other way round.
+    """
+    places, confidence = keypoints.positions, keypoints.confidence
+    check_shape("keypoints.positions", places, len(keypoints.names), 2)
+    check_shape("keypoints.confidence", confidence)
+    if confidence.shape != places.shape[:-1]:
+        raise KeypointError(
+            f"keypoints: {list(places.shape)} places have confidences {list(confidence.shape)}; "
+            "expected one of each"
+        )
+    if places.ndim != 2 + frames:
+        wanted = "all frames, [t j 2]" if frames else "one image, [j 2]: use keypoints.at(frame)"
+        raise KeypointError(f"keypoints: expected those of {wanted}; got {list(places.shape)}")
 
 
 def default_sigma(keypoints: Keypoints) -> float:

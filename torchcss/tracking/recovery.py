@@ -10,11 +10,9 @@ image. A track that was lost for that reason is found in one frame.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import field, replace
 
-from torchcss.cost.choice import TERM_TABLE
-from torchcss.inference.loss_monitor import LossMonitor, MonitorState
+from torchcss.inference.loss_monitor import LossMonitor
 from torchcss.inference.particle import AnnealedParticleFilter, ParticleFilter
 from torchcss.inference.proposals import CovarianceScaled, HeavyTailed
 from torchcss.inference.tracker import SequenceTracker, Tracker
@@ -42,11 +40,6 @@ class Recovery:
     scale: float = 2.0
     num_flips: int = 12
     patience: int = 25
-
-    def judge(self, state: MonitorState, terms: Mapping[str, float]) -> tuple[MonitorState, bool]:
-        """Take in what the terms of a frame cost at the best mode; see `LossMonitor.update`."""
-        observed = {name: cost for name, cost in terms.items() if TERM_TABLE[name].watched}
-        return self.monitor.update(state, observed)
 
     def widened(self, tracker: SequenceTracker) -> SequenceTracker:
         """The same tracker with a wider search, which forgets: no pose is too far from those lost.

@@ -78,6 +78,9 @@ Image = Frame | np.ndarray
 Windows = tuple[Window | None, ...]
 """Where each view is looked at; None: everywhere."""
 
+Views = CameraView | Camera | Sequence[CameraView | Camera]
+"""The cameras that look on, in one world, the first one's video counting the frames; or the one."""
+
 Images = Image | Sequence[Image | None]
 """The images of one moment, one of each view; None from a camera that has ended."""
 
@@ -164,22 +167,24 @@ class TrackingSession:
     Args:
         settings: How to track.
         first: Where the body may be in the first frame, and the body.
-        views: The cameras that look on, in one world, with their keypoints where there are any;
-            the first one's video is the one that counts the frames.
+        views: The cameras that look on, with their keypoints where there are any.
         frame_interval: Seconds between frames, which scales the expected motion.
         generator: Source of the samples; None: one seeded with `settings.seed`.
         plan: The parts of the session, for studies that exchange some; None: what `make_plan` makes
             of the settings.
 
     Raises:
-        ConfigurationError: If there is no view, or what the settings ask for does not fit them.
+        ConfigurationError: If there is no view, what the settings ask for does not fit them, or the
+            first mixture is not finite.
+        KeypointError: If a view's keypoints do not agree in their shapes, or the body has none of
+            their joints.
     """
 
     def __init__(
         self,
         settings: Settings,
         first: Initialisation,
-        views: Sequence[CameraView | Camera],
+        views: Views,
         *,
         frame_interval: float = 1 / 25,
         generator: torch.Generator | None = None,
@@ -206,9 +211,10 @@ class TrackingSession:
         cls,
         state: SessionState,
         settings: Settings,
-        views: Sequence[CameraView | Camera],
+        views: Views,
         *,
         frame_interval: float = 1 / 25,
+        plan: Plan | None = None,
     ) -> TrackingSession:
         """A session that goes on where another left off, with the same settings and views.
 
@@ -217,13 +223,14 @@ class TrackingSession:
             settings: How to track.
             views: The cameras.
             frame_interval: Seconds between frames.
+            plan: The same parts of the session, if it had some of its own.
         """
         session = cls.__new__(cls)
-        session._begin(settings, state.body, views, frame_interval)
+        session._begin(settings, state.body, views, frame_interval, plan)
         if len(state.seen) != len(session._observers):
             raise ConfigurationError(
-                f"the checkpoint is of {len(state.seen)} views, given are {len(views)}; give the "
-                "same views"
+                f"the checkpoint is of {len(state.seen)} views, given are "
+                f"{len(session._observers)}; give the same views"
             )
         session.state = state
         session._expect(state)
@@ -242,13 +249,18 @@ class TrackingSession:
         self,
         settings: Settings,
         body: BodyModel,
-        views: Sequence[CameraView | Camera],
+        views: Views,
         frame_interval: float,
         plan: Plan | None = None,
     ) -> None:
+        views = [views] if isinstance(views, (Camera, CameraView)) else views
         if not views:
             raise ConfigurationError("views: expected at least one camera that looks on, got none")
+        if not 0 < frame_interval < math.inf:
+            raise ConfigurationError(f"frame_interval: expected seconds, got {frame_interval}")
         views = [CameraView(view) if isinstance(view, Camera) else view for view in views]
+        for view in views:
+            view.check(body)
         self.settings = settings
         self.plan = plan or make_plan(settings, body, views[0], frame_interval)
         self._observers = [self.plan.observer(body, view) for view in views]
@@ -294,6 +306,10 @@ class TrackingSession:
 
         Args:
             images: One of each view, or that of the only one.
+
+        Raises:
+            CameraError: If an image is of another size than its camera's.
+            ConfigurationError: If there are more images than views, or none of the first view.
         """
         with threads_for(self.plan.engine):
             began = time.perf_counter()
@@ -313,7 +329,18 @@ class TrackingSession:
             raise ConfigurationError(
                 f"images: expected one of each of the {len(self._observers)} views, got more"
             )
-        if image is None or isinstance(image, Frame):
+        if image is None:
+            if observer is self._observers[0]:
+                raise ConfigurationError("images: the first view has none; it counts the frames")
+            return None
+        pixels = image.image if isinstance(image, Frame) else image
+        if not isinstance(pixels, np.ndarray) or pixels.ndim < 2:
+            raise ConfigurationError(
+                "images: expected pixels [h w 3] as a NumPy array, or a Frame of them, got a "
+                f"{type(pixels).__name__}"
+            )
+        observer.view.camera.check_size(pixels.shape[1], pixels.shape[0])
+        if isinstance(image, Frame):
             return image
         index = self._num_seen
         return Frame(index + observer.view.offset, index * self.plan.frame_interval, image)
@@ -389,7 +416,9 @@ class TrackingSession:
         recovery, monitor = self.plan.recovery, self.state.monitor
         if recovery is None or monitor is None:
             return monitor, False
-        return recovery.judge(monitor, _per_view(terms, observation))
+        watched = {term.name for term in self.plan.choice.terms if term.watched}
+        per_view = _per_view(terms, observation).items()
+        return recovery.monitor.update(monitor, {n: cost for n, cost in per_view if n in watched})
 
     def _of_views(
         self, memory: Sequence[ViewMemory], observation: Observation

@@ -19,7 +19,9 @@ import numpy as np
 from torchcss.body.model import BodyModel
 from torchcss.cost.frame import FrameCosts
 from torchcss.cost.total import TrackingCost
-from torchcss.initialise.keypoint_checks import typical_sigma
+from torchcss.errors import ConfigurationError, KeypointError
+from torchcss.files import shortened
+from torchcss.initialise.keypoint_checks import check_numbers, typical_sigma
 from torchcss.stopwatch import Stopwatch
 from torchcss.types import Frame, Keypoints, Numbers, Vectors, frozen
 from torchcss.vision.appearance import Appearance
@@ -45,6 +47,29 @@ class CameraView(NamedTuple):
     keypoints: Keypoints | None = None
     sigma: float | None = None
     offset: int = 0
+
+    def check(self, body: BodyModel) -> None:
+        """Refuse keypoints that cannot be a body's in all frames.
+
+        Args:
+            body: The body.
+
+        Raises:
+            ConfigurationError: If their noise is no number of pixels.
+            ShapeError: If they are no tensors, or not pairs of a joint each.
+            KeypointError: If they are not those of all frames, or of none of the body's joints.
+        """
+        if self.sigma is not None and not 0 < self.sigma < math.inf:
+            raise ConfigurationError(f"sigma: expected a number of pixels, got {self.sigma}")
+        if self.keypoints is None:
+            return
+        check_numbers(self.keypoints, frames=True)
+        names = self.keypoints.names
+        if names and not set(names) & set(body.joint_names):
+            raise KeypointError(
+                f"{body.name} has none of the joints {shortened(', '.join(names))}; its own are "
+                f"{shortened(', '.join(body.joint_names))}"
+            )
 
     @property
     def noise(self) -> float:

@@ -491,6 +491,18 @@ class Camera(nn.Module):
         normalised, _ = self.undistort(uv)
         return torch.cat([normalised, torch.ones_like(normalised[..., :1])], dim=-1)
 
+    def check_size(self, width: int, height: int) -> None:
+        """Make sure that an image is of the size that the camera belongs to.
+
+        Raises:
+            CameraError: If it is not.
+        """
+        if (width, height) != self.image_size_wh:
+            raise CameraError(
+                f"camera {self.name!r} belongs to images of {self.image_size_wh} pixels, this one "
+                f"has {(width, height)}; use camera.resized if it was only resized"
+            )
+
     # Cameras made from this one.
 
     def resized(self, width: int, height: int) -> Camera:
