@@ -178,6 +178,7 @@ def test_from_files(folder: Path, tmp_path: Path, sequence: SyntheticSequence):
     assert over is not None
     assert over.name == "side"
     assert any("2 views set the scale" in note for note in summary["notes"])
+    assert {"front: format: NPZ", "side: format: NPZ"} <= set(summary["notes"])
     track = load_track(tmp_path)
     away = track.joints_world[:, 0] - sequence.joints_world.numpy()
     assert 1000 * float(np.linalg.norm(away, axis=-1).mean()) < 15

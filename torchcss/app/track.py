@@ -170,7 +170,9 @@ def _begin(
     _now(f"finding the first pose, in frame {start}")
     first = _first_pose(views, eye, settings, start, options, generator)
     views = [opened.with_noise(first.noise) for opened in views]
-    notes = [*(note for opened in views for note in opened.notes), *first.report]
+    names = [f"{view.camera.camera.name}: " if len(views) > 1 else "" for view in views]
+    seen = zip(names, views, strict=True)
+    notes = [*(name + note for name, view in seen for note in view.notes), *first.report]
     tqdm.write("\n".join(notes))
     interval = options.stride / float(views[0].reader.info.frame_rate)
     looking = [opened.view(first.body.tie) for opened in views]

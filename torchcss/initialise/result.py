@@ -245,7 +245,7 @@ def scale_report(stature: float | None, lengths: Mapping[str, float], *, num_vie
         source = f"{num_views} views set the scale"
     else:
         source = "the prior on proportions sets the scale, which one image does not show"
-    return f"{source}; lengths within 10 % of the standard humanoid: {fitted}"
+    return f"{source}; proportions within 10 % of the standard humanoid: {fitted}"
 
 
 def undetermined_line(body: BodyModel, modes: Modes, joints: TrackingCost) -> str | None:

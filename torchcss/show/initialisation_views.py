@@ -18,7 +18,7 @@ from torch import Tensor
 from torchcss.body.catalog import LENGTHS, PLACES
 from torchcss.body.model import BodyModel
 from torchcss.show.style import save_figure
-from torchcss.show.track_plots import bones_of, draw_bones, in_perspective, mode_colour
+from torchcss.show.track_plots import bones_of, draw_bones, in_perspective, label, mode_colour
 from torchcss.vision.camera import Camera
 
 _VIEWS = {
@@ -58,14 +58,17 @@ def draw_hypotheses(
         across = np.cos(turn) * joints[..., 0] + np.sin(turn) * joints[..., 2]
         places = seen if degrees == 0.0 else np.stack([across, joints[..., 1]], axis=-1)
         for mode in reversed(range(len(joints))):
-            label = "" if cost is None else f"{mode + 1}: {float(cost[mode]):.1f}"
+            text = "" if cost is None else f"{mode + 1}: {float(cost[mode]):.1f}"
             look = {"color": mode_colour(mode), "lw": 3 if mode == 0 else 1.5}
-            draw_bones(axes, places[mode], bones, look, label=label)
-        axes.set(title=title, aspect="equal", xlim=(-extent, extent), ylim=(-extent, extent))
-        axes.set_xlabel("m")
+            draw_bones(axes, places[mode], bones, look, label=text)
+        label(axes, title, "metres")
+        axes.set(aspect="equal", xlim=(-extent, extent), ylim=(-extent, extent))
     if cost is not None:
         handles, labels = figure.axes[0].get_legend_handles_labels()
-        figure.legend(handles[::-1], labels[::-1], title="cost, nats", loc="outside right upper")
+        figure.legend(
+            handles[::-1], labels[::-1], title="cost, nats", loc="outside lower center",
+            ncols=len(handles), frameon=False,
+        )  # fmt: skip
     save_figure(figure, path, dpi=100)
 
 
