@@ -37,7 +37,8 @@ class CameraView(NamedTuple):
 
     Attributes:
         camera: Camera of the full-size images. All views share one world.
-        keypoints: 2D keypoints by frame of its video, pixels of the full-size images; None: none.
+        keypoints: 2D keypoints by frame of its video, pixels of the full-size images; frames after
+            the last of them have none. None: none at all.
         sigma: Noise of a wrist's keypoint, pixels of the full-size images; None: a share of the
             person's size.
         offset: Its frame at the time of the first view's frame 0.
