@@ -360,7 +360,7 @@ def test_dynamics_of_the_surface_spread_as_the_others() -> None:
 
 def test_the_setting_is_checked() -> None:
     assert Settings(prediction="surface").prediction == "surface"
-    with pytest.raises(ConfigurationError, match="velocity or surface"):
+    with pytest.raises(ConfigurationError, match="one of velocity, surface"):
         Settings(prediction="guess")  # type: ignore[arg-type]
     with pytest.raises(ConfigurationError, match="does not descend from samples"):
         Settings(prediction="surface", preset="ijrr_condensation")
