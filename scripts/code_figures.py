@@ -62,7 +62,7 @@ def main(config: Config) -> dict[str, Any]:
     for path in sorted(package.rglob("*.py")):
         source, name = path.read_text(encoding="utf-8"), str(path.relative_to(package))
         counted = count(source)
-        folder = figures["folders"].setdefault(room_of(path, package) or "ground", [0, 0])
+        folder = figures["folders"].setdefault(folder_of(path, package) or "ground", [0, 0])
         folder[0] += len(counted.lines)
         folder[1] += counted.tokens
         for function in functions(source):
@@ -110,7 +110,7 @@ def num_parameters(function: Function) -> int:
     return len(named) - (bool(named) and named[0].arg in ("self", "cls"))
 
 
-def room_of(path: Path, package: Path) -> str:
+def folder_of(path: Path, package: Path) -> str:
     """The folder that a file of the package counts with; '' for the ground."""
     parts = path.relative_to(package).parts
     return parts[0] if len(parts) > 1 else ""
@@ -145,7 +145,7 @@ def arrows(package: Path) -> dict[tuple[str, str], set[str]]:
     """
     found: dict[tuple[str, str], set[str]] = {}
     for path in sorted(package.rglob("*.py")):
-        own = room_of(path, package)
+        own = folder_of(path, package)
         for name in imports_of(path, package) if path != package / "__init__.py" else ():
             top, *below = name.split(".")
             if top != "torchcss":

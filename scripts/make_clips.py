@@ -204,7 +204,7 @@ def detected(config: Config, folder: Path, seed: int) -> None:
 def detector_noise(
     config: Config, hidden: Tensor, *, generator: torch.Generator
 ) -> Float[Tensor, "t j 2"]:
-    """Errors of the marks of all joints in all frames, in heights of the person."""
+    """Errors of the keypoints of all joints in all frames, in heights of the person."""
     num_frames, num_joints = hidden.shape
     offset, first, *later = torch.randn(
         1 + num_frames, num_joints, 2, generator=generator, dtype=torch.float64

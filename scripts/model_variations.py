@@ -23,7 +23,7 @@ from typing import Any
 
 import torch
 from common import Table, start, write_report
-from common.side_by_side import Entrants, by_name, cells_of
+from common.comparison import Entrants, by_name, cells_of
 
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from common import Table, start, write_report
-from common.side_by_side import Entrants, by_name, cells_of
+from common.comparison import Entrants, by_name, cells_of
 
 from torchcss.cli.options import SettingsOptions
 from torchcss.inference.tracker import Tracker

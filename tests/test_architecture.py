@@ -9,7 +9,7 @@ import ast
 from pathlib import Path
 
 import pytest
-from code_figures import arrows, imported, imports_of, room_of
+from code_figures import arrows, folder_of, imported, imports_of
 
 PACKAGE = Path(__file__).resolve().parents[1] / "torchcss"
 
@@ -100,7 +100,7 @@ def test_only_the_chain_knows_pytorch_kinematics() -> None:
 @pytest.mark.parametrize("library", ["av"])
 def test_costs_and_below_do_not_read_files(library: str) -> None:
     for path in modules():
-        if room_of(path, PACKAGE) in ("inference", "body", "vision", "cost", "initialise"):
+        if folder_of(path, PACKAGE) in ("inference", "body", "vision", "cost", "initialise"):
             assert not any(name.split(".")[0] == library for name in imports_of(path, PACKAGE)), (
                 path
             )

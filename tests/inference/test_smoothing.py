@@ -63,7 +63,7 @@ def test_path_is_the_best_of_all(t: int, points: bool):
             cost,
             times,
             Transition(velocity=(velocity, 2 * velocity)),
-            evidence=0.5,
+            likelihood_power=0.5,
         )
         path, least = plain.all_paths(
             mean.numpy(),
@@ -88,14 +88,14 @@ def test_path_leaves_a_mode_that_was_better_for_one_frame():
     assert jump.mode.tolist() == [0, 0, 0, 1, 0, 0, 0]
 
 
-def test_unequal_evidence_and_a_constant_offset():
+def test_unequal_powers_and_a_constant_offset():
     mean, cost, times = draw(6, 3, 2), 3 * draw(6, 3, seed=1), uneven_times(6)
     transition = Transition(velocity=5.0)
-    some = best_path(mean, None, cost, times, transition, evidence=0.3)
+    some = best_path(mean, None, cost, times, transition, likelihood_power=0.3)
     # Costs have no zero: the path does not depend on an offset by frame.
-    other = best_path(mean, None, cost + draw(6, 1), times, transition, evidence=0.3)
+    other = best_path(mean, None, cost + draw(6, 1), times, transition, likelihood_power=0.3)
     assert some.mode.tolist() == other.mode.tolist()
-    strong = best_path(mean, None, cost, times, transition, evidence=1e6)
+    strong = best_path(mean, None, cost, times, transition, likelihood_power=1e6)
     assert strong.mode.tolist() == cost.argmin(1).tolist()
 
 
@@ -162,8 +162,8 @@ def test_bad_paths_are_refused():
         best_path(mean / 0, None, cost, times, transition)
     with pytest.raises(ConfigurationError, match="times that increase"):
         best_path(mean, None, cost, times.flip(0), transition)
-    with pytest.raises(ConfigurationError, match="evidence"):
-        best_path(mean, None, cost, times, transition, evidence=0.0)
+    with pytest.raises(ConfigurationError, match="likelihood_power"):
+        best_path(mean, None, cost, times, transition, likelihood_power=0.0)
     with pytest.raises(ConfigurationError, match="velocities alone"):
         best_path(mean, None, cost, times, Transition(acceleration=50.0))
     with pytest.raises(ConfigurationError, match="velocity"):

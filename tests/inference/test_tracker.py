@@ -355,16 +355,16 @@ def test_modes_that_see_nothing_come_to_rest_inside_the_bounds(generator):
     assert float(state.velocity.abs().max()) < 1e-3
 
 
-def test_evidence_is_the_power_of_the_likelihood(generator):
+def test_likelihoods_count_by_their_power(generator):
     well = problems.DoubleWell(tilt=0.4)
-    for evidence in (1.0, 0.1):
-        tracker = replace(CSS, likelihood_power=evidence)
+    for power in (1.0, 0.1):
+        tracker = replace(CSS, likelihood_power=power)
         state, info = tracker.step(
             tracker.init(single(), generator=generator), SearchProblem(well), BOUNDS
         )
-        torch.testing.assert_close(state.mixture.weight, (-evidence * info.cost).softmax(0))
+        torch.testing.assert_close(state.mixture.weight, (-power * info.cost).softmax(0))
         assert info.parent.tolist() == [0, -1]
-        assert tracker.stated_power == evidence
+        assert tracker.stated_power == power
     # Frame after frame it adds up: the odds of two modes are those of all costs so far.
     assert float(info.cost[1] - info.cost[0]) > 0.5
     both = GaussianMixture(
@@ -419,7 +419,7 @@ def test_separation_keeps_modes_whose_landmarks_differ(generator):
     assert found(SearchProblem(Comb()), 2.8, 3) == [0, 1, -1]
 
 
-def step_of_rivals(generator, *, soft_matching: bool, evidence: float = 1.0):
+def step_of_rivals(generator, *, soft_matching: bool, likelihood_power: float = 1.0):
     """Of two modes the first has all the weight, and meets a rival that is cheaper, and alike."""
     tracker = replace(
         CSS,
@@ -427,7 +427,7 @@ def step_of_rivals(generator, *, soft_matching: bool, evidence: float = 1.0):
         num_modes=2,
         separation=1.6,
         soft_matching=soft_matching,
-        likelihood_power=evidence,
+        likelihood_power=likelihood_power,
     )
     past = GaussianMixture(
         torch.tensor([[1.4, 0.0], [0.0, 0.0]]).double(),

@@ -20,16 +20,16 @@ def path_cost(
     cost: np.ndarray,
     times: np.ndarray,
     velocity: np.ndarray,
-    evidence: float,
+    likelihood_power: float,
 ) -> float:
-    """Negative log of a path: evidence, and the densities of its motions relative to none."""
+    """Negative log of a path: costs, and the densities of its motions relative to none."""
     n, total = mean.shape[-1], 0.0
     nothing = np.zeros((n, n))
     x = [mean[t, k] for t, k in enumerate(path)]
     spread = [nothing if covariance is None else covariance[t, k] for t, k in enumerate(path)]
     for t, k in enumerate(path):
         if np.isfinite(cost[t]).any():
-            total += evidence * cost[t, k]
+            total += likelihood_power * cost[t, k]
         if t >= 1:
             motion = np.diag((velocity * (times[t] - times[t - 1])) ** 2)
             total += surprise(x[t] - x[t - 1], motion, spread[t] + spread[t - 1])

@@ -153,7 +153,7 @@ def test_every_script_that_tracks_is_among_them() -> None:
     tracking = (
         *("TrackingSession", "track_video", "track_sequence", "track_together", "run_demo"),
         "session_of",
-        *("side_by_side", "evaluate_posterior as posterior"),
+        *("common.comparison", "evaluate_posterior as posterior"),
     )
     found = {
         path.stem

@@ -44,7 +44,7 @@ def together(
     return list(track_together(sequence, runs, thresholds, stop=stop, **options))
 
 
-def test_side_by_side_is_as_alone(sequence: RecordedSequence, begin: Start) -> None:
+def test_together_is_as_alone(sequence: RecordedSequence, begin: Start) -> None:
     counts: list[tuple[int, int]] = []
     presets = ("css", "ijrr_condensation")
     both = together(sequence, begin, *presets, progress=lambda *count: counts.append(count))

@@ -43,8 +43,8 @@ def cost_of(
     """
     body, camera = a_body_before_a_camera(dtype)
     truth, term = moved(body, angle), SegmentationTerm()
-    likeness = painted(body, camera, truth, missing)
-    images = term.images(likeness, layers(body)[1], camera, body, truth)
+    ratio = painted(body, camera, truth, missing)
+    images = term.images(ratio, layers(body)[1], camera, body, truth)
     colours = Ready(term, term.bind(images))
     choice = CostChoice().without("contour", "joints").having(colours)
     view = FrameContext(body=body, camera=camera, deviation=body.motion_rate / 25)

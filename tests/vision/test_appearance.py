@@ -27,13 +27,13 @@ def test_pixels_look_like_what_they_were_learnt_to_be(dtype: torch.dtype) -> Non
     known = Appearance.unknown(2, like=image).learn(
         image, torch.stack([thing, ~thing & False]), torch.stack([~thing, ~thing & False])
     )
-    likeness = known.foreground_ratio(image)
-    assert likeness.shape == (2, 40, 60)
-    assert likeness.dtype == dtype
-    assert float(likeness[0, 12, 25]) > 0.95
-    assert float(likeness[0, 5, 5]) < -0.95
-    assert abs(float(likeness[0, 21, 25])) < 0.5, "grey is both"
-    assert not likeness[1].any(), "a thing never seen looks like nothing"
+    ratio = known.foreground_ratio(image)
+    assert ratio.shape == (2, 40, 60)
+    assert ratio.dtype == dtype
+    assert float(ratio[0, 12, 25]) > 0.95
+    assert float(ratio[0, 5, 5]) < -0.95
+    assert abs(float(ratio[0, 21, 25])) < 0.5, "grey is both"
+    assert not ratio[1].any(), "a thing never seen looks like nothing"
     stranger = torch.full_like(image, 0.02)
     assert float(known.foreground_ratio(stranger)[0].abs().max()) < 1e-6
 
@@ -44,10 +44,10 @@ def test_the_ratio_is_that_of_the_posteriors() -> None:
     thing = torch.rand(64, 64, generator=generator) < 0.3
     known = Appearance.unknown(1, like=image).learn(image, thing[None], ~thing[None])
     assert float(known.inside.sum()) == pytest.approx(1.0)
-    likeness = known.foreground_ratio(image)
-    assert float(likeness.abs().max()) <= 1.0
+    ratio = known.foreground_ratio(image)
+    assert float(ratio.abs().max()) <= 1.0
     # The same colours inside and out: nothing to tell them apart on average.
-    assert abs(float(likeness[0][thing].mean() - likeness[0][~thing].mean())) < 0.6
+    assert abs(float(ratio[0][thing].mean() - ratio[0][~thing].mean())) < 0.6
 
 
 def test_old_colours_are_forgotten_by_degrees_and_too_few_pixels_teach_nothing() -> None:

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchcss.errors import ShapeError
-from torchcss.vision.boundaries import carried, motion_boundaries
+from torchcss.vision.boundaries import displaced, motion_boundaries
 from torchcss.vision.flow import TRACKING, OpticalFlow, robust_flow
 
 
@@ -100,7 +100,7 @@ def test_carried_outliers_move_with_the_picture(shift: tuple[float, float]) -> N
     outlier = torch.zeros(2, 20, 30)
     outlier[0, 8:12, 10:12] = 1.0
     flow = torch.tensor(shift)[:, None, None].expand(2, 2, 20, 30)
-    there = carried(outlier, flow, reach=3)
+    there = displaced(outlier, flow, reach=3)
     u, v = math.floor(shift[0]), math.floor(shift[1])
     assert not there[1].any()
     if u == 40:

@@ -40,7 +40,7 @@ def test_carried_marks(size, monkeypatch, generator):
     marks[marks < 0.3] = 0.0
     moves = 4 * torch.randn(2, 2, *size, generator=generator)
     moves[0, 0, 0, 0] = torch.nan
-    got, expected = both(monkeypatch, lambda: boundaries.carried(marks, moves, reach=3))
+    got, expected = both(monkeypatch, lambda: boundaries.displaced(marks, moves, reach=3))
     torch.testing.assert_close(got, expected, rtol=0, atol=2e-6)
 
 

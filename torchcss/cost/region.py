@@ -86,7 +86,7 @@ def layer_of_part(body: BodyModel) -> Int[Tensor, " parts"]:
 def region_field(
     ratio: Float[Tensor, "layers h w"], *, window: Window | None = None, smoothing: float = 3.0
 ) -> SplineField:
-    """Make the likenesses of a frame, or of a window of it, smooth functions.
+    """Make the foreground ratios of a frame, or of a window of it, smooth functions.
 
     Args:
         ratio: How much each pixel looks like each layer, in -1..1.
@@ -169,10 +169,10 @@ def _window(mask: Bool[Tensor, "h w"], margin: int) -> tuple[EllipsisType, slice
 
 
 class RegionImages(NamedTuple):
-    """The likenesses of a frame, and which of them each contour node looks at.
+    """The foreground ratios of a frame, and which of them each contour node looks at.
 
     Attributes:
-        field: The likenesses as smooth functions, one a layer.
+        field: The foreground ratios as smooth functions, one a layer.
         layer: Layer of each contour node.
         origin: Column and row of the frame where `field` begins.
     """

@@ -149,7 +149,7 @@ class ChainSum(NamedTuple):
 
     Attributes:
         cost: Costs of the frames.
-        evidence: Factor on them.
+        likelihood_power: Factor on them.
         times: Seconds.
         transition: What motion is to be expected.
         changes: Where coordinates change.
@@ -157,7 +157,7 @@ class ChainSum(NamedTuple):
     """
 
     cost: Differentiable
-    evidence: float
+    likelihood_power: float
     times: Float[Tensor, " t"]
     transition: Transition
     changes: Changes
@@ -166,7 +166,7 @@ class ChainSum(NamedTuple):
     def at(self, x: Trajectory) -> Chain:
         """The model of the sum at a state."""
         model = self.cost.local_model(x.to(self.dtype))
-        frames = LocalModel(*(self.evidence * part.detach().double() for part in model))
+        frames = LocalModel(*(self.likelihood_power * part.detach().double() for part in model))
         return Chain.of(frames, motion_terms(x, self.times, self.transition, self.changes))
 
 

@@ -5,7 +5,7 @@ modes of an earlier one was right, and a motion that is possible tells where in 
 
 `best_path` chooses one mode per frame, by dynamic programming (Viterbi 1967) over
 
-    sum_t  evidence * cost_t(k_t)  -  sum_t log N(x_t - x_t-1; 0, Q_t + Sigma_t-1 + Sigma_t)
+    sum_t  power * cost_t(k_t)  -  sum_t log N(x_t - x_t-1; 0, Q_t + Sigma_t-1 + Sigma_t)
 
 `refine` then moves the states of the path together, to the least of
 
@@ -22,7 +22,7 @@ so do the covariances, the diagonal blocks of its inverse.
 Both terms are deviations per frame and not densities of a Wiener process: errors of images persist
 over frames, so that more frames per second are not more evidence, and with terms that scale in the
 same way the smoothing of a motion does not depend on the frame rate. For the same reason a cost
-counts less than its nats when frames are weighed against each other: the parameter `evidence`, as
+counts less than its nats when frames are weighed against each other: `likelihood_power`, as
 `Tracker.likelihood_power` does while tracking.
 
 Where the coordinates of the state change between frames (a body is hung on another base),
@@ -139,7 +139,7 @@ def best_path(
     times: Float[Tensor, " t"],
     transition: Transition,
     *,
-    evidence: float = 1.0,
+    likelihood_power: float = 1.0,
     changes: Changes | None = None,
     period: Vector | None = None,
 ) -> Path:
@@ -152,7 +152,7 @@ def best_path(
             A frame without any is passed over: all its modes cost the same.
         times: Seconds, increasing; gaps make steps longer.
         transition: What velocities are to be expected; accelerations are for `refine`.
-        evidence: Factor on the costs.
+        likelihood_power: Factor on the costs.
         changes: Where coordinates change, see the module's page.
         period: Period of each parameter, infinite for most: differences are taken the short way.
 
@@ -161,12 +161,12 @@ def best_path(
 
     Raises:
         ShapeError: If the shapes do not agree, or a mode of finite cost is not finite.
-        ConfigurationError: If the times do not increase, the evidence is not positive, or the
-            transition judges accelerations.
+        ConfigurationError: If the times do not increase, the likelihood power is not positive, or
+            the transition judges accelerations.
     """
     if transition.judges_acceleration:
         raise ConfigurationError("best_path: it judges velocities alone; leave accelerations out")
-    state, spread, node = _checked_modes(mean, covariance, cost, evidence)
+    state, spread, node = _checked_modes(mean, covariance, cost, likelihood_power)
     motion, _ = transition.deviations(_checked_times(times, len(state)), state.shape[-1])
     edges = []
     for step, deviation in enumerate(motion):
@@ -180,7 +180,7 @@ def best_path(
 
 
 def _checked_modes(
-    mean: Tensor, covariance: Tensor | None, cost: Tensor, evidence: float
+    mean: Tensor, covariance: Tensor | None, cost: Tensor, power: float
 ) -> tuple[Float[Tensor, "t k n"], Float[Tensor, "t k n n"] | None, Float[Tensor, "t k"]]:
     """Means, covariances and what each mode costs the path, in float64."""
     check_shape("mean", mean, None, None, None)
@@ -188,8 +188,8 @@ def _checked_modes(
     check_shape("cost", cost, t, k)
     if covariance is not None:
         check_shape("covariance", covariance, t, k, n, n)
-    if not evidence > 0:
-        raise ConfigurationError(f"best_path: expected a positive evidence, got {evidence}")
+    if not power > 0:
+        raise ConfigurationError(f"best_path: expected a positive likelihood_power, got {power}")
     if bool(cost.isnan().any()):
         raise ShapeError("best_path: costs hold NaN; expected numbers, inf for a missing mode")
     present, finite = cost.isfinite(), mean.isfinite().all(-1)
@@ -197,7 +197,7 @@ def _checked_modes(
         finite = finite & covariance.isfinite().flatten(-2).all(-1)
     if not bool(finite[present].all()):
         raise ShapeError("best_path: expected finite means and covariances of the modes")
-    node = torch.where(present.any(1, keepdim=True), evidence * cost.double(), 0.0)
+    node = torch.where(present.any(1, keepdim=True), power * cost.double(), 0.0)
     return mean.double(), None if covariance is None else covariance.double(), node
 
 

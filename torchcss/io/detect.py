@@ -130,8 +130,8 @@ class MediaPipe:
         self._last_ms = max(self._last_ms + 1, round(1000 * frame.time_s))
         with _quiet():
             found = self._landmarker.detect_for_video(image, self._last_ms)
-        marks = [[(m.x, m.y, m.visibility) for m in person] for person in found.pose_landmarks]
-        joints = np.array(marks, dtype=np.float64).reshape(-1, 33, 3)
+        landmarks = [[(m.x, m.y, m.visibility) for m in person] for person in found.pose_landmarks]
+        joints = np.array(landmarks, dtype=np.float64).reshape(-1, 33, 3)
         joints[..., :2] = joints[..., :2] * (pixels.shape[1], pixels.shape[0]) - 0.5
         sure = joints[..., 2:] > _LEAST_VISIBILITY
         joints[..., 2] **= 2

@@ -30,7 +30,7 @@ from torchcss.types import Vector
 from torchcss.vision.camera import Camera
 
 MARKED = (*LIMB_JOINTS, "vc7", "skull_tip")
-"""The joints that a person marks: those of the limbs, the base of the neck, the top of the head."""
+"""The joints of the keypoints: those of the limbs, the base of the neck, the top of the head."""
 
 
 class Person(NamedTuple):

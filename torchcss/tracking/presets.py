@@ -432,7 +432,7 @@ def make_tracker(
             num_modes=num_modes,
             optimiser=row.optimiser,
         )
-    evidence = row.power_arm if arm and row.power_arm is not None else row.likelihood_power
+    power = row.power_arm if arm and row.power_arm is not None else row.likelihood_power
     # Who searches by noise adds it in the proposal; the dynamics themselves then add none.
     if isinstance(proposal, (ChamRehg, Condensation)):
         proposal, dynamics = replace(proposal, deviation=noise), replace(dynamics, deviation=0.0)
@@ -446,7 +446,7 @@ def make_tracker(
         capped=row.capped,
         keep_alike=row.keep_alike,
         forgetting=row.forgetting,
-        likelihood_power=evidence,
+        likelihood_power=power,
         survivors=row.survivors_arm if arm else row.survivors_body,
         dynamics=dynamics,
         separation=row.separation,

@@ -175,7 +175,7 @@ def _all_in_view(body: BodyModel, track: TrackedModes, choice: Smoothing) -> Smo
         node,
         track.times,
         Transition(velocity=tuple(body.motion_rate.tolist())),
-        evidence=choice.likelihood_power,
+        likelihood_power=choice.likelihood_power,
         changes=changes,
         period=period,
     )

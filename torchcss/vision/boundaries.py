@@ -10,7 +10,7 @@ term and a Gaussian blur G_s of s pixels:
     potential  S_p = 1 - B
 
 The flow is known on the grid of the frame before, and the edges are those of this frame: outliers
-are `carried` along the flow first.
+are `displaced` along the flow first.
 
 The sign deserves a word: with W = 1 - k S_p the text wants k = 1 to exclude every edge that is
 *not* on a motion boundary, so S_p is low on boundaries and 1 elsewhere, a potential with the
@@ -81,14 +81,14 @@ def motion_boundaries(
             f"flow: expected two numbers for each pixel of smoothness_outlier "
             f"{list(outlier.shape)}, got {list(flow.flow.shape)}"
         )
-    outlier = carried(outlier, flow.flow, reach=math.ceil(2 * smoothing))
+    outlier = displaced(outlier, flow.flow, reach=math.ceil(2 * smoothing))
     blurred = gaussian_blur(outlier, smoothing)
     squared = (math.sqrt(0.5 * math.pi) * smoothing * blurred).square()
     strength = squared / (squared + half_strength_line**2)
     return MotionBoundaries(strength, 1.0 - strength)
 
 
-def carried(outlier: Images, flow: Float[Tensor, "*batch 2 h w"], *, reach: int) -> Images:
+def displaced(outlier: Images, flow: Float[Tensor, "*batch 2 h w"], *, reach: int) -> Images:
     """Outliers of the flow's smoothness on the grid of the frame that the flow leads to.
 
     A boundary moves with what is in front, which the flow does not tell: each outlier goes where
@@ -101,17 +101,17 @@ def carried(outlier: Images, flow: Float[Tensor, "*batch 2 h w"], *, reach: int)
         reach: How far from a boundary both sides move as they are, pixels.
     """
     height, width = outlier.shape[-2:]
-    marks, moves = outlier.reshape(-1, height, width), flow.reshape(-1, 2, height, width)
-    if has_kernels(marks) and moves.dtype == marks.dtype:
+    outliers, moves = outlier.reshape(-1, height, width), flow.reshape(-1, 2, height, width)
+    if has_kernels(outliers) and moves.dtype == outliers.dtype:
         from torchcss.vision import flow_kernels
 
-        arrived = marks.new_zeros(len(marks), 5, height, width)
-        for mark, move, into in zip(marks, moves, arrived, strict=True):
+        arrived = outliers.new_zeros(len(outliers), 5, height, width)
+        for mark, move, into in zip(outliers, moves, arrived, strict=True):
             run(flow_kernels.displace, mark, move.contiguous(), reach, _LEAST_OUTLIER, into)
         return arrived.amax(1).clamp(max=1.0).reshape(outlier.shape)
-    found = torch.zeros_like(marks).flatten()
-    image, row, column = torch.nonzero(marks > _LEAST_OUTLIER, as_tuple=True)
-    mark = marks[image, row, column]
+    found = torch.zeros_like(outliers).flatten()
+    image, row, column = torch.nonzero(outliers > _LEAST_OUTLIER, as_tuple=True)
+    mark = outliers[image, row, column]
     for down, right in ((0, 0), (0, reach), (0, -reach), (reach, 0), (-reach, 0)):
         side = (row + down).clamp(0, height - 1), (column + right).clamp(0, width - 1)
         move = moves[image, :, *side]

@@ -284,7 +284,7 @@ def structure(image, scale, step, num_steps, along, across, smooth):  # type: ig
 
 @entry
 def displace(outliers, flow, reach, least, arrived):  # type: ignore[no-untyped-def]
-    """Add outliers where five neighbours of each go, see `torchcss.vision.boundaries.carried`.
+    """Add outliers where five neighbours of each go, see `torchcss.vision.boundaries.displaced`.
 
     Args:
         outliers: `[h w]`.

@@ -87,13 +87,13 @@ def make_skeleton(body: BodyModel) -> Skeleton:
     Args:
         body: Any body; one from a URDF keeps all its joints, named by their links.
     """
-    links, marks = body.tree.link_names, _landmarks(body)
+    links, landmarks = body.tree.link_names, _landmarks(body)
     specifications = body.tree.specifications
     children = [joint.parent for joint in specifications]
     # The first landmark at a link's origin; and whether more hangs on the link than the next joint
     # at its origin.
-    name_at = {link: name for name, link, point in reversed(marks) if not any(point)}
-    busy = {link: any(any(point) for _, on, point in marks if on == link) for link in links}
+    name_at = {link: name for name, link, point in reversed(landmarks) if not any(point)}
+    busy = {link: any(any(point) for _, on, point in landmarks if on == link) for link in links}
 
     nodes: list[Node] = []
     named: list[bool] = []
@@ -131,7 +131,7 @@ def make_skeleton(body: BodyModel) -> Skeleton:
             nodes.append(node._replace(parent=at))
             named.append(own_name is not None)
     used = {node.name for node, has in zip(nodes, named, strict=True) if has}
-    for name, link, point in marks:
+    for name, link, point in landmarks:
         if name not in used:
             used.add(name)
             nodes.append(Node(name, owner[link], links.index(link), point))

@@ -138,21 +138,21 @@ def plant_feet(body: BodyModel, states: Trajectory) -> Trajectory:
         states: The motion; hip, knee and ankle angles are taken from its first state only.
     """
     names = [f"{side}_{place}" for side in "lr" for place in ("heel", "midtarsal", "toe")]
-    marks = torch.tensor([body.joint_index(name) for name in names])
+    soles = torch.tensor([body.joint_index(name) for name in names])
     columns = torch.tensor([
         body.state_index(f"{side}_{angle}")
         for side in "lr"
         for angle in ("hip_flexion", "hip_abduction", "hip_twist", "knee_flexion", "ankle_flexion")
     ])  # fmt: skip
-    link = body.marker_link[marks]
-    goal = body.pose(states[0]).joints[marks]
+    link = body.marker_link[soles]
+    goal = body.pose(states[0]).joints[soles]
     planted = states.clone()
     planted[:, columns] = states[0, columns]
     identity = torch.eye(3).to(states).expand(len(names), 3, 3)
     damping = 1e-5 * torch.eye(len(columns)).to(states)
     for _ in range(20):
         pose = body.pose(planted)
-        points = pose.joints[:, marks]
+        points = pose.joints[:, soles]
         apart = points - goal
         cost = PointCost(
             0.5 * apart.square().sum(-1), apart, identity.expand(len(states), -1, 3, 3)

@@ -123,7 +123,7 @@ def robot_sequence(
 
     Args:
         body: What `robot_arm` gives.
-        generator: Source of the motion, the room, the paint and the sensor noise.
+        generator: Source of the motion, the background, the paint and the sensor noise.
         middle: See `swing`.
         amplitude: See `swing`.
         num_frames: Number of frames.
@@ -148,7 +148,7 @@ def film_robot(
     Args:
         body: A body whose parts are about as long as its links.
         states: Its motion.
-        generator: Source of the room, the paint and the sensor noise.
+        generator: Source of the background, the paint and the sensor noise.
         cameras: Who looks; by default one camera that sees all of the motion.
         frame_rate: Frames per second.
 
@@ -163,7 +163,7 @@ def film_robot(
         away = torch.tensor([0.45, 0.25, 1.0], dtype=torch.float64)
         eye = centre + 1.1 * size * 700 / 480 * away / away.norm()
         cameras = [look_at(eye.tolist(), centre.tolist(), focal_px=700.0, name="robot")]
-    rooms = [
+    backgrounds = [
         clutter_background(*reversed(camera.image_size_wh), generator=generator)
         for camera in cameras
     ]
@@ -185,10 +185,10 @@ def film_robot(
         )  # fmt: skip
     return [
         film_parts(
-            body, states, painted, camera=camera, background=room, lighting=lighting,
+            body, states, painted, camera=camera, background=background, lighting=lighting,
             frame_rate=frame_rate, generator=generator,
         )
-        for camera, room in zip(cameras, rooms, strict=True)
+        for camera, background in zip(cameras, backgrounds, strict=True)
     ]  # fmt: skip
 
 

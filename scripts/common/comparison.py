@@ -1,4 +1,4 @@
-"""Trackers by name, run side by side on a sequence."""
+"""Trackers by name, compared on a sequence."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Entrants = Mapping[str, tuple[Settings, Start, Plan]]
 """What is run: settings, first pose and plan by name."""
 
 
-def side_by_side(
+def summaries(
     sequence: RecordedSequence, entrants: Entrants, frames: int
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """Run trackers on the first frames of a sequence, with a progress bar.
@@ -65,7 +65,7 @@ def by_name(
     for seed in seeds:
         named = entrants(seed)
         runs |= {name: runs.get(name, []) for name in named}
-        for name, summary in side_by_side(sequence, named, frames):
+        for name, summary in summaries(sequence, named, frames):
             runs[name].append(summary)
     return {name: over_seeds(each) for name, each in runs.items() if each}
 
