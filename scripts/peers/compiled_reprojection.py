@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -15,11 +15,12 @@ from torchcss.cost.fused.records import Array, Points, Result, Tree
 from torchcss.errors import ConfigurationError, check_shape
 from torchcss.kernels.checked import run
 from torchcss.studies.reprojection import ReprojectionCost
-from torchcss.types import LocalModel
+from torchcss.types import BlendedCost, LocalModel
 
 
-class CompiledReprojection(NamedTuple):
-    """A `ReprojectionCost` that is evaluated by compiled kernels; a `BlendedCost`.
+@dataclass(frozen=True)
+class CompiledReprojection(BlendedCost):
+    """A `ReprojectionCost` that is evaluated by compiled kernels.
 
     In double precision, one state after the other: no result depends on the batch.
 

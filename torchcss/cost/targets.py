@@ -26,7 +26,7 @@ from torchcss.body.uncertainty import point_jacobian
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.errors import ShapeError, check_shape
-from torchcss.types import LocalModel, PointCost
+from torchcss.types import BlendedCost, LocalModel, PointCost
 
 States = Float[Tensor, "*batch m"]
 
@@ -35,7 +35,7 @@ _CORNERS = ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 
 
 
 @dataclass(frozen=True, kw_only=True)
-class PointTargets:
+class PointTargets(BlendedCost):
     """Squared distances of points from where they should be; a `CostFunction`.
 
     Attributes:

@@ -37,7 +37,16 @@ from torchcss.cost.stabiliser import Stabiliser
 from torchcss.errors import BodyError, CameraError, check_shape
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.robust import Lorentzian, Quadratic, RobustPotential
-from torchcss.types import Bounds, LocalModel, Modes, Numbers, PointCost, Vector, Vectors
+from torchcss.types import (
+    BlendedCost,
+    Bounds,
+    LocalModel,
+    Modes,
+    Numbers,
+    PointCost,
+    Vector,
+    Vectors,
+)
 from torchcss.vision.camera import Camera
 
 WIDTH, HEIGHT, FOCAL_PX = 1920, 1080, 1900.0
@@ -61,7 +70,7 @@ _VECTOR = 32
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReprojectionCost:
+class ReprojectionCost(BlendedCost):
     """Reprojection error of joint centres and sticky priors; a `CostFunction`.
 
     A joint that the camera cannot see (behind it) costs as much as one that is missed by the
