@@ -9,6 +9,7 @@ clip:
 | fault | what happens |
 |---|---|
 | kill | a process is killed |
+| crash | a clip kills whoever tracks it: it is failed, and tried again later |
 | sleep | a process is stopped, taken over, and woken up |
 | end | a process is asked to end, as schedulers do: within ten seconds, with status 0 |
 | group | a process of torchrun is killed, which starts all of them again |
@@ -34,7 +35,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,7 +43,7 @@ from typing import Any
 import numpy as np
 from common import Table, start, write_report
 
-from torchcss.app.batch import Batch
+from torchcss.app.batch import MOST_DEATHS, Batch
 from torchcss.io.tracks import load_track
 from torchcss.studies.demo import CLIP
 from torchcss.tracking.settings import Settings
@@ -79,7 +80,8 @@ class Config:
     patience: float = 2.0
     """Seconds until a process that shows no life is taken over."""
     faults: tuple[str, ...] = (
-        "kill", "sleep", "end", "disk", "video", "folder", "group", "torchrun", "join", "clock",
+        "kill", "crash", "sleep", "end", "disk", "video", "folder", "group", "torchrun", "join",
+        "clock",
     )  # fmt: skip
     """What is tried, in turns."""
     folder: Path = Path("faults")
@@ -157,11 +159,11 @@ class Round:
         with (self.folder / "printed.txt").open("ab") as printed:
             return subprocess.Popen(words, stdout=printed, stderr=printed, env=environment)
 
-    def again(self) -> None:
+    def again(self, *, retry_failed: bool = False) -> None:
         """The same command, here, when the cause is gone."""
         Batch(
             manifest=self.folder / "clips.jsonl", out=self.out, settings=SETTINGS,
-            patience=self.config.patience,
+            patience=self.config.patience, retry_failed=retry_failed,
         ).run()  # fmt: skip
 
     def wait_for(self, what: Callable[[], bool], process: subprocess.Popen[bytes]) -> None:
@@ -189,6 +191,22 @@ def kill(batch: Round) -> None:
     processes[0].kill()
     for process in processes:
         process.wait(_LATE_S)
+
+
+def crash(batch: Round) -> None:
+    """SIGKILL in the midst of a clip, whoever tracks it; those that died start again."""
+    frames = batch.moment.randrange(batch.config.frames)
+    deadly = "import os; from torchcss.app.batch import _Watch as W; add = W.add; "
+    deadly += "W.add = lambda w, f, p: os.kill(os.getpid(), 9) if w._claim.name == 'clip0' "
+    deadly += f"and f.frame.index >= {frames} else add(w, f, p); "
+    for _ in range(MOST_DEATHS + 1):
+        processes = [batch.begin(deadly) for _ in range(batch.config.processes)]
+        if not any([process.wait(_LATE_S) for process in processes]):
+            break
+    else:
+        raise Lost("a clip that kills its processes was not given up")
+    _expect(f"died {MOST_DEATHS} times" in batch.printed, "a deadly clip: not told")
+    batch.again(retry_failed=True)
 
 
 def sleep(batch: Round) -> None:
@@ -284,7 +302,8 @@ def _children(process: subprocess.Popen[bytes]) -> list[int]:
 
 
 FAULTS = {
-    f.__name__: f for f in (kill, sleep, end, disk, video, folder, group, torchrun, join, clock)
+    fault.__name__: fault
+    for fault in (kill, crash, sleep, end, disk, video, folder, group, torchrun, join, clock)
 }
 _UNABLE: dict[str, tuple[bool, str]] = {
     "folder": (os.geteuid() == 0, "root may write everywhere"),
@@ -336,12 +355,27 @@ def main(config: Config) -> dict[str, Any]:
             rows.append([number, name, "nothing lost"])
             shutil.rmtree(batch.folder)
         print(*rows[-1], flush=True)
-    table = Table("Faults", ("round", "fault", "outcome"), rows)
+    table = Table("Batches disturbed", ("fault", "rounds", "lost"), summed(rows))
     table.print()
-    lost = sum(str(row[2]).startswith("lost") for row in rows)
-    report = {"rounds": len(rows), "lost": lost, "rows": rows}
+    report = {"rounds": len(rows), "lost": table.rows[-1][2], "rows": rows}
     write_report(config.out, report, table)
     return report
+
+
+def summed(rows: Sequence[Sequence[Any]]) -> list[list[str | float | None]]:
+    """Rounds and losses of each fault, and of all that was tried."""
+    outcomes: dict[str, list[str]] = {}
+    for _, fault, outcome in rows:
+        outcomes.setdefault(fault, []).append(outcome)
+        if not outcome.startswith("left out"):
+            outcomes.setdefault("all", []).append(outcome)
+    outcomes["all"] = outcomes.pop("all", [])  # below the others
+    return [
+        [fault, len(ended), ended[0]]
+        if ended and ended[0].startswith("left out")
+        else [fault, len(ended), sum(each.startswith("lost") for each in ended)]
+        for fault, ended in outcomes.items()
+    ]
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ import pytest
 from torchcss.app.batch import Batch, Job, _go_on_from, _track, read_manifest
 from torchcss.app.claims import Claims
 from torchcss.errors import ConfigurationError
+from torchcss.io.checkpoint import Checkpoint, write_checkpoint
 from torchcss.io.run import Run
 from torchcss.studies.demo import CLIP
 from torchcss.tracking.settings import Settings
@@ -115,6 +116,81 @@ def test_who_was_taken_over_says_nothing_of_the_clip(tmp_path: Path) -> None:
     assert job.claims.take("a") is not None
     _track(job, clip, claim)
     assert job.failure(clip) is None
+
+
+@pytest.mark.parametrize(
+    ("ends", "dead"),
+    [
+        ("0 0 0", True),
+        ("0 2 2 2", True),
+        ("2 2", False),
+        ("0 1 2 3", False),
+        ("2 2 2 end", False),
+        ("2 2 end 2", False),
+    ],
+)
+def test_a_clip_whose_owners_die_at_one_place_is_failed(
+    tmp_path: Path, ends: str, dead: bool
+) -> None:
+    """An owner has died with some frames done, or was asked to end, as schedulers do."""
+    manifest = write_manifest(tmp_path, {"name": "a", "video": "none.mp4"})
+    job = Job.begin(Batch(manifest=manifest, out=tmp_path / "out", settings=SETTINGS))
+    for end in ends.split():
+        claim = job.claims.take("a", gone=True)
+        assert claim is not None
+        place = tmp_path / "out" / ".batch" / "work" / "a" / str(claim.generation)
+        place.mkdir(parents=True)
+        write_checkpoint(place, Checkpoint(2 if end == "end" else int(end), {}))
+        if end == "end":
+            claim.release()
+    for fails in (dead, False):
+        claim = job.claims.take("a", gone=True)
+        assert claim is not None
+        _track(job, job.clips[0], claim)
+        line = (job.failure(job.clips[0]) or {})["line"]
+        assert ("died 3 times" in line) == fails, line
+        job = Job.begin(
+            Batch(manifest=manifest, out=tmp_path / "out", settings=SETTINGS, retry_failed=True)
+        )
+
+
+DEADLY = """
+import os, signal, sys
+from torchcss.app import batch
+
+add = batch._Watch.add
+
+def add_or_die(watch, frame, picture):
+    if watch._claim.name == "deadly" and frame.frame.index:
+        os.kill(os.getpid(), signal.SIGKILL)
+    add(watch, frame, picture)
+
+batch._Watch.add = add_or_die  # in the processes that it starts, too
+if __name__ == "__main__":
+    sys.exit(batch.main())
+"""
+
+
+def test_a_clip_that_kills_its_processes_ends_no_batch(tmp_path: Path) -> None:
+    names = ("deadly", "a", "b")
+    manifest = write_manifest(tmp_path, *({"name": name} for name in names))
+    (tmp_path / "deadly.py").write_text(DEADLY)
+    words = ["--body=arm8", "--samples=4", "--modes=2", "--keypoints-use=first", "--no-overlay"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    out = tmp_path / "out"
+    ended = subprocess.run(
+        [sys.executable, str(tmp_path / "deadly.py"), str(manifest), *words, f"--out={out}",
+         "--workers=2", "--patience=2"],
+        env=environment, text=True, capture_output=True, timeout=600,
+    )  # fmt: skip
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout.count("died with its clip; another one starts") == 3
+    clips = json.loads((out / "batch.json").read_text())["clips"]
+    assert [clips[name]["kind"] for name in names] == ["failed", "done", "done"]
+    assert "died 3 times with 1 frames done" in clips["deadly"]["about"]
+    assert (out / ".batch" / "work" / "deadly" / "4" / "checkpoint.npz").is_file()
+    Batch(manifest=manifest, out=out, settings=SETTINGS, retry_failed=True).run()
+    assert json.loads((out / "batch.json").read_text())["done"] == 3
 
 
 def test_other_results_are_not_taken_for_the_batch_s(tmp_path: Path) -> None:

@@ -6,7 +6,9 @@
 What is true lies in the folder and nowhere else. A process claims a clip (`torchcss.app.claims`),
 tracks it in a folder of that claim, going on from what an earlier claim left, and publishes it by
 renaming that folder to the clip's name. Whoever was taken over meanwhile writes into a folder that
-nobody looks at, and publishes nothing. The same command goes on with an interrupted batch.
+nobody looks at, and publishes nothing. The same command goes on with an interrupted batch. A clip
+whose owners die one after the other at the same place, by a crash or for want of memory, is failed
+before it ends all processes.
 
     OUT/NAME/                a clip that is done, as `torchcss track` leaves it
     OUT/batch.json, .html    the state of every clip
@@ -32,13 +34,15 @@ import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import asdict, dataclass, field
+from multiprocessing.connection import wait
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 from urllib.parse import quote
 
 import tyro
 
-from torchcss.app.claims import Claim, Claims
+from torchcss.app.claims import Claim, Claims, process_name
 from torchcss.app.recorder import Picture, ended_by_sigterm
 from torchcss.app.track import TrackOptions, track_video
 from torchcss.errors import ConfigurationError, OutputError, TorchcssError
@@ -51,7 +55,7 @@ from torchcss.files import (
     unexpected,
     write_text,
 )
-from torchcss.io.checkpoint import CHECKPOINT_NAME
+from torchcss.io.checkpoint import CHECKPOINT_NAME, read_checkpoint
 from torchcss.io.tracks import TRACK_NAME
 from torchcss.io.video import VideoReader
 from torchcss.joint_names import names_in
@@ -74,6 +78,9 @@ _NUMBERS = {
 _COLUMNS = ("name", "start", "stop", *FILES, *OPTIONS, *SETTINGS)
 _FOLDER = re.compile(r"(?!\.|batch\.(json|html)$)[^\0-\x1f\ud800-\udfff]+")
 """Names of clips: not hidden, not the batch's own files, and of signs that can be written."""
+
+MOST_DEATHS = 3
+"""Owners of a clip that may die at the same place of it, one after the other."""
 
 _POLL_S = 0.5
 
@@ -120,20 +127,34 @@ class Batch:
             print(job.report())
 
     def _with_workers(self, job: Job) -> None:
-        """Start processes, and wait for them."""
+        """Start processes, and wait for them; for one that died with a clip, another starts."""
         os.environ["OMP_NUM_THREADS"] = "1"  # for those that start now
-        spawn = multiprocessing.get_context("spawn")
-        workers = [spawn.Process(target=_worker, args=(job,)) for _ in range(self.workers)]
+        workers: list[BaseProcess] = []
         try:
-            for worker in workers:
-                worker.start()
-            for worker in workers:
-                worker.join()
+            for _ in range(self.workers):
+                workers.append(_started(job))
+            while workers:
+                wait([worker.sentinel for worker in workers])
+                for worker in [each for each in workers if not each.is_alive()]:
+                    workers.remove(worker)
+                    # One that died before it had a clip would do so again.
+                    if worker.pid is not None and job.is_held_by(worker.pid):
+                        print(
+                            f"process {worker.pid} died with its clip; another one starts",
+                            flush=True,
+                        )
+                        workers.append(_started(job))
         finally:
             for worker in workers:
                 worker.terminate()
             for worker in workers:
                 worker.join()
+
+
+def _started(job: Job) -> BaseProcess:
+    process = multiprocessing.get_context("spawn").Process(target=_worker, args=(job,))
+    process.start()
+    return process
 
 
 def _worker(job: Job) -> None:
@@ -335,6 +356,12 @@ class Job(NamedTuple):
         """Whether a clip is to be tracked."""
         return not self.is_done(clip) and self.failure(clip) is None
 
+    def is_held_by(self, process: int) -> bool:
+        """Whether a process of this machine has claimed a clip, and not let it go."""
+        seen = (self.claims.sight(clip.name) for clip in self.clips)
+        owners = (each.owner for each in seen if each is not None and not each.released)
+        return process_name(process) in owners
+
     def states(self) -> dict[str, State]:
         """How far every clip is."""
         return {clip.name: self._state(clip) for clip in self.clips}
@@ -398,6 +425,10 @@ class TakenOver(Exception):
     """Somebody else has the clip now."""
 
 
+class Deadly(TorchcssError):
+    """Whoever tracks a clip dies."""
+
+
 class _Watch:
     """A sink that tells how far a clip is, and ends the tracking when somebody took over."""
 
@@ -428,6 +459,7 @@ def _track(job: Job, clip: Clip, claim: Claim) -> None:
             return
         with claim.alive(watch.progress):
             _go_on_from(place)
+            _refuse_deadly(place, job.claims, claim)
             with (
                 (place / "log.txt").open("a", encoding="utf-8") as log,
                 redirect_stdout(log),
@@ -485,6 +517,28 @@ def _go_on_from(place: Path) -> None:
                     shutil.copy2(file, draft / file.name)
     shutil.rmtree(place, ignore_errors=True)
     draft.rename(place)
+
+
+def _refuse_deadly(place: Path, claims: Claims, claim: Claim) -> None:
+    """Raise where owner after owner died, and the checkpoint got no further.
+
+    Whoever is asked to end, or fails the clip, lets it go, and the count begins anew.
+    """
+    done = _frames_in(place)
+    for before in range(1, MOST_DEATHS + 1):
+        generation = claim.generation - before
+        seen = claims.sight(claim.name, generation)
+        if seen is None or seen.released or _frames_in(place.with_name(f"{generation}")) != done:
+            return
+    raise Deadly(
+        f"the process that tracked it died {MOST_DEATHS} times with {done} frames done (by a "
+        "crash, or for want of memory); these are kept, --retry-failed tries again"
+    )
+
+
+def _frames_in(place: Path) -> int:
+    checkpoint = read_checkpoint(place)
+    return 0 if checkpoint is None else checkpoint.num_frames
 
 
 def _publish(place: Path, out: Path) -> None:

@@ -25,8 +25,13 @@ from torchcss.files import output_error
 _RELEASED = "released"
 
 
+def process_name(number: int) -> str:
+    """How a process of this machine is called as an owner."""
+    return f"{socket.gethostname()} process {number}"
+
+
 class Sight(NamedTuple):
-    """What is seen of the newest claim to something.
+    """What is seen of a claim to something.
 
     Attributes:
         generation: Its number, from 1 on.
@@ -107,17 +112,19 @@ class Claims:
         self._clock = clock
         self._watched: dict[str, tuple[tuple[int, int], float]] = {}
 
-    def sight(self, name: str) -> Sight | None:
-        """The newest claim to something; None: nobody has claimed it."""
+    def sight(self, name: str, generation: int | None = None) -> Sight | None:
+        """A claim to something, the newest if no other is named; None: there is none."""
+        place = self.folder / name
         try:
-            found = [int(file) for file in os.listdir(self.folder / name) if file.isdigit()]
-            newest = self.folder / name / str(max(found, default=0))
-            lines = newest.read_text(encoding="utf-8").splitlines()
+            if generation is None:
+                found = [int(file) for file in os.listdir(place) if file.isdigit()]
+                generation = max(found, default=0)
+            lines = (place / str(generation)).read_text(encoding="utf-8").splitlines()
         except FileNotFoundError:  # or removed just now, as that of a lock is
             return None
         # A machine that lost its power may leave an empty file.
         owner = lines[0] if lines else "unknown"
-        return Sight(max(found), owner, len(lines), lines[-1] if len(lines) > 1 else "")
+        return Sight(generation, owner, len(lines), lines[-1] if len(lines) > 1 else "")
 
     def take(self, name: str, *, gone: bool = False) -> Claim | None:
         """Claim something; None where somebody else has it, or was faster.
@@ -137,7 +144,7 @@ class Claims:
         draft = place / f".{uuid.uuid4().hex}"
         try:
             place.mkdir(exist_ok=True)
-            draft.write_text(f"{socket.gethostname()} process {os.getpid()}\n", encoding="utf-8")
+            draft.write_text(process_name(os.getpid()) + "\n", encoding="utf-8")
             os.link(draft, place / str(generation))
         except FileExistsError:
             return None
