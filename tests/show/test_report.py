@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import re
+from dataclasses import replace
 from html import unescape
 from pathlib import Path
 
@@ -69,3 +70,32 @@ def test_the_verb_for_a_run_that_is_there(folder: Path) -> None:
     page = unescape((folder / "smooth_report.html").read_text())
     assert "torchcss smooth" not in page
     assert "say where with" in page  # the overlay is the track's, the video is gone
+
+
+def test_the_page_says_which_tracker_it_was(folder: Path) -> None:
+    settings = {"preset": "ijrr_css", "recovery": None, "keypoints_use": None}
+    summary = {"settings": settings, "samples": 40, "modes": 3}
+    told = facts_of(folder, {**summary, "changed_beside_preset": ["samples"]})
+    assert told["Preset"].startswith("ijrr_css: covariance scaled sampling as printed")
+    assert told["Preset"].endswith(
+        "at most 40 samples a frame and 3 modes; changed beside it: samples"
+    )
+    assert told["Told lost"] == "not watched for, without recovery"
+    assert told["Keypoints"].endswith("joints.npz, in the first frame alone")
+    ours = facts_of(folder, {"settings": {"preset": "css"}, "events": [{"event": "lost"}]})
+    assert ours["Told lost"] == "1 time"
+    assert ours["Keypoints"].endswith("joints.npz")
+    assert facts_of(folder, {"settings": {"preset": "css_figure_6", "recovery": True}})[
+        "Preset"
+    ].startswith("css_figure_6: covariance scaled")
+    assert facts_of(folder, {})["Preset"] == "not known"
+
+
+def facts_of(folder: Path, summary: dict) -> dict[str, str]:
+    """What the page tells of a run with keypoints and this summary."""
+    write_summary(folder, summary)
+    run = Run.open(folder)
+    (camera,) = run.cameras
+    files = replace(camera.files, keypoints=Path("joints.npz"))
+    run = replace(run, track=run.track._replace(cameras=(camera._replace(files=files),)))
+    return dict(report._facts(run))

@@ -28,6 +28,7 @@ from torchcss.io.video import VideoWriter
 from torchcss.show.posterior_plots import angles_figure
 from torchcss.show.track_pictures import has_pictures, pictures_of, rows_with_modes
 from torchcss.show.track_plots import effective_number, modes_figure, side_view_figure
+from torchcss.tracking.presets import ALIASES, PRESETS, Preset
 
 REPORT_NAME = "report.html"
 
@@ -156,17 +157,16 @@ def _facts(run: Run) -> list[tuple[str, str]]:
     track, summary, settings = run.track, run.summary, run.settings
     span = f"{track.frames[0]} to {track.frames[-1]}, {track.times[-1] - track.times[0]:.2f} s"
     files = run.cameras[0].files if run.cameras else None
-    lost = sum(event["event"] == "lost" for event in summary.get("events", ()))
     facts = [
         ("Video", str(files.video) if files else "not known"),
         (
             "Frames",
             f"{len(track.frames)} ({span}), {summary.get('ended', 'not known whether all')}",
         ),
-        ("Told lost", f"{lost} times"),
+        ("Told lost", _losses(run)),
         ("Body", f"{settings.get('body', run.body.name)}, {track.state.shape[2]} parameters"),
-        ("Keypoints", str(files.keypoints) if files and files.keypoints else "not known"),
-        ("Preset", str(settings.get("preset", "not known"))),
+        ("Keypoints", _keypoints(run)),
+        ("Preset", _preset(run)),
     ]
     if "l_knee" in track.joint_names:
         stature = settings.get("stature")
@@ -177,6 +177,47 @@ def _facts(run: Run) -> list[tuple[str, str]]:
         facts.append(("Stature", told))
         facts.append(("Followed", f"--person {files.person}" if files else "not known"))
     return facts
+
+
+def _row(run: Run) -> Preset | None:
+    """The preset that was run; None: not known."""
+    name = run.settings.get("preset", "")
+    return PRESETS.get(ALIASES.get(name, name))
+
+
+def _option(run: Run, name: str) -> Any:
+    """An option as it was given or else as the preset has it; None: not known."""
+    given = run.settings.get(name)
+    return getattr(_row(run), name, None) if given is None else given
+
+
+def _preset(run: Run) -> str:
+    """Which tracker it was, and with which numbers."""
+    row, summary = _row(run), run.summary
+    name = str(run.settings.get("preset", "not known"))
+    parts = [name if row is None else f"{name}: {row.what}"]
+    if "samples" in summary and "modes" in summary:
+        parts.append(f"at most {summary['samples']} samples a frame and {summary['modes']} modes")
+    if changed := summary.get("changed_beside_preset"):
+        parts.append("changed beside it: " + ", ".join(map(str, changed)))
+    return "; ".join(parts)
+
+
+def _keypoints(run: Run) -> str:
+    """Where the keypoints are from, and whether they counted in all frames."""
+    files = run.cameras[0].files if run.cameras else None
+    if not (files and files.keypoints):
+        return "not known"
+    only = ", in the first frame alone" if _option(run, "keypoints_use") == "first" else ""
+    return f"{files.keypoints}{only}"
+
+
+def _losses(run: Run) -> str:
+    """How often the track was told lost, if somebody watched."""
+    if _option(run, "recovery") is False:
+        return "not watched for, without recovery"
+    lost = sum(event["event"] == "lost" for event in run.summary.get("events", ()))
+    return f"{lost} time{'' if lost == 1 else 's'}"
 
 
 def _cameras(run: Run) -> list[tuple[str, str]]:
