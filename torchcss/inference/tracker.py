@@ -12,12 +12,12 @@ and could never recover.
         proposal=CovarianceScaled(covariance_scale=8), num_samples=100, num_modes=7
     )
     state = tracker.init(mixture, generator=generator)
-    for problem in problems:
-        state, info = tracker.step(state, problem, bounds)
+    for cost in costs:
+        state, info = tracker.step(state, SearchProblem(cost), bounds)
 
-A frame is a `SearchProblem`: the cost, and what else is known of it. The state is a record of
-tensors: `step` is a pure function of it, so that a run that was saved and restored continues
-exactly as one that was never interrupted.
+A frame is a `SearchProblem`: the cost, any `CostFunction`, and what else is known of the frame. The
+state is a record of tensors: `step` is a pure function of it, so that a run that was saved and
+restored continues exactly as one that was never interrupted.
 """
 
 from __future__ import annotations
