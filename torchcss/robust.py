@@ -8,11 +8,14 @@ length. Every potential satisfies
 so that all of them agree on small residuals: a central peak of scale sigma against a spread of
 outliers nu. They differ in what a large residual costs.
 
-| potential | rho(s), with z = s / sigma^2 | saturates at |
+| potential | rho(s), with z = s / sigma^2 | rho saturates at |
 |---|---|---|
 | `Quadratic` | nu z (Gaussian errors) | never |
 | `Lorentzian` | nu log(1 + z) | never, but only logarithmically |
 | `Leclerc` | nu (1 - exp(-z)) | nu |
+
+The cost, half of rho, reaches nu / 2 at most with `Leclerc`. Eq. 5 [IJRR] counts a node that faces
+away with nu, and a hidden one with k nu, without the half.
 
 By default: `Lorentzian` for correspondences, which pull from afar; `Leclerc` where what is far off
 must not pull.
@@ -39,7 +42,7 @@ class RobustValue(NamedTuple):
     """A potential and its derivatives with respect to the squared weighted error s.
 
     Attributes:
-        rho: The potential; a cost in nats is half of it.
+        rho: The potential, in the unit of nu; a residual costs half of it.
         first: First derivative, never negative.
         second: Second derivative, never positive.
     """
@@ -110,7 +113,8 @@ class Leclerc(RobustPotential):
     """The Leclerc potential of section 3.1.1 [IJRR], rho = nu (1 - exp(-s / sigma^2)).
 
     Attributes:
-        nu: Spread of the outliers; also the cost of a residual without bound.
+        nu: Spread of the outliers; also what rho rises to, so that no residual costs more than
+            nu / 2.
         sigma: Scale of the central peak in the unit of the weighted residual.
     """
 

@@ -139,7 +139,7 @@ class Status(IntEnum):
         """What happened and what to try."""
         return {
             Status.RUNNING: "still running",
-            Status.CONVERGED: "the projected gradient is below the tolerance",
+            Status.CONVERGED: "a Newton step promises to lower the cost by less than the tolerance",
             Status.SMALL_STEP: "short steps lower the cost by less than the tolerance, as where it "
             "jumps or has a kink; use float64 if the gradient matters",
             Status.STEP_LIMIT: "the step limit was reached; raise max_steps",

@@ -416,10 +416,11 @@ def prior_at(
         sum_j  pi_j exp(-c min(d_j, 1)),   d_j = (mu - mu_j)^T (Sigma + Sigma_j)^-1 (mu - mu_j) / 2n
 
     with c = n: for small d_j p(x_t | R_{t-1}) of eq. 10 [IJRR] smoothed by the mode, but for the
-    components' volumes. In n dimensions d_j is 1/2 on average for a mode that moved as the prior
-    expects. What is twice as far from all components is new and has no parent; it is unlikely, not
-    impossible. A smaller c takes p(x_t | R_{t-1}) to the power c / n: what the prior on motion
-    lacks is wrong for many frames, as an acceleration is.
+    components' volumes. d_j is a squared distance, and 1/2 on average for a mode that moved as the
+    prior expects. A mode with twice that, d_j of 1 or more for every component, is new and has no
+    parent; it is unlikely, not impossible. A smaller c takes p(x_t | R_{t-1}) to the power
+    c / n: what the prior on motion lacks is wrong for many frames, as an acceleration is.
+
     Other than in `match_to_prior`, no mode can take a component's weight from another, and none is
     handed the weight of a component that merely was left over.
 

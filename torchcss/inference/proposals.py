@@ -7,7 +7,7 @@ All proposals share one interface, `Proposal`, and differ in what a mode (mu, Si
 | proposal | samples of a mode | where from |
 |---|---|---|
 | `CovarianceScaled` | N(mu, s Sigma) | Fig. 6 [IJRR] |
-| `HeavyTailed` | Student t of shape s Sigma | Fig. 6 [IJRR], "heavy tail sampling" |
+| `HeavyTailed` | Student t of shape s Sigma | Fig. 8d (3) [IJRR], "heavy tail sampling" |
 | `Spherical` | N(mu, r^2 I), r^2 the geometric mean of s Sigma's eigenvalues | Table 1 [IJRR] |
 | `EigenDirectionGrid` | steps along the widest eigenvectors of Sigma | Fig. 4 [RR] |
 | `Condensation` | N(mu, Q), the modes randomised by dynamical noise Q | Fig. 8d (1) [IJRR] |

@@ -8,7 +8,7 @@ gives beside it wins (`Settings.changed`).
 |---|---|---|
 | css | covariance scaled sampling, modes kept apart, soft matching, jumps | ours |
 | ijrr_css | covariance scaled sampling as printed | [IJRR] Fig. 6 |
-| ijrr_css_heavy_tailed | the same with Student t tails | [IJRR] Fig. 6, section 8 |
+| ijrr_css_heavy_tailed | the same with Student t tails | [IJRR] Fig. 8d (3) |
 | ijrr_css_spherical | the same from balls of the same volume | [IJRR] section 7 |
 | ijrr_css_limits, ijrr_css_constrained | without and with non-self-intersection | [IJRR] 6.2 |
 | ijrr_gaussian_single, ijrr_robust_single | one mode: Gaussian errors, robust errors | [IJRR] 6 |

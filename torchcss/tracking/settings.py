@@ -109,7 +109,9 @@ class Settings:
         body: Body to track: arm7, arm8, body30, body32, body34, or a URDF, MJCF or BVH file.
         free_root: Let a body move about that by itself stands in one place, as robots do.
         stature: Height of the standing person, metres, where it is known: it sets the size.
-        preset: Tracker, a name in `presets.PRESETS`; one of `presets.ALIASES` becomes that.
+        preset: Tracker: css, ours, or one after the papers, such as ijrr_css, ijrr_condensation and
+            rr_multiple_hypothesis; a name that is not there is answered with the list of all, and
+            `torchcss.tracking.presets` says what each is.
         samples: Samples per frame; the preset's number by default.
         modes: Modes kept; the preset's number by default.
         prediction: "velocity": a mode is expected where its own last motion leads; "surface": its
