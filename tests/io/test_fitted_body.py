@@ -44,17 +44,17 @@ def camera(generator: torch.Generator) -> Camera:
     )  # fmt: skip
 
 
-def test_a_known_size_stays_known(
+def test_what_is_known_of_the_size_stays_known(
     found: Initialisation, generator: torch.Generator, tmp_path: Path
 ) -> None:
-    for known in (True, False):
-        some = found._replace(size_known=known)
+    for doubt in (0.0, 0.02):
+        some = found._replace(size_deviation=doubt)
         write_fitted_body(tmp_path / "body.npz", some, camera(generator))
-        assert read_fitted_body(tmp_path).size_known == known
+        assert read_fitted_body(tmp_path).size_deviation == doubt
     arrays = dict(np.load(tmp_path / "body.npz"))
-    del arrays["size_known"]
+    del arrays["size_deviation"]
     np.savez(tmp_path / "earlier.npz", **arrays)
-    assert not read_fitted_body(tmp_path / "earlier.npz").size_known
+    assert read_fitted_body(tmp_path / "earlier.npz").size_deviation > 0.03
 
 
 def test_round_trip(found: Initialisation, generator: torch.Generator, tmp_path: Path):

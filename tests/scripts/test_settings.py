@@ -28,7 +28,7 @@ CHANGED: dict[str, Any] = {
     "curvature": "gauss-newton", "working_size": 160, "contour_weight": 120.0,
     "weights": {"region": 0.5}, "boundary_emphasis": 0.2, "potential": "leclerc", "seed": 3,
     "device": "cpu:0", "dtype": "float32", "engine": "eager", "engine_dtype": "float32",
-    "threads": 2, "overlay": False, "recovery": False, "stature": 1.6,
+    "threads": 2, "overlay": False, "recovery": False, "stature": 1.6, "ground": -1.2,
 }  # fmt: skip
 """Another value than the default for every setting."""
 

@@ -207,6 +207,7 @@ def initialise_video(
     options = InitialiseOptions(
         sigma=noise.sigma,
         stature=settings.stature,
+        ground=settings.ground,
         learn_noise=noise.is_guess,
         least_joints=LEAST_JOINTS,
         pose_prior="pose_prior" in settings.used_terms,

@@ -25,7 +25,6 @@ from torchcss.app.lens import PERSONS, Lens, fitted
 from torchcss.app.lock import locked
 from torchcss.app.recorder import CHECKPOINT_EVERY, Recorder, Sink
 from torchcss.app.view_files import OpenView, Selection, moments, open_view
-from torchcss.cost.anthropometric import Anthropometric
 from torchcss.cost.view import View
 from torchcss.errors import CameraError, ConfigurationError, TrackFileError
 from torchcss.files import StrPath, naming
@@ -200,9 +199,8 @@ def _begin(
 
 def _size_deviation(settings: Settings, first: Initialisation, num_cameras: int) -> float:
     """What is not known of the body's size: of a person of any stature before one camera."""
-    given = first.size_known or settings.stature is not None
-    known = given or num_cameras > 1 or settings.body not in PERSONS
-    return 0.0 if known else Anthropometric().stature
+    known = num_cameras > 1 or settings.body not in PERSONS or settings.stature is not None
+    return 0.0 if known else first.size_deviation
 
 
 _KEYPOINTS_NAME = "keypoints.npz"

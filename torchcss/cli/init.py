@@ -36,6 +36,9 @@ class Init:
     """Let a body move about that by itself stands in one place, as robots from files do."""
     stature: float | None = None
     """Height of the standing person, metres; by default the prior sets the scale."""
+    ground: float | None = None
+    """Height of the floor that the person stands on, along the world's axis that points up, metres;
+    it tells the size. In a camera's own frame: how far it is above the floor, with a minus."""
     proportions: Literal["all", "papers"] = "all"
     """All lengths, or the papers' eight (places of hips, clavicles and skull tip) beside those of
     trunk and limbs."""
@@ -79,6 +82,7 @@ class Init:
         options = InitialiseOptions(
             sigma=self.sigma,
             stature=self.stature,
+            ground=self.ground,
             num_modes={"best": 1, "all": None}.get(str(self.hypotheses), self.hypotheses),  # type: ignore[arg-type]
             contours=self.contours,
             colours=self.colours,

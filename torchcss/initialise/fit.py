@@ -37,8 +37,9 @@ from torchcss.cost.region import RegionTerm
 from torchcss.cost.shaped import Outline
 from torchcss.cost.total import TrackingCost
 from torchcss.cost.view import View
-from torchcss.errors import CameraError
+from torchcss.errors import CameraError, ConfigurationError
 from torchcss.initialise.from_joints import fit_joints
+from torchcss.initialise.ground import stature_on_floor
 from torchcss.initialise.keypoint_checks import (
     check_numbers,
     default_sigma,
@@ -117,7 +118,8 @@ def initialise(
             or the keypoints are not those of one image.
         CameraError: If the camera is of another image size or looks away from a placed body, or
             there is neither picture nor camera.
-        BodyError: If the stature is no person's.
+        BodyError: If the stature is no person's, or the floor is to tell the size of another body.
+        ConfigurationError: If the floor is known, and several cameras look on.
     """
     options, others = options or InitialiseOptions(), tuple(others)
     if not isinstance(keypoints, Keypoints):
@@ -142,7 +144,7 @@ def initialise(
                     "well; look at the first frame's keypoints, or start at another frame"
                 )
             notes.append(line)
-        first = fit_joints(body, view, generator=generator, options=options, others=others)
+        first, options = _fit_of_size(body, view, generator, options, others)
         first = first._replace(noise=noise)
         given = keypoints.only(first.body.joint_names).to(first.body.tie)
         alone = options.joint_cost(first.body, [view._replace(keypoints=given)])
@@ -158,6 +160,26 @@ def _own_joints(body: str | BodyModel) -> tuple[str, ...]:
     if body in BODY_NAMES:
         return ()
     return (body if isinstance(body, BodyModel) else load_body(body)).joint_names
+
+
+def _fit_of_size(
+    body: str | BodyModel,
+    view: View,
+    generator: torch.Generator,
+    options: InitialiseOptions,
+    others: tuple[View, ...],
+) -> tuple[Initialisation, InitialiseOptions]:
+    """The fit to the joints, of the size that the floor tells where it is known, which is held."""
+    first = fit_joints(body, view, generator=generator, options=options, others=others)
+    if options.ground is None or options.stature is not None:
+        return first, options
+    if others:
+        raise ConfigurationError("ground: several cameras show the size; leave it out")
+    stature, doubt = stature_on_floor(first, view.camera, options.ground)
+    options = replace(options, ground=None, stature=round(stature, 3))
+    first = fit_joints(body, view, generator=generator, options=options)
+    line = f"the floor tells the size: {stature:.2f} m, to {100 * doubt:.1f} %"
+    return first._replace(size_deviation=doubt, report=(*first.report, line)), options
 
 
 def _camera_of(image: Picture | None, camera: Camera | None) -> tuple[Camera, list[str]]:

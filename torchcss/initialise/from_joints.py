@@ -23,6 +23,7 @@ import torch
 from torchcss.body.load import has_free_root, load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.root import base_without_root, has_root, move_base, root_pose
+from torchcss.cost.anthropometric import Anthropometric
 from torchcss.cost.joints import JointTargets, match_joints
 from torchcss.cost.total import TrackingCost
 from torchcss.cost.view import View
@@ -120,6 +121,7 @@ def _with_lengths_fitted(
     if (line := undetermined_line(held, kept, joints=cost.with_body(held))) is not None:
         report.append(line)
     fits = fits.take(slice(options.num_modes))
+    known = options.stature is not None or len(cost.views) > 1
     return result._replace(
         report=tuple(report),
         lengths=lengths,
@@ -127,7 +129,7 @@ def _with_lengths_fitted(
         left_out=left_out,
         free_body=free,
         free_mixture=mixture_of(fits),
-        size_known=options.stature is not None or len(cost.views) > 1,
+        size_deviation=0.0 if known else Anthropometric().stature,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import field, replace
 from typing import Literal
@@ -37,6 +38,9 @@ class InitialiseOptions:
         learn_noise: Take that as a guess, and learn the noise from the best fit's errors
             (`torchcss.initialise.noise`); None: where `sigma` is not given.
         stature: Height of the standing person, metres, where it is known.
+        ground: Height of the floor that the person stands on, metres along the axis of the world
+            that points up, where it is known; it tells the size where `stature` does not, see
+            `torchcss.initialise.ground`.
         num_modes: Most hypotheses; 1 for the best alone, None for all.
         least_joints: Fewest joints of the body that have to be known; with fewer than
             `LEAST_JOINTS` much stays at its prior.
@@ -61,6 +65,7 @@ class InitialiseOptions:
     sigma: float | None = None
     learn_noise: bool | None = None
     stature: float | None = None
+    ground: float | None = None
     num_modes: int | None = 8
     least_joints: int = 1
     pose_prior: bool = True
@@ -78,6 +83,8 @@ class InitialiseOptions:
     engine: Literal["fused", "eager"] = "fused"
 
     def __post_init__(self) -> None:
+        if self.ground is not None and not math.isfinite(self.ground):
+            raise ConfigurationError(f"ground: expected metres, got {self.ground}")
         if self.num_modes is not None and self.num_modes < 1:
             raise ConfigurationError(
                 f"expected at least 1 hypothesis to be kept, got {self.num_modes}"

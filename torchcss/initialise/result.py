@@ -20,7 +20,7 @@ from torchcss.body.catalog import LENGTHS, PROPORTION_RANGE, Proportions
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, move_base, root_pose
-from torchcss.cost.anthropometric import proportion_columns
+from torchcss.cost.anthropometric import Anthropometric, proportion_columns
 from torchcss.cost.total import TrackingCost
 from torchcss.errors import BodyError
 from torchcss.inference.mixture import GaussianMixture
@@ -70,7 +70,8 @@ class Initialisation(NamedTuple):
         free_mixture: The fits of pose and lengths together, best first, on `free_body`.
         left_out: Joints whose keypoints fit no pose and were left out.
         noise: How many times as noisy as was assumed keypoints were found to be.
-        size_known: Whether the person's stature was given, or several cameras looked on.
+        size_deviation: What is not known of a person's size, as the deviation of its logarithm;
+            zero if the stature was given, or several cameras looked on.
     """
 
     body: BodyModel
@@ -84,7 +85,7 @@ class Initialisation(NamedTuple):
     free_mixture: GaussianMixture | None = None
     left_out: tuple[str, ...] = ()
     noise: float = 1.0
-    size_known: bool = False
+    size_deviation: float = Anthropometric().stature
 
     def hypotheses(self, num: int, *, generator: torch.Generator) -> Vectors:
         """The first `num` states to believe in: the fits, then samples of their mixture.

@@ -8,7 +8,7 @@ One NPZ file, schema version 1. K hypotheses, n parameters, P parts, L lengths:
 | `body` | | name of the body; of one from a file, its path as it was given |
 | `body_file` | | the absolute path of that file; empty for a body that ships |
 | `scale` | | of the standard humanoid |
-| `size_known` | | whether the person's stature was given, or several cameras looked on |
+| `size_deviation` | | what is not known of the person's size: deviation of its logarithm |
 | `length_names`, `lengths` | L | fitted lengths, metres |
 | `part_names`, `part_shape` | P, P 9 | shape numbers of the parts |
 | `state_names` | n | names of the parameters |
@@ -81,7 +81,7 @@ def write_fitted_body(path: StrPath, found: Initialisation, camera: Camera) -> N
         "body_file": os.path.abspath(body.name) if _is_file(body.name) else "",
         "scale": found.scale,
         "noise": found.noise,
-        "size_known": found.size_known,
+        "size_deviation": found.size_deviation,
         "length_names": np.array(list(found.lengths), dtype=np.str_),
         "lengths": np.array(list(found.lengths.values()), dtype=np.float64),
         "part_names": np.array(body.part_names, dtype=np.str_),
@@ -147,12 +147,11 @@ def read_fitted_body(
     mixture = GaussianMixture(tensors["state"], tensors["covariance"], tensors["log_weight"])
     note = f"first pose: {len(mixture.mean)} hypotheses from {path}"
     body = body.with_base(rotation, translation)
+    found = Initialisation(body, mixture, tensors["cost"], (note,), lengths, scale)
     # Earlier files lack these two.
-    noise, size_known = float(arrays.get("noise", 1.0)), bool(arrays.get("size_known", False))
-    return Initialisation(
-        *(body, mixture, tensors["cost"], (note,), lengths, scale),
-        noise=noise,
-        size_known=size_known,
+    return found._replace(
+        noise=float(arrays.get("noise", found.noise)),
+        size_deviation=float(arrays.get("size_deviation", found.size_deviation)),
     )
 
 

@@ -173,7 +173,7 @@ def _facts(run: Run) -> list[tuple[str, str]]:
         told = f"{stature:g} m, as given" if stature else "not given; the size is known otherwise"
         if track.size_deviation:
             doubt = f"known to {100 * track.size_deviation:.0f} %"
-            told = f"not given; it would set the size ({doubt}): --stature METRES"
+            told = f"not given; it would set the size ({doubt}): --stature METRES, or --ground"
         facts.append(("Stature", told))
         facts.append(("Followed", f"--person {files.person}" if files else "not known"))
     return facts

@@ -109,6 +109,10 @@ class Settings:
         body: Body to track: arm7, arm8, body30, body32, body34, or a URDF, MJCF or BVH file.
         free_root: Let a body move about that by itself stands in one place, as robots do.
         stature: Height of the standing person, metres, where it is known: it sets the size.
+        ground: Height of the floor that the person stands on in the first frame, metres along the
+            axis of the camera's world that points up, where it is known: it tells the size where
+            the stature does not, see `torchcss.initialise.ground`. In a camera's own frame: how far
+            it is above the floor, with a minus.
         preset: Tracker: css, ours, or one after the papers, such as ijrr_css, ijrr_condensation and
             rr_multiple_hypothesis; a name that is not there is answered with the list of all, and
             `torchcss.tracking.presets` says what each is.
@@ -156,6 +160,7 @@ class Settings:
     body: str = "body34"
     free_root: bool = False
     stature: float | None = None
+    ground: float | None = None
     preset: str = "css"
     samples: int | None = None
     modes: int | None = None
@@ -229,6 +234,8 @@ class Settings:
             raise ConfigurationError(
                 f"likelihood_power must lie above 0 and at most at 1, got {self.likelihood_power}"
             )
+        if self.ground is not None and not math.isfinite(self.ground):
+            raise ConfigurationError(f"ground must be finite, metres, got {self.ground}")
         if self.limb_jumps < 0:
             raise ConfigurationError(f"limb_jumps must be at least 0, got {self.limb_jumps}")
 
