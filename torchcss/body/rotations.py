@@ -5,8 +5,9 @@
 | `about`, `about_fixed_axes` | turns about coordinate axes: URDF, BVH, Acclaim |
 | `euler_angles` | angles in any order, continuous over frames: BVH, MOT |
 | `axis_angle`, `from_axis_angle` | rotation vectors: SMPL, OpenCV |
-| `from_quaternion` | quaternions: MJCF |
+| `quaternions`, `from_quaternion` | quaternions: skins, viewer, MJCF |
 | `root_rotation`, `root_angles` | yaw, pitch, roll of a body's root, as tensors |
+| `within_half_turn` | angles that differ by whole turns |
 | `check_rotation` | matrices that users give |
 | `frame_along` | a frame whose z axis has a direction |
 | `as_vector`, `as_rows` | plain numbers, as specifications hold them |
@@ -151,14 +152,21 @@ def euler_angles(
 
 
 def axis_angle(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 3"]:
-    """Rotation vectors: the axis times the angle in [0, pi], radians.
+    """Rotation vectors: the axis times the angle in [0, pi], radians."""
+    quaternion = quaternions(rotation)
+    quaternion = np.where(quaternion[..., :1] < 0, -quaternion, quaternion)
+    sine = np.linalg.norm(quaternion[..., 1:], axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, quaternion[..., :1])
+    ratio = np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0)
+    return ratio * quaternion[..., 1:]
 
-    By way of the unit quaternion, whose largest entry is never small (Shepperd 1978).
-    """
+
+def quaternions(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 4"]:
+    """Unit quaternions (w, x, y, z) whose largest entry is positive (Shepperd 1978)."""
     r = rotation
     trace = np.trace(r, axis1=-2, axis2=-1)
     diagonal = np.diagonal(r, axis1=-2, axis2=-1)
-    # Row m: the quaternion (w, x, y, z) times four times its entry m, from sums and differences.
+    # Row m: the quaternion times four times its entry m, from sums and differences.
     skew = np.stack(
         [r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]],
         axis=-1,
@@ -171,12 +179,12 @@ def axis_angle(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "
         rows[..., 1 + m, 1 + m] = 1.0 + 2.0 * diagonal[..., m] - trace
     largest = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), axis=-1)
     quaternion = np.take_along_axis(rows, largest[..., None, None], axis=-2)[..., 0, :]
-    quaternion = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
-    quaternion = np.where(quaternion[..., :1] < 0, -quaternion, quaternion)
-    sine = np.linalg.norm(quaternion[..., 1:], axis=-1, keepdims=True)
-    angle = 2.0 * np.arctan2(sine, quaternion[..., :1])
-    ratio = np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0)
-    return ratio * quaternion[..., 1:]
+    return quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
+
+
+def within_half_turn(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """The same angles, from minus half a turn to half a turn, radians."""
+    return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
 
 
 def root_rotation(angles: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:

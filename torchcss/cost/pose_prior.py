@@ -38,6 +38,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchcss.body.catalog import without_side
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.uncertainty import point_jacobian
 from torchcss.cost.context import FrameContext
@@ -360,7 +361,7 @@ def learnt_mixtures() -> dict[str, PoseMixture]:
     found = {}
     with np.load(FILE) as held:
         for group in GROUPS:
-            kind = group.removeprefix("l_").removeprefix("r_")
+            kind = without_side(group)
             numbers = (held[f"{kind}_{field}"].astype(np.float64) for field in PoseMixture._fields)
             found[group] = PoseMixture(*map(torch.from_numpy, numbers)).with_mirrored(group)
     return found

@@ -32,6 +32,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from torchcss.body.catalog import without_side
 from torchcss.body.model import BodyModel
 from torchcss.body.root import has_root
 from torchcss.cost.context import FrameContext
@@ -73,7 +74,7 @@ def part_layers(body: BodyModel) -> tuple[tuple[str, ...], tuple[int, ...]]:
     Returns:
         Names of the layers, and the layer of each part.
     """
-    names = [name.removeprefix("l_").removeprefix("r_") for name in body.part_names]
+    names = [without_side(name) for name in body.part_names]
     layers = tuple(dict.fromkeys(names))
     return layers, tuple(layers.index(name) for name in names)
 

@@ -35,6 +35,7 @@ from torchcss.body.catalog import PLACES, PROPORTIONS, Proportions
 from torchcss.body.flips import Segments
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, has_root
+from torchcss.body.rotations import within_half_turn
 from torchcss.cost.anthropometric import proportion_columns
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.targets import PointDistances
@@ -234,7 +235,7 @@ def starts_about(body: BodyModel, num: int, generator: torch.Generator) -> Vecto
 def _all_round(x: Vectors) -> Numbers:
     """As many angles as there are states, evenly round the circle from zero."""
     turn = torch.arange(len(x), device=x.device).to(x) * (2 * math.pi / len(x))
-    return torch.remainder(turn + math.pi, 2 * math.pi) - math.pi
+    return within_half_turn(turn)
 
 
 def _coarse_start(cost: TrackingCost, x: Vectors, search: Search) -> Vectors:

@@ -31,7 +31,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import torch
 from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
@@ -39,6 +38,7 @@ from tqdm import tqdm
 
 from torchcss.body.bases import on_origin, pose_track
 from torchcss.body.model import BodyModel
+from torchcss.body.rotations import quaternions
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.errors import ConfigurationError, OutputError
 from torchcss.files import one_line, prepare_output_folder, replace_file
@@ -408,13 +408,10 @@ def ellipsoids(
     Args:
         covariance: Covariances of points, square metres.
     """
-    from kornia.geometry.conversions import rotation_matrix_to_quaternion
-
     values, axes = np.linalg.eigh(covariance)
     # Eigenvectors may form a mirrored frame, which no rotation is.
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
-    wxyz = rotation_matrix_to_quaternion(torch.from_numpy(axes)).numpy()
-    return DEVIATIONS * np.sqrt(values.clip(min=0)), np.roll(wxyz, -1, axis=-1)
+    return DEVIATIONS * np.sqrt(values.clip(min=0)), np.roll(quaternions(axes), -1, axis=-1)
 
 
 def _reduced(camera: Camera) -> Camera:

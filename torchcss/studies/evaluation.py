@@ -45,6 +45,7 @@ from torch import Tensor
 from torchcss.body.bases import pose_track
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.root import ROOT_NAMES, has_root, move_base
+from torchcss.body.rotations import within_half_turn
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.cost.interpenetration import InterpenetrationPairs
 from torchcss.cost.part_map import part_map
@@ -424,8 +425,7 @@ class Evaluator:
             _, x, _ = move_base(truth.body, turn, shift, x)
             # Where the body stands goes with its size, which one image does not tell.
             angles = [body.state_index(name) for name in body.state_names if name not in _PLACE]
-        away = (x - mixture.mean.double().cpu())[:, angles]
-        away = torch.remainder(away + math.pi, 2 * math.pi) - math.pi
+        away = within_half_turn((x - mixture.mean.double().cpu())[:, angles])
         spread = spread[:, angles][:, :, angles]
         return (squared_mahalanobis(away, spread) / len(angles)).sqrt().numpy()
 

@@ -22,8 +22,11 @@ from torchcss.body.catalog import LENGTHS, PROPORTION_RANGE
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.root import move_base
+from torchcss.body.rotations import within_half_turn
+from torchcss.body.uncertainty import joint_covariance
 from torchcss.cost.anthropometric import Anthropometric, proportion_columns
 from torchcss.inference.mixture import GaussianMixture
+from torchcss.linalg import squared_mahalanobis
 from torchcss.studies.metrics import LIMB_JOINTS
 from torchcss.studies.reprojection import DISTANCE, HEIGHT, WIDTH, camera_in_front, plausible_pose
 from torchcss.types import Vector
@@ -146,15 +149,13 @@ def coverage(person: Person, body: BodyModel, mixture: GaussianMixture) -> Cover
         truth[column] = person.body.lengths[name] - body.lengths[name]
     apart = truth - mixture.mean
     yaw = body.state_index("root_yaw")
-    apart[:, yaw] = torch.remainder(apart[:, yaw] + math.pi, 2 * math.pi) - math.pi
+    apart[:, yaw] = within_half_turn(apart[:, yaw])
     z = apart.abs() / mixture.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     nearest = int(z.square().mean(-1).argmin())
     index = [body.joint_index(name) for name in LIMB_JOINTS]
-    mean = mixture.mean[nearest]
-    slope = torch.autograd.functional.jacobian(lambda x: body.pose(x).joints[index], mean)
-    spread = slope @ mixture.covariance[nearest] @ slope.mT
-    error = person.joints_world(LIMB_JOINTS) - body.pose(mean).joints[index]
-    squared = (torch.linalg.solve(spread, error[..., None])[..., 0] * error).sum(-1)
+    pose = body.pose(mixture.mean[nearest])
+    spread = joint_covariance(body, pose, mixture.covariance[nearest])[index]
+    squared = squared_mahalanobis(person.joints_world(LIMB_JOINTS) - pose.joints[index], spread)
     chi_squared_95 = 7.815  # three degrees of freedom
     return Coverage(
         float((z[nearest] < 1.96).double().mean()),

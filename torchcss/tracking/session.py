@@ -35,6 +35,7 @@ from torch import Tensor
 
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, has_root, move_base, root_pose
+from torchcss.body.rotations import within_half_turn
 from torchcss.cost.fused import threads_for
 from torchcss.cost.total import TrackingCost, beside
 from torchcss.errors import ConfigurationError
@@ -530,7 +531,7 @@ def follow_with_base(body: BodyModel, state: TrackerState) -> tuple[BodyModel, T
     assert covariance is not None
     velocity = mean - last
     turned = [body.state_index(name) for name in ROOT_NAMES[3:]]
-    velocity[:, turned] = torch.remainder(velocity[:, turned] + math.pi, 2 * math.pi) - math.pi
+    velocity[:, turned] = within_half_turn(velocity[:, turned])
     # Particles belong to the old base; a filter draws new ones from the mixture.
     return body, state._replace(
         mixture=mixture._replace(mean=mean, covariance=covariance),

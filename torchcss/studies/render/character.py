@@ -26,9 +26,10 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn import functional
 
+from torchcss.body.catalog import without_side
 from torchcss.body.model import BodyModel, BodyPose
+from torchcss.body.rotations import quaternions
 from torchcss.body.surface import straighten
 from torchcss.studies.render.renderer import Colour, Mesh, random_waves
 from torchcss.types import Vector
@@ -238,7 +239,7 @@ class Character:
         # Motion of every part since the skin was made: turn about the origin, then shift.
         turn = rotation @ self._bind_rotation.mT
         shift = centre - (turn @ self._bind_centre[..., None])[..., 0]
-        real = _quaternion(turn)
+        real = torch.from_numpy(quaternions(turn.numpy()))
         dual = 0.5 * _times(torch.cat([torch.zeros_like(shift[:, :1]), shift], -1), real)
         first, second = real[self._owner[:, 0]], real[self._owner[:, 1]]
         bend = 2 * (first * second).sum(-1).abs().clamp(max=1).acos()
@@ -307,7 +308,7 @@ def _other_girths(body: BodyModel, deviation: float, generator: torch.Generator)
     """The body's shapes with girths of their own, left and right alike."""
     shape, factors = body.part_shape.clone(), {}
     for index, name in enumerate(body.part_names):
-        bare = _without_side(name)
+        bare = without_side(name)
         if bare not in factors:
             drawn = torch.randn(2, generator=generator, dtype=shape.dtype)
             factors[bare] = 1 + deviation * drawn.clamp(-2, 2)
@@ -315,14 +316,10 @@ def _other_girths(body: BodyModel, deviation: float, generator: torch.Generator)
     return shape
 
 
-def _without_side(name: str) -> str:
-    return name.removeprefix("l_").removeprefix("r_")
-
-
 def _spread_state(body: BodyModel) -> Tensor:
     state = body.rest.clone()
     for column, name in enumerate(body.state_names):
-        degrees = _SPREAD_POSE.get(_without_side(name), 0.0)
+        degrees = _SPREAD_POSE.get(without_side(name), 0.0)
         state[column] += math.radians(degrees)
     return body.bounds.project(state)
 
@@ -341,13 +338,13 @@ def _padding(
         centres.append(place[None])
 
     for index, name in enumerate(body.joint_names):
-        bare = _without_side(name)
+        bare = without_side(name)
         side = name.removesuffix(bare)
         owner, axes = _PADDING.get(bare, ("", ()))
         if side + owner in body.part_names and side + owner not in without:
             add(axes, body.base_rotation, pose.joints[index])
     for index, name in enumerate(body.part_names):
-        bare = _without_side(name)
+        bare = without_side(name)
         for place, axes in _FEATURES.get(bare, ()) if name not in without else ():
             turn = rotation[index]
             if bare == "hand":
@@ -518,20 +515,6 @@ def _head(place: _OnBody, clothing: Clothing, colour: Vertices) -> Tensor:
         colour = _painted(colour, front & brow, clothing.hair)
     mouth = (x / 0.3) ** 2 + ((z + 0.45) / 0.05) ** 2 < 1
     return _painted(colour, front & mouth, (0.62, 0.30, 0.28))
-
-
-def _quaternion(rotation: Float[Tensor, "p 3 3"]) -> Float[Tensor, "p 4"]:
-    """Unit quaternions, scalar first: the largest of the four candidates, for accuracy."""
-    skew = rotation - rotation.mT
-    axis = torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], -1)
-    x, y, z = rotation.diagonal(dim1=-2, dim2=-1).unbind(-1)
-    squares = torch.stack([1 + x + y + z, 1 + x - y - z, 1 - x + y - z, 1 - x - y + z], -1)
-    # Every row is the quaternion times four times one of its numbers.
-    rows = functional.pad(rotation + rotation.mT, (1, 0, 1, 0))
-    rows[:, 0, 1:] = rows[:, 1:, 0] = axis
-    rows.diagonal(dim1=-2, dim2=-1).copy_(squares)
-    best = rows[torch.arange(len(rows)), squares.argmax(-1)]
-    return functional.normalize(best, dim=-1)
 
 
 def _times(p: Float[Tensor, "*b 4"], q: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 4"]:
