@@ -18,6 +18,7 @@ from torchcss.files import load_json, prepare_output_folder
 from torchcss.initialise.multi_start import PAPER_LENGTHS, Search
 from torchcss.initialise.options import InitialiseOptions
 from torchcss.io.video import read_frame
+from torchcss.tracking.settings import Settings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,11 +31,11 @@ class Init:
     """Mark the joints by clicking in a window; they are saved as joints.json too."""
     out: Path = Path("out/init")
     """Folder for body.npz, the overlays, side.png, proportions.csv and summary.json."""
-    body: str = "body34"
+    body: str = Settings.body
     """arm7, arm8, body30, body32 or body34, or a URDF, MJCF or BVH file."""
-    free_root: bool = False
+    free_root: bool = InitialiseOptions.free_root
     """Let a body move about that by itself stands in one place, as robots from files do."""
-    stature: float | None = None
+    stature: float | None = InitialiseOptions.stature
     """Height of the standing person, metres; by default the prior sets the scale."""
     ground: float | None = None
     """Height of the floor that the person stands on, along the world's axis that points up, metres;
@@ -46,21 +47,21 @@ class Init:
     """From many starts, or the papers' three stages: one fit from a coarse pose, no colours."""
     coarse_pose: Path | None = None
     """JSON file of a pose to start from: radians by parameter of the body."""
-    hypotheses: Literal["best", "all"] | int = 8
+    hypotheses: Literal["best", "all"] | int = InitialiseOptions.num_modes or "all"
     """How many hypotheses to keep: best, all, or a number."""
-    contours: bool = True
+    contours: bool = InitialiseOptions.contours
     """Fit cross-sections and tapers to the picture's contours too."""
-    colours: bool = True
+    colours: bool = InitialiseOptions.colours
     """Let these fits see the colours on either side of the outline too."""
-    sigma: float | None = None
+    sigma: float | None = InitialiseOptions.sigma
     """Noise of a marked wrist, pixels; by default 0.6 % of the person's size."""
-    seed: int = 0
+    seed: int = Settings.seed
     """Seed of all random numbers."""
-    device: str = "cpu"
+    device: str = Settings.device
     """Where to compute."""
-    dtype: Literal["float64", "float32"] = "float64"
+    dtype: Literal["float64", "float32"] = Settings.dtype
     """Floating type."""
-    engine: Literal["fused", "eager"] = "fused"
+    engine: Literal["fused", "eager"] = InitialiseOptions.engine
     """What evaluates the costs: compiled kernels, on a CPU, or the terms as they are written."""
     files: Annotated[PictureFiles, tyro.conf.OmitArgPrefixes] = field(default_factory=PictureFiles)
 

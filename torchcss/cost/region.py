@@ -93,8 +93,8 @@ def region_field(
         ratio: How much each pixel looks like each layer, in -1..1.
         window: The part of the frame that the functions are of, outside of which they are zero;
             None: all of it.
-        smoothing: Standard deviation of the blur, pixels. On the beam clip 3 tells good poses from
-            lost ones by a quarter more than 1 does; with more, thin limbs fade.
+        smoothing: Standard deviation of the blur, pixels. With more than the default, thin limbs
+            fade.
     """
     # Single precision is far finer than the colours, and twice as fast.
     seen = (ratio if window is None else ratio[window.pixels]).float()

@@ -84,8 +84,7 @@ LEAST_RATIO = 1e-4
 PLEASANT = 0.25
 """Weight of the prediction's error where the cost falls by more than was predicted."""
 GOOD_ERROR = 0.25
-"""Relative error of the predicted decrease at which the radius stays as it is (measured: see
-`_next_radius`)."""
+"""Relative error of the predicted decrease at which the radius stays, see `_next_radius`."""
 
 
 class TrustRegionState(NamedTuple):
@@ -177,9 +176,8 @@ class TrustRegionNewton:
             at the default 34-parameter bodies converge from almost every sample.
         tolerance: Expected decrease, in nats, below which an item is done. At the default the
             quadratic model puts the minimum a thousandth of a standard deviation away; in a valley
-            that curves within that length, the true decrease left is a few times more. 1e-3 (a
-            twentieth) saves a sixth of the steps on a reprojection cost of 34 parameters, but
-            leaves a quarter more modes that look distinct there (measured).
+            that curves within that length, the true decrease left is a few times more. With 1e-3
+            there are fewer steps, and more modes that look distinct but are not.
         initial_radius: First trust radius in units of `scale`; the default is a radian.
         factorisations: Cholesky factorisations that may be spent on the damping of one step; two
             to four are taken as a rule.
@@ -565,11 +563,9 @@ def _next_radius(radius: Tensor, length: Tensor, ratio: Tensor, accepted: Tensor
     """Trust radius after a step of some length had some ratio of actual to predicted decrease.
 
     The factor falls with the root of the prediction's relative error, from 2 to 1/5, and is at
-    most 1/2 after a rejection. On reprojection and Fourier costs of 34 parameters this takes a
-    tenth to a fifth fewer evaluations than the textbook's three intervals. An error for the better
-    counts less: robust potentials are concave in the squared error, so that Gauss-Newton promises
-    too little all along the way, and would go in ever shorter steps (36 on the Lorentzian
-    reprojection cost, instead of 15).
+    most 1/2 after a rejection. An error for the better counts less: robust potentials are concave
+    in the squared error, so that Gauss-Newton promises too little all along the way, and would go
+    in ever shorter steps.
     """
     error = torch.where(ratio > 1, PLEASANT * (ratio - 1), 1 - ratio).clamp(min=1e-3)
     factor = (GOOD_ERROR / error).sqrt().clamp(0.2, 2.0)

@@ -88,8 +88,7 @@ def check_numbers(keypoints: Keypoints, *, frames: bool) -> None:
 def default_sigma(keypoints: Keypoints) -> float:
     """Noise of a detector's keypoints, pixels: 0.6 % of the diagonal of the person's box.
 
-    Detectors err in proportion to the person's size in the image: the beam clip's keypoints, 6 px
-    on a person of 950 px, set the ratio. At least one pixel.
+    Detectors err in proportion to the person's size in the image. At least one pixel.
     """
     places = keypoints.positions[keypoints.confidence > 0]
     places = places[places.isfinite().all(-1)]

@@ -94,9 +94,7 @@ def open_detector(name: DetectorName, model: Path | None) -> Detector:
 class MediaPipe:
     """MediaPipe's pose landmarker: 33 landmarks, in space too, and masks.
 
-    Its places are off by 1.8 / visibility standard deviations of what other detectors have:
-    measured on 4500 limb joints of four clips with a reference, where the median error rises from
-    2.0 (at visibility above 0.95) to 3.0 (0.85), 5.5 (0.6), 9.8 (0.25) and 38 (below 0.05).
+    Its places are off by 1.8 / visibility standard deviations of what other detectors have.
 
     Args:
         model: The bundle.

@@ -15,8 +15,7 @@ covariance. The same generator state gives the same problem, whatever the noise 
 
 The camera has 1920 x 1080 pixels and a view of 54 degrees; the body stands 3.5 m before it, which
 fills the image's height. With a pixel of noise the standard deviations of the start mode then
-spread about as far as in Fig. 5 [IJRR] (2000 for a body, 350 for an arm): 650 to 2600, typically
-750, for body34 and 240 to 540 for arm8 over the first eight seeds. Three pixels halve that.
+spread about as far as in Fig. 5 [IJRR] (`scripts/spectra.py` measures it). Three pixels halve that.
 """
 
 from __future__ import annotations

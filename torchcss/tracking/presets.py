@@ -73,24 +73,21 @@ class Preset:
             dynamical noise gets its `deviation` from `noise`. An `EigenDirectionGrid` makes a
             `GridTracker`.
         particles: The particle filter instead; its numbers and dynamics are filled in.
-        samples_arm: Samples per frame for an arm. With 160 halved instead of 40 that all descend,
-            none of five seeds on the rendered arm is lost; with 40 two were.
+        samples_arm: Samples per frame for an arm (`scripts/failure_modes.py` measures it).
         samples_body: Samples per frame for a body.
         modes_arm: Modes kept for an arm.
         modes_body: Modes kept for a body.
         forgetting: See `Tracker`.
-        likelihood_power: See `Tracker`. On the rendered arm 0.1 instead of 1 (with a forgetting of
-            0.98 and matching as in Fig. 6) took the best mode's error from 128 to 59 mm: of
-            two poses that look alike the one that was right so far stays the best.
+        likelihood_power: See `Tracker`. Below 1, of two poses that look alike the one that was
+            right so far stays the best (`scripts/evaluate_posterior.py` measures it).
         survivors_arm: `Tracker.survivors` for an arm.
         survivors_body: The same for a body.
         proposal_arm: Where samples go for an arm, if elsewhere than for a body.
         power_arm: `likelihood_power` for an arm, if other than for a body. Its modes cost the same
             for longer, since it has no `segmentation`: the rest of its person looks the same.
         persistence: Share of its last motion that a mode goes on with: 0 is driftless diffusion, 1
-            constant velocity. The papers' trackers have 0. With 0.8 a mode does not lag behind a
-            limb whose flow is underestimated: on the beam clip it doubles the time that limbs are
-            held, and takes a quarter off the errors of the demo.
+            constant velocity. The papers' trackers have 0. With some, a mode does not lag behind a
+            limb whose flow is underestimated.
         noise: Dynamical noise that the tracker searches by, in multiples of the motion of one
             frame. Ours that descend from scaled covariances have 1, realistic noise; the papers' 0.
         robust: Whether the cost's potentials are robust (False: `Quadratic`).
@@ -99,8 +96,7 @@ class Preset:
         curvature: Which Hessian the cost gives.
         separation: Distance of some joint centre, metres, from which two modes count as two
             explanations, see `Tracker`. The papers have none; their modes are distinct minima. By
-            the mean distance an arm that is flipped hardly counts: on the rendered body-clutter
-            the best of the modes is at 78 mm with this, and was at 101 with a mean of 5 cm.
+            the mean distance of all joints an arm that is flipped would hardly count.
         soft_matching: See `Tracker`.
         surprise_body: `Tracker.surprise` for a body: a tenth of its n = 34 nats, as a frame's
             likelihood counts a tenth. An arm keeps n: nothing tells it from its mirror image but
@@ -180,7 +176,7 @@ class Preset:
 
 _OURS = TrustRegionNewton(max_steps=60, tolerance=1e-2, initial_radius=1 / 16)
 """Of our rows. The radius is in metres and radians: the edges are searched for some 20 pixels to
-either side, and of first steps of a radian, a half and a quarter most are rejected (measured)."""
+either side, and most first steps of a quarter of a radian and more are rejected."""
 
 _TO_CONVERGENCE = TrustRegionNewton(max_steps=200, tolerance=1e-6, initial_radius=1.0)
 """Of the papers' rows (note 8 [IJRR]); the numbers are ours."""

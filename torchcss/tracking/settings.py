@@ -89,8 +89,8 @@ def named_terms(names: Iterable[str]) -> tuple[str, ...]:
 
 SINGLE_PRECISION = 1e-3
 """Tolerance of descents, nats, from which on single precision is enough: costs are some hundred
-nats, of which it leaves an error of 1e-4. On 12 rendered clips of 30 frames, three seeds, errors of
-the leading mode differ from those in double precision by 0.1 mm (standard error 0.5)."""
+nats, of which it leaves an error of 1e-4 (`scripts/evaluate_posterior.py` with either
+`--engine-dtype` measures it)."""
 
 _OF_SAMPLES = ("prediction", "oversampling", "likelihood_power", "limb_jumps")
 """Settings of trackers that descend from samples."""
@@ -362,8 +362,7 @@ def make_choice(settings: Settings, sigma: float, free_root: bool | None = None)
     and weighed by `p(r_t | x_t)` alone (section 1.1 [IJRR]). The prior would count twice.
 
     Segmentation weighs what descents have found, which particles are not. An arm gets none either:
-    what looks like it may be the rest of the person, who is not modelled. On the rendered arm its
-    best mode flips in four of five seeds with it, and in none without. Nor does an arm know a
+    what looks like it may be the rest of the person, who is not modelled. Nor does an arm know a
     background, which the rest of the person would be taken for.
 
     As printed (`Preset.cost`) the contour is eq. 8 [IJRR] or 7 [RR], the flow eq. 9, both divided
@@ -412,9 +411,7 @@ _OCCLUSION_FACTOR = {"ijrr": 1.1, "rr": 0.9}
 
 _PRINTED_WINDOW = 8.0
 """Half length of the search as printed, pixels. With `ContourTerm.least_edge` it makes the mean
-error per node of a fitted model less than nu, as section 3.1.1 [IJRR] asks for: 0.6, 0.6 and 0.3 at
-the truth of the three rendered sequences, and 0.8 to 0.9 at 5 to 15 cm from it. With 12 pixels and
-edges of 0.2 it is 1.0, 1.5 and 0.6, and a body leaves the picture."""
+error per node of a fitted model less than nu, as section 3.1.1 [IJRR] asks for."""
 
 _GAUSSIAN_TAILS = 1e6
 """Height of tails that no parameter reaches."""

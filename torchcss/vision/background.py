@@ -64,12 +64,10 @@ _STRANGE = 3.0
 _MOST_STRANGE_BARE = 0.1
 _MOST_STRANGE = 0.4
 """Share of the bare pixels, and of all known ones, from which it is the camera that has moved or
-the light that has changed. On the beam clip's two views at most 0.1 % of the bare pixels look
-strange, and 2 % of all. A person may come to stand before much of the picture."""
+the light that has changed. A person may come to stand before much of the picture."""
 
 _LEAST_MOTION = 0.25
-"""Median of the flow where nobody is, pixels, from which the camera moves. On those views it is
-at most 0.02."""
+"""Median of the flow where nobody is, pixels, from which the camera moves."""
 
 
 class Background(NamedTuple):

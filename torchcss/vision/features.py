@@ -46,14 +46,12 @@ _WHITE = {torch.uint8: 255.0, torch.uint16: 65535.0}
 """The value of white in the integer types that frames come in."""
 
 _CUT_SHARE = 0.3
-"""Mean outlier of constant brightness from which two frames are of different scenes. Measured on
-six videos: at most 0.07 between neighbouring frames and 0.18 at thirty frames' distance, at least
-0.39 across cuts."""
+"""Mean outlier of constant brightness from which two frames are of different scenes: between what
+frames half a second apart reach, and what cuts have."""
 
 _DISCONTINUITY_DOUBT = 0.5
-"""How far a pixel whose neighbours move otherwise is in doubt. A small, fast limb is all boundary:
-at 1, half of the hand's pixels on the demo's sequence count as outliers although their flow is
-right to a pixel."""
+"""How far a pixel whose neighbours move otherwise is in doubt. Below 1, since a small, fast limb is
+all boundary."""
 
 _FLAT_RANGE = 1.0 / 255.0
 """Range of grey levels up to which a frame is of one colour."""
