@@ -84,6 +84,22 @@ def test_leaves_a_saddle(start):
     assert float(modes.cost) < 1e-5
 
 
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize(
+    ("across", "barrier"), [(0.0, 1e-2), (0.0, 10.0), (0.0, 1e5), (0.3, 1e-2), (0.3, 10.0)]
+)
+def test_leaves_a_ridge_between_mirror_images(compiled, across, barrier, monkeypatch):
+    """No slope along the ridge's fall, and a Hessian whose diagonal is its spectrum."""
+    monkeypatch.setattr(
+        trust_region.compiler, "AVAILABLE", compiled and trust_region.compiler.AVAILABLE
+    )
+    cost = problems.DoubleWell(slope=0.0, barrier=barrier)
+    x0 = torch.tensor([[0.0, across]]).double()
+    modes = NEWTON.minimise(cost, x0, problems.unbounded(2))
+    assert int(modes.status) == Status.CONVERGED
+    assert float(modes.cost) < 1e-4
+
+
 def test_flat_directions_are_no_reason_to_go_on(generator):
     hessian = torch.diag(torch.tensor([5.0, 0.0, 0.0]).double())
     cost = problems.Bowl(hessian, torch.zeros(3).double())

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from torchcss.inference.trust_region import GOOD_ERROR, LEAST_RATIO, PLEASANT
+from torchcss.inference.trust_region import FLAT, GOOD_ERROR, LEAST_RATIO, PLEASANT
 from torchcss.kernels.compiler import by_precision, entry, inlined, kernel, sqrt
 from torchcss.types import Status
 
@@ -289,6 +289,10 @@ def _damped_step(
         lam = max(after, floor)
         if lam <= lo or 0.0 < hi <= lam:
             lam = sqrt(lo * hi) if hi > 0.0 else 10.0 * lo
+        # On a saddle no lambda makes the step longer: back to the one that has a factor.
+        closed = lo >= 0.5 * hi or remaining == 1
+        if not ok and hi > 0.0 and size <= FLAT * radius and closed:
+            lam = hi
     return found
 
 

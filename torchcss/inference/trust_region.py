@@ -158,6 +158,8 @@ class _Trial(NamedTuple):
 
 _PINNING_ROUNDS = 12
 """Solves that may be spent on finding which bounds a step ends at."""
+FLAT = 1e-9
+"""Share of the trust radius below which a damped step counts as none: the slope is zero."""
 _FAST, _SLOW = 0.02, 0.005
 """Share of the cost that a step must promise to remove for Gauss-Newton to be the better model, and
 below which the exact one is."""
@@ -618,12 +620,14 @@ def _damped_step(
     todo = torch.arange(len(gradient), device=gradient.device)
     lam, rad, guess = damping.clamp(min=floor), radius, guess
     lo, hi = torch.zeros_like(lam), torch.full_like(lam, torch.inf)
+    flat = torch.zeros_like(lam, dtype=torch.bool)
     for remaining in reversed(range(rounds)):
         d, slope, ok = _solve_damped(problem, todo, lam[:, None] * weight)
         size = _norm(d, weight)
         too_long, too_short = ok & (size > 1.25 * rad), ok & (size < 0.75 * rad) & (lam > floor)
         lo = torch.where(~ok | (size > rad), lam, lo)
         hi = torch.where(ok & (size <= rad), lam, hi)
+        flat = torch.where(ok, size <= FLAT * rad, flat)
         # Almost singular and still short: the gradient has no share in the direction of negative
         # curvature ("hard case"; a saddle is one). Go along it as far as the radius allows.
         stuck = too_short & ((lo >= 0.5 * lam) | (remaining == 0))
@@ -638,13 +642,15 @@ def _damped_step(
         left = torch.nonzero(~ok | too_long | (too_short & ~stuck))[:, 0]
         if remaining == 0 or not len(left):
             break
-        todo, lam, rad, guess, lo, hi, size, slope, ok = (
-            part[left] for part in (todo, lam, rad, guess, lo, hi, size, slope, ok)
+        todo, lam, rad, guess, lo, hi, size, slope, ok, flat = (
+            part[left] for part in (todo, lam, rad, guess, lo, hi, size, slope, ok, flat)
         )
         newton = lam + size.square() / torch.where(slope > 0, slope, 1.0) * (size - rad) / rad
         after = torch.where(ok, newton, torch.maximum(10 * lam, guess)).clamp(min=floor)
         between = torch.where(hi.isfinite(), (lo * hi).sqrt(), 10 * lo)
         lam = torch.where((after > lo) & (after < hi), after, between)
+        # On a saddle no lambda makes the step longer: back to the one that has a factor.
+        lam = torch.where(~ok & flat & ((lo >= 0.5 * hi) | (remaining == 1)), hi, lam)
     return step, found
 
 
