@@ -40,9 +40,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import torch
-from common import Table, start, write_report
+from common import QUARTILES, Table, quartiles, start, write_report
 from peers.autograd_cost import joints_by_autograd, made_up_costs, made_up_frames
 from torch import Tensor
 
@@ -60,7 +59,6 @@ COMPARED = {  # with which other way each is compared
     "full_one_by_one": "full_closed",
 }
 Way = tuple[Callable[[Tensor], Any], Tensor]
-QUARTILES = {"lower_quartile": 0.25, "median": 0.5, "upper_quartile": 0.75}
 AT_LEAST_S = 0.3  # A way that is faster is called again, and the mean time taken.
 
 
@@ -137,11 +135,6 @@ def difference(closed: LocalModel, other: LocalModel) -> float:
     """Largest difference of an item's derivatives, relative to the item's largest of that order."""
     pairs = [(a.flatten(1), b.flatten(1)) for a, b in zip(closed[1:], other[1:], strict=True)]
     return max(float(((a - b).abs().amax(1) / b.abs().amax(1)).max()) for a, b in pairs)
-
-
-def quartiles(values: list[float]) -> dict[str, float]:
-    """The middle and the spread."""
-    return {name: float(np.quantile(values, q)) for name, q in QUARTILES.items()}
 
 
 def main(config: Config) -> dict[str, Any]:

@@ -78,8 +78,6 @@ def main(config: Config) -> None:
         print("OpenCV is not installed (extra 'bench'): its rows are left out")
     rows = []
     for pair in read_pairs(config):
-        print(f"\n{pair.name}, {pair.first.shape[1]} x {pair.first.shape[0]} pixels")
-        print(f"{'method':<20}" + "".join(f"{column:>11}" for column in COLUMNS))
         boundary = flow_discontinuities(pair.flow, pair.known, jump=config.jump)
         for name, method in methods.items():
             runs = [timed(method, pair) for _ in range(1 if config.small else config.repeats)]
@@ -90,13 +88,11 @@ def main(config: Config) -> None:
             if isinstance(result, OpticalFlow):
                 row |= boundary_score(result, boundary, config.tolerance)
             rows.append(row)
-            values = (row.get(column) for column in COLUMNS)
-            cells = ("-" if value is None else f"{value:.3f}" for value in values)
-            print(f"{name:<20}" + "".join(f"{cell:>11}" for cell in cells))
     setting = {key: getattr(config, key) for key in ("jump", "near", "tolerance", "small")}
     setting |= {"torch": torch.__version__, "threads": torch.get_num_threads()}
     cells = [[row["pair"], row["method"], *map(row.get, COLUMNS)] for row in rows]
     table = Table("Optical flow", ("pair", "method", *COLUMNS), cells)
+    table.print()
     write_report(config.out, {"setting": setting, "rows": rows}, table)
 
 

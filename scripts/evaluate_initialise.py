@@ -96,7 +96,6 @@ def main(config: Config) -> dict[str, Any]:
     report = {"unit": "mm, %, s", "direction": "lower is better; params and joints: 95 is right",
               "setting": config, "rows": rows}  # fmt: skip
     conditions = [*SYNTHETIC, *(CLIPS if config.data else ())]
-    print(f"{'':42}" + "".join(f"{head:>9}" for head in HEADS))
     for variant in config.variants[: 2 if config.small else None]:
         for condition in ("noise 2 px",) if config.small else conditions:
             if variant != "full" and condition not in COMPARED:
@@ -106,9 +105,8 @@ def main(config: Config) -> dict[str, Any]:
             rows.append({"variant": variant, "condition": condition, "count": len(fits), **mean,
                          "per_case": fits})  # fmt: skip
             shown.append([condition, variant, *mean.values()])
-            cells = "".join(f"{value:9.1f}" for value in mean.values())
-            print(f"{variant:20}{condition:22}{cells}", flush=True)
             table = Table("First pose", ("condition", "fit", *HEADS), shown)
+            table.print()
             write_report(config.out, report, table)
     return report
 

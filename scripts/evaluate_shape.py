@@ -63,7 +63,6 @@ class Config:
 def main(config: Config) -> dict[str, Any]:
     """Fit, print and write the table; return what is written."""
     report: dict[str, Any] = {"setting": config, "rows": []}
-    print(f"{'':44}{'overlap':>9}{'area':>9}{'root mm':>9}{'of all':>9}")
     for folder in config.sequences:
         sequence = read_sequence(folder)
         if sequence.mask is None:
@@ -75,10 +74,9 @@ def main(config: Config) -> dict[str, Any]:
                 report["rows"].append(
                     {"sequence": sequence.name, "frame": int(index), "by": name, **row}
                 )
-                cells = "".join(f"{value:9.2f}" for value in row.values())
-                print(f"{sequence.name:22}{index:6}  {name:14}{cells}", flush=True)
     columns = ("sequence", "frame", "by", "overlap", "area", "root mm", "of all mm")
     table = Table("Outline of the first pose", columns, [[*r.values()] for r in report["rows"]])
+    table.print()
     write_report(config.out, report, table)
     return report
 

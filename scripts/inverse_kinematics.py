@@ -300,21 +300,24 @@ def main(config: Config) -> dict[str, Any]:
         raise ConfigurationError(f"no cases {unknown}; there are {'; '.join(CASES)}")
     torch.set_num_threads(1)
     report: dict[str, Any] = {"config": config, "cases": {}}
-    print(f"{'':>22} {'poses':>5} {'solutions':>10} {'checked':>8} {'recall':>7} {'error':>8}"
-          f" {'seconds':>8} {'peer finds':>10} {'rate over peer (range)':>24}")  # fmt: skip
     for case in config.cases:
         rows = [run_pose(config, case, number) for number in range(config.poses)]
         report["cases"][case] = {"poses": rows, **summarise(rows)}
-        print_row(case, report["cases"][case])
+        table = table_of(report["cases"])
+        table.print()
+        write_report(config.out, report, table)
+    return report
+
+
+def table_of(cases: dict[str, Any]) -> Table:
+    """What is shown of each arm."""
     columns = ("arm", "solutions", "checked", "recall", "error", "seconds", "peer finds")
     keys = ("solutions", "reference", "recall", "error", "seconds", "peer_solutions")
     rows = [
         [name, *(case[key] for key in keys), case["ratio_quantiles"][1]]
-        for name, case in report["cases"].items()
+        for name, case in cases.items()
     ]
-    table = Table("Inverse kinematics", (*columns, "rate over peer"), rows)
-    write_report(config.out, report, table)
-    return report
+    return Table("Inverse kinematics", (*columns, "rate over peer"), rows)
 
 
 def summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -332,17 +335,6 @@ def summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "peer_solutions": float(np.mean([n for r in rows for n in r["peer_solutions"]] or [0.0])),
         "ratio_quantiles": np.quantile(ratios or [math.nan], [0.0, 0.5, 1.0]).tolist(),
     }
-
-
-def print_row(case: str, total: dict[str, Any]) -> None:
-    """One line of the table."""
-    low, middle, high = total["ratio_quantiles"]
-    print(
-        f"{case:>22} {len(total['poses']):5d} {total['solutions']:10d} {total['reference']:8d} "
-        f"{100 * total['recall']:6.2f}% {total['error']:8.1e} {total['seconds']:8.2f} "
-        f"{total['peer_solutions']:10.1f} {middle:8.2f} ({low:.2f} to {high:.2f})",
-        flush=True,
-    )
 
 
 if __name__ == "__main__":

@@ -41,7 +41,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from common import Table, start, write_report
+from common import Table, quartiles, start, write_report
 from matplotlib.figure import Figure
 from peers.tracker_step import Step, Work, compile_step, make_frames, profiled, tracker_step
 
@@ -49,7 +49,6 @@ from torchcss.errors import ConfigurationError
 from torchcss.io.tracks import prepare_output_folder
 from torchcss.tracking.settings import Settings
 
-QUARTILES = {"lower_quartile": 0.25, "median": 0.5, "upper_quartile": 0.75}
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 
 
@@ -138,11 +137,6 @@ def measure(config: Config, body: str) -> Iterator[dict[str, Any]]:
             row[name]["seconds"] = quartiles([times[name] for times in rounds])
         row["speed_up"] = quartiles([times["eager"] / times["compiled"] for times in rounds])
         yield row
-
-
-def quartiles(values: list[float]) -> dict[str, float]:
-    """The middle and the spread."""
-    return {name: float(np.quantile(values, q)) for name, q in QUARTILES.items()}
 
 
 def picture(rows: list[dict[str, Any]]) -> Figure:

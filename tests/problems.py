@@ -9,6 +9,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.problem import SearchProblem
 from torchcss.inference.tracker import SequenceTracker, TrackerInfo, TrackerState
 from torchcss.types import Bounds, LocalModel
@@ -22,6 +23,14 @@ def box(n: int, lower: float, upper: float, dtype: torch.dtype = torch.float64) 
 def unbounded(n: int, dtype: torch.dtype = torch.float64) -> Bounds:
     """No limits at all."""
     return box(n, -torch.inf, torch.inf, dtype)
+
+
+def single(
+    mean: tuple[float, float] = (2.0, 1.0), variance: tuple[float, float] = (1.0, 0.25)
+) -> GaussianMixture:
+    """One mode of two parameters."""
+    covariance = torch.diag(torch.tensor(variance).double())
+    return GaussianMixture(torch.tensor([mean]).double(), covariance[None], torch.zeros(1).double())
 
 
 def follow(

@@ -16,6 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
 import tyro
 
 from torchcss.errors import ConfigurationError, TorchcssError
@@ -39,6 +40,14 @@ def start(main: Callable[[Config], Any], config: type[Config], page: str | None)
     except TorchcssError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
+
+
+QUARTILES = {"lower_quartile": 0.25, "median": 0.5, "upper_quartile": 0.75}
+
+
+def quartiles(values: Sequence[float]) -> dict[str, float]:
+    """The middle of some measurements, and their spread."""
+    return {name: float(np.quantile(values, q)) for name, q in QUARTILES.items()}
 
 
 class Table(NamedTuple):

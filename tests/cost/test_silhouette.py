@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 import torch
 from made_costs import Ready
+from painted import a_body_before_a_camera, moved
 from torch import Tensor
 from torch.func import hessian, jacrev, vmap
 
-from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.cost.choice import CostChoice
 from torchcss.cost.context import FrameContext
@@ -21,24 +21,11 @@ from torchcss.cost.interior import InteriorNodes
 from torchcss.cost.part_map import part_map
 from torchcss.cost.silhouette import SilhouetteImages, SilhouetteTerm
 from torchcss.cost.total import TrackingCost, beside
+from torchcss.types import Curvature
 from torchcss.vision.appearance import Appearance
 from torchcss.vision.background import Background
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor, FrameFeatures
-
-
-def a_body_before_a_camera(dtype: torch.dtype = torch.float64) -> tuple[BodyModel, Camera]:
-    body = load_body("body34").with_base(
-        torch.eye(3, dtype=torch.float64), torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64)
-    )
-    K = [[450.0, 0.0, 239.5], [0.0, 450.0, 299.5], [0.0, 0.0, 1.0]]
-    return body.to(dtype), Camera(K, (480, 600)).to(dtype)
-
-
-def moved(body: BodyModel, angle: float) -> Tensor:
-    x = body.rest.clone()
-    x[body.state_index("r_shoulder_raising")] += angle
-    return x
 
 
 def nodes(body: BodyModel, x: Tensor) -> Tensor:
@@ -229,7 +216,8 @@ def test_the_whole_cost_has_its_derivatives_and_chunks() -> None:
     cost = TrackingCost(choice=CostChoice(terms=(Ready(term, bound),)), views=(view,))
     x = torch.stack([moved(body, 0.1), moved(body, 1.4), body.rest])
     model = cost.local_model(x)
-    gradient = torch.stack([jacrev(lambda y: cost.terms(y[None])["silhouette"][0])(y) for y in x])
+    by_autograd = replace(cost.choice, curvature=Curvature.AUTOGRAD)
+    gradient = replace(cost, choice=by_autograd).local_model(x).gradient
     torch.testing.assert_close(model.gradient, gradient, rtol=1e-7, atol=1e-8)
     torch.testing.assert_close(model.value, cost.value(x))
     torch.testing.assert_close(cost.take(torch.arange(3)).value(x), model.value)

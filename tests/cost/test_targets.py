@@ -9,22 +9,16 @@ import torch
 from torch import Tensor
 
 from torchcss.body.load import load_body
-from torchcss.body.model import BodyModel, differentiate_twice
+from torchcss.body.model import differentiate_twice
 from torchcss.cost.targets import PointTargets, pose_targets
 from torchcss.errors import BodyError, ShapeError
-
-
-def pose_of(body: BodyModel, link: str, x: Tensor) -> Tensor:
-    tree, index = body.pose(x).tree, body.tree.link_index(link)
-    pose = torch.eye(4, dtype=x.dtype)
-    pose[:3, :3], pose[:3, 3] = tree.rotation[index], tree.translation[index]
-    return pose
+from torchcss.solve.inverse_kinematics import link_pose
 
 
 def cost_of(name: str, link: str, *, place_only: bool = False, **options) -> PointTargets:
     body = load_body(name)
     x = body.bounds.project(torch.full_like(body.rest, 0.3))
-    pose = pose_of(body, link, x)
+    pose = link_pose(body, link, x)
     return pose_targets(body, link, pose[:3, 3] if place_only else pose, **options)
 
 
@@ -98,7 +92,7 @@ def test_what_a_displacement_and_a_turn_cost() -> None:
     body = load_body("body30")
     x, arm, sigma = body.rest.clone(), 0.25, 0.1
     cost = pose_targets(
-        body, "root_roll_link", pose_of(body, "root_roll_link", x), arm=arm, sigma=sigma
+        body, "root_roll_link", link_pose(body, "root_roll_link", x), arm=arm, sigma=sigma
     )
     assert float(cost.value(x)) == 0
     moved = x.clone()

@@ -20,11 +20,6 @@ ARM = GridTracker(num_samples=9, num_modes=3, pattern=EigenDirectionGrid(num_dir
 START = torch.Generator().manual_seed(0)
 
 
-def at(mean=(2.0, 1.0), variance=(1.0, 0.25)) -> GaussianMixture:
-    covariance = torch.diag(torch.tensor(variance).double())
-    return GaussianMixture(torch.tensor([mean]).double(), covariance[None], torch.zeros(1).double())
-
-
 @dataclass(frozen=True)
 class Counted(problems.Alike):
     """Any cost, with every state at which it was asked."""
@@ -55,7 +50,7 @@ def test_k_hypotheses_descend_and_the_pattern_is_scored_alone():
     """The starts of the next frame are the best k of the pool, undescended."""
     cost, edges = Counted.of(bowl(100.0, 4.0)), Counted.of(bowl(1.0, 1.0, minimum=(0.0, 9.0)))
     problem = SearchProblem(cost, screening=edges)
-    state, info = ARM.step(ARM.init(at(), generator=START), problem, BOUNDS)
+    state, info = ARM.step(ARM.init(problems.single(), generator=START), problem, BOUNDS)
     assert int(info.num_samples) == 3
     assert info.status_counts.tolist()[Status.CONVERGED] == 3
     assert len(cost.models[0]) == 3
@@ -82,7 +77,7 @@ def test_k_hypotheses_descend_and_the_pattern_is_scored_alone():
 def test_the_first_hypotheses_are_the_pattern_about_the_fit():
     body = replace(ARM, num_samples=49, num_modes=7, pattern=EigenDirectionGrid())
     cost = Counted.of(bowl(1.0, 1.0))
-    body.step(body.init(at(), generator=START), SearchProblem(cost), BOUNDS)
+    body.step(body.init(problems.single(), generator=START), SearchProblem(cost), BOUNDS)
     fit, step = torch.tensor([2.0, 1.0]), torch.tensor([[1.0, 0.0], [0.0, 0.5]])
     expected = torch.stack([fit, fit - step[0], fit + step[0], fit - step[1], fit + step[1]])
     found = torch.cdist(cost.models[0], expected.double()).amin(0)
@@ -107,7 +102,7 @@ def test_a_held_parameter_is_no_direction_of_the_pattern():
     bounds = problems.box(2, -6, 0.5)
     edges = Counted.of(bowl(1.0, 1.0))
     problem = SearchProblem(bowl(1e-3, 1.0, minimum=(4.0, 0.0)), screening=edges)
-    state, _ = ARM.step(ARM.init(at(), generator=START), problem, bounds)
+    state, _ = ARM.step(ARM.init(problems.single(), generator=START), problem, bounds)
     pool = edges.values[-1]
     assert bool((pool[:, 0] == 0.5).all())
     assert float(pool[:, 1].abs().max()) == pytest.approx(1.0)
@@ -117,13 +112,15 @@ def test_a_held_parameter_is_no_direction_of_the_pattern():
 def test_what_has_not_converged_is_left_out_and_all_stay_if_none_has():
     hurried = replace(ARM, optimiser=replace(ARM.optimiser, max_steps=1))
     well = SearchProblem(problems.DoubleWell())
-    begun, _ = ARM.step(ARM.init(at(), generator=START), well, BOUNDS)
+    begun, _ = ARM.step(ARM.init(problems.single(), generator=START), well, BOUNDS)
     state, info = hurried.step(begun, well, BOUNDS)
     assert int(info.num_distinct) == int(info.status_counts[Status.CONVERGED])
-    first, info = hurried.step(hurried.init(at((0.3, 1.0)), generator=START), well, BOUNDS)
+    first, info = hurried.step(
+        hurried.init(problems.single((0.3, 1.0)), generator=START), well, BOUNDS
+    )
     assert int(info.num_distinct) == 0
     assert info.cost.tolist() == [math.inf]
-    assert torch.equal(first.mixture.mean, at((0.3, 1.0)).mean)
+    assert torch.equal(first.mixture.mean, problems.single((0.3, 1.0)).mean)
 
     class Nowhere(problems.DoubleWell):
         def local_model(self, x):
@@ -136,11 +133,11 @@ def test_what_has_not_converged_is_left_out_and_all_stay_if_none_has():
 
 def test_nothing_is_random_and_steps_are_pure():
     wells = [SearchProblem(problems.DoubleWell(tilt=0.1 * t)) for t in range(6)]
-    start = ARM.init(at(), generator=START)
+    start = ARM.init(problems.single(), generator=START)
     *_, (whole, _) = problems.follow(ARM, start, wells, BOUNDS)
     *_, (half, _) = problems.follow(ARM, start, wells[:3], BOUNDS)
     *_, (end, _) = problems.follow(ARM, half, wells[3:], BOUNDS)
-    other = ARM.init(at(), generator=torch.Generator().manual_seed(9))
+    other = ARM.init(problems.single(), generator=torch.Generator().manual_seed(9))
     *_, (same, _) = problems.follow(ARM, other, wells, BOUNDS)
     for one in (end, same):
         assert whole.particles is not None
@@ -155,7 +152,7 @@ def test_nothing_is_random_and_steps_are_pure():
 def test_floored_hessians_are_counted():
     """Of a parameter about which the cost says nothing, the deviation is the prior's."""
     problem = SearchProblem(bowl(4.0, 0.0))
-    start = ARM.init(at(), generator=START)
+    start = ARM.init(problems.single(), generator=START)
     state, info = ARM.step(start, problem, BOUNDS)
     assert int(info.num_floored) == 3
     expected = torch.tensor([0.25, 9.0]).double()

@@ -15,11 +15,7 @@ from torchcss.types import LocalModel, Status
 FREE = problems.unbounded(2)
 BOUNDS = problems.box(2, -6, 6)
 STEP = (0.5, 0.3)
-
-
-def single(mean=(0.0, 0.0), variance=(1.0, 0.25)) -> GaussianMixture:
-    covariance = torch.diag(torch.tensor(variance).double())
-    return GaussianMixture(torch.tensor([mean]).double(), covariance[None], torch.zeros(1).double())
+CENTRE = problems.single((0.0, 0.0))
 
 
 def make(kind, **options):
@@ -50,9 +46,9 @@ def test_it_is_the_kalman_filter_where_that_is_exact(options, generator):
     """Gaussian prior, linear dynamics, Gaussian likelihood; the weights undo any inflation."""
     tracker = make(ParticleFilter, num_samples=40000, **options)
     costs = [bowl(0.3, -0.2), bowl(0.6, 0.1), bowl(0.2, 0.4)]
-    mean, covariance = single().mean[0], single().covariance[0]
+    mean, covariance = CENTRE.mean[0], CENTRE.covariance[0]
     noise = torch.diag(torch.tensor(STEP).double().square())
-    state = tracker.init(single(), generator=generator)
+    state = tracker.init(CENTRE, generator=generator)
     for cost, (now, info) in zip(
         costs, problems.follow(tracker, state, map(SearchProblem, costs), FREE), strict=True
     ):
@@ -71,7 +67,7 @@ def test_it_is_the_kalman_filter_where_that_is_exact(options, generator):
 @pytest.mark.parametrize("tracker", FILTERS)
 def test_the_mixture_sums_the_particles_up(tracker, generator):
     state, info = tracker.step(
-        tracker.init(single(), generator=generator), SearchProblem(bowl(0.3, 0.2)), FREE
+        tracker.init(CENTRE, generator=generator), SearchProblem(bowl(0.3, 0.2)), FREE
     )
     for got, expected in zip(state.mixture.moments(), moments(state.particles), strict=True):
         torch.testing.assert_close(got, expected)
@@ -104,7 +100,9 @@ def test_two_separate_wells_are_two_components(tracker, generator):
 def test_annealing_drifts_into_a_minimum_that_resampling_misses(generator):
     """Far away and narrow: one layer leaves next to no survivor, many find the way."""
     far = problems.Bowl(400 * torch.eye(2).double(), torch.tensor([2.0, 1.5]).double())
-    state = make(ParticleFilter).init(single(variance=(0.01, 0.01)), generator=generator)
+    state = make(ParticleFilter).init(
+        problems.single((0.0, 0.0), variance=(0.01, 0.01)), generator=generator
+    )
     _, plain = make(ParticleFilter, num_samples=200).step(state, SearchProblem(far), FREE)
     annealed = make(AnnealedParticleFilter, num_samples=200, num_layers=10)
     _, info = annealed.step(state, SearchProblem(far), FREE)
@@ -116,7 +114,7 @@ def test_annealing_drifts_into_a_minimum_that_resampling_misses(generator):
 @pytest.mark.parametrize("tracker", FILTERS)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_bounds_type_and_repeatability(tracker, dtype):
-    mixture = GaussianMixture(*(field.to(dtype) for field in single()))
+    mixture = GaussianMixture(*(field.to(dtype) for field in CENTRE))
     bounds = problems.box(2, -0.3, 0.4, dtype)
     runs = []
     for _ in range(2):
@@ -138,7 +136,7 @@ def test_bounds_type_and_repeatability(tracker, dtype):
 @pytest.mark.parametrize("tracker", FILTERS)
 def test_saved_and_restored_runs_continue_exactly(tracker, generator):
     costs = [bowl(0.1 * t, 0.2) for t in range(6)]
-    state = tracker.init(single(), generator=generator)
+    state = tracker.init(CENTRE, generator=generator)
     *_, (whole, _) = problems.follow(tracker, state, map(SearchProblem, costs), FREE)
     *_, (half, _) = problems.follow(tracker, state, map(SearchProblem, costs[:3]), FREE)
     file = io.BytesIO()
@@ -156,7 +154,7 @@ def test_saved_and_restored_runs_continue_exactly(tracker, generator):
 @pytest.mark.parametrize("tracker", FILTERS)
 def test_dropped_particles_are_drawn_from_the_mixture(tracker, generator):
     state, _ = tracker.step(
-        tracker.init(single(), generator=generator), SearchProblem(bowl(0.3, 0.2)), FREE
+        tracker.init(CENTRE, generator=generator), SearchProblem(bowl(0.3, 0.2)), FREE
     )
     again, _ = tracker.step(state._replace(particles=None), SearchProblem(bowl(0.3, 0.2)), FREE)
     assert float((again.mixture.moments()[0] - state.mixture.moments()[0]).norm()) < 0.3
@@ -171,7 +169,7 @@ class Nowhere(problems.Bowl):
 def test_no_finite_cost(tracker, generator):
     nowhere = Nowhere(torch.eye(2).double(), torch.zeros(2).double())
     state, info = tracker.step(
-        tracker.init(single(), generator=generator), SearchProblem(nowhere), FREE
+        tracker.init(CENTRE, generator=generator), SearchProblem(nowhere), FREE
     )
     assert int(info.status_counts[Status.NON_FINITE]) == tracker.num_samples
     assert int(info.num_distinct) == 0
@@ -184,13 +182,15 @@ def test_no_finite_cost(tracker, generator):
 @pytest.mark.parametrize("tracker", FILTERS)
 @pytest.mark.parametrize("variance", [0.0, 1e-14, 1e14])
 def test_awkward_priors(tracker, variance, generator):
-    state = tracker.init(single(variance=(variance, variance)), generator=generator)
+    state = tracker.init(
+        problems.single((0.0, 0.0), variance=(variance, variance)), generator=generator
+    )
     twice = map(SearchProblem, [bowl(0.0, 0.0)] * 2)
     for state, _ in problems.follow(tracker, state, twice, BOUNDS):  # noqa: B020
         assert all(bool(field.isfinite().all()) for field in state.mixture)
     still = make(type(tracker), num_samples=50, dynamics=Diffusion())
     state, _ = still.step(
-        still.init(single(), generator=generator), SearchProblem(bowl(0.0, 0.0)), BOUNDS
+        still.init(CENTRE, generator=generator), SearchProblem(bowl(0.0, 0.0)), BOUNDS
     )
     assert 1 <= len(state.mixture.mean) <= 3
 
@@ -204,7 +204,9 @@ def test_velocity_carries_particles_on(generator):
     behind = []
     for dynamics in (ConstantVelocity(deviation=0.05), Diffusion(deviation=0.05)):
         tracker = make(ParticleFilter, dynamics=dynamics)
-        state = tracker.init(single(variance=(0.01, 0.01)), generator=generator)
+        state = tracker.init(
+            problems.single((0.0, 0.0), variance=(0.01, 0.01)), generator=generator
+        )
         *_, (state, _) = problems.follow(tracker, state, map(SearchProblem, path), FREE)
         behind.append(float(path[-1].minimum[0] - state.mixture.moments()[0][0]))
     assert abs(behind[0]) < 0.05 < behind[1]
@@ -222,7 +224,7 @@ def test_parents_are_the_modes_of_the_last_frame(generator):
 
     problem = SearchProblem(bowl(0.0, 0.0), of_children=children)
 
-    state = tracker.init(single(), generator=generator)
+    state = tracker.init(CENTRE, generator=generator)
     state, _ = tracker.step(state, problem, FREE)
     state, info = tracker.step(state, problem, FREE)
     for parent, prior in seen:

@@ -28,13 +28,8 @@ BOUNDS = problems.box(2, -6, 6)
 CSS = Tracker(proposal=CovarianceScaled(covariance_scale=8), num_samples=40, num_modes=3)
 
 
-def single(mean=(2.0, 1.0), variance=(1.0, 0.25)) -> GaussianMixture:
-    covariance = torch.diag(torch.tensor(variance).double())
-    return GaussianMixture(torch.tensor([mean]).double(), covariance[None], torch.zeros(1).double())
-
-
 def test_both_wells_are_found_and_followed(generator):
-    state = CSS.init(single(), generator=generator)
+    state = CSS.init(problems.single(), generator=generator)
     wells = [problems.DoubleWell(slope=0.5 + 0.02 * t) for t in range(5)]
     for well, (now, info) in zip(
         wells, problems.follow(CSS, state, map(SearchProblem, wells), BOUNDS), strict=True
@@ -59,14 +54,16 @@ def test_both_wells_are_found_and_followed(generator):
 
 def test_weights_are_those_of_the_costs(generator):
     well = problems.DoubleWell(tilt=0.4)
-    state, info = CSS.step(CSS.init(single(), generator=generator), SearchProblem(well), BOUNDS)
+    state, info = CSS.step(
+        CSS.init(problems.single(), generator=generator), SearchProblem(well), BOUNDS
+    )
     # One prior mode: its weight is one, and the posterior that of the likelihood.
     expected = (-info.cost).softmax(0)
     torch.testing.assert_close(state.mixture.weight, expected)
     assert info.parent.tolist() == [0, -1]
     evidence = Tracker(proposal=CSS.proposal, num_samples=40, num_modes=3, laplace_evidence=True)
     state, info = evidence.step(
-        evidence.init(single(), generator=generator), SearchProblem(well), BOUNDS
+        evidence.init(problems.single(), generator=generator), SearchProblem(well), BOUNDS
     )
     expected = (-info.cost + 0.5 * state.mixture.covariance.logdet()).softmax(0)
     torch.testing.assert_close(state.mixture.weight, expected)
@@ -80,7 +77,7 @@ def test_saved_and_restored_runs_continue_exactly(generator):
         num_modes=3,
         dynamics=ConstantVelocity(deviation=0.01),
     )
-    state = tracker.init(single(), generator=generator)
+    state = tracker.init(problems.single(), generator=generator)
     *_, (whole, _) = problems.follow(tracker, state, map(SearchProblem, wells), BOUNDS)
     *_, (half, _) = problems.follow(tracker, state, map(SearchProblem, wells[:3]), BOUNDS)
     file = io.BytesIO()
@@ -95,7 +92,7 @@ def test_saved_and_restored_runs_continue_exactly(generator):
 
 
 def test_a_step_is_a_pure_function_of_the_state(generator):
-    state = CSS.init(single(), generator=generator)
+    state = CSS.init(problems.single(), generator=generator)
     a, _ = CSS.step(state, SearchProblem(problems.DoubleWell()), BOUNDS)
     b, _ = CSS.step(state, SearchProblem(problems.DoubleWell()), BOUNDS)
     assert torch.equal(a.mixture.mean, b.mixture.mean)
@@ -167,7 +164,7 @@ class Shuffled:
 def test_the_order_of_the_samples_is_irrelevant(generator):
     other = Tracker(proposal=Shuffled(), num_samples=40, num_modes=3)
     well = problems.DoubleWell(tilt=0.3)
-    state = CSS.init(single(), generator=generator)
+    state = CSS.init(problems.single(), generator=generator)
     a, b = (t.step(state, SearchProblem(well), BOUNDS)[0].mixture for t in (CSS, other))
     torch.testing.assert_close(a.mean, b.mean, rtol=1e-6, atol=1e-6)
     torch.testing.assert_close(a.log_weight, b.log_weight, rtol=1e-6, atol=1e-6)
@@ -182,7 +179,7 @@ def test_the_order_of_the_samples_is_irrelevant(generator):
 )
 def test_awkward_covariances(variance, num_modes, single_precision, seed):
     dtype = torch.float32 if single_precision else torch.float64
-    mixture = single(variance=(variance, 0.5 * variance))
+    mixture = problems.single(variance=(variance, 0.5 * variance))
     mixture = GaussianMixture(*(x.to(dtype) for x in mixture))
     tracker = Tracker(proposal=CSS.proposal, num_samples=15, num_modes=num_modes)
     state = tracker.init(mixture, generator=torch.Generator().manual_seed(seed))
@@ -197,7 +194,9 @@ def test_awkward_covariances(variance, num_modes, single_precision, seed):
 
 def test_all_samples_in_one_minimum(generator):
     bowl = problems.Bowl(4 * torch.eye(2).double(), torch.tensor([0.5, 0.0]).double())
-    state, info = CSS.step(CSS.init(single(), generator=generator), SearchProblem(bowl), BOUNDS)
+    state, info = CSS.step(
+        CSS.init(problems.single(), generator=generator), SearchProblem(bowl), BOUNDS
+    )
     assert state.mixture.mean.shape == (1, 2)
     assert float(state.mixture.log_weight) == 0
     assert int(info.num_distinct) == 1
@@ -213,7 +212,7 @@ def test_no_sample_with_a_finite_cost_carries_the_prior_over(generator):
     tracker = Tracker(
         proposal=CSS.proposal, num_samples=10, num_modes=3, dynamics=Diffusion(deviation=0.5)
     )
-    start = tracker.init(single(), generator=generator)
+    start = tracker.init(problems.single(), generator=generator)
     state, info = tracker.step(start, SearchProblem(Nowhere()), BOUNDS)
     assert torch.equal(state.mixture.mean, start.mixture.mean)
     assert bool((state.mixture.covariance - start.mixture.covariance).diagonal(0, 1, 2).gt(0).all())
@@ -247,7 +246,7 @@ def test_a_cost_made_from_the_samples_parents(generator):
         seen.append((parent, prior))
         return Sticky(torch.ones(len(parent), 1).double(), prior.mixture.mean[parent])
 
-    state = CSS.init(single(), generator=generator)
+    state = CSS.init(problems.single(), generator=generator)
     problem = SearchProblem(
         problems.Bowl(torch.eye(2).double(), torch.zeros(2).double()),
         of_children=lambda parent, prior: SearchProblem(make(parent, prior)),
@@ -255,7 +254,7 @@ def test_a_cost_made_from_the_samples_parents(generator):
     state, _ = CSS.step(state, problem, BOUNDS)
     parent, prior = seen[0]
     assert parent.shape == (40,)
-    assert torch.equal(prior.mixture.mean, single().mean)
+    assert torch.equal(prior.mixture.mean, problems.single().mean)
     torch.testing.assert_close(state.mixture.mean[:1], prior.mixture.mean, rtol=0, atol=0.2)
 
 
@@ -290,8 +289,8 @@ def test_bad_input(generator):
     with pytest.raises(ConfigurationError, match="num_samples"):
         Tracker(proposal=CSS.proposal, num_samples=0, num_modes=1)
     with pytest.raises(ShapeError, match=r"mixture.covariance.*\[..., 1, 2, 2\]"):
-        CSS.init(single()._replace(covariance=torch.eye(3)[None]), generator=generator)
-    state = CSS.init(single(), generator=generator)
+        CSS.init(problems.single()._replace(covariance=torch.eye(3)[None]), generator=generator)
+    state = CSS.init(problems.single(), generator=generator)
     with pytest.raises(ShapeError, match="bounds"):
         CSS.step(state, SearchProblem(problems.DoubleWell()), problems.box(3, -1, 1))
 
@@ -309,7 +308,7 @@ def test_oversampling_descends_from_the_best_alone(generator, screened):
     screening = problems.Bowl(torch.eye(2).double(), torch.tensor([-2.0, 1.0]).double())
     problem = SearchProblem(Watched(), screening=screening if screened else None)
     many = replace(CSS, num_samples=6, oversampling=20)
-    state = many.init(single(), generator=generator)
+    state = many.init(problems.single(), generator=generator)
     again = torch.Generator()
     again.set_state(state.generator_state)
     drawn = many.proposal.sample(state.mixture, 120, BOUNDS, generator=again).x
@@ -360,7 +359,7 @@ def test_likelihoods_count_by_their_power(generator):
     for power in (1.0, 0.1):
         tracker = replace(CSS, likelihood_power=power)
         state, info = tracker.step(
-            tracker.init(single(), generator=generator), SearchProblem(well), BOUNDS
+            tracker.init(problems.single(), generator=generator), SearchProblem(well), BOUNDS
         )
         torch.testing.assert_close(state.mixture.weight, (-power * info.cost).softmax(0))
         assert info.parent.tolist() == [0, -1]
@@ -403,7 +402,7 @@ class LandmarkedComb(Comb):
 def test_separation_keeps_modes_whose_landmarks_differ(generator):
     def found(cost, separation: float, num_modes: int) -> list[int]:
         tracker = replace(CSS, num_samples=60, num_modes=num_modes, separation=separation)
-        start = tracker.init(single((0.0, 0.0), (0.6, 0.1)), generator=generator)
+        start = tracker.init(problems.single((0.0, 0.0), (0.6, 0.1)), generator=generator)
         state, _ = tracker.step(start, cost, problems.box(2, -3.7, 3.7))
         # In multiples of the distance between two minima, the best mode first.
         return (state.mixture.mean[:, 0] / 1.5).round().int().tolist()
@@ -464,7 +463,7 @@ def test_with_soft_matching_who_weighs_most_is_kept(separation, kept, generator)
         CSS, num_samples=80, num_modes=len(kept), separation=separation, soft_matching=True,
         likelihood_power=0.1,
     )  # fmt: skip
-    start = tracker.init(single((3.0, 0.0), (0.8, 0.1)), generator=generator)
+    start = tracker.init(problems.single((3.0, 0.0), (0.8, 0.1)), generator=generator)
     state, info = tracker.step(start, with_landmarks(LandmarkedComb()), problems.box(2, -3.7, 3.7))
     assert (state.mixture.mean[:, 0] / 1.5).round().int().tolist() == kept
     assert int(info.parent[0]) == 0
@@ -478,7 +477,7 @@ def test_with_soft_matching_who_weighs_most_is_kept(separation, kept, generator)
 def test_halving_leaves_the_best_minima_and_takes_fewer_evaluations(generator):
     def run(survivors: int):
         tracker = replace(CSS, num_samples=200, num_modes=5, survivors=survivors)
-        start = tracker.init(single((0.0, 0.0), (0.6, 0.1)), generator=generator)
+        start = tracker.init(problems.single((0.0, 0.0), (0.6, 0.1)), generator=generator)
         return tracker.step(start, SearchProblem(Comb()), problems.box(2, -3.7, 3.7))
 
     (every, all_of_them), (halved, info) = run(0), run(20)
@@ -526,7 +525,7 @@ def test_halving_leaves_what_is_unlike(generator):
     def found(separation: float) -> list[float]:
         tracker = replace(CSS, proposal=FromThePlaces(), num_samples=12, num_modes=4)
         tracker = replace(tracker, survivors=4, separation=separation)
-        start = tracker.init(single((0.0, 0.0), (1e-4, 0.1)), generator=generator)
+        start = tracker.init(problems.single((0.0, 0.0), (1e-4, 0.1)), generator=generator)
         state, _ = tracker.step(start, with_landmarks(Crowded()), problems.box(2, -3.7, 3.7))
         return sorted(state.mixture.mean[:, 0].mul(10).round().int().tolist())  # decimetres
 
@@ -577,7 +576,9 @@ def test_covariances_as_printed_are_not_capped(generator):
     """A shallow bowl: its deviation of 100 exceeds the prior's by far."""
     bowl = SearchProblem(problems.Bowl(1e-4 * torch.eye(2).double(), torch.zeros(2).double()))
     for tracker, variance in ((CSS, 9.0), (PRINTED, 1e4)):
-        state, info = tracker.step(tracker.init(single(), generator=generator), bowl, BOUNDS)
+        state, info = tracker.step(
+            tracker.init(problems.single(), generator=generator), bowl, BOUNDS
+        )
         expected = variance * torch.eye(2).double()
         torch.testing.assert_close(state.mixture.covariance[0], expected)
         assert int(info.num_floored) == 0
@@ -587,9 +588,9 @@ def test_floored_covariances_are_counted(generator):
     flat = SearchProblem(
         problems.Bowl(torch.diag(torch.tensor([4.0, 0.0])).double(), torch.zeros(2).double())
     )
-    _, info = PRINTED.step(PRINTED.init(single(), generator=generator), flat, BOUNDS)
+    _, info = PRINTED.step(PRINTED.init(problems.single(), generator=generator), flat, BOUNDS)
     assert int(info.num_floored) == 40
-    _, info = CSS.step(CSS.init(single(), generator=generator), flat, BOUNDS)
+    _, info = CSS.step(CSS.init(problems.single(), generator=generator), flat, BOUNDS)
     assert int(info.num_floored) == 0
 
 
@@ -602,7 +603,7 @@ def test_a_held_parameter_is_never_sampled(generator, kind):
     )
     proposal = kind(covariance_scale=4, include_modes=False)
     tracker = replace(PRINTED, proposal=proposal)
-    state, _ = tracker.step(tracker.init(single(), generator=generator), problem, bounds)
+    state, _ = tracker.step(tracker.init(problems.single(), generator=generator), problem, bounds)
     assert state.mixture.mean[0, 0] == 0.5
     assert not bool(state.mixture.covariance[0, 0].any())
     samples = proposal.sample(state.mixture, 50, bounds, generator=generator)
@@ -635,7 +636,7 @@ class Rippled(problems.Alike):
 
 def test_ripples_do_not_fool_the_test_for_confounded_minima(generator):
     """[IJRR] 3.3: after convergence modes are separated or confounded."""
-    start = single((2.0, 0.0), (1e-4, 0.01))
+    start = problems.single((2.0, 0.0), (1e-4, 0.01))
     both = GaussianMixture(*(torch.cat([part, part]) for part in start))
     both = both._replace(mean=torch.tensor([[-2.0, 0.0], [2.0, 0.0]]).double())
     problem = SearchProblem(Rippled(), landmarks=lambda x: x[:, None])

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -12,17 +10,10 @@ import pytest
 import torch
 from made_robots import SIX, write_arm
 
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "inverse_kinematics.py"
-
 
 @pytest.fixture
-def script(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location("inverse_kinematics_study", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "inverse_kinematics_study", module)
-    spec.loader.exec_module(module)
+def study(script: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
+    """The script, on arms made here."""
     write_arm(tmp_path / "six.urdf", SIX)
     write_arm(tmp_path / "seven.urdf")
     cases = {
@@ -30,20 +21,20 @@ def script(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
         "seven, one fixed": ("seven.urdf", "tip", "joint3"),
         "seven": ("seven.urdf", "tip", None),
     }
-    monkeypatch.setattr(module, "CASES", cases)
-    return module
+    monkeypatch.setattr(script, "CASES", cases)
+    return script
 
 
-def small(script: ModuleType, folder: Path, **options):
-    search = script.Search(num_samples=64, patience=2, spacing=0.2)
-    return script.Config(
-        data=folder, cases=tuple(script.CASES), poses=1, restarts=100, search=search, **options
+def small(study: ModuleType, folder: Path, **options):
+    search = study.Search(num_samples=64, patience=2, spacing=0.2)
+    return study.Config(
+        data=folder, cases=tuple(study.CASES), poses=1, restarts=100, search=search, **options
     )
 
 
-def test_small_mode(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_small_mode(study: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "tables" / "study.json"
-    report = script.main(small(script, tmp_path, repeats=1, out=out))
+    report = study.main(small(study, tmp_path, repeats=1, out=out))
     for case in report["cases"].values():
         assert case["solutions"] >= 1
         assert case["recall"] == 1
@@ -54,12 +45,12 @@ def test_small_mode(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFi
         assert 0 < low <= middle <= high
     saved = json.loads(out.read_text())["cases"]
     assert saved["six"]["reference"] == report["cases"]["six"]["reference"]
-    assert "100.00%" in capsys.readouterr().out
+    assert "rate over peer" in capsys.readouterr().out
 
 
-def test_a_welded_joint_keeps_the_poses(script: ModuleType, tmp_path: Path) -> None:
-    config = small(script, tmp_path)
-    problem = script.make_problem(config, "seven, one fixed", 3)
+def test_a_welded_joint_keeps_the_poses(study: ModuleType, tmp_path: Path) -> None:
+    config = small(study, tmp_path)
+    problem = study.make_problem(config, "seven, one fixed", 3)
     assert list(problem.fixed) == ["joint3"]
     chain = problem.chain()
     assert "joint3" not in chain.get_joint_parameter_names()

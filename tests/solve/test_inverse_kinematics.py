@@ -16,16 +16,9 @@ from torchcss.body.model import BodyModel
 from torchcss.cost.targets import pose_targets
 from torchcss.errors import BodyError, ConfigurationError, ShapeError
 from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.solve.inverse_kinematics import Search, inverse_kinematics, pose_errors
+from torchcss.solve.inverse_kinematics import Search, inverse_kinematics, link_pose, pose_errors
 
 QUICK = Search(num_samples=64, patience=2, spacing=0.2)
-
-
-def pose_of(body: BodyModel, link: str, x: Tensor) -> Tensor:
-    tree, index = body.pose(x).tree, body.tree.link_index(link)
-    pose = torch.eye(4, dtype=x.dtype)
-    pose[:3, :3], pose[:3, 3] = tree.rotation[index], tree.translation[index]
-    return pose
 
 
 def poses_by_another_program(urdf: Path, x: Tensor) -> Tensor:
@@ -95,7 +88,7 @@ def test_an_arm_of_six_joints(tmp_path: Path, generator: torch.Generator) -> Non
     urdf = write_arm(tmp_path / "six.urdf", SIX)
     body = load_body(urdf)
     truth = torch.tensor([0.4, -0.8, 1.1, 0.5, -0.9, 0.3], dtype=torch.float64)
-    pose = pose_of(body, "tip", truth)
+    pose = link_pose(body, "tip", truth)
     found = inverse_kinematics(body, "tip", pose, generator=generator)
     assert bool(((found.x >= body.lower) & (found.x <= body.upper)).all())
     assert float(found.position_error.max()) < 1e-10
@@ -116,7 +109,7 @@ def test_one_fixed_joint_makes_seven_joints_isolated(
 ) -> None:
     body = load_body(write_arm(tmp_path / "seven.urdf"))
     truth = torch.tensor([0.3, 0.7, -0.4, 1.2, 0.5, -0.8, 0.2], dtype=torch.float64)
-    pose = pose_of(body, "tip", truth)
+    pose = link_pose(body, "tip", truth)
     found = inverse_kinematics(
         body, "tip", pose, fixed={"joint3": -0.4}, generator=generator, search=QUICK
     )
@@ -132,7 +125,7 @@ def test_seven_free_joints_move_along_curves(tmp_path: Path, generator: torch.Ge
     urdf = write_arm(tmp_path / "seven.urdf")
     body = load_body(urdf)
     truth = torch.tensor([0.3, 0.7, -0.4, 1.2, 0.5, -0.8, 0.2], dtype=torch.float64)
-    pose = pose_of(body, "tip", truth)
+    pose = link_pose(body, "tip", truth)
     found = inverse_kinematics(body, "tip", pose, generator=generator, search=QUICK)
     assert float((poses_by_another_program(urdf, found.x) - pose).abs().max()) < 1e-6
     assert float(found.angle_error.max()) < 1e-10
@@ -150,7 +143,7 @@ def test_seven_free_joints_move_along_curves(tmp_path: Path, generator: torch.Ge
 def test_a_pose_at_the_limits_is_found(tmp_path: Path, generator: torch.Generator) -> None:
     body = load_body(write_arm(tmp_path / "six.urdf", SIX))
     truth = torch.tensor([0.4, -0.8, 3.1, 0.5, -0.9, 0.3], dtype=torch.float64)
-    pose = pose_of(body, "tip", truth)
+    pose = link_pose(body, "tip", truth)
     found = inverse_kinematics(body, "tip", pose, generator=generator, search=QUICK)
     assert float((found.x - truth).abs().amax(-1).min()) < 1e-6
     assert bool((found.x <= body.upper).all())
@@ -180,7 +173,7 @@ def test_the_same_seed_gives_the_same_solutions(tmp_path: Path) -> None:
 
 def test_bad_questions_are_told(tmp_path: Path, generator: torch.Generator) -> None:
     body = load_body(write_arm(tmp_path / "seven.urdf"))
-    pose = pose_of(body, "tip", body.rest)
+    pose = link_pose(body, "tip", body.rest)
     with pytest.raises(ConfigurationError, match=r"within its limits, -2\.9 to 2\.9, got 4"):
         inverse_kinematics(body, "tip", pose, fixed={"joint1": 4.0}, generator=generator)
     with pytest.raises(BodyError, match="no parameter 'elbow'"):
@@ -207,6 +200,6 @@ def test_a_frame_in_single_precision_is_reached(tmp_path: Path, generator: torch
     body = load_body(write_arm(tmp_path / "six.urdf", SIX))
     truth = torch.tensor([0.4, -0.8, 1.1, 0.5, -0.9, 0.3], dtype=torch.float64)
     found = inverse_kinematics(
-        body, "tip", pose_of(body, "tip", truth).float(), generator=generator
+        body, "tip", link_pose(body, "tip", truth).float(), generator=generator
     )
     assert float((found.x - truth).abs().amax(-1).min()) < 1e-5
