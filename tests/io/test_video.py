@@ -20,6 +20,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from torchcss.app.lens import Lens
+from torchcss.app.view_files import OpenView
 from torchcss.errors import ConfigurationError, OutputError, ShapeError, VideoError
 from torchcss.io import video
 from torchcss.io.video import (
@@ -30,6 +32,7 @@ from torchcss.io.video import (
     read_image,
     several_kinds,
 )
+from torchcss.io.view_files import ViewFiles
 from torchcss.studies.demo import CLIP
 from torchcss.types import Frame
 
@@ -745,3 +748,20 @@ def test_real_folder_shows_what_the_video_shows(shared_data: Path) -> None:
     (half,) = VideoReader(beam / "frames_half" / "cam01", start=7, stop=8)
     shrunk = np.asarray(Image.fromarray(whole.image).resize((540, 960), Image.Resampling.BOX))
     assert np.abs(shrunk.astype(float) - half.image).mean() < 4
+
+
+def test_pixels_that_are_not_square_are_told(tmp_path: Path) -> None:
+    path = tmp_path / "a.mp4"
+    with av.open(path, "w") as container:
+        stream = container.add_stream("libx264", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        stream.codec_context.sample_aspect_ratio = Fraction(16, 11)
+        for _ in range(3):
+            picture = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), format="rgb24")
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode())
+    reader = VideoReader(path)
+    assert reader.pixel_aspect == Fraction(16, 11)
+    lens = Lens(focal=100.0).camera(path)
+    notes = OpenView(ViewFiles(video=path, keypoints=None), reader, None, lens, None, 1.0).notes
+    assert any("1.45 times as wide as high" in note for note in notes)

@@ -73,6 +73,11 @@ class OpenView(NamedTuple):
             notes.append(
                 f"{rate:g} images a second, as the video says: --frame-rate is of pictures"
             )
+        if (aspect := float(self.reader.pixel_aspect)) != 1:
+            notes.append(
+                f"pixels are {aspect:.3g} times as wide as high: in a camera file fy is so many "
+                "times fx; an assumed camera takes them as square"
+            )
         if self.keypoints is not None:
             notes += self.keypoints.report
         return [note for note in notes if note]

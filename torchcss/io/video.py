@@ -98,12 +98,14 @@ class VideoReader:
 
     Attributes:
         info: Frame rate and size, as the file states them.
+        pixel_aspect: Width of a pixel against its height.
 
     Raises:
         VideoError: If nothing can be read, no frame is selected, or the stride is not positive.
     """
 
     info: VideoInfo
+    pixel_aspect = Fraction(1)
 
     def __init__(
         self,
@@ -235,6 +237,9 @@ class VideoReader:
                 if first is None:
                     raise self._not_a_video("its first frame cannot be decoded")
                 height, width = _upright(first, stream).shape[:2]
+                aspect = stream.sample_aspect_ratio or Fraction(1)
+                is_turned = (width, height) != (first.width, first.height)
+                self.pixel_aspect = 1 / aspect if is_turned else aspect
         except VideoError:
             raise
         except (*_av_errors(), ValueError, _Damage) as error:
