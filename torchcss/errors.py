@@ -10,6 +10,7 @@ Numerical trouble is not an error: it is data (see `torchcss.types.Status`).
 from __future__ import annotations
 
 import importlib
+import math
 from typing import Any
 
 import torch
@@ -88,20 +89,21 @@ def optional_package(name: str, message: str) -> Any:
         raise MissingExtraError(message) from error
 
 
-def check_positive(choice: object, *names: str, hint: str = "") -> None:
+def check_positive(choice: object, *names: str, hint: str = "", finite: bool = False) -> None:
     """Check that attributes of a choice are positive numbers, or None.
 
     Args:
         choice: A record of choices.
         names: Its attributes.
         hint: What to do, for the message.
+        finite: Infinity is no number either.
 
     Raises:
         ConfigurationError: If one is not.
     """
     for name in names:
         value = getattr(choice, name)
-        if value is not None and not value > 0:
+        if value is not None and not (value > 0 and (value < math.inf or not finite)):
             where = f"{type(choice).__name__}.{name}"
             raise ConfigurationError(f"{where}: expected a positive number, got {value}{hint}")
 

@@ -26,7 +26,6 @@ v = W r, the gradient rho' v and the Hessian rho' W + 2 rho'' v v^T (eq. 9 [RR])
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from typing import NamedTuple
 
@@ -34,7 +33,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchcss.errors import ConfigurationError
+from torchcss.errors import check_positive
 from torchcss.types import Numbers, frozen
 
 
@@ -65,11 +64,7 @@ class RobustPotential(ABC):
     sigma: float = 1.0
 
     def __post_init__(self) -> None:
-        for name, value in (("nu", self.nu), ("sigma", self.sigma)):
-            if not 0.0 < value < math.inf:
-                raise ConfigurationError(
-                    f"{type(self).__name__}: {name} must be positive and finite, got {value}"
-                )
+        check_positive(self, "nu", "sigma", finite=True)
 
     @abstractmethod
     def __call__(self, s: Numbers) -> RobustValue:

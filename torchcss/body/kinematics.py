@@ -284,6 +284,12 @@ class KinematicTree(nn.Module):
             levels.append(frames)
         return torch.cat(levels)
 
+    def at_base(self, frames: Float[Tensor, "frames 3 4 b"]) -> TreePose:
+        """The tree with the base in place of all links, from `frames`: enough for the lift."""
+        # The lift needs no more of the links than a place near the body.
+        parts = (frames[:1, :, :3], frames[:1, :, 3], *self.twists(frames))
+        return TreePose(*(part.movedim(-1, 0) for part in parts))
+
     def twists(
         self, frames: Float[Tensor, "frames 3 4 b"]
     ) -> tuple[Float[Tensor, "q 3 b"], Float[Tensor, "q 3 b"]]:

@@ -37,7 +37,7 @@ class Init:
     """Let a body move about that by itself stands in one place, as robots from files do."""
     stature: float | None = InitialiseOptions.stature
     """Height of the standing person, metres; by default the prior sets the scale."""
-    ground: float | None = None
+    ground: float | None = InitialiseOptions.ground
     """Height of the floor that the person stands on, along the world's axis that points up, metres;
     it tells the size. In a camera's own frame: how far it is above the floor, with a minus."""
     proportions: Literal["all", "papers"] = "all"

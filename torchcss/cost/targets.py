@@ -102,10 +102,7 @@ class PointTargets(BlendedCost):
         state = self.whole(x).reshape(x.shape[:-1].numel(), body.num_parameters)
         q = state if body.is_untied else state @ body.tie.T + body.offset
         frames = body.tree.frames(q, body.base_rotation, body.base_translation)
-        # The lift needs no more of the links than a place near the body.
-        parts = (frames[:1, :, :3], frames[:1, :, 3], *body.tree.twists(frames))
-        points = body.tree.points(frames, self.link, self.offset)
-        return TreePose(*(part.movedim(-1, 0) for part in parts)), points
+        return body.tree.at_base(frames), body.tree.points(frames, self.link, self.offset)
 
     def _local_model(self, x: States, share: Float[Tensor, "*batch"] | None) -> LocalModel:
         tree, points = self._pose(x)

@@ -46,7 +46,7 @@ from torchcss.body.root import ROOT_NAMES, free_turns
 from torchcss.body.rotations import root_angles, root_rotation
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
 from torchcss.cost.targets import PointDistances
-from torchcss.errors import ConfigurationError
+from torchcss.errors import ConfigurationError, check_positive
 from torchcss.inference.smoothing import Refinement, Transition, best_path, refine
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.io.motion.positions import MotionCapture, limb_positions
@@ -108,11 +108,8 @@ class Retargeting:
     max_steps: int = 60
 
     def __post_init__(self) -> None:
-        for name in ("sigma", "sigma_others", "num_starts", "settling_s", "max_steps"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ConfigurationError(
-                    f"Retargeting.{name}: expected a positive number, got {getattr(self, name)}"
-                )
+        names = ("sigma", "sigma_others", "num_starts", "settling_s", "max_steps")
+        check_positive(self, *names, finite=True)
 
 
 class Retargeted(NamedTuple):

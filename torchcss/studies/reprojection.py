@@ -160,9 +160,7 @@ class ReprojectionCost(BlendedCost):
         points = body.tree.points(
             frames, body.marker_link[self.index], body.marker_offset[self.index]
         )
-        # The base stands for all links: the lift needs no more of them than a place near the body.
-        parts = (frames[:1, :, :3], frames[:1, :, 3], *body.tree.twists(frames))
-        return TreePose(*(part.movedim(-1, 0) for part in parts)), points.transpose(0, 1)
+        return body.tree.at_base(frames), points.transpose(0, 1)
 
     def _image(self, points: Float[Tensor, "3 j b"]) -> tuple[Tensor, ...]:
         """Normalised coordinates and inverse depth (0 where invalid), errors in units of noise."""

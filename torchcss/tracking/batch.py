@@ -72,7 +72,7 @@ def _step(
 ) -> tuple[Posterior | None, ...]:
     """One moment of all sequences that have not ended."""
     going = [number for number, images in enumerate(moment) if images is not None]
-    meeting, enabled = _Meeting(len(going)), torch.is_grad_enabled()
+    collector, enabled = _Collector(len(going)), torch.is_grad_enabled()
 
     def search(number: int) -> Posterior:
         images = moment[number]
@@ -81,9 +81,9 @@ def _step(
         try:
             with torch.set_grad_enabled(enabled):
                 seen = session.observe(images)
-                return session.step(seen, partial(meeting.seat, number))
+                return session.step(seen, partial(collector.collecting, number))
         finally:
-            meeting.leave()
+            collector.leave()
 
     futures: dict[int, Future[Posterior]] = {n: pool.submit(search, n) for n in going}
     for future in futures.values():
@@ -93,7 +93,7 @@ def _step(
 
 
 @dataclass(eq=False)
-class _Ask:
+class _Request:
     """What one search wants to know.
 
     Attributes:
@@ -110,22 +110,22 @@ class _Ask:
 
 
 @dataclass(eq=False)
-class _Meeting:
+class _Collector:
     """Where the searches of one moment meet; the last to come evaluates for all.
 
     Attributes:
         size: Searches that have not ended.
-        asks: What those want that wait.
+        requests: What those want that wait.
         turn: Guards both.
     """
 
     size: int
-    asks: list[_Ask] = field(default_factory=list)
+    requests: list[_Request] = field(default_factory=list)
     turn: threading.Condition = field(default_factory=threading.Condition)
 
-    def seat(self, number: int, cost: TrackingCost) -> TrackingCost:
+    def collecting(self, number: int, cost: TrackingCost) -> TrackingCost:
         """The cost of one sequence, whose evaluations wait for those of the others."""
-        return replace(numbered(cost, number), engine=_Seat(self, cost.engine))
+        return replace(numbered(cost, number), engine=_Collecting(self, cost.engine))
 
     def leave(self) -> None:
         """One search less to wait for."""
@@ -133,54 +133,56 @@ class _Meeting:
             self.size -= 1
             self._answer_if_all_wait()
 
-    def ask(self, ask: _Ask) -> Any:
+    def evaluated(self, request: _Request) -> Any:
         """Wait for an answer."""
         with self.turn:
-            self.asks.append(ask)
+            self.requests.append(request)
             self._answer_if_all_wait()
-            self.turn.wait_for(lambda: ask.answer is not None)
-        if isinstance(ask.answer, BaseException):
-            raise ask.answer
-        return ask.answer
+            self.turn.wait_for(lambda: request.answer is not None)
+        if isinstance(request.answer, BaseException):
+            raise request.answer
+        return request.answer
 
     def _answer_if_all_wait(self) -> None:
-        if not self.asks or len(self.asks) < self.size:
+        if not self.requests or len(self.requests) < self.size:
             return
-        left = sorted(self.asks, key=lambda ask: ask.cost.views[0].sequence)
-        self.asks.clear()
+        left = sorted(self.requests, key=lambda request: request.cost.views[0].sequence)
+        self.requests.clear()
         while left:
-            alike = [ask for ask in left if _is_alike(ask, left[0])]
-            left = [ask for ask in left if ask not in alike]
+            alike = [request for request in left if _is_alike(request, left[0])]
+            left = [request for request in left if request not in alike]
             try:
                 _answer(alike)
             except Exception as error:
-                for ask in alike:
-                    ask.answer = error
+                for request in alike:
+                    request.answer = error
         self.turn.notify_all()
 
 
 @dataclass(frozen=True, eq=False)
-class _Seat:
-    """An `Engine` that asks the meeting.
+class _Collecting:
+    """An `Engine` that leaves evaluations to the collector.
 
     Attributes:
-        meeting: The meeting.
+        collector: The collector.
         engine: What evaluates in the end; None: the terms as they are written.
     """
 
-    meeting: _Meeting
+    collector: _Collector
     engine: Engine | None
 
     def value(self, cost: TrackingCost, x: Tensor) -> Tensor:
         """See `TrackingCost.value`."""
-        return self.meeting.ask(_Ask("value", replace(cost, engine=self.engine), x))
+        return self.collector.evaluated(_Request("value", replace(cost, engine=self.engine), x))
 
     def local_model(self, cost: TrackingCost, x: Tensor) -> LocalModel:
         """See `TrackingCost.local_model`."""
-        return self.meeting.ask(_Ask("local_model", replace(cost, engine=self.engine), x))
+        return self.collector.evaluated(
+            _Request("local_model", replace(cost, engine=self.engine), x)
+        )
 
 
-def _is_alike(one: _Ask, other: _Ask) -> bool:
+def _is_alike(one: _Request, other: _Request) -> bool:
     """Whether two searches can be answered by one evaluation."""
     if one is other:
         return True
@@ -190,21 +192,21 @@ def _is_alike(one: _Ask, other: _Ask) -> bool:
     return same and batches and x.dtype == y.dtype and x.device == y.device
 
 
-def _answer(asks: Sequence[_Ask]) -> None:
+def _answer(requests: Sequence[_Request]) -> None:
     """Evaluate in one call; each gets its share."""
-    sizes = [ask.x.shape[:-1].numel() for ask in asks]
-    if len(asks) == 1:
-        (ask,) = asks
-        ask.answer = getattr(ask.cost, ask.what)(ask.x)
+    sizes = [request.x.shape[:-1].numel() for request in requests]
+    if len(requests) == 1:
+        (request,) = requests
+        request.answer = getattr(request.cost, request.what)(request.x)
         return
-    x = torch.cat([ask.x for ask in asks])
-    numbers = torch.tensor([ask.cost.views[0].sequence for ask in asks])
+    x = torch.cat([request.x for request in requests])
+    numbers = torch.tensor([request.cost.views[0].sequence for request in requests])
     sequence = numbers.repeat_interleave(torch.tensor(sizes)).to(x.device)
-    cost = replace(together([ask.cost for ask in asks], sequence), stopwatch=None)
-    if asks[0].what == "value":
+    cost = replace(together([request.cost for request in requests], sequence), stopwatch=None)
+    if requests[0].what == "value":
         shares: Sequence[Any] = cost.value(x).split(sizes)
     else:
         parts = (part.split(sizes) for part in cost.local_model(x))
         shares = [LocalModel(*share) for share in zip(*parts, strict=True)]
-    for ask, share in zip(asks, shares, strict=True):
-        ask.answer = share
+    for request, share in zip(requests, shares, strict=True):
+        request.answer = share

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, free_turns, has_root, move_base
-from torchcss.errors import ConfigurationError, TrackFileError
+from torchcss.errors import ConfigurationError, TrackFileError, check_positive
 from torchcss.inference.smoothing import (
     GaussianEvidence,
     Refined,
@@ -61,9 +61,7 @@ class Smoothing:
     def __post_init__(self) -> None:
         if self.lag is not None and self.lag < 0:
             raise ConfigurationError(f"lag: expected at least 0 frames, got {self.lag}")
-        for name in ("likelihood_power", "acceleration_ratio", "persistence"):
-            if not 0 < (number := getattr(self, name)) < math.inf:
-                raise ConfigurationError(f"{name}: expected a positive number, got {number}")
+        check_positive(self, "likelihood_power", "acceleration_ratio", "persistence", finite=True)
 
 
 class TrackedModes(NamedTuple):

@@ -34,7 +34,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from torchcss.errors import ConfigurationError, ShapeError
+from torchcss.errors import ShapeError, check_positive
 from torchcss.vision.sampling import gaussian_blur
 
 Image = Float[Tensor, "h w"]
@@ -61,10 +61,7 @@ class EdgeConfiguration:
     half_energy_step: float = 1.0
 
     def __post_init__(self) -> None:
-        for name in ("smoothing", "window", "floor", "half_energy_step"):
-            value = getattr(self, name)
-            if value is not None and not (math.isfinite(value) and value > 0.0):
-                raise ConfigurationError(f"edges: {name} must be positive and finite, got {value}")
+        check_positive(self, "smoothing", "window", "floor", "half_energy_step", finite=True)
 
 
 class EdgeFeatures(NamedTuple):
