@@ -68,6 +68,7 @@ def random_person(
     generator: torch.Generator,
     body_name: str = "body34",
     joint_names: tuple[str, ...] = MARKED,
+    spread: float = 1.0,
     noise_px: float = 2.0,
     missing: float = 0.0,
     outliers: float = 0.0,
@@ -78,6 +79,8 @@ def random_person(
         generator: Source of everything.
         body_name: A body with a root.
         joint_names: Which joints are marked.
+        spread: Factor on how far all angles are from rest. Each by itself is one that people take
+            at 1, all together are a contortion; with a half they stand about.
         noise_px: Standard deviation of each coordinate.
         missing: Probability that a joint is missing.
         outliers: Probability that its mark is anywhere in the image.
@@ -85,7 +88,7 @@ def random_person(
     lengths = random_lengths(generator=generator, body_name=body_name)
     place = torch.tensor([0.0, 0.0, -DISTANCE], dtype=torch.float64)
     body = load_body(body_name, lengths=lengths).with_base(torch.eye(3), place)
-    state = plausible_pose(body, generator=generator)
+    state = torch.lerp(body.rest, plausible_pose(body, generator=generator), spread)
     turn = torch.rand((), generator=generator, dtype=torch.float64)
     state[body.state_index("root_yaw")] = math.pi * (2 * turn - 1)
     camera = camera_in_front("random")
