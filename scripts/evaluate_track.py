@@ -28,7 +28,7 @@ from torchcss.studies.metrics import LIMB_JOINTS, LOST_MM
 FRAMES_NOTE = (
     "MPJPE means something only if track and reference share one world frame; root-aligned MPJPE, "
     "losses and regions only if their axes agree (a camera file without R and t gives the camera's "
-    "axes); PA-MPJPE needs neither."
+    "axes: --turned); PA-MPJPE needs neither."
 )
 KINDS = {
     "mpjpe": "absolute",
@@ -53,6 +53,9 @@ class Config:
     """Array of the reference that holds the positions."""
     root: str | None = None
     """Joint that is aligned for the root-aligned error; by default the midpoint of the hips."""
+    turned: bool = False
+    """Give the whole track the one turn that brings it nearest to the reference: for a camera of
+    which it is not known how it stands in the reference's world."""
 
 
 def main(config: Config) -> dict[str, Any]:
@@ -86,6 +89,7 @@ def evaluation(run: Run, config: Config) -> Evaluation:
         joints=config.joints,
         root=config.root,
         array=config.reference_array,
+        turned=config.turned,
     )
 
 

@@ -206,6 +206,52 @@ def test_calibration_is_told_of_a_run_that_knows_its_body(
     assert "inside the stated regions" in capsys.readouterr().out
 
 
+def test_a_run_in_other_axes_is_turned_as_a_whole(
+    script: ModuleType, joints: np.ndarray, tmp_path: Path
+) -> None:
+    """One turn for all frames: what is wrong within it stays wrong, and mirrors stay mirrors."""
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]) @ np.diag([1.0, -1, -1])
+    off = joints + np.random.default_rng(0).normal(scale=0.02, size=joints.shape)
+    off[0, 0] = np.nan
+    reference = write_reference(tmp_path / "r.npz", off, list(LIMB_JOINTS))
+    straight = write_track(tmp_path / "straight", joints[:, None], LIMB_JOINTS)
+    moved = write_track(tmp_path / "moved", joints[:, None] @ turn.T, LIMB_JOINTS)
+    wanted = torchcss.evaluate(straight, reference).errors.root_aligned.mean_mm
+    assert torchcss.evaluate(moved, reference).errors.root_aligned.mean_mm > 10 * wanted
+    for track in (straight, moved):
+        found = torchcss.evaluate(track, reference, turned=True).errors
+        assert found.root_aligned.mean_mm == pytest.approx(wanted, rel=0.02)
+    report = script.main(script.Config(track=moved, reference=reference, turned=True))
+    assert report["root_aligned_mpjpe_mm"] == pytest.approx(wanted, rel=0.02)
+    mirrored = write_track(tmp_path / "mirrored", joints[:, None] * [-1, 1, 1], LIMB_JOINTS)
+    assert torchcss.evaluate(mirrored, reference, turned=True).errors.root_aligned.mean_mm > wanted
+
+
+def test_stated_regions_turn_with_the_run(tmp_path: Path) -> None:
+    """Thin regions along one axis of the camera hold errors along that axis of the world."""
+    body = load_body("body34", dtype=torch.float64)
+    n = body.num_parameters
+    spread = 1e-8 * np.eye(n)
+    spread[body.state_index("root_yaw")] *= 1e5
+    modes = FrameModes(
+        frame=0, time_s=0.0, state=body.rest[None].numpy(), covariance=spread[None],
+        log_weight=np.zeros(1), cost=np.zeros(1), parent=np.full(1, -1), base_transform=np.eye(4),
+        joints_world=body.pose(body.rest).joints[None].numpy(),
+    )  # fmt: skip
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    writer = TrackWriter(
+        tmp_path / "track.npz", Track.empty(body.state_names, body.joint_names, body=body)
+    )
+    writer.append(modes)
+    writer.save()
+    places = modes.joints_world @ turn.T
+    reference = write_reference(tmp_path / "r.npz", places, list(body.joint_names))
+    straight, turned = (torchcss.evaluate(tmp_path, reference, turned=t) for t in (False, True))
+    assert straight.covariance is not None
+    assert turned.covariance is not None
+    np.testing.assert_allclose(turned.covariance, turn @ straight.covariance @ turn.T, atol=1e-12)
+
+
 def test_other_units_are_refused(script: ModuleType, joints: np.ndarray, tmp_path: Path) -> None:
     reference = write_reference(tmp_path / "r.npz", joints, list(LIMB_JOINTS), units="mm")
     track = write_track(tmp_path / "run", joints[:, None], LIMB_JOINTS)

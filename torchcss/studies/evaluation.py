@@ -675,11 +675,13 @@ def evaluate(
     root: str | None = None,
     array: str = "joints",
     deviation_m: float | None = None,
+    turned: bool = False,
 ) -> Evaluation:
     """Errors of a run against joints in space.
 
     Absolute errors mean something only if run and reference share one world frame, root-aligned
-    ones, losses and regions only if their axes agree; Procrustes errors need neither.
+    ones, losses and regions only if their axes agree, or with `turned`; Procrustes errors need
+    neither.
 
     Args:
         run: The run, its folder, or its track's file.
@@ -692,6 +694,8 @@ def evaluate(
         deviation_m: Standard deviation of the reference per coordinate, metres; None: what the file
             says in `deviation_m`, or 20 mm. It counts as 5 mm at least: to that much it is a matter
             of definition where a joint is.
+        turned: Give the whole run the one turn that brings its best modes nearest to the reference:
+            for a camera of which it is not known how it stands in the reference's world.
 
     Raises:
         TrackFileError: If a file is missing or malformed, or the run has no frames.
@@ -718,12 +722,14 @@ def evaluate(
     column = [tracked_names.index(name) for name in common]
     true = positions[track.frames][:, [names.index(name) for name in common]]
     tracked = track.joints_world[:, :, column]
+    index, middle = ([common.index(name) for name in some] for some in (compared, roots))
+    turn = _turn(tracked[:, 0], true, middle) if turned else np.eye(3)
+    tracked = tracked @ turn.T
     present = np.isfinite(track.log_weight)
     errors = track_errors(
         tracked, true, common, present=present, compared=compared,
         root=None if root is None else roots[0],
     )  # fmt: skip
-    index, middle = ([common.index(name) for name in some] for some in (compared, roots))
     if deviation_m is None:
         deviation_m = reference_deviation(reference)
     away = tracked[:, 0] - true
@@ -734,7 +740,7 @@ def evaluate(
         errors=errors,
         left_out=tuple(name for name in wanted if name not in common),
         away_m=away,
-        covariance=_stated(track, *([column[i] for i in some] for some in (index, middle))),
+        covariance=_stated(track, [column[i] for i in index], [column[i] for i in middle], turn),
         deviation_m=max(deviation_m, _LEAST_DEVIATION_M),
     )
 
@@ -770,9 +776,9 @@ def reference_deviation(path: str | os.PathLike[str]) -> float:
 
 
 def _stated(
-    track: Track, joints: Sequence[int], roots: Sequence[int]
+    track: Track, joints: Sequence[int], roots: Sequence[int], turn: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, "t j 3 3"] | None:
-    """Covariances of joints of the best modes, from the roots; None if the body is not known."""
+    """Covariances of joints of the best modes, from the roots and turned; None without a body."""
     if track.body is None:
         return None
     state, base, spread = (
@@ -781,4 +787,14 @@ def _stated(
     )
     pose = pose_track(track.body, state, base)
     found = joint_covariance(track.body, pose, spread, about=roots, held=track.held)
-    return found[:, list(joints)].numpy()
+    return turn @ found[:, list(joints)].numpy() @ turn.T
+
+
+def _turn(
+    places: Float[np.ndarray, "t j 3"], wanted: Float[np.ndarray, "t j 3"], roots: Sequence[int]
+) -> Float[np.ndarray, "3 3"]:
+    """The rotation that brings joints, seen from their roots, nearest to where they should be."""
+    ours, theirs = (p - p[:, roots].mean(1, keepdims=True) for p in (places, wanted))
+    known = np.isfinite(ours + theirs).all(-1)
+    left, _, right = np.linalg.svd(theirs[known].T @ ours[known])
+    return left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
