@@ -195,7 +195,7 @@ def test_many_starts_find_what_a_single_one_does_not(found: Initialisation):
 def test_known_stature_sets_the_scale(found: Initialisation):
     tall = find(person(), stature=2.0, num_modes=2)
     assert stature_of(tall.lengths, tall.scale) == pytest.approx(2.0, abs=1e-6)
-    assert "known stature of 2 m" in "\n".join(tall.report)
+    assert "a stature of 2 m sets the scale" in "\n".join(tall.report)
     distances = [float(each.body.base_translation.norm()) for each in (tall, found)]
     statures = [stature_of(each.lengths, each.scale) for each in (tall, found)]
     assert distances[0] / distances[1] == pytest.approx(statures[0] / statures[1], rel=0.05)

@@ -28,11 +28,16 @@ import re
 import shutil
 import signal
 import sys
-import threading
 import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
+from contextlib import (
+    AbstractContextManager,
+    nullcontext,
+    redirect_stderr,
+    redirect_stdout,
+    suppress,
+)
 from dataclasses import asdict, dataclass, field
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
@@ -42,7 +47,7 @@ from urllib.parse import quote
 
 import tyro
 
-from torchcss.app.claims import Claim, Claims, process_name
+from torchcss.app.claims import Claim, Claims, process_name, repeated
 from torchcss.app.recorder import Picture, ended_by_sigterm
 from torchcss.app.track import TrackOptions, track_video
 from torchcss.errors import ConfigurationError, OutputError, TorchcssError
@@ -165,29 +170,18 @@ def _worker(job: Job) -> None:
             sys.exit(f"torchcss: {error}")
 
 
-@contextmanager
-def _shown(job: Job) -> Iterator[None]:
+def _shown(job: Job) -> AbstractContextManager[None]:
     """Print what becomes of the clips while the body runs; of torchrun's processes one does."""
-    over, to = threading.Event(), sys.stdout
-    if os.environ.get("RANK", "0") != "0":
-        over.set()
+    shown: dict[str, State] = {}
+    to = sys.stdout
 
     def show() -> None:
-        shown: dict[str, State] = {}
-        while not over.wait(_POLL_S):
-            states = job.states()
-            for name, state in states.items():
-                if shown.get(name) != state:
-                    print(f"{name}: {state.text}", file=to, flush=True)
-            shown = states
+        for name, state in job.states().items():
+            if shown.get(name) != state:
+                print(f"{name}: {state.text}", file=to, flush=True)
+                shown[name] = state
 
-    thread = threading.Thread(target=show, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        over.set()
-        thread.join()
+    return nullcontext() if os.environ.get("RANK", "0") != "0" else repeated(show, _POLL_S)
 
 
 class Clip(NamedTuple):

@@ -16,7 +16,7 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -78,22 +78,27 @@ class Claim:
         """Let it go: the next one may claim at once."""
         self.beat(_RELEASED)
 
-    @contextmanager
-    def alive(self, progress: Callable[[], str]) -> Iterator[None]:
+    def alive(self, progress: Callable[[], str]) -> AbstractContextManager[None]:
         """Beat from a thread of its own while the body runs."""
-        over = threading.Event()
+        return repeated(lambda: self.beat(progress()), self._claims.beat_s)
 
-        def beat() -> None:
-            while not over.wait(self._claims.beat_s):
-                self.beat(progress())
 
-        thread = threading.Thread(target=beat, daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            over.set()
-            thread.join()
+@contextmanager
+def repeated(act: Callable[[], None], every_s: float) -> Iterator[None]:
+    """Do something every so many seconds, in a thread of its own, while the body runs."""
+    over = threading.Event()
+
+    def go_on() -> None:
+        while not over.wait(every_s):
+            act()
+
+    thread = threading.Thread(target=go_on, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
 
 
 class Claims:

@@ -241,7 +241,7 @@ def scale_report(stature: float | None, lengths: Mapping[str, float], *, num_vie
         return "the lengths of the body are its file's, which set the scale"
     fitted = ", ".join(f"{name} {length:.3f} m" for name, length in lengths.items())
     if stature is not None:
-        source = f"the known stature of {stature:g} m sets the scale"
+        source = f"a stature of {stature:g} m sets the scale"
     elif num_views > 1:
         source = f"{num_views} views set the scale"
     else:
