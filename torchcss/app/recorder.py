@@ -29,13 +29,19 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchcss.app.claims import Claim
-from torchcss.app.smooth import SMOOTH_NAME
 from torchcss.errors import OutputError
 from torchcss.files import output_error
 from torchcss.io.cameras import calibration
 from torchcss.io.checkpoint import Checkpoint, remove_checkpoint, write_checkpoint
 from torchcss.io.run import Run
-from torchcss.io.tracks import TRACK_NAME, FrameModes, Track, TrackWriter, write_summary
+from torchcss.io.tracks import (
+    SMOOTH_NAME,
+    TRACK_NAME,
+    FrameModes,
+    Track,
+    TrackWriter,
+    write_summary,
+)
 from torchcss.io.view_files import RecordedCamera
 from torchcss.show.overlay import draw_poses
 from torchcss.show.track_pictures import caption

@@ -67,6 +67,7 @@ from torchcss.io.view_files import RecordedCamera, camera_from_plain, camera_to_
 
 SCHEMA_VERSION = 2
 TRACK_NAME = "track.npz"
+SMOOTH_NAME = "smooth.npz"
 SUMMARY_NAME = "summary.json"
 
 _ABSENT = {"log_weight": -np.inf, "cost": np.inf, "parent": -1}
@@ -369,6 +370,10 @@ def load_track(path: StrPath) -> Track:
         TrackFileError: If it is missing, damaged, no track, or of another schema version.
     """
     path = _in_folder(path, TRACK_NAME)
+    if path.name == TRACK_NAME and not path.exists():
+        smooth = path.with_name(SMOOTH_NAME)
+        if smooth.is_file():
+            raise TrackFileError(f"{path}: is missing, but there is {smooth}: give that file")
     arrays = load_arrays(path, TrackFileError)
     version = arrays.get("schema_version")
     if version is None or version.shape != () or version.dtype.kind not in "iu":

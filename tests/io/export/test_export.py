@@ -15,7 +15,8 @@ from torchcss.io.cameras import camera_entry
 from torchcss.io.export import FORMATS
 from torchcss.io.export.selection import DEFAULT_RATE, UP_AXES, SelectionChoice, select
 from torchcss.io.tracks import save_track, write_summary
-from torchcss.io.view_files import RecordedCamera
+from torchcss.io.video import VideoWriter
+from torchcss.io.view_files import RecordedCamera, ViewFiles
 from torchcss.vision.camera import Camera
 
 BODY = load_body("arm8")
@@ -138,9 +139,28 @@ def test_rates(track: Track):
     rough = select(track._replace(times=np.array([0.0, 0.04, 0.08, 0.2])))
     assert rough.rate == pytest.approx(25.0)
     assert any("not evenly spaced" in line for line in rough.report)
-    single = select(track, SelectionChoice(stop=5))
-    assert single.rate == DEFAULT_RATE
-    assert any("frame rate" in line for line in single.report)
+    assert select(track, SelectionChoice(stop=5)).rate == 60.0
+
+
+def test_the_rate_of_a_track_of_one_frame(tmp_path: Path):
+    single = make_track(BODY, counts=(2,))
+    alone = select(single)
+    assert alone.rate == DEFAULT_RATE
+    assert any("25 is written: neither the track nor a video" in line for line in alone.report)
+    camera = Camera([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], (640, 480))
+    with VideoWriter(tmp_path / "film.mp4", 50) as writer:
+        writer.write(np.zeros((16, 16, 3), np.uint8))
+    for name, rate in (("film.mp4", 50.0), ("gone.mp4", DEFAULT_RATE)):
+        files = ViewFiles(video=tmp_path / name, keypoints=None)
+        found = select(single._replace(cameras=(RecordedCamera(camera, files),)))
+        assert found.rate == rate
+        assert any(f"a frame rate of {rate:g} is written" in line for line in found.report)
+
+
+def test_a_folder_with_a_smoothed_track_alone(track: Track, tmp_path: Path):
+    save_track(tmp_path / "smooth.npz", track)
+    with pytest.raises(TrackFileError, match=r"track\.npz: is missing, .*smooth\.npz: give that"):
+        export_as(tmp_path, to="trc")
 
 
 @pytest.mark.parametrize("to", [to for to in FORMATS if to != "c3d"])

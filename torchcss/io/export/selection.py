@@ -15,6 +15,7 @@ Call `select`.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -23,12 +24,13 @@ import torch
 from jaxtyping import Float, Int
 
 from torchcss.body.uncertainty import Held
-from torchcss.errors import ConfigurationError
+from torchcss.errors import ConfigurationError, VideoError
 from torchcss.io.tracks import Track
+from torchcss.io.video import VideoReader
 from torchcss.vision.camera import Camera
 
 DEFAULT_RATE = 25.0
-"""Frames per second where a single frame, or equal times, do not tell."""
+"""Frames per second where neither times nor a video tell."""
 
 _TO_Y_UP: dict[str, tuple[tuple[int, int, int], ...]] = {
     # Z up: the cyclic exchange, file's (X, Y, Z) = world's (y, z, x), as Pose2Sim writes TRC files.
@@ -140,7 +142,7 @@ def select(
         if missing:
             report.append(f"{label or 'best mode'}: absent in {missing} of {len(kept)} frames")
     turn, upright = _frame_of_file(track, frame, choice.world_up, report)
-    rate = _rate(track.times[kept], report)
+    rate = _rate(track, kept, report)
 
     present = ranks >= 0
     row = np.arange(len(kept))[:, None].repeat(len(wanted), axis=1)
@@ -298,12 +300,16 @@ def up_axis(
     return axis, float(np.array(_TO_Y_UP[axis][1]) @ up)
 
 
-def _rate(times: np.ndarray, report: list[str]) -> float:
+def _rate(track: Track, kept: np.ndarray, report: list[str]) -> float:
     """Frames per second, made whole where it is so but for the rounding of the times."""
+    times = track.times[kept] if len(kept) > 1 else track.times
     steps = np.diff(times)
     if not steps.size or not (steps > 0).all():
-        report.append(f"a frame rate of {DEFAULT_RATE:g} is written: the track does not tell one")
-        return DEFAULT_RATE
+        rate, said = _rate_of_video(track), "that of its video or pictures"
+        if rate is None:
+            rate, said = DEFAULT_RATE, "neither the track nor a video tells one"
+        report.append(f"a frame rate of {rate:g} is written: {said}")
+        return rate
     step = float(np.median(steps))
     if (np.abs(steps - step) > 0.01 * step).any():
         report.append(
@@ -314,6 +320,16 @@ def _rate(times: np.ndarray, report: list[str]) -> float:
         step = float(times[-1] - times[0]) / len(steps)
     rate = 1.0 / step
     return float(round(rate)) if abs(rate - round(rate)) < 1e-6 * rate else rate
+
+
+def _rate_of_video(track: Track) -> float | None:
+    """Frames per second of the first camera's video; None where there is none any more."""
+    files = track.cameras[0].files if track.cameras else None
+    if files is None:
+        return None
+    with suppress(VideoError):
+        return float(VideoReader(files.video, image_frame_rate=files.frame_rate).info.frame_rate)
+    return None
 
 
 def camera_up(camera: Camera | None) -> np.ndarray | None:
