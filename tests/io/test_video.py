@@ -70,6 +70,17 @@ def noisy_film(path: Path, num_frames: int = 60, **options: str) -> Path:
     return path
 
 
+def demo_film(path: Path) -> Path:
+    """The demo's film, whose frames are stored in another order than shown, in any container."""
+    options = {"movflags": "faststart"} if path.suffix == ".mp4" else {}
+    with av.open(str(CLIP / "video.mp4")) as source, av.open(str(path), "w", options=options) as to:
+        stream = to.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(video=0):
+            packet.stream = stream
+            to.mux([packet] if packet.dts is not None else [])
+    return path
+
+
 def cut(path: Path, fraction: float) -> Path:
     """Write the beginning of a file under another name."""
     data = path.read_bytes()
@@ -396,15 +407,9 @@ def test_what_is_read_before_the_damage_are_the_right_frames(
     tmp_path: Path, suffix: str, at_once: bool
 ) -> None:
     """Frames are decoded in another order than they are shown in, and some were lost between."""
-    path = tmp_path / f"a{suffix}"
-    options = {"movflags": "faststart"} if suffix == ".mp4" else {}
-    with av.open(str(CLIP / "video.mp4")) as source, av.open(str(path), "w", options=options) as to:
-        stream = to.add_stream_from_template(source.streams.video[0])
-        for packet in source.demux(video=0):
-            packet.stream = stream
-            to.mux([packet] if packet.dts is not None else [])
+    path = demo_film(tmp_path / f"a{suffix}")
     whole, expected = path.read_bytes(), [frame.image for frame in VideoReader(path)]
-    # Odd: whole packets of MPEG-TS, of 188 bytes, do not tell that others are missing.
+    # Odd: whole packets of MPEG-TS, of 188 bytes, are a case of their own.
     for size in (int(share * len(whole)) | 1 for share in (0.2, 0.48, 0.5)):
         path.write_bytes(whole[:size] if at_once else whole)
         reader = VideoReader(path)
@@ -437,6 +442,32 @@ def test_truncated_where_no_number_of_frames_is_stated(
     frames, error = read_until_error(VideoReader(cut(whole, share)))
     assert share - 0.2 < len(frames) / 60 <= 1
     assert f"{len(frames)} frames could be read (the file is cut off)" in str(error)
+
+
+def test_a_transport_stream_that_ends_between_two_of_its_packets(tmp_path: Path) -> None:
+    """It tells where half a picture is there, or one is missing before the last."""
+    path = demo_film(tmp_path / "a.ts")
+    whole, expected = path.read_bytes(), [frame.image for frame in VideoReader(path)]
+    packets = [whole[start : start + 188] for start in range(0, len(whole), 188)]
+    # Where pictures begin: packets of the film (number 256) that are marked so.
+    begins = [n for n, p in enumerate(packets) if p[1] & 0x40 and (p[1] & 0x1F, p[2]) == (1, 0)]
+    assert len(begins) == len(expected)
+    silent = 0
+    for number, begin in enumerate(begins[20:40], 20):
+        for end in {begin, (begin + begins[number + 1]) // 2}:
+            path.write_bytes(whole[: 188 * end])
+            reader = VideoReader(path)
+            frames, error = read_until_error(reader)
+            assert number - 4 <= len(frames) <= number
+            for frame in frames:
+                np.testing.assert_array_equal(frame.image, expected[frame.index])
+            if error is None:
+                silent += 1
+                assert len(frames) == number == reader.count_frames()
+                assert end == begin
+            else:
+                assert "frames could be read (the file is cut off)" in str(error)
+    assert 0 < silent < 20
 
 
 def test_a_last_picture_that_is_held_is_no_damage(tmp_path: Path) -> None:

@@ -7,7 +7,9 @@ containers only. Rotation that a telephone writes into the file is applied, as e
 and high dynamic range is brought to 8 bit (`torchcss.io.high_dynamic_range`).
 
 A damaged video is read up to the damage. The frames before it are yielded, then a `VideoError` says
-how many there were; whoever consumed them keeps what was computed.
+how many there were; whoever consumed them keeps what was computed. An MPEG-TS does not say how long
+it is: where it ends behind a whole picture, and none is missing before that one, nothing tells that
+more was to follow.
 
 By default: `for frame in VideoReader(path)` and `with VideoWriter(path, frame_rate) as writer`.
 """
@@ -158,7 +160,10 @@ class VideoReader:
         return None if self._images is None else self._images[0]
 
     def count_frames(self) -> int:
-        """Count the frames without decoding them; those before the damage, if there is any."""
+        """Count the frames without decoding them; those before the damage, if there is any.
+
+        Where an MPEG-TS ends in the middle of a picture, that one and its neighbours count as well.
+        """
         return len(self._images or self._shown_at())
 
     def frame_times(self) -> list[float] | None:
@@ -172,11 +177,13 @@ class VideoReader:
     def _shown_at(self) -> list[float | None]:
         """When each frame of a container is shown, in the order in which they are stored."""
         times: list[float | None] = []
-        whole, sent = None, None
+        whole, sent, longest = None, None, 0.0
         # What cannot be demuxed ends the count, as it ends the reading: see `_decode`.
         with suppress(*_av_errors()), self.opened() as container:
             for packet in container.demux(video=0):
                 if not packet.size and not _is_cut_off(container):
+                    if _lacks_some(container, times, sent, longest):
+                        break
                     return times
                 if packet.is_corrupt or not packet.size:
                     sent = sent if packet.size else whole
@@ -186,6 +193,7 @@ class VideoReader:
                     for at in (packet.pts, packet.dts)
                 )
                 times += [] if packet.is_discard else [shown]
+                longest = max(longest, _step(sent, decoded))
                 whole, sent = sent, decoded
         return [time for time in times if _is_shown_by(time, sent)]
 
@@ -609,6 +617,7 @@ def _decode(container: InputContainer) -> Iterator[VideoFrame]:
         raise _Damage(f"{decoder.width} x {decoder.height} pixels, more than {_MOST_PIXELS:,}")
     held: list[VideoFrame] = []
     whole, sent = None, None  # when the last packets but one and but none were to be decoded
+    longest = 0.0
     packets = container.demux(stream)
     try:
         while (packet := next(packets, None)) is not None:
@@ -618,7 +627,14 @@ def _decode(container: InputContainer) -> Iterator[VideoFrame]:
                 sent = whole  # half of the last one may be missing
                 raise _Damage("the file is cut off")
             pictures = packet.decode()
+            if not packet.size and container.format.name == "mpegts":
+                held, pictures = held + pictures, []
+                is_half = any(picture.is_corrupt for picture in held)
+                if is_half or _lacks_some(container, [p.pts for p in held], sent, longest):
+                    sent = whole if is_half else sent
+                    raise _Damage("the file is cut off")
             yield from held
+            longest = max(longest, _step(sent, packet.dts))
             held, whole, sent = pictures, sent, packet.dts
         yield from held
     except (*_av_errors(), _Damage):
@@ -633,6 +649,27 @@ def _decode(container: InputContainer) -> Iterator[VideoFrame]:
 def _is_shown_by(time: float | None, sent: float | None) -> bool:
     """Whether a picture is shown when a packet was to be decoded, or before, or has no time."""
     return time is None or (sent is not None and time <= sent)
+
+
+def _step(before: float | None, after: float | None) -> float:
+    return 0.0 if before is None or after is None else after - before
+
+
+def _lacks_some(
+    container: InputContainer, shown: Sequence[float | None], sent: float | None, longest: float
+) -> bool:
+    """Whether an MPEG-TS lacks pictures that were to be shown between its last ones.
+
+    Args:
+        container: The container.
+        shown: When its last pictures, or all, are shown.
+        sent: When the last packet was to be decoded: what is shown until then is there.
+        longest: The longest step from one packet to the next.
+    """
+    if container.format.name != "mpegts" or sent is None:
+        return False
+    late = sorted(time for time in shown if time is not None and time >= sent)
+    return any(after - before > 1.5 * longest for before, after in pairwise(late))
 
 
 def _is_cut_off(container: InputContainer) -> bool:
