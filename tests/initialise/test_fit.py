@@ -157,6 +157,11 @@ def test_covariances_are_those_of_modes_with_unknown_lengths(found: Initialisati
     assert found.free_mixture is not None
     stated = coverage(person(), found.free_body, found.free_mixture)
     assert stated.parameters > 0.7
+    assert found.uncapped is not None
+    free = found.uncapped.diagonal() > 0
+    wider = torch.linalg.eigvalsh((found.uncapped - covariance)[free][:, free])
+    assert float(wider[0]) > -1e-9
+    assert float(wider[-1]) > 0
 
 
 def test_hypotheses_are_the_fits_and_then_samples(found: Initialisation):

@@ -70,7 +70,14 @@ def test_round_trip(found: Initialisation, generator: torch.Generator, tmp_path:
         torch.testing.assert_close(
             found.body.surface(ours).points, back.body.surface(theirs).points
         )
+        assert back.uncapped is None
     assert read_fitted_body(tmp_path, dtype=torch.float32).mixture.mean.dtype == torch.float32
+    uncapped = 3 * found.mixture.covariance[0]
+    some = found._replace(uncapped=uncapped)
+    write_fitted_body(tmp_path / "body.npz", some, camera(generator))
+    back = read_fitted_body(tmp_path)
+    assert back.uncapped is not None
+    assert torch.equal(back.uncapped, uncapped)
 
 
 def test_keeps_its_place_before_another_camera(

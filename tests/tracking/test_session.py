@@ -327,6 +327,22 @@ def test_a_body_from_a_file_is_the_same_by_any_path(
         _first_pose_from_file(tmp_path, eye, Settings(body="other.urdf"))
 
 
+def test_the_papers_start_from_one_fit_whose_covariance_nothing_caps():
+    body = load_body("arm8")
+    camera = Camera.pinhole(640, 480, focal_px=500.0)
+    first = start_at(body, body.rest)
+    wide = 4 * first.mixture.covariance[0]
+    first = first._replace(uncapped=wide)
+    for preset, variance in {"css": 0.01, "ijrr_css": 0.04}.items():
+        session = TrackingSession(Settings(preset=preset, body="arm8"), first, camera)
+        covariance = session.state.tracker.mixture.covariance[0]
+        free = covariance.diagonal() > 0
+        assert bool(free.any())
+        torch.testing.assert_close(
+            covariance.diagonal()[free], torch.full_like(covariance.diagonal()[free], variance)
+        )
+
+
 def test_base_follows_a_body_that_leans_over(generator: torch.Generator):
     body = load_body("body30")
     x = body.rest.clone()

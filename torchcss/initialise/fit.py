@@ -59,6 +59,7 @@ from torchcss.initialise.result import (
     hang_on_best,
     scale_report,
     spread_to,
+    uncapped_covariance,
     with_lengths,
     with_unknown_lengths,
 )
@@ -286,13 +287,15 @@ def _with_contours(
     body = shaped(load(lengths), whole)
     best = columns_of(loose, body, whole.state[None])
     starts = torch.cat([best, first.mixture.mean])
-    fits = optimise(cost.with_body(body), starts, search.bounds(body), 40)
+    cost = cost.with_body(body)
+    fits = optimise(cost, starts, search.bounds(body), 40)
     kept = best_distinct(fits, options.num_modes)
     if rooted:
         body, kept = hang_on_best(body, kept)
         free = shaped(load(lengths, free_proportions=search.parameters), whole)
         free = free.with_base(body.base_rotation, body.base_translation)
-        kept = with_unknown_lengths(cost.with_body(free), body, kept, search)
+        cost = cost.with_body(free)
+        kept = with_unknown_lengths(cost, body, kept, search)
     result = as_initialisation(body, kept, first.report)
     second = Stage(
         "cross-sections, with contours", shaped(first.body, sections),
@@ -311,6 +314,7 @@ def _with_contours(
             scale_line(lengths),
         ),
         lengths=lengths,
+        uncapped=uncapped_covariance(cost, body, kept.mean[0], search),
         stages=(*first.stages, second, third),
     )
 

@@ -19,6 +19,8 @@ from __future__ import annotations
 import math
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from torchcss.body.load import has_free_root, load_body
 from torchcss.body.model import BodyModel
@@ -42,6 +44,7 @@ from torchcss.initialise.result import (
     mixture_of,
     scale_of,
     scale_report,
+    uncapped_covariance,
     undetermined_line,
     with_lengths,
     with_unknown_lengths,
@@ -92,7 +95,9 @@ def fit_joints(
     if isinstance(body, BodyModel):
         _check_in_view(body, view.camera)
         fits = multi_start_fits(cost, search=options.search, generator=generator)
-        return as_initialisation(body, best_distinct(fits, options.num_modes), notes)
+        kept = best_distinct(fits, options.num_modes)
+        uncapped = uncapped_covariance(cost, body, kept.mean[0], options.search)
+        return as_initialisation(body, kept, notes)._replace(uncapped=uncapped)
     free = hang_before_camera(free, view.camera, match_joints(keypoints, free.joint_names))
     return _with_lengths_fitted(cost.with_body(free), generator, options, scale, notes)
 
@@ -115,7 +120,7 @@ def _with_lengths_fitted(
         notes = (*notes, f"keypoints that fit no pose, left out: {', '.join(left_out)}")
         cost = without(cost, outliers)
     lengths = fitted_lengths(free, fits.mean[0], options.stature)
-    held, kept = _with_lengths_held(cost, fits, lengths, scale, options)
+    held, kept, uncapped = _with_lengths_held(cost, fits, lengths, scale, options)
     result = as_initialisation(held, kept, notes)
     report = [*result.report, scale_report(options.stature, lengths, num_views=len(cost.views))]
     if (line := undetermined_line(held, kept, joints=cost.with_body(held))) is not None:
@@ -130,6 +135,7 @@ def _with_lengths_fitted(
         free_body=free,
         free_mixture=mixture_of(fits),
         size_deviation=0.0 if known else Anthropometric().stature,
+        uncapped=uncapped,
     )
 
 
@@ -139,8 +145,11 @@ def _with_lengths_held(
     lengths: dict[str, float],
     scale: float,
     options: InitialiseOptions,
-) -> tuple[BodyModel, Modes]:
-    """Refine fits on the body with these lengths; the distinct ones, the body hung on the best."""
+) -> tuple[BodyModel, Modes, Float[Tensor, "n n"]]:
+    """Refine fits on the body with these lengths.
+
+    The distinct ones, the body hung on the best, whose covariance uncapped comes last.
+    """
     free, num = cost.body, options.num_modes
     # Twice as many fits as are asked for have their chance.
     candidates = fits.mean if num is None else fits.mean[: 2 * num + 8]
@@ -155,13 +164,16 @@ def _with_lengths_held(
         arm = arm.with_base(*base_without_root(body, arm, best))
         starts = columns_of(body, arm, refined.mean)
         body, refined = arm, refine(cost.with_body(arm), starts, options.search)
-    kept = best_distinct(refined, num)
-    if not has_root(body):
-        return body, kept
-    body, kept = hang_on_best(body, kept)
-    parameters = options.search.parameters
-    loose = with_lengths(body, lengths, scale, free_root=True, free_proportions=parameters)
-    return body, with_unknown_lengths(cost.with_body(loose), body, kept, options.search)
+    kept, search = best_distinct(refined, num), options.search
+    if has_root(body):
+        body, kept = hang_on_best(body, kept)
+        parameters = search.parameters
+        loose = with_lengths(body, lengths, scale, free_root=True, free_proportions=parameters)
+        cost = cost.with_body(loose)
+        kept = with_unknown_lengths(cost, body, kept, search)
+    else:
+        cost = cost.with_body(body)
+    return body, kept, uncapped_covariance(cost, body, kept.mean[0], search)
 
 
 def _check_in_view(body: BodyModel, camera: Camera) -> None:

@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchcss.body.catalog import LENGTHS, PROPORTION_RANGE, Proportions
@@ -26,8 +26,8 @@ from torchcss.errors import BodyError
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.trust_region import default_prior_variance
 from torchcss.initialise.multi_start import Search
-from torchcss.linalg import inverse_on_free
-from torchcss.types import Modes, Vector, Vectors
+from torchcss.linalg import constrained_inverse, inverse_on_free
+from torchcss.types import LocalModel, Modes, Vector, Vectors
 
 STANDARD_STATURE = 1.75
 """Stature of the standard humanoid, metres."""
@@ -72,6 +72,8 @@ class Initialisation(NamedTuple):
         noise: How many times as noisy as was assumed keypoints were found to be.
         size_deviation: What is not known of a person's size, as the deviation of its logarithm;
             zero if the stature was given, or several cameras looked on.
+        uncapped: Covariance of the best fit that no prior caps (`uncapped_covariance`), from which
+            the papers' trackers start; None: that of the mixture.
     """
 
     body: BodyModel
@@ -86,6 +88,7 @@ class Initialisation(NamedTuple):
     left_out: tuple[str, ...] = ()
     noise: float = 1.0
     size_deviation: float = Anthropometric().stature
+    uncapped: Float[Tensor, "n n"] | None = None
 
     def hypotheses(self, num: int, *, generator: torch.Generator) -> Vectors:
         """The first `num` states to believe in: the fits, then samples of their mixture.
@@ -177,19 +180,40 @@ def with_unknown_lengths(cost: TrackingCost, body: BodyModel, fits: Modes, searc
         fits: Its fits.
         search: Whether limits hold.
     """
+    model, free, columns = _with_lengths(cost, body, fits.mean, search)
+    variance = default_prior_variance(cost.body.bounds)
+    covariance = inverse_on_free(model.hessian, free, variance, model.gradient)
+    return fits._replace(covariance=covariance[:, columns][:, :, columns])
+
+
+def uncapped_covariance(
+    cost: TrackingCost, body: BodyModel, x: Vector, search: Search
+) -> Float[Tensor, "n n"]:
+    """Covariance of a fit as the papers print it (`torchcss.linalg.constrained_inverse`).
+
+    Args:
+        cost: Cost of the same body on the same base, with free lengths or with lengths held.
+        body: The body with lengths held.
+        x: The fit.
+        search: Whether limits hold.
+    """
+    model, free, columns = _with_lengths(cost, body, x[None], search)
+    variance = default_prior_variance(cost.body.bounds)
+    covariance, _ = constrained_inverse(model.hessian, free, variance)
+    return covariance[0, columns][:, columns]
+
+
+def _with_lengths(
+    cost: TrackingCost, body: BodyModel, x: Vectors, search: Search
+) -> tuple[LocalModel, Bool[Tensor, "k m"], list[int]]:
+    """The cost about fits, its free parameters, of which lengths are some, and the body's own."""
     loose = cost.body
     columns = [loose.state_index(name) for name in body.state_names]
-    full = spread_to(body, loose, fits.mean)
+    full = spread_to(body, loose, x)
     model, bounds = cost.local_model(full), search.bounds(loose)
     lengths = bounds.upper > bounds.lower
     lengths[columns] = False
-    covariance = inverse_on_free(
-        model.hessian,
-        ~bounds.hold(full, model.gradient) | lengths,
-        default_prior_variance(loose.bounds),
-        model.gradient,
-    )
-    return fits._replace(covariance=covariance[:, columns][:, :, columns])
+    return model, ~bounds.hold(full, model.gradient) | lengths, columns
 
 
 def stature_of(lengths: Mapping[str, float], scale: float = 1.0) -> float:

@@ -17,6 +17,7 @@ One NPZ file, schema version 1. K hypotheses, n parameters, P parts, L lengths:
 | `motion_rate` | n | expected velocities, radians or metres per second |
 | `neighbours` | N 2 | names of the parts that touch in every pose |
 | `state`, `covariance`, `log_weight`, `cost` | K n, K n n, K, K | the hypotheses, best first |
+| `uncapped` | n n | covariance of the best that no prior caps; may be missing |
 | `base_rotation`, `base_translation` | 3 3, 3 | frame in which the root moves, in the world |
 | `camera_rotation`, `camera_translation`, `camera_matrix` | 3 3, 3, 3 3 | the picture's camera |
 
@@ -69,6 +70,7 @@ def write_fitted_body(path: StrPath, found: Initialisation, camera: Camera) -> N
         "covariance": mixture.covariance,
         "log_weight": mixture.log_weight,
         "cost": found.cost,
+        **({} if found.uncapped is None else {"uncapped": found.uncapped}),
         "base_rotation": body.base_rotation,
         "base_translation": body.base_translation,
         "camera_rotation": camera.R_camera_world,
@@ -148,8 +150,9 @@ def read_fitted_body(
     note = f"first pose: {len(mixture.mean)} hypotheses from {path}"
     body = body.with_base(rotation, translation)
     found = Initialisation(body, mixture, tensors["cost"], (note,), lengths, scale)
-    # Earlier files lack these two.
+    # Earlier files lack these.
     return found._replace(
+        uncapped=tensors.get("uncapped"),
         noise=float(arrays.get("noise", found.noise)),
         size_deviation=float(arrays.get("size_deviation", found.size_deviation)),
     )
@@ -193,6 +196,8 @@ def _read_tensors(
         "log_weight": (k,), "cost": (k,), "base_rotation": (3, 3), "base_translation": (3,),
         "camera_rotation": (3, 3), "camera_translation": (3,),
     }  # fmt: skip
+    if "uncapped" in arrays:
+        shapes["uncapped"] = (n, n)
     tensors = {}
     for key, shape in shapes.items():
         tensors[key] = torch.from_numpy(np.array(arrays[key], dtype=np.float64))

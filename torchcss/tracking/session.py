@@ -196,7 +196,7 @@ class TrackingSession:
         nothing = len(self._observers)
         mixture = first.mixture
         if self.plan.one_fit:
-            mixture = _one_fit(mixture, self._bounds)
+            mixture = _one_fit(first, self._bounds)
         self.state = SessionState(
             tracker=self.plan.tracker.init(mixture, generator=generator),
             body=first.body,
@@ -498,9 +498,14 @@ class TrackingSession:
         return {name: float(value[0]) for name, value in values.items()}
 
 
-def _one_fit(mixture: GaussianMixture, bounds: Bounds) -> GaussianMixture:
-    """The likeliest fit alone; what a bound holds has no width (section 5 of both papers)."""
-    best = mixture.prune(1)
+def _one_fit(first: Initialisation, bounds: Bounds) -> GaussianMixture:
+    """The likeliest fit alone, its covariance not capped; what a bound holds has no width.
+
+    Section 5 of both papers.
+    """
+    best = first.mixture.prune(1)
+    if first.uncapped is not None:
+        best = best._replace(covariance=first.uncapped[None])
     free = (best.mean > bounds.lower.to(best.mean)) & (best.mean < bounds.upper.to(best.mean))
     both = free[:, :, None] & free[:, None, :]
     return best._replace(covariance=torch.where(both, best.covariance, 0.0))
