@@ -120,7 +120,8 @@ class FrameContext:
     def _before_surroundings(self) -> Float[Tensor, "layers h w"] | None:
         if self.appearance is None or self.features is None or self.features.colour is None:
             return None
-        colour, window = self.features.colour, self.features.window
+        # Single precision is far finer than the colours: these are a picture for each layer.
+        colour, window = self.features.colour.float(), self.features.window
         if window is None:
             return self.appearance.foreground_ratio(colour)
         seen = self.appearance.foreground_ratio(colour[window.pixels])

@@ -102,7 +102,8 @@ class Appearance(NamedTuple):
         known = (self.inside.sum(-1) > 0) & (self.outside.sum(-1) > 0)
         inside, outside = ((_smooth(part) + _FLOOR).log() for part in (self.inside, self.outside))
         if background is None:
-            return (0.5 * torch.where(known[:, None], inside - outside, 0.0)).tanh()[:, bins]
+            ratio = (0.5 * torch.where(known[:, None], inside - outside, 0.0)).tanh()
+            return ratio.to(colour)[:, bins]
         # Densities over the unit cube of colours, as the background's.
         inside, outside = (
             torch.where(known[:, None], part + math.log(BINS**3), 0.0)[:, bins]
