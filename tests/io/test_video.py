@@ -18,10 +18,11 @@ import pytest
 from av.container import InputContainer
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from PIL import Image
+from PIL import ExifTags, Image
 
+from torchcss.app.detect import detect_video
 from torchcss.app.lens import Lens
-from torchcss.app.view_files import OpenView
+from torchcss.app.view_files import OpenView, open_view
 from torchcss.errors import ConfigurationError, OutputError, ShapeError, VideoError
 from torchcss.io import video
 from torchcss.io.video import (
@@ -35,6 +36,7 @@ from torchcss.io.video import (
 from torchcss.io.view_files import ViewFiles
 from torchcss.studies.demo import CLIP
 from torchcss.types import Frame
+from torchcss.vision.camera import Camera
 
 
 def grey_level(index: int) -> int:
@@ -626,6 +628,10 @@ def test_bad_folders(tmp_path: Path) -> None:
     assert len(frames) == 1
     assert "9 x 6" in str(error)
     assert "8 x 6" in str(error)
+    for chosen in ({"start": 1}, {"stop": 1}):
+        reader = VideoReader(tmp_path, **chosen)
+        reader.check_sizes()
+        assert len(list(reader)) == 1
     with pytest.raises(VideoError, match="beyond the end"):
         VideoReader(tmp_path, start=2)
     (tmp_path / "1.png").write_bytes((tmp_path / "0.png").read_bytes()[:40])
@@ -634,6 +640,32 @@ def test_bad_folders(tmp_path: Path) -> None:
     assert "1.png" in str(error)
     with pytest.raises(VideoError, match="per second"):
         VideoReader(tmp_path, image_frame_rate=0)
+
+
+def test_pictures_of_several_sizes_are_told_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    upright = Image.new("RGB", (8, 6))
+    turned, exif = Image.new("RGB", (6, 8)), Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    for suffix in (".jpg", ".png", ".tif", ".webp"):
+        upright.save(tmp_path / f"a{suffix}")
+        turned.save(tmp_path / f"b{suffix}", exif=exif)
+    (tmp_path / "broken.jpg").write_bytes(b"x")
+    VideoReader(tmp_path).check_sizes()
+    files = ViewFiles(video=tmp_path, keypoints=None)
+    open_view(files, Camera.pinhole(8, 6, focal_px=6.0))
+    turned.save(tmp_path / "c.jpg")
+    for act in (
+        lambda: open_view(files, Camera.pinhole(8, 6, focal_px=6.0)),
+        lambda: detect_video(tmp_path, tmp_path / "people.npz"),
+    ):
+        with pytest.raises(VideoError, match=r"c\.jpg: has 6 x 8 pixels, the first one has 8 x 6"):
+            act()
+    # Twenty thousand pictures must take seconds: none is decoded that is of the first one's size.
+    reader = VideoReader(tmp_path, stop=3)
+    monkeypatch.setattr(video, "read_image", None)
+    reader.check_sizes()
 
 
 # Writing.

@@ -67,6 +67,7 @@ def detect_video(
     """
     options = options or DetectOptions()
     reader = VideoReader(video, start=start, stop=stop, image_frame_rate=frame_rate)
+    reader.check_sizes()
     prepare_output_folder(out.parent)
     if detector is None:
         tqdm.write("loading the detector ...", file=sys.stderr)

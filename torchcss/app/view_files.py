@@ -169,10 +169,12 @@ def open_view(
     reader = VideoReader(
         files.video, start=start, stop=stop, stride=stride, image_frame_rate=files.frame_rate
     )
+    reader.check_sizes()
     width, height = reader.info.width, reader.info.height
     masks = None
     if files.masks is not None:
         masks = VideoReader(files.masks, start=start, stop=stop, stride=stride)
+        masks.check_sizes()
         _, *theirs, _ = masks.info
         # Films of odd sizes are a row or column larger.
         if theirs not in ([width, height], [width + width % 2, height + height % 2]):

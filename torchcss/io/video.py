@@ -135,7 +135,8 @@ class VideoReader:
         if self._images is None:
             self.info = self._probe_container()
         else:
-            height, width = read_image(self._images[0]).shape[:2]
+            first = self._images[min(start, len(self._images) - 1)]
+            height, width = read_image(first).shape[:2]
             self.info = VideoInfo(self._image_frame_rate, width, height, len(self._images))
         if self.info.num_frames is not None and start >= self.info.num_frames:
             raise self._beyond_the_end(self.info.num_frames)
@@ -336,17 +337,36 @@ class VideoReader:
             raise VideoError(f"{str(self.path)!r}: cannot be read: {_reason(error)}") from error
         return [self.path] if self.path.suffix.lower() in IMAGE_SUFFIXES else None
 
-    def _read_images(self) -> Generator[Frame]:
+    @property
+    def _chosen(self) -> range:
+        return range(len(self._images or ()))[self._start : self._stop : self._stride]
+
+    def check_sizes(self) -> None:
+        """See that the pictures of a folder have one size, by what stands at their beginnings.
+
+        Raises:
+            VideoError: If one of the selected ones has another. One that cannot be read is left to
+                whoever reads it.
+        """
+        for index in self._chosen:
+            assert self._images is not None
+            if _size_at_beginning(self._images[index]) not in (None, self.info[1:3]):
+                self._image(index)
+
+    def _image(self, index: int) -> UInt8[np.ndarray, "h w 3"]:
         assert self._images is not None
-        for index in range(len(self._images))[self._start : self._stop : self._stride]:
-            image = read_image(self._images[index])
-            if image.shape[:2] != (self.info.height, self.info.width):
-                raise VideoError(
-                    f"{self._images[index]}: has {image.shape[1]} x {image.shape[0]} pixels, "
-                    f"{self._images[0].name} has {self.info.width} x {self.info.height}; "
-                    "all images of a folder must have one size"
-                )
-            yield Frame(index, float(index / self.info.frame_rate), image)
+        image = read_image(self._images[index])
+        if image.shape[:2] != (self.info.height, self.info.width):
+            raise VideoError(
+                f"{self._images[index]}: has {image.shape[1]} x {image.shape[0]} pixels, the first "
+                f"one has {self.info.width} x {self.info.height}; all must have one size: make it "
+                "so, or select those that have with start and stop"
+            )
+        return image
+
+    def _read_images(self) -> Generator[Frame]:
+        for index in self._chosen:
+            yield Frame(index, float(index / self.info.frame_rate), self._image(index))
 
 
 class VideoWriter:
@@ -512,6 +532,18 @@ def read_image(path: StrPath) -> UInt8[np.ndarray, "h w 3"]:
         raise VideoError(
             f"{path}: not an image that can be read ({_reason(error)}); get a complete copy"
         ) from error
+
+
+def _size_at_beginning(path: Path) -> tuple[int, int] | None:
+    """Columns and rows of an image, turned upright; None: nothing that can be read says it.
+
+    What a PNG says of its turn behind the pixels is not looked for.
+    """
+    with suppress(Exception), Image.open(path) as opened:  # see `read_image`
+        width, height = opened.size
+        turn = opened.getexif().get(ExifTags.Base.Orientation, 1) if "exif" in opened.info else 1
+        return (height, width) if turn > 4 else (width, height)
+    return None
 
 
 def read_frame(path: StrPath, index: int = 0) -> UInt8[np.ndarray, "h w 3"]:
