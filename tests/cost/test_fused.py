@@ -23,6 +23,7 @@ from torchcss.cost.fused.priors import add_priors
 from torchcss.cost.fused.repulsion import add_repulsion
 from torchcss.cost.fused.view import add_view
 from torchcss.cost.total import beside, numbered, together
+from torchcss.kernels import compiler
 from torchcss.kernels.checked import checked
 from torchcss.types import Curvature, LocalModel
 
@@ -136,17 +137,41 @@ print("checked")
 """
 
 
-def test_no_index_is_out_of_range() -> None:
+def said(code: str, **variables: str) -> str:
+    """What a process of its own prints."""
     here = Path(__file__).parent
-    paths = [str(here), str(here.parent), str(here.parents[1])]
-    environment = {
-        **os.environ,
-        "TORCHCSS_CHECK_KERNELS": "1",
-        "PYTHONPATH": os.pathsep.join(paths),
-    }
-    run = [sys.executable, "-c", CHECK]
-    done = subprocess.run(run, env=environment, capture_output=True, text=True, check=False)
-    assert done.stdout == "checked\n", done.stderr
+    path = os.pathsep.join([str(here.parent), str(here.parents[1])])
+    environment = {**os.environ, "PYTHONPATH": path, **variables}
+    run = [sys.executable, "-c", code]
+    done = subprocess.run(
+        run, env=environment, capture_output=True, text=True, check=False, timeout=600
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_no_index_is_out_of_range() -> None:
+    assert said(CHECK, TORCHCSS_CHECK_KERNELS="1") == "checked\n"
+
+
+FORK = """
+import os, torch
+from dataclasses import replace
+from made_costs import JOINTS_ONLY, make_cost, random_states
+from torchcss.cost.fused.engine import FusedEngine
+cost = replace(make_cost("arm8", JOINTS_ONLY), engine=FusedEngine(threads=2))
+x = random_states(cost.body, 4, generator=torch.Generator().manual_seed(0))
+value = cost.value(x)
+if os.fork() == 0:
+    os._exit(0 if torch.equal(cost.value(x), value) else 1)
+print(os.waitstatus_to_exitcode(os.wait()[1]))
+"""
+
+
+@pytest.mark.skipif(not compiler.COMPILED, reason="numba is not installed")
+@pytest.mark.skipif(sys.platform == "win32", reason="no forks")
+def test_a_fork_has_threads_of_its_own() -> None:
+    assert said(FORK) == "0\n"
 
 
 def test_an_index_out_of_range_is_refused() -> None:

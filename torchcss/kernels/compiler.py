@@ -27,13 +27,15 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from torchcss.errors import ConfigurationError
+
 AVAILABLE = find_spec("numba") is not None  # a plain install has it; some platforms do not
 """Whether kernels can be compiled."""
 
 CHECKED = os.environ.get("TORCHCSS_CHECK_KERNELS", "") == "1"
 """Whether kernels run as plain Python with every index checked."""
 
-COMPILED = AVAILABLE and not CHECKED
+COMPILED = AVAILABLE and not CHECKED and os.environ.get("NUMBA_DISABLE_JIT", "0") in ("", "0")
 """Whether kernels are compiled: where they are not, they are of use for tests alone."""
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
@@ -57,8 +59,13 @@ def entry(function: _Function) -> _Function:
 def _compiled(function: _Function, role: str) -> _Function:
     if not COMPILED:
         return function
-    from torchcss.kernels import pipeline
-
+    try:
+        from torchcss.kernels import pipeline
+    except ImportError as error:  # most often a numpy that this numba does not know
+        raise ConfigurationError(
+            f"numba is installed but cannot be imported ({error}); update it, or uninstall it and "
+            "costs are evaluated more slowly"
+        ) from error
     return pipeline.compiled(function, role)
 
 

@@ -1,9 +1,11 @@
 """What is done to kernels on their way through numba, and where compiled ones are kept.
 
-They are kept in the user's cache folder. A folder of the package has its own folder there, whose
-name is a digest of its modules, of these here and of the versions that compile them: a change of
-any of them compiles its kernels anew, another process finds them, and the package's own folder may
-be read-only. `TORCHCSS_CACHE` names another place.
+They are kept in the user's cache folder, or else in a temporary folder of the user's own; the
+package's own folder may be read-only. `TORCHCSS_CACHE` names another place. Each compiled entry is
+a file by itself, whose name is a digest of what it is made from, for which arguments and which
+processor: a change of any of them compiles it anew, and another process finds it. Files appear at
+once and whole, so that processes that start together do not disturb each other; a damaged one is
+made anew.
 """
 
 from __future__ import annotations
@@ -11,10 +13,12 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import pickle
 import sys
 import tempfile
-from collections.abc import Callable
-from functools import cache
+import uuid
+from collections.abc import Iterator
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +26,9 @@ import llvmlite
 import numba
 import numpy as np
 from llvmlite import binding as llvm
-from numba.core import caching, compiler, ir, types
+from numba.core import compiler, ir, serialize, types
 from numba.core.compiler_machinery import FunctionPass, register_pass
+from numba.core.dispatcher import Dispatcher
 from numba.core.untyped_passes import IRProcessing
 
 _FREEDOM = {"contract", "nsz", "arcp", "reassoc"}
@@ -58,68 +63,122 @@ def compiled(function: Any, role: str) -> Any:
     template = made.get_call_template
     # One version for all numbers that a caller may write down.
     made.get_call_template = lambda args, kws: template(map(types.unliteral, args), kws)
-    if role == "entry":
-        with contextlib.suppress(OSError):  # nowhere to write: it is compiled in every process
-            made._cache = _Cache(function)
+    if role == "entry" and Path(function.__code__.co_filename).is_file():  # not typed in
+        made._cache = _Cache(function)
     return made
 
 
-@cache
-def cache_folder(kernels: Path) -> Path:
-    """Where the compiled kernels of a folder of the package are kept.
-
-    In the user's cache, or else in a temporary folder. Kernels call those of their own folder only.
-    """
-    own = sorted({*kernels.glob("*.py"), *Path(__file__).parent.glob("*.py")})
-    made_by = f"{numba.__version__} {llvmlite.__version__} {sys.version_info[:2]}"
-    text = b"".join(path.read_bytes() for path in own) + made_by.encode()
-    name = f"{kernels.name}-{hashlib.sha256(text).hexdigest()[:16]}"
+def cache_folders() -> Iterator[Path]:
+    """Where compiled kernels may be kept, the best place first."""
     root = os.environ.get("TORCHCSS_CACHE") or os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    with contextlib.suppress(OSError, RuntimeError):
-        folder = Path(root).expanduser() / "torchcss" / name
-        folder.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()
-        return folder
-    return Path(tempfile.gettempdir()) / f"torchcss-{Path.home().name}" / name
+    with contextlib.suppress(RuntimeError):  # a user without a home
+        yield Path(root).expanduser() / "torchcss" / "kernels"
+    with contextlib.suppress(OSError):
+        own = Path(tempfile.gettempdir()) / "torchcss"
+        if sys.platform != "win32":
+            # Anybody may write there, and what is kept is run: it has to be the user's own.
+            own = own.with_name(f"torchcss-{os.getuid()}")
+            own.mkdir(mode=0o700, exist_ok=True)
+            if own.lstat().st_uid != os.getuid():
+                return
+        yield own / "kernels"
 
 
-class _Locator(caching._CacheLocator):
-    """Tells numba where the cache is, and that its name says what is in it."""
+def source_digest(entry: Any) -> bytes:
+    """Digest of all that an entry is made from.
 
-    def __init__(self, path: Path) -> None:
-        self._name = self._py_file = path.stem
-        self._kernels = path.parent
+    These are the modules of the kernels and records that it can reach, the numbers that those
+    import, the modules here, and the versions that compile them.
+    """
+    todo, reached = [entry.__module__], set()
+    while todo:
+        name = todo.pop()
+        if name not in reached and name in sys.modules:
+            reached.add(name)
+            for value in vars(sys.modules[name]).values():
+                if isinstance(value, Dispatcher):
+                    todo.append(value.py_func.__module__)
+                elif isinstance(value, type) and issubclass(value, tuple):
+                    todo.append(value.__module__)
+    made_by = (numba.__version__, llvmlite.__version__, np.__version__, *sys.version_info[:2])
+    digest = hashlib.sha256(repr(made_by).encode())
+    paths = sorted(Path(__file__).parent.glob("*.py"))
+    for module in (sys.modules[name] for name in sorted(reached)):
+        if file := vars(module).get("__file__"):
+            paths.append(Path(file))
+        numbers = {
+            name: value
+            for name, value in vars(module).items()
+            if isinstance(value, int | float | str | tuple) and not name.startswith("__")
+        }
+        digest.update(repr(sorted(numbers.items())).encode())
+    for path in paths:
+        digest.update(path.read_bytes())
+    return digest.digest()
 
-    @classmethod
-    def from_function(cls, py_func: Callable[..., Any], py_file: str) -> _Locator:
-        return cls(Path(py_file))
 
-    def get_cache_path(self) -> Any:
-        return str(cache_folder(self._kernels))
+class _Cache:
+    """Compiled versions of an entry on disk, as numba asks for them."""
 
-    def get_source_stamp(self) -> Any:
-        return ""
-
-    def get_disambiguator(self) -> Any:
-        return self._name
-
-
-class _CacheFiles(caching.CompileResultCacheImpl):
-    _locator_classes = (_Locator,)
-
-
-class _Cache(caching.FunctionCache):
-    """Says so when kernels have to be compiled."""
-
-    _impl_class = _CacheFiles
     _said = False
 
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
-        found = super().load_overload(sig, target_context)
-        if found is None and not _Cache._said:
+    def __init__(self, entry: Any) -> None:
+        self._entry = entry
+
+    def load_overload(self, signature: Any, target_context: Any) -> Any:
+        """The version for some types of arguments; None, and a line that says so: there is none."""
+        target_context.refresh()
+        name = self._file(signature, target_context.codegen())
+        for folder in cache_folders():
+            with contextlib.suppress(OSError, ValueError):
+                data = _checked((folder / name).read_bytes())
+                return compiler.CompileResult._rebuild(target_context, *pickle.loads(data))
+        if not _Cache._said:
             _Cache._said = True
             print("torchcss: compiling for this processor, once (about a minute)", file=sys.stderr)
-        return found
+        return None
+
+    def save_overload(self, signature: Any, result: Any) -> None:
+        """Keep a version; where nothing can be written it is compiled in every process."""
+        data = serialize.dumps(result._reduce())
+        name = self._file(signature, result.codegen)
+        for folder in cache_folders():
+            with contextlib.suppress(OSError):
+                folder.mkdir(parents=True, exist_ok=True)
+                _write(folder / name, hashlib.sha256(data).digest() + data)
+                return
+
+    @cached_property
+    def _source(self) -> bytes:
+        return source_digest(self._entry)
+
+    def _file(self, signature: Any, codegen: Any) -> str:
+        """Name of the file of a version, for this processor."""
+        made_for = repr((signature, codegen.magic_tuple())).encode()
+        digest = hashlib.sha256(self._source + made_for).hexdigest()
+        return f"{self._entry.__module__}.{self._entry.__name__}-{digest[:16]}"
+
+
+def _checked(data: bytes) -> bytes:
+    """What follows its own digest.
+
+    Raises:
+        ValueError: If it is not what was written.
+    """
+    digest, rest = data[:32], data[32:]
+    if hashlib.sha256(rest).digest() != digest:
+        raise ValueError("damaged")
+    return rest
+
+
+def _write(path: Path, data: bytes) -> None:
+    """Write a file that appears at once and whole."""
+    beside = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
+    try:
+        beside.write_bytes(data)
+        beside.replace(path)
+    finally:
+        beside.unlink(missing_ok=True)
 
 
 @register_pass(mutates_CFG=False, analysis_only=False)

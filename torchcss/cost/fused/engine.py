@@ -9,6 +9,7 @@ kernel stands in a file with the name of its twin.
 from __future__ import annotations
 
 import math
+import os
 import warnings
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator, Sequence
@@ -155,7 +156,7 @@ class FusedEngine:
         self.real: Any = np.float32 if dtype == "float32" else np.float64
         self._views, self._priors = _Packs(), _Packs()
         self._threads = threads
-        self._helpers = ThreadPoolExecutor(threads - 1) if threads > 1 else None
+        self._helpers: dict[int, ThreadPoolExecutor] = {}  # by process: a fork has no threads
 
     def value(self, cost: TrackingCost, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
         """Cost in nats; see `TrackingCost.value`."""
@@ -236,12 +237,15 @@ class FusedEngine:
             for packed, mode in calls:
                 packed.add(x[rows], None if mode is None else mode[rows], part)
 
-        if self._helpers is None or len(x) < 2:
+        if self._threads < 2 or len(x) < 2:
             add(slice(None))
             return
+        process = os.getpid()
+        if process not in self._helpers:
+            self._helpers[process] = ThreadPoolExecutor(self._threads - 1)
         size = math.ceil(len(x) / self._threads)
         others = [slice(i, i + size) for i in range(size, len(x), size)]
-        helped = [self._helpers.submit(add, rows) for rows in others]
+        helped = [self._helpers[process].submit(add, rows) for rows in others]
         add(slice(size))
         for each in helped:
             each.result()
