@@ -89,6 +89,26 @@ def test_what_is_released_can_be_claimed_at_once(tmp_path: Path) -> None:
     assert again.generation == 2
 
 
+def test_who_is_known_to_be_dead_is_not_waited_for(tmp_path: Path) -> None:
+    claims = Claims(tmp_path, clock=Clock())
+    first = claims.take("a")
+    assert first is not None
+    first.beat("5 %")
+    seen = claims.sight("a")
+    assert seen is not None
+    assert not seen.free
+    claims.tell_dead("a", seen)
+    seen = claims.sight("a")
+    assert seen is not None
+    assert seen.free
+    assert not seen.released  # deaths are counted
+    second = Claims(tmp_path, clock=Clock()).take("a")
+    assert second is not None
+    assert second.generation == 2
+    assert not first.holds
+    assert claims.take("a") is None
+
+
 def test_it_beats_by_itself(tmp_path: Path) -> None:
     claims = Claims(tmp_path, patience_s=0.1)
     claim = claims.take("a")

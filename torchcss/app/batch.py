@@ -143,7 +143,7 @@ class Batch:
                 for worker in [each for each in workers if not each.is_alive()]:
                     workers.remove(worker)
                     # One that died before it had a clip would do so again.
-                    if worker.pid is not None and job.is_held_by(worker.pid):
+                    if worker.pid is not None and job.free_from(worker.pid):
                         print(
                             f"process {worker.pid} died with its clip; another one starts",
                             flush=True,
@@ -350,11 +350,14 @@ class Job(NamedTuple):
         """Whether a clip is to be tracked."""
         return not self.is_done(clip) and self.failure(clip) is None
 
-    def is_held_by(self, process: int) -> bool:
-        """Whether a process of this machine has claimed a clip, and not let it go."""
-        seen = (self.claims.sight(clip.name) for clip in self.clips)
-        owners = (each.owner for each in seen if each is not None and not each.released)
-        return process_name(process) in owners
+    def free_from(self, process: int) -> bool:
+        """Whether a process of this machine, which is dead, had a clip: others may have it now."""
+        for clip in self.clips:
+            seen = self.claims.sight(clip.name)
+            if seen is not None and not seen.free and seen.owner == process_name(process):
+                self.claims.tell_dead(clip.name, seen)
+                return True
+        return False
 
     def states(self) -> dict[str, State]:
         """How far every clip is."""
@@ -366,7 +369,7 @@ class Job(NamedTuple):
         if (failure := self.failure(clip)) is not None:
             return State("failed", failure["line"])
         seen = self.claims.sight(clip.name)
-        if seen is None or seen.released:
+        if seen is None or seen.free:
             return State("waiting")
         return State("tracking", seen.progress)
 

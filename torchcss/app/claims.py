@@ -5,7 +5,8 @@ complete, which network file systems honour): of several that try, one succeeds.
 that it lives by adding lines; their number is a counter, and the last one says how far it is. A
 claim whose counter stands still, as long as another process watches it by a clock of its own, may
 be taken over: by a claim of the next generation. Clocks of two machines are never compared. An
-owner that wakes up finds the newer generation, and has to write nothing more.
+owner that wakes up finds the newer generation, and has to write nothing more. Whoever knows that an
+owner is dead, because it started that process, says so in its claim, and nobody has to wait.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from typing import NamedTuple
 
 from torchcss.files import output_error
 
-_RELEASED = "released"
+_RELEASED, _DIED = "released", "died"
 
 
 def process_name(number: int) -> str:
@@ -49,6 +50,11 @@ class Sight(NamedTuple):
     def released(self) -> bool:
         """Whether its owner has let it go."""
         return self.progress == _RELEASED
+
+    @property
+    def free(self) -> bool:
+        """Whether nobody works under it, as its owner has let it go or is known to be dead."""
+        return self.released or self.progress == _DIED
 
 
 class Claim:
@@ -142,7 +148,7 @@ class Claims:
             OutputError: If the folder cannot be written.
         """
         seen = self.sight(name)
-        if seen is not None and not (gone or seen.released or self._stands_still(name, seen)):
+        if seen is not None and not (gone or seen.free or self._stands_still(name, seen)):
             return None
         generation = 1 if seen is None else seen.generation + 1
         place = self.folder / name
@@ -159,6 +165,10 @@ class Claims:
             with suppress(OSError):
                 draft.unlink(missing_ok=True)
         return Claim(self, name, generation)
+
+    def tell_dead(self, name: str, seen: Sight) -> None:
+        """Say of a claim that its owner is dead: the next one may claim at once."""
+        Claim(self, name, seen.generation).beat(_DIED)
 
     def _stands_still(self, name: str, seen: Sight) -> bool:
         now, state = self._clock(), (seen.generation, seen.counter)
