@@ -6,7 +6,9 @@ DIR is a sequence folder (`torchcss.studies.sequences`). Every preset starts fro
 pose per seed and gets one row: when it loses the body, its errors until then, whether the true mode
 is among those kept, how often the truth is inside the regions that it states, impossible poses, and
 what it takes. Definitions are in `torchcss.studies.evaluation`. Beside ours stand the paper's own
-failure times, which were measured on its sequences.
+failure times, which were measured on its sequences. A second table has the weight of the modes that
+are another explanation than the best one, over time: over the whole sequence without
+`--stop-when-lost`.
 
 The trackers of a seed run side by side through the video and share its features; `--together 6`
 puts six runs side by side, of several seeds where a seed has fewer. The file OUT is written
@@ -22,6 +24,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from common import Table, start, write_report
 from peers.published import PUBLISHED
 from tqdm import tqdm
@@ -32,6 +35,7 @@ from torchcss.io.tracks import read_summary
 from torchcss.show.style import save_figure
 from torchcss.studies.comparison import Run, Start, find_start, track_together
 from torchcss.studies.evaluation import Thresholds, over_seeds, summarise
+from torchcss.studies.metrics import spread
 from torchcss.studies.plots import error_curves, failure_figure
 from torchcss.studies.sequences import RecordedSequence, read_sequence
 from torchcss.tracking.presets import PRESETS, preset_name
@@ -58,6 +62,8 @@ COLUMNS = {
 """What is printed: until the loss, the last two over all frames."""
 TRACKING = Settings(keypoints_use="first", overlay=False)
 """How this script tracks, where nothing else is said."""
+STEP_S = 0.5
+"""Over how long weights are averaged, seconds."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,6 +74,8 @@ class Config:
     """Sequence folder."""
     view: str | None = None
     """Camera, of a sequence with several."""
+    tracked_as: str | None = None
+    """Body that tracks, if other than that which moved: `arm7`, the arm of [RR], for one of 8."""
     presets: tuple[str, ...] = tuple(PRESETS)
     """Trackers."""
     seeds: int = 3
@@ -115,6 +123,7 @@ def main(config: Config) -> dict[str, Any]:
             runs.append(entry_of(run, thresholds, 1 / sequence.frame_rate))
             report = write(config, study, runs)
     print_table(report["by_tracker"], sequence.name)
+    weights_table(report["apart_weight"]).print()
     if config.plot is not None and report["by_tracker"]:
         told = {row.preset: row.times_s for row in report["published"]}
         order = [name for name in PRESETS if name in config.presets]
@@ -141,12 +150,13 @@ def groups_of(config: Config, done: set[tuple[str, int]]) -> Iterator[list[tuple
 def study_of(config: Config, sequence: RecordedSequence, thresholds: Thresholds) -> dict[str, Any]:
     """What all runs of a file have in common."""
     shared = ("start", "frames", "stop_when_lost", "small")
+    truth = sequence.truth
     tracked = {k: v for k, v in asdict(config.tracking).items() if k not in ("seed", "preset")}
     return {
         "sequence": sequence.name,
         "num_frames": sequence.num_frames,
         "frame_rate": sequence.frame_rate,
-        "body": config.tracking.body if sequence.truth is None else sequence.truth.body.name,
+        "body": config.tracked_as or (truth.body.name if truth else config.tracking.body),
         "thresholds": asdict(thresholds),
         "settings": {
             name: list(value) if isinstance(value, tuple) else value
@@ -175,14 +185,18 @@ def earlier_runs(config: Config, study: dict[str, Any]) -> list[dict[str, Any]]:
 
 def write(config: Config, study: dict[str, Any], runs: list[dict[str, Any]]) -> dict[str, Any]:
     """Make the table of all trackers so far, and write what there is."""
-    table = {}
+    table, weights = {}, {}
     for name in PRESETS:
         own = [run for run in runs if run["preset"] == name]
         if measured := [run for run in own if "num_frames" in run]:
             errors = sum(run["ended"].startswith("error") for run in own)
             table[name] = {**over_seeds(measured), "errors": errors}
+            weights[name] = weight_over_time([run["per_frame"] for run in measured])
     published = [row for row in PUBLISHED if row.sequence == study["sequence"]]
-    report = {"study": study, "published": published, "runs": runs, "by_tracker": table}
+    report = {
+        "study": study, "published": published, "runs": runs, "by_tracker": table,
+        "apart_weight": weights,
+    }  # fmt: skip
     cells = []
     for name, row in table.items():
         lost = f"{row['lost']} of {row['seeds']}", row["lost_s"][0]
@@ -194,6 +208,32 @@ def write(config: Config, study: dict[str, Any], runs: list[dict[str, Any]]) -> 
     columns = ("tracker", "lost", "lost at s", *COLUMNS)
     write_report(config.out, report, Table(title, columns, cells))
     return report
+
+
+def weight_over_time(frames: list[dict[str, Any]]) -> dict[str, list[tuple[float, float, float]]]:
+    """Weight of other explanations: median, least and most over the seeds, by `STEP_S`."""
+    steps = [np.array(run["time_s"]) // STEP_S for run in frames]
+    weights = [np.array(run["apart_weight"], np.float64) for run in frames]
+    count = int(max(step[-1] for step in steps)) + 1
+
+    def during(i: int) -> list[float]:
+        pairs = zip(steps, weights, strict=True)
+        return [float(weight[step == i].mean()) for step, weight in pairs if (step == i).any()]
+
+    whole = spread([float(weight.mean()) for weight in weights])
+    return {"whole": [whole], "by_step": [spread(during(i)) for i in range(count)]}
+
+
+def weights_table(weights: dict[str, dict[str, list[tuple[float, float, float]]]]) -> Table:
+    """Medians over time of the trackers that have several modes."""
+    several = {name: row for name, row in weights.items() if row["whole"][0][2] > 0}
+    count = max((len(row["by_step"]) for row in several.values()), default=0)
+    cells = []
+    for name, row in several.items():
+        steps = [step[0] for step in row["by_step"]]
+        cells.append([name, row["whole"][0][0], *steps, *[None] * (count - len(steps))])
+    columns = ("tracker", "all", *(f"from {STEP_S * i:g} s" for i in range(count)))
+    return Table("Weight of other explanations, 3 cm from the best mode", columns, cells)
 
 
 def settings_of(config: Config, body: str, preset: str, seed: int) -> Settings:

@@ -14,7 +14,9 @@ from made_sequences import write_arm
 from peers.published import PUBLISHED
 
 from torchcss.errors import ConfigurationError
+from torchcss.studies.evaluation import Thresholds
 from torchcss.studies.plots import ErrorCurves, error_curves, failure_figure
+from torchcss.studies.sequences import read_sequence
 from torchcss.tracking.presets import PRESETS
 from torchcss.tracking.settings import TERMS, Settings
 
@@ -76,7 +78,11 @@ def test_small_mode_and_resume(
         "ijrr_gaussian_single",
         "ijrr_css",
     }
+    weight = report["apart_weight"]["ijrr_condensation"]
+    assert len(weight["by_step"]) == 1, "within the first half second"
+    assert weight["by_step"] == weight["whole"]
     text = capsys.readouterr().out
+    assert "Weight of other explanations" in text
     assert "2.6 s" in text  # the paper's robust tracker
     assert "0/2" in text
     assert "never" in text
@@ -114,11 +120,37 @@ def test_how_trackers_are_set_up_can_be_chosen(script: ModuleType, arm: Path) ->
     assert script.settings_of(script.Config(sequence=arm), "arm8", "css", 0).used_terms == TERMS
 
 
+def test_weights_of_other_explanations_over_time(script: ModuleType) -> None:
+    runs = [
+        {"time_s": [0.0, 0.25, 0.5, 1.0], "apart_weight": [0.0, 0.2, 0.4, 0.8]},
+        {"time_s": [0.0, 0.25], "apart_weight": [0.2, 0.2]},
+    ]
+    weight = script.weight_over_time(runs)
+    np.testing.assert_allclose(weight["by_step"], [[0.15, 0.1, 0.2], [0.4] * 3, [0.8] * 3])
+    np.testing.assert_allclose(weight["whole"], [[0.275, 0.2, 0.35]])
+    table = script.weights_table({"css": weight, "one": script.weight_over_time([
+        {"time_s": [0.0], "apart_weight": [0.0]}
+    ])})  # fmt: skip
+    assert table.columns == ("tracker", "all", "from 0 s", "from 0.5 s", "from 1 s")
+    (row,) = table.rows
+    assert row[0] == "css"
+    np.testing.assert_allclose(row[1:], [0.275, 0.15, 0.4, 0.8])
+
+
+def test_another_arm_can_track(script: ModuleType, arm: Path) -> None:
+    sequence = read_sequence(arm)
+    limits = Thresholds.of(sequence)
+    assert script.study_of(script.Config(sequence=arm), sequence, limits)["body"] == "arm8"
+    config = script.Config(sequence=arm, tracked_as="arm7")
+    assert script.study_of(config, sequence, limits)["body"] == "arm7"
+
+
 def test_a_lost_track_in_the_table(
     script: ModuleType, arm: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     times = [0.0, 0.04, 0.08]
     measured = {"time_s": times, "root_aligned_mm": [10.0, 300.0, None]}
+    measured["apart_weight"] = [0.0, 0.0, 0.0]
     measured["root_aligned_best_of_modes_mm"] = [10.0, 200.0, 200.0]
     base = {"preset": "ijrr_single_limits", "ended": "lost", "num_frames": 3, "per_frame": measured}
     entries = {key: 1.0 for key, _, _ in script.COLUMNS.values()}

@@ -9,7 +9,8 @@ import pytest
 import torch
 from made_sequences import NOISE_PX, write_arm
 
-from torchcss.studies.comparison import Run, Start, find_start, track_together
+from torchcss.body.load import load_body
+from torchcss.studies.comparison import Run, Start, find_start, told_arm, track_together
 from torchcss.studies.evaluation import Thresholds
 from torchcss.studies.sequences import RecordedSequence, read_sequence
 from torchcss.tracking.session import Observation, Posterior, TrackingSession
@@ -144,6 +145,33 @@ def test_the_start_is_the_sequences(sequence: RecordedSequence) -> None:
     begins = [(choose(preset), begin) for preset in ("ijrr_condensation", "annealed")]
     list(track_together(sequence, begins, Thresholds(), stop=1))
     assert torch.equal(begin.generator.get_state(), state)
+
+
+def test_an_arm_with_fewer_joints_hangs_where_its_first_one_is(sequence: RecordedSequence) -> None:
+    truth = sequence.truth
+    assert truth is not None
+    assert told_arm(truth, "arm8", 0) is truth.body
+    assert told_arm(truth, "body34", 0) is None
+    assert told_arm(truth._replace(body=load_body("arm7")), "arm8", 0) is None
+    frame = 2
+    x = truth.states[frame].clone()
+    x[0] = 0.3
+    turned = truth._replace(states=truth.states.index_copy(0, torch.tensor([frame]), x[None]))
+    arm = told_arm(turned, "arm7", frame)
+    assert arm is not None
+    assert arm.lengths == truth.body.lengths
+    ours, theirs = arm.pose(x[1:]), truth.body.pose(x)
+    for name in ("r_shoulder", "r_elbow", "r_wrist", "r_hand_tip"):
+        torch.testing.assert_close(
+            ours.joints[arm.joint_index(name)], theirs.joints[truth.body.joint_index(name)]
+        )
+    begin = find_start(sequence, choose("rr_multiple_hypothesis", body="arm7"))
+    assert begin.first.body.num_parameters == 7
+    (run,) = track_together(
+        sequence, [(choose("rr_multiple_hypothesis", body="arm7"), begin)], Thresholds(), stop=2
+    )
+    assert run.ended == "complete"
+    assert run.measures[-1].absolute_mm[0].mean() < 60
 
 
 def test_a_recorded_person_is_initialised(shared_data: Path) -> None:

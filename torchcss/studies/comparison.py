@@ -11,9 +11,14 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 
 from torchcss.app.init import initialise_video
+from torchcss.body.catalog import ARM_NAMES
+from torchcss.body.chain import offset_matrix
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel
 from torchcss.body.root import has_root
 from torchcss.errors import TorchcssError
 from torchcss.initialise.fit import initialise
@@ -23,6 +28,7 @@ from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
 from torchcss.initialise.result import Initialisation
 from torchcss.io.video import VideoReader
 from torchcss.studies.evaluation import Evaluator, FrameMeasures, Thresholds, loss
+from torchcss.studies.render.motions import Motion
 from torchcss.studies.sequences import RecordedSequence
 from torchcss.tracking.session import TrackingSession
 from torchcss.tracking.settings import Plan, Settings, make_plan
@@ -48,7 +54,8 @@ def find_start(sequence: RecordedSequence, settings: Settings, *, start: int = 0
     """Find the first pose from the keypoints of the first frame.
 
     A body is fitted in the three stages of `torchcss.initialise`. An arm is told base and lengths,
-    as in the demo, and only its pose is fitted.
+    as in the demo, and only its pose is fitted; one with fewer joints than the one that moved is
+    told where its first joint is in the first frame.
 
     Args:
         sequence: What is to be tracked.
@@ -58,13 +65,13 @@ def find_start(sequence: RecordedSequence, settings: Settings, *, start: int = 0
     keypoints, dtype, device = sequence.keypoints, settings.torch_dtype, settings.device
     generator = torch.Generator().manual_seed(settings.seed)
     camera = sequence.camera.to(dtype=dtype, device=device)
-    truth = sequence.truth
-    if truth is not None and truth.body.name == settings.body and not has_root(truth.body):
+    told = None if sequence.truth is None else told_arm(sequence.truth, settings.body, start)
+    if told is not None:
         sigma = sequence.keypoint_noise_px or typical_sigma(keypoints)
         options = InitialiseOptions(
             sigma=sigma, least_joints=LEAST_JOINTS, dtype=dtype, device=device
         )
-        placed = truth.body.to(dtype=dtype, device=device)
+        placed = told.to(dtype=dtype, device=device)
         first = initialise(
             None, keypoints.at(start), camera, placed, generator=generator, options=options
         )
@@ -75,6 +82,35 @@ def find_start(sequence: RecordedSequence, settings: Settings, *, start: int = 0
             generator=generator,
         )  # fmt: skip
     return Start(first, sigma, generator)
+
+
+def told_arm(truth: Motion, name: str, start: int) -> BodyModel | None:
+    """An arm with base and lengths of the one that moved.
+
+    Args:
+        truth: What moved.
+        name: The body that tracks it.
+        start: First frame, in which the arm's first joint is where it hangs.
+
+    Returns:
+        None if there is no such arm: the body is to be fitted.
+    """
+    moved = truth.body
+    if has_root(moved) or moved.name == name:
+        return None if has_root(moved) else moved
+    if name not in ARM_NAMES:
+        return None
+    arm = load_body(name, lengths=moved.lengths)
+    above, own = (
+        next((row for row in body.tree.specifications if row.name == arm.state_names[0]), None)
+        for body in (moved, arm)
+    )
+    if above is None or own is None:
+        return None
+    links = moved.forward_kinematics(truth.states[start])
+    hung = links[moved.tree.link_index(above.parent)].numpy(force=True) @ offset_matrix(above)
+    base = torch.from_numpy(hung @ np.linalg.inv(offset_matrix(own)))
+    return arm.with_base(base[:3, :3], base[:3, 3])
 
 
 class Run(NamedTuple):
