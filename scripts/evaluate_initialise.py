@@ -8,7 +8,8 @@ rendered turn, against their 3D references. Errors are means over the limbs' twe
 over people or frames. "Inside": the share of true parameters, and of true joints, inside the 95 %
 interval or ellipsoid that the nearest mode states. The last rows fit the same data from a single
 start, without limits, without the prior on lengths (they stay within their interval), or without
-robust potential. Seconds are the processor's.
+robust potential. The last two fit pose and lengths in one search that leaves no keypoints out, left
+and right equal as in section 5 [IJRR], and free. Seconds are the processor's.
 """
 
 from __future__ import annotations
@@ -24,7 +25,12 @@ import numpy as np
 import torch
 from common import Table, start, write_report
 
+from torchcss.body.catalog import specification, without_side
+from torchcss.body.model import BodyModel
+from torchcss.cost.anthropometric import proportion_columns
+from torchcss.cost.joints import match_joints
 from torchcss.initialise.fit import initialise
+from torchcss.initialise.from_joints import hang_before_camera
 from torchcss.initialise.keypoint_checks import default_sigma
 from torchcss.initialise.multi_start import SINGLE_START, Search
 from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
@@ -34,7 +40,7 @@ from torchcss.joint_names import canonical_joint_name
 from torchcss.robust import Quadratic
 from torchcss.studies.metrics import LIMB_JOINTS, pa_mpjpe_mm, root_aligned_mpjpe_mm
 from torchcss.studies.random_person import Person, coverage, random_person
-from torchcss.types import Keypoints
+from torchcss.types import Keypoints, Vector
 from torchcss.vision.camera import Camera
 
 LIMBS = {"thigh": ("hip", "knee"), "shank": ("knee", "ankle"), "upper_arm": ("shoulder", "elbow"),
@@ -54,7 +60,8 @@ CLIPS = {
     "beam, camera 3": ("balance_beam_4cam", "cam03.mp4", "keypoints2d_cam03.npz"),
     "rendered turn": ("rendered_turn", "video.mp4", "keypoints2d.npz"),
 }
-VARIANTS = ("full", "single start", "without limits", "no prior on lengths", "not robust")
+VARIANTS = ("full", "single start", "without limits", "no prior on lengths", "not robust",
+            "sides equal", "sides free")  # fmt: skip
 COMPARED = ("noise 2 px", "2 px, 5 % outliers", *CLIPS)
 HEADS = ("best", "of 7", "of 50", "r-a best", "r-a of 7", "ratios %", "viol. %", "params %",
          "joints %", "s")  # fmt: skip
@@ -164,9 +171,10 @@ def fit(case: Case, variant: str, config: Config, seed: int) -> dict[str, float]
         search = replace(search, leave_out=False)
         options = replace(options, potential_kind=Quadratic, search=search)
     generator = torch.Generator().manual_seed(seed)
+    given = loose_body(case, tied=variant == "sides equal") if "sides" in variant else "body34"
     began = time.process_time()
     found = initialise(
-        None, case.keypoints, case.camera, "body34", generator=generator, options=options
+        None, case.keypoints, case.camera, given, generator=generator, options=options
     )
     seconds = time.process_time() - began
     body, states = found.body, found.hypotheses(50, generator=generator)
@@ -176,7 +184,7 @@ def fit(case: Case, variant: str, config: Config, seed: int) -> dict[str, float]
     modes = found.mixture.mean
     outside = ((modes < body.lower) | (modes > body.upper)).any(-1)
     share, right = (np.array([lengths[limb] for limb in LIMBS]) for lengths in
-                    (found.lengths, case.lengths))  # fmt: skip
+                    (found.lengths or mean_lengths(body, modes[0]), case.lengths))  # fmt: skip
     ratios = (share / share.sum()) / (right / right.sum()) - 1
     parameters, ellipsoids = math.nan, math.nan
     if case.person is not None and found.free_body and found.free_mixture:
@@ -190,6 +198,29 @@ def fit(case: Case, variant: str, config: Config, seed: int) -> dict[str, float]
             "root_aligned_best_of_7_mm", "length_ratio_error_percent", "limit_violations_percent",
             "parameters_inside_percent", "joints_inside_percent", "seconds")  # fmt: skip
     return dict(zip(keys, map(float, numbers), strict=True))
+
+
+def loose_body(case: Case, *, tied: bool) -> BodyModel:
+    """A body before the camera whose lengths are parameters, left and right one or two."""
+    rows = specification("body34", free_proportions=True)
+    if not tied:
+        sides = {joint: name for joint, (name, _) in rows.ties.items() if joint.endswith("_length")}
+        sticky = {k: v for k, v in rows.sticky.items() if k not in sides.values()}
+        sticky |= {joint: rows.sticky[name] for joint, name in sides.items()}
+        ties = {joint: row for joint, row in rows.ties.items() if joint not in sides}
+        rows = replace(rows, ties=ties, sticky=sticky)
+    body = BodyModel(rows).to(torch.float64)
+    targets = match_joints(case.keypoints.only(body.joint_names), body.joint_names)
+    return hang_before_camera(body, case.camera, targets)
+
+
+def mean_lengths(body: BodyModel, x: Vector) -> dict[str, float]:
+    """The fitted lengths of a body that has them as parameters, the means over the sides."""
+    found: dict[str, list[float]] = {}
+    for name, column in proportion_columns(body).items():
+        bare = without_side(name)
+        found.setdefault(bare, []).append(body.lengths[bare] + float(x[column]))
+    return {name: float(np.mean(values)) for name, values in found.items()}
 
 
 if __name__ == "__main__":

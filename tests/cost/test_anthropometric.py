@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from reference import anthropometric as reference
 from torch import Tensor
 
-from torchcss.body.catalog import BODY_NAMES, LENGTHS, PLACES, PROPORTIONS
+from torchcss.body.catalog import BODY_NAMES, LENGTHS, PLACES, PROPORTIONS, specification
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel, differentiate_twice
 from torchcss.cost.anthropometric import INDIVIDUAL, Anthropometric, proportion_columns
 from torchcss.errors import ConfigurationError
-from torchcss.initialise.multi_start import PAPER_PROPORTIONS
+from torchcss.initialise.multi_start import PAPER_PROPORTIONS, Search
 from torchcss.types import LocalModel
 
 PRIOR = Anthropometric()
@@ -82,6 +83,23 @@ def test_covariance_is_the_inverse_of_the_hessian(free: bool | tuple[str, ...]) 
     identity = torch.eye(len(columns), dtype=torch.float64)
     torch.testing.assert_close(covariance @ hessian, identity, rtol=0, atol=1e-9)
     assert float(torch.linalg.eigvalsh(covariance).min()) > 0
+
+
+def test_sides_that_are_not_tied_share_their_stature_alone() -> None:
+    rows = specification("body34", free_proportions=True)
+    ties = {joint: row for joint, row in rows.ties.items() if not joint.endswith("_length")}
+    body = BodyModel(replace(rows, ties=ties)).double()
+    names = list(proportion_columns(body))
+    assert {"l_thigh", "r_thigh", "trunk"} < set(names)
+    left, right = names.index("l_thigh"), names.index("r_thigh")
+    covariance = PRIOR.covariance(body)
+    length = LENGTHS["thigh"]
+    assert float(covariance[left, right]) == pytest.approx((PRIOR.stature * length) ** 2)
+    own = float(covariance[left, left] - covariance[left, right])
+    assert own == pytest.approx((INDIVIDUAL["thigh"] * length) ** 2)
+    held = Search(proportions=("trunk",)).bounds(body)
+    columns = [body.state_index(f"{side}_thigh_length") for side in "lr"]
+    assert bool((held.upper[columns] == 0).all())
 
 
 def test_the_numbers_of_the_survey() -> None:

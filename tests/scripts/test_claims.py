@@ -258,8 +258,12 @@ def test_first_poses_without_constraints(script: ModuleType, tmp_path: Path) -> 
         "noise 2 px: 60 mm, without limits 75", "holds",
     )  # fmt: skip
     assert seen["so do prior lengths"][1] == "does not hold"
-    words, verdict = seen["so does that left and right are equal"]
-    assert (words.split(";")[0], verdict) == (
-        "because fits hold left and right equal",
-        "not tested",
-    )
+    apart = "so does that left and right are equal"
+    assert seen[apart][1] == "not tested"
+    rows += [
+        {"variant": variant, "condition": "noise 2 px", "pa_best_mm": error}
+        for variant, error in {"sides equal": 60.0, "sides free": 70.0}.items()
+    ]
+    path.write_text(json.dumps({"rows": rows}))
+    seen = verdicts(script.main(script.Config(first_poses=path)))
+    assert seen[apart] == ("noise 2 px: 60 mm, sides free 70", "holds")

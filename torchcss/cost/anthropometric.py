@@ -41,7 +41,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchcss.body.catalog import PLACES, PROPORTIONS
+from torchcss.body.catalog import PLACES, PROPORTIONS, without_side
 from torchcss.body.model import BodyModel
 from torchcss.cost.context import FrameContext
 from torchcss.cost.term import OnStates, Term
@@ -68,9 +68,16 @@ _OF_PLACES = 0.05
 
 
 def proportion_columns(body: BodyModel) -> dict[str, int]:
-    """Free lengths and places of a body by name, and the state parameter that changes each."""
-    names = {f"{length}_length": length for length in (*PROPORTIONS, *PLACES)}
-    return {names[name]: i for i, name in enumerate(body.state_names) if name in names}
+    """Free lengths and places of a body by name, and the state parameter that changes each.
+
+    Where left and right are not tied, the names are those of the sides: `l_thigh`.
+    """
+    names = {f"{length}_length" for length in (*PROPORTIONS, *PLACES)}
+    return {
+        name.removesuffix("_length"): i
+        for i, name in enumerate(body.state_names)
+        if without_side(name) in names
+    }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,11 +141,12 @@ class Anthropometric(Term):
     def _deviations(self, body: BodyModel) -> tuple[Float[Tensor, " m"], Float[Tensor, " m"]]:
         """Standard deviations that stature gives to every length, and those of its own, metres."""
         columns = proportion_columns(body)
+        names = list(map(without_side, columns))
         # The parameters count from the body's lengths, and the standard rests at `sticky_mean`.
-        built = body.tie.new_tensor([body.lengths.get(name, 0.0) for name in columns])
+        built = body.tie.new_tensor([body.lengths.get(name, 0.0) for name in names])
         standard = built + body.sticky_mean[list(columns.values())]
-        lengths = body.tie.new_tensor([body.lengths[PLACES.get(name, name)] for name in columns])
-        places = torch.tensor([name in PLACES for name in columns]).to(lengths.device, torch.bool)
-        own = body.tie.new_tensor([INDIVIDUAL.get(name, _OF_PLACES) for name in columns])
+        lengths = body.tie.new_tensor([body.lengths[PLACES.get(name, name)] for name in names])
+        places = torch.tensor([name in PLACES for name in names]).to(lengths.device, torch.bool)
+        own = body.tie.new_tensor([INDIVIDUAL.get(name, _OF_PLACES) for name in names])
         extent = torch.where(places, lengths, standard)
         return self.stature * standard, self.individual * own * extent

@@ -31,7 +31,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchcss.body.catalog import PLACES, PROPORTIONS, Proportions
+from torchcss.body.catalog import PLACES, PROPORTIONS, Proportions, without_side
 from torchcss.body.flips import Segments
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, has_root
@@ -122,7 +122,7 @@ class Search:
             angle = torch.ones_like(lower, dtype=torch.bool)
             angle[list(columns.values())] = False
             lower[angle], upper[angle] = -math.inf, math.inf
-        held = [column for name, column in columns.items() if name not in self.proportions]
+        held = [k for name, k in columns.items() if without_side(name) not in self.proportions]
         lower[held] = upper[held] = 0.0
         return Bounds(lower, upper)
 

@@ -105,7 +105,7 @@ def told_arm(truth: Motion, name: str, start: int) -> BodyModel | None:
         next((row for row in body.tree.specifications if row.name == arm.state_names[0]), None)
         for body in (moved, arm)
     )
-    if above is None or own is None:
+    if above is None or own is None or above.parent is None:
         return None
     links = moved.forward_kinematics(truth.states[start])
     hung = links[moved.tree.link_index(above.parent)].numpy(force=True) @ offset_matrix(above)
