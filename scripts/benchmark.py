@@ -50,7 +50,7 @@ from torchcss.io.video import read_image
 from torchcss.stopwatch import Stopwatch
 from torchcss.types import Curvature, LocalModel
 from torchcss.vision.features import FeatureExtractor
-from torchcss.vision.flow import TRACKING
+from torchcss.vision.flow import TRACKING_FLOW
 
 COMPARED = {  # with which other way each is compared
     "joints_plain": "joints_closed",
@@ -161,7 +161,7 @@ def main(config: Config) -> dict[str, Any]:
     watches = {"full_value": Stopwatch(), "full_closed": Stopwatch()}
     replace(full, stopwatch=watches["full_value"]).value(ways["full_value"][1])
     replace(full, stopwatch=watches["full_closed"]).local_model(ways["full_closed"][1])
-    extractor = FeatureExtractor(flow=TRACKING, working_size=640)
+    extractor = FeatureExtractor(flow=TRACKING_FLOW, working_size=640)
     extract = [seconds_of(lambda frame: extractor(frame, pair[0]), pair[1]) for _ in rounds]
     metrics = {
         "seconds": {name: quartiles([times[name] for times in rounds]) for name in ways},

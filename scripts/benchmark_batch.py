@@ -65,7 +65,7 @@ class Config:
     """JSON file to write."""
 
 
-class Film(NamedTuple):
+class Prepared(NamedTuple):
     """A sequence, ready to be tracked."""
 
     settings: Settings
@@ -89,7 +89,7 @@ def folders(config: Config) -> list[Path]:
     return found
 
 
-def films(config: Config) -> Iterator[Film]:
+def films(config: Config) -> Iterator[Prepared]:
     """The sequences, over and over."""
     settings = config.settings
     clips = folders(config)
@@ -110,10 +110,10 @@ def films(config: Config) -> Iterator[Film]:
             first, view = begin.first, CameraView(sequence.camera, sequence.keypoints, begin.sigma)
         reader = VideoReader(video)
         frames = list(islice(reader, config.frames))
-        yield Film(own, first, view, frames, 1 / float(reader.info.frame_rate))
+        yield Prepared(own, first, view, frames, 1 / float(reader.info.frame_rate))
 
 
-def timed(config: Config, sequences: list[Film], *, beside: bool) -> tuple[float, list[Any]]:
+def timed(config: Config, sequences: list[Prepared], *, beside: bool) -> tuple[float, list[Any]]:
     """Seconds that all sequences take, and the modes of their last frames."""
     sessions = [film.session() for film in sequences]
     pairs = [(session, film.frames) for session, film in zip(sessions, sequences, strict=True)]

@@ -58,7 +58,7 @@ class Config:
     """JSON file to write."""
 
 
-class Recorder:
+class RecordingEngine:
     """An engine that evaluates eagerly and keeps what it was asked."""
 
     def __init__(self) -> None:
@@ -76,7 +76,7 @@ class Recorder:
 
 def visited(config: Config) -> tuple[TrackingCost, Tensor]:
     """The whole cost of the last frame, for the states visited there."""
-    recorder, sequence = Recorder(), read_sequence(config.sequence, view=config.view)
+    recorder, sequence = RecordingEngine(), read_sequence(config.sequence, view=config.view)
     settings = config.settings
     begin = find_start(sequence, settings)
     with patch("torchcss.tracking.settings.make_engine", lambda _: recorder):

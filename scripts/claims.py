@@ -71,7 +71,7 @@ class Config:
     """JSON file to write."""
 
 
-class Seen(NamedTuple):
+class Finding(NamedTuple):
     """What was seen of a claim, and whether it holds."""
 
     words: str
@@ -122,7 +122,7 @@ class Evidence:
         return self.table1[method, scale]
 
 
-Judge = Callable[[Evidence], Seen]
+Judge = Callable[[Evidence], Finding]
 
 
 class Claim(NamedTuple):
@@ -166,9 +166,9 @@ def typical(runs: list[dict[str, Any]], key: str) -> float:
 def fails(sequence: str, preset: str) -> Judge:
     """A tracker fails in most of its runs."""
 
-    def judge(evidence: Evidence) -> Seen:
+    def judge(evidence: Evidence) -> Finding:
         runs = evidence.of(sequence, preset)
-        return Seen(told(runs), median(map(failed_s, runs)) < math.inf)
+        return Finding(told(runs), median(map(failed_s, runs)) < math.inf)
 
     return judge
 
@@ -176,10 +176,10 @@ def fails(sequence: str, preset: str) -> Judge:
 def tracks(sequence: str, preset: str) -> Judge:
     """A tracker fails in none of its runs."""
 
-    def judge(evidence: Evidence) -> Seen:
+    def judge(evidence: Evidence) -> Finding:
         runs = evidence.of(sequence, preset)
         error = typical(runs, "root_aligned_best_of_modes_mm")
-        return Seen(
+        return Finding(
             f"failed: {told(runs)}; until then {error:.0f} mm in the nearest mode",
             all(math.isinf(failed_s(run)) for run in runs),
         )
@@ -190,9 +190,9 @@ def tracks(sequence: str, preset: str) -> Judge:
 def outlasts(sequence: str, better: str, worse: str) -> Judge:
     """A tracker fails later than another."""
 
-    def judge(evidence: Evidence) -> Seen:
+    def judge(evidence: Evidence) -> Finding:
         one, two = evidence.of(sequence, better), evidence.of(sequence, worse)
-        return Seen(
+        return Finding(
             f"{better}: {told(one)}; {worse}: {told(two)}",
             median(map(failed_s, one)) > median(map(failed_s, two)),
         )
@@ -203,10 +203,10 @@ def outlasts(sequence: str, better: str, worse: str) -> Judge:
 def in_depth(sequence: str, preset: str) -> Judge:
     """Errors along the line of sight are more than twice those across it."""
 
-    def judge(evidence: Evidence) -> Seen:
+    def judge(evidence: Evidence) -> Finding:
         runs = evidence.of(sequence, preset)
         along, across = typical(runs, "along_mm"), typical(runs, "across_mm")
-        return Seen(f"{along:.0f} mm along, {across:.0f} mm across", along > 2 * across)
+        return Finding(f"{along:.0f} mm along, {across:.0f} mm across", along > 2 * across)
 
     return judge
 
@@ -214,9 +214,9 @@ def in_depth(sequence: str, preset: str) -> Judge:
 def share(sequence: str, preset: str, key: str, words: str, least: float = 0.0) -> Judge:
     """Something happens in more than a share of a tracker's frames."""
 
-    def judge(evidence: Evidence) -> Seen:
+    def judge(evidence: Evidence) -> Finding:
         value = typical(evidence.of(sequence, preset), key)
-        return Seen(f"{words} in {100 * value:.1f} % of the frames", value > least)
+        return Finding(f"{words} in {100 * value:.1f} % of the frames", value > least)
 
     return judge
 
@@ -224,12 +224,12 @@ def share(sequence: str, preset: str, key: str, words: str, least: float = 0.0) 
 def hits_elbow(sequence: str, preset: str) -> Judge:
     """The elbow is at its bound when the track fails."""
 
-    def judge(evidence: Evidence) -> Seen:
+    def judge(evidence: Evidence) -> Finding:
         runs = evidence.of(sequence, preset)
         hits = [_elbow_hit(run) for run in runs]
         least = median(hits)
         words = "never" if math.isinf(least) else f"first at {least:.1f} s"
-        return Seen(
+        return Finding(
             f"elbow at its bound: {words} (median); failed: {told(runs)}",
             median(map(failed_s, runs)) < math.inf and least <= median(map(failed_s, runs)),
         )
@@ -247,7 +247,7 @@ def _elbow_hit(run: Mapping[str, Any]) -> float:
 def multimodal(sequence: str, preset: str) -> Judge:
     """Other explanations weigh in some frames, and more so while the body moves in depth."""
 
-    def judge(evidence: Evidence) -> Seen:
+    def judge(evidence: Evidence) -> Finding:
         runs = evidence.of(sequence, preset)
         if sequence not in evidence.depth:
             raise Missing("the sequence is not given")
@@ -259,7 +259,7 @@ def multimodal(sequence: str, preset: str) -> Judge:
             deep.append(float(weight[much].mean()))
             flat.append(float(weight[~much].mean()))
         often = multimodal_share(runs)
-        return Seen(
+        return Finding(
             f"weight of other explanations: {median(deep):.2f} in the half of the frames that "
             f"moves most in depth, {median(flat):.2f} in the other; above {MULTIMODAL:g} in "
             f"{100 * often:.0f} % of the frames",
@@ -272,10 +272,10 @@ def multimodal(sequence: str, preset: str) -> Judge:
 def mostly_multimodal(sequence: str, preset: str) -> Judge:
     """Other explanations weigh in most frames."""
 
-    def judge(evidence: Evidence) -> Seen:
+    def judge(evidence: Evidence) -> Finding:
         often = multimodal_share(evidence.of(sequence, preset))
         words = f"other explanations weigh more than {MULTIMODAL:g} in {100 * often:.0f} % of the"
-        return Seen(f"{words} frames", often > 0.5)
+        return Finding(f"{words} frames", often > 0.5)
 
     return judge
 
@@ -289,13 +289,13 @@ def multimodal_share(runs: list[dict[str, Any]]) -> float:
 def at_all_scales(words: str, better: Callable[[Mapping, Mapping], tuple[str, bool]]) -> Judge:
     """CSS against SS at scales 1, 4 and 8."""
 
-    def judge(evidence: Evidence) -> Seen:
+    def judge(evidence: Evidence) -> Finding:
         told_by_scale, holds = [], True
         for scale in (1.0, 4.0, 8.0):
             seen, so = better(evidence.row("CSS", scale), evidence.row("SS", scale))
             told_by_scale.append(f"{seen} at {scale:g}")
             holds &= so
-        return Seen(f"{words}: {', '.join(told_by_scale)}", holds)
+        return Finding(f"{words}: {', '.join(told_by_scale)}", holds)
 
     return judge
 
@@ -319,22 +319,22 @@ def _descent(css: Mapping[str, Any], ss: Mapping[str, Any]) -> tuple[str, bool]:
     return f"{raw:.3g} to {end:.3g}", end is not None and raw > 10 * end
 
 
-def median_costs(evidence: Evidence) -> Seen:
+def median_costs(evidence: Evidence) -> Finding:
     """SS's minima cost slightly less than CSS's."""
     css, ss = (evidence.row(method, 8.0)["cost"] for method in ("CSS", "SS"))
-    return Seen(f"CSS {css:.3g}, SS {ss:.3g} nats above the start at scale 8", ss < css)
+    return Finding(f"CSS {css:.3g}, SS {ss:.3g} nats above the start at scale 8", ss < css)
 
 
-def falls_back(evidence: Evidence) -> Seen:
+def falls_back(evidence: Evidence) -> Finding:
     """Nearly all samples of the covariance itself descend to where they came from."""
     back = evidence.row("CSS", 1.0)["back"], evidence.row("CSS", 8.0)["back"]
-    return Seen(
+    return Finding(
         f"{100 * back[0]:.1f} % of the samples fall back at scale 1, {100 * back[1]:.1f} % at 8",
         back[0] > 0.9 > back[1],
     )
 
 
-def edges_suffice(evidence: Evidence) -> Seen:
+def edges_suffice(evidence: Evidence) -> Finding:
     """Scored by edges alone, a tracker is as near as the worst scored by the whole cost."""
     if not evidence.scores:
         raise Missing(f"no report of {SCORES} is given")
@@ -346,10 +346,10 @@ def edges_suffice(evidence: Evidence) -> Seen:
             f"{edges[0]:.0f} mm, by the whole cost {full[0]:.0f}"
         )
         holds &= edges[0] <= full[2]
-    return Seen("; ".join(words), holds)
+    return Finding("; ".join(words), holds)
 
 
-def pattern_helps(evidence: Evidence) -> Seen:
+def pattern_helps(evidence: Evidence) -> Finding:
     """With the pattern the best mode is nearer than with any seed's random hypotheses."""
     if not evidence.scores:
         raise Missing(f"no report of {SCORES} is given")
@@ -358,7 +358,7 @@ def pattern_helps(evidence: Evidence) -> Seen:
         pattern, drawn = (rows[way]["root_aligned_mm"] for way in ("edges", "random"))
         words.append(f"{name}: {pattern[0]:.0f} mm, as many at random {_range(drawn)}")
         holds &= pattern[0] < drawn[1]
-    return Seen("; ".join(words), holds)
+    return Finding("; ".join(words), holds)
 
 
 def _range(numbers: list[float]) -> str:
@@ -372,14 +372,14 @@ def varied(preset: str, change: str, *, better: bool) -> Judge:
     Judged is the nearest mode.
     """
 
-    def judge(evidence: Evidence) -> Seen:
+    def judge(evidence: Evidence) -> Finding:
         words, holds = [], True
         for name, (plain, other) in _pairs(evidence, preset, change).items():
             before, after = (row["root_aligned_best_of_modes_mm"] for row in (plain, other))
             words.append(f"{name}: {before[0]:.0f} mm ({before[1]:.0f} to {before[2]:.0f}), ")
             words[-1] += f"{change} {_range(after)}"
             holds &= after[0] < before[1] if better else after[0] > before[2]
-        return Seen(f"{preset}, {'; '.join(words)}", holds)
+        return Finding(f"{preset}, {'; '.join(words)}", holds)
 
     return judge
 
@@ -387,14 +387,14 @@ def varied(preset: str, change: str, *, better: bool) -> Judge:
 def tolerated(preset: str, *changes: str) -> Judge:
     """No more seeds lose the body or a limb than without the changes."""
 
-    def judge(evidence: Evidence) -> Seen:
+    def judge(evidence: Evidence) -> Finding:
         words, holds = [], True
         for change in changes:
             for name, pair in _pairs(evidence, preset, change).items():
                 before, after = map(_all_held, pair)
                 words.append(f"{change}, {name}: {_told_held(after)}, else {_told_held(before)}")
                 holds &= after or not before
-        return Seen(f"{preset}, {'; '.join(words)}", holds)
+        return Finding(f"{preset}, {'; '.join(words)}", holds)
 
     return judge
 
@@ -425,7 +425,7 @@ def _pairs(
     return found
 
 
-def weights_help(evidence: Evidence) -> Seen:
+def weights_help(evidence: Evidence) -> Finding:
     """With weighed edges every tracker has less error on every sequence than any seed without."""
     words, holds = [], True
     for sequence, presets in evidence.unweighted.items():
@@ -439,13 +439,13 @@ def weights_help(evidence: Evidence) -> Seen:
             holds &= less < min(errors)
     if not words:
         raise Missing("no report without weights is given")
-    return Seen("; ".join(words), holds)
+    return Finding("; ".join(words), holds)
 
 
 def spectrum_of(bodies: tuple[str, ...], key: str, least: float) -> Judge:
     """Spectra of all costs of these bodies have at least a number."""
 
-    def judge(evidence: Evidence) -> Seen:
+    def judge(evidence: Evidence) -> Finding:
         if not evidence.spectra:
             raise Missing(f"no report of {SPECTRA} is given")
         seen = {
@@ -454,7 +454,7 @@ def spectrum_of(bodies: tuple[str, ...], key: str, least: float) -> Judge:
             if runs[0]["body"] in bodies
         }
         words = "; ".join(f"{value:.0f} ({of})" for of, value in seen.items())
-        return Seen(words, bool(seen) and min(seen.values()) >= least)
+        return Finding(words, bool(seen) and min(seen.values()) >= least)
 
     return judge
 
@@ -465,7 +465,7 @@ def _frames(evidence: Evidence) -> Mapping[str, Mapping[str, Any]]:
     return evidence.slices
 
 
-def displaced(evidence: Evidence) -> Seen:
+def slope_at_limit(evidence: Evidence) -> Finding:
     """In some frame the cost has a slope at a minimum that a joint limit holds."""
     found = {
         name: f"{name}: {frame['displaced_minimum']['line']}, "
@@ -473,10 +473,10 @@ def displaced(evidence: Evidence) -> Seen:
         for name, frame in _frames(evidence).items()
         if frame["displaced_minimum"] is not None
     }
-    return Seen("; ".join(found.values()) or "no minimum at a limit was found", bool(found))
+    return Finding("; ".join(found.values()) or "no minimum at a limit was found", bool(found))
 
 
-def several_minima(evidence: Evidence) -> Seen:
+def several_minima(evidence: Evidence) -> Finding:
     """Along the least certain direction every frame of the papers' times has several minima."""
     words, holds = [], True
     for name, frame in _frames(evidence).items():
@@ -487,13 +487,13 @@ def several_minima(evidence: Evidence) -> Seen:
             holds &= count > 1
     if not words:
         raise Missing("no frame of the body before clutter is given")
-    return Seen(f"minima along the least certain direction, {'; '.join(words)}", holds)
+    return Finding(f"minima along the least certain direction, {'; '.join(words)}", holds)
 
 
 def few_minima(scale: str, most: float) -> Judge:
     """In no frame more minima a line, in the mean, than so many."""
 
-    def judge(evidence: Evidence) -> Seen:
+    def judge(evidence: Evidence) -> Finding:
         counts = {
             name: row["num_minima"]
             for name, frame in _frames(evidence).items()
@@ -501,7 +501,7 @@ def few_minima(scale: str, most: float) -> Judge:
             if (row["term"], row["scale"]) == ("sum", scale)
         }
         words = "; ".join(f"{name}: {count:.1f}" for name, count in counts.items())
-        return Seen(f"minima a line, {words}", max(counts.values()) <= most)
+        return Finding(f"minima a line, {words}", max(counts.values()) <= most)
 
     return judge
 
@@ -509,7 +509,7 @@ def few_minima(scale: str, most: float) -> Judge:
 def steadier(variant: str, than: str = "full") -> Judge:
     """Without a constraint the cheapest first poses are worse in all conditions."""
 
-    def judge(evidence: Evidence) -> Seen:
+    def judge(evidence: Evidence) -> Finding:
         rows = evidence.first_poses
         seen = {
             condition: (rows[than, condition]["pa_best_mm"], row["pa_best_mm"])
@@ -519,7 +519,7 @@ def steadier(variant: str, than: str = "full") -> Judge:
         if not seen:
             raise Missing(f"no report of {FIRST} {variant} is given")
         words = "; ".join(f"{name}: {a:.0f} mm, {variant} {b:.0f}" for name, (a, b) in seen.items())
-        return Seen(words, all(a < b for a, b in seen.values()))
+        return Finding(words, all(a < b for a, b in seen.values()))
 
     return judge
 
@@ -527,7 +527,7 @@ def steadier(variant: str, than: str = "full") -> Judge:
 def untested(why: str) -> Judge:
     """A claim that no study of ours can judge."""
 
-    def judge(evidence: Evidence) -> Seen:
+    def judge(evidence: Evidence) -> Finding:
         raise Missing(why)
 
     return judge
@@ -596,7 +596,7 @@ CLAIMS: tuple[Claim, ...] = (
           "[IJRR] Fig. 5", SPECTRA, spectrum_of(FULL_BODIES, "ratio", 2000 / 3)),
     Claim("noise alike in all directions fills 10^54 times the volume (two thirds of the power)",
           "[IJRR] 1.1", SPECTRA, spectrum_of(FULL_BODIES, "volume", 36)),
-    Claim("a joint limit displaces the minimum", "[IJRR] 4.1, [RR] 4.1", SLICES, displaced),
+    Claim("a joint limit displaces the minimum", "[IJRR] 4.1, [RR] 4.1", SLICES, slope_at_limit),
     Claim("several minima along uncertain directions at 0.8 and 0.9 s",
           "[IJRR] Fig. 7, [RR] Fig. 5", SLICES, several_minima),
     Claim("close to a mode the cost usually has a single peak", "[RR] 4.2",

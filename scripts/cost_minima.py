@@ -36,10 +36,10 @@ from torchcss.robust import Leclerc, Lorentzian, Quadratic
 from torchcss.show.style import OKABE_ITO, save_figure
 from torchcss.studies import plots
 from torchcss.studies.scenes import Scene, arm_scenes, clip_scenes
-from torchcss.studies.slices import PROMINENCE, find_minima, num_spurious
+from torchcss.studies.slices import PROMINENCE, curve_minima, num_spurious
 from torchcss.tracking.settings import Settings, make_choice
 
-TERMS = ("contour", "motion_boundaries", "flow", "stabiliser")
+COUNTED_TERMS = ("contour", "motion_boundaries", "flow", "stabiliser")
 POTENTIALS = {  # with sigma in pixels and the colour of its lines
     "quadratic": (Quadratic, 2.5, "vermilion"),
     "Lorentzian": (Lorentzian, 2.5, "blue"),
@@ -77,7 +77,7 @@ class Config:
     """Where else to write the JSON file, such as docs/results/cost_minima.json."""
 
 
-class Curve(NamedTuple):
+class SliceCounts(NamedTuple):
     """What is kept of a slice: spurious minima by least prominence, and where it is lowest."""
 
     frame: str
@@ -85,7 +85,9 @@ class Curve(NamedTuple):
     lowest_at: float
 
 
-Curves = dict[tuple[str, str, str, float], list[Curve]]  # by body, terms, potential and k
+CountsByCase = dict[
+    tuple[str, str, str, float], list[SliceCounts]
+]  # by body, terms, potential and k
 
 
 def main(config: Config) -> dict[str, Any]:
@@ -94,7 +96,7 @@ def main(config: Config) -> dict[str, Any]:
         config = replace(config, data=None, seeds=(0,), frames=(3,), samples=41)
     if config.out is not None:
         prepare_output_folder(config.out)
-    curves: Curves = defaultdict(list)
+    curves: CountsByCase = defaultdict(list)
     for scene in scenes(config):
         measure(scene, config, curves)
     rows = [row_of(key, curves) for key in sorted(curves, key=lambda key: key[:2])]
@@ -109,7 +111,7 @@ def main(config: Config) -> dict[str, Any]:
 
 
 def scenes(config: Config) -> Iterator[Scene]:
-    settings = Settings(body="arm8", terms=TERMS)
+    settings = Settings(body="arm8", terms=COUNTED_TERMS)
     for seed in config.seeds:
         generator, name = torch.Generator().manual_seed(seed), f"arm {seed}"
         yield from arm_scenes(config.frames, generator=generator, settings=settings, name=name)
@@ -121,7 +123,7 @@ def scenes(config: Config) -> Iterator[Scene]:
 
 def contour_of(scene: Scene, potential: type, sigma: float, k: float) -> TrackingCost:
     """A variant of the contour term; a node without match costs as many nats as by default."""
-    usual = make_choice(Settings(terms=TERMS, boundary_emphasis=k), 1.0)
+    usual = make_choice(Settings(terms=COUNTED_TERMS, boundary_emphasis=k), 1.0)
     contour = usual.find(ContourTerm)
     assert contour is not None
     term = replace(contour, potential_kind=potential, sigma=sigma)
@@ -133,7 +135,7 @@ def contour_of(scene: Scene, potential: type, sigma: float, k: float) -> Trackin
     return replace(scene.cost, choice=CostChoice(terms=(term,)), views=(view,))
 
 
-def measure(scene: Scene, config: Config, curves: Curves) -> None:
+def measure(scene: Scene, config: Config, curves: CountsByCase) -> None:
     """Add the slices of one frame; draw those along one line."""
     limits, body = scene.limits(scene.truth), scene.cost.body.name
     flow = replace(scene.cost, choice=scene.cost.choice.only(["flow"]))
@@ -148,9 +150,9 @@ def measure(scene: Scene, config: Config, curves: Curves) -> None:
                 edges = contour_of(scene, potential, sigma, k).value(states).numpy()
                 shown[name][f"k = {k:g}"] = edges
                 for terms, curve in (("contour", edges), ("contour + flow", edges + by_flow)):
-                    minima, extent = find_minima(curve), float(np.ptp(curve))
+                    minima, extent = curve_minima(curve), float(np.ptp(curve))
                     counts = [num_spurious(minima.above(least * extent)) for least in LEAST]
-                    taken = Curve(scene.name, counts, float(offsets[curve.argmin()]))
+                    taken = SliceCounts(scene.name, counts, float(offsets[curve.argmin()]))
                     curves[body, terms, name, k].append(taken)
         if line.name == DRAWN and config.out is not None:
             title = f"Contour term of {scene.name}, {plots.title_of(line)}"
@@ -158,7 +160,7 @@ def measure(scene: Scene, config: Config, curves: Curves) -> None:
             save_figure(figure, config.out / f"variants_{scene.slug}.png")
 
 
-def row_of(key: tuple[str, str, str, float], curves: Curves) -> dict[str, Any]:
+def row_of(key: tuple[str, str, str, float], curves: CountsByCase) -> dict[str, Any]:
     """Means over slices; and what is gained on the first row, with the error over frames."""
     found, first, usual = curves[key], curves[*key[:2], *FIRST], LEAST.index(PROMINENCE)
     gains: dict[str, list[int]] = defaultdict(list)
@@ -242,7 +244,7 @@ def curves_figure(
             curves.items(), ("vermilion", "blue", "green"), strict=False
         ):
             height = (curve - curve.min()) / max(float(np.ptp(curve)), np.finfo(float).tiny)
-            at = find_minima(height).above(prominence).sample
+            at = curve_minima(height).above(prominence).sample
             axes.plot(t, height, color=OKABE_ITO[colour], lw=1.3, label=f"{label}: {len(at)}")
             axes.plot(t[at], height[at], "o", mfc="none", mec=OKABE_ITO[colour], ms=5)
         plots.decorate(axes, unit if axes is column[-1] else plots.Unit(""))

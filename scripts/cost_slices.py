@@ -36,7 +36,7 @@ from torchcss.show.style import OKABE_ITO, save_figure
 from torchcss.studies import plots
 from torchcss.studies.scenes import Scene, arm_scenes, clip_scenes, sequence_scenes
 from torchcss.studies.sequences import read_sequence
-from torchcss.studies.slices import PROMINENCE, Line, Slice, sample_slice
+from torchcss.studies.slices import PROMINENCE, Slice, StateLine, sample_slice
 from torchcss.tracking.settings import Settings
 
 # Of a body the lines that are looked at; of an arm all of them are.
@@ -216,7 +216,7 @@ def displaced_minimum(scene: Scene, config: Config) -> dict[str, Any] | None:
     if float(slope[mode, joint]) == 0:
         return None
     name = cost.body.state_names[joint]
-    line = Line(name, modes.mean[mode], torch.eye(slope.shape[1]).to(slope)[joint], 1.0)
+    line = StateLine(name, modes.mean[mode], torch.eye(slope.shape[1]).to(slope)[joint], 1.0)
     low, high = line.interval(scene.limits(line.centre))
     shown = (max(low, -NEAR), NEAR) if high < -low else (-NEAR, min(high, NEAR))
     taken = sample_slice(cost.terms, line, shown, config.samples)

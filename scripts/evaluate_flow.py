@@ -32,7 +32,7 @@ from torchcss.errors import FlowFileError
 from torchcss.io.video import read_image
 from torchcss.robust import Quadratic
 from torchcss.vision.boundaries import motion_boundaries
-from torchcss.vision.flow import ACCURATE, TRACKING, OpticalFlow, robust_flow
+from torchcss.vision.flow import ACCURATE, TRACKING_FLOW, OpticalFlow, robust_flow
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +84,7 @@ def main(config: Config) -> None:
             result, seconds = min(runs, key=lambda run: run[1])
             row = {"pair": pair.name, "method": name, "seconds": seconds}
             flow = result.flow if isinstance(result, OpticalFlow) else result
-            row |= errors(flow, pair, widened(boundary, config.near))
+            row |= errors(flow, pair, with_margin(boundary, config.near))
             if isinstance(result, OpticalFlow):
                 row |= boundary_score(result, boundary, config.tolerance)
             rows.append(row)
@@ -105,7 +105,7 @@ def timed(method: Method, pair: Pair) -> tuple[OpticalFlow | Tensor, float]:
 def ours() -> dict[str, Method]:
     choices = {
         "accurate": ACCURATE,
-        "tracking": TRACKING,
+        "tracking": TRACKING_FLOW,
         "accurate-quadratic": with_potentials(ACCURATE, Quadratic),
     }
     return {
@@ -175,14 +175,14 @@ def errors(flow: Tensor, pair: Pair, near: Tensor) -> dict[str, float | None]:
 
 def boundary_score(result: OpticalFlow, true: Tensor, tolerance: int) -> dict[str, float | None]:
     found = motion_boundaries(result).strength > 0.5
-    hits, caught = found & widened(true, tolerance), true & widened(found, tolerance)
+    hits, caught = found & with_margin(true, tolerance), true & with_margin(found, tolerance)
     return {
         "precision": float(hits.sum() / found.sum()) if found.any() else None,
         "recall": float(caught.sum() / true.sum()) if true.any() else None,
     }
 
 
-def widened(mask: Tensor, radius: int) -> Tensor:
+def with_margin(mask: Tensor, radius: int) -> Tensor:
     side = 2 * radius + 1
     return functional.max_pool2d(mask[None].float(), side, stride=1, padding=radius)[0] > 0.0
 

@@ -32,18 +32,18 @@ from torchcss.cost.joints import match_joints
 from torchcss.initialise.fit import initialise
 from torchcss.initialise.from_joints import hang_before_camera
 from torchcss.initialise.keypoint_checks import default_sigma
-from torchcss.initialise.multi_start import SINGLE_START, Search
+from torchcss.initialise.multi_start import SINGLE_START, StartSearch
 from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
 from torchcss.io.cameras import read_camera
 from torchcss.io.keypoints.read import read_keypoints
-from torchcss.joint_names import canonical_joint_name
+from torchcss.joint_names import LIMB_JOINTS, canonical_joint_name
 from torchcss.robust import Quadratic
-from torchcss.studies.metrics import LIMB_JOINTS, pa_mpjpe_mm, root_aligned_mpjpe_mm
-from torchcss.studies.random_person import Person, coverage, random_person
+from torchcss.studies.metrics import pa_mpjpe_mm, root_aligned_mpjpe_mm
+from torchcss.studies.random_person import RandomPerson, person_coverage, random_person
 from torchcss.types import Keypoints, Vector
 from torchcss.vision.camera import Camera
 
-LIMBS = {"thigh": ("hip", "knee"), "shank": ("knee", "ankle"), "upper_arm": ("shoulder", "elbow"),
+BONES = {"thigh": ("hip", "knee"), "shank": ("knee", "ankle"), "upper_arm": ("shoulder", "elbow"),
          "forearm": ("elbow", "wrist")}  # fmt: skip
 SYNTHETIC: dict[str, dict[str, float]] = {
     "noise 0 px": {"noise_px": 0.0},
@@ -93,7 +93,7 @@ class Case(NamedTuple):
     joints: np.ndarray
     sigma: float
     lengths: dict[str, float]
-    person: Person | None = None
+    person: RandomPerson | None = None
 
 
 def main(config: Config) -> dict[str, Any]:
@@ -149,7 +149,7 @@ def cases(config: Config, condition: str) -> Iterator[tuple[int, Case]]:
     at = {name: joints[:, i] for i, name in enumerate(LIMB_JOINTS)}
     lengths = {
         limb: float(np.nanmedian([np.linalg.norm(at[f"{side}_{a}"] - at[f"{side}_{b}"], axis=-1)
-                                  for side in "lr"])) for limb, (a, b) in LIMBS.items()
+                                  for side in "lr"])) for limb, (a, b) in BONES.items()
     }  # fmt: skip
     for frame in np.linspace(0, len(joints) - 1, config.frames).round().astype(int).tolist():
         there = keypoints.at(frame)
@@ -158,7 +158,9 @@ def cases(config: Config, condition: str) -> Iterator[tuple[int, Case]]:
 
 def fit(case: Case, variant: str, config: Config, seed: int) -> dict[str, float]:
     """Initialise and compare with the truth."""
-    search = Search(num_starts=8, num_flips=8, num_samples=8) if config.small else Search()
+    search = (
+        StartSearch(num_starts=8, num_flips=8, num_samples=8) if config.small else StartSearch()
+    )
     search = SINGLE_START if variant == "single start" else search
     if variant == "without limits":
         search = replace(search, limits=False)
@@ -183,12 +185,12 @@ def fit(case: Case, variant: str, config: Config, seed: int) -> dict[str, float]
     aligned = root_aligned_mpjpe_mm(places, case.joints, LIMB_JOINTS)
     modes = found.mixture.mean
     outside = ((modes < body.lower) | (modes > body.upper)).any(-1)
-    share, right = (np.array([lengths[limb] for limb in LIMBS]) for lengths in
+    share, right = (np.array([lengths[limb] for limb in BONES]) for lengths in
                     (found.lengths or mean_lengths(body, modes[0]), case.lengths))  # fmt: skip
     ratios = (share / share.sum()) / (right / right.sum()) - 1
     parameters, ellipsoids = math.nan, math.nan
     if case.person is not None and found.free_body and found.free_mixture:
-        stated = coverage(case.person, found.free_body, found.free_mixture)
+        stated = person_coverage(case.person, found.free_body, found.free_mixture)
         parameters, ellipsoids = 100 * stated.parameters, 100 * stated.joints
     numbers = (
         procrustes[0], procrustes[:7].min(), procrustes.min(), aligned[0], aligned[:7].min(),

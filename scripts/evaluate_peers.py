@@ -24,7 +24,8 @@ from evaluate_posterior import find_clips
 from torchcss import Run, read_camera, read_keypoints
 from torchcss.app.detect import DetectOptions, detect_video
 from torchcss.io.keypoints.arrays import read_points
-from torchcss.studies.metrics import LIMB_JOINTS, pa_mpjpe_mm, root_aligned_mpjpe_mm
+from torchcss.joint_names import LIMB_JOINTS
+from torchcss.studies.metrics import pa_mpjpe_mm, root_aligned_mpjpe_mm
 from torchcss.studies.sequences import read_reference
 
 HEADS = ("clip", "frames", "found", "PA", "root", "css PA", "of 7", "css root", "of 7")

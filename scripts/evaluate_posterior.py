@@ -46,9 +46,9 @@ from torchcss.body.bases import pose_track
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.cli.options import SettingsOptions
 from torchcss.errors import ConfigurationError
+from torchcss.joint_names import LIMB_JOINTS
 from torchcss.linalg import squared_mahalanobis
 from torchcss.studies.evaluation import evaluate
-from torchcss.studies.metrics import LIMB_JOINTS
 from torchcss.studies.sequences import read_reference
 from torchcss.tracking.smooth import Smoothing
 

@@ -23,7 +23,7 @@ from common import Table, start, write_report
 
 from torchcss.errors import ConfigurationError
 from torchcss.initialise.fit import initialise
-from torchcss.initialise.multi_start import Search
+from torchcss.initialise.multi_start import StartSearch
 from torchcss.initialise.options import InitialiseOptions
 from torchcss.initialise.result import Initialisation
 from torchcss.io.video import VideoReader
@@ -39,7 +39,7 @@ COMPARED = {
 }
 """What is fitted, as options."""
 
-FEW = Search(num_starts=8, num_trunks=2, num_flips=8, num_samples=2)
+FEW = StartSearch(num_starts=8, num_trunks=2, num_flips=8, num_samples=2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,7 +92,7 @@ def fit(
         sequence.camera,
         config.body,
         generator=torch.Generator().manual_seed(config.seed),
-        options=InitialiseOptions(search=FEW if config.small else Search(), **fitted),
+        options=InitialiseOptions(search=FEW if config.small else StartSearch(), **fitted),
     )
     assert sequence.mask is not None
     true = sequence.mask[index]

@@ -22,11 +22,11 @@ from torchcss import read_motion_capture
 from torchcss.errors import ConfigurationError
 from torchcss.io.keypoints.one_person import size_of
 from torchcss.io.keypoints.sides import with_sides_put_back
-from torchcss.io.motion.positions import resample
+from torchcss.io.motion.positions import resample_motion
 from torchcss.joint_names import skeleton_joint_names
 
 LEGS = ("hip", "knee", "ankle")
-APART = 0.06
+FAR = 0.06
 HEADS = ("frames a second", "right frames", "of these exchanged", "exchanged frames", "put back, %")
 
 
@@ -55,7 +55,7 @@ class Config:
 def film(path: Path, rate: float, config: Config, draw: np.random.Generator) -> tuple[Any, Any]:
     """A motion's joints in pixels with their confidence `[t j 3]`, and their names."""
     motion = read_motion_capture(path)
-    motion = resample(motion, rate=rate, stop=min(config.seconds, motion.duration))
+    motion = resample_motion(motion, rate=rate, stop=min(config.seconds, motion.duration))
     found = skeleton_joint_names(motion.joint_names)
     columns = [column for column, name in enumerate(found) if name]
     turn, tilt = draw.uniform(0, 2 * math.pi), draw.uniform(-0.2, 0.4)
@@ -80,7 +80,7 @@ def measure(rate: float, config: Config, files: list[Path]) -> list[float]:
         rows = np.flatnonzero(exchanged)
         given[np.ix_(rows, left + right)] = truth[np.ix_(rows, right + left)]
         gap = np.linalg.norm(truth[:, left, :2] - truth[:, right, :2], axis=-1)
-        apart = np.median(gap, axis=1) > APART * np.array([size_of(person) for person in truth])
+        apart = np.median(gap, axis=1) > FAR * np.array([size_of(person) for person in truth])
         whole = with_sides_put_back(truth, names, [])
         mended = with_sides_put_back(given, names, [])
         spoilt = (whole != truth).any((1, 2))

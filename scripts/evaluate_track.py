@@ -22,8 +22,9 @@ from common import Table, start, write_report
 from torchcss.app.view_files import open_view
 from torchcss.errors import ConfigurationError
 from torchcss.io.run import Run
+from torchcss.joint_names import LIMB_JOINTS
 from torchcss.studies.evaluation import Evaluation, evaluate
-from torchcss.studies.metrics import LIMB_JOINTS, LOST_MM
+from torchcss.studies.metrics import LOST_MM
 
 FRAMES_NOTE = (
     "MPJPE means something only if track and reference share one world frame; root-aligned MPJPE, "

@@ -33,7 +33,7 @@ from torchcss.cli.options import SettingsOptions
 from torchcss.errors import ConfigurationError
 from torchcss.io.tracks import read_summary
 from torchcss.show.style import save_figure
-from torchcss.studies.comparison import Run, Start, find_start, track_together
+from torchcss.studies.comparison import Start, TrackerRun, find_start, track_together
 from torchcss.studies.evaluation import Thresholds, over_seeds, summarise
 from torchcss.studies.metrics import spread
 from torchcss.studies.plots import error_curves, failure_figure
@@ -249,7 +249,7 @@ def follow(
     sequence: RecordedSequence,
     together: list[tuple[Settings, Start]],
     thresholds: Thresholds,
-) -> Iterator[Run]:
+) -> Iterator[TrackerRun]:
     """Run some trackers side by side, with a progress bar."""
     frames = 4 if config.small else config.frames or sequence.num_frames
     stop = min(config.start + frames, sequence.num_frames)
@@ -266,7 +266,7 @@ def follow(
         )  # fmt: skip
 
 
-def entry_of(run: Run, thresholds: Thresholds, interval_s: float) -> dict[str, Any]:
+def entry_of(run: TrackerRun, thresholds: Thresholds, interval_s: float) -> dict[str, Any]:
     """A run as it is written."""
     entry = {"preset": run.settings.preset, "seed": run.settings.seed, "ended": run.ended}
     return entry | summarise(run.measures, thresholds, interval_s) if run.measures else entry

@@ -32,7 +32,7 @@ from torch import Tensor
 
 from torchcss.body.load import load_body
 from torchcss.errors import ConfigurationError
-from torchcss.io.motion.positions import read_motion_capture, resample
+from torchcss.io.motion.positions import read_motion_capture, resample_motion
 from torchcss.io.tracks import prepare_output_folder, write_summary
 from torchcss.solve.retarget import retarget
 from torchcss.studies.random_person import random_lengths
@@ -89,7 +89,7 @@ class Config:
     """A quarter of the picture's width and height."""
 
 
-class Clip(NamedTuple):
+class PlannedClip(NamedTuple):
     """A clip that is to be filmed.
 
     Attributes:
@@ -123,7 +123,7 @@ def find_motions(config: Config) -> list[Path]:
     return [files[i] for i in torch.randperm(len(files), generator=generator).tolist()]
 
 
-def make_clips(config: Config) -> Iterator[Clip]:
+def make_clips(config: Config) -> Iterator[PlannedClip]:
     """What is filmed, clip by clip."""
     files = find_motions(config)
     for number in range(config.first, config.first + config.num):
@@ -133,14 +133,16 @@ def make_clips(config: Config) -> Iterator[Clip]:
         # The first frame of a converted motion is a T-pose, from which splines swing for a moment.
         latest = max(0.5, whole.duration - config.seconds)
         begin = uniform(generator, 0.5, latest) if latest > 0.5 else 0.5
-        part = resample(whole, rate=config.rate, start=begin, stop=begin + config.seconds)
+        part = resample_motion(whole, rate=config.rate, start=begin, stop=begin + config.seconds)
         moved = retarget(part, generator=generator)
         lengths = random_lengths(generator=generator)
         body = load_body(moved.body.name, lengths=lengths).with_base(
             moved.body.base_rotation, moved.body.base_translation
         )
         motion = Motion(body, moved.states, config.rate, f"{source.stem} from {begin:.2f} s")
-        yield Clip(f"clip{number:03d}", source, begin, film(config, motion, number, generator))
+        yield PlannedClip(
+            f"clip{number:03d}", source, begin, film(config, motion, number, generator)
+        )
 
 
 def film(config: Config, motion: Motion, number: int, generator: torch.Generator) -> Shot:

@@ -34,7 +34,7 @@ from matplotlib.figure import Figure
 
 from torchcss.errors import ConfigurationError
 from torchcss.files import replace_file
-from torchcss.io.motion.positions import MotionCapture, read_motion_capture, resample
+from torchcss.io.motion.positions import MotionCapture, read_motion_capture, resample_motion
 from torchcss.io.tracks import prepare_output_folder
 from torchcss.solve.retarget import Retargeted, retarget
 from torchcss.studies import sequence_writer
@@ -83,7 +83,7 @@ def main(config: Config) -> dict[str, Any]:
     whole = read_motion_capture(
         config.file, skeleton=config.asf, units=config.units, frame_rate=config.source_rate
     )
-    motion = resample(whole, rate=config.rate, start=config.start, stop=config.stop)
+    motion = resample_motion(whole, rate=config.rate, start=config.start, stop=config.stop)
     began = time.perf_counter()
     result = retarget(
         motion, body=config.body, generator=torch.Generator().manual_seed(config.seed)
@@ -91,7 +91,7 @@ def main(config: Config) -> dict[str, Any]:
     seconds = time.perf_counter() - began
     report = report_of(config, whole, result, seconds)
     print_table(report)
-    write_motion(config.out, config, result)
+    write_retargeted(config.out, config, result)
     if config.reference is not None:
         write_reference(config.reference, config, result)
     cells = [[name, *row.values()] for name, row in report["error_mm"].items()]
@@ -151,7 +151,7 @@ def print_table(report: dict[str, Any]) -> None:
     )
 
 
-def write_motion(path: Path, config: Config, result: Retargeted) -> None:
+def write_retargeted(path: Path, config: Config, result: Retargeted) -> None:
     description = f"motion capture {config.file.name} from {config.start:g} s on"
     sequence_writer.write_motion(
         path,

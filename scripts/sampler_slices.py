@@ -67,14 +67,14 @@ class Config:
 
 
 @dataclass(frozen=True)
-class Slice:
+class Plane:
     """A cost on the plane `origin + x basis^T`."""
 
     cost: CostFunction
     origin: Tensor  # [n]
     basis: Tensor  # [n 2]
 
-    def take(self, items: Tensor) -> Slice:
+    def take(self, items: Tensor) -> Plane:
         """The same cost for all items."""
         return self
 
@@ -98,7 +98,7 @@ def ellipse(axis: Axes, covariance: Tensor, scale: float, **style: Any) -> None:
 
 
 def picture(
-    config: Config, plane: Slice, own: Tensor, noise: float, runs: dict[str, Any]
+    config: Config, plane: Plane, own: Tensor, noise: float, runs: dict[str, Any]
 ) -> Figure:
     """The slice once per method, with samples and minima."""
     side = torch.linspace(-config.reach, config.reach, config.resolution, dtype=torch.float64)
@@ -132,7 +132,7 @@ def main(config: Config) -> dict[str, Any]:
     problem = study_problem(config.body, generator=generator, choice=CHOICE)
     start = problem.start
     values, vectors = (part.flip(-1) for part in torch.linalg.eigh(start.covariance))
-    plane = Slice(problem.cost, start.mean, vectors[:, list(config.directions)])
+    plane = Plane(problem.cost, start.mean, vectors[:, list(config.directions)])
     own = torch.diag(values[list(config.directions)])
     free = torch.full((2,), torch.inf, dtype=torch.float64)
     limits = Bounds(-free, free)

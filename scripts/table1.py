@@ -208,7 +208,7 @@ def run_seed(config: Config, seed: int) -> dict[str, Any]:
         title = f"{config.body}, seed {seed}, scale {config.scales[-1]:g}, {config.samples} samples"
         figures = {
             "fig1": minima_and_costs_figure(last, title),
-            "fig5": spectra_figure(spectra),
+            "fig5": eigenvector_figure(spectra),
             "fig13": samples_and_minima_figure(last, title),
         }
         for name, figure in figures.items():
@@ -299,7 +299,7 @@ def minima_and_costs_figure(runs: Mapping[str, SamplerRun], title: str = "") -> 
     return figure
 
 
-def spectra_figure(spectra: Mapping[str, Sequence[float]]) -> Figure:
+def eigenvector_figure(spectra: Mapping[str, Sequence[float]]) -> Figure:
     """Fig. 5: standard deviations along the eigenvectors of a mode's covariance, on a log scale.
 
     Args:

@@ -13,7 +13,7 @@ import torch
 from torchcss.body.model import BodyModel
 from torchcss.errors import TrackFileError
 from torchcss.files import load_arrays
-from torchcss.io.export import Export, ExportOptions, export
+from torchcss.io.export import Exported, ExportOptions, export
 from torchcss.io.export.bvh import BvhStyle
 from torchcss.io.export.selection import SelectionChoice
 from torchcss.io.run import Run
@@ -82,7 +82,7 @@ def save_v01_track(path: Path, track: Track) -> None:
 
 def export_as(
     run: Run | Track | Path, to: str, out: Path | None = None, *, frame: Any = None, **options: Any
-) -> Export:
+) -> Exported:
     """Export with the options of all choices side by side."""
     bvh = {name: options.pop(name) for name in list(options) if hasattr(BvhStyle, name)}
     choice = ExportOptions(selection=SelectionChoice(**options), frame=frame, bvh=BvhStyle(**bvh))

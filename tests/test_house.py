@@ -81,6 +81,26 @@ def test_no_concrete_class_is_subclassed(path: Path) -> None:
                 assert not ours or meant or issubclass(base, BaseException), (one, base)
 
 
+def test_a_name_means_one_thing() -> None:
+    """No function, class or constant is public in two modules.
+
+    Compiled twins have the names of what they are twins of, verbs those of what they make.
+    """
+    defined: dict[str, list[str]] = {}
+    for path in MODULES:
+        if path.parent.name in ("fused", "cli") or path.stem == "v01":
+            continue
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            named = [node.name] if isinstance(node, Function | ast.ClassDef) else []
+            if isinstance(node, ast.Assign | ast.AnnAssign):
+                targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+                named = [x.id for x in targets if isinstance(x, ast.Name) and x.id.isupper()]
+            for name in named:
+                defined.setdefault(name, []).append(str(path.relative_to(PACKAGE)))
+    twice = {name: paths for name, paths in defined.items() if len(paths) > 1}
+    assert {name: paths for name, paths in twice.items() if name[0] != "_"} == {}
+
+
 def test_the_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     package = tmp_path / "torchcss"
     many = ", ".join("abcdefghi")

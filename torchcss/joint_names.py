@@ -211,6 +211,11 @@ def _numbered_side(name: str, names: Sequence[str]) -> str | None:
 
 LIMB_PLACES: Final[tuple[str, ...]] = ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")
 
+LIMB_JOINTS: Final[tuple[str, ...]] = tuple(
+    f"{side}_{place}" for place in (*LIMB_PLACES[3:], *LIMB_PLACES[:3]) for side in "lr"
+)
+"""The twelve joints of the limbs, which every body, skeleton, detector and data set has."""
+
 
 def _of_limbs(*words: str) -> dict[str, tuple[str, ...]]:
     """What the places of the limbs are called."""

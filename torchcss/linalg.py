@@ -21,7 +21,7 @@ from torch import Tensor
 
 from torchcss.types import Matrices, Numbers, Vector, Vectors
 
-CHUNK = 256
+MATRICES_AT_ONCE = 256
 """Matrices inverted at a time: a few copies of them stay in the caches."""
 
 
@@ -132,8 +132,8 @@ def inverse_on_free(
     batch, n = hessian.shape[:-2], hessian.shape[-1]
     units = prior_units(prior_variance.to(device=hessian.device, dtype=torch.float64))
     pairs = zip(
-        hessian.detach().reshape(batch.numel(), n, n).split(CHUNK),
-        free.expand(*batch, n).reshape(batch.numel(), n).split(CHUNK),
+        hessian.detach().reshape(batch.numel(), n, n).split(MATRICES_AT_ONCE),
+        free.expand(*batch, n).reshape(batch.numel(), n).split(MATRICES_AT_ONCE),
         strict=True,
     )
     parts = [_inverse_at_least_one(part.double() * units, loose) * units for part, loose in pairs]

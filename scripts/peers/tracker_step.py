@@ -33,7 +33,7 @@ LIBRARY = ("linalg_cholesky_ex", "linalg_solve_triangular", "aten::bmm", "aten::
 Step = Callable[..., tuple[FixedStepState, Tensor]]
 
 
-class Frame(NamedTuple):
+class FrameData(NamedTuple):
     """What a frame brings; tensors have one row per place of the pool.
 
     Attributes:
@@ -50,14 +50,14 @@ class Frame(NamedTuple):
 
 
 def tracker_step(
-    frame: Frame, state: FixedStepState, fresh: Tensor, deviation_scale: float
+    frame: FrameData, state: FixedStepState, fresh: Tensor, deviation_scale: float
 ) -> tuple[FixedStepState, Tensor]:
     """Draw where a place is fresh; then evaluate, accept or refuse, and plan for all."""
     drawn = scaled_draw(frame.mean, frame.factor, frame.noise, deviation_scale)
     return fixed_step(frame.cost, refill(state, fresh, drawn), frame.cost.body.bounds)
 
 
-def make_frames(body_name: str, pool: int, like: Tensor, seed: int) -> Iterator[Frame]:
+def make_frames(body_name: str, pool: int, like: Tensor, seed: int) -> Iterator[FrameData]:
     """Frame after frame: other keypoints, other modes, other draws, in the type of a tensor."""
     generator = torch.Generator().manual_seed(seed)
     problem = reprojection_problem(body_name, generator=generator)
@@ -79,7 +79,7 @@ def make_frames(body_name: str, pool: int, like: Tensor, seed: int) -> Iterator[
         parents = Prior.of(GaussianMixture(mean, alike, mean.new_zeros(len(mean))))
         cost = TrackingCost(choice=choice, views=(view,))
         cost = cost.of_children(torch.arange(len(mean), device=mean.device), parents)
-        yield Frame(cost, mean, factor, noise)
+        yield FrameData(cost, mean, factor, noise)
 
 
 def difference(
@@ -110,7 +110,7 @@ def difference(
 class Work:
     """So many samples of a frame in pools, and their states."""
 
-    def __init__(self, frame: Frame, samples: int, scale: float) -> None:
+    def __init__(self, frame: FrameData, samples: int, scale: float) -> None:
         self.frame, self.scale = frame, scale
         self.fresh = torch.ones_like(frame.mean[:, 0], dtype=torch.bool)
         self.states = [start(frame.mean) for _ in range(math.ceil(samples / len(frame.mean)))]
@@ -122,7 +122,7 @@ class Work:
 
 
 def compile_step(
-    frames: Iterator[Frame], scale: float, *, cached: bool
+    frames: Iterator[FrameData], scale: float, *, cached: bool
 ) -> tuple[Step, dict[str, Any]]:
     """Compile, and compare with eager in three iterations of each of two frames.
 

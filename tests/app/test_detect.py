@@ -11,7 +11,7 @@ import pytest
 
 import torchcss
 from torchcss.app.detect import detect_video, is_detected, masks_of
-from torchcss.app.view_files import Selection, open_view
+from torchcss.app.view_files import FrameSelection, open_view
 from torchcss.errors import KeypointError, TorchcssError
 from torchcss.io.detect import Detected
 from torchcss.io.keypoints.frames import Film
@@ -168,7 +168,7 @@ def test_frames_that_nobody_asks_for_are_not_detected(files: Path, crowd: Crowd)
     seen = read(path, "largest", frame=1).confidence.amax(-1) > 0
     assert seen.tolist() == [False, True, False]
     given = ViewFiles(video=files / "video.mp4", keypoints=path, masks=masks_of(path))
-    view = open_view(given, Camera.pinhole(*SIZE, focal_px=60.0), Selection(start=1, stop=2))
+    view = open_view(given, Camera.pinhole(*SIZE, focal_px=60.0), FrameSelection(start=1, stop=2))
     (mask,) = [frame.mask for frame in view.images()]
     assert mask is not None
     assert mask[24].mean() > 200 > mask[40].mean()

@@ -12,7 +12,7 @@ import torch
 from PIL import ExifTags, Image
 
 import torchcss
-from torchcss.app.lens import Lens
+from torchcss.app.lens import KnownLens
 from torchcss.body.bases import pose_track
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.errors import CameraError
@@ -34,25 +34,27 @@ def video(path: Path, **metadata: str) -> Path:
     return path
 
 
-def focal(lens: Lens, path: Path) -> float:
+def focal(lens: KnownLens, path: Path) -> float:
     return float(lens.of(path).camera(path).camera.K[0, 0])
 
 
 def test_the_file_says_it(tmp_path: Path) -> None:
     path = video(tmp_path / "a.mov", **{KEY: "26"})
     assert focal_length_35mm(path) == 26
-    assert focal(Lens(), path) == pytest.approx(26 * 80 / math.hypot(36, 24))
-    assert "26 mm" in (Lens().of(path).camera(path).units_note or "")
-    assert focal(Lens(focal=99.0), path) == 99  # the user knows better
-    doubts = [lens.of(path).camera(path).focal_deviation for lens in (Lens(focal=99.0), Lens())]
-    assert doubts[0] == 0 < doubts[1] < Lens().camera(path).focal_deviation
+    assert focal(KnownLens(), path) == pytest.approx(26 * 80 / math.hypot(36, 24))
+    assert "26 mm" in (KnownLens().of(path).camera(path).units_note or "")
+    assert focal(KnownLens(focal=99.0), path) == 99  # the user knows better
+    doubts = [
+        lens.of(path).camera(path).focal_deviation for lens in (KnownLens(focal=99.0), KnownLens())
+    ]
+    assert doubts[0] == 0 < doubts[1] < KnownLens().camera(path).focal_deviation
 
 
 @pytest.mark.parametrize("said", ["", "none", "0", "nan", "1e9", "-26"])
 def test_nonsense_in_the_file_is_no_answer(tmp_path: Path, said: str) -> None:
     path = video(tmp_path / "a.mov", **{KEY: said})
     assert focal_length_35mm(path) is None
-    assert not Lens().of(path).is_known
+    assert not KnownLens().of(path).is_known
 
 
 def test_pictures_say_it_by_exif(tmp_path: Path) -> None:
@@ -67,15 +69,15 @@ def test_pictures_say_it_by_exif(tmp_path: Path) -> None:
 
 def test_a_camera_is_said_once() -> None:
     with pytest.raises(CameraError, match="not several"):
-        Lens(fov=60.0).unless(Path("cameras.json"))
+        KnownLens(fov=60.0).unless(Path("cameras.json"))
     with pytest.raises(CameraError, match="not both"):
-        Lens(fov=60.0, focal=900.0)
+        KnownLens(fov=60.0, focal=900.0)
     for bad in (0.0, -5.0, math.nan):
         with pytest.raises(CameraError, match="--focal: expected"):
-            Lens(focal=bad)
+            KnownLens(focal=bad)
     with pytest.raises(CameraError, match=r"--fov: expected .* got 400"):
-        Lens(fov=400.0)
-    assert Lens().unless(Path("cameras.json")) == Path("cameras.json")
+        KnownLens(fov=400.0)
+    assert KnownLens().unless(Path("cameras.json")) == Path("cameras.json")
     with pytest.raises(CameraError):
         torchcss.Camera.pinhole(64, 48, focal_px=10.0, field_of_view_degrees=20.0)
 

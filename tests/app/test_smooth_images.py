@@ -14,7 +14,7 @@ from made_clip import track
 from made_sequences import rendered_arm
 
 from torchcss import load_track
-from torchcss.app.smooth import settings_of, smooth_frames, smooth_track
+from torchcss.app.smooth import run_settings, smooth_frames, smooth_track
 from torchcss.cli import main as cli
 from torchcss.errors import ConfigurationError, VideoError
 from torchcss.io.run import Run
@@ -152,7 +152,7 @@ def test_track_and_smooth_on_files(files: Path, capsys: pytest.CaptureFixture[st
 
 def test_settings_come_from_the_run(setup: Setup):
     def told(settings: dict[str, Any]) -> Settings:
-        return settings_of(Run(path=Path("a"), track=setup.track._replace(settings=settings)))
+        return run_settings(Run(path=Path("a"), track=setup.track._replace(settings=settings)))
 
     assert told({}).body == "arm8"
     settings = told({"body": "arm8", "terms": ["joints"], "dtype": "float32", "new": 3})

@@ -16,7 +16,7 @@ from made_sequences import rendered_arm
 from torchcss.app.init import write_png
 from torchcss.cli import init as cli_init
 from torchcss.cli import main as cli
-from torchcss.initialise.multi_start import Search
+from torchcss.initialise.multi_start import StartSearch
 from torchcss.initialise.options import InitialiseOptions
 from torchcss.io.tracks import load_track
 from torchcss.io.video import VideoReader, VideoWriter, read_image
@@ -151,7 +151,7 @@ def test_the_papers_stages_from_a_coarse_pose(scene: Path, tmp_path: Path, capsy
 
 def few_starts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the verb look less widely."""
-    plain, small = cli_init.initialise_image, Search(num_starts=8, num_flips=8, num_samples=0)
+    plain, small = cli_init.initialise_image, StartSearch(num_starts=8, num_flips=8, num_samples=0)
 
     def quick(*files, options: InitialiseOptions, **more):
         return plain(*files, options=replace(options, search=small), **more)

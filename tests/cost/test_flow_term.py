@@ -22,7 +22,7 @@ from torchcss.studies.render.sequences import arm_sequence
 from torchcss.types import Curvature, PointCost
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor
-from torchcss.vision.flow import TRACKING
+from torchcss.vision.flow import TRACKING_FLOW
 
 WIDTH, HEIGHT = 64, 48
 DISTORTION = [-0.33, 0.046, -0.0043, 0.0041, 0.067]
@@ -369,7 +369,7 @@ def test_a_true_pose_costs_less_than_its_neighbours(generator: torch.Generator) 
     """The whole way from rendered frames: the truth against the pose before and one too far on."""
     sequence = arm_sequence(generator=generator, num_frames=4)
     body, camera = sequence.body, sequence.camera
-    features = FeatureExtractor(flow=TRACKING).double()(sequence.frames[3], sequence.frames[2])
+    features = FeatureExtractor(flow=TRACKING_FLOW).double()(sequence.frames[3], sequence.frames[2])
     assert features.flow is not None
     nodes, term = InteriorNodes(body), FlowTerm()
     before, truth = sequence.states[2], sequence.states[3]

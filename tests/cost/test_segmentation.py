@@ -29,7 +29,7 @@ from torchcss.tracking.view import NOTHING_KNOWN, NOTHING_SEEN, CameraView, Obse
 from torchcss.types import Bounds, Frame, LocalModel
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor
-from torchcss.vision.flow import TRACKING
+from torchcss.vision.flow import TRACKING_FLOW
 
 
 def plain_twin(
@@ -232,7 +232,7 @@ def test_a_body_without_flesh_shows_nothing(tmp_path: Path, dtype: torch.dtype) 
     x = torch.zeros(2, 3, 1, dtype=dtype)
     assert torch.equal(part_map(body, x, camera), torch.full((2, 3, 30, 40), -1))
     noise = torch.rand(30, 40, 3, generator=torch.Generator().manual_seed(0)).numpy()
-    features = FeatureExtractor(colour=True, flow=TRACKING)(noise, noise)
+    features = FeatureExtractor(colour=True, flow=TRACKING_FLOW)(noise, noise)
     choice = CostChoice().having(RegionTerm(), SegmentationTerm(), FlowTerm())
     costs = FrameCosts(body, camera, choice)
     appearance = costs.learn(None, features, body, x[0, 0])

@@ -34,14 +34,15 @@ from torchcss.initialise.multi_start import (
     PAPER_PROPORTIONS,
     PAPERS,
     SINGLE_START,
-    Search,
+    StartSearch,
     multi_start_fits,
 )
 from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
 from torchcss.initialise.result import Initialisation, hang_on_best, stature_of
+from torchcss.joint_names import LIMB_JOINTS
 from torchcss.show.initialisation_views import proportion_table
-from torchcss.studies.metrics import LIMB_JOINTS, mask_overlap, pa_mpjpe_mm
-from torchcss.studies.random_person import Person, coverage, random_person
+from torchcss.studies.metrics import mask_overlap, pa_mpjpe_mm
+from torchcss.studies.random_person import RandomPerson, person_coverage, random_person
 from torchcss.studies.render.clutter import clutter_background
 from torchcss.studies.render.renderer import Mesh, render_meshes
 from torchcss.studies.render.scene import look_at
@@ -49,14 +50,14 @@ from torchcss.types import Keypoints, Modes
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import grid_faces
 
-SMALL = Search(num_starts=16, num_trunks=2, num_flips=16, num_samples=4)
+SMALL = StartSearch(num_starts=16, num_trunks=2, num_flips=16, num_samples=4)
 
 
-def person(seed: int = 1, **options) -> Person:
+def person(seed: int = 1, **options) -> RandomPerson:
     return random_person(generator=torch.Generator().manual_seed(seed), **options)
 
 
-def marks(someone: Person) -> dict[str, tuple[float, ...]]:
+def marks(someone: RandomPerson) -> dict[str, tuple[float, ...]]:
     return {
         name: tuple(place)
         for name, place, seen in zip(
@@ -66,7 +67,7 @@ def marks(someone: Person) -> dict[str, tuple[float, ...]]:
     }
 
 
-def find(someone: Person, search: Search = SMALL, **options) -> Initialisation:
+def find(someone: RandomPerson, search: Search = SMALL, **options) -> Initialisation:
     return initialise(
         None,
         Keypoints(someone.keypoints, someone.confidence, someone.joint_names),
@@ -81,7 +82,7 @@ def find(someone: Person, search: Search = SMALL, **options) -> Initialisation:
     )
 
 
-def error_mm(found: Initialisation, someone: Person) -> np.ndarray:
+def error_mm(found: Initialisation, someone: RandomPerson) -> np.ndarray:
     index = [found.body.joint_index(name) for name in LIMB_JOINTS]
     joints = found.body.pose(found.mixture.mean).joints[:, index].numpy()
     return pa_mpjpe_mm(joints, someone.joints_world(LIMB_JOINTS).numpy()[None])
@@ -155,7 +156,7 @@ def test_covariances_are_those_of_modes_with_unknown_lengths(found: Initialisati
     assert 0.05 < float(largest.sqrt()) < 0.3
     assert found.free_body is not None
     assert found.free_mixture is not None
-    stated = coverage(person(), found.free_body, found.free_mixture)
+    stated = person_coverage(person(), found.free_body, found.free_mixture)
     assert stated.parameters > 0.7
     assert found.uncapped is not None
     free = found.uncapped.diagonal() > 0
@@ -235,7 +236,7 @@ def test_colours_tell_the_outline_of_a_chequered_shirt():
     assert abs(girth[1] - 1) < 0.05 < abs(girth[0] - 1)
 
 
-def _in_squares(someone: Person) -> list[Mesh]:
+def _in_squares(someone: RandomPerson) -> list[Mesh]:
     def squares(points: torch.Tensor) -> torch.Tensor:
         return 0.35 + 0.65 * ((points * 40).floor().sum(-1, keepdim=True) % 2)
 
@@ -484,7 +485,7 @@ def test_only_the_papers_proportions_if_asked():
         100 * found.lengths["hip_depth"] / LENGTHS["hip_width"]
     )
     with pytest.raises(ConfigurationError, match="tail"):
-        Search(proportions=("tail",))
+        StartSearch(proportions=("tail",))
 
 
 def test_the_papers_stages_are_one_fit_that_keeps_parts_apart():
@@ -564,7 +565,7 @@ def test_a_detectors_points_are_a_start() -> None:
     away = someone.camera.R_camera_world.to(torch.float64) @ someone.joints_world(names).T
     known = Keypoints(someone.keypoints, someone.confidence, someone.joint_names).only(names)
     told = known._replace(points=1.3 * (away.T - away.T.mean(0)))  # of a larger person
-    alone = Search(num_starts=1, num_flips=0, num_samples=0, leave_out=False)
+    alone = StartSearch(num_starts=1, num_flips=0, num_samples=0, leave_out=False)
     options = InitialiseOptions(sigma=1.0, search=alone, least_joints=LEAST_JOINTS)
 
     def error(keypoints: Keypoints) -> tuple[float, float]:

@@ -11,7 +11,7 @@ from torchcss.errors import BodyError, CameraError, ConfigurationError
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.initialise.fit import initialise
 from torchcss.initialise.ground import stature_on_floor
-from torchcss.initialise.multi_start import Search
+from torchcss.initialise.multi_start import StartSearch
 from torchcss.initialise.options import InitialiseOptions
 from torchcss.initialise.result import Initialisation, stature_of
 from torchcss.types import Keypoints
@@ -99,7 +99,7 @@ def test_a_small_adult_is_found_small_and_near() -> None:
     names = true.body.joint_names
     uv = camera().project(true.body.pose(true.mixture.mean[0]).joints).uv
     keypoints = Keypoints(uv, torch.ones(len(names)).double(), names)
-    search = Search(num_starts=8, num_trunks=2, num_flips=8, num_samples=2)
+    search = StartSearch(num_starts=8, num_trunks=2, num_flips=8, num_samples=2)
     errors = {}
     for ground in (None, 0.0):
         found = initialise(

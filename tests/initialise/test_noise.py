@@ -9,15 +9,15 @@ from torchcss.cost.context import FrameContext
 from torchcss.cost.joints import SPREAD
 from torchcss.cost.total import TrackingCost
 from torchcss.initialise.fit import initialise
-from torchcss.initialise.multi_start import Search
+from torchcss.initialise.multi_start import StartSearch
 from torchcss.initialise.noise import noise_factor
 from torchcss.initialise.options import InitialiseOptions
 from torchcss.initialise.result import spread_to, with_lengths
-from torchcss.studies.random_person import Person, random_person
+from torchcss.studies.random_person import RandomPerson, random_person
 from torchcss.types import Keypoints
 
 
-def seen(noise_px: float, seed: int) -> tuple[Person, Keypoints]:
+def seen(noise_px: float, seed: int) -> tuple[RandomPerson, Keypoints]:
     """A person whose keypoints err as the joint term expects, but for the scale."""
     generator = torch.Generator().manual_seed(seed)
     person = random_person(generator=generator, noise_px=0.0)
@@ -31,7 +31,7 @@ def factor(noise_px: float, assumed_px: float, seed: int) -> float:
     return factor_of(*seen(noise_px, seed), assumed_px)
 
 
-def factor_of(person: Person, keypoints: Keypoints, assumed_px: float) -> float:
+def factor_of(person: RandomPerson, keypoints: Keypoints, assumed_px: float) -> float:
     loose = with_lengths(
         person.body, dict(person.body.lengths), 1.0, free_root=True, free_proportions=True
     )
@@ -39,7 +39,7 @@ def factor_of(person: Person, keypoints: Keypoints, assumed_px: float) -> float:
         choice=InitialiseOptions(sigma=assumed_px).joint_choice.without("pose_prior"),
         views=(FrameContext(body=loose, camera=person.camera, keypoints=keypoints),),
     )
-    return noise_factor(cost, spread_to(person.body, loose, person.state[None])[0], Search())
+    return noise_factor(cost, spread_to(person.body, loose, person.state[None])[0], StartSearch())
 
 
 @pytest.mark.parametrize("ratio", [0.4, 1.0, 3.0])
@@ -58,7 +58,7 @@ def test_outliers_are_no_noise() -> None:
 def test_it_is_learnt_where_it_is_not_given() -> None:
     person, keypoints = seen(8.0, 1)
     generator = torch.Generator().manual_seed(0)
-    few = Search(num_starts=4, num_flips=0, num_samples=0, leave_out=False)
+    few = StartSearch(num_starts=4, num_flips=0, num_samples=0, leave_out=False)
     noises = {
         given: initialise(
             None,
@@ -78,7 +78,7 @@ def test_it_is_learnt_where_it_is_not_given() -> None:
 
 def test_marks_that_fit_no_pose_are_told() -> None:
     person, keypoints = seen(60.0, 1)
-    few = Search(num_starts=4, num_flips=0, num_samples=0, leave_out=False)
+    few = StartSearch(num_starts=4, num_flips=0, num_samples=0, leave_out=False)
     found = initialise(
         None,
         keypoints,

@@ -13,20 +13,20 @@ from torchcss.cost.context import FrameContext
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.total import TrackingCost
-from torchcss.initialise.multi_start import Search
+from torchcss.initialise.multi_start import StartSearch
 from torchcss.initialise.outliers import (
     best_distinct,
     capped_cost,
     find_outliers,
     price_of_leaving_out,
-    refine,
+    refine_fits,
     without,
 )
-from torchcss.studies.random_person import Person, random_person
+from torchcss.studies.random_person import RandomPerson, random_person
 from torchcss.types import Keypoints
 
 
-def person_and_cost(seed: int = 0, **options) -> tuple[Person, TrackingCost]:
+def person_and_cost(seed: int = 0, **options) -> tuple[RandomPerson, TrackingCost]:
     """A person and the cost of the marks, lengths known."""
     someone = random_person(generator=torch.Generator().manual_seed(seed), **options)
     keypoints = Keypoints(someone.keypoints, someone.confidence, someone.joint_names)
@@ -57,12 +57,12 @@ def test_price_is_that_of_a_place_anywhere_in_the_image():
 def test_a_mark_that_is_elsewhere_is_left_out_and_no_other(name: str):
     someone, cost = person_and_cost()
     mark = someone.joint_names.index(name)
-    search = Search()
-    fits = best_distinct(refine(cost, someone.state[None], search))
+    search = StartSearch()
+    fits = best_distinct(refine_fits(cost, someone.state[None], search))
     assert not bool(find_outliers(cost, fits, search).any())
     spoilt = moved(cost, mark, (180.0, -120.0))
     outliers = find_outliers(
-        spoilt, best_distinct(refine(spoilt, someone.state[None], search)), search
+        spoilt, best_distinct(refine_fits(spoilt, someone.state[None], search)), search
     )
     assert torch.nonzero(outliers)[:, 0].tolist() == [mark]
 
@@ -73,8 +73,8 @@ def test_where_very_many_marks_do_not_fit_none_is_left_out(generator: torch.Gene
     size = torch.tensor(cost.camera.image_size_wh)
     anywhere = size * torch.rand(14, 2, generator=generator).double()
     scattered = cost.with_keypoints(cost.keypoints._replace(positions=anywhere))
-    search = Search()
-    fits = best_distinct(refine(scattered, someone.state[None], search))
+    search = StartSearch()
+    fits = best_distinct(refine_fits(scattered, someone.state[None], search))
     assert not bool(find_outliers(scattered, fits, search).any())
 
 

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from PIL import ExifTags, Image
 
 from torchcss.app.detect import detect_video
-from torchcss.app.lens import Lens
+from torchcss.app.lens import KnownLens
 from torchcss.app.view_files import OpenView, open_view
 from torchcss.errors import ConfigurationError, OutputError, ShapeError, VideoError
 from torchcss.io import video
@@ -825,6 +825,6 @@ def test_pixels_that_are_not_square_are_told(tmp_path: Path) -> None:
         container.mux(stream.encode())
     reader = VideoReader(path)
     assert reader.pixel_aspect == Fraction(16, 11)
-    lens = Lens(focal=100.0).camera(path)
+    lens = KnownLens(focal=100.0).camera(path)
     notes = OpenView(ViewFiles(video=path, keypoints=None), reader, None, lens, None, 1.0).notes
     assert any("1.45 times as wide as high" in note for note in notes)

@@ -17,7 +17,7 @@ from torchcss.body.load import load_body
 from torchcss.errors import ConfigurationError, ShapeError, TrackFileError
 from torchcss.io.tracks import FrameModes, Track, TrackWriter, load_track, save_track
 from torchcss.io.view_files import RecordedCamera, ViewFiles
-from torchcss.studies.metrics import LIMB_JOINTS
+from torchcss.joint_names import LIMB_JOINTS
 from torchcss.vision.camera import Camera
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "evaluate_track.py"

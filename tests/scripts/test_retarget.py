@@ -16,7 +16,7 @@ from made_tracks import export_as
 
 from torchcss import load_body
 from torchcss.errors import ConfigurationError, MotionCaptureError, OutputError
-from torchcss.io.motion.positions import LIMBS
+from torchcss.io.motion.positions import LIMB_JOINTS
 from torchcss.io.tracks import FrameModes, Track, TrackWriter
 from torchcss.studies.sequences import read_reference
 
@@ -81,7 +81,7 @@ def test_files_and_table(
     assert found["error_mm"].max() < 5
 
     positions, names = read_reference(reference, "joints")
-    assert set(names) == {*LIMBS, "HumanoidRoot", "vt1"}
+    assert set(names) == {*LIMB_JOINTS, "HumanoidRoot", "vt1"}
     index = [body.joint_index(name) for name in names]
     assert 1000 * np.linalg.norm(positions - joints[:, index].numpy(), axis=-1).mean() < 10
     with np.load(reference) as arrays:
@@ -89,7 +89,7 @@ def test_files_and_table(
 
     written = json.loads(report.read_text())
     table = capsys.readouterr().out
-    for name in (*LIMBS, "all"):
+    for name in (*LIMB_JOINTS, "all"):
         row = written["error_mm"][name]
         assert row["mean"] <= row["worst"]
         assert f"{name} | {row['mean']:6.1f} {row['p95']:6.1f} {row['worst']:6.1f}" in table

@@ -20,8 +20,8 @@ from torchcss.cli import main as cli
 from torchcss.errors import ConfigurationError
 from torchcss.io.tracks import TRACK_NAME, Track, save_track
 from torchcss.io.video import VideoWriter
-from torchcss.show.posterior_plots import DEVIATIONS, angles_figure, joints_figure, spectra_figure
-from torchcss.show.style import save_figure
+from torchcss.show.posterior_plots import angles_figure, joints_figure, spectra_figure
+from torchcss.show.style import DEVIATIONS, save_figure
 from torchcss.show.track_plots import effective_number
 from torchcss.studies.render.scene import look_at
 

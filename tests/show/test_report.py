@@ -43,8 +43,8 @@ def folder(tmp_path: Path) -> Path:
 def test_the_page_needs_nothing_else_and_holds_what_was_noted(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(report, "MOST_FRAMES", 2)
-    page = report.write_report(Run.open(folder)).read_text()
+    monkeypatch.setattr(report, "MOST_PICTURES", 2)
+    page = report.write_report_page(Run.open(folder)).read_text()
     assert set(re.findall(r'(?:src|href|poster)="(.{11})', page)) == {
         *("data:video/", "data:image/")
     }

@@ -25,6 +25,7 @@ from torchcss.io.video import VideoWriter
 from torchcss.io.view_files import RecordedCamera
 from torchcss.show import viewer
 from torchcss.show.overlay import PALETTE
+from torchcss.show.style import DEVIATIONS
 from torchcss.show.track_plots import bones_of, count_apart, effective_number
 from torchcss.show.viewer import shown_frames, view_track
 from torchcss.show.viewer_layout import _eye, layout, world_axes
@@ -112,7 +113,7 @@ def test_ellipsoids_are_the_covariances(rows: Rows, track: Track, body: BodyMode
             )
             truth = joint_covariance(body, pose, torch.from_numpy(track.covariance[row, mode]))
             logged = rows[f"/world/modes/{mode}/uncertainty"][int(frame)]
-            half = np.array(logged["Ellipsoids3D:half_sizes"]) / viewer.DEVIATIONS
+            half = np.array(logged["Ellipsoids3D:half_sizes"]) / DEVIATIONS
             turn = rotation(np.array(logged["Ellipsoids3D:quaternions"]))
             centres = np.array(logged["Ellipsoids3D:centers"])
             np.testing.assert_allclose(centres, track.joints_world[row, mode], atol=1e-6)
@@ -253,7 +254,7 @@ def test_ellipsoids_of_mirrored_and_flat_covariances() -> None:
     covariance[1] = np.diag([4.0, 0.0, 1.0])
     half, quaternions = viewer.ellipsoids(covariance)
     turn = rotation(quaternions)
-    spread = turn @ ((half[:, :, None] / viewer.DEVIATIONS) ** 2 * turn.swapaxes(-1, -2))
+    spread = turn @ ((half[:, :, None] / DEVIATIONS) ** 2 * turn.swapaxes(-1, -2))
     np.testing.assert_allclose(spread, covariance, atol=1e-9)
     assert (half >= 0).all()
 

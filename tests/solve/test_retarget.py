@@ -17,19 +17,18 @@ from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPai
 from torchcss.cost.targets import PointDistances
 from torchcss.errors import ConfigurationError, MotionCaptureError
 from torchcss.io.motion.positions import (
-    LIMBS,
+    LIMB_JOINTS,
     MotionCapture,
     limb_positions,
     read_motion_capture,
-    resample,
+    resample_motion,
 )
 from torchcss.solve.retarget import (
     Retargeting,
-    collision_depth,
     fit_lengths,
     levelled,
+    limbs_with_lengths,
     retarget,
-    with_lengths,
 )
 
 TREE = {
@@ -102,7 +101,7 @@ def test_a_known_motion_comes_back(subject: BodyModel, generator: torch.Generato
     for name in ("thigh", "shank", "upper_arm", "forearm", "hip_width", "foot"):
         assert found.body.lengths[name] == pytest.approx(subject.lengths[name], abs=1e-3)
     assert found.body.lengths["trunk"] == pytest.approx(subject.lengths["trunk"], abs=0.01)
-    assert found.target_names == LIMBS
+    assert found.target_names == LIMB_JOINTS
     assert found.error.mean() < 0.001
     assert found.error.max() < 0.003
     yaw = found.states[:, found.body.state_index("root_yaw")]
@@ -220,11 +219,11 @@ def test_no_numbers_that_make_no_sense() -> None:
 
 
 def test_lengths_stay_in_range(subject: BodyModel) -> None:
-    joints = subject.pose(moving(subject)).joints[:, [subject.joint_index(n) for n in LIMBS]]
-    lengths, (line,) = fit_lengths(LIMBS, joints)
+    joints = subject.pose(moving(subject)).joints[:, [subject.joint_index(n) for n in LIMB_JOINTS]]
+    lengths, (line,) = fit_lengths(LIMB_JOINTS, joints)
     assert "all within" in line
     assert lengths["thigh"] == pytest.approx(subject.lengths["thigh"])
-    large, (line,) = fit_lengths(LIMBS, 1.3 * joints)
+    large, (line,) = fit_lengths(LIMB_JOINTS, 1.3 * joints)
     assert "thigh 526 -> 469" in line
     for name, value in large.items():
         assert 0.9 <= value / LENGTHS[name] <= 1.1 + 1e-12
@@ -235,27 +234,29 @@ def test_joints_take_lengths_and_keep_directions(
     subject: BodyModel, generator: torch.Generator
 ) -> None:
     joints = subject.pose(moving(subject, count=6)).joints
-    joints = joints[:, [subject.joint_index(name) for name in LIMBS]]
+    joints = joints[:, [subject.joint_index(name) for name in LIMB_JOINTS]]
     narrow = joints.clone()
     for side, sign in (("l", 1), ("r", -1)):  # the shoulders 6 cm nearer to each other
-        across = joints[:, LIMBS.index("l_shoulder")] - joints[:, LIMBS.index("r_shoulder")]
-        arm = [LIMBS.index(f"{side}_{joint}") for joint in ("shoulder", "elbow", "wrist")]
+        across = (
+            joints[:, LIMB_JOINTS.index("l_shoulder")] - joints[:, LIMB_JOINTS.index("r_shoulder")]
+        )
+        arm = [LIMB_JOINTS.index(f"{side}_{joint}") for joint in ("shoulder", "elbow", "wrist")]
         narrow[:, arm] -= sign * 0.03 * (across / across.norm(dim=-1, keepdim=True))[:, None]
-    restored = with_lengths(LIMBS, narrow, subject.lengths)
+    restored = limbs_with_lengths(LIMB_JOINTS, narrow, subject.lengths)
     torch.testing.assert_close(restored, joints, rtol=0, atol=2e-3)
-    elbowless = [i for i, name in enumerate(LIMBS) if "elbow" not in name]
-    names = tuple(LIMBS[i] for i in elbowless)
-    restored = with_lengths(names, narrow[:, elbowless], subject.lengths)
+    elbowless = [i for i, name in enumerate(LIMB_JOINTS) if "elbow" not in name]
+    names = tuple(LIMB_JOINTS[i] for i in elbowless)
+    restored = limbs_with_lengths(names, narrow[:, elbowless], subject.lengths)
     torch.testing.assert_close(restored, joints[:, elbowless], rtol=0, atol=2e-3)
 
 
 def test_derivatives_against_autograd(subject: BodyModel, generator: torch.Generator) -> None:
     states = moving(subject, count=3)
-    count = len(LIMBS)
+    count = len(LIMB_JOINTS)
     target = torch.randn(3, count, 3, generator=generator, dtype=torch.float64)
     cost = PointDistances(
         body=subject,
-        link=subject.marker_link[[subject.joint_index(name) for name in LIMBS]],
+        link=subject.marker_link[[subject.joint_index(name) for name in LIMB_JOINTS]],
         offset=0.1 * torch.randn(count, 3, generator=generator, dtype=torch.float64),
         target=target,
         sigma=torch.linspace(0.1, 0.2, count, dtype=torch.float64),
@@ -296,22 +297,6 @@ def test_a_tilted_floor_is_levelled(degrees: float, generator: torch.Generator) 
         assert report == []
 
 
-def test_depth_of_collisions(subject: BodyModel) -> None:
-    clear = subject.rest.clone()
-    clear[subject.state_index("l_shoulder_raising")] = 1.0
-    clear[subject.state_index("r_shoulder_raising")] = 1.0
-    folded = clear.clone()
-    folded[subject.state_index("l_elbow_flexion")] = 2.0
-    folded[subject.state_index("l_shoulder_twist")] = 1.5
-    folded[subject.state_index("l_shoulder_raising")] = -0.4
-    depth, pairs = collision_depth(subject, torch.stack([clear, folded, clear]))
-    assert depth[0] == depth[2] == 0
-    assert pairs[0] == pairs[2] == ""
-    assert depth[1] > 0.01
-    assert "l_" in pairs[1]
-    assert " and " in pairs[1]
-
-
 # Real recordings.
 
 
@@ -329,7 +314,7 @@ def test_recordings_are_followed(
 ) -> None:  # fmt: skip
     folder = shared_data / "mocap_cmu"
     whole = read_motion_capture(folder / file, skeleton=folder / skeleton)
-    motion = resample(whole, rate=8, start=start, stop=stop)
+    motion = resample_motion(whole, rate=8, start=start, stop=stop)
     found = retarget(motion, generator=generator)
     assert 1000 * found.error.mean() < mean_mm
     assert 1000 * found.error.max() < worst_mm

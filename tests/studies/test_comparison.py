@@ -10,7 +10,7 @@ import torch
 from made_sequences import NOISE_PX, write_arm
 
 from torchcss.body.load import load_body
-from torchcss.studies.comparison import Run, Start, find_start, told_arm, track_together
+from torchcss.studies.comparison import Start, TrackerRun, find_start, told_arm, track_together
 from torchcss.studies.evaluation import Thresholds
 from torchcss.studies.sequences import RecordedSequence, read_sequence
 from torchcss.tracking.session import Observation, Posterior, TrackingSession
@@ -39,7 +39,7 @@ def begin(sequence: RecordedSequence) -> Start:
 
 def together(
     sequence: RecordedSequence, begin: Start, *presets: str, stop: int = 2, **options: Any
-) -> list[Run]:
+) -> list[TrackerRun]:
     runs = [(choose(preset), begin) for preset in presets]
     thresholds = options.pop("thresholds", Thresholds.of(sequence))
     return list(track_together(sequence, runs, thresholds, stop=stop, **options))

@@ -16,10 +16,9 @@ from torch import Tensor
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.root import move_base
-from torchcss.body.surface import implicit
-from torchcss.cost.interpenetration import InterpenetrationPairs
 from torchcss.errors import ConfigurationError
 from torchcss.inference.mixture import GaussianMixture
+from torchcss.joint_names import LIMB_JOINTS
 from torchcss.studies.evaluation import (
     Evaluator,
     FrameMeasures,
@@ -28,12 +27,11 @@ from torchcss.studies.evaluation import (
     num_evaluations,
     number,
     over_seeds,
-    penetration_depth,
     region_probability,
     silhouette,
     summarise,
 )
-from torchcss.studies.metrics import LIMB_JOINTS, root_aligned_mpjpe_mm
+from torchcss.studies.metrics import root_aligned_mpjpe_mm
 from torchcss.studies.render.motions import Motion
 from torchcss.studies.render.sequences import arm_motion
 from torchcss.studies.sequences import RecordedSequence
@@ -277,38 +275,6 @@ def test_limits_of_bodies_without_roots() -> None:
     x[:, body.state_index("r_elbow_flexion")] = -math.radians(4)
     measures = Evaluator(sequence, body, Thresholds.of(sequence))(tracked(body, x), START, 0.0)
     assert measures.outside_degrees == pytest.approx(4.0)
-
-
-def test_penetration_is_the_distance_to_the_surface() -> None:
-    """Against the nearest of many surface points, for a fist that goes into the chest."""
-    body = load_body("body34")
-    pairs = InterpenetrationPairs(body, rings=8, meridians=12)
-    surface = body.mesh(48, 64).points.flatten(1, 2)
-    x = body.sticky_mean.clone()
-    for name, angle in (
-        ("r_shoulder_swing", -38.9), ("r_shoulder_raising", 16.3), ("r_shoulder_twist", -81.8)
-    ):  # fmt: skip
-        x[body.state_index(name)] = math.radians(angle)
-    flexion = torch.tensor([80.0, 95.0, 100.0, 106.0, 138.1]).deg2rad()
-    states = x.repeat(5, 1)
-    states[:, body.state_index("r_elbow_flexion")] = flexion
-    depth = penetration_depth(body, body.pose(states), pairs, surface)
-    fine = body.mesh(150, 200).points.flatten(1, 2)
-    expected = []
-    for state in states:
-        rotation, centre = body.part_poses(body.pose(state))
-        deepest = 0.0
-        for a, b in zip(pairs.first.tolist(), pairs.second.tolist(), strict=True):
-            nodes = pairs.nodes[a] @ rotation[a].T + centre[a]
-            local = (nodes - centre[b]) @ rotation[b]
-            local = local[implicit(body.part_shape[b], local) < 0]
-            if len(local):
-                deepest = max(deepest, float(torch.cdist(local, fine[b]).amin(1).max()))
-        expected.append(deepest)
-    assert expected[0] == depth[0] == 0.0
-    assert expected[2] > 0.02
-    # The pairs take the parts for slightly rounder than they are.
-    np.testing.assert_allclose(depth, expected, atol=0.004)
 
 
 def measure(

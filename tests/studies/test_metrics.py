@@ -12,9 +12,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from torchcss.errors import ConfigurationError, ShapeError
-from torchcss.joint_names import JOINT_NAMES
+from torchcss.joint_names import JOINT_NAMES, LIMB_JOINTS
 from torchcss.studies.metrics import (
-    LIMB_JOINTS,
     absolute_errors_mm,
     acceleration_error,
     best_of_modes,

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from torchcss.errors import OutputError
 from torchcss.show.style import save_figure
 from torchcss.studies import plots
-from torchcss.studies.slices import Line, Slice, sample_slice
+from torchcss.studies.slices import Slice, StateLine, sample_slice
 
 
 def terms(x: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -28,7 +28,9 @@ def terms(x: torch.Tensor) -> dict[str, torch.Tensor]:
 @pytest.fixture
 def taken() -> Slice:
     axes = torch.eye(2, dtype=torch.float64)
-    return sample_slice(terms, Line("r_elbow_flexion", 0 * axes[0], axes[0], 0.5), (-1.5, 1.5), 101)
+    return sample_slice(
+        terms, StateLine("r_elbow_flexion", 0 * axes[0], axes[0], 0.5), (-1.5, 1.5), 101
+    )
 
 
 def test_a_slice_shows_its_terms_above_the_centre(taken: Slice) -> None:
@@ -50,7 +52,7 @@ def test_a_slice_shows_its_terms_above_the_centre(taken: Slice) -> None:
 
 def test_units_and_titles() -> None:
     zero = torch.zeros(1)
-    of = {name: Line(name, zero, zero, 0.25) for name in ("root_y", "root_yaw", "eigen 3")}
+    of = {name: StateLine(name, zero, zero, 0.25) for name in ("root_y", "root_yaw", "eigen 3")}
     assert plots.unit_of(of["root_y"]) == ("metres", 1.0)
     assert plots.unit_of(of["root_yaw"], close=True).label == "degrees"
     assert plots.unit_of(of["eigen 3"], close=True) == ("standard deviations", 4.0)

@@ -149,7 +149,7 @@ def test_an_item_has_the_same_bits_in_any_batch(
         part = cost.blended_model(x[some], share[some])
         for got, want in zip(part, whole, strict=True):
             assert torch.equal(got, want[some])
-    monkeypatch.setattr("torchcss.studies.reprojection.CHUNK", 32)
+    monkeypatch.setattr("torchcss.studies.reprojection.STATES_AT_ONCE", 32)
     for got, want in zip(cost.blended_model(x, share), whole, strict=True):
         assert torch.equal(got, want)
 

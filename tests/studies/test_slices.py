@@ -11,9 +11,9 @@ from scipy.signal import find_peaks, peak_prominences
 
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.studies.slices import (
-    Line,
+    StateLine,
+    curve_minima,
     eigen_lines,
-    find_minima,
     joint_lines,
     largest_jump,
     num_spurious,
@@ -22,9 +22,9 @@ from torchcss.studies.slices import (
 from torchcss.types import Bounds
 
 
-def line(deviation: float = 1.0) -> Line:
+def line(deviation: float = 1.0) -> StateLine:
     zero = torch.zeros(2, dtype=torch.float64)
-    return Line("first", zero, torch.tensor([1.0, 0.0], dtype=torch.float64), deviation)
+    return StateLine("first", zero, torch.tensor([1.0, 0.0], dtype=torch.float64), deviation)
 
 
 @pytest.mark.parametrize("levels", [3, 8, 1000])
@@ -34,7 +34,7 @@ def test_minima_and_prominences_are_those_of_scipy(levels: int) -> None:
     for length in (3, 4, 7, 60):
         for _ in range(50):
             curve = random.integers(levels, size=length).astype(float)
-            minima = find_minima(curve)
+            minima = curve_minima(curve)
             expected, _ = find_peaks(-curve)
             np.testing.assert_array_equal(minima.sample, expected)
             np.testing.assert_array_equal(minima.prominence, peak_prominences(-curve, expected)[0])
@@ -42,20 +42,20 @@ def test_minima_and_prominences_are_those_of_scipy(levels: int) -> None:
 
 def test_prominence_is_the_easier_climb_and_ends_are_no_minima() -> None:
     curve = [0.0, 5.0, 3.0, 4.0, 1.0, 9.0, 2.0]
-    minima = find_minima(curve)
+    minima = curve_minima(curve)
     assert minima.sample.tolist() == [2, 4]
     assert minima.prominence.tolist() == [1.0, 4.0]  # over 4 to the 1; over 5 to the 0
     assert minima.above(2.0).sample.tolist() == [4]
     assert num_spurious(minima) == 1
     assert num_spurious(minima.above(100.0)) == 0
     for monotone in ([1.0, 2.0, 3.0], [3.0, 2.0, 2.0], [1.0] * 5, [1.0]):
-        assert find_minima(monotone).sample.tolist() == []
+        assert curve_minima(monotone).sample.tolist() == []
 
 
 @pytest.mark.parametrize("values", [[[1.0, 2.0]], [1.0, math.nan, 2.0]])
 def test_no_curve_is_a_typed_error(values: list) -> None:
     with pytest.raises(ShapeError, match="one axis of numbers"):
-        find_minima(values)
+        curve_minima(values)
 
 
 def test_lines_follow_the_covariance(generator: torch.Generator) -> None:
@@ -83,7 +83,7 @@ def test_the_interval_ends_at_the_first_bound() -> None:
 
     def interval(direction: list[float], at: torch.Tensor = centre, **reach: float):
         d = torch.tensor(direction, dtype=torch.float64)
-        return Line("x", at, d, 1.0).interval(bounds, **reach)
+        return StateLine("x", at, d, 1.0).interval(bounds, **reach)
 
     assert interval([1.0, 0.0]) == (-1.0, 2.0)
     assert interval([-1.0, 0.0]) == (-2.0, 1.0)

@@ -30,7 +30,7 @@ from torchcss.inference.proposals import (
 )
 from torchcss.inference.tracker import Tracker
 from torchcss.robust import Leclerc, Lorentzian
-from torchcss.tracking.presets import ALIASES, PRESETS, Preset, make_tracker
+from torchcss.tracking.presets import OLD_NAMES, PRESETS, Preset, make_tracker
 from torchcss.tracking.settings import (
     PAPER_TERMS,
     TERMS,
@@ -323,7 +323,7 @@ def test_either_potential_of_the_papers_can_be_chosen():
 
 
 def test_old_names_and_old_runs_still_open():
-    for old, new in ALIASES.items():
+    for old, new in OLD_NAMES.items():
         assert Settings(preset=old).preset == new
         assert old not in PRESETS
         assert make_tracker(old, "arm8") == make_tracker(new, "arm8")

@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from torchcss.errors import ShapeError
 from torchcss.vision.boundaries import displaced, motion_boundaries
-from torchcss.vision.flow import TRACKING, OpticalFlow, robust_flow
+from torchcss.vision.flow import TRACKING_FLOW, OpticalFlow, robust_flow
 
 
 def with_outliers(outlier: Tensor) -> OpticalFlow:
@@ -87,7 +87,7 @@ def test_boundaries_lie_where_the_second_frame_has_them(
         whole[30:90, 50 + offset : 100 + offset] = thing
         return whole
 
-    flow = robust_flow(picture(0), picture(moved), TRACKING)
+    flow = robust_flow(picture(0), picture(moved), TRACKING_FLOW)
     strength = motion_boundaries(flow).strength[40:80].mean(0)
     assert strength[50 + moved - 1 : 50 + moved + 1].max() > 0.75, "trailing"
     assert strength[100 + moved - 1 : 100 + moved + 1].max() > 0.75, "leading"
@@ -135,7 +135,7 @@ def test_true_boundaries_are_found(shared_data: Path) -> None:
         torch.from_numpy(np.array(matplotlib.image.imread(folder / f"frame{number}.png")))
         for number in (10, 11)
     )
-    flow = robust_flow(first[..., :3].mean(dim=-1), second[..., :3].mean(dim=-1), TRACKING)
+    flow = robust_flow(first[..., :3].mean(dim=-1), second[..., :3].mean(dim=-1), TRACKING_FLOW)
     found = motion_boundaries(flow).strength > 0.5
     true = flow_discontinuities(*read_flow(folder / "flow10.flo"))
 

@@ -12,7 +12,7 @@ from torchcss.vision.boundaries import motion_boundaries
 from torchcss.vision.camera import Camera
 from torchcss.vision.edges import EdgeConfiguration, edge_features, foreground_weight
 from torchcss.vision.features import FeatureExtractor, FrameFeatures, Window
-from torchcss.vision.flow import TRACKING, robust_flow
+from torchcss.vision.flow import TRACKING_FLOW, robust_flow
 from torchcss.vision.sampling import gaussian_blur
 
 
@@ -168,13 +168,13 @@ def assert_unusable(features: FrameFeatures) -> None:
 
 def test_features_of_motion(generator: torch.Generator) -> None:
     before, after, mask = moving_square(generator)
-    extractor = FeatureExtractor(flow=TRACKING)
+    extractor = FeatureExtractor(flow=TRACKING_FLOW)
     assert extractor(after).flow is None
     features = extractor(after, before)
     assert features.flow is not None
     assert features.flow_outlier is not None
     assert features.motion_boundary is not None
-    expected = robust_flow(before, after, TRACKING)
+    expected = robust_flow(before, after, TRACKING_FLOW)
     assert torch.equal(features.flow, expected.flow)
     assert torch.equal(features.motion_boundary, motion_boundaries(expected).potential)
     assert (features.flow_outlier >= expected.data_outlier - 1e-6).all()
@@ -190,7 +190,7 @@ def test_features_of_motion(generator: torch.Generator) -> None:
 
 def test_edge_fields_emphasise_what_moves(generator: torch.Generator) -> None:
     before, after, mask = moving_square(generator)
-    features = FeatureExtractor(flow=TRACKING)(after, before, mask)
+    features = FeatureExtractor(flow=TRACKING_FLOW)(after, before, mask)
     assert features.motion_boundary is not None
     plain = features.edge_energy * features.edge_direction
     weight = foreground_weight(mask)
@@ -209,7 +209,7 @@ def test_edge_fields_emphasise_what_moves(generator: torch.Generator) -> None:
 
 def test_a_repeated_frame_does_not_move(generator: torch.Generator) -> None:
     frame = texture(generator)
-    features = FeatureExtractor(flow=TRACKING)(frame, frame)
+    features = FeatureExtractor(flow=TRACKING_FLOW)(frame, frame)
     assert features.flow is not None
     assert features.flow_outlier is not None
     assert float(features.flow.abs().max()) < 1e-3
@@ -218,7 +218,7 @@ def test_a_repeated_frame_does_not_move(generator: torch.Generator) -> None:
 
 def test_a_dropped_frame_is_a_larger_motion(generator: torch.Generator) -> None:
     before, after, _ = moving_square(generator, shift=6)
-    features = FeatureExtractor(flow=TRACKING)(after, before)
+    features = FeatureExtractor(flow=TRACKING_FLOW)(after, before)
     assert features.flow is not None
     torch.testing.assert_close(
         features.flow[0, 25:35, 30:40].median(), torch.tensor(6.0), atol=0.3, rtol=0
@@ -226,7 +226,7 @@ def test_a_dropped_frame_is_a_larger_motion(generator: torch.Generator) -> None:
 
 
 def test_motion_across_a_cut_is_unusable(generator: torch.Generator) -> None:
-    extractor = FeatureExtractor(flow=TRACKING)
+    extractor = FeatureExtractor(flow=TRACKING_FLOW)
     one, other = texture(generator, 90, 120), texture(generator, 90, 120)
     assert_unusable(extractor(one, other))
     assert_unusable(extractor(one, 1.0 - one))
@@ -236,7 +236,7 @@ def test_motion_across_a_cut_is_unusable(generator: torch.Generator) -> None:
 def test_motion_of_a_frame_of_one_colour_is_unusable(
     level: float, generator: torch.Generator
 ) -> None:
-    extractor = FeatureExtractor(flow=TRACKING)
+    extractor = FeatureExtractor(flow=TRACKING_FLOW)
     flat, frame = torch.full((60, 80), level), texture(generator)
     for current, previous in ((flat, frame), (frame, flat), (flat, flat), (flat, 1.0 - flat)):
         features = extractor(current, previous)
@@ -249,7 +249,7 @@ def test_motion_of_a_frame_of_one_colour_is_unusable(
 def test_motion_of_thin_small_and_saturated_frames(
     size: tuple[int, int], dtype: torch.dtype, generator: torch.Generator
 ) -> None:
-    extractor = FeatureExtractor(flow=TRACKING, working_size=24, colour=True).to(dtype)
+    extractor = FeatureExtractor(flow=TRACKING_FLOW, working_size=24, colour=True).to(dtype)
     frames = torch.randint(0, 256, (2, *size, 4), generator=generator, dtype=torch.uint8)
     saturated = torch.where(frames > 128, 255, 0).to(torch.uint8)
     for before, after in (frames, saturated, (frames[0], saturated[1])):
@@ -267,7 +267,7 @@ def test_motion_of_thin_small_and_saturated_frames(
 
 
 def test_motion_between_pictures_of_all_kinds(picture: torch.Tensor) -> None:
-    extractor = FeatureExtractor(flow=TRACKING)
+    extractor = FeatureExtractor(flow=TRACKING_FLOW)
     shifted = picture.roll(2, dims=1)
     expected = extractor(shifted, picture)
     assert expected.flow is not None
@@ -298,7 +298,7 @@ def test_in_a_window_features_are_those_of_the_whole_but_for_its_border() -> Non
     texture = gaussian_blur(torch.rand(120, 160, generator=generator), 2.0)
     texture = (texture - texture.min()) / (texture.max() - texture.min())
     before, after = texture[:, :-2], texture[:, 2:]
-    extractor, window = FeatureExtractor(flow=TRACKING, colour=True), Window(40, 24, 128, 96)
+    extractor, window = FeatureExtractor(flow=TRACKING_FLOW, colour=True), Window(40, 24, 128, 96)
     whole = extractor(after, before)
     part = extractor(after, extractor(before), window=window)
     inner = (..., slice(24 + 20, 96 - 20), slice(40 + 20, 128 - 20))

@@ -19,7 +19,13 @@ from torch.nn import functional
 from torchcss.errors import ConfigurationError, FrameError, ShapeError
 from torchcss.robust import Leclerc, Lorentzian, Quadratic
 from torchcss.vision import flow as module
-from torchcss.vision.flow import ACCURATE, TRACKING, FlowConfiguration, OpticalFlow, robust_flow
+from torchcss.vision.flow import (
+    ACCURATE,
+    TRACKING_FLOW,
+    FlowConfiguration,
+    OpticalFlow,
+    robust_flow,
+)
 
 KINDS = (Lorentzian, Leclerc, Quadratic)
 
@@ -188,7 +194,7 @@ def test_structure_keeps_the_mean_and_has_less_variation(generator: torch.Genera
 # Scenes of known motion
 
 
-@pytest.mark.parametrize("configuration", [ACCURATE, TRACKING])
+@pytest.mark.parametrize("configuration", [ACCURATE, TRACKING_FLOW])
 @pytest.mark.parametrize("motion", [(0.4, -0.3), (5.5, 2.25)])
 def test_subpixel_translation(
     configuration: FlowConfiguration, motion: tuple[float, float]
@@ -204,12 +210,12 @@ def test_subpixel_translation(
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_potential_finds_the_motion(kind: type[Quadratic]) -> None:
     first, second = shifted(48, 64, 1.5, -2.0)
-    result = robust_flow(first, second, with_potentials(TRACKING, kind))
+    result = robust_flow(first, second, with_potentials(TRACKING_FLOW, kind))
     error = end_point_error(result.flow, torch.tensor([1.5, -2.0]).view(2, 1, 1))
     assert error[6:-6, 6:-6].mean() < 0.03
 
 
-@pytest.mark.parametrize("configuration", [ACCURATE, TRACKING])
+@pytest.mark.parametrize("configuration", [ACCURATE, TRACKING_FLOW])
 def test_moving_disc(configuration: FlowConfiguration) -> None:
     first, second, truth = disc(80, 100)
     boundary = flow_discontinuities(truth)
@@ -229,7 +235,7 @@ def test_moving_disc(configuration: FlowConfiguration) -> None:
     assert (quadratic.smoothness_outlier == 0.0).all()
 
 
-@pytest.mark.parametrize("configuration", [ACCURATE, TRACKING])
+@pytest.mark.parametrize("configuration", [ACCURATE, TRACKING_FLOW])
 def test_motion_of_a_tenth_of_the_frame(configuration: FlowConfiguration) -> None:
     first, second = shifted(120, 160, 12.0, -5.0)
     error = end_point_error(
@@ -240,13 +246,13 @@ def test_motion_of_a_tenth_of_the_frame(configuration: FlowConfiguration) -> Non
 
 def test_what_leaves_the_view_is_an_outlier() -> None:
     first, second = shifted(48, 64, 6.0, 0.0)
-    outlier = robust_flow(first, second, TRACKING).data_outlier
+    outlier = robust_flow(first, second, TRACKING_FLOW).data_outlier
     assert outlier[:, -4:].mean() > 0.95
     assert outlier[:, 8:-8].mean() < 0.1
 
 
 @pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
-@pytest.mark.parametrize("configuration", [ACCURATE, TRACKING])
+@pytest.mark.parametrize("configuration", [ACCURATE, TRACKING_FLOW])
 def test_any_batch(batch: tuple[int, ...], configuration: FlowConfiguration) -> None:
     first, second = (frame.expand(*batch, 33, 38) for frame in shifted(33, 38, 1.0, 0.5))
     result = robust_flow(first, second, configuration)
@@ -255,7 +261,7 @@ def test_any_batch(batch: tuple[int, ...], configuration: FlowConfiguration) -> 
     assert error[..., 6:-6, 6:-6].mean() < 0.03
 
 
-@pytest.mark.parametrize("configuration", [ACCURATE, TRACKING])
+@pytest.mark.parametrize("configuration", [ACCURATE, TRACKING_FLOW])
 def test_items_do_not_influence_each_other(
     configuration: FlowConfiguration, generator: torch.Generator
 ) -> None:
@@ -271,15 +277,15 @@ def test_items_do_not_influence_each_other(
 
 def test_double_agrees_with_single_precision() -> None:
     first, second = shifted(40, 50, 2.0, 1.0)
-    single = robust_flow(first, second, TRACKING)
-    double = robust_flow(first.double(), second.double(), TRACKING)
+    single = robust_flow(first, second, TRACKING_FLOW)
+    double = robust_flow(first.double(), second.double(), TRACKING_FLOW)
     assert double.flow.dtype == torch.float64
     torch.testing.assert_close(single.flow.double(), double.flow, atol=1e-2, rtol=0)
 
 
 def test_frames_that_require_gradients_are_fine() -> None:
     first, second = shifted(20, 20, 1.0, 0.0)
-    assert not robust_flow(first.requires_grad_(), second, TRACKING).flow.requires_grad
+    assert not robust_flow(first.requires_grad_(), second, TRACKING_FLOW).flow.requires_grad
 
 
 # Middlebury
@@ -302,7 +308,7 @@ DIS = {388: (0.223, 0.474), 480: (0.853, 1.715)}
 REACH = {388: 0.16, 480: 0.75}
 
 
-@pytest.mark.parametrize("configuration", [ACCURATE, TRACKING])
+@pytest.mark.parametrize("configuration", [ACCURATE, TRACKING_FLOW])
 def test_middlebury(pair: tuple[Tensor, ...], configuration: FlowConfiguration) -> None:
     first, second, truth, known = pair
     result = robust_flow(first, second, configuration)
@@ -319,7 +325,7 @@ def test_robust_beats_quadratic_near_boundaries(pair: tuple[Tensor, ...]) -> Non
     near = known & (functional.max_pool2d(boundary[None].float(), 11, 1, 5)[0] > 0.0)
     robust, quadratic = (
         end_point_error(robust_flow(first, second, configuration).flow, truth)[near].mean()
-        for configuration in (TRACKING, with_potentials(TRACKING, Quadratic))
+        for configuration in (TRACKING_FLOW, with_potentials(TRACKING_FLOW, Quadratic))
     )
     assert robust < 0.97 * quadratic
 
@@ -328,7 +334,7 @@ def test_robust_beats_quadratic_near_boundaries(pair: tuple[Tensor, ...]) -> Non
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("configuration", [ACCURATE, TRACKING])
+@pytest.mark.parametrize("configuration", [ACCURATE, TRACKING_FLOW])
 @pytest.mark.parametrize("size", [(1, 1), (1, 40), (40, 1), (2, 3), (37, 23)])
 def test_awkward_frames_give_finite_flow(
     kind: type[Quadratic],

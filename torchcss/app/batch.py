@@ -47,7 +47,7 @@ from urllib.parse import quote
 
 import tyro
 
-from torchcss.app.claims import Claim, Claims, process_name, repeated
+from torchcss.app.claims import Claims, WorkClaim, process_name, repeated
 from torchcss.app.recorder import Picture, ended_by_sigterm
 from torchcss.app.track import TrackOptions, track_video
 from torchcss.errors import ConfigurationError, OutputError, TorchcssError
@@ -67,20 +67,20 @@ from torchcss.joint_names import names_in
 from torchcss.tracking.session import Posterior
 from torchcss.tracking.settings import Settings, settings_from_plain
 
-FILES = names_in("video camera keypoints masks init")
+FILE_COLUMNS = names_in("video camera keypoints masks init")
 """Columns that are paths, from the manifest's folder on."""
 
-OPTIONS = names_in("camera_name layout person frame_rate sigma focal fov stride")
+OPTION_COLUMNS = names_in("camera_name layout person frame_rate sigma focal fov stride")
 """Columns that are options of the files, see `TrackOptions`."""
 
-SETTINGS = names_in("body preset seed samples modes keypoints_use working_size")
+SETTING_COLUMNS = names_in("body preset seed samples modes keypoints_use working_size")
 """Columns that are settings of this clip alone."""
 
 _NUMBERS = {
     **dict.fromkeys(names_in("start stop stride seed samples modes working_size"), int),
     **dict.fromkeys(names_in("frame_rate sigma focal fov"), float),
 }
-_COLUMNS = ("name", "start", "stop", *FILES, *OPTIONS, *SETTINGS)
+_COLUMNS = ("name", "start", "stop", *FILE_COLUMNS, *OPTION_COLUMNS, *SETTING_COLUMNS)
 _FOLDER = re.compile(r"(?!\.|batch\.(json|html)$)[^\0-\x1f\ud800-\udfff]+")
 """Names of clips: not hidden, not the batch's own files, and of signs that can be written."""
 
@@ -198,7 +198,7 @@ class Clip(NamedTuple):
     def fingerprint(self) -> list[list[int]]:
         """What changes when its files do."""
         found = []
-        for column in FILES:
+        for column in FILE_COLUMNS:
             with suppress(OSError):
                 if column in self.row:
                     about = os.stat(self.row[column])
@@ -261,7 +261,7 @@ def _clip(row: object, where: str, folder: Path) -> Clip:
             given[name] = _NUMBERS.get(name, str)(str(value))
         except ValueError as error:
             raise unexpected(ConfigurationError, f"{where}: {name}", what, value) from error
-        if name in FILES:
+        if name in FILE_COLUMNS:
             given[name] = os.path.abspath(folder / given[name])
     name = given.pop("name", Path(given["video"]).stem)
     if name != Path(name).name or not _FOLDER.fullmatch(name) or len(name.encode()) > 200:
@@ -429,7 +429,7 @@ class Deadly(TorchcssError):
 class _Watch:
     """A sink that tells how far a clip is, and ends the tracking when somebody took over."""
 
-    def __init__(self, claim: Claim) -> None:
+    def __init__(self, claim: WorkClaim) -> None:
         self._claim, self.first, self.done = claim, 0, 0
         self.total: int | None = None
 
@@ -447,7 +447,7 @@ class _Watch:
         """Nothing is open."""
 
 
-def _track(job: Job, clip: Clip, claim: Claim) -> None:
+def _track(job: Job, clip: Clip, claim: WorkClaim) -> None:
     """Track a claimed clip and publish it, or say why it failed."""
     place = job.out / ".batch" / "work" / clip.name / str(claim.generation)
     watch = _Watch(claim)
@@ -485,8 +485,8 @@ def _track_into(place: Path, job: Job, clip: Clip, watch: _Watch) -> None:
     begin, end = row.get("start", 0), row.get("stop")
     watch.first = begin
     watch.total = VideoReader(row["video"], start=begin, stop=end).num_selected
-    own = {name: row[name] for name in SETTINGS if name in row}
-    options = {name: row[name] for name in OPTIONS if name in row}
+    own = {name: row[name] for name in SETTING_COLUMNS if name in row}
+    options = {name: row[name] for name in OPTION_COLUMNS if name in row}
     options |= {name: Path(row[name]) for name in ("masks", "init") if name in row}
     track_video(
         row["video"],
@@ -516,7 +516,7 @@ def _go_on_from(place: Path) -> None:
     draft.rename(place)
 
 
-def _refuse_deadly(place: Path, claims: Claims, claim: Claim) -> None:
+def _refuse_deadly(place: Path, claims: Claims, claim: WorkClaim) -> None:
     """Raise where owner after owner died, and the checkpoint got no further.
 
     Whoever is asked to end, or fails the clip, lets it go, and the count begins anew.

@@ -57,7 +57,7 @@ class Sight(NamedTuple):
         return self.released or self.progress == _DIED
 
 
-class Claim:
+class WorkClaim:
     """One's own claim.
 
     Attributes:
@@ -137,7 +137,7 @@ class Claims:
         owner = lines[0] if lines else "unknown"
         return Sight(generation, owner, len(lines), lines[-1] if len(lines) > 1 else "")
 
-    def take(self, name: str, *, gone: bool = False) -> Claim | None:
+    def take(self, name: str, *, gone: bool = False) -> WorkClaim | None:
         """Claim something; None where somebody else has it, or was faster.
 
         Args:
@@ -164,11 +164,11 @@ class Claims:
         finally:
             with suppress(OSError):
                 draft.unlink(missing_ok=True)
-        return Claim(self, name, generation)
+        return WorkClaim(self, name, generation)
 
     def tell_dead(self, name: str, seen: Sight) -> None:
         """Say of a claim that its owner is dead: the next one may claim at once."""
-        Claim(self, name, seen.generation).beat(_DIED)
+        WorkClaim(self, name, seen.generation).beat(_DIED)
 
     def _stands_still(self, name: str, seen: Sight) -> bool:
         now, state = self._clock(), (seen.generation, seen.counter)

@@ -33,7 +33,7 @@ _OF_FILE = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lens:
+class KnownLens:
     """What is known of a lens.
 
     Attributes:
@@ -69,7 +69,7 @@ class Lens:
             raise CameraError("give --camera, --focal or --fov, not several")
         return calibration
 
-    def of(self, video: Path) -> Lens:
+    def of(self, video: Path) -> KnownLens:
         """The lens, with what the video's file says of it where the user says nothing.
 
         Raises:
@@ -80,7 +80,7 @@ class Lens:
         info = VideoReader(video).info
         focal = equivalent * math.hypot(info.width, info.height) / _DIAGONAL_35MM
         source = f"from the file's own {equivalent:g} mm on 35 mm film"
-        return Lens(focal=focal, source=source, deviation=_OF_FILE)
+        return KnownLens(focal=focal, source=source, deviation=_OF_FILE)
 
     @property
     def is_known(self) -> bool:

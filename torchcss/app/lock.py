@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from torchcss.app.claims import Claim, Claims, Sight
+from torchcss.app.claims import Claims, Sight, WorkClaim
 from torchcss.errors import OutputError
 from torchcss.files import prepare_output_folder
 
@@ -26,7 +26,7 @@ PATIENCE_S = 20.0
 
 
 @contextmanager
-def locked(folder: Path, *, patience_s: float = PATIENCE_S) -> Iterator[Claim]:
+def locked(folder: Path, *, patience_s: float = PATIENCE_S) -> Iterator[WorkClaim]:
     """Hold the lock of a folder.
 
     Args:
@@ -51,7 +51,7 @@ def locked(folder: Path, *, patience_s: float = PATIENCE_S) -> Iterator[Claim]:
             (folder / LOCK_NAME).rmdir()
 
 
-def _claimed(claims: Claims) -> Claim:
+def _claimed(claims: Claims) -> WorkClaim:
     first: Sight | None = None
     while True:
         seen = claims.sight(LOCK_NAME)

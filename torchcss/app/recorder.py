@@ -28,7 +28,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 from tqdm import tqdm
 
-from torchcss.app.claims import Claim
+from torchcss.app.claims import WorkClaim
 from torchcss.errors import OutputError
 from torchcss.files import output_error
 from torchcss.io.cameras import calibration
@@ -127,7 +127,7 @@ class Recorder:
     on_first_frame: Callable[[], None] | None = None
     checkpoint_every: float = CHECKPOINT_EVERY
     begun: Run | None = None
-    lock: Claim | None = None
+    lock: WorkClaim | None = None
 
     def __post_init__(self) -> None:
         session = self.session

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchcss.app.view_files import Selection, moments, open_view
+from torchcss.app.view_files import FrameSelection, moments, open_view
 from torchcss.body.bases import pose_track
 from torchcss.errors import ConfigurationError, TrackFileError
 from torchcss.files import StrPath, prepare_output_folder
@@ -23,7 +23,7 @@ from torchcss.io.tracks import SMOOTH_NAME, TRACK_NAME, Track, save_track, write
 from torchcss.tracking import smooth_images
 from torchcss.tracking.settings import Settings, settings_from_plain
 from torchcss.tracking.smooth import Smoothed, Smoothing, TrackedModes, smooth_modes
-from torchcss.tracking.smooth_images import IMAGES, Images
+from torchcss.tracking.smooth_images import IMAGES, ShownFrames
 from torchcss.tracking.view import CameraView
 from torchcss.types import Status
 
@@ -98,7 +98,7 @@ def smooth_track(track: Track, choice: Smoothing | None = None) -> SmoothedTrack
 
 def smooth_frames(
     track: Track,
-    images: Iterable[Images],
+    images: Iterable[ShownFrames],
     *,
     settings: Settings,
     views: Sequence[CameraView],
@@ -117,7 +117,7 @@ def smooth_frames(
         TorchcssError: As `smooth_track`; or if frames are missing.
     """
     began, body = time.perf_counter(), body_of_track(track)
-    done = smooth_images.smooth_frames(
+    done = smooth_images.smooth_modes_on_images(
         body, _tensors(track), images, settings=settings, views=views, choice=choice
     )
     refined = done.refined
@@ -210,7 +210,7 @@ def _effect(track: Track, modes: Int[np.ndarray, " t"], smooth: Track) -> dict[s
 
 def _with_images(run: Run, choice: Smoothing) -> SmoothedTrack:
     """Smooth a run with the images of its cameras in view."""
-    track, settings = run.track, settings_of(run)
+    track, settings = run.track, run_settings(run)
     if not len(track.frames):
         raise TrackFileError(f"{run.path}: the track has no frames, of which images could show any")
     files = run.cameras[0].files if run.cameras else None
@@ -226,7 +226,7 @@ def _with_images(run: Run, choice: Smoothing) -> SmoothedTrack:
         )
     first, stop = int(track.frames[0]), int(track.frames[-1]) + 1
     views = [
-        open_view(each.files, each.camera, Selection(start=first, stop=stop))
+        open_view(each.files, each.camera, FrameSelection(start=first, stop=stop))
         for each in run.cameras
         if each.files is not None
     ]
@@ -239,7 +239,7 @@ def _with_images(run: Run, choice: Smoothing) -> SmoothedTrack:
     )
 
 
-def settings_of(run: Run) -> Settings:
+def run_settings(run: Run) -> Settings:
     """The settings that a run was made with, for evaluation on the processor in float64.
 
     Args:

@@ -18,13 +18,13 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from torchcss.app.claims import Claim
+from torchcss.app.claims import WorkClaim
 from torchcss.app.detect import DetectOptions, detect_video, is_detected, masks_of
 from torchcss.app.init import initialise_video
-from torchcss.app.lens import PERSONS, Lens, fitted
+from torchcss.app.lens import PERSONS, KnownLens, fitted
 from torchcss.app.lock import locked
 from torchcss.app.recorder import CHECKPOINT_EVERY, Recorder, Sink
-from torchcss.app.view_files import OpenView, Selection, moments, open_view
+from torchcss.app.view_files import FrameSelection, OpenView, moments, open_view
 from torchcss.cost.view import View
 from torchcss.errors import CameraError, ConfigurationError, TrackFileError
 from torchcss.files import StrPath, naming
@@ -135,7 +135,7 @@ def track_video(
     """
     settings, options = settings or Settings(), options or TrackOptions()
     out = prepare_output_folder(Path(out))
-    selection = Selection(start=start, stop=stop, stride=options.stride)
+    selection = FrameSelection(start=start, stop=stop, stride=options.stride)
     with locked(out) as lock:
         if options.resume and (out / TRACK_NAME).is_file():
             begun = Run.open(out)
@@ -158,9 +158,9 @@ def _begin(
     views: Sequence[OpenView],
     out: Path,
     settings: Settings,
-    selection: Selection,
+    selection: FrameSelection,
     options: TrackOptions,
-    lock: Claim,
+    lock: WorkClaim,
 ) -> Run:
     """Find the first pose, and track from it."""
     start = selection.start
@@ -226,7 +226,7 @@ def _with_keypoints(
     files: ViewFiles,
     source: Path | LoadedCamera,
     out: Path,
-    selection: Selection,
+    selection: FrameSelection,
     options: TrackOptions,
 ) -> ViewFiles:
     """The files with keypoints, which are detected where none are given, and their masks."""
@@ -241,7 +241,7 @@ def _with_keypoints(
     return replace(files, keypoints=keypoints, masks=masks)
 
 
-def _detect(video: Path, keypoints: Path, selection: Selection, options: TrackOptions) -> None:
+def _detect(video: Path, keypoints: Path, selection: FrameSelection, options: TrackOptions) -> None:
     """Find the keypoints of the frames that are tracked."""
     detect_video(
         video, keypoints, options.detect, frame_rate=options.frame_rate,
@@ -249,7 +249,7 @@ def _detect(video: Path, keypoints: Path, selection: Selection, options: TrackOp
     )  # fmt: skip
 
 
-def _detect_further(run: Run, selection: Selection, options: TrackOptions) -> None:
+def _detect_further(run: Run, selection: FrameSelection, options: TrackOptions) -> None:
     """Find the keypoints anew where a run goes on beyond the frames that were looked at."""
     own = run.cameras[0].files
     found = (run.folder / _KEYPOINTS_NAME).resolve()
@@ -263,7 +263,7 @@ def _camera_of(
     video: Path, camera: StrPath | None, options: TrackOptions
 ) -> tuple[Path | LoadedCamera, bool]:
     """The calibration file or the camera, and whether its focal length is known."""
-    lens = Lens(focal=options.focal, fov=options.fov)
+    lens = KnownLens(focal=options.focal, fov=options.fov)
     if camera is not None:
         return lens.unless(Path(camera)), True
     lens = lens.of(video)
@@ -273,7 +273,7 @@ def _camera_of(
 def _all_views(
     own: ViewFiles,
     source: Path | LoadedCamera,
-    selection: Selection,
+    selection: FrameSelection,
     options: TrackOptions,
 ) -> list[OpenView]:
     """The files of all cameras opened."""
@@ -314,11 +314,11 @@ def resume(run: Run | StrPath, *, live: Sink | None = None) -> Run:
     known = run.checkpoint.notes["extra"]["frames_selected"]
     settings = settings_from_plain(run.settings)
     with locked(run.folder) as lock:
-        return _go_on(run, settings, Selection(**known), TrackOptions(live=live), lock)
+        return _go_on(run, settings, FrameSelection(**known), TrackOptions(live=live), lock)
 
 
 def _go_on(
-    run: Run, settings: Settings, selection: Selection, options: TrackOptions, lock: Claim
+    run: Run, settings: Settings, selection: FrameSelection, options: TrackOptions, lock: WorkClaim
 ) -> Run:
     """Track the frames that a run has not got to."""
     checkpoint, out = run.checkpoint, run.folder
@@ -353,15 +353,17 @@ def _record(recorder: Recorder, views: Sequence[OpenView]) -> Run:
     run = Run.open(recorder.folder)
     if recorder.session.settings.overlay:
         # Drawing figures takes long to import.
-        from torchcss.show.report import write_report
+        from torchcss.show.report import write_report_page
 
         _now("drawing overlay and report")
         write_overlays(run, 1 / recorder.frame_interval)
-        write_report(run)
+        write_report_page(run)
     return run
 
 
-def _check_same(run: Run, settings: Settings, selection: Selection, known: dict[str, Any]) -> None:
+def _check_same(
+    run: Run, settings: Settings, selection: FrameSelection, known: dict[str, Any]
+) -> None:
     """Refuse to go on with other settings or frames than a run was begun with."""
     before = {**asdict(settings_from_plain(run.settings)), **known}
     other = [
@@ -447,7 +449,7 @@ def _first_pose_from_file(path: Path, camera: Camera, settings: Settings) -> Ini
 
 
 def _description(
-    views: Sequence[OpenView], first: Initialisation, selection: Selection
+    views: Sequence[OpenView], first: Initialisation, selection: FrameSelection
 ) -> dict[str, Any]:
     """Entries of the summary about the files."""
     return {

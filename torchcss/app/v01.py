@@ -13,7 +13,7 @@ from torchcss.app.smooth import SmoothedTrack, smooth
 from torchcss.body.model import BodyModel
 from torchcss.files import StrPath
 from torchcss.initialise.result import Initialisation
-from torchcss.io.export import Export, ExportOptions, export
+from torchcss.io.export import Exported, ExportOptions, export
 from torchcss.io.run import Given, GivenKeypoints, Run, body_of_track
 from torchcss.io.tracks import Track
 from torchcss.tracking.session import Images, Posterior, TrackingSession
@@ -67,7 +67,7 @@ def export_track(
     out: StrPath | None = None,
     body: BodyModel | None = None,
     options: ExportOptions | None = None,
-) -> Export:
+) -> Exported:
     """As `torchcss.export`; a track of version 0.1 needs the body."""
     _say("export_track", "torchcss.export(run, path)")
     known = _with(track, body) if isinstance(track, Track) else _opened(track, body)

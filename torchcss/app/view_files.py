@@ -130,7 +130,7 @@ def moments(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Selection:
+class FrameSelection:
     """Which frames of the first camera's video.
 
     Attributes:
@@ -145,7 +145,7 @@ class Selection:
 
 
 def open_view(
-    files: ViewFiles, camera: Path | Camera | LoadedCamera, selection: Selection | None = None
+    files: ViewFiles, camera: Path | Camera | LoadedCamera, selection: FrameSelection | None = None
 ) -> OpenView:
     """Open the files of a view.
 
@@ -157,7 +157,7 @@ def open_view(
     Raises:
         TorchcssError: If a file cannot be read, or two of them do not belong together.
     """
-    start, stop, stride = astuple(selection or Selection())
+    start, stop, stride = astuple(selection or FrameSelection())
     if start < 0:
         raise VideoError(f"{files.video}: start must be at least 0, got {start}")
     start, stop = start + files.offset, None if stop is None else stop + files.offset

@@ -29,7 +29,7 @@ from typing import NamedTuple
 import numpy as np
 
 from torchcss.body.chain import JointSpecification
-from torchcss.body.rotations import Vector, as_rows, as_vector
+from torchcss.body.rotations import Vector3, as_rows, as_vector
 from torchcss.errors import BodyError
 
 _TABLE = tomllib.loads(Path(__file__).with_name("humanoid.toml").read_text(encoding="utf-8"))
@@ -88,8 +88,8 @@ class PartSpecification:
 
     name: str
     link: str
-    translation: Vector
-    rotation: tuple[Vector, Vector, Vector]
+    translation: Vector3
+    rotation: tuple[Vector3, Vector3, Vector3]
     shape: tuple[float, ...]
 
 
@@ -105,7 +105,7 @@ class MarkerSpecification:
 
     name: str
     link: str
-    translation: Vector = (0.0, 0.0, 0.0)
+    translation: Vector3 = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -234,7 +234,7 @@ class _Builder:
             total += math.prod(self.lengths[w] if w in self.lengths else float(w) for w in words)
         return total
 
-    def _joint(self, name: str, row: _Row, place: Vector, mirror: np.ndarray) -> None:
+    def _joint(self, name: str, row: _Row, place: Vector3, mirror: np.ndarray) -> None:
         """Add a joint that turns, slides, or is fixed."""
         kind, axis = "fixed", np.array([0.0, 0.0, 1.0])
         if row.slide:
@@ -262,7 +262,7 @@ class _Builder:
         kind: str,
         axis: np.ndarray,
         limits: Sequence[float],
-        place: Vector = (0.0, 0.0, 0.0),
+        place: Vector3 = (0.0, 0.0, 0.0),
     ) -> None:
         """Hang a joint on the present link, and go on below it."""
         joint = JointSpecification(
@@ -354,7 +354,7 @@ def scaled(body: BodySpecification, scale: float) -> BodySpecification:
     if scale == 1.0:
         return body
 
-    def times(vector: Vector) -> Vector:
+    def times(vector: Vector3) -> Vector3:
         return as_vector(scale * np.array(vector))
 
     unit = {joint.name: scale if joint.kind == "prismatic" else 1.0 for joint in body.joints}

@@ -37,7 +37,7 @@ from torchcss.body.catalog import (
     specification,
 )
 from torchcss.body.chain import JointSpecification
-from torchcss.body.files.bvh import Skeleton, read_bvh_skeleton
+from torchcss.body.files.bvh import HungTree, read_bvh_skeleton
 from torchcss.body.files.default_shape import bone_parts, rest_poses, touching_parts
 from torchcss.body.files.mjcf import read_mjcf
 from torchcss.body.files.urdf import read_urdf
@@ -199,7 +199,7 @@ def _from_file(path: Path, options: FileOptions, free_root: bool | None) -> Body
 
 def _read(
     path: Path, units: str | float | None
-) -> tuple[Skeleton, tuple[PartSpecification, ...], tuple[tuple[float, ...], ...]]:
+) -> tuple[HungTree, tuple[PartSpecification, ...], tuple[tuple[float, ...], ...]]:
     """Tree, solids, and how the file's frame hangs on a root that is Y up."""
     if path.suffix.lower() == ".bvh":
         try:

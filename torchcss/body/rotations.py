@@ -27,7 +27,7 @@ from torchcss.errors import ConfigurationError, check_shape
 
 Matrix = Float[np.ndarray, "3 3"]
 
-Vector = tuple[float, float, float]
+Vector3 = tuple[float, float, float]
 
 ROUNDING = 1e-4
 """What is rounding in a rotation that was written down, in the entries of `R R^T`."""
@@ -213,13 +213,13 @@ def root_angles(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 
     return torch.stack([yaw, pitch, roll], dim=-1)
 
 
-def as_vector(values: Float[np.ndarray, "3"]) -> Vector:
+def as_vector(values: Float[np.ndarray, "3"]) -> Vector3:
     """Three numbers, as specifications hold them."""
     x, y, z = values.tolist()
     return x, y, z
 
 
-def as_rows(matrix: Matrix) -> tuple[Vector, Vector, Vector]:
+def as_rows(matrix: Matrix) -> tuple[Vector3, Vector3, Vector3]:
     """The rows of a rotation, as specifications hold them."""
     a, b, c = matrix
     return as_vector(a), as_vector(b), as_vector(c)

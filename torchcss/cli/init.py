@@ -15,7 +15,7 @@ from torchcss.body.catalog import PROPORTIONS
 from torchcss.cli.options import PathArgument
 from torchcss.errors import ConfigurationError, KeypointError
 from torchcss.files import load_json, prepare_output_folder
-from torchcss.initialise.multi_start import PAPER_LENGTHS, Search
+from torchcss.initialise.multi_start import PAPER_LENGTHS, StartSearch
 from torchcss.initialise.options import InitialiseOptions
 from torchcss.io.video import read_frame
 from torchcss.tracking.settings import Settings
@@ -87,7 +87,7 @@ class Init:
             num_modes={"best": 1, "all": None}.get(str(self.hypotheses), self.hypotheses),  # type: ignore[arg-type]
             contours=self.contours,
             colours=self.colours,
-            search=Search(proportions=proportions, coarse_pose=_coarse_pose(self.coarse_pose)),
+            search=StartSearch(proportions=proportions, coarse_pose=_coarse_pose(self.coarse_pose)),
             dtype=torch.float32 if self.dtype == "float32" else torch.float64,
             device=self.device,
             free_root=self.free_root,

@@ -66,7 +66,7 @@ class Report:
 
     def run(self) -> None:
         """Run the verb."""
-        from torchcss.show.report import write_report
+        from torchcss.show.report import write_report_page
 
         run = Run.open(self.track, self.given)
-        print(f"wrote {write_report(run, anew=self.given.video is not None)}")
+        print(f"wrote {write_report_page(run, anew=self.given.video is not None)}")

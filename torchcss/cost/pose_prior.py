@@ -51,7 +51,7 @@ Each = Float[Tensor, " k"]
 Square = Float[Tensor, "k d d"]
 """a matrix."""
 
-Batch = Float[Tensor, "*batch d"]
+LimbDirections = Float[Tensor, "*batch d"]
 """Directions of a group, three numbers each."""
 
 FILE = Path(__file__).with_name("pose_prior.npz")
@@ -172,7 +172,9 @@ def _axes(unit: Float[Tensor, "*batch m 3"], line: int) -> _Axes:
     return _Axes(torch.stack([left, up, front], dim=-2), normal)
 
 
-def limb_directions(joints: Float[Tensor, "*batch j 3"], which: Directions) -> dict[str, Batch]:
+def limb_directions(
+    joints: Float[Tensor, "*batch j 3"], which: Directions
+) -> dict[str, LimbDirections]:
     """The directions of each group of posed bodies in its frame, three numbers each.
 
     Those of a right arm are mirrored, so that arms are alike.
@@ -319,7 +321,7 @@ class Density(NamedTuple):
     uniform: float
 
     def parts(
-        self, directions: Batch
+        self, directions: LimbDirections
     ) -> tuple[Float[Tensor, "*batch k+1"], Float[Tensor, "*batch k d"]]:
         """Log densities of all parts, the uniform one last, and the pulls of the Gaussians."""
         offset = directions[..., None, :] - self.mean
@@ -328,11 +330,11 @@ class Density(NamedTuple):
         tail = exponent.new_full((*exponent.shape[:-1], 1), self.uniform)
         return torch.cat([exponent, tail], dim=-1), pull
 
-    def cost(self, directions: Batch) -> Float[Tensor, "*batch"]:
+    def cost(self, directions: LimbDirections) -> Float[Tensor, "*batch"]:
         """`-log p`, nats."""
         return -self.parts(directions)[0].logsumexp(-1)
 
-    def local_model(self, directions: Batch) -> LocalModel:
+    def local_model(self, directions: LimbDirections) -> LocalModel:
         """`-log p`, its gradient, and a Hessian without negative directions.
 
         The Hessian is that of the bound from above that expectation maximisation uses: the mean
@@ -346,7 +348,7 @@ class Density(NamedTuple):
         return LocalModel(-parts.logsumexp(-1), gradient, hessian)
 
 
-def mirrored(directions: Batch, group: str) -> Batch:
+def mirrored(directions: LimbDirections, group: str) -> LimbDirections:
     """The directions of the mirror image of a pose; of trunk or legs, all of them."""
     each = directions.unflatten(-1, (-1, 3)) * directions.new_tensor([-1.0, 1.0, 1.0])
     if group == "trunk":

@@ -78,7 +78,7 @@ class Transition:
         return step * velocity, change * acceleration
 
 
-class Motion(NamedTuple):
+class TransitionSum(NamedTuple):
     """The transitions' share of the sum.
 
     Attributes:
@@ -110,7 +110,7 @@ class Chain(NamedTuple):
     frames: LocalModel
 
     @staticmethod
-    def of(frames: LocalModel, motion: Motion) -> Chain:
+    def of(frames: LocalModel, motion: TransitionSum) -> Chain:
         """Frames and transitions together."""
         return Chain(
             frames.value.sum() + motion.value,
@@ -251,7 +251,7 @@ def held_by(x: Tensor, gradient: Tensor, bounds: Bounds) -> Bool[Tensor, "t n"]:
 
 def motion_terms(
     x: Trajectory, times: Float[Tensor, " t"], transition: Transition, changes: Changes
-) -> Motion:
+) -> TransitionSum:
     """Value, gradient and (Gauss-Newton) Hessian of the transitions.
 
     Args:
@@ -306,7 +306,7 @@ def motion_terms(
                 (weight * ratio)[..., None] * far_slope[:-2],
             ],
         )
-    return Motion(value, gradient, band)
+    return TransitionSum(value, gradient, band)
 
 
 def with_slope(

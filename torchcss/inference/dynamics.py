@@ -77,7 +77,7 @@ class ConstantVelocity:
         return Diffusion(deviation=self.deviation).predict(moved, velocity)
 
 
-Transition = Callable[[Vector, Vector], Vector]
+ExpectedMotion = Callable[[Vector, Vector], Vector]
 """Next state, expected, from one state and how far it moved in the last frame. It must be made of
 operations that `torch.func` can map over modes and differentiate."""
 
@@ -91,11 +91,11 @@ class Learned:
     move by g alone.
 
     Attributes:
-        transition: g, see `Transition`.
+        transition: g, see `ExpectedMotion`.
         deviation: Standard deviation of what g does not predict, as in `Diffusion`.
     """
 
-    transition: Transition
+    transition: ExpectedMotion
     deviation: Deviation = 0.0
 
     def predict(self, mixture: GaussianMixture, velocity: Vectors) -> GaussianMixture:

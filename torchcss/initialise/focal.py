@@ -25,7 +25,7 @@ from torchcss.cost.joints import match_joints
 from torchcss.cost.total import TrackingCost
 from torchcss.cost.view import View
 from torchcss.initialise.from_joints import hang_before_camera
-from torchcss.initialise.multi_start import descend, optimise, starts_about
+from torchcss.initialise.multi_start import descend_widened, optimise, starts_about
 from torchcss.initialise.options import InitialiseOptions
 from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
@@ -115,7 +115,7 @@ def _costs(
     x = starts_about(body, _NUM_STARTS, generator).repeat(num, 1)
     x[:, [body.state_index(name) for name in ROOT_NAMES[:3]]] += places[frame]
     first = _before(cost, cameras[middle], frame)
-    x = descend(first, x, bounds, _SCHEDULE)
+    x = descend_widened(first, x, bounds, _SCHEDULE)
     best = first.value(x).nan_to_num(math.inf).view(num, _NUM_STARTS).argsort(1)[:, :2]
     x = x[(best + _NUM_STARTS * torch.arange(num)[:, None]).flatten()]
     frame = torch.arange(num).repeat_interleave(2)

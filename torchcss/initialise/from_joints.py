@@ -30,10 +30,10 @@ from torchcss.cost.joints import JointTargets, match_joints
 from torchcss.cost.total import TrackingCost
 from torchcss.cost.view import View
 from torchcss.errors import CameraError
-from torchcss.initialise.keypoint_checks import check_joints
+from torchcss.initialise.keypoint_checks import check_keypoints
 from torchcss.initialise.multi_start import multi_start_fits
 from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
-from torchcss.initialise.outliers import best_distinct, fits_and_outliers, refine, without
+from torchcss.initialise.outliers import best_distinct, fits_and_outliers, refine_fits, without
 from torchcss.initialise.result import (
     STANDARD_STATURE,
     Initialisation,
@@ -90,7 +90,7 @@ def fit_joints(
     assert view.keypoints is not None
     keypoints = view.keypoints.only(free.joint_names).to(free.tie)
     keypoints = keypoints.without(~keypoints.positions.isfinite().all(-1))
-    notes = (*free.notes, *check_joints(free.name, keypoints, view.camera, options.least_joints))
+    notes = (*free.notes, *check_keypoints(free.name, keypoints, view.camera, options.least_joints))
     cost = options.joint_cost(free, (View(view.camera, keypoints), *others))
     if isinstance(body, BodyModel):
         _check_in_view(body, view.camera)
@@ -156,14 +156,14 @@ def _with_lengths_held(
     body = with_lengths(free, lengths, scale, free_root=True)
     starts = columns_of(free, body, candidates)
     body, starts, _ = move_base(body, *root_pose(body, starts[0]), starts)
-    refined = refine(cost.with_body(body), starts, options.search)
+    refined = refine_fits(cost.with_body(body), starts, options.search)
     if not (options.free_root or has_free_root(free.name)):
         # The root of the best fit becomes the arm's base, and only its angles are searched.
         best = refined.mean[int(refined.cost.nan_to_num(math.inf).argmin())]
         arm = with_lengths(free, lengths, scale, free_root=None)
         arm = arm.with_base(*base_without_root(body, arm, best))
         starts = columns_of(body, arm, refined.mean)
-        body, refined = arm, refine(cost.with_body(arm), starts, options.search)
+        body, refined = arm, refine_fits(cost.with_body(arm), starts, options.search)
     kept, search = best_distinct(refined, num), options.search
     if has_root(body):
         body, kept = hang_on_best(body, kept)

@@ -14,7 +14,7 @@ import torch
 from torchcss.body.root import has_root
 from torchcss.cost.total import TrackingCost
 from torchcss.errors import KeypointError, check_shape
-from torchcss.initialise.multi_start import Search, multi_start_fits
+from torchcss.initialise.multi_start import StartSearch, multi_start_fits
 from torchcss.initialise.outliers import capped_cost
 from torchcss.joint_names import JOINT_NAMES, canonical_joint_name
 from torchcss.types import Keypoints, Vector
@@ -113,7 +113,7 @@ def typical_sigma(keypoints: Keypoints) -> float:
     return statistics.median(sizes)
 
 
-def check_joints(name: str, keypoints: Keypoints, camera: Camera, least: int) -> tuple[str, ...]:
+def check_keypoints(name: str, keypoints: Keypoints, camera: Camera, least: int) -> tuple[str, ...]:
     """Refuse joints from which nothing can be fitted, and say what is odd about the others.
 
     Args:
@@ -169,7 +169,7 @@ def swapped_sides(cost: TrackingCost, x: Vector, generator: torch.Generator) -> 
     best = float(capped_cost(cost, x))
     if best < _SUSPICIOUS * int((given.confidence > 0).sum()) or not has_root(cost.body):
         return ()
-    quick = Search(num_starts=24, num_flips=0, num_samples=0, max_steps=30)
+    quick = StartSearch(num_starts=24, num_flips=0, num_samples=0, max_steps=30)
     costs: dict[str, float] = {}
     for what, places in _SIDED.items():
         names = tuple(_other_side(name, places) for name in given.names)

@@ -62,7 +62,7 @@ _SAME_ANGLE = 0.05
 
 
 @frozen
-class Search:
+class StartSearch:
     """How widely poses are looked for.
 
     Attributes:
@@ -135,7 +135,7 @@ PAPER_LENGTHS = (*PAPER_PROPORTIONS, "trunk", "upper_arm", "forearm", "thigh", "
 """What the first stage of section 5 [IJRR] fits: x_i, and the sizes of parts as lengths of bones.
 Shoulder width and neck stay the standard humanoid's."""
 
-SINGLE_START = Search(
+SINGLE_START = StartSearch(
     num_starts=1, num_flips=0, num_samples=0, anneal=False, leave_out=False, max_steps=100
 )
 """One descent from the rest pose: what a local fit without search does."""
@@ -147,7 +147,9 @@ _TURNS = 8
 """Directions that a turned start is looked for in."""
 
 
-def multi_start_fits(cost: TrackingCost, *, search: Search, generator: torch.Generator) -> Modes:
+def multi_start_fits(
+    cost: TrackingCost, *, search: StartSearch, generator: torch.Generator
+) -> Modes:
     """Descend from many starts to the minima of a cost of keypoints.
 
     Args:
@@ -162,7 +164,7 @@ def multi_start_fits(cost: TrackingCost, *, search: Search, generator: torch.Gen
     bounds = search.bounds(body)
     first = starts_about(body, search.num_starts, generator)
     first[:1] = _coarse_start(cost, first[:1], search)
-    fits = descend(
+    fits = descend_widened(
         cost, first, bounds,
         ((_WIDE, 12), (_MIDDLE, 12)) if search.anneal else (),
     )  # fmt: skip
@@ -185,7 +187,7 @@ def multi_start_fits(cost: TrackingCost, *, search: Search, generator: torch.Gen
             proposal = CovarianceScaled(covariance_scale=search.covariance_scale)
             samples = proposal.sample(mixture, search.num_samples, bounds, generator=generator)
             starts.append(samples.x)
-    x = descend(cost, torch.cat(starts), bounds, ((_MIDDLE, 10),) if search.anneal else ())
+    x = descend_widened(cost, torch.cat(starts), bounds, ((_MIDDLE, 10),) if search.anneal else ())
     return optimise(cost, x, bounds, search.max_steps)
 
 
@@ -194,7 +196,7 @@ def optimise(cost: TrackingCost, x: Vectors, bounds: Bounds, steps: int) -> Mode
     return TrustRegionNewton(max_steps=steps, tolerance=1e-2).minimise(cost, x, bounds)
 
 
-def descend(
+def descend_widened(
     cost: TrackingCost, x: Tensor, bounds: Bounds, schedule: tuple[tuple[float, int], ...]
 ) -> Tensor:
     """Descend with the keypoints' scale widened by each factor in turn.
@@ -238,7 +240,7 @@ def _all_round(x: Vectors) -> Numbers:
     return within_half_turn(turn)
 
 
-def _coarse_start(cost: TrackingCost, x: Vectors, search: Search) -> Vectors:
+def _coarse_start(cost: TrackingCost, x: Vectors, search: StartSearch) -> Vectors:
     """A start with the parameters of the coarse pose, turned as the keypoints say."""
     body, x = cost.body, x.clone()
     for name, value in search.coarse_pose.items():

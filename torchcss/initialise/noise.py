@@ -24,8 +24,8 @@ from torch import Tensor
 
 from torchcss.cost.joints import JointTerm, match_joints
 from torchcss.cost.total import TrackingCost
-from torchcss.initialise.multi_start import Search, widened
-from torchcss.initialise.outliers import refine
+from torchcss.initialise.multi_start import StartSearch, widened
+from torchcss.initialise.outliers import refine_fits
 from torchcss.linalg import symmetric_part
 from torchcss.types import Curvature, Vector, Vectors
 
@@ -50,14 +50,14 @@ class Noise(NamedTuple):
     is_guess: bool = False
 
 
-def briefly(search: Search) -> Search:
+def briefly(search: StartSearch) -> StartSearch:
     """How widely to look for a fit that tells the noise: errors do not tell flipped limbs apart."""
     return replace(
         search, num_starts=min(16, search.num_starts), num_flips=0, num_samples=0, leave_out=False
     )
 
 
-def noise_factor(cost: TrackingCost, x: Vector, search: Search) -> float:
+def noise_factor(cost: TrackingCost, x: Vector, search: StartSearch) -> float:
     """How many times as noisy as a cost assumes its keypoints are.
 
     Args:
@@ -69,12 +69,12 @@ def noise_factor(cost: TrackingCost, x: Vector, search: Search) -> float:
     cost = replace(cost, choice=replace(cost.choice, curvature=Curvature.GAUSS_NEWTON))
     for _ in range(_TURNS):
         wide = widened(cost, factor)
-        state = refine(wide, state, search).mean
+        state = refine_fits(wide, state, search).mean
         factor *= _left_over(wide, state, search)
     return factor
 
 
-def _left_over(cost: TrackingCost, x: Vectors, search: Search) -> float:
+def _left_over(cost: TrackingCost, x: Vectors, search: StartSearch) -> float:
     """The factor that follows from the errors of one fit."""
     joints, points = cost.choice.find(JointTerm), cost.body.pose(x[0]).joints
     assert joints is not None
@@ -94,7 +94,7 @@ def _left_over(cost: TrackingCost, x: Vectors, search: Search) -> float:
     return math.sqrt((BELIEF + float((w * z2).sum())) / (BELIEF + expected))
 
 
-def _explained(cost: TrackingCost, x: Vectors, search: Search) -> float:
+def _explained(cost: TrackingCost, x: Vectors, search: StartSearch) -> float:
     """How many parameters the keypoints determine."""
     lower, upper = search.bounds(cost.body)
     moves = (x[0] > lower) & (x[0] < upper)

@@ -21,7 +21,7 @@ from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.total import Engine, TrackingCost
 from torchcss.cost.view import View
 from torchcss.errors import ConfigurationError
-from torchcss.initialise.multi_start import PAPERS, Search
+from torchcss.initialise.multi_start import PAPERS, StartSearch
 from torchcss.robust import Lorentzian
 from torchcss.types import frozen
 
@@ -74,7 +74,7 @@ class InitialiseOptions:
     colours: bool = True
     bends: bool = False
     working_size: int = 640
-    search: Search = field(default_factory=Search)
+    search: StartSearch = field(default_factory=StartSearch)
     potential_kind: type = Lorentzian
     weights: Mapping[str, float] = field(default_factory=dict)
     dtype: torch.dtype = torch.float64

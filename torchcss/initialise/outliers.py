@@ -29,7 +29,7 @@ from torchcss.cost.joints import JointTargets, JointTerm, match_joints
 from torchcss.cost.total import TrackingCost
 from torchcss.inference.mixture import distinct_modes
 from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.initialise.multi_start import Search, descend, multi_start_fits
+from torchcss.initialise.multi_start import StartSearch, descend_widened, multi_start_fits
 from torchcss.types import Modes, Numbers, Vectors
 
 SHARE = 0.05
@@ -43,7 +43,7 @@ _NUM_TRIED = 6
 
 
 def fits_and_outliers(
-    cost: TrackingCost, *, search: Search, generator: torch.Generator
+    cost: TrackingCost, *, search: StartSearch, generator: torch.Generator
 ) -> tuple[Modes, Bool[Tensor, " j"]]:
     """Find the poses that explain the keypoints, and which of these are better left out.
 
@@ -69,7 +69,7 @@ def fits_and_outliers(
     return _put_back(cost, fits, outliers, search)
 
 
-def find_outliers(cost: TrackingCost, fits: Modes, search: Search) -> Bool[Tensor, " j"]:
+def find_outliers(cost: TrackingCost, fits: Modes, search: StartSearch) -> Bool[Tensor, " j"]:
     """Leave keypoints out, one at a time, as long as that pays; none if that would be very many.
 
     Args:
@@ -91,7 +91,7 @@ def find_outliers(cost: TrackingCost, fits: Modes, search: Search) -> Bool[Tenso
         more[torch.arange(len(tried)), tried] = True
         starts = fits.mean[:_NUM_TRIED]
         each = without(cost, more.repeat_interleave(len(starts), dim=0))
-        ends = refine(each, starts.repeat(len(tried), 1), search)
+        ends = refine_fits(each, starts.repeat(len(tried), 1), search)
         ends = Modes(*(field.unflatten(0, (len(tried), -1)) for field in ends))
         total = ends.cost.amin(-1) + price[tried]
         best = int(total.argmin())
@@ -103,16 +103,19 @@ def find_outliers(cost: TrackingCost, fits: Modes, search: Search) -> Bool[Tenso
 
 
 def _put_back(
-    cost: TrackingCost, fits: Modes, outliers: Bool[Tensor, " j"], search: Search
+    cost: TrackingCost, fits: Modes, outliers: Bool[Tensor, " j"], search: StartSearch
 ) -> tuple[Modes, Bool[Tensor, " j"]]:
     """Use the keypoints again that fit after all."""
     price = price_of_leaving_out(cost)
     for column in torch.nonzero(outliers)[:, 0].tolist():
         fewer = outliers.clone()
         fewer[column] = False
-        tried = refine(without(cost, fewer), fits.mean[:_NUM_TRIED], search)
+        tried = refine_fits(without(cost, fewer), fits.mean[:_NUM_TRIED], search)
         if float(tried.cost.min()) < float(fits.cost[0] + price[column]):
-            fits, outliers = best_distinct(refine(without(cost, fewer), fits.mean, search)), fewer
+            fits, outliers = (
+                best_distinct(refine_fits(without(cost, fewer), fits.mean, search)),
+                fewer,
+            )
     return fits, outliers
 
 
@@ -150,10 +153,10 @@ def without(cost: TrackingCost, outliers: Bool[Tensor, "*b j"]) -> TrackingCost:
     return cost.with_keypoints(keypoints._replace(positions=places).without(outliers))
 
 
-def refine(cost: TrackingCost, x: Vectors, search: Search) -> Modes:
+def refine_fits(cost: TrackingCost, x: Vectors, search: StartSearch) -> Modes:
     """Descend from fits to other keypoints or lengths: wide at first, then to the end."""
     bounds = search.bounds(cost.body)
-    x = descend(cost, x, bounds, ((4.0, 8),))
+    x = descend_widened(cost, x, bounds, ((4.0, 8),))
     return TrustRegionNewton(max_steps=60, tolerance=1e-3).minimise(cost, x, bounds)
 
 

@@ -25,7 +25,7 @@ from torchcss.cost.total import TrackingCost
 from torchcss.errors import BodyError
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.trust_region import default_prior_variance
-from torchcss.initialise.multi_start import Search
+from torchcss.initialise.multi_start import StartSearch
 from torchcss.linalg import constrained_inverse, inverse_on_free
 from torchcss.types import LocalModel, Modes, Vector, Vectors
 
@@ -171,7 +171,9 @@ def with_lengths(
     return other.with_base(body.base_rotation, body.base_translation)
 
 
-def with_unknown_lengths(cost: TrackingCost, body: BodyModel, fits: Modes, search: Search) -> Modes:
+def with_unknown_lengths(
+    cost: TrackingCost, body: BodyModel, fits: Modes, search: StartSearch
+) -> Modes:
     """Fits with the covariances that their poses have when the lengths are unknown too.
 
     Args:
@@ -187,7 +189,7 @@ def with_unknown_lengths(cost: TrackingCost, body: BodyModel, fits: Modes, searc
 
 
 def uncapped_covariance(
-    cost: TrackingCost, body: BodyModel, x: Vector, search: Search
+    cost: TrackingCost, body: BodyModel, x: Vector, search: StartSearch
 ) -> Float[Tensor, "n n"]:
     """Covariance of a fit as the papers print it (`torchcss.linalg.constrained_inverse`).
 
@@ -204,7 +206,7 @@ def uncapped_covariance(
 
 
 def _with_lengths(
-    cost: TrackingCost, body: BodyModel, x: Vectors, search: Search
+    cost: TrackingCost, body: BodyModel, x: Vectors, search: StartSearch
 ) -> tuple[LocalModel, Bool[Tensor, "k m"], list[int]]:
     """The cost about fits, its free parameters, of which lengths are some, and the body's own."""
     loose = cost.body

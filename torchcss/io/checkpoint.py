@@ -19,7 +19,7 @@ from torchcss.errors import TrackFileError
 from torchcss.files import load_arrays, output_error, refusing, save_arrays
 
 CHECKPOINT_NAME = "checkpoint.npz"
-SCHEMA_VERSION = 1
+CHECKPOINT_VERSION = 1
 
 _PREFIX = "tensor."
 
@@ -51,7 +51,7 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     tensors = checkpoint.tensors.items()
     arrays = {_PREFIX + name: tensor.detach().cpu().numpy() for name, tensor in tensors}
     about = {
-        "schema_version": SCHEMA_VERSION,
+        "schema_version": CHECKPOINT_VERSION,
         "num_frames": checkpoint.num_frames,
         "notes": json.dumps(dict(checkpoint.notes)),
     }
@@ -71,9 +71,9 @@ def read_checkpoint(folder: Path) -> Checkpoint | None:
     with refusing(TrackFileError, f"{path}: not a checkpoint"):
         version = int(arrays["schema_version"])
         num_frames, notes = int(arrays["num_frames"]), json.loads(str(arrays["notes"]))
-    if version != SCHEMA_VERSION:
+    if version != CHECKPOINT_VERSION:
         raise TrackFileError(
-            f"{path}: has schema version {version}, this program reads {SCHEMA_VERSION}; go on "
+            f"{path}: has schema version {version}, this program reads {CHECKPOINT_VERSION}; go on "
             "with the version of torchcss that wrote it, or track again without --resume"
         )
     tensors = {

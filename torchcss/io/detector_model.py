@@ -48,7 +48,7 @@ OFFICIAL = Source(
 )
 
 
-def cache_folder() -> Path:
+def model_folder() -> Path:
     """Where fetched models lie: `TORCHCSS_CACHE`, else the user's cache folder."""
     given = os.environ.get("TORCHCSS_CACHE")
     if given:
@@ -68,7 +68,7 @@ def find_model(given: Path | None, source: Source = OFFICIAL) -> Path:
     """
     if given is not None:
         return check_model(given)
-    kept = cache_folder() / Path(source.url).name
+    kept = model_folder() / Path(source.url).name
     if kept.is_file():
         return check_model(kept)
     if sys.stdin.isatty() and sys.stderr.isatty():
@@ -97,7 +97,7 @@ def download_model(source: Source = OFFICIAL) -> Path:
         DetectorError: If it cannot be fetched, or is not what was announced.
         OutputError: If it cannot be written.
     """
-    path = prepare_output_folder(cache_folder()) / Path(source.url).name
+    path = prepare_output_folder(model_folder()) / Path(source.url).name
     try:
         with urllib.request.urlopen(source.url, timeout=_TIMEOUT_S) as answer:
             # A byte more than it should be tells that it is longer.

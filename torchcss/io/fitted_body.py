@@ -47,7 +47,7 @@ from torchcss.initialise.result import Initialisation
 from torchcss.io.track_body import PARAMETER_NUMBERS, set_numbers
 from torchcss.vision.camera import Camera
 
-SCHEMA_VERSION = 1
+BODY_VERSION = 1
 FITTED_BODY_NAME = "body.npz"
 
 
@@ -78,7 +78,7 @@ def write_fitted_body(path: StrPath, found: Initialisation, camera: Camera) -> N
         "camera_matrix": camera.K,
     }
     about = {
-        "schema_version": SCHEMA_VERSION,
+        "schema_version": BODY_VERSION,
         "body": body.name,
         "body_file": os.path.abspath(body.name) if _is_file(body.name) else "",
         "scale": found.scale,
@@ -118,10 +118,10 @@ def read_fitted_body(
         path = path / FITTED_BODY_NAME
     arrays = load_arrays(path, BodyError)
     try:
-        if int(arrays["schema_version"]) != SCHEMA_VERSION:
+        if int(arrays["schema_version"]) != BODY_VERSION:
             raise BodyError(
                 f"{path}: schema version {int(arrays['schema_version'])}, expected "
-                f"{SCHEMA_VERSION}; write the file with this version of torchcss init"
+                f"{BODY_VERSION}; write the file with this version of torchcss init"
             )
         names, values = arrays["length_names"].tolist(), arrays["lengths"].tolist()
         lengths, scale = dict(zip(names, values, strict=True)), float(arrays["scale"])

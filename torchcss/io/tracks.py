@@ -65,7 +65,7 @@ from torchcss.files import prepare_output_folder as prepare_output_folder
 from torchcss.io.track_body import body_from_plain, body_to_plain
 from torchcss.io.view_files import RecordedCamera, camera_from_plain, camera_to_plain
 
-SCHEMA_VERSION = 2
+TRACK_VERSION = 2
 TRACK_NAME = "track.npz"
 SMOOTH_NAME = "smooth.npz"
 SUMMARY_NAME = "summary.json"
@@ -354,7 +354,7 @@ def _arrays(track: Track) -> dict[str, Any]:
         "settings": dict(track.settings),
     }
     arrays |= {name: json.dumps(value, default=str) for name, value in plain.items()}
-    return {"schema_version": SCHEMA_VERSION, **arrays}
+    return {"schema_version": TRACK_VERSION, **arrays}
 
 
 def load_track(path: StrPath) -> Track:
@@ -381,10 +381,10 @@ def load_track(path: StrPath) -> Track:
             f"{path}: not a track: expected an array schema_version, "
             f"found {', '.join(arrays) or 'no arrays'}"
         )
-    if int(version) not in (1, SCHEMA_VERSION):
+    if int(version) not in (1, TRACK_VERSION):
         raise TrackFileError(
             f"{path}: has schema version {int(version)}, this program reads 1 and "
-            f"{SCHEMA_VERSION}; use the version of torchcss that wrote it, or track again"
+            f"{TRACK_VERSION}; use the version of torchcss that wrote it, or track again"
         )
     return Track(**_checked_arrays(arrays, path), **_described(arrays, path))
 

@@ -44,7 +44,7 @@ from torchcss.vision.rasterise import (
 Picture = UInt8[Tensor, "h w 3"]
 """Red, green and blue."""
 
-Labels = Int[Tensor, "r s"]
+PartLabels = Int[Tensor, "r s"]
 """Part of the body, or triangle, of every coarse pixel; -1 where there is none."""
 
 _ORDER = ("sky", "orange", "purple", "green", "vermilion", "yellow", "blue")
@@ -88,7 +88,7 @@ class ProjectedBody(NamedTuple):
         own = torch.zeros_like(self.valid).index_fill(0, faces.flatten(), True)
         return self._replace(valid=self.valid & own, faces=faces, part=self.part[chosen])
 
-    def parts_seen(self, face: Labels) -> Labels:
+    def parts_seen(self, face: PartLabels) -> PartLabels:
         """The part of every pixel's triangle, -1 where there is none."""
         if not len(self.part):
             return face
@@ -282,13 +282,13 @@ def _window(
     return _Window(top, left, rows, columns, min(1.0, (resolution / (rows * columns)) ** 0.5))
 
 
-def _labels(mode: ProjectedBody, window: _Window) -> Labels:
+def _labels(mode: ProjectedBody, window: _Window) -> PartLabels:
     """Part labels of a body in its window."""
     place, depth, valid = window.place(mode.uv)[None], mode.depth[None], mode.valid[None]
     return mode.parts_seen(nearest_faces(place, depth, mode.faces, *window.coarse, valid=valid)[0])
 
 
-def _borders(part: Labels) -> Float[Tensor, "R S"]:
+def _borders(part: PartLabels) -> Float[Tensor, "R S"]:
     """Length of outline that passes each lattice point, in coarse pixels; zero for most.
 
     The lattice lies between the pixels and is one larger than the image. An outline runs along the
@@ -418,7 +418,7 @@ def _shading(
 
 
 def _hidden_borders(
-    mode: ProjectedBody, visible: Labels, window: _Window, line: float
+    mode: ProjectedBody, visible: PartLabels, window: _Window, line: float
 ) -> Float[Tensor, "R S"]:
     """Dashed lattice of part silhouettes that lie behind other parts of the same body."""
     rows, columns = visible.shape

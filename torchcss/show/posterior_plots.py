@@ -33,7 +33,7 @@ from torchcss.errors import ConfigurationError
 from torchcss.files import prepare_output_folder
 from torchcss.io.run import Run, body_of_track
 from torchcss.io.tracks import TRACK_NAME, Track
-from torchcss.show.style import OKABE_ITO, save_figure
+from torchcss.show.style import DEVIATIONS, OKABE_ITO, save_figure
 from torchcss.show.track_pictures import has_pictures, pictures_of, rows_with_modes
 from torchcss.show.track_plots import (
     effective_number,
@@ -48,10 +48,7 @@ from torchcss.show.track_plots import (
 )
 from torchcss.vision.camera import Camera
 
-DEVIATIONS = 2.0
-"""Half-width of the bands, standard deviations."""
-
-LIMBS = (
+SHOWN_JOINTS = (
     "skull_tip", "l_shoulder", "l_elbow", "l_wrist", "r_shoulder", "r_elbow", "r_wrist",
     "r_hand_tip", "l_hip", "l_knee", "l_ankle", "r_hip", "r_knee", "r_ankle",
 )  # fmt: skip
@@ -124,14 +121,16 @@ def joints_figure(
         track: The track.
         camera: Its camera: directions are then to the right, up and away as it sees them. None: the
             axes of the track's world.
-        joints: Which joints; by default those of `LIMBS` that it has, or all.
+        joints: Which joints; by default those of `SHOWN_JOINTS` that it has, or all.
 
     Raises:
         ConfigurationError: If the track has no frames, or no such joint.
         TrackFileError: If the body cannot be told.
     """
     rows = _rows(track)
-    names = list(joints) if joints is not None else [n for n in LIMBS if n in track.joint_names]
+    names = (
+        list(joints) if joints is not None else [n for n in SHOWN_JOINTS if n in track.joint_names]
+    )
     names = names or list(track.joint_names)
     if missing := set(names) - set(track.joint_names):
         raise ConfigurationError(

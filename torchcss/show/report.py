@@ -28,15 +28,15 @@ from torchcss.io.video import VideoWriter
 from torchcss.show.posterior_plots import angles_figure
 from torchcss.show.track_pictures import has_pictures, pictures_of, rows_with_modes
 from torchcss.show.track_plots import effective_number, modes_figure, side_view_figure
-from torchcss.tracking.presets import ALIASES, PRESETS, Preset
+from torchcss.tracking.presets import OLD_NAMES, PRESETS, Preset
 
 REPORT_NAME = "report.html"
 
-MOST_FRAMES = 450
+MOST_PICTURES = 450
 """Frames of the film in the page; of longer ones every second, third and so on is shown."""
 
 LONGER_SIDE = 640
-"""Pixels to which the film's pictures are reduced. With `MOST_FRAMES`: a few megabytes."""
+"""Pixels to which the film's pictures are reduced. With `MOST_PICTURES`: a few megabytes."""
 
 _CRF = 28
 
@@ -66,7 +66,7 @@ pre {{ background: #f4f4f4; padding: .7rem; overflow-x: auto; font-size: .85rem;
 """
 
 
-def write_report(run: Run, *, anew: bool = False) -> Path:
+def write_report_page(run: Run, *, anew: bool = False) -> Path:
     """Write `report.html` into the folder of a run; of a smoothed track, `smooth_report.html`.
 
     Args:
@@ -109,7 +109,7 @@ def _film(run: Run, rows: np.ndarray, *, anew: bool) -> str:
     """The film, small enough to lie in the page."""
     if not has_pictures(run):
         return "<p>The video is not where it was; say where with <code>--video</code>.</p>"
-    rows = rows[:: math.ceil(len(rows) / MOST_FRAMES)]
+    rows = rows[:: math.ceil(len(rows) / MOST_PICTURES)]
     times = run.track.times[rows]
     rate = (len(rows) - 1) / float(times[-1] - times[0]) if len(rows) > 1 else 1.0
     still = BytesIO()
@@ -182,7 +182,7 @@ def _facts(run: Run) -> list[tuple[str, str]]:
 def _row(run: Run) -> Preset | None:
     """The preset that was run; None: not known."""
     name = run.settings.get("preset", "")
-    return PRESETS.get(ALIASES.get(name, name))
+    return PRESETS.get(OLD_NAMES.get(name, name))
 
 
 def _option(run: Run, name: str) -> Any:

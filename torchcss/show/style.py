@@ -22,6 +22,9 @@ OKABE_ITO: dict[str, str] = {
 }
 """Okabe and Ito's colours by name."""
 
+DEVIATIONS = 2.0
+"""Half-width of bands and half-axes of ellipsoids, standard deviations."""
+
 
 def save_figure(figure: Figure, path: Path, *, dpi: int = 130) -> Path:
     """Write a figure as PNG.

@@ -38,7 +38,7 @@ from torchcss.show.overlay import PALETTE
 from torchcss.show.style import OKABE_ITO
 from torchcss.vision.camera import Camera
 
-APART = 0.12
+EXPLANATION_M = 0.12
 """Distance of some joint centre, metres, from which two modes are two explanations; the preset
 `css` keeps modes apart by it (`Tracker.separation`)."""
 
@@ -174,7 +174,7 @@ def _label_side_view(figure: Figure, front: Axes, side: Axes) -> None:
     )  # fmt: skip
 
 
-def num_explanations(track: Track, *, apart: float = APART) -> np.ndarray:
+def num_explanations(track: Track, *, apart: float = EXPLANATION_M) -> np.ndarray:
     """How many of each frame's modes differ from all better ones, `[T]`.
 
     Args:
@@ -185,7 +185,7 @@ def num_explanations(track: Track, *, apart: float = APART) -> np.ndarray:
     return np.array([count_apart(joints[:num], apart=apart) for joints, num in frames], np.int64)
 
 
-def count_apart(joints: Float[np.ndarray, "k j 3"], *, apart: float = APART) -> int:
+def count_apart(joints: Float[np.ndarray, "k j 3"], *, apart: float = EXPLANATION_M) -> int:
     """How many of the modes of one frame differ from all better ones.
 
     Args:
@@ -239,7 +239,8 @@ def modes_figure(track: Track, summary: Mapping[str, Any] | None = None) -> Figu
     for values, look in (
         (track.num_modes, {"color": OKABE_ITO["sky"], "lw": 4, "label": "modes"}),
         (num_explanations(track),
-         {"color": OKABE_ITO["black"], "lw": 1.6, "label": f"of these {100 * APART:g} cm apart"}),
+         {"color": OKABE_ITO["black"], "lw": 1.6,
+          "label": f"of these {100 * EXPLANATION_M:g} cm apart"}),
     ):  # fmt: skip
         number.step(times, values, where="mid", **look)
     number.plot(

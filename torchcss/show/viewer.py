@@ -46,8 +46,9 @@ from torchcss.io.export.selection import camera_up, up_axis
 from torchcss.io.run import Run
 from torchcss.io.tracks import FrameModes
 from torchcss.show.overlay import PALETTE
+from torchcss.show.style import DEVIATIONS
 from torchcss.show.track_pictures import pictures_of, rows_with_modes
-from torchcss.show.track_plots import APART, bones_of, count_apart
+from torchcss.show.track_plots import EXPLANATION_M, bones_of, count_apart
 from torchcss.show.viewer_layout import layout, rerun, world_axes
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import grid_faces
@@ -55,14 +56,11 @@ from torchcss.vision.rasterise import grid_faces
 if TYPE_CHECKING:
     import rerun as rr
 
-DEVIATIONS = 2.0
-"""Half-axes of the ellipsoids, standard deviations."""
-
 APPLICATION = "torchcss"
 
 _COUNTS = {
     "number": "modes",
-    "apart": f"of these {100 * APART:g} cm apart",
+    "apart": f"of these {100 * EXPLANATION_M:g} cm apart",
     "effective": "effective number",
 }
 

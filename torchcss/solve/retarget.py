@@ -45,6 +45,7 @@ from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, free_turns
 from torchcss.body.rotations import root_angles, root_rotation
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
+from torchcss.cost.penetration import Penetration, PenetrationDepth
 from torchcss.cost.targets import PointDistances
 from torchcss.errors import ConfigurationError, check_positive
 from torchcss.inference.smoothing import Refinement, Transition, best_path, refine
@@ -79,7 +80,7 @@ _SLACK = 1e-6
 _DEEP = 0.01
 """Metres that a surface must be inside another part to count as a collision."""
 
-Limbs = Float[Tensor, "t limbs 3"]
+LimbPlaces = Float[Tensor, "t limbs 3"]
 """Joint centres of the limbs, frame by frame, metres."""
 
 
@@ -132,7 +133,7 @@ class Retargeted(NamedTuple):
     states: Trajectory
     joints: Float[Tensor, "t j 3"]
     target_names: tuple[str, ...]
-    targets: Limbs
+    targets: LimbPlaces
     source: Float[Tensor, "t k 3"]
     error: Float[Tensor, "t limbs"]
     at_limit: Bool[Tensor, "t n"]
@@ -178,7 +179,7 @@ def retarget(
     model = load_body(body, lengths=lengths)
     others, line = _anchored(motion, model, names, index)
     report += [*level, line]
-    limbs = with_lengths(names, source[:, limb], lengths)
+    limbs = limbs_with_lengths(names, source[:, limb], lengths)
     followed = [*limbs.unbind(1), *(source[:, other.joint] for other in others)]
     cost = _cost(model, names, torch.stack(followed, 1), others, choice)
     root = _root_by_trunk(names, source[:, limb])
@@ -193,16 +194,25 @@ def retarget(
     joints = model.pose(states).joints
     columns = [model.joint_index(name) for name in names]
     at_limit = (states <= model.lower + _SLACK) | (states >= model.upper - _SLACK)
-    depth, pairs = collision_depth(model, states)
-    report += _findings(model, states, at_limit, depth, pairs)
+    collisions = PenetrationDepth(model)(model, states)
+    report += _findings(model, states, at_limit, collisions)
     error = (joints[:, columns] - limbs).norm(dim=-1)
     return Retargeted(
-        model, states, joints, names, limbs, source, error, at_limit, depth, tuple(report)
+        model,
+        states,
+        joints,
+        names,
+        limbs,
+        source,
+        error,
+        at_limit,
+        collisions.depth,
+        tuple(report),
     )
 
 
 def fit_lengths(
-    names: tuple[str, ...], limbs: Limbs, *, foot: float | None = None
+    names: tuple[str, ...], limbs: LimbPlaces, *, foot: float | None = None
 ) -> tuple[dict[str, float], list[str]]:
     """Lengths of the catalogue from joint centres.
 
@@ -231,7 +241,9 @@ def fit_lengths(
     return lengths, [f"lengths held within 10 % of the standard humanoid's, mm: {', '.join(held)}"]
 
 
-def with_lengths(names: tuple[str, ...], limbs: Limbs, lengths: Mapping[str, float]) -> Limbs:
+def limbs_with_lengths(
+    names: tuple[str, ...], limbs: LimbPlaces, lengths: Mapping[str, float]
+) -> LimbPlaces:
     """Joint centres that keep their directions from each other, and take other lengths.
 
     Args:
@@ -261,7 +273,7 @@ def with_lengths(names: tuple[str, ...], limbs: Limbs, lengths: Mapping[str, flo
     return torch.stack([moved[name] for name in names], dim=1)
 
 
-def _measured(names: tuple[str, ...], limbs: Limbs) -> dict[str, float]:
+def _measured(names: tuple[str, ...], limbs: LimbPlaces) -> dict[str, float]:
     """Those lengths of the catalogue that the limbs' joints tell: medians, of both sides alike."""
     place = _places(names, limbs)
     width = _distance(place["l_shoulder"], place["r_shoulder"])
@@ -281,7 +293,7 @@ def _measured(names: tuple[str, ...], limbs: Limbs) -> dict[str, float]:
     return found
 
 
-def _places(names: tuple[str, ...], limbs: Limbs) -> dict[str, Float[Tensor, "t 3"]]:
+def _places(names: tuple[str, ...], limbs: LimbPlaces) -> dict[str, Float[Tensor, "t 3"]]:
     """Where the limbs' joints are, and the middles of "hips" and "shoulders"."""
     place = dict(zip(names, limbs.unbind(1), strict=True))
     for joint in ("hip", "shoulder"):
@@ -292,39 +304,6 @@ def _places(names: tuple[str, ...], limbs: Limbs) -> dict[str, Float[Tensor, "t 
 def _distance(one: Float[Tensor, "t 3"], other: Float[Tensor, "t 3"]) -> float:
     """Median distance of two joints, metres."""
     return float((one - other).norm(dim=-1).median())
-
-
-def collision_depth(body: BodyModel, states: Trajectory) -> tuple[Float[Tensor, " t"], list[str]]:
-    """How deep surfaces are inside other parts, and which, state by state.
-
-    Along the ray from the centre of the outer part, which exceeds the distance to its surface
-    somewhat. Parts that touch in every pose do not count.
-
-    Args:
-        body: The body.
-        states: Some states.
-
-    Returns:
-        Metres, 0 where nothing collides, and the two parts' names, '' there.
-    """
-    pairs = InterpenetrationPairs(body, rings=8, meridians=12)
-    depths, names = [], []
-    for part in states.split(64):
-        near = pairs.near(body, body.pose(part), 1.0)
-        square, _, _ = pairs.radial_square(near)
-        distance = near.points.norm(dim=-1)
-        inside = torch.where(square < 1, distance * (square.clamp(min=1e-4).rsqrt() - 1), 0.0)
-        item = near.item[near.owner]
-        deepest = part.new_zeros(len(part)).scatter_reduce(0, item, inside, "amax")
-        found = [""] * len(part)
-        for node in (inside == deepest[item]).nonzero()[:, 0].tolist():
-            if inside[node] > 0:
-                pair = near.pair[near.owner[node]]
-                ends = sorted((int(pairs.first[pair]), int(pairs.second[pair])))
-                found[int(item[node])] = " and ".join(body.part_names[end] for end in ends)
-        depths.append(deepest)
-        names += found
-    return torch.cat(depths), names
 
 
 def levelled(
@@ -375,7 +354,7 @@ def _face_middle(body: BodyModel, states: Trajectory) -> tuple[BodyModel, Trajec
     return body.with_base(facing, torch.zeros(3)), states
 
 
-def _root_by_trunk(names: tuple[str, ...], limbs: Limbs) -> Float[Tensor, "t 6"]:
+def _root_by_trunk(names: tuple[str, ...], limbs: LimbPlaces) -> Float[Tensor, "t 6"]:
     """Place and turns of the root as hips and shoulders show them, turns without jumps."""
     place = _places(names, limbs)
     up = place["shoulders"] - place["hips"]
@@ -523,7 +502,7 @@ def _fit(
 
 
 def _findings(
-    body: BodyModel, states: Tensor, at_limit: Tensor, depth: Tensor, pairs: list[str]
+    body: BodyModel, states: Tensor, at_limit: Tensor, collisions: Penetration
 ) -> list[str]:
     """Lines about turns, limits and collisions."""
     lines = []
@@ -550,8 +529,11 @@ def _findings(
     worst = share.argsort(descending=True)[:6].tolist()
     held = [f"{body.state_names[i]} {100 * share[i]:.0f} %" for i in worst if share[i] > 0.005]
     lines.append(f"angles at a limit, share of frames: {', '.join(held) or 'none'}")
+    depth = collisions.depth
     deep = depth > _DEEP
     if bool(deep.any()):
+        parts = collisions.parts.sort(-1).values.tolist()
+        pairs = [" and ".join(body.part_names[part] for part in pair) for pair in parts]
         named = [pair for pair, is_deep in zip(pairs, deep.tolist(), strict=True) if is_deep]
         common = max(set(named), key=named.count)
         lines.append(

@@ -113,7 +113,7 @@ def told_arm(truth: Motion, name: str, start: int) -> BodyModel | None:
     return arm.with_base(base[:3, :3], base[:3, 3])
 
 
-class Run(NamedTuple):
+class TrackerRun(NamedTuple):
     """One tracker from the first frame to its end.
 
     Attributes:
@@ -138,7 +138,7 @@ def track_together(
     stop: int | None = None,
     stop_when_lost: bool = False,
     progress: Callable[[int, int], None] | None = None,
-) -> Iterator[Run]:
+) -> Iterator[TrackerRun]:
     """Run several trackers, frame by frame, in one pass over the video.
 
     Args:
@@ -157,7 +157,7 @@ def track_together(
     reader = VideoReader(sequence.video, start=start, stop=stop)
     going = [
         (
-            Run(number, settings, [], "complete"),
+            TrackerRun(number, settings, [], "complete"),
             session_of(sequence, settings, begin, *plan),
             Evaluator(sequence, begin.first.body, thresholds),
         )

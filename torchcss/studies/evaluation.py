@@ -40,25 +40,24 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor
 
 from torchcss.body.bases import pose_track
-from torchcss.body.model import BodyModel, BodyPose
+from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, has_root, move_base
 from torchcss.body.rotations import within_half_turn
 from torchcss.body.uncertainty import joint_covariance
-from torchcss.cost.interpenetration import InterpenetrationPairs
 from torchcss.cost.part_map import part_map
+from torchcss.cost.penetration import PenetrationDepth
 from torchcss.errors import ConfigurationError, TrackFileError
 from torchcss.files import load_arrays
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.tracker import TrackerInfo
 from torchcss.io.run import Run, as_run
 from torchcss.io.tracks import Track
+from torchcss.joint_names import LIMB_JOINTS
 from torchcss.linalg import squared_mahalanobis
 from torchcss.studies.metrics import (
     LEVELS,
-    LIMB_JOINTS,
     LOST_MM,
     REGAIN_S,
     TrackErrors,
@@ -76,7 +75,7 @@ from torchcss.studies.metrics import (
 )
 from torchcss.studies.sequences import RecordedSequence, common_name, read_reference
 from torchcss.tracking.session import Posterior
-from torchcss.types import Frame, Numbers, Vector
+from torchcss.types import Frame, Vector
 from torchcss.vision.camera import Camera
 
 ARM_LOST_MM = 150.0
@@ -196,31 +195,6 @@ def num_evaluations(info: TrackerInfo) -> int:
     return int(info.num_steps.sum()) or int(info.num_samples)
 
 
-def penetration_depth(
-    body: BodyModel, pose: BodyPose, pairs: InterpenetrationPairs, surface: Tensor
-) -> Numbers:
-    """How deep the deepest node of a part is inside a part that is not its neighbour, metres.
-
-    Args:
-        body: The body.
-        pose: Any number of posed bodies.
-        pairs: The tables of that body, with as many nodes as shall be looked at.
-        surface: Points on every part in its frame, `[parts points 3]`, the nearest of which gives
-            the depth.
-    """
-    near = pairs.near(body, pose, 1.0)
-    square, _, _ = pairs.radial_square(near)
-    near, _ = near.select(square < 1)
-    inside = pairs.second[near.pair][near.owner]
-    depth = torch.zeros_like(near.points[:, 0])
-    for part in inside.unique().tolist():
-        own = inside == part
-        depth[own] = torch.cdist(near.points[own], surface[part]).amin(-1)
-    batch = pose.x.shape[:-1]
-    deepest = depth.new_zeros(batch.numel())
-    return deepest.scatter_reduce(0, near.item[near.owner], depth, "amax").reshape(batch)
-
-
 def silhouette(body: BodyModel, x: Vector, camera: Camera) -> Bool[np.ndarray, "h w"]:
     """Pixels whose centres see the posed body.
 
@@ -333,8 +307,7 @@ class Evaluator:
         self._column = [body.joint_index(name) for name in self._common]
         index = [sequence.joint_names.index(name) for name in self._common]
         self._reference = sequence.joints_world[:, index]
-        self._pairs = InterpenetrationPairs(body, rings=8, meridians=12)
-        self._surface = body.mesh(48, 64).points.flatten(1, 2)
+        self._penetration = PenetrationDepth(body)
         self._rooted = bool(roots)
 
     def __call__(self, tracked: Posterior, start: Frame, features_s: float) -> FrameMeasures:
@@ -359,7 +332,7 @@ class Evaluator:
         if sequence.mask is not None:
             drawn = silhouette(body, mixture.mean[0], sequence.camera)
             overlap = float(mask_overlap(drawn, sequence.mask[number]))
-        poses, error = body.pose(mixture.mean), _mean(aligned[0])
+        error = _mean(aligned[0])
         weight = mixture.weight.double().cpu().numpy()
         along, across = self._directions(joints[0], reference)
         within = region_probability(
@@ -381,7 +354,7 @@ class Evaluator:
             reference_m=reference[:count],
             overlap=overlap,
             outside_degrees=_outside(body, mixture.mean[0]),
-            penetration_m=penetration_depth(body, poses, self._pairs, self._surface).cpu().numpy(),
+            penetration_m=self._penetration(body, mixture.mean).depth.cpu().numpy(),
             along_mm=along,
             across_mm=across,
             apart_weight=_apart_weight(joints, weight),

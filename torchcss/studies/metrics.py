@@ -44,13 +44,6 @@ from numpy.typing import ArrayLike
 
 from torchcss.errors import ConfigurationError, ShapeError
 
-LIMB_JOINTS: Final[tuple[str, ...]] = tuple(
-    f"{side}_{place}"
-    for place in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
-    for side in ("l", "r")
-)
-"""The twelve joints of the limbs, which every body, detector and data set has."""
-
 LOST_MM: Final = 250.0
 """Root-aligned error above which a frame counts as lost."""
 

@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from torchcss.show.style import OKABE_ITO
 from torchcss.show.track_plots import is_length, tidy
 from torchcss.studies.metrics import spread
-from torchcss.studies.slices import PROMINENCE, Line, Slice
+from torchcss.studies.slices import PROMINENCE, Slice, StateLine
 
 _TERM_COLOURS = {
     "sum": "black",
@@ -53,7 +53,7 @@ class Unit(NamedTuple):
     factor: float = 1.0
 
 
-def unit_of(line: Line, *, close: bool = False) -> Unit:
+def unit_of(line: StateLine, *, close: bool = False) -> Unit:
     """How to show offsets on a line: degrees, metres, or for eigen-directions what both mix to.
 
     Args:
@@ -74,7 +74,7 @@ def term_colour(name: str) -> str:
     return OKABE_ITO.get(_TERM_COLOURS.get(name, ""), GREY)
 
 
-def title_of(line: Line) -> str:
+def title_of(line: StateLine) -> str:
     """A line's name for people."""
     return line.name.replace("_", " ").replace("eigen", "eigen-direction")
 

@@ -5,8 +5,8 @@ humanoid), in a pose drawn from the sticky priors, turned any way about the vert
 camera of `torchcss.studies.reprojection`: 1920 x 1080 pixels, at 3.5 m. Keypoints have Gaussian
 noise; some may be missing, and some may be anywhere in the image.
 
-Call `random_person(generator=...)`, or `random_lengths` for the lengths alone; `coverage` tells
-whether stated covariances hold the truth.
+Call `random_person(generator=...)`, or `random_lengths` for the lengths alone; `person_coverage`
+tells whether stated covariances hold the truth.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from torchcss.body.rotations import within_half_turn
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.cost.anthropometric import Anthropometric, proportion_columns
 from torchcss.inference.mixture import GaussianMixture
+from torchcss.joint_names import LIMB_JOINTS
 from torchcss.linalg import squared_mahalanobis
-from torchcss.studies.metrics import LIMB_JOINTS
-from torchcss.studies.reprojection import DISTANCE, HEIGHT, WIDTH, camera_in_front, plausible_pose
+from torchcss.studies.reprojection import DISTANCE, HEIGHT, WIDTH, plausible_pose, study_camera
 from torchcss.types import Vector
 from torchcss.vision.camera import Camera
 
@@ -36,7 +36,7 @@ MARKED = (*LIMB_JOINTS, "vc7", "skull_tip")
 """The joints of the keypoints: those of the limbs, the base of the neck, the top of the head."""
 
 
-class Person(NamedTuple):
+class RandomPerson(NamedTuple):
     """A person with marked joints.
 
     Attributes:
@@ -72,7 +72,7 @@ def random_person(
     noise_px: float = 2.0,
     missing: float = 0.0,
     outliers: float = 0.0,
-) -> Person:
+) -> RandomPerson:
     """Draw a person, the same one for all kinds of keypoints from the same state of the generator.
 
     Args:
@@ -91,7 +91,7 @@ def random_person(
     state = torch.lerp(body.rest, plausible_pose(body, generator=generator), spread)
     turn = torch.rand((), generator=generator, dtype=torch.float64)
     state[body.state_index("root_yaw")] = math.pi * (2 * turn - 1)
-    camera = camera_in_front("random")
+    camera = study_camera("random")
     index = [body.joint_index(name) for name in joint_names]
     uv = camera.project(body.pose(state).joints[index]).uv
     noise = torch.randn(uv.shape, generator=generator, dtype=uv.dtype)
@@ -101,7 +101,7 @@ def random_person(
     anywhere = anywhere * uv.new_tensor([WIDTH, HEIGHT])
     uv = torch.where(is_outlier[:, None], anywhere, uv + noise_px * noise)
     confidence = (chance[1] >= missing).to(uv)
-    return Person(body, state, camera, joint_names, uv, confidence, is_outlier)
+    return RandomPerson(body, state, camera, joint_names, uv, confidence, is_outlier)
 
 
 def random_lengths(*, generator: torch.Generator, body_name: str = "body34") -> dict[str, float]:
@@ -121,7 +121,7 @@ def random_lengths(*, generator: torch.Generator, body_name: str = "body34") -> 
     return lengths
 
 
-class Coverage(NamedTuple):
+class PersonCoverage(NamedTuple):
     """Shares of the truth inside what the nearest mode states at 95 %.
 
     Attributes:
@@ -133,7 +133,9 @@ class Coverage(NamedTuple):
     joints: float
 
 
-def coverage(person: Person, body: BodyModel, mixture: GaussianMixture) -> Coverage:
+def person_coverage(
+    person: RandomPerson, body: BodyModel, mixture: GaussianMixture
+) -> PersonCoverage:
     """Compare the true pose and lengths with a mixture over both.
 
     The nearest mode is that whose deviations, each in its own standard deviations, are least. All
@@ -160,7 +162,7 @@ def coverage(person: Person, body: BodyModel, mixture: GaussianMixture) -> Cover
     spread = joint_covariance(body, pose, mixture.covariance[nearest])[index]
     squared = squared_mahalanobis(person.joints_world(LIMB_JOINTS) - pose.joints[index], spread)
     chi_squared_95 = 7.815  # three degrees of freedom
-    return Coverage(
+    return PersonCoverage(
         float((z[nearest] < 1.96).double().mean()),
         float((squared < chi_squared_95).double().mean()),
     )

@@ -62,7 +62,7 @@ camera or turned sideways. The other parameters are drawn from their sticky prio
 _FACE = ("nose", "l_eye", "r_eye", "l_ear", "r_ear")
 _FOOT = ("l_heel", "r_heel", "l_midtarsal", "r_midtarsal")
 
-CHUNK = 1024
+STATES_AT_ONCE = 1024
 """States evaluated at a time: small enough for the caches, large enough to hide call overhead."""
 _VECTOR = 32
 """A batch is filled up to a multiple of this, so that an item's bits do not depend on its place."""
@@ -145,7 +145,7 @@ class ReprojectionCost(BlendedCost):
         missing = -len(flat) % _VECTOR
         flat = torch.cat([flat, flat[-1:].expand(missing, n)])
         share = torch.cat([share, share[-1:].expand(missing)])
-        pairs = zip(flat.split(CHUNK), share.split(CHUNK), strict=True)
+        pairs = zip(flat.split(STATES_AT_ONCE), share.split(STATES_AT_ONCE), strict=True)
         parts = list(zip(*(evaluate(*pair) for pair in pairs), strict=True))
         whole = (part[0] if len(part) == 1 else torch.cat(part) for part in parts)
         return tuple(part[: batch.numel()].reshape((*batch, *part.shape[1:])) for part in whole)
@@ -282,7 +282,7 @@ def reprojection_problem(
     body = load_body(body_name)
     place = torch.tensor([0.0, 0.0, -DISTANCE], dtype=torch.float64)
     body = body.with_base(torch.eye(3, dtype=torch.float64), place)
-    camera = camera_in_front("reprojection")
+    camera = study_camera("reprojection")
     truth = plausible_pose(body, generator=generator)
     names = joint_names or tuple(n for n in body.joint_names if n not in (*_FACE, *_FOOT))
     index = torch.tensor([body.joint_index(name) for name in names])
@@ -302,7 +302,7 @@ def reprojection_problem(
     return ReprojectionProblem(body, camera, truth, names, observed, cost, body.bounds, start)
 
 
-def camera_in_front(name: str) -> Camera:
+def study_camera(name: str) -> Camera:
     """The camera of the study, at the world's origin: Y is up, and the body is along -Z."""
     K = Camera.pinhole(WIDTH, HEIGHT, focal_px=FOCAL_PX).K
     upright = torch.tensor([1.0, -1.0, -1.0]).diag()

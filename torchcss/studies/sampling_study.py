@@ -28,7 +28,7 @@ from torchcss.studies.minima import FoundMinima, find_minima, joined_minima, oth
 from torchcss.studies.reprojection import ReprojectionProblem, reprojection_problem
 from torchcss.types import Bounds, CostFunction, Items, LocalModel, Modes, Numbers, Vector, Vectors
 
-LIMB_JOINTS = (
+CLICKED_JOINTS = (
     "HumanoidRoot", "vt1", "skull_tip", "l_shoulder", "l_elbow", "l_wrist", "r_shoulder", "r_elbow",
     "r_wrist", "l_hip", "l_knee", "l_ankle", "r_hip", "r_knee", "r_ankle",
 )  # fmt: skip
@@ -135,8 +135,8 @@ class StudyChoice:
             optimiser's, a quarter of its range.
         limits: Whether the joint limits hold.
         robust: Lorentzian reprojection error instead of a quadratic one.
-        all_joints: All joint centres but those of face and foot are seen, not `LIMB_JOINTS` alone;
-            an arm shows all that it has.
+        all_joints: All joint centres but those of face and foot are seen, not `CLICKED_JOINTS`
+            alone; an arm shows all that it has.
     """
 
     pixel_noise: float = 3.0
@@ -174,7 +174,7 @@ def study_problem(
         generator=generator,
         pixel_noise=choice.pixel_noise,
         potential=Lorentzian(nu=ROBUST_NU, sigma=ROBUST_NU**0.5) if choice.robust else Quadratic(),
-        joint_names=None if choice.all_joints or body_name.startswith("arm") else LIMB_JOINTS,
+        joint_names=None if choice.all_joints or body_name.startswith("arm") else CLICKED_JOINTS,
     )
     cost, truth, bounds = problem.cost, problem.truth, problem.bounds
     cost.body.sticky_deviation.mul_(choice.prior_scale)

@@ -36,10 +36,11 @@ from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
 from torchcss.io.cameras import read_camera
 from torchcss.io.keypoints.read import read_keypoints
 from torchcss.io.video import VideoReader
-from torchcss.studies.metrics import LIMB_JOINTS, root_aligned_mpjpe_mm
+from torchcss.joint_names import LIMB_JOINTS
+from torchcss.studies.metrics import root_aligned_mpjpe_mm
 from torchcss.studies.render.sequences import arm_sequence
 from torchcss.studies.sequences import RecordedSequence, read_reference
-from torchcss.studies.slices import Line, eigen_lines, joint_lines
+from torchcss.studies.slices import StateLine, eigen_lines, joint_lines
 from torchcss.tracking.settings import Settings, make_choice, make_plan
 from torchcss.tracking.view import NOTHING_KNOWN, NOTHING_SEEN, CameraView
 from torchcss.types import Bounds, Frame, Modes, Vector
@@ -73,7 +74,7 @@ class Scene(NamedTuple):
         """The name as a part of a file's name."""
         return self.name.replace(",", "").replace(" ", "_")
 
-    def lines(self, centre: Vector) -> list[Line]:
+    def lines(self, centre: Vector) -> list[StateLine]:
         """The lines through a state along all joints, then along the mode's eigenvectors.
 
         A line on which the state cannot move either way without leaving its limits is left out.

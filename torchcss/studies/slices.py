@@ -47,7 +47,7 @@ PROMINENCE = 0.02
 Terms = Callable[[Float[Tensor, "s n"]], Mapping[str, Float[Tensor, " s"]]]
 """Cost of every term by name, as `TrackingCost.terms` gives it."""
 
-Curve = Float[np.ndarray, " s"]
+SampledCurve = Float[np.ndarray, " s"]
 """A number at every sample of a slice."""
 
 _ROUNDING_NATS = 1e-6
@@ -62,7 +62,7 @@ _HALVINGS = 12
 """A bisected step ends 4096 times shorter, and with it the share that a slope has in its height."""
 
 
-class Line(NamedTuple):
+class StateLine(NamedTuple):
     """A straight line through the space of states.
 
     Attributes:
@@ -109,7 +109,7 @@ class Line(NamedTuple):
 
 def joint_lines(
     names: Sequence[str], centre: Vector, covariance: Float[Tensor, "n n"]
-) -> list[Line]:
+) -> list[StateLine]:
     """The lines along which one parameter moves and the others stay.
 
     Args:
@@ -121,7 +121,7 @@ def joint_lines(
     return [_line(name, centre, d, covariance) for name, d in zip(names, axes, strict=True)]
 
 
-def eigen_lines(centre: Vector, covariance: Float[Tensor, "n n"]) -> list[Line]:
+def eigen_lines(centre: Vector, covariance: Float[Tensor, "n n"]) -> list[StateLine]:
     """The lines along the eigenvectors of a covariance, the least certain first.
 
     Directions have unit length in the units of the state, metres and radians alike, and the sign
@@ -137,9 +137,11 @@ def eigen_lines(centre: Vector, covariance: Float[Tensor, "n n"]) -> list[Line]:
     return [_line(f"eigen {i}", centre, d, covariance) for i, d in enumerate(vectors)]
 
 
-def _line(name: str, centre: Tensor, direction: Tensor, covariance: Tensor) -> Line:
+def _line(name: str, centre: Tensor, direction: Tensor, covariance: Tensor) -> StateLine:
     # Of the offset given the line, that is with all other directions held: as a slice shows it.
-    return Line(name, centre, direction, float(squared_mahalanobis(direction, covariance)) ** -0.5)
+    return StateLine(
+        name, centre, direction, float(squared_mahalanobis(direction, covariance)) ** -0.5
+    )
 
 
 class Minima(NamedTuple):
@@ -159,7 +161,7 @@ class Minima(NamedTuple):
         return Minima(self.sample[kept], self.prominence[kept])
 
 
-def find_minima(values: Float[ArrayLike, " s"]) -> Minima:
+def curve_minima(values: Float[ArrayLike, " s"]) -> Minima:
     """Find the minima of a sampled curve, as the module page defines them.
 
     Args:
@@ -180,7 +182,7 @@ def find_minima(values: Float[ArrayLike, " s"]) -> Minima:
     return Minima(np.array(middle, dtype=int), np.array(prominence, dtype=float))
 
 
-def _climb(levels: Curve) -> float:
+def _climb(levels: SampledCurve) -> float:
     """How far one climbs from the first sample on before one is below it, or the end is reached."""
     lower = np.flatnonzero(levels < levels[0])
     return float(levels[: lower[0] if len(lower) else None].max() - levels[0])
@@ -230,9 +232,9 @@ class Slice(NamedTuple):
         discontinuity: See `SliceReport`, nats.
     """
 
-    line: Line
-    offsets: Curve
-    values: dict[str, Curve]
+    line: StateLine
+    offsets: SampledCurve
+    values: dict[str, SampledCurve]
     fine_offsets: Float[np.ndarray, " f"]
     fine_values: dict[str, Float[np.ndarray, " f"]]
     discontinuity: dict[str, float]
@@ -250,7 +252,9 @@ class Slice(NamedTuple):
             prominence: Least prominence as a share of the range; 0 for the raw count.
         """
         extent = self.extent(name)
-        return find_minima(self.values[name]).above(prominence * extent if extent > 0 else math.inf)
+        return curve_minima(self.values[name]).above(
+            prominence * extent if extent > 0 else math.inf
+        )
 
     def report(self, name: str, prominence: float = PROMINENCE) -> SliceReport:
         """Describe one term; arguments as for `minima`."""
@@ -271,7 +275,7 @@ class Slice(NamedTuple):
 
 
 def sample_slice(
-    terms: Terms, line: Line, interval: tuple[float, float], num_samples: int = 401
+    terms: Terms, line: StateLine, interval: tuple[float, float], num_samples: int = 401
 ) -> Slice:
     """Evaluate a cost along a line.
 
@@ -291,7 +295,7 @@ def sample_slice(
             f"{num_samples} on {low:g} to {high:g}"
         )
 
-    def evaluate(offsets: Curve) -> dict[str, Curve]:
+    def evaluate(offsets: SampledCurve) -> dict[str, SampledCurve]:
         costs = terms(line.states(offsets))
         curves = {name: cost.detach().cpu().double().numpy() for name, cost in costs.items()}
         return {**curves, "sum": np.sum(list(curves.values()), axis=0)}

@@ -38,7 +38,7 @@ _ALL = 1_000_000
 _AT_ONCE = 128
 """Combinations that are posed at a time; the first few hundred of thousands mostly do."""
 
-APART = 0.15
+POSES_APART = 0.15
 """Least distance of some joint, metres, at which two poses are two. A body has a thousand flips
 that differ by the tilt of a foot or of the trunk, and they are the most plausible."""
 
@@ -74,8 +74,8 @@ def flipped_poses(body: BodyModel, camera: Camera, x: Vector, *, num: int) -> Ve
         num: Most poses wanted.
 
     Returns:
-        The poses, each with a joint `APART` from where it is in the given one and in the others;
-        none for a body without limbs that can flip, or wholly out of the camera's sight.
+        The poses, each with a joint `POSES_APART` from where it is in the given one and in the
+        others; none for a body without limbs that can flip, or wholly out of the camera's sight.
     """
     segments = Segments(body)
     nothing = x.new_zeros(0, len(x))
@@ -96,10 +96,10 @@ def flipped_poses(body: BodyModel, camera: Camera, x: Vector, *, num: int) -> Ve
     for poses in flips(cost, segments, x[None], body.bounds, _ALL).split(_AT_ONCE):
         places = body.pose(poses).joints
         missed = torch.where(valid, (camera.project(places).uv - uv).norm(dim=-1), 0.0).amax(-1)
-        differs = (places - joints).norm(dim=-1).amax(-1) >= APART
+        differs = (places - joints).norm(dim=-1).amax(-1) >= POSES_APART
         left = torch.nonzero((missed <= _MOST_NOISE * sigma) & differs)[:, 0]
         kept, where = torch.cat([kept, poses[left]]), torch.cat([where, places[left]])
-        chosen = separated(where, APART, num, fill=False)
+        chosen = separated(where, POSES_APART, num, fill=False)
         kept, where = kept[chosen], where[chosen]
         if len(kept) == num:
             break

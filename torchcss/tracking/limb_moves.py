@@ -27,7 +27,7 @@ from torchcss.body.shape import with_shape
 from torchcss.cost.total import TrackingCost
 from torchcss.inference.mixture import GaussianMixture, Prior, separated
 from torchcss.inference.proposals import Move
-from torchcss.tracking.flip_moves import APART
+from torchcss.tracking.flip_moves import POSES_APART
 from torchcss.types import Bounds, Vector, Vectors, frozen
 
 REACH = 0.2
@@ -135,7 +135,7 @@ def other_poses(
     order = value.argsort(stable=True)
     order = order[better[order]]
     joints = body.pose(every).joints[order]
-    return every[order[separated(joints, APART, num, fill=False)]]
+    return every[order[separated(joints, POSES_APART, num, fill=False)]]
 
 
 def _without(cost: TrackingCost, body: BodyModel, limb: Limb, x: Vector) -> float:

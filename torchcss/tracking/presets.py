@@ -353,7 +353,7 @@ PRESETS: dict[str, Preset] = {
     ),
 }
 
-ALIASES: Mapping[str, str] = MappingProxyType(
+OLD_NAMES: Mapping[str, str] = MappingProxyType(
     {
         "css_figure_6": "ijrr_css",
         "css_heavy_tailed": "ijrr_css_heavy_tailed",
@@ -375,12 +375,12 @@ def preset_name(name: str) -> str:
     """The present name of a row.
 
     Args:
-        name: A name in `PRESETS`, or one of `ALIASES`.
+        name: A name in `PRESETS`, or one of `OLD_NAMES`.
 
     Raises:
         ConfigurationError: If there is no such tracker.
     """
-    known = ALIASES.get(name, name)
+    known = OLD_NAMES.get(name, name)
     if known not in PRESETS:
         raise ConfigurationError(f"no tracker {name!r}; there are {', '.join(PRESETS)}")
     return known
@@ -398,7 +398,7 @@ def make_tracker(
     """Build a tracker from the table.
 
     Args:
-        preset: A name in `PRESETS` or `ALIASES`.
+        preset: A name in `PRESETS` or `OLD_NAMES`.
         body_name: The body; arms and bodies differ in numbers.
         num_samples: Samples per frame instead of the table's.
         num_modes: Modes kept instead of the table's.

@@ -76,7 +76,7 @@ _NUM_FLIPS = 8
 Image = Frame | np.ndarray
 """An image with its place in the video, or its pixels `[h w 3]` alone: it then is the next one."""
 
-Windows = tuple[Window | None, ...]
+ViewWindows = tuple[Window | None, ...]
 """Where each view is looked at; None: everywhere."""
 
 Views = CameraView | Camera | Sequence[CameraView | Camera]
@@ -159,7 +159,7 @@ class SessionState(NamedTuple):
     memory: tuple[ViewMemory, ...]
     monitor: MonitorState | None
     num_lost: int = 0
-    windows: tuple[Windows, ...] = ()
+    windows: tuple[ViewWindows, ...] = ()
 
 
 class TrackingSession:
@@ -242,7 +242,7 @@ class TrackingSession:
         self._seen, self._num_seen = state.seen, int(state.tracker.frame)
         self._ahead = deque(state.windows, maxlen=2)
 
-    def _windows(self, body: BodyModel, mixture: GaussianMixture) -> Windows:
+    def _windows(self, body: BodyModel, mixture: GaussianMixture) -> ViewWindows:
         """Where each view is looked at two frames later."""
         return tuple(observer.window(body, mixture.mean) for observer in self._observers)
 
@@ -318,7 +318,7 @@ class TrackingSession:
             pairs = zip_longest(given, self._observers)
             frames = [self._placed(image, observer) for image, observer in pairs]
             self._num_seen += 1
-            windows: Windows = (None,) * len(frames)
+            windows: ViewWindows = (None,) * len(frames)
             if self._ahead:
                 windows = self._ahead.popleft()
             self._seen = tuple(map(Observer.observe, self._observers, frames, self._seen, windows))
@@ -378,7 +378,7 @@ class TrackingSession:
         term_seconds, modes = dict(stopwatch.seconds), after.mixture
         terms = self._terms_of_best(cost.of_children(info.origin[:1], info.prior), modes)
         monitor, lost = self._judged(terms, observation)
-        windows: Windows = (None,) * len(self._observers)
+        windows: ViewWindows = (None,) * len(self._observers)
         if not lost:
             memory = tuple(
                 observer.learn(known, seen, body, modes.mean, modes.log_weight)

@@ -36,7 +36,7 @@ from torchcss.tracking.view import CameraView, Observer
 from torchcss.types import Bounds, Curvature, Vector, frozen
 from torchcss.vision.edges import EdgeConfiguration
 from torchcss.vision.features import FeatureExtractor
-from torchcss.vision.flow import TRACKING
+from torchcss.vision.flow import TRACKING_FLOW
 
 TERMS = (
     *("contour", "motion_boundaries", "region", "segmentation", "flow", "joints"),
@@ -334,7 +334,7 @@ def make_extractor(settings: Settings) -> FeatureExtractor:
     """The features that the settings ask for, in their type and on their device."""
     kinds = [kind for name, kind in TERM_TABLE.items() if name in settings.used_terms]
     needs = {need for kind in kinds for need in kind().needs}
-    flow = TRACKING if "flow" in needs or "motion_boundaries" in settings.used_terms else None
+    flow = TRACKING_FLOW if "flow" in needs or "motion_boundaries" in settings.used_terms else None
     report = PRESETS[settings.preset].cost == "rr"
     extractor = FeatureExtractor(
         edges=EdgeConfiguration(window=None, floor=_CONTRAST) if report else None,

@@ -1,11 +1,11 @@
 """Smooth a track with its video in view: a second pass in which all frames share what they see.
 
 `torchcss.tracking.smooth` takes the mode of a frame as a Gaussian, found when only the frames
-before were known, with a temporal prior about the frame before in it. `smooth_frames` starts from
-that result and fits the states again to the images, a window of frames at a time: the cost of every
-frame (edges, keypoints, flow, priors, but no temporal prior about a parent mode) plus the motion
-prior over all of them (`inference.smoothing.refine_in_windows`). Frames that the tracker had lost
-get the evidence of their image again.
+before were known, with a temporal prior about the frame before in it. `smooth_modes_on_images`
+starts from that result and fits the states again to the images, a window of frames at a time: the
+cost of every frame (edges, keypoints, flow, priors, but no temporal prior about a parent mode) plus
+the motion prior over all of them (`inference.smoothing.refine_in_windows`). Frames that the tracker
+had lost get the evidence of their image again.
 
 The flow of a frame moves the nodes of the frame before, as the start has them.
 """
@@ -42,7 +42,7 @@ IMAGES = Smoothing(acceleration_ratio=20.0)
 """How to smooth by default. Images say where the body is more exactly than the modes of a tracker
 do, so that motion may be freer; chosen on the same view as the other default."""
 
-Images = Frame | Sequence[Frame | None]
+ShownFrames = Frame | Sequence[Frame | None]
 """What one moment shows: a frame of the only view, or one of each view."""
 
 
@@ -60,10 +60,10 @@ class SmoothedOnImages(NamedTuple):
     cost_at_start: Float[Tensor, " t"]
 
 
-def smooth_frames(
+def smooth_modes_on_images(
     body: BodyModel,
     track: TrackedModes,
-    images: Iterable[Images],
+    images: Iterable[ShownFrames],
     *,
     settings: Settings,
     views: Sequence[CameraView],
@@ -111,7 +111,7 @@ def smooth_frames(
 
 
 def _moments(
-    images: Iterable[Images], frames: Sequence[int], num_views: int
+    images: Iterable[ShownFrames], frames: Sequence[int], num_views: int
 ) -> Iterator[tuple[Frame | None, ...]]:
     """The images of the frames, of every view; checked."""
     moments = iter(tqdm(images, total=len(frames), unit="frame", dynamic_ncols=True))

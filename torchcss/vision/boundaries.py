@@ -35,7 +35,7 @@ from torch import Tensor
 
 from torchcss.errors import ShapeError
 from torchcss.kernels.checked import run
-from torchcss.vision.flow import OpticalFlow, has_kernels
+from torchcss.vision.flow import OpticalFlow, has_flow_kernels
 from torchcss.vision.sampling import gaussian_blur
 
 Images = Float[Tensor, "*batch h w"]
@@ -102,7 +102,7 @@ def displaced(outlier: Images, flow: Float[Tensor, "*batch 2 h w"], *, reach: in
     """
     height, width = outlier.shape[-2:]
     outliers, moves = outlier.reshape(-1, height, width), flow.reshape(-1, 2, height, width)
-    if has_kernels(outliers) and moves.dtype == outliers.dtype:
+    if has_flow_kernels(outliers) and moves.dtype == outliers.dtype:
         from torchcss.vision import flow_kernels
 
         arrived = outliers.new_zeros(len(outliers), 5, height, width)

@@ -60,7 +60,7 @@ ImagePoints = Float[Tensor, "*batch p 2"]
 Points = Float[Tensor, "*batch p 3"]
 """those in space."""
 
-Numbers = Tensor | np.ndarray | Sequence[Any]
+NumbersLike = Tensor | np.ndarray | Sequence[Any]
 Values = Float[Tensor, "*batch p"]
 Pixels = Float[Tensor, "*batch 2"]
 Matrix = Float[Tensor, "3 3"]
@@ -164,12 +164,12 @@ class Camera(nn.Module):
 
     def __init__(
         self,
-        K: Numbers,
+        K: NumbersLike,
         image_size_wh: Sequence[int],
         *,
-        distortion: Numbers | None = None,
-        R_camera_world: Numbers | None = None,
-        t_camera_world: Numbers | None = None,
+        distortion: NumbersLike | None = None,
+        R_camera_world: NumbersLike | None = None,
+        t_camera_world: NumbersLike | None = None,
         name: str = "camera",
         near: float = 0.05,
     ) -> None:

@@ -39,7 +39,7 @@ from torchcss.vision.flow import FlowConfiguration, robust_flow
 
 Image = Float[Tensor, "h w"]
 
-Frame = UInt8[Tensor, "h w"] | UInt8[Tensor, "h w c"] | Image | Float[Tensor, "h w c"]
+RawImage = UInt8[Tensor, "h w"] | UInt8[Tensor, "h w c"] | Image | Float[Tensor, "h w c"]
 """A picture: grey, RGB or RGBA, 8 or 16 bits or floating point in 0..1."""
 
 _WHITE = {torch.uint8: 255.0, torch.uint16: 65535.0}
@@ -207,8 +207,8 @@ class FeatureExtractor(nn.Module):
 
     def forward(
         self,
-        frame: Frame | np.ndarray,
-        previous: Frame | np.ndarray | FrameFeatures | None = None,
+        frame: RawImage | np.ndarray,
+        previous: RawImage | np.ndarray | FrameFeatures | None = None,
         mask: Bool[Tensor, "h w"] | Image | np.ndarray | None = None,
         *,
         window: Window | None = None,

@@ -61,7 +61,7 @@ Right = Float[Tensor, "b 1 h x"]
 Down = Float[Tensor, "b 1 y w"]
 """for each link downwards."""
 
-Potential = Quadratic | Lorentzian | Leclerc
+FlowPotential = Quadratic | Lorentzian | Leclerc
 
 _STRUCTURE_SCALE = 1.0 / 16.0
 """Weight of the total variation when structure is separated from texture, grey levels of 0..1."""
@@ -107,8 +107,8 @@ class FlowConfiguration:
         weighted_median_radius: Radius of the weighted median's window; 0 leaves it out.
     """
 
-    data: Potential = field(default_factory=lambda: Lorentzian(nu=1.0, sigma=0.0033))
-    smoothness: Potential = field(default_factory=lambda: Lorentzian(nu=0.06, sigma=0.042))
+    data: FlowPotential = field(default_factory=lambda: Lorentzian(nu=1.0, sigma=0.0033))
+    smoothness: FlowPotential = field(default_factory=lambda: Lorentzian(nu=0.06, sigma=0.042))
     texture: float = 0.9
     pyramid_factor: float = 0.7
     sigma_factors: tuple[float, ...] = (100.0, 10.0, 1.0)
@@ -139,7 +139,7 @@ class FlowConfiguration:
 ACCURATE = FlowConfiguration()
 """The best flow; seconds per 640 x 480 pair."""
 
-TRACKING = FlowConfiguration(
+TRACKING_FLOW = FlowConfiguration(
     pyramid_factor=0.5,
     sigma_factors=(100.0, 1.0),
     num_warps=4,
@@ -186,7 +186,7 @@ def robust_flow(
     Args:
         first: Grey levels in 0..1.
         second: The other frame of each pair, of the same size.
-        configuration: The choices; `ACCURATE` or `TRACKING` as they are, or changed.
+        configuration: The choices; `ACCURATE` or `TRACKING_FLOW` as they are, or changed.
 
     Raises:
         ShapeError: If the two are not floating-point `[..., h, w]` of one shape, dtype and device
@@ -261,7 +261,7 @@ def _resize(images: Images, size: tuple[int, int]) -> Float[Tensor, "b c y x"]:
     )
 
 
-def has_kernels(images: Tensor) -> bool:
+def has_flow_kernels(images: Tensor) -> bool:
     """Whether the loops over these images have compiled twins."""
     return images.dtype == torch.float32 and sampling.has_kernels(images)
 
@@ -269,7 +269,7 @@ def has_kernels(images: Tensor) -> bool:
 def _structure(images: Images) -> Images:
     """Smooth part of each image: least total variation near the image (Chambolle 2004)."""
     step = 0.249 / _STRUCTURE_SCALE
-    if has_kernels(images):
+    if has_flow_kernels(images):
         from torchcss.vision import flow_kernels
 
         structure, (height, width) = images.clone(), images.shape[-2:]
@@ -323,7 +323,7 @@ def _refine(flow: Field, frames: Field, guide: Plane, configuration: FlowConfigu
     return flow
 
 
-def _of_scale(potential: Potential, sigma: float) -> Potential:
+def _of_scale(potential: FlowPotential, sigma: float) -> FlowPotential:
     """Exchange sigma, and nu so that the curvature nu / sigma^2 at zero stays."""
     nu = potential.nu * (sigma / potential.sigma) ** 2
     return dataclasses.replace(potential, nu=nu, sigma=sigma)
@@ -361,7 +361,7 @@ def _linearise(
         first: Grey levels of the first frame, and their gradient.
         second: The same of the other.
     """
-    if has_kernels(flow):
+    if has_flow_kernels(flow):
         from torchcss.vision import flow_kernels
 
         gradient = torch.empty_like(flow, memory_format=torch.contiguous_format)
@@ -389,14 +389,14 @@ def _squared_differences(flow: Field) -> tuple[Right, Down]:
 
 
 def _relative_weight(
-    potential: Potential, squared: Float[Tensor, "*batch"]
+    potential: FlowPotential, squared: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch"]:
     """Robust weight relative to that of a residual of zero, in [0, 1]."""
     weight = potential(squared).first * (potential.sigma**2 / potential.nu)
     return weight.clamp(0.0, 1.0)
 
 
-def _data_held(flow: Field, frames: Field, potential: Potential) -> Plane:
+def _data_held(flow: Field, frames: Field, potential: FlowPotential) -> Plane:
     """How far constant brightness holds under the flow: 0 where the pixel leaves the view."""
     warped, visible = _sample(frames[:, 1:], flow)
     return _relative_weight(potential, (warped - frames[:, :1]).square()) * visible
@@ -421,14 +421,14 @@ def _solve(
     """
     root = weight.sqrt()
     q = root * constancy.gradient
-    if has_kernels(flow):
+    if has_flow_kernels(flow):
         from torchcss.vision import flow_kernels
 
         flow, target = flow.clone(), -q * (root * constancy.offset)
         links = functional.pad(right, (1, 1)), functional.pad(down, (0, 0, 1, 1))
-        memory = flow_kernels.make_memory(*flow.shape[-2:])
+        memory = flow_kernels.make_flow_memory(*flow.shape[-2:])
         for x, a, b, (across,), (along,) in zip(flow, q, target, *links, strict=True):
-            run(flow_kernels.solve, x, a, b, across, along, num_iterations, memory)
+            run(flow_kernels.solve_flow, x, a, b, across, along, num_iterations, memory)
         return flow
     system = _NormalEquations.of(q, _degree(weight, right, down), right, down)
     flow = flow.clone()
@@ -519,7 +519,7 @@ def _median(images: Images, radius: int) -> Images:
     Strip by strip: what is worked on at a time stays in the cache (twice as fast, measured).
     """
     height, width = images.shape[-2:]
-    if has_kernels(images) and radius == 2:
+    if has_flow_kernels(images) and radius == 2:
         from torchcss.vision import flow_kernels
 
         padded = functional.pad(images, (radius,) * 4, mode="replicate").flatten(0, 1)

@@ -13,8 +13,8 @@ import numpy as np
 
 from torchcss.kernels.compiler import entry, floor, inlined, kernel, sqrt
 
-Memory = namedtuple("Memory", "degree inverse x image residual conditioned")
-"""Memory for `solve`.
+FlowMemory = namedtuple("Memory", "degree inverse x image residual conditioned")
+"""Memory for `solve_flow`.
 
 Attributes:
     degree: Sum of each pixel's links, `[h w]`.
@@ -26,11 +26,11 @@ Attributes:
 """
 
 
-def make_memory(height: int, width: int) -> Memory:
+def make_flow_memory(height: int, width: int) -> FlowMemory:
     """Memory for images of a size."""
     inside = [np.empty((channels, height, width), np.float32) for channels in (3, 2, 2, 2)]
     border = np.zeros((2, height + 2, width + 2), np.float32)
-    return Memory(np.empty((height, width), np.float32), inside[0], border, *inside[1:])
+    return FlowMemory(np.empty((height, width), np.float32), inside[0], border, *inside[1:])
 
 
 @inlined
@@ -153,7 +153,7 @@ def _turn(share, conditioned, x):  # type: ignore[no-untyped-def]
 
 
 @entry
-def solve(flow, q, target, right, down, num_iterations, memory):  # type: ignore[no-untyped-def]
+def solve_flow(flow, q, target, right, down, num_iterations, memory):  # type: ignore[no-untyped-def]
     """Improve a flow, in place, by conjugate gradients on `(q q^T + L) f = target`.
 
     Args:

@@ -212,12 +212,14 @@ def _nearest_faces(
     """
     on_cpu = triangles.place.device.type == "cpu"
     if compiler.COMPILED and on_cpu and not torch.compiler.is_compiling():
-        from torchcss.vision.rasterise_kernels import draw  # compiled: only where it is used
+        from torchcss.vision.rasterise_kernels import (
+            draw_triangles,
+        )  # compiled: only where it is used
 
         near = torch.full((pictures, height, width), -1, dtype=torch.float32)
         seen = torch.full_like(near, -1, dtype=torch.long)
         place, distance, faces, _, drawn = (part.contiguous() for part in triangles)
-        run(draw, place, distance, faces, drawn, len(faces) // pictures, near, seen)
+        run(draw_triangles, place, distance, faces, drawn, len(faces) // pictures, near, seen)
         return seen.flatten()
     return _by_spans(triangles, height, width, pictures=pictures)
 

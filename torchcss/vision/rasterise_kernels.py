@@ -18,7 +18,7 @@ def _first_from(x, size):  # type: ignore[no-untyped-def]
 
 
 @entry
-def draw(place, distance, faces, drawn, faces_per_picture, near, seen):  # type: ignore[no-untyped-def]
+def draw_triangles(place, distance, faces, drawn, faces_per_picture, near, seen):  # type: ignore[no-untyped-def]
     """Draw triangles, nearer ones over others, and at the same depth the first over the next.
 
     Args:

@@ -13,7 +13,7 @@ from torchcss.cli import main as cli
 from torchcss.errors import ConfigurationError, OutputError, TrackFileError
 from torchcss.io.cameras import camera_entry
 from torchcss.io.export import FORMATS
-from torchcss.io.export.selection import DEFAULT_RATE, UP_AXES, SelectionChoice, select
+from torchcss.io.export.selection import DEFAULT_FRAME_RATE, UP_AXES, SelectionChoice, select
 from torchcss.io.tracks import save_track, write_summary
 from torchcss.io.video import VideoWriter
 from torchcss.io.view_files import RecordedCamera, ViewFiles
@@ -145,12 +145,12 @@ def test_rates(track: Track):
 def test_the_rate_of_a_track_of_one_frame(tmp_path: Path):
     single = make_track(BODY, counts=(2,))
     alone = select(single)
-    assert alone.rate == DEFAULT_RATE
+    assert alone.rate == DEFAULT_FRAME_RATE
     assert any("25 is written: neither the track nor a video" in line for line in alone.report)
     camera = Camera([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], (640, 480))
     with VideoWriter(tmp_path / "film.mp4", 50) as writer:
         writer.write(np.zeros((16, 16, 3), np.uint8))
-    for name, rate in (("film.mp4", 50.0), ("gone.mp4", DEFAULT_RATE)):
+    for name, rate in (("film.mp4", 50.0), ("gone.mp4", DEFAULT_FRAME_RATE)):
         files = ViewFiles(video=tmp_path / name, keypoints=None)
         found = select(single._replace(cameras=(RecordedCamera(camera, files),)))
         assert found.rate == rate

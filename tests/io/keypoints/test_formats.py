@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from torchcss.errors import KeypointError
-from torchcss.io.keypoints.mediapipe import NAMES
+from torchcss.io.keypoints.mediapipe import MEDIAPIPE_NAMES
 from torchcss.io.keypoints.read import read_keypoints
 from torchcss.joint_names import ALIASES, JOINT_NAMES, canonical_joint_name
 from torchcss.types import Keypoints
@@ -71,7 +71,11 @@ POSES = [landmarks(frame) for frame in fractions()]
         pytest.param({"fps": 30, "frames": [{"landmarks": p} for p in POSES]}, id="object"),
         pytest.param({f"frame_{i:03d}": pose for i, pose in enumerate(POSES)}, id="by number"),
         pytest.param(
-            [dict(zip(map(str.upper, NAMES), pose, strict=True)) for pose in POSES], id="names"
+            [
+                dict(zip(map(str.upper, MEDIAPIPE_NAMES), pose, strict=True))
+                for pose in POSES
+            ],
+            id="names",
         ),
         pytest.param(
             [{"frame_number": i, "landmarks": dict(zip(map(str, range(33)), p, strict=True))}
@@ -153,7 +157,7 @@ def wide(heading: list[str], rows: np.ndarray, *, frame: str | None = None) -> s
 def test_mediapipe_csv(tmp_path: Path, form: str, frame: str | None) -> None:
     heading = [
         part.format(i=i, n=i + 1, name=name, NAME=name.upper())
-        for i, name in enumerate(NAMES)
+        for i, name in enumerate(MEDIAPIPE_NAMES)
         for part in form.split("|")
     ]
     path = tmp_path / "pose.csv"
@@ -169,7 +173,7 @@ def test_mediapipe_long_csv(tmp_path: Path) -> None:
     for index, frame in enumerate(fractions()):
         rows += [
             f"{index},{name.upper()},{x},{y},{z},{v}"
-            for name, (x, y, z, v) in zip(NAMES, frame.tolist(), strict=True)
+            for name, (x, y, z, v) in zip(MEDIAPIPE_NAMES, frame.tolist(), strict=True)
         ]
     path = tmp_path / "pose.csv"
     path.write_text("\n".join(rows))
@@ -359,6 +363,6 @@ def test_malformed_archives(tmp_path: Path, recordings: Any) -> None:
 
 
 def test_names_of_mediapipe_are_its_layout() -> None:
-    found = [canonical_joint_name(name) for name in NAMES]
+    found = [canonical_joint_name(name) for name in MEDIAPIPE_NAMES]
     assert tuple(found) == ALIASES["MediaPipe-33"]
-    assert torch.tensor([len(NAMES)]).item() == 33
+    assert torch.tensor([len(MEDIAPIPE_NAMES)]).item() == 33

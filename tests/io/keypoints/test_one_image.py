@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from torchcss.errors import KeypointError
-from torchcss.io.keypoints.mediapipe import NAMES
+from torchcss.io.keypoints.mediapipe import MEDIAPIPE_NAMES
 from torchcss.io.keypoints.one_image import read_joints
 from torchcss.joint_names import ALIASES
 
@@ -69,10 +69,10 @@ def test_other_csv_goes_to_its_reader(tmp_path: Path, text: str):
 def test_csv_of_landmarks(tmp_path: Path, named: bool):
     """A row for each of MediaPipe's, of which the catalogue knows some."""
     path = tmp_path / "joints.csv"
-    rows = [f"{name if named else i},0.5,0.25,-0.1,0.8" for i, name in enumerate(NAMES)]
+    rows = [f"{name if named else i},0.5,0.25,-0.1,0.8" for i, name in enumerate(MEDIAPIPE_NAMES)]
     path.write_text("\n".join(["landmark,x,y,z,visibility", *rows]))
     found = read_joints(path, image_size_wh=SIZE)
-    assert len(found.names) == len(NAMES)
+    assert len(found.names) == len(MEDIAPIPE_NAMES)
     assert found.positions[found.names.index("l_wrist")].tolist() == [319.5, 119.5]
 
 

@@ -17,11 +17,11 @@ from torchcss import load_body
 from torchcss.body.files.bvh import UNITS
 from torchcss.errors import ConfigurationError, MotionCaptureError
 from torchcss.io.motion.positions import (
-    LIMBS,
+    LIMB_JOINTS,
     MotionCapture,
     limb_positions,
     read_motion_capture,
-    resample,
+    resample_motion,
 )
 
 BVH = """HIERARCHY
@@ -222,7 +222,7 @@ def test_our_own_export_comes_back(tmp_path: Path) -> None:
         index = [found.joint_names.index(name) for name in body.joint_names]
         np.testing.assert_allclose(found.joints[:, index], track.joints_world[:, 0], atol=1e-5)
         names, _, limbs = limb_positions(found)
-        assert names == LIMBS
+        assert names == LIMB_JOINTS
         where = [body.joint_names.index(name) for name in names]
         np.testing.assert_allclose(limbs, track.joints_world[:, 0, where], atol=1e-5)
 
@@ -298,7 +298,7 @@ def test_real_recordings(shared_data: Path, file: str, skeleton: str | None, fra
     height = motion.joints[..., 1].max(1) - motion.joints[..., 1].min(1)
     assert 1.3 < np.median(height) < 2.1
     names, _, limbs = limb_positions(motion)
-    assert names == LIMBS
+    assert names == LIMB_JOINTS
     at = dict(zip(names, np.moveaxis(limbs, 1, 0), strict=True))
     for side in "lr":
         thigh = np.linalg.norm(at[f"{side}_hip"] - at[f"{side}_knee"], axis=-1)
@@ -399,7 +399,7 @@ def test_resampling_is_exact_for_cubics_inside() -> None:
     def cubic(t: np.ndarray) -> np.ndarray:
         return 1 + 2 * t - 3 * t**2 + t**3
 
-    found = resample(of_times(cubic), rate=50, start=0.1, stop=0.9)
+    found = resample_motion(of_times(cubic), rate=50, start=0.1, stop=0.9)
     times = 0.1 + np.arange(40) / 50
     assert found.joints.shape == (40, 1, 3)
     assert found.frame_rate == 50
@@ -412,7 +412,7 @@ def test_resampling_follows_a_fast_limb() -> None:
     def swing(t: np.ndarray) -> np.ndarray:
         return 0.25 * np.sin(4 * np.pi * t + 0.3)
 
-    found = resample(of_times(swing), rate=50)
+    found = resample_motion(of_times(swing), rate=50)
     times = np.arange(len(found.joints)) / 50
     assert times[-1] == 1.0
     error = np.abs(found.joints[:, 0, 0] - swing(times))
@@ -425,7 +425,7 @@ def test_resampling_short_motions(count: int) -> None:
     def line(t: np.ndarray) -> np.ndarray:
         return 3 * t
 
-    found = resample(of_times(line, rate=10, count=count), rate=20)
+    found = resample_motion(of_times(line, rate=10, count=count), rate=20)
     assert len(found.joints) == 2 * count - 1
     np.testing.assert_allclose(found.joints[:, 0, 0], 3 * np.arange(2 * count - 1) / 20)
 
@@ -443,7 +443,7 @@ def test_resampling_short_motions(count: int) -> None:
 )
 def test_parts_that_are_none(options: dict) -> None:
     with pytest.raises(ConfigurationError, match="expected"):
-        resample(of_times(np.sin), **options)
+        resample_motion(of_times(np.sin), **options)
 
 
 # Whatever is wrong with a file is one error that says where.

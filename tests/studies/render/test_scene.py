@@ -11,11 +11,11 @@ from torch import Tensor
 from torchcss.body.load import load_body
 from torchcss.errors import CameraError, ConfigurationError
 from torchcss.studies.render.character import Character, Clothing
-from torchcss.studies.render.scene import Place, SceneRenderer, Style, look_at
+from torchcss.studies.render.scene import SceneRenderer, Standpoint, Style, look_at
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import rasterise
 
-PLACE = Place(torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64), 0.0, 0.3)
+PLACE = Standpoint(torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64), 0.0, 0.3)
 PLAIN = Style(scene="dark", lamps=(), shadows=False, fill=0.0, ambient=1.0, specular=0.0)
 """Nothing but the colour of things."""
 

@@ -57,7 +57,7 @@ _LEAST_PERSON, _LARGEST_PERSON = 0.5, 1.6
 """Shares of that span that still are a person's: from a small child to an outsize figure."""
 
 
-class Skeleton(NamedTuple):
+class HungTree(NamedTuple):
     """A tree that a file describes, hung on a root link of its own.
 
     Attributes:
@@ -77,7 +77,7 @@ class Skeleton(NamedTuple):
     is_z_up: bool = False
 
 
-def read_bvh_skeleton(path: Path, *, units: str | float | None = None) -> Skeleton:
+def read_bvh_skeleton(path: Path, *, units: str | float | None = None) -> HungTree:
     """Read the skeleton of a BVH file.
 
     Args:
@@ -135,7 +135,7 @@ def read_bvh_skeleton(path: Path, *, units: str | float | None = None) -> Skelet
     if is_z_up:
         notes.append(Z_UP_NOTE)
     names = tuple(segment.name for segment in segments)
-    return Skeleton(tuple(joints), sticky, tuple(notes), names, True, is_z_up)
+    return HungTree(tuple(joints), sticky, tuple(notes), names, True, is_z_up)
 
 
 def metres_per_unit(units: str | float | None) -> float | None:

@@ -22,7 +22,7 @@ from torchcss.errors import MotionCaptureError
 from torchcss.files import Line, read_lines, shortened
 
 
-class Turn(NamedTuple):
+class Channel(NamedTuple):
     """One number per frame that moves a segment: which column, and what it does."""
 
     column: int
@@ -46,7 +46,7 @@ class Segment(NamedTuple):
     parent: int
     offset: tuple[float, float, float]
     axes: Float[np.ndarray, "3 3"]
-    turns: tuple[Turn, ...]
+    turns: tuple[Channel, ...]
     turns_itself: bool
 
 
@@ -60,7 +60,7 @@ def bad(path: Path, line: int, expected: str, found: object) -> MotionCaptureErr
     )
 
 
-def numbers(path: Path, line: int, words: Sequence[str], expected: str) -> list[float]:
+def finite_numbers(path: Path, line: int, words: Sequence[str], expected: str) -> list[float]:
     """Finite numbers, as any program writes them (float() takes 1_000, too)."""
     try:
         values = [math.nan if "_" in word else float(word) for word in words]
@@ -71,7 +71,7 @@ def numbers(path: Path, line: int, words: Sequence[str], expected: str) -> list[
     return values
 
 
-def count(path: Path, line: int, word: str, expected: str) -> int:
+def whole_number(path: Path, line: int, word: str, expected: str) -> int:
     """A whole number of few digits: the interpreter refuses thousands of them in its own way."""
     if not re.fullmatch(r"[0-9]{1,9}", word):
         raise bad(path, line, expected, word)
@@ -130,7 +130,7 @@ class _Words:
         self.keyword("OFFSET")
         line = self.line
         words = [self.take("three numbers") for _ in range(3)]
-        x, y, z = numbers(self.path, line, words, "three numbers")
+        x, y, z = finite_numbers(self.path, line, words, "three numbers")
         return x, y, z
 
 
@@ -192,17 +192,19 @@ def parse_bvh(path: Path) -> tuple[list[Segment], Float[np.ndarray, "t c"], floa
     return segments, values, rate
 
 
-def _channels(words: _Words, first_column: int) -> tuple[Turn, ...]:
+def _channels(words: _Words, first_column: int) -> tuple[Channel, ...]:
     words.keyword("CHANNELS")
     line = words.line
-    number = count(words.path, line, words.take("a number of channels"), "a number of channels")
-    turns: list[Turn] = []
+    number = whole_number(
+        words.path, line, words.take("a number of channels"), "a number of channels"
+    )
+    turns: list[Channel] = []
     for column in range(first_column, first_column + min(number, 7)):
         word = words.take("a channel")
         match = _CHANNEL.fullmatch(word)
         if match is None:
             raise bad(words.path, line, "Xposition, ..., Zrotation", word)
-        turn = Turn(column, axis_of(match[1]), match[2].lower() == "rotation")
+        turn = Channel(column, axis_of(match[1]), match[2].lower() == "rotation")
         if any(turn[1:] == other[1:] for other in turns):
             raise bad(words.path, line, "every channel once", word)
         turns.append(turn)
@@ -216,9 +218,9 @@ def _bvh_frames(
     if len(lines) < 3:
         raise bad(path, lines[0].number, "Frames: and Frame Time: after it", "the end of the file")
     first, second, rows = lines[1], lines[2], lines[3:]
-    number = count(path, first.number, _said(path, first, "Frames"), "a number of frames")
+    number = whole_number(path, first.number, _said(path, first, "Frames"), "a number of frames")
     digits = _said(path, second, "Frame Time")
-    (interval,) = numbers(path, second.number, [digits], "the seconds of a frame")
+    (interval,) = finite_numbers(path, second.number, [digits], "the seconds of a frame")
     if not 1e-6 < interval < 1e3:
         raise bad(path, second.number, "the seconds of a frame", digits)
     if number != len(rows):
@@ -252,5 +254,5 @@ def _table(path: Path, rows: Sequence[Line], is_angle: np.ndarray) -> np.ndarray
     for out, (line, words) in zip(values, rows, strict=True):
         if len(words) != len(is_angle):
             raise bad(path, line, f"{len(is_angle)} numbers, one for every channel", len(words))
-        out[:] = numbers(path, line, words, "numbers")
+        out[:] = finite_numbers(path, line, words, "numbers")
     return np.where(is_angle, np.radians(values), values)

@@ -26,7 +26,7 @@ from jaxtyping import Float
 
 from torchcss.body.catalog import PartSpecification, without_side
 from torchcss.body.chain import JointSpecification
-from torchcss.body.rotations import Vector, as_rows, as_vector, frame_along
+from torchcss.body.rotations import Vector3, as_rows, as_vector, frame_along
 from torchcss.body.surface import angular_grid, implicit, surface_points
 
 GIRTHS: dict[tuple[str, str], tuple[str, float]] = {
@@ -89,7 +89,7 @@ def rest_poses(joints: Sequence[JointSpecification]) -> dict[str, Float[np.ndarr
     return poses
 
 
-def _frame(rotation: Sequence[Sequence[float]], place: Vector) -> Float[np.ndarray, "4 4"]:
+def _frame(rotation: Sequence[Sequence[float]], place: Vector3) -> Float[np.ndarray, "4 4"]:
     frame = np.eye(4)
     frame[:3, :3], frame[:3, 3] = rotation, place
     return frame

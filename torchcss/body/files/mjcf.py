@@ -30,7 +30,7 @@ from jaxtyping import Float
 
 from torchcss.body.catalog import PartSpecification
 from torchcss.body.chain import JointSpecification
-from torchcss.body.files.bvh import BASE, Skeleton
+from torchcss.body.files.bvh import BASE, HungTree
 from torchcss.body.files.default_shape import solid_shape, unused
 from torchcss.body.files.xml import parse_xml
 from torchcss.body.rotations import as_rows, as_vector, from_quaternion
@@ -57,7 +57,7 @@ _LIGHT = 1e-6
 """Mass and inertia that every body has at least: the compiler refuses moving ones without."""
 
 
-def read_mjcf(path: Path) -> tuple[Skeleton, tuple[PartSpecification, ...]]:
+def read_mjcf(path: Path) -> tuple[HungTree, tuple[PartSpecification, ...]]:
     """Read tree and solids of an MJCF file.
 
     Args:
@@ -215,7 +215,7 @@ class _Reader:
 
     def read(
         self, chosen: int, notes: tuple[str, ...]
-    ) -> tuple[Skeleton, tuple[PartSpecification, ...]]:
+    ) -> tuple[HungTree, tuple[PartSpecification, ...]]:
         """The tree that hangs on a body of the world, and its parts."""
         for body in np.flatnonzero(self.model.body_rootid == chosen).tolist():
             self._body(body)
@@ -224,7 +224,7 @@ class _Reader:
         del self.links[0]
         places = tuple(self.links.values())
         notes += tuple(self._couple())
-        return Skeleton(tuple(self.joints), {}, notes, places, self.has_root), tuple(self.parts)
+        return HungTree(tuple(self.joints), {}, notes, places, self.has_root), tuple(self.parts)
 
     def _couple(self) -> Iterator[str]:
         """Let joints follow others by the file's equalities; yield what was left out."""

@@ -20,9 +20,9 @@ from itertools import count
 
 from torchcss.body.catalog import PartSpecification
 from torchcss.body.chain import JointSpecification, check_joints, link_order, urdf_joints
-from torchcss.body.files.bvh import Skeleton
+from torchcss.body.files.bvh import HungTree
 from torchcss.body.files.default_shape import solid_shape
-from torchcss.body.rotations import Vector, about_fixed_axes, as_rows
+from torchcss.body.rotations import Vector3, about_fixed_axes, as_rows
 from torchcss.errors import BodyError
 from torchcss.files import shortened
 
@@ -35,7 +35,7 @@ _SIZES = {
 }
 
 
-def read_urdf(robot: ElementTree.Element) -> tuple[Skeleton, tuple[PartSpecification, ...]]:
+def read_urdf(robot: ElementTree.Element) -> tuple[HungTree, tuple[PartSpecification, ...]]:
     """Tree and solids of a URDF.
 
     Args:
@@ -69,7 +69,7 @@ def read_urdf(robot: ElementTree.Element) -> tuple[Skeleton, tuple[PartSpecifica
     solids = _solids(robot)
     check_joints(joints)
     places = tuple(link_order(joints))
-    return Skeleton(tuple(joints), {}, tuple(notes), places, floats), solids
+    return HungTree(tuple(joints), {}, tuple(notes), places, floats), solids
 
 
 def _bare_joints(robot: ElementTree.Element) -> list[JointSpecification]:
@@ -243,7 +243,7 @@ def _simple_solids(
 
 def _origin(
     where: str, element: ElementTree.Element
-) -> tuple[Vector, tuple[Vector, Vector, Vector]]:
+) -> tuple[Vector3, tuple[Vector3, Vector3, Vector3]]:
     """Where a joint or a solid sits, and how it is turned."""
     origin = element.find("origin")
     values = {} if origin is None else origin.attrib

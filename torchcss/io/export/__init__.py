@@ -59,7 +59,7 @@ class ExportOptions:
     bvh: BvhStyle = field(default_factory=BvhStyle)
 
 
-class Export(NamedTuple):
+class Exported(NamedTuple):
     """What was written.
 
     Attributes:
@@ -77,7 +77,7 @@ def export(
     *,
     to: str | None = None,
     options: ExportOptions | None = None,
-) -> Export:
+) -> Exported:
     """Write a track in the format of another program.
 
     Args:
@@ -127,7 +127,7 @@ def export(
             save_arrays(paths[0], {**npz_arrays(selection, covariance), **smpl})
     else:
         report += _write_modes(paths, to, selection, track, options.bvh)
-    return Export(tuple(paths), tuple(report))
+    return Exported(tuple(paths), tuple(report))
 
 
 def _write_modes(

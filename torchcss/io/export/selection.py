@@ -29,7 +29,7 @@ from torchcss.io.tracks import Track
 from torchcss.io.video import VideoReader
 from torchcss.vision.camera import Camera
 
-DEFAULT_RATE = 25.0
+DEFAULT_FRAME_RATE = 25.0
 """Frames per second where neither times nor a video tell."""
 
 _TO_Y_UP: dict[str, tuple[tuple[int, int, int], ...]] = {
@@ -307,7 +307,7 @@ def _rate(track: Track, kept: np.ndarray, report: list[str]) -> float:
     if not steps.size or not (steps > 0).all():
         rate, said = _rate_of_video(track), "that of its video or pictures"
         if rate is None:
-            rate, said = DEFAULT_RATE, "neither the track nor a video tells one"
+            rate, said = DEFAULT_FRAME_RATE, "neither the track nor a video tells one"
         report.append(f"a frame rate of {rate:g} is written: {said}")
         return rate
     step = float(np.median(steps))

@@ -29,7 +29,7 @@ from torchcss.io.keypoints.people import (
     is_there,
     screened,
 )
-from torchcss.io.keypoints.words import FRAMES, NAMES, SCORES, SIZES, first_of
+from torchcss.io.keypoints.words import FRAMES, ORDER_NAMES, SCORES, SIZES, first_of
 from torchcss.joint_names import names_in
 from torchcss.types import Keypoints
 
@@ -88,7 +88,7 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
     texts = {key: each for key, each in texts.items() if each.shape == values.shape[2:3]}
     return People(
         _counted(people, first_of(numbers, FRAMES)),
-        _names(arrays.get("joint_names", first_of(texts, NAMES)), values.shape[2]),
+        _names(arrays.get("joint_names", first_of(texts, ORDER_NAMES)), values.shape[2]),
         report,
         corner_fractions=is_movenet,
         size_wh=None if size is None else (size[0], size[1]),

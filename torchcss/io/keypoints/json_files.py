@@ -42,10 +42,10 @@ from torchcss.io.keypoints.people import (
     Person,
     Size,
     is_there,
-    numbers,
+    number_array,
     united,
 )
-from torchcss.io.keypoints.words import FRAMES, NAMES, PICTURES, TIMES, first_of, time_word
+from torchcss.io.keypoints.words import FRAMES, ORDER_NAMES, PICTURES, TIMES, first_of, time_word
 from torchcss.io.video import natural_order
 
 _FORMATS = {
@@ -137,7 +137,7 @@ def _five_deep(content: object) -> np.ndarray | None:
     inner, depth = content, 0
     while isinstance(inner, list) and inner and depth < 5:
         inner, depth = inner[0], depth + 1
-    return numbers(content, "MoveNet's") if depth == 5 and isinstance(inner, float) else None
+    return number_array(content, "MoveNet's") if depth == 5 and isinstance(inner, float) else None
 
 
 def _load(path: Path) -> Any:
@@ -179,7 +179,7 @@ def _said_names(content: object, frames: Frames) -> Names | None:
     """As many names as joints that stand in the head, as a list or by number (MMPose's)."""
     counts = {len(person.joints) for people in frames.values() for person in people}
     for head in heads(content):
-        names = first_of(head, NAMES)
+        names = first_of(head, ORDER_NAMES)
         if isinstance(names, dict) and all(str(i) in names for i in range(len(names))):
             names = [names[str(i)] for i in range(len(names))]
         if isinstance(names, list) and {len(names)} == counts and isinstance(names[0], str):

@@ -17,7 +17,7 @@ import numpy as np
 
 from torchcss.errors import KeypointError
 from torchcss.files import unexpected
-from torchcss.io.keypoints.people import LAYOUT_SIZES, Person, numbers, screened, track_of
+from torchcss.io.keypoints.people import LAYOUT_SIZES, Person, number_array, screened, track_of
 from torchcss.io.keypoints.words import CONFIDENCES, SCORES, SIDES, SIZES, first_of
 from torchcss.joint_names import names_in
 
@@ -114,7 +114,7 @@ def one_person(where: str, value: Any, around: Mapping[str, Any] | None = None) 
     while isinstance(scores, list) and scores and isinstance(scores[0], list):
         scores = [each[0] if isinstance(each, list) and each else each for each in scores]
     if _flat(value) or value[0] is None:
-        joints = _in_a_row(where, numbers(value, where), scores)
+        joints = _in_a_row(where, number_array(value, where), scores)
     else:
         rows = [_row(f"{where}: joint {index}", row) for index, row in enumerate(value)]
         joints = screened(np.array(rows)[:, :2], np.array(rows)[:, 2])
@@ -148,7 +148,7 @@ def _in_a_row(where: str, values: np.ndarray, scores: object) -> np.ndarray:
 def _with_scores(where: str, joints: np.ndarray, scores: object) -> np.ndarray:
     if scores is None or np.isnan(joints).any():
         return joints
-    confidence = numbers(scores, f"{where}: scores")
+    confidence = number_array(scores, f"{where}: scores")
     if confidence.shape != joints.shape[:1]:
         raise KeypointError(
             f"{where}: {confidence.size} confidences for {len(joints)} joints; expected as many"
@@ -168,7 +168,7 @@ def _row(where: str, row: Any) -> list[float]:
         row = [place["x"], place["y"], given]
     elif isinstance(row, list) and len(row) == 4:
         row = [row[0], row[1], row[3]]  # x, y, z, visibility
-    values = numbers(row, where)
+    values = number_array(row, where)
     if values.shape not in ((2,), (3,)):
         raise unexpected(KeypointError, where, "x, y[, confidence]", row)
     return [*values.tolist(), np.nan][:3]
@@ -181,7 +181,7 @@ def _labelme(where: str, shapes: object) -> list[Person]:
         if not isinstance(shape, dict) or shape.get("shape_type") != "point":
             continue
         place = f"{where}: shape {index}"
-        point = numbers(shape.get("points"), place)
+        point = number_array(shape.get("points"), place)
         if point.shape != (1, 2):
             raise unexpected(KeypointError, place, "one point", point.tolist())
         group = people.setdefault(str(shape.get("group_id")), {})

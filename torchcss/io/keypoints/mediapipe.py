@@ -19,7 +19,7 @@ from torchcss.joint_names import ALIASES, names_in
 LAYOUT = "MediaPipe-33"
 NUM_LANDMARKS = len(ALIASES[LAYOUT])
 
-NAMES = names_in(
+MEDIAPIPE_NAMES = names_in(
     "nose left_eye_inner left_eye left_eye_outer right_eye_inner right_eye right_eye_outer "
     "left_ear right_ear mouth_left mouth_right left_shoulder right_shoulder left_elbow right_elbow "
     "left_wrist right_wrist left_pinky right_pinky left_index right_index left_thumb right_thumb "
@@ -39,8 +39,8 @@ def reordered(frames: Frames, names: Sequence[str]) -> tuple[Frames, Names | Non
     plain = [re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_") for name in names]
     if plain and all(map(str.isdigit, plain)):
         order = sorted(range(len(plain)), key=lambda index: int(plain[index]))
-    elif set(plain) == set(NAMES):
-        order = [plain.index(name) for name in NAMES]
+    elif set(plain) == set(MEDIAPIPE_NAMES):
+        order = [plain.index(name) for name in MEDIAPIPE_NAMES]
     else:
         return frames, tuple(names) or None
     return {

@@ -81,7 +81,7 @@ def identified(frames: list[np.ndarray]) -> list[list[int]]:
     return numbers
 
 
-def follow(
+def follow_person(
     frames: list[np.ndarray], tracks: list[list[str | None]], whom: Whom, report: list[str]
 ) -> np.ndarray:
     """Return `[t j 3]`: the person that is followed among those of every frame.

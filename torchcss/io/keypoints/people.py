@@ -101,7 +101,7 @@ def united(frames: Frames) -> tuple[Frames, Names | None]:
     return found, names
 
 
-def numbers(value: object, where: str) -> np.ndarray:
+def number_array(value: object, where: str) -> np.ndarray:
     """Nested lists of numbers, in which null is NaN, as an array.
 
     Raises:

@@ -48,7 +48,7 @@ from torchcss.io.keypoints.h36m import is_h36m, read_h36m
 from torchcss.io.keypoints.hdf5 import read_hdf5
 from torchcss.io.keypoints.json_files import read_folder, read_json
 from torchcss.io.keypoints.labels import read_labels
-from torchcss.io.keypoints.one_person import Whom, follow, size_of
+from torchcss.io.keypoints.one_person import Whom, follow_person, size_of
 from torchcss.io.keypoints.people import Names, People, Person, Size, is_there
 from torchcss.io.keypoints.sides import with_sides_put_back
 from torchcss.io.keypoints.tables import read_table
@@ -178,7 +178,7 @@ def _person(
     for frame in frames:
         frame[..., :2] = scale * frame[..., :2] + shift
     tracks = [[person.track for person in frame] for frame in everyone]
-    chosen = follow(frames, tracks, whom, report)
+    chosen = follow_person(frames, tracks, whom, report)
     names = _joint_names(people, chosen, layout, report)
     chosen = with_sides_put_back(chosen, names, report)
     report += findings(chosen, names, image_size_wh, first_frame)

@@ -54,7 +54,7 @@ SCORES = (
 )  # fmt: skip
 """The confidences of all joints together."""
 
-NAMES = names_in(
+ORDER_NAMES = names_in(
     "jointnames keypointnames keypointid2name keypointsnames nodenames landmarknames bodyparts "
     "names labels joints keypoints"
 )

@@ -15,7 +15,14 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from torchcss.body.files.bvh_parser import Segment, Turn, axis_of, bad, count, numbers
+from torchcss.body.files.bvh_parser import (
+    Channel,
+    Segment,
+    axis_of,
+    bad,
+    finite_numbers,
+    whole_number,
+)
 from torchcss.body.rotations import about_fixed_axes
 from torchcss.errors import MotionCaptureError
 from torchcss.files import Line, read_lines
@@ -95,14 +102,14 @@ def _parse_asf(path: Path, lines: list[Line]) -> _Acclaim:
     return _Acclaim(segments, counts, is_angle, radians, metres)
 
 
-def _turns(path: Path, bone: _Bone, first: int, *, may_travel: bool) -> tuple[Turn, ...]:
+def _turns(path: Path, bone: _Bone, first: int, *, may_travel: bool) -> tuple[Channel, ...]:
     """What moves a bone, by columns from the first one on."""
     turns = []
     for column, word in enumerate(bone.freedom, first):
         kind, axis = word[:1].lower(), axis_of(word[1:] or "?")
         if len(word) != 2 or axis < 0 or kind not in ("rt" if may_travel else "r"):
             raise bad(path, bone.line, "degrees of freedom rx, ry, rz", word)
-        turns.append(Turn(column, axis, kind == "r"))
+        turns.append(Channel(column, axis, kind == "r"))
     if len({turn[1:] for turn in turns}) < len(turns):
         raise bad(path, bone.line, "every degree of freedom once", " ".join(bone.freedom))
     return tuple(turns)
@@ -111,7 +118,7 @@ def _turns(path: Path, bone: _Bone, first: int, *, may_travel: bool) -> tuple[Tu
 def _vector(path: Path, line: Line, expected: str) -> tuple[float, float, float]:
     """The three numbers of a line."""
     words = line.words[1:4]
-    values = numbers(path, line.number, words, expected)
+    values = finite_numbers(path, line.number, words, expected)
     if len(values) != 3:
         raise bad(path, line.number, expected, " ".join(words))
     return values[0], values[1], values[2]
@@ -124,7 +131,7 @@ def _units(path: Path, lines: Sequence[Line]) -> tuple[bool, float | None]:
     if "length" not in units:
         return radians, None
     line = units["length"]
-    fraction, *_ = numbers(path, line.number, line.words[1:2] or ["nothing"], "a length")
+    fraction, *_ = finite_numbers(path, line.number, line.words[1:2] or ["nothing"], "a length")
     return radians, 0.0254 / fraction if fraction > 1e-9 else None
 
 
@@ -172,7 +179,7 @@ def _bone(path: Path, block: Sequence[Line], radians: bool) -> tuple[str, _Bone]
     direction = _vector(path, entries["direction"], "3 numbers")
     axis = _vector(path, entries["axis"], "3 numbers")
     line = entries["length"]
-    (length,) = numbers(path, line.number, line.words[1:2], "1 numbers")
+    (length,) = finite_numbers(path, line.number, line.words[1:2], "1 numbers")
     order = (entries["axis"].words[4:5] or ["XYZ"])[0].upper()
     if sorted(order) != ["X", "Y", "Z"]:
         raise bad(path, entries["axis"].number, "an order of X, Y and Z", order)
@@ -222,7 +229,8 @@ def _parse_amc(path: Path, lines: list[Line], skeleton: _Acclaim) -> Float[np.nd
             if frames:
                 _check_frame(path, line.number, skeleton, rows[-1])
                 number, before = (
-                    count(path, line.number, word, "a frame number") for word in (first, frames[-1])
+                    whole_number(path, line.number, word, "a frame number")
+                    for word in (first, frames[-1])
                 )
                 if number != before + 1:
                     raise bad(path, line.number, f"the frame after {frames[-1]}", first)
@@ -235,7 +243,7 @@ def _parse_amc(path: Path, lines: list[Line], skeleton: _Acclaim) -> Float[np.nd
             raise bad(path, line.number, "a bone of the skeleton with freedom", first)
         if first in rows[-1]:
             raise bad(path, line.number, "every bone once in a frame", first)
-        row = rows[-1][first] = numbers(path, line.number, words, "numbers")
+        row = rows[-1][first] = finite_numbers(path, line.number, words, "numbers")
         if len(row) != (size := skeleton.counts[first]):
             raise bad(path, line.number, f"{size} numbers for {first}", len(row))
     if not frames:

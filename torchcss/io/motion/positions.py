@@ -18,8 +18,8 @@ Neither format is sure to say its unit. An ASF states a fraction of an inch (tha
 database 1 / 0.45 inch, 56.4 mm); a BVH states none. Without `units`, the statement is taken if a
 person results, else the unit that makes the skeleton as large as one; the report says which.
 
-Call `read_motion_capture`, then `resample` for a part of it at another rate, and `limb_positions`
-for the joints that the catalogue names.
+Call `read_motion_capture`, then `resample_motion` for a part of it at another rate, and
+`limb_positions` for the joints that the catalogue names.
 """
 
 from __future__ import annotations
@@ -45,14 +45,10 @@ from torchcss.body.rotations import about
 from torchcss.errors import ConfigurationError, MotionCaptureError
 from torchcss.files import StrPath, shortened
 from torchcss.io.motion.acclaim import parse_acclaim
-from torchcss.joint_names import LIMB_PLACES, skeleton_joint_names
+from torchcss.joint_names import LIMB_JOINTS, skeleton_joint_names
 
 ACCLAIM_RATE = 120.0
 """Frames per second of an AMC, which does not say: those of the CMU database."""
-
-LIMBS: Final[tuple[str, ...]] = tuple(f"{side}_{place}" for place in LIMB_PLACES for side in "lr")
-"""The joints that all skeletons have and mean alike."""
-
 
 _Z_TO_Y: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Turns rows of places that are Z up to Y up."""
@@ -157,7 +153,7 @@ def _parse(
     return segments, values, ACCLAIM_RATE, stated, ["rate assumed: an AMC does not say it"]
 
 
-def resample(
+def resample_motion(
     motion: MotionCapture, *, rate: float, start: float = 0.0, stop: float | None = None
 ) -> MotionCapture:
     """A part of a motion at another rate, every coordinate interpolated on its own.
@@ -198,19 +194,19 @@ def limb_positions(
         motion: The motion, its names such as `skeleton_joint_names` knows.
 
     Returns:
-        Those of `LIMBS` that there are, which joint of the motion each is, and their positions.
+        Those of `LIMB_JOINTS` that there are, which joint of the motion each is, and their places.
 
     Raises:
         MotionCaptureError: If hips or shoulders are not among them.
     """
     places = skeleton_joint_names(motion.joint_names, ends=True)
-    found = {name: index for index, name in enumerate(places) if name in LIMBS}
+    found = {name: index for index, name in enumerate(places) if name in LIMB_JOINTS}
     if not {"l_hip", "r_hip", "l_shoulder", "r_shoulder"} <= set(found):
         raise MotionCaptureError(
             "expected hips and shoulders of both sides among the joints, found "
             f"{shortened(', '.join(motion.joint_names))}; rename the joints"
         )
-    names = tuple(name for name in LIMBS if name in found)
+    names = tuple(name for name in LIMB_JOINTS if name in found)
     index = tuple(found[name] for name in names)
     return names, index, motion.joints[:, list(index)]
 

@@ -46,7 +46,7 @@ _FARTHEST_M = 50.0
 """Metres from the camera beyond which there is no wall."""
 
 
-class Place(NamedTuple):
+class Standpoint(NamedTuple):
     """Where a character is in a scene.
 
     Attributes:
@@ -124,7 +124,7 @@ class SceneRenderer:
     """
 
     def __init__(
-        self, camera: Camera, place: Place, style: Style, *, generator: torch.Generator
+        self, camera: Camera, place: Standpoint, style: Style, *, generator: torch.Generator
     ) -> None:
         if camera.has_distortion:
             raise CameraError(
@@ -169,7 +169,7 @@ def _level_axes(camera: Camera) -> Float[Tensor, "3 3"]:
 
 
 def _backdrop(
-    camera: Camera, place: Place, back: Float[Tensor, "3"], wall: float
+    camera: Camera, place: Standpoint, back: Float[Tensor, "3"], wall: float
 ) -> tuple[Float[Tensor, "i 3"], Float[Tensor, "i 3"]]:
     """What every pixel sees of wall and floor, and the normals there.
 

@@ -47,7 +47,7 @@ from torchcss.studies.render.renderer import (
     random_texture,
     render_meshes,
 )
-from torchcss.studies.render.scene import Place, SceneRenderer, Style, lamp, look_at
+from torchcss.studies.render.scene import SceneRenderer, Standpoint, Style, lamp, look_at
 from torchcss.types import Trajectory, Vector
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import grid_faces, join_faces
@@ -300,7 +300,7 @@ class Shot:
         return characters, generator
 
 
-def _place(joints: Float[Tensor, "t j 3"], camera: Camera, floor: float) -> Place:
+def _place(joints: Float[Tensor, "t j 3"], camera: Camera, floor: float) -> Standpoint:
     """Where the motion is, seen from the camera."""
     lowest, highest = joints.amin((0, 1)), joints.amax((0, 1))
     middle = 0.5 * (lowest + highest)
@@ -308,7 +308,7 @@ def _place(joints: Float[Tensor, "t j 3"], camera: Camera, floor: float) -> Plac
     away[1] = 0
     away = functional.normalize(away, dim=-1)
     behind = float(((joints - middle) @ away).max())
-    return Place(middle, floor, behind + 0.15)
+    return Standpoint(middle, floor, behind + 0.15)
 
 
 def _rest_of_person(
