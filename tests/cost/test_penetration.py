@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from torchcss.body.load import load_body
-from torchcss.body.superquadric import implicit
+from torchcss.body.surface import implicit
 from torchcss.cost.penetration import PenetrationDepth
 
 

@@ -194,20 +194,11 @@ def retarget(
     joints = model.pose(states).joints
     columns = [model.joint_index(name) for name in names]
     at_limit = (states <= model.lower + _SLACK) | (states >= model.upper - _SLACK)
-    collisions = PenetrationDepth(model)(model, states)
-    report += _findings(model, states, at_limit, collisions)
+    inside = PenetrationDepth(model)(model, states)
+    report += _findings(model, states, at_limit, inside)
     error = (joints[:, columns] - limbs).norm(dim=-1)
     return Retargeted(
-        model,
-        states,
-        joints,
-        names,
-        limbs,
-        source,
-        error,
-        at_limit,
-        collisions.depth,
-        tuple(report),
+        model, states, joints, names, limbs, source, error, at_limit, inside.depth, tuple(report)
     )
 
 
@@ -529,18 +520,22 @@ def _findings(
     worst = share.argsort(descending=True)[:6].tolist()
     held = [f"{body.state_names[i]} {100 * share[i]:.0f} %" for i in worst if share[i] > 0.005]
     lines.append(f"angles at a limit, share of frames: {', '.join(held) or 'none'}")
+    lines.append(_colliding(body, collisions))
+    return lines
+
+
+def _colliding(body: BodyModel, collisions: Penetration) -> str:
+    """Which parts are inside others, how deep and how often."""
     depth = collisions.depth
     deep = depth > _DEEP
-    if bool(deep.any()):
-        parts = collisions.parts.sort(-1).values.tolist()
-        pairs = [" and ".join(body.part_names[part] for part in pair) for pair in parts]
-        named = [pair for pair, is_deep in zip(pairs, deep.tolist(), strict=True) if is_deep]
-        common = max(set(named), key=named.count)
-        lines.append(
-            f"parts more than {1000 * _DEEP:.0f} mm inside others in "
-            f"{100 * float(deep.double().mean()):.0f} % of frames, {1000 * float(depth.max()):.0f} "
-            f"mm at most ({pairs[int(depth.argmax())]}), most often {common}"
-        )
-    else:
-        lines.append(f"no part more than {1000 * _DEEP:.0f} mm inside another")
-    return lines
+    if not bool(deep.any()):
+        return f"no part more than {1000 * _DEEP:.0f} mm inside another"
+    parts = collisions.parts.sort(-1).values.tolist()
+    pairs = [" and ".join(body.part_names[part] for part in pair) for pair in parts]
+    named = [pair for pair, is_deep in zip(pairs, deep.tolist(), strict=True) if is_deep]
+    common = max(set(named), key=named.count)
+    return (
+        f"parts more than {1000 * _DEEP:.0f} mm inside others in "
+        f"{100 * float(deep.double().mean()):.0f} % of frames, {1000 * float(depth.max()):.0f} "
+        f"mm at most ({pairs[int(depth.argmax())]}), most often {common}"
+    )
