@@ -38,6 +38,7 @@ from torchcss.inference.implicit import TermWeights, weighted_minimum
 from torchcss.inference.mixture import GaussianMixture, Prior
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.initialise.result import Initialisation
+from torchcss.initialise.view import CameraView
 from torchcss.io.video import VideoReader
 from torchcss.studies.render.sequences import arm_sequence
 from torchcss.studies.sequences import read_sequence
@@ -49,7 +50,6 @@ from torchcss.tracking.settings import (
     make_choice,
     make_extractor,
 )
-from torchcss.tracking.view import CameraView
 from torchcss.types import Frame
 from torchcss.vision.appearance import Appearance
 from torchcss.vision.camera import Camera

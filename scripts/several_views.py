@@ -46,6 +46,7 @@ from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.initialise.outliers import best_distinct
 from torchcss.initialise.result import Initialisation
+from torchcss.initialise.view import CameraView
 from torchcss.io.cameras import read_camera
 from torchcss.io.video import VideoReader
 from torchcss.io.view_files import ViewFiles
@@ -57,7 +58,6 @@ from torchcss.studies.metrics import (
 )
 from torchcss.tracking.session import TrackingSession
 from torchcss.tracking.settings import Settings
-from torchcss.tracking.view import CameraView
 from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
 

@@ -25,14 +25,13 @@ from torch import Tensor
 from torchcss.body.load import FileOptions, load_body
 from torchcss.body.model import BodyModel
 from torchcss.cli.options import SettingsOptions
-from torchcss.cost.view import View
 from torchcss.initialise.fit import initialise
 from torchcss.initialise.options import InitialiseOptions
+from torchcss.initialise.view import CameraView
 from torchcss.studies.render.robots import film_robot, stand, trot
 from torchcss.studies.render.scene import look_at
 from torchcss.tracking.session import TrackingSession
 from torchcss.tracking.settings import TERMS, Settings
-from torchcss.tracking.view import CameraView
 from torchcss.types import Keypoints
 
 MARKED = ("THIGH", "SHANK", "FOOT")
@@ -107,16 +106,12 @@ def begin(config: Config, body: BodyModel, truth: Tensor) -> tuple[TrackingSessi
     settings = replace(config.tracking, body=body.name)
     dtype, device = settings.torch_dtype, settings.device
     there = [camera.to(dtype=dtype, device=device) for camera in cameras]
-    others = [
-        View(camera=camera, keypoints=keypoints.at(0).to(camera.K))
-        for camera, keypoints in zip(there[1:], seen[1:], strict=True)
-    ]
+    views = [CameraView(*pair, config.noise) for pair in zip(there, seen, strict=True)]
     first = initialise(
         None, seen[0].at(0), there[0], body.to(dtype=dtype, device=device), generator=generator,
         options=InitialiseOptions(sigma=config.noise, dtype=dtype, device=torch.device(device)),
-        others=others,
+        others=[view.at(0) for view in views[1:]],
     )  # fmt: skip
-    views = [CameraView(*pair, config.noise) for pair in zip(there, seen, strict=True)]
     session = TrackingSession(settings, first, views, frame_interval=1 / RATE, generator=generator)
     return session, list(zip(*(film.frames for film in films), strict=True))
 

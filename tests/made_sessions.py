@@ -13,10 +13,10 @@ from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.initialise.result import Initialisation
+from torchcss.initialise.view import CameraView
 from torchcss.studies.render.sequences import SyntheticSequence
 from torchcss.tracking.session import TrackingSession
 from torchcss.tracking.settings import Settings
-from torchcss.tracking.view import CameraView
 from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
 

@@ -19,6 +19,7 @@ from torchcss.body.model import BodyModel
 from torchcss.initialise.fit import initialise
 from torchcss.initialise.options import InitialiseOptions
 from torchcss.initialise.result import Initialisation
+from torchcss.initialise.view import CameraView
 from torchcss.io.cameras import read_camera, read_cameras
 from torchcss.io.export import export
 from torchcss.io.keypoints.read import read_keypoints
@@ -31,7 +32,6 @@ from torchcss.studies.evaluation import Evaluation, evaluate
 from torchcss.tracking.batch import track_batch
 from torchcss.tracking.session import Observation, Posterior, SessionState, TrackingSession
 from torchcss.tracking.settings import Settings
-from torchcss.tracking.view import CameraView
 from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
 

@@ -17,12 +17,12 @@ from torchcss import load_track
 from torchcss.app.smooth import run_settings, smooth_frames, smooth_track
 from torchcss.cli import main as cli
 from torchcss.errors import ConfigurationError, VideoError
+from torchcss.initialise.view import CameraView
 from torchcss.io.run import Run
 from torchcss.io.tracks import FrameModes, Track, TrackWriter, read_summary
 from torchcss.studies.render.sequences import SyntheticSequence
 from torchcss.tracking.settings import Settings
 from torchcss.tracking.smooth import Smoothing
-from torchcss.tracking.view import CameraView
 from torchcss.types import Frame, Keypoints
 
 NUM_FRAMES = 8

@@ -25,7 +25,8 @@ from torchcss.inference.mixture import GaussianMixture, Prior
 from torchcss.inference.problem import SearchProblem
 from torchcss.inference.proposals import CovarianceScaled
 from torchcss.inference.tracker import Tracker
-from torchcss.tracking.view import NOTHING_KNOWN, NOTHING_SEEN, CameraView, Observer
+from torchcss.initialise.view import CameraView
+from torchcss.tracking.view import NOTHING_KNOWN, NOTHING_SEEN, Observer
 from torchcss.types import Bounds, Frame, LocalModel
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor

@@ -22,7 +22,7 @@ from torchcss.cost.choice import CostChoice
 from torchcss.cost.context import FrameContext
 from torchcss.cost.joints import JointTerm, match_joints
 from torchcss.cost.total import TrackingCost, beside
-from torchcss.cost.view import View
+from torchcss.initialise.view import CameraView
 from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
 
@@ -145,7 +145,7 @@ def test_samples_keep_their_own_targets_in_every_view(generator: torch.Generator
 
 def test_keypoints_of_a_view_in_a_picture_of_another_size() -> None:
     first, _, _ = two_views()
-    small = View(first.camera, first.keypoints).of_keypoints(0.6)
+    small = CameraView(first.camera, first.keypoints).scaled(0.6)
     assert small.camera.image_size_wh == (96, 72)
     assert small.keypoints is not None
     assert first.keypoints is not None

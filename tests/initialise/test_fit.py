@@ -24,7 +24,6 @@ from torchcss.cost.joints import JointTerm, match_joints
 from torchcss.cost.part_map import part_map
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.total import TrackingCost
-from torchcss.cost.view import View
 from torchcss.errors import BodyError, CameraError, ConfigurationError, KeypointError
 from torchcss.initialise.fit import DEFAULT_VIEW_DEGREES, default_camera, initialise
 from torchcss.initialise.from_joints import hang_before_camera
@@ -39,6 +38,7 @@ from torchcss.initialise.multi_start import (
 )
 from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
 from torchcss.initialise.result import Initialisation, hang_on_best, stature_of
+from torchcss.initialise.view import CameraView
 from torchcss.joint_names import LIMB_JOINTS
 from torchcss.show.initialisation_views import proportion_table
 from torchcss.studies.metrics import mask_overlap, pa_mpjpe_mm
@@ -276,7 +276,7 @@ def test_marks_keep_their_place_in_a_picture_whose_sides_are_rounded(
         np.zeros((1000, 303, 3), np.uint8), keypoints, camera, "arm7",
         generator=torch.Generator().manual_seed(0),
         options=InitialiseOptions(search=SINGLE_START, working_size=64),
-        others=[View(camera=camera, keypoints=keypoints)],
+        others=[CameraView(camera, keypoints)],
     )  # fmt: skip
     for view in cost.views:
         assert view.camera.image_size_wh == (19, 64)
@@ -456,7 +456,7 @@ def test_terms_of_the_first_stage_can_be_weighed(generator):
     x = body.bounds.project(0.05 * drawn)
     with_all, without = (
         InitialiseOptions(sigma=1.0, weights=weights).joint_cost(
-            body, [View(camera=person().camera, keypoints=None)]
+            body, [CameraView(person().camera)]
         )
         for weights in ({}, {"anthropometric": 0.0})
     )

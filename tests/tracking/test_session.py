@@ -30,6 +30,7 @@ from torchcss.errors import ConfigurationError, OutputError, TorchcssError, Vide
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.tracker import Tracker, TrackerState
 from torchcss.initialise.result import Initialisation
+from torchcss.initialise.view import CameraView
 from torchcss.io import tracks
 from torchcss.io.fitted_body import read_fitted_body, write_fitted_body
 from torchcss.io.run import body_of_track
@@ -49,7 +50,6 @@ from torchcss.tracking.settings import (
     make_settings_tracker,
     named_terms,
 )
-from torchcss.tracking.view import CameraView
 from torchcss.types import Bounds, Frame
 from torchcss.vision.camera import Camera
 

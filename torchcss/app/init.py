@@ -23,13 +23,13 @@ from typing import Any
 
 import torch
 
-from torchcss.cost.view import View
 from torchcss.errors import CameraError, KeypointError
 from torchcss.files import prepare_output_folder, replace_file
 from torchcss.initialise.fit import default_camera, initialise
 from torchcss.initialise.noise import Noise
 from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
 from torchcss.initialise.result import Initialisation, stature_of
+from torchcss.initialise.view import CameraView
 from torchcss.io.cameras import check_image_size, load_camera
 from torchcss.io.fitted_body import FITTED_BODY_NAME, write_fitted_body
 from torchcss.io.keypoints.one_image import read_joints
@@ -187,7 +187,7 @@ def initialise_video(
     start: int,
     noise: Noise,
     generator: torch.Generator,
-    others: Sequence[View] = (),
+    others: Sequence[CameraView] = (),
 ) -> Initialisation:
     """Fit pose, proportions and shape to the frame where tracking starts, as the settings say.
 

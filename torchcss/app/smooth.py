@@ -18,13 +18,13 @@ from torchcss.body.bases import pose_track
 from torchcss.errors import ConfigurationError, TrackFileError
 from torchcss.files import StrPath, prepare_output_folder
 from torchcss.inference.smoothing import Refined
+from torchcss.initialise.view import CameraView
 from torchcss.io.run import Run, as_run, body_of_track
 from torchcss.io.tracks import SMOOTH_NAME, TRACK_NAME, Track, save_track, write_summary
 from torchcss.tracking import smooth_images
 from torchcss.tracking.settings import Settings, settings_from_plain
 from torchcss.tracking.smooth import Smoothed, Smoothing, TrackedModes, smooth_modes
 from torchcss.tracking.smooth_images import IMAGES, ShownFrames
-from torchcss.tracking.view import CameraView
 from torchcss.types import Status
 
 

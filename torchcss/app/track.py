@@ -25,7 +25,6 @@ from torchcss.app.lens import PERSONS, KnownLens, fitted
 from torchcss.app.lock import locked
 from torchcss.app.recorder import CHECKPOINT_EVERY, Recorder, Sink
 from torchcss.app.view_files import FrameSelection, OpenView, moments, open_view
-from torchcss.cost.view import View
 from torchcss.errors import CameraError, ConfigurationError, TrackFileError
 from torchcss.files import StrPath, naming
 from torchcss.initialise.noise import Noise
@@ -420,18 +419,8 @@ def _first_pose(
         start=start,
         noise=Noise(view.sigma, is_guess=view.files.sigma is None),
         generator=generator,
-        others=[_first_view(each, start, view.sigma, settings) for each in beside],
+        others=[each.view(eye.K).at(start) for each in beside],
     )
-
-
-def _first_view(opened: OpenView, start: int, sigma: float, settings: Settings) -> View:
-    """What a further camera sees of the first frame, in the pixels of its video."""
-    camera = opened.camera.camera.to(dtype=settings.torch_dtype, device=settings.device)
-    keypoints, frame = opened.keypoints, start + opened.files.offset
-    if keypoints is None or not 0 <= frame < len(keypoints.confidence):
-        return View(camera=camera)
-    keypoints = keypoints.at(frame).to(camera.K)
-    return View(camera=camera, keypoints=keypoints._replace(relative_noise=opened.sigma / sigma))
 
 
 def _first_pose_from_file(path: Path, camera: Camera, settings: Settings) -> Initialisation:

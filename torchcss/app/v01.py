@@ -13,13 +13,13 @@ from torchcss.app.smooth import SmoothedTrack, smooth
 from torchcss.body.model import BodyModel
 from torchcss.files import StrPath
 from torchcss.initialise.result import Initialisation
+from torchcss.initialise.view import CameraView
 from torchcss.io.export import Exported, ExportOptions, export
 from torchcss.io.run import Given, GivenKeypoints, Run, body_of_track
 from torchcss.io.tracks import Track
 from torchcss.tracking.session import Images, Posterior, TrackingSession
 from torchcss.tracking.settings import Settings
 from torchcss.tracking.smooth import Smoothing
-from torchcss.tracking.view import CameraView
 
 
 def smooth_track(

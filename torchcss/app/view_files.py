@@ -16,6 +16,7 @@ from torch import Tensor
 from torchcss.errors import CameraError, VideoError
 from torchcss.files import naming
 from torchcss.initialise.keypoint_checks import typical_sigma
+from torchcss.initialise.view import CameraView
 from torchcss.io.cameras import LoadedCamera, camera_findings, check_image_size, load_camera
 from torchcss.io.keypoints.arrays import read_points
 from torchcss.io.keypoints.frames import Film
@@ -23,7 +24,6 @@ from torchcss.io.keypoints.one_person import Whom
 from torchcss.io.keypoints.read import read_person
 from torchcss.io.video import VideoReader, missing_numbers, several_kinds
 from torchcss.io.view_files import RecordedCamera, ViewFiles
-from torchcss.tracking.view import CameraView
 from torchcss.types import Frame, Keypoints
 from torchcss.vision.camera import Camera
 

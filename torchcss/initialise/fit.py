@@ -36,7 +36,6 @@ from torchcss.cost.outline import OutlineTerm
 from torchcss.cost.region import RegionTerm
 from torchcss.cost.shaped import Outline
 from torchcss.cost.total import TrackingCost
-from torchcss.cost.view import View
 from torchcss.errors import CameraError, ConfigurationError
 from torchcss.initialise.from_joints import fit_joints
 from torchcss.initialise.ground import stature_on_floor
@@ -64,6 +63,7 @@ from torchcss.initialise.result import (
     with_unknown_lengths,
 )
 from torchcss.initialise.shape import ShapeFit, fit_shape
+from torchcss.initialise.view import CameraView
 from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor
@@ -97,7 +97,7 @@ def initialise(
     *,
     generator: torch.Generator,
     options: InitialiseOptions | None = None,
-    others: Sequence[View] = (),
+    others: Sequence[CameraView] = (),
 ) -> Initialisation:
     """Fit pose, proportions and shape of a body to one picture with known joints: all stages.
 
@@ -111,8 +111,8 @@ def initialise(
             base, lengths and shape are known, of which the pose alone is fitted.
         generator: Source of the starting poses.
         options: How the pose is looked for, and what else is fitted.
-        others: What further cameras see at the same time, in the same world; of these the keypoints
-            are used.
+        others: What further cameras see at the same time, in the same world (`CameraView.at`); of
+            these the keypoints are used.
 
     Raises:
         KeypointError: If fewer joints of the body are known than asked for, all are at one place,
@@ -122,15 +122,16 @@ def initialise(
         BodyError: If the stature is no person's, or the floor is to tell the size of another body.
         ConfigurationError: If the floor is known, and several cameras look on.
     """
-    options, others = options or InitialiseOptions(), tuple(others)
+    options = options or InitialiseOptions()
     if not isinstance(keypoints, Keypoints):
         keypoints = keypoints_by_name(keypoints, own=_own_joints(body))
     check_numbers(keypoints, frames=False)
     camera, notes = _camera_of(image, camera)
-    view = View(camera=camera.to(dtype=options.dtype, device=options.device), keypoints=keypoints)
+    view = CameraView(camera.to(dtype=options.dtype, device=options.device), keypoints)
     with threads_for(options.evaluator):
         learns = options.sigma is None if options.learn_noise is None else options.learn_noise
         sigma = options.sigma or default_sigma(keypoints)
+        others = tuple(each.to(view.camera.K).relative_to(sigma) for each in others)
         options = replace(options, sigma=sigma)
         noise = 1.0
         if learns:
@@ -165,10 +166,10 @@ def _own_joints(body: str | BodyModel) -> tuple[str, ...]:
 
 def _fit_of_size(
     body: str | BodyModel,
-    view: View,
+    view: CameraView,
     generator: torch.Generator,
     options: InitialiseOptions,
-    others: tuple[View, ...],
+    others: tuple[CameraView, ...],
 ) -> tuple[Initialisation, InitialiseOptions]:
     """The fit to the joints, of the size that the floor tells where it is known, which is held."""
     first = fit_joints(body, view, generator=generator, options=options, others=others)
@@ -198,8 +199,8 @@ def _camera_of(image: Picture | None, camera: Camera | None) -> tuple[Camera, li
 def _to_the_picture(
     first: Initialisation,
     image: Picture,
-    view: View,
-    others: tuple[View, ...],
+    view: CameraView,
+    others: tuple[CameraView, ...],
     options: InitialiseOptions,
 ) -> Initialisation:
     """The stages that look at the picture, from a fit to its joints."""
@@ -208,7 +209,7 @@ def _to_the_picture(
     left_out = torch.tensor([name in first.left_out for name in given.names])
     view = view._replace(keypoints=given.without(left_out.to(options.device)))
     cost = _contour_cost(image, first, view, options)
-    scaled = (each.of_keypoints(_factor(view.camera, cost.camera)) for each in others)
+    scaled = (each.scaled(_factor(view.camera, cost.camera)) for each in others)
     beside = (
         replace(cost.views[0], camera=each.camera, keypoints=each.keypoints, edge_field=None,
                 features=None, appearance=None)
@@ -218,7 +219,10 @@ def _to_the_picture(
 
 
 def _noise(
-    first: Initialisation, view: View, others: tuple[View, ...], options: InitialiseOptions
+    first: Initialisation,
+    view: CameraView,
+    others: tuple[CameraView, ...],
+    options: InitialiseOptions,
 ) -> float:
     """How many times as noisy as the options say keypoints are."""
     body, fits = first.free_body or first.body, first.free_mixture or first.mixture
@@ -240,7 +244,7 @@ def _factor(camera: Camera, working: Camera) -> float:
 def _contour_cost(
     image: Picture,
     first: Initialisation,
-    view: View,
+    view: CameraView,
     options: InitialiseOptions,
 ) -> TrackingCost:
     """The cost of a picture at its working size: joints, edges and colours."""
@@ -259,7 +263,7 @@ def _contour_cost(
     return costs(
         features,
         body=first.body,
-        keypoints=view.of_keypoints(factor).keypoints,
+        keypoints=view.scaled(factor).keypoints,
         appearance=costs.learn(None, features, first.body, first.mixture.mean[0], fitted=False),
     )
 

@@ -23,10 +23,10 @@ from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES
 from torchcss.cost.joints import match_joints
 from torchcss.cost.total import TrackingCost
-from torchcss.cost.view import View
 from torchcss.initialise.from_joints import hang_before_camera
 from torchcss.initialise.multi_start import descend_widened, optimise, starts_about
 from torchcss.initialise.options import InitialiseOptions
+from torchcss.initialise.view import CameraView
 from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
 
@@ -109,7 +109,7 @@ def _costs(
     """What the best fits to all frames cost before each camera, nats."""
     num, middle = len(keypoints.confidence), len(cameras) // 2
     body, places = _hung(free, keypoints, cameras[middle])
-    cost = options.joint_cost(body, [View(cameras[middle], keypoints)])
+    cost = options.joint_cost(body, [CameraView(cameras[middle], keypoints)])
     bounds = options.search.bounds(body)
     frame = torch.arange(num).repeat_interleave(_NUM_STARTS)
     x = starts_about(body, _NUM_STARTS, generator).repeat(num, 1)

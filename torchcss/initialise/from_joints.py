@@ -28,7 +28,6 @@ from torchcss.body.root import base_without_root, has_root, move_base, root_pose
 from torchcss.cost.anthropometric import Anthropometric
 from torchcss.cost.joints import JointTargets, match_joints
 from torchcss.cost.total import TrackingCost
-from torchcss.cost.view import View
 from torchcss.errors import CameraError
 from torchcss.initialise.keypoint_checks import check_keypoints
 from torchcss.initialise.multi_start import multi_start_fits
@@ -49,17 +48,18 @@ from torchcss.initialise.result import (
     with_lengths,
     with_unknown_lengths,
 )
+from torchcss.initialise.view import CameraView
 from torchcss.types import Modes
 from torchcss.vision.camera import Camera
 
 
 def fit_joints(
     body: str | BodyModel,
-    view: View,
+    view: CameraView,
     *,
     generator: torch.Generator,
     options: InitialiseOptions,
-    others: tuple[View, ...] = (),
+    others: tuple[CameraView, ...] = (),
 ) -> Initialisation:
     """Fit place, pose and lengths of a body to the joints of one image.
 
@@ -91,7 +91,7 @@ def fit_joints(
     keypoints = view.keypoints.only(free.joint_names).to(free.tie)
     keypoints = keypoints.without(~keypoints.positions.isfinite().all(-1))
     notes = (*free.notes, *check_keypoints(free.name, keypoints, view.camera, options.least_joints))
-    cost = options.joint_cost(free, (View(view.camera, keypoints), *others))
+    cost = options.joint_cost(free, (view._replace(keypoints=keypoints), *others))
     if isinstance(body, BodyModel):
         _check_in_view(body, view.camera)
         fits = multi_start_fits(cost, search=options.search, generator=generator)

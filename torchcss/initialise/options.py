@@ -19,9 +19,9 @@ from torchcss.cost.joints import JointTerm
 from torchcss.cost.pose_prior import PosePrior
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.total import Engine, TrackingCost
-from torchcss.cost.view import View
 from torchcss.errors import ConfigurationError
 from torchcss.initialise.multi_start import PAPERS, StartSearch
+from torchcss.initialise.view import CameraView
 from torchcss.robust import Lorentzian
 from torchcss.types import frozen
 
@@ -120,7 +120,7 @@ class InitialiseOptions:
             weights=self.weights,
         )
 
-    def joint_cost(self, body: BodyModel, views: Iterable[View]) -> TrackingCost:
+    def joint_cost(self, body: BodyModel, views: Iterable[CameraView]) -> TrackingCost:
         """Cost of the first stage.
 
         Args:

@@ -26,13 +26,13 @@ from torchcss.initialise.keypoint_checks import typical_sigma
 from torchcss.initialise.noise import Noise
 from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
 from torchcss.initialise.result import Initialisation
+from torchcss.initialise.view import CameraView
 from torchcss.io.video import VideoReader
 from torchcss.studies.evaluation import Evaluator, FrameMeasures, Thresholds, loss
 from torchcss.studies.render.motions import Motion
 from torchcss.studies.sequences import RecordedSequence
 from torchcss.tracking.session import TrackingSession
 from torchcss.tracking.settings import Plan, Settings, make_plan
-from torchcss.tracking.view import CameraView
 from torchcss.types import Frame
 
 

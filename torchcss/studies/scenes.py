@@ -33,6 +33,7 @@ from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.initialise.fit import initialise
 from torchcss.initialise.keypoint_checks import default_sigma
 from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
+from torchcss.initialise.view import CameraView
 from torchcss.io.cameras import read_camera
 from torchcss.io.keypoints.read import read_keypoints
 from torchcss.io.video import VideoReader
@@ -42,7 +43,7 @@ from torchcss.studies.render.sequences import arm_sequence
 from torchcss.studies.sequences import RecordedSequence, read_reference
 from torchcss.studies.slices import StateLine, eigen_lines, joint_lines
 from torchcss.tracking.settings import Settings, make_choice, make_plan
-from torchcss.tracking.view import NOTHING_KNOWN, NOTHING_SEEN, CameraView
+from torchcss.tracking.view import NOTHING_KNOWN, NOTHING_SEEN
 from torchcss.types import Bounds, Frame, Modes, Vector
 from torchcss.vision.features import FrameFeatures
 

@@ -50,6 +50,7 @@ from torchcss.inference.tracker import (
 )
 from torchcss.inference.trust_region import default_prior_variance
 from torchcss.initialise.result import Initialisation
+from torchcss.initialise.view import CameraView
 from torchcss.stopwatch import Stopwatch
 from torchcss.tracking.flip_moves import Flips
 from torchcss.tracking.limb_moves import LostLimbs
@@ -58,7 +59,6 @@ from torchcss.tracking.surface_prediction import PicturePair, SurfaceDynamics, S
 from torchcss.tracking.view import (
     NOTHING_KNOWN,
     NOTHING_SEEN,
-    CameraView,
     Observer,
     ViewMemory,
     ViewObservation,

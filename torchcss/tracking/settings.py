@@ -29,10 +29,11 @@ from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.total import Engine
 from torchcss.errors import ConfigurationError, check_device
 from torchcss.inference.tracker import SequenceTracker, Tracker
+from torchcss.initialise.view import CameraView
 from torchcss.robust import Leclerc, Lorentzian, Quadratic
 from torchcss.tracking.presets import PRESETS, Preset, make_tracker, preset_name
 from torchcss.tracking.recovery import Recovery
-from torchcss.tracking.view import CameraView, Observer
+from torchcss.tracking.view import Observer
 from torchcss.types import Bounds, Curvature, Vector, frozen
 from torchcss.vision.edges import EdgeConfiguration
 from torchcss.vision.features import FeatureExtractor

@@ -26,6 +26,7 @@ from torchcss.body.root import free_turns
 from torchcss.cost.total import TrackingCost, beside
 from torchcss.errors import ConfigurationError, VideoError
 from torchcss.inference.smoothing import IN_WINDOWS, Refined, refine_in_windows
+from torchcss.initialise.view import CameraView
 from torchcss.tracking.settings import Plan, Settings, make_plan
 from torchcss.tracking.smooth import (
     Smoothed,
@@ -35,7 +36,7 @@ from torchcss.tracking.smooth import (
     motion_prior,
     smooth_modes,
 )
-from torchcss.tracking.view import NOTHING_KNOWN, NOTHING_SEEN, CameraView, Observer
+from torchcss.tracking.view import NOTHING_KNOWN, NOTHING_SEEN, Observer
 from torchcss.types import Frame, Trajectory
 
 IMAGES = Smoothing(acceleration_ratio=20.0)

@@ -1,9 +1,9 @@
 """What a camera sends, what is seen of a frame, and what is remembered: the loop's input side.
 
-A `CameraView` says where a camera stands and what keypoints its video has. An `Observer` turns its
-frames into what the cost compares with; it holds constants only. What is seen of a frame depends on
-the pictures alone (`observe`); what the cost makes of it depends on what the body and its
-surroundings look like (`cost`), which is learnt from the poses found (`learn`).
+An `Observer` turns the frames of a camera (`CameraView`) into what the cost compares with; it holds
+constants only. What is seen of a frame depends on the pictures alone (`observe`); what the cost
+makes of it depends on what the body and its surroundings look like (`cost`), which is learnt from
+the poses found (`learn`).
 
 A camera that sends pictures of one colour, or none any more, is out: it says nothing until it is
 back.
@@ -19,67 +19,14 @@ import numpy as np
 from torchcss.body.model import BodyModel
 from torchcss.cost.frame import FrameCosts
 from torchcss.cost.total import TrackingCost
-from torchcss.errors import ConfigurationError, KeypointError
-from torchcss.files import shortened
-from torchcss.initialise.keypoint_checks import check_numbers, typical_sigma
+from torchcss.initialise.view import CameraView
 from torchcss.stopwatch import Stopwatch
 from torchcss.types import Frame, Keypoints, Numbers, Vectors, frozen
 from torchcss.vision.appearance import Appearance
 from torchcss.vision.background import Background
-from torchcss.vision.camera import Camera
 from torchcss.vision.contrast import local_contrast
 from torchcss.vision.features import FeatureExtractor, FrameFeatures, Window
 from torchcss.vision.spline import SplineField, spline_field
-
-
-class CameraView(NamedTuple):
-    """A camera that looks on, with the keypoints of its video.
-
-    Attributes:
-        camera: Camera of the full-size images. All views share one world.
-        keypoints: 2D keypoints by frame of its video, pixels of the full-size images; frames after
-            the last of them have none. None: none at all.
-        sigma: Noise of a wrist's keypoint, pixels of the full-size images; None: a share of the
-            person's size.
-        offset: Its frame at the time of the first view's frame 0.
-    """
-
-    camera: Camera
-    keypoints: Keypoints | None = None
-    sigma: float | None = None
-    offset: int = 0
-
-    def check(self, body: BodyModel) -> None:
-        """Refuse keypoints that cannot be a body's in all frames.
-
-        Args:
-            body: The body.
-
-        Raises:
-            ConfigurationError: If their noise is no number of pixels.
-            ShapeError: If they are no tensors, or not pairs of a joint each.
-            KeypointError: If they are not those of all frames, or of none of the body's joints.
-        """
-        if self.sigma is not None and not 0 < self.sigma < math.inf:
-            raise ConfigurationError(f"sigma: expected a number of pixels, got {self.sigma}")
-        if self.keypoints is None:
-            return
-        check_numbers(self.keypoints, frames=True)
-        names = self.keypoints.names
-        if names and not set(names) & set(body.joint_names):
-            raise KeypointError(
-                f"{body.name} has none of the joints {shortened(', '.join(names))}; its own are "
-                f"{shortened(', '.join(body.joint_names))}"
-            )
-
-    @property
-    def noise(self) -> float:
-        """Noise of a wrist's keypoint, pixels of the full-size images; 1 without keypoints."""
-        if self.sigma is not None:
-            return self.sigma
-        if self.keypoints is None:
-            return 1.0
-        return typical_sigma(self.keypoints)
 
 
 class ViewObservation(NamedTuple):
