@@ -101,12 +101,12 @@ class StartSearch:
                             ("num_samples", 0), ("max_steps", 1)):  # fmt: skip
             if getattr(self, name) < least:
                 raise ConfigurationError(
-                    f"Search.{name}: expected at least {least}, got {getattr(self, name)}"
+                    f"StartSearch.{name}: expected at least {least}, got {getattr(self, name)}"
                 )
         known = (*PROPORTIONS, *PLACES)
         if unknown := sorted(set(self.proportions) - set(known)):
             raise ConfigurationError(
-                f"Search.proportions: unknown {', '.join(unknown)}; there are {', '.join(known)}"
+                f"StartSearch.proportions: unknown {', '.join(unknown)}; there are {', '.join(known)}"
             )
 
     @property
