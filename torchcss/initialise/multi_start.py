@@ -106,7 +106,8 @@ class StartSearch:
         known = (*PROPORTIONS, *PLACES)
         if unknown := sorted(set(self.proportions) - set(known)):
             raise ConfigurationError(
-                f"StartSearch.proportions: unknown {', '.join(unknown)}; there are {', '.join(known)}"
+                f"StartSearch.proportions: unknown {', '.join(unknown)}; there are "
+                f"{', '.join(known)}"
             )
 
     @property
