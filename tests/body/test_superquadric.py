@@ -76,3 +76,18 @@ def test_one_on_the_surface(bent: bool, generator: torch.Generator) -> None:
     torch.testing.assert_close(implicit(shape, points), value - 1)
     slope = torch.stack(half, -1)
     torch.testing.assert_close(slope / slope.norm(dim=-1, keepdim=True), normals, atol=1e-5, rtol=0)
+
+
+def test_single_precision_holds_far_beyond_a_tip(generator: torch.Generator) -> None:
+    """Where the section is a tenth, points next to the part are dozens of sections away."""
+    shape = random_shapes(300, generator, bent=False)
+    shape[:, 5:7] = torch.where(shape[:, 5:7] > 0, 0.9, -0.9)
+    points = 3 * torch.randn(300, 3, generator=generator, dtype=torch.float64) * shape[:, 2:3]
+    value, slope = radial_square(Superquadrics.of(shape), *points.unbind(-1), bent=False)
+    assert float(value.max()) > 2000
+    single = Superquadrics.of(shape.float()), *points.float().unbind(-1)
+    found, half = radial_square(*single, bent=False)
+    torch.testing.assert_close(found.double(), value, rtol=1e-3, atol=1e-3)
+    size = torch.stack(slope, -1).norm(dim=-1, keepdim=True)
+    error = (torch.stack(half, -1) - torch.stack(slope, -1)) / size
+    assert float(error.abs().max()) < 1e-3

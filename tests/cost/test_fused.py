@@ -27,7 +27,7 @@ from torchcss.kernels import compiler
 from torchcss.kernels.checked import checked
 from torchcss.types import Curvature, LocalModel
 
-BODIES = ["arm8", "arm7", "body30", "body34"]
+BODIES = ["arm8", "arm7", "body30", "body32", "body34"]
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])

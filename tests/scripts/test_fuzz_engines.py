@@ -17,6 +17,13 @@ def test_engines_agree_at_random(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert "5 cases, 0 differ" in capsys.readouterr().out
 
 
+def test_parts_that_taper_to_a_point(shared_data: Path) -> None:
+    """Next to a tip points are dozens of sections away."""
+    panda = str(shared_data / "robot_models" / "panda.urdf")
+    found, _ = script.run_case(51007, panda, 8)
+    assert max(row.value for row in found) < 1
+
+
 def test_a_difference_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(script.NATS, "float32", 1e-12)
     monkeypatch.setitem(script.RELATIVE, "float32", 0.0)

@@ -17,6 +17,7 @@ from torchcss.cost.choice import TERM_TABLE
 from torchcss.cost.context import FrameContext
 from torchcss.cost.term import Kind, Posed, Term, differentiated
 from torchcss.inference.implicit import TermWeights, weighted_minimum
+from torchcss.kernels import compiler
 from torchcss.studies.render.sequences import SyntheticSequence
 from torchcss.studies.slices import joint_lines, sample_slice
 from torchcss.tracking.session import Posterior, TrackingSession
@@ -99,6 +100,25 @@ def test_it_tracks_is_timed_weighed_and_watched(
     missing = [Frame(0, 0.0, np.zeros_like(sequence.frames[0]))]
     session = session_at(settings, sequence.body, sequence.states[0], seen_by(sequence.camera))
     assert "middle" not in next(iter(session.track(missing))).terms
+
+
+@pytest.mark.skipif(not compiler.AVAILABLE, reason="needs numba")
+def test_both_engines_know_it(sequence: SyntheticSequence, settings: Settings) -> None:
+    """Without a kernel it is evaluated eagerly and added to what the kernels give."""
+    view, x = seen_by(sequence.camera), sequence.states[:3]
+    found = []
+    for engine in ("fused", "eager"):
+        each = replace(settings, engine=engine, engine_dtype="float64")
+        session = session_at(each, sequence.body, x[0], view)
+        seen = session.observe(Frame(0, 0.0, sequence.frames[0])).views[0]
+        (observer,) = session._observers
+        cost = observer.cost(seen, session.state.memory[0], sequence.body, None)
+        assert (cost.engine is None) == (engine == "eager")
+        without = replace(cost, choice=cost.choice.without("middle"))
+        assert bool((cost.value(x) > without.value(x)).all())
+        found.append((cost.value(x), *cost.local_model(x)))
+    for ours, theirs in zip(*found, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-6)
 
 
 def test_it_is_learnt_and_plotted(sequence: SyntheticSequence, settings: Settings) -> None:

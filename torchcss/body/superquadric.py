@@ -36,7 +36,8 @@ from torch import Tensor
 Triple = tuple[Tensor, Tensor, Tensor]
 
 _LEAST_SQUARE = {torch.float32: 1e-12, torch.float64: 1e-24}
-_MOST_SQUARE = {torch.float32: 400.0, torch.float64: 1e12}
+_MOST_SQUARE = 1e12
+_MOST_POWER = 60.0  # of e, in single precision
 _LEAST_POWER = {torch.float32: 1e-30, torch.float64: 1e-280}
 """Bounds on squared coordinates and on powers, so that the type holds all products."""
 
@@ -64,6 +65,7 @@ class Superquadrics(NamedTuple):
         overhang: How far the taper goes on beyond the ends, in semi-axes.
         bend: Curvature of the axis, per metre.
         c, s: Cosine and sine of the direction of the bend.
+        most: Bound on squared coordinates in single precision.
     """
 
     ia: Tensor
@@ -79,6 +81,7 @@ class Superquadrics(NamedTuple):
     bend: Tensor
     c: Tensor
     s: Tensor
+    most: Tensor
 
     @classmethod
     def of(
@@ -102,7 +105,9 @@ class Superquadrics(NamedTuple):
         safe = torch.where(is_bent, square, 1.0).sqrt()
         bend = torch.where(is_bent, safe, 0.0)
         turn = (torch.where(is_bent, bend_x / safe, 1.0), bend_y / safe)
-        return cls(1 / a1, 1 / a2, 1 / a3, *exponent, taper_x, taper_y, overhang, bend, *turn)
+        most = (_MOST_POWER * torch.minimum(e1, e2)).exp().clamp(max=_MOST_SQUARE)
+        axes = (1 / a1, 1 / a2, 1 / a3)
+        return cls(*axes, *exponent, taper_x, taper_y, overhang, bend, *turn, most)
 
     def height(self, w: Tensor) -> Tensor:
         """What a taper is multiplied by at a height in semi-axes."""
@@ -244,7 +249,8 @@ def _factors(shape: Superquadrics, x: Tensor, y: Tensor, z: Tensor) -> _Factors:
     u, v = x * ix, y * iy
     # Added, not clamped to, so that autograd sees the curvature where a coordinate is zero.
     least = _LEAST_SQUARE[x.dtype]
-    uu, vv, ww = ((a.square() + least).clamp(max=_MOST_SQUARE[x.dtype]) for a in (u, v, w))
+    most = shape.most if x.dtype == torch.float32 else _MOST_SQUARE
+    uu, vv, ww = ((a.square() + least).clamp(max=most) for a in (u, v, w))
     pu, pv, pw = _power(uu, shape.around), _power(vv, shape.around), _power(ww, shape.along)
     of_u, of_v = pu * uu, pv * vv
     section = (of_u + of_v).clamp(min=_LEAST_POWER[x.dtype])

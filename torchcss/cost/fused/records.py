@@ -36,7 +36,7 @@ Parts = namedtuple(
 Attributes:
     row: Row of the frame that carries each part.
     constant: The part's frame in that one, `[parts 3 4]`, double precision.
-    shape: The fields of `Superquadrics`, `[13 parts]`.
+    shape: The fields of `Superquadrics`, `[14 parts]`.
     radius: Of the sphere outside which a part hides nothing, metres.
     around: Reciprocal semi-axes of an ellipsoid outside which it hides nothing, `[3 parts]`.
     within: Squared radius of a plain part's own ellipsoid inside which it hides for sure.
@@ -285,7 +285,7 @@ Attributes:
     last: the exponential there.
     spheres: Distance of the centres of each two parts beyond which they are apart, metres.
     nodes: Nodes of each part in its frame, metres, `[parts 3 nodes]`.
-    shape: The fields of `Superquadrics`, `[13 parts]`.
+    shape: The fields of `Superquadrics`, `[14 parts]`.
     inner: Half sides of a box that holds the nodes, `[parts 3]`.
     outer: Half sides of a box that holds the potential.
     pair: Number of the ordered pair of a part and one that repels it; -1: they may touch.

@@ -16,7 +16,7 @@ _SMALL = 0.1
 """Angle, radians, below which a quotient by it is its series."""
 
 
-Shape = namedtuple("Shape", "ia ib ic around section along whole taper_x taper_y overhang")
+Shape = namedtuple("Shape", "ia ib ic around section along whole taper_x taper_y overhang most")
 """A column of the table; see `torchcss.body.superquadric.Superquadrics`."""
 
 
@@ -38,6 +38,7 @@ def shape_of(table: Array, part: int) -> Shape:
         table[7, part],
         table[8, part],
         table[9, part],
+        table[13, part],
     )
 
 
@@ -63,8 +64,8 @@ def narrowed(shape: Shape, w: float) -> tuple[float, float]:
 
 
 @inlined
-def _bounded_square(x: float) -> float:
-    return min(x * x + by_precision(x, 1e-12, 1e-24), by_precision(x, 400.0, 1e12))
+def _bounded_square(shape: Shape, x: float) -> float:
+    return min(x * x + by_precision(x, 1e-12, 1e-24), by_precision(x, shape.most, 1e12))
 
 
 @inlined
@@ -73,7 +74,7 @@ def radial_square(shape: Shape, x: float, y: float, z: float) -> tuple[float, fl
     w = z * shape.ic
     ix, iy = narrowed(shape, w)
     u, v = x * ix, y * iy
-    uu, vv, ww = _bounded_square(u), _bounded_square(v), _bounded_square(w)
+    uu, vv, ww = _bounded_square(shape, u), _bounded_square(shape, v), _bounded_square(shape, w)
     pu, pv, pw = power(uu, shape.around), power(vv, shape.around), power(ww, shape.along)
     section = max(pu * uu + pv * vv, by_precision(x, 1e-30, 1e-280))
     outer = power(section, shape.section)
@@ -155,7 +156,7 @@ def straight_hessian(shape: Shape, x: float, y: float, z: float) -> Bowl:
     w = z * shape.ic
     i, j = narrowed(shape, w)
     u, v = x * i, y * j
-    uu, vv, ww = _bounded_square(u), _bounded_square(v), _bounded_square(w)
+    uu, vv, ww = _bounded_square(shape, u), _bounded_square(shape, v), _bounded_square(shape, w)
     pu, pv, pw = power(uu, shape.around), power(vv, shape.around), power(ww, shape.along)
     section = max(pu * uu + pv * vv, by_precision(x, 1e-30, 1e-280))
     outer = power(section, shape.section)
