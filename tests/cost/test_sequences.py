@@ -61,7 +61,9 @@ def test_samples_of_several_clips_descend_from_the_modes_of_their_own(
     generator: torch.Generator,
 ) -> None:
     sequence, parent = torch.tensor([1, 0, 1, 0, 0]), torch.tensor([2, 1, 0, 0, 1])
-    costs = [numbered(replace(c, parent=None), n) for n, c in enumerate(two_clips())]
+    costs = [
+        numbered(replace(c, parent=None, component=None), n) for n, c in enumerate(two_clips())
+    ]
     priors = [
         Prior.of(
             GaussianMixture(

@@ -42,11 +42,13 @@ from typing import Any, Protocol
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.autograd.forward_ad import unpack_dual
 
 from torchcss.body.model import BodyModel, BodyPose, differentiate_twice
 from torchcss.cost.choice import CostChoice
 from torchcss.cost.context import BodyTables, FrameContext
 from torchcss.cost.term import BoundImage, Kind, Posed, Term
+from torchcss.errors import ShapeError
 from torchcss.inference.mixture import GaussianMixture, Prior
 from torchcss.inference.problem import SearchProblem
 from torchcss.stopwatch import Stopwatch
@@ -213,11 +215,16 @@ class TrackingCost:
     def value(self, x: States) -> Costs:
         """Cost in nats, visibility and assignments found fresh at x.
 
-        Where x requires it, autograd gets the derivatives of `local_model`, first and second.
+        Where x requires it, autograd and the transforms of `torch.func` get the derivatives of
+        `local_model`, first and second.
         """
-        self.body.check_state(x)
-        if x.requires_grad and torch.is_grad_enabled():
-            return self.local_model(x.detach()).at(x - x.detach())
+        at = x.detach()
+        if (x.requires_grad and torch.is_grad_enabled()) or unpack_dual(x).tangent is not None:
+            return LocalModel(*_Opaque.apply(self.local_model, at)).at(x - at)
+        return _Opaque.apply(self._value, at)
+
+    def _value(self, x: States) -> Costs:
+        self._check(x)
         if self.engine is not None:
             return self.engine.value(self, x)
         return self._evaluated(
@@ -234,10 +241,20 @@ class TrackingCost:
 
     def local_model(self, x: States) -> LocalModel:
         """Cost, gradient and Hessian, visibility and assignments found at x and held fixed."""
-        self.body.check_state(x)
+        self._check(x)
         if self.engine is not None and self.choice.curvature is not Curvature.AUTOGRAD:
             return self.engine.local_model(self, x)
         return LocalModel(**self._evaluated(lambda part: part.local_model()._asdict(), x))
+
+    def _check(self, x: States) -> None:
+        self.body.check_state(x)
+        each = (self.parent, self.component, self.sequence)
+        number, own = x.shape[:-1].numel(), [len(index) for index in each if index is not None]
+        if any(count != number for count in own):
+            raise ShapeError(
+                f"x: {number} states, and the cost is that of {own[0]} samples with parents of "
+                "their own: give all of them, or take those (TrackingCost.take)"
+            )
 
     @property
     def weighs(self) -> bool:
@@ -314,6 +331,25 @@ class TrackingCost:
         for term in self.choice.terms:
             if term.kind == kind and (bound := self.bound[term, context]) is not None:
                 yield term.name, bound
+
+
+class _Opaque(torch.autograd.Function):
+    """A function of states that no transform looks into: it is constant for all of them."""
+
+    @staticmethod
+    def forward(evaluate: Callable[[Tensor], Any], x: States) -> Any:
+        return evaluate(x)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+        ctx.mark_non_differentiable(*((output,) if isinstance(output, Tensor) else output))
+
+    @staticmethod
+    def vmap(info: Any, in_dims: Any, *args: Any) -> Any:
+        """Evaluate a batch as one."""
+        (evaluate, x), (_, dim) = args, in_dims
+        result = _Opaque.apply(evaluate, x.movedim(dim, 0))
+        return result, 0 if isinstance(result, Tensor) else (0,) * len(result)
 
 
 @dataclass(frozen=True, eq=False)
