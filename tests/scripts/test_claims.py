@@ -29,8 +29,8 @@ def run_of(preset: str, seed: int, lost_s: float | None = None, **entries: Any) 
     }  # fmt: skip
 
 
-def report_of(sequence: str, runs: list[dict[str, Any]], path: Path) -> Path:
-    path.write_text(json.dumps({"study": {"sequence": sequence}, "runs": runs}))
+def report_of(sequence: str, runs: list[dict[str, Any]], path: Path, body: str = "arm8") -> Path:
+    path.write_text(json.dumps({"study": {"sequence": sequence, "body": body}, "runs": runs}))
     return path
 
 
@@ -55,13 +55,17 @@ def test_claims_are_judged(script: ModuleType, tmp_path: Path) -> None:
     slips = "Gaussian single mode slips off at the pillar (0.5 s and 2.2 s, arm)"
     runs = [run_of("ijrr_gaussian_single", seed, lost_s=1.0) for seed in range(2)]
     runs += [run_of("ijrr_css", seed) for seed in range(2)]
-    runs.append(run_of("rr_multiple_hypothesis", 0, lost_s=2.0))
+    runs.append(run_of("rr_multiple_hypothesis", 0))
+    seven = [run_of("rr_multiple_hypothesis", 0, lost_s=2.0)]
     elbow = {"time_s": [0.0, 1.0, 2.0], "at_bound": [[], ["r_elbow_flexion"], []]}
     runs.append(run_of("ijrr_single_limits", 0, lost_s=2.0, per_frame=elbow))
     runs.append({"preset": "ijrr_css", "seed": 2, "ended": "error: it broke"})
     out = tmp_path / "claims.json"
     config = script.Config(
-        failures=(report_of("arm", runs, tmp_path / "arm.json"),),
+        failures=(
+            report_of("arm", runs, tmp_path / "arm.json"),
+            report_of("arm", seven, tmp_path / "arm7.json", "arm7"),
+        ),
         table1=table1_of(tmp_path / "table1.json"),
         spectra=tmp_path / "spectra.json",
         out=out,
