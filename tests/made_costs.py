@@ -49,6 +49,7 @@ class Ready(Term):
         object.__setattr__(self, "name", self.term.name)
         object.__setattr__(self, "kind", self.term.kind)
         object.__setattr__(self, "screens", self.term.screens)
+        object.__setattr__(self, "of_past", self.term.of_past)
 
     def prepare(self, context: FrameContext) -> Any:
         return self.bound

@@ -462,3 +462,14 @@ def test_the_stopwatch_knows_every_term(generator: torch.Generator) -> None:
     cost.local_model(x)
     assert set(stopwatch.seconds) == {*before, "lift"}
     assert all(stopwatch.seconds[name] > spent > 0 for name, spent in before.items())
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_what_the_cost_says_of_the_past(engine: str, generator: torch.Generator) -> None:
+    cost = replace(make_full_cost("arm8"), engine=engine_for(engine, "cpu", "float64"))
+    x = random_states(cost.body, 4, generator=generator)
+    past, terms = cost.problem().past, cost.terms(x)
+    assert past is not None
+    torch.testing.assert_close(past(x), terms["temporal"] + terms["temporal_mixture"])
+    choice = cost.choice.without("temporal", "temporal_mixture")
+    assert replace(cost, choice=choice).problem().past is None

@@ -7,9 +7,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from torchcss.cost.temporal import MixturePrior
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.inference.dynamics import ConstantVelocity, Diffusion
-from torchcss.inference.mixture import GaussianMixture
+from torchcss.inference.mixture import GaussianMixture, Prior
 from torchcss.inference.particle import ParticleFilter
 from torchcss.inference.problem import SearchProblem
 from torchcss.inference.proposals import (
@@ -450,6 +451,57 @@ def test_soft_matching_hands_no_past_to_who_is_far_from_it(generator):
     # What is near no mode of the last frame did not move there: it is new.
     torch.testing.assert_close(state.velocity[0], state.mixture.mean[0] - torch.tensor([1.4, 0.0]))
     assert torch.equal(state.velocity[1], torch.zeros_like(state.velocity[1]))
+
+
+@dataclass(frozen=True)
+class AfterModes(problems.Alike):
+    """What a frame says, and what the modes before make likely."""
+
+    seen: problems.DoubleWell
+    prior: Prior
+
+    def past(self, x):
+        return self._past(x).value
+
+    def _past(self, x):
+        return MixturePrior().local_model(x, MixturePrior().density(self.prior.mixture))
+
+    def value(self, x):
+        return self.local_model(x).value
+
+    def local_model(self, x):
+        pairs = zip(self.seen.local_model(x), self._past(x), strict=True)
+        return LocalModel(*(seen + past for seen, past in pairs))
+
+    @staticmethod
+    def problem(well):
+        def children(_, prior):
+            cost = AfterModes(well, prior)
+            return SearchProblem(cost, past=cost.past)
+
+        return SearchProblem(well, of_children=children)
+
+
+@pytest.mark.parametrize("power", [0.1, 1.0])
+def test_the_past_counts_once(power, generator):
+    """The prior in the cost guides descents; weights are those of a cost without it."""
+    well = problems.DoubleWell()
+    before = GaussianMixture(
+        well.minima,
+        torch.diag_embed(torch.tensor([[0.01, 0.01], [0.04, 0.04]]).double()),
+        torch.tensor([0.6, 0.4]).double().log(),
+    )
+    tracker = replace(CSS, soft_matching=True, likelihood_power=power)
+    start = tracker.init(before, generator=generator)
+    runs = [
+        list(problems.follow(tracker, start, [frame] * 12, BOUNDS))
+        for frame in (SearchProblem(well), AfterModes.problem(well))
+    ]
+    for (plain, told), (state, info) in zip(*runs, strict=True):
+        torch.testing.assert_close(state.mixture.weight, plain.mixture.weight, rtol=0, atol=0.01)
+        torch.testing.assert_close(info.cost, told.cost, rtol=0, atol=0.01)
+        # A frame that prefers neither makes neither surer.
+        assert float(state.mixture.weight[0]) < 0.61
 
 
 @pytest.mark.parametrize(

@@ -587,11 +587,13 @@ def test_what_is_wrong_with_an_image_is_told_by_two_threads_too():
 
 
 def test_terms_of_the_best_mode_add_up_to_its_cost():
-    """In every frame: the priors are about the mixture that the search had, one frame ahead."""
+    """In every frame; what the frame before makes likely is a term, and no cost of this one's."""
     sequence = rendered_arm(0, 4)
     settings = Settings(body="arm8", keypoints_use="first", working_size=160, engine="eager")
     for tracked in track(sequence.frames, sequence, settings):
-        assert sum(tracked.terms.values()) == pytest.approx(float(tracked.info.cost[0]), rel=1e-9)
+        terms = dict(tracked.terms)
+        terms.pop("temporal_mixture")
+        assert sum(terms.values()) == pytest.approx(float(tracked.info.cost[0]), rel=1e-9)
 
 
 def test_frames_without_detections_have_no_term_of_joints():
@@ -647,7 +649,7 @@ def test_awkward_frames_leave_no_nan_and_lose_nothing():
         ({}, 0.1),
         ({"keypoints_use": "first"}, 0.1),
         ({"terms": ("contour", "temporal")}, 0.1),
-        ({"body": "arm8"}, 0.05),
+        ({"body": "arm8"}, 0.035),
         ({"likelihood_power": 0.7}, 0.7),
         ({"keypoints_use": "first", "likelihood_power": 0.7}, 0.7),
         ({"preset": "ijrr_css_heavy_tailed"}, 1.0),

@@ -36,6 +36,7 @@ class TemporalPrior(Term):
 
     name = "temporal"
     kind = "prior"
+    of_past = True
 
     nu: float = 4.0
 
@@ -95,6 +96,7 @@ class MixturePrior(Term):
 
     name = "temporal_mixture"
     kind = "prior"
+    of_past = True
 
     nu: float | None = None
 

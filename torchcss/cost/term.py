@@ -53,12 +53,15 @@ class Term(Protocol):
         kind: What `prepare` returns.
         watched: Whether its cost tells a loss of the track (`torchcss.inference.loss_monitor`).
         screens: Whether it counts where samples are screened ([RR] section 4.2: edges alone).
+        of_past: Whether it says what the modes before make likely: it guides descents, and is left
+            out where the weights of those modes are multiplied in.
     """
 
     name: ClassVar[str]
     kind: ClassVar[Kind]
     watched: ClassVar[bool] = False
     screens: ClassVar[bool] = False
+    of_past: ClassVar[bool] = False
 
     @property
     def needs(self) -> frozenset[Need]:

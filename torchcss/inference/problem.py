@@ -9,6 +9,7 @@ inside them:
 | `coarse` | a smoother cost, on which some samples descend first |
 | `screening` | a cheaper cost, by which more samples than descend are sorted out |
 | `weight_only` | what has no derivatives and counts among modes, nats |
+| `past` | what the cost says of the past: it guides descents, and is no news of the frame, nats |
 | `landmarks` | points by whose distance two states are told apart |
 | `restrict` | the problem of some of the samples |
 | `of_children` | the problem of samples of a prior, where they are compared with it |
@@ -34,6 +35,8 @@ class SearchProblem(NamedTuple):
         coarse: A smoother one; None: there is none.
         screening: A cheaper one; None: the cost itself.
         weight_only: Cost in nats of what counts in the weights of modes alone.
+        past: The part of the cost that says what the modes before make likely. Weights that inherit
+            from these modes leave it out.
         landmarks: Points of each state.
         restrict: Makes the problem of some samples, by index; None: by the costs' `take`.
         of_children: Makes the problem of samples from the component of the prior that each came
@@ -44,6 +47,7 @@ class SearchProblem(NamedTuple):
     coarse: CostFunction | None = None
     screening: CostFunction | None = None
     weight_only: Callable[[Vectors], Numbers] | None = None
+    past: Callable[[Vectors], Numbers] | None = None
     landmarks: Callable[[Vectors], Float[Tensor, "b m d"]] | None = None
     restrict: Callable[[Items], SearchProblem] | None = None
     of_children: Callable[[Int[Tensor, " s"], Prior], SearchProblem] | None = None

@@ -106,8 +106,9 @@ class TrackerInfo(NamedTuple):
     """What one step did.
 
     Attributes:
-        cost: Cost of each mode kept, weight-only cost included, nats; `inf` where a mode was
-            carried over (no sample had a finite cost).
+        cost: Cost of each mode kept, weight-only cost included and what the past makes likely left
+            out (`SearchProblem.past`), nats; `inf` where a mode was carried over (no sample had a
+            finite cost).
         parent: Mode before that is matched with each mode (Fig. 6 step 5), or next to it where
             matching is soft; that from which a move was made, where the jump is; -1 for none.
         origin: Component of the prior whose sample descended to each mode.
@@ -492,6 +493,7 @@ class Tracker(SequenceTracker):
         cost = modes.cost
         if problem.weight_only is not None:
             cost = cost + problem.weight_only(modes.mean)
+        told = torch.zeros_like(cost) if problem.past is None else problem.past(modes.mean)
         volume = torch.zeros_like(cost)
         if self.laplace_evidence:
             volume = 0.5 * log_determinant(modes.covariance)
@@ -499,7 +501,11 @@ class Tracker(SequenceTracker):
         unpruned = GaussianMixture(modes.mean, modes.covariance, log_weight).normalise()
         remembered = self.forgetting * prior.mixture.normalise().log_weight
         tempered = prior.mixture._replace(log_weight=remembered)
-        past = prior_at(unpruned, tempered, self.surprise) if self.soft_matching else None
+        past = None
+        if self.soft_matching:
+            past = prior_at(unpruned, tempered, self.surprise)
+            # It takes the place of what the cost says of the past, which else would count twice.
+            past = past._replace(log_weight=past.log_weight + self.likelihood_power * told)
         kept = self._explanations(problem, unpruned, volume - cost, past)
         pruned = unpruned.take(kept).normalise()
         if past is None:
@@ -513,7 +519,7 @@ class Tracker(SequenceTracker):
         velocity = torch.where((match >= 0)[:, None], moved, 0.0)
         parent = torch.where(match >= 0, prior.parent[match.clamp(min=0)], -1)
         effective = (-(2 * unpruned.log_weight).logsumexp(0)).exp()
-        return _Kept(mixture, velocity, cost[kept], parent, origin[kept], effective)
+        return _Kept(mixture, velocity, (cost - told)[kept], parent, origin[kept], effective)
 
     def _explanations(
         self,

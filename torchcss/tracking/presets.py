@@ -77,7 +77,6 @@ class Preset:
         samples_body: Samples per frame for a body.
         modes_arm: Modes kept for an arm.
         modes_body: Modes kept for a body.
-        forgetting: See `Tracker`.
         likelihood_power: See `Tracker`. Below 1, of two poses that look alike the one that was
             right so far stays the best (`scripts/evaluate_posterior.py` measures it).
         survivors_arm: `Tracker.survivors` for an arm.
@@ -124,7 +123,6 @@ class Preset:
     samples_body: int
     modes_arm: int = 3
     modes_body: int = 7
-    forgetting: float = 1.0
     likelihood_power: float = 1.0
     survivors_arm: int = 0
     survivors_body: int = 0
@@ -186,12 +184,12 @@ _CONFOUNDED = 0.03
 
 _CSS = Preset(
     what="covariance scaled sampling, [IJRR] Fig. 6 with s = 8, modes kept apart, and jumps",
+    converged_only=True,
     proposal=CovarianceScaled(covariance_scale=8.0, max_deviation=1.0),
     samples_arm=160,
     samples_body=60,
-    forgetting=0.98,
     likelihood_power=0.1,
-    power_arm=0.05,
+    power_arm=0.035,
     survivors_arm=20,
     survivors_body=15,
     persistence=0.8,
@@ -441,7 +439,6 @@ def make_tracker(
         converged_only=row.converged_only,
         capped=row.capped,
         keep_alike=row.keep_alike,
-        forgetting=row.forgetting,
         likelihood_power=power,
         survivors=row.survivors_arm if arm else row.survivors_body,
         dynamics=dynamics,

@@ -89,7 +89,8 @@ def smooth_modes_on_images(
     first = smooth_modes(body, track, choice)
     start = first.refined.mean
     plan = make_plan(settings, body, views[0], 0.0)
-    cost = plan.choice.without("temporal", "temporal_mixture", "segmentation")
+    past = (term.name for term in plan.choice.terms if term.of_past)
+    cost = plan.choice.without(*past, "segmentation")
     plan = plan._replace(choice=cost, surface_prediction=False)
     moments = _moments(images, track.frames.tolist(), len(views))
     at_start: list[float] = []
