@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from made_robots import planar_arm
 from reference.kinematics import lift_by_autograd
 from torch import Tensor
 
@@ -339,6 +340,7 @@ def test_mjcf_by_hand(tmp_path: Path, generator: torch.Generator) -> None:
     for name, place in (("arm", arm), ("hand", hand), ("tip", hand @ shift(0, 0, 0.15))):
         np.testing.assert_allclose(joints[body.joint_index(name)], place[:3, 3], atol=1e-12)
     # Solids of the file, and a bone where a link has only a mesh.
+    assert any(note.startswith("a.xml: meshes are not opened, hand:") for note in body.notes)
     assert body.part_names == ("trunk", "arm", "hand")
     torch.testing.assert_close(
         body.part_shape[:, :3],
@@ -564,3 +566,17 @@ def test_bad_requests(tmp_path: Path) -> None:
         load_body(path, device="nope")
     path.write_bytes(MJCF.encode("utf-16"))
     assert load_body(path).num_parameters == 11  # XML says its encoding itself
+
+
+def test_meshes_that_stand_for_a_link_are_told(tmp_path: Path) -> None:
+    path = planar_arm(tmp_path / "arm.urdf", 0.5, 0.4)
+    mesh = '<visual><geometry><mesh filename="package://arm/meshes/{}.stl"/></geometry></visual>'
+    ball = '<collision><geometry><sphere radius="0.05"/></geometry></collision>'
+    text = path.read_text()
+    for link, inside in (("link1", mesh + ball), ("link2", mesh), ("tip", "")):
+        text = text.replace(f'<link name="{link}"/>', f'<link name="{link}">{inside}</link>')
+    path.write_text(text)
+    notes = load_body(path).notes
+    assert notes[0] == "arm.urdf: limits, axes and solids: as the URDF says"
+    assert len(notes) == 2
+    assert notes[1].startswith("arm.urdf: meshes are not opened, link2: ")

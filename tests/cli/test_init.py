@@ -165,7 +165,7 @@ def test_clicked_joints_are_used_and_kept(
     marks = json.loads((scene / "joints.json").read_text())["joints"]
     places = torch.tensor(list(marks.values()), dtype=torch.float64)
     clicked = Keypoints(places, torch.ones(len(places)).double(), tuple(marks))
-    monkeypatch.setattr("torchcss.show.click.click_joints", lambda picture: clicked)
+    monkeypatch.setattr("torchcss.show.click.click_joints", lambda picture, body: clicked)
     few_starts(monkeypatch)
     assert init(scene, tmp_path, "--click", "--no-contours", "--hypotheses", "best") == 0
     kept = json.loads((tmp_path / "joints.json").read_text())["joints"]
@@ -185,7 +185,7 @@ def test_from_a_frame_of_a_video(scene: Path, tmp_path: Path, monkeypatch: pytes
     seen = []
     few_starts(monkeypatch)
     monkeypatch.setattr(
-        "torchcss.show.click.click_joints", lambda picture: seen.append(picture) or clicked
+        "torchcss.show.click.click_joints", lambda picture, body: seen.append(picture) or clicked
     )
     quick = [
         "--camera", str(scene / "cameras.json"), "--no-contours", "--hypotheses", "best",

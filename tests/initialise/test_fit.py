@@ -16,7 +16,7 @@ from made_robots import planar_arm
 import torchcss
 from torchcss.body.catalog import LENGTHS, PLACES, PROPORTIONS
 from torchcss.body.load import load_body
-from torchcss.body.root import has_root
+from torchcss.body.root import has_root, unwound
 from torchcss.cost.anthropometric import Anthropometric
 from torchcss.cost.context import FrameContext
 from torchcss.cost.interpenetration import Interpenetration
@@ -391,6 +391,26 @@ def test_joints_of_a_robot_have_its_own_names(tmp_path: Path, generator: torch.G
         torch.testing.assert_close(camera.project(joints).uv, places, rtol=0, atol=1.0)
     with pytest.raises(KeypointError, match=f"unknown joint 'tap'.* {body.joint_names[-1]}"):
         initialise(None, {"tap": (1.0, 2.0)}, camera, body, generator=generator)
+
+
+def test_a_joint_without_limits_has_one_value_for_a_pose(tmp_path: Path, generator):
+    path = planar_arm(tmp_path / "arm.urdf", 0.5, 0.4, 0.3)
+    body = load_body(path)
+    x = torch.tensor([0.3, 2.8, -2.9], dtype=torch.float64)
+    camera = look_at([0.2, -0.4, 3.0], [0.0, 0.0, 0.0], focal_px=700.0, name="above")
+    places = camera.project(body.pose(x).joints).uv
+    marked = dict(zip(body.joint_names, places.tolist(), strict=True))
+    found = initialise(None, marked, camera, str(path), generator=generator)
+    modes = found.mixture.mean
+    assert float(modes.abs().max()) <= math.pi
+    apart = torch.pdist(found.body.pose(modes).joints.flatten(1))
+    assert not bool((apart < 1e-3).any())
+    # The arm stands where the fit puts it: turned there, its first joint reaches the same.
+    (line,) = (line for line in found.report if line.startswith("not determined"))
+    assert line.endswith("as its place was sought as well: joint1")
+    limited = load_body(planar_arm(tmp_path / "limited.urdf", 0.5, 0.4, limit=7.0))
+    wound = torch.tensor([6.5, -0.1], dtype=torch.float64)
+    torch.testing.assert_close(unwound(limited, wound), wound - wound.new_tensor([2 * math.pi, 0]))
 
 
 def test_cameras(generator: torch.Generator):

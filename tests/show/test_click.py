@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_robots import planar_arm
 from matplotlib.backend_bases import KeyEvent, MouseButton, MouseEvent
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_webagg_core import FigureCanvasWebAggCore, FigureManagerWebAgg
 from matplotlib.figure import Figure
 
+from torchcss.body.load import load_body
 from torchcss.errors import ConfigurationError, KeypointError
 from torchcss.io.keypoints.one_image import read_joints
 from torchcss.show.click import CLICKED, JointClicker, click_joints, spoken, write_clicked
@@ -147,6 +149,17 @@ def test_written_joints_read_back(clicker: JointClicker, tmp_path: Path):
     found = read_joints(path, image_size_wh=(200, 120))
     assert found.names == clicker.joints.names
     np.testing.assert_allclose(found.positions.numpy(), clicker.joints.positions.numpy())
+
+
+def test_a_robot_is_asked_for_its_own_joints(tmp_path: Path):
+    path = planar_arm(tmp_path / "arm.urdf", 0.5, 0.4)
+    clicker = JointClicker(PICTURE, figure=Figure(), body=str(path))
+    assert clicker.names == ("link0", "link1", "link2", "tip")
+    clicker.mark(10, 20)
+    write_clicked(tmp_path / "joints.json", clicker.joints, (200, 120))
+    links = load_body(path).joint_of_name
+    found = read_joints(tmp_path / "joints.json", image_size_wh=(200, 120), links=links)
+    assert found.names == ("link0",)
 
 
 def test_bad_requests(clicker: JointClicker):

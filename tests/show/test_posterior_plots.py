@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from made_robots import write_arm
 from made_tracks import make_track
 from matplotlib.axes import Axes
 from matplotlib.collections import FillBetweenPolyCollection, PathCollection
@@ -97,6 +98,17 @@ def test_parameters_in_degrees_with_their_limits(track: Track, body: BodyModel) 
     limits = [line.get_ydata() for line in axes.get_lines() if line.get_linestyle() == ":"]
     expected = np.degrees([body.lower[index].item(), body.upper[index].item()])
     assert {round(float(np.ravel(limit)[0])) for limit in limits} <= set(expected.round())
+
+
+def test_a_sliding_joint_is_in_metres(tmp_path: Path) -> None:
+    path = write_arm(tmp_path / "arm.urdf", (((0, 0, 0.3), (0, 0, 0), (0, 0, 1), 0.4),) * 2)
+    path.write_text(path.read_text().replace("revolute", "prismatic", 1))
+    body = load_body(path)
+    assert body.is_angle.tolist() == [False, True]
+    track = make_track(body)
+    axes = panel(angles_figure(track), "joint1 (m)")
+    np.testing.assert_allclose(lines(axes)[0], track.state[:, 0, 0])
+    assert panel(angles_figure(track), "joint2 (degrees)")
 
 
 def test_lines_of_the_root_end_where_the_base_moves() -> None:

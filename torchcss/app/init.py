@@ -23,6 +23,7 @@ from typing import Any
 
 import torch
 
+from torchcss.body.load import load_body
 from torchcss.errors import CameraError, KeypointError
 from torchcss.files import prepare_output_folder, replace_file
 from torchcss.initialise.fit import default_camera, initialise
@@ -32,6 +33,7 @@ from torchcss.initialise.result import Initialisation, stature_of
 from torchcss.initialise.view import CameraView
 from torchcss.io.cameras import check_image_size, load_camera
 from torchcss.io.fitted_body import FITTED_BODY_NAME, write_fitted_body
+from torchcss.io.keypoints.links import Links
 from torchcss.io.keypoints.one_image import read_joints
 from torchcss.io.keypoints.read import Scale
 from torchcss.io.tracks import write_summary
@@ -91,8 +93,8 @@ class PictureFiles:
         notes = [f"camera: {loaded.camera.name}", loaded.units_note]
         return loaded.camera, [note for note in notes if note]
 
-    def read_joints(self, width: int, height: int) -> Keypoints:
-        """The joints in a picture of this size.
+    def read_joints(self, width: int, height: int, links: Links) -> Keypoints:
+        """The joints in a picture of this size, and of a body with names of its own.
 
         Raises:
             KeypointError: If they cannot be read.
@@ -105,6 +107,7 @@ class PictureFiles:
             layout=self.layout,
             normalised=self.normalised,
             frame=self.frame,
+            links=links,
         )
 
 
@@ -143,7 +146,7 @@ def initialise_image(
     height, width = picture.shape[:2]
     prepare_output_folder(out)
     camera, notes = files.read_camera(image, width, height)
-    keypoints = files.read_joints(width, height) if keypoints is None else keypoints
+    keypoints = keypoints or files.read_joints(width, height, load_body(body).joint_of_name)
     began, generator = time.perf_counter(), torch.Generator().manual_seed(seed)
     found = initialise(picture, keypoints, camera, body, generator=generator, options=options)
     seconds = time.perf_counter() - began

@@ -225,8 +225,9 @@ def _with_images(run: Run, choice: Smoothing) -> SmoothedTrack:
             f"known; give {', '.join(missing)}"
         )
     first, stop = int(track.frames[0]), int(track.frames[-1]) + 1
+    selection = FrameSelection(start=first, stop=stop)
     views = [
-        open_view(each.files, each.camera, FrameSelection(start=first, stop=stop))
+        open_view(each.files, each.camera, selection, run.body.joint_of_name)
         for each in run.cameras
         if each.files is not None
     ]

@@ -25,16 +25,21 @@ from torchcss.app.lens import PERSONS, KnownLens, fitted
 from torchcss.app.lock import locked
 from torchcss.app.recorder import CHECKPOINT_EVERY, Recorder, Sink
 from torchcss.app.view_files import FrameSelection, OpenView, moments, open_view
+from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel
 from torchcss.errors import CameraError, ConfigurationError, TrackFileError
 from torchcss.files import StrPath, naming
 from torchcss.initialise.noise import Noise
+from torchcss.initialise.options import LEAST_JOINTS
 from torchcss.initialise.result import Initialisation, scale_of
 from torchcss.io.cameras import LoadedCamera
 from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body, write_fitted_body
+from torchcss.io.keypoints.links import Links
 from torchcss.io.keypoints.read import Scale
 from torchcss.io.run import Run, as_run
 from torchcss.io.tracks import TRACK_NAME, prepare_output_folder
 from torchcss.io.view_files import ViewFiles
+from torchcss.joint_names import JOINT_NAMES
 from torchcss.show.track_pictures import write_overlays
 from torchcss.tracking.checkpoint import state_from_tensors
 from torchcss.tracking.session import TrackingSession
@@ -49,7 +54,8 @@ class TrackOptions:
     Attributes:
         stride: Every how many frames to track.
         camera_name: Which camera of the file; by default the one of this video.
-        layout: Layout of a keypoint file that does not name its joints, e.g. BODY_25.
+        layout: Layout of a keypoint file that does not name its joints, e.g. BODY_25; own: take
+            its names as they are.
         normalised: Whether keypoints are pixels, or fractions of the image from 0 to 1 or from -1
             to 1.
         masks: Foreground of every frame, white or in shades of belief: a video or a folder of
@@ -143,10 +149,13 @@ def track_video(
                 return _go_on(begun, settings, selection, options, lock)
         # What is wrong is told before the detector runs, which may take long.
         scale_of(settings.stature)
+        body = load_body(settings.body) if options.first is None else options.first.body
+        if keypoints is None:
+            _check_for_detector(body)
         source, is_known = _camera_of(Path(video), camera, options)
         files = _files_of(Path(video), keypoints, options)
         files = _with_keypoints(files, source, out, selection, options)
-        views = _all_views(files, source, selection, options)
+        views = _all_views(files, source, selection, options, body.joint_of_name)
         if not is_known:
             _now("fitting the focal length to the keypoints")
             views = [fitted(views[0], settings)]
@@ -240,6 +249,16 @@ def _with_keypoints(
     return replace(files, keypoints=keypoints, masks=masks)
 
 
+def _check_for_detector(body: BodyModel) -> None:
+    """Refuse to look for people where the body is none."""
+    if len(set(body.joint_names) & set(JOINT_NAMES)) < LEAST_JOINTS:
+        raise ConfigurationError(
+            f"{body.name} has no joints of a person, which is what detectors find: give "
+            "keypoints, of the first frame at least (torchcss init --click, or a labelling tool), "
+            f"named as its own: {', '.join(body.joint_names)}"
+        )
+
+
 def _detect(video: Path, keypoints: Path, selection: FrameSelection, options: TrackOptions) -> None:
     """Find the keypoints of the frames that are tracked."""
     detect_video(
@@ -274,9 +293,10 @@ def _all_views(
     source: Path | LoadedCamera,
     selection: FrameSelection,
     options: TrackOptions,
+    links: Links,
 ) -> list[OpenView]:
     """The files of all cameras opened."""
-    views = [open_view(each, source, selection) for each in (own, *options.others)]
+    views = [open_view(each, source, selection, links) for each in (own, *options.others)]
     for opened in views:
         if len(views) > 1 and not opened.camera.metric:
             raise CameraError(
@@ -324,7 +344,10 @@ def _go_on(
     assert checkpoint is not None
     _check_same(run, settings, selection, checkpoint.notes["extra"]["frames_selected"])
     _detect_further(run, selection, options)
-    views = [open_view(each.files, each.camera, selection) for each in run.cameras if each.files]
+    links = run.body.joint_of_name
+    views = [
+        open_view(each.files, each.camera, selection, links) for each in run.cameras if each.files
+    ]
     body = run.body.to(dtype=settings.torch_dtype, device=settings.device)
     state = state_from_tensors(checkpoint.tensors, body)
     interval = selection.stride / float(views[0].reader.info.frame_rate)

@@ -9,6 +9,7 @@ from collections.abc import Container, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 from torch import Tensor
@@ -20,6 +21,7 @@ from torchcss.initialise.view import CameraView
 from torchcss.io.cameras import LoadedCamera, camera_findings, check_image_size, load_camera
 from torchcss.io.keypoints.arrays import read_points
 from torchcss.io.keypoints.frames import Film
+from torchcss.io.keypoints.links import Links
 from torchcss.io.keypoints.one_person import Whom
 from torchcss.io.keypoints.read import read_person
 from torchcss.io.video import VideoReader, missing_numbers, several_kinds
@@ -145,7 +147,10 @@ class FrameSelection:
 
 
 def open_view(
-    files: ViewFiles, camera: Path | Camera | LoadedCamera, selection: FrameSelection | None = None
+    files: ViewFiles,
+    camera: Path | Camera | LoadedCamera,
+    selection: FrameSelection | None = None,
+    links: Links = MappingProxyType({}),
 ) -> OpenView:
     """Open the files of a view.
 
@@ -153,6 +158,7 @@ def open_view(
         files: The files.
         camera: The calibration file, or the camera, or one with what is said about it.
         selection: Which frames; None: all.
+        links: What the body's file calls its joints (`BodyModel.joint_of_name`).
 
     Raises:
         TorchcssError: If a file cannot be read, or two of them do not belong together.
@@ -192,16 +198,23 @@ def open_view(
         check_image_size(loaded.camera, width, height)
     if files.keypoints is None:
         return OpenView(files, reader, masks, loaded, None, 1.0)
-    rate = None if reader.image_names else float(reader.info.frame_rate)
-    count = reader.info.num_frames or reader.count_frames()
-    film = Film(count, reader.image_names, rate, reader.frame_times)
-    keypoints = read_person(
-        files.keypoints,
-        film=film,
-        whom=Whom(start, files.person, (width, height)),
-        layout=files.layout,
-        normalised=files.normalised,
-    )
+    keypoints = _keypoints(files, reader, start, links)
     sigma = files.sigma or keypoints.relative_noise * typical_sigma(keypoints)
     keypoints = read_points(files.keypoints, keypoints._replace(relative_noise=1.0))
     return OpenView(files, reader, masks, loaded, keypoints, sigma)
+
+
+def _keypoints(files: ViewFiles, reader: VideoReader, start: int, links: Links) -> Keypoints:
+    """The keypoints of a view that has some."""
+    assert files.keypoints is not None
+    rate = None if reader.image_names else float(reader.info.frame_rate)
+    count = reader.info.num_frames or reader.count_frames()
+    film = Film(count, reader.image_names, rate, reader.frame_times)
+    return read_person(
+        files.keypoints,
+        film=film,
+        whom=Whom(start, files.person, (reader.info.width, reader.info.height)),
+        layout=files.layout,
+        normalised=files.normalised,
+        links=links,
+    )

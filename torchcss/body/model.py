@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from torchcss.body.catalog import BodySpecification, motion_rate
+from torchcss.body.catalog import BODY_NAMES, BodySpecification, motion_rate
 from torchcss.body.kinematics import KinematicTree, TreePose
 from torchcss.body.lift import lift_to_joints
 from torchcss.body.rotations import check_rotation
@@ -189,6 +189,28 @@ class BodyModel(nn.Module):
     def rest(self) -> Float[Tensor, " n"]:
         """The rest pose: zero, moved inside the limits."""
         return self.bounds.project(torch.zeros_like(self.lower))
+
+    @property
+    def is_angle(self) -> Bool[Tensor, " n"]:
+        """Which parameters turn joints; the others move along an axis or are lengths."""
+        return ((self.tie == 0) | self.tree.is_revolute[:, None]).all(0)
+
+    @property
+    def comes_round(self) -> Bool[Tensor, " n"]:
+        """Which parameters a whole turn brings back to the same pose."""
+        return self.is_angle & (self.tie == self.tie.round()).all(0)
+
+    @property
+    def joint_of_name(self) -> dict[str, str]:
+        """Joint centres by what the body's file calls the link at whose origin they are.
+
+        Their own names count where no link has them. Empty for a body that ships.
+        """
+        if self.name in BODY_NAMES:
+            return {}
+        markers = self.specification.markers
+        links = {mark.link: mark.name for mark in markers if not any(mark.translation)}
+        return {**{name: name for name in self.joint_names}, **links}
 
     def joint_index(self, name: str) -> int:
         """Position of a joint centre on axis `j`.

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchcss.body.chain import offset_matrix
 from torchcss.body.model import BodyModel
 from torchcss.body.rotations import root_angles, root_rotation
-from torchcss.types import Bounds
+from torchcss.types import Bounds, Vectors
 
 ROOT_NAMES = ("root_x", "root_y", "root_z", "root_yaw", "root_pitch", "root_roll")
 
@@ -25,6 +25,21 @@ ROOT_NAMES = ("root_x", "root_y", "root_z", "root_yaw", "root_pitch", "root_roll
 def has_root(body: BodyModel) -> bool:
     """Whether the body has the six root parameters."""
     return set(ROOT_NAMES) <= set(body.state_names)
+
+
+def unwound(body: BodyModel, x: Vectors) -> Vectors:
+    """The same poses without whole turns of joints, as far as limits let them.
+
+    The angles of a free root stay as they are.
+
+    Args:
+        body: The body.
+        x: States, radians and metres.
+    """
+    less = x - 2 * math.pi * (x / (2 * math.pi)).round()
+    fits = body.comes_round & (less >= body.lower) & (less <= body.upper)
+    joints = torch.tensor([name not in ROOT_NAMES for name in body.state_names], device=x.device)
+    return torch.where(fits & joints, less, x)
 
 
 def free_turns(body: BodyModel) -> Bounds:

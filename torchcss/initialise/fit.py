@@ -22,7 +22,6 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from torchcss.body.catalog import BODY_NAMES
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.root import has_root
@@ -157,11 +156,9 @@ def initialise(
         return _to_the_picture(first, image, view._replace(keypoints=given), others, options)
 
 
-def _own_joints(body: str | BodyModel) -> tuple[str, ...]:
+def _own_joints(body: str | BodyModel) -> dict[str, str]:
     """Joints of a body under its file's names."""
-    if body in BODY_NAMES:
-        return ()
-    return (body if isinstance(body, BodyModel) else load_body(body)).joint_names
+    return (body if isinstance(body, BodyModel) else load_body(body)).joint_of_name
 
 
 def _fit_of_size(

@@ -16,8 +16,6 @@ or the view of another camera, else the anthropometric prior does.
 
 from __future__ import annotations
 
-import math
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -44,7 +42,7 @@ from torchcss.initialise.result import (
     scale_of,
     scale_report,
     uncapped_covariance,
-    undetermined_line,
+    undetermined,
     with_lengths,
     with_unknown_lengths,
 )
@@ -120,11 +118,12 @@ def _with_lengths_fitted(
         notes = (*notes, f"keypoints that fit no pose, left out: {', '.join(left_out)}")
         cost = without(cost, outliers)
     lengths = fitted_lengths(free, fits.mean[0], options.stature)
-    held, kept, uncapped = _with_lengths_held(cost, fits, lengths, scale, options)
+    held, kept, uncapped, loose = _with_lengths_held(cost, fits, lengths, scale, options)
     result = as_initialisation(held, kept, notes)
     report = [*result.report, scale_report(options.stature, lengths, num_views=len(cost.views))]
-    if (line := undetermined_line(held, kept, joints=cost.with_body(held))) is not None:
-        report.append(line)
+    if loose:
+        what = "kept at their prior" if has_root(held) else "as its place was sought as well"
+        report.append(f"not determined by the joints, {what}: {', '.join(loose)}")
     fits = fits.take(slice(options.num_modes))
     known = options.stature is not None or len(cost.views) > 1
     return result._replace(
@@ -145,10 +144,12 @@ def _with_lengths_held(
     lengths: dict[str, float],
     scale: float,
     options: InitialiseOptions,
-) -> tuple[BodyModel, Modes, Float[Tensor, "n n"]]:
+) -> tuple[BodyModel, Modes, Float[Tensor, "n n"], list[str]]:
     """Refine fits on the body with these lengths.
 
-    The distinct ones, the body hung on the best, whose covariance uncapped comes last.
+    Returns:
+        The body hung on the best of them, the distinct fits, the covariance of the best uncapped,
+        and the parameters that the joints do not determine.
     """
     free, num = cost.body, options.num_modes
     # Twice as many fits as are asked for have their chance.
@@ -156,24 +157,27 @@ def _with_lengths_held(
     body = with_lengths(free, lengths, scale, free_root=True)
     starts = columns_of(free, body, candidates)
     body, starts, _ = move_base(body, *root_pose(body, starts[0]), starts)
-    refined = refine_fits(cost.with_body(body), starts, options.search)
+    refined, loose = refine_fits(cost.with_body(body), starts, options.search), []
     if not (options.free_root or has_free_root(free.name)):
         # The root of the best fit becomes the arm's base, and only its angles are searched.
-        best = refined.mean[int(refined.cost.nan_to_num(math.inf).argmin())]
+        found = best_distinct(refined, 1)
+        # Where the arm stands is looked for too: what turns it all is then not known.
+        loose = undetermined(body, found, joints=cost.with_body(body))
         arm = with_lengths(free, lengths, scale, free_root=None)
-        arm = arm.with_base(*base_without_root(body, arm, best))
+        arm = arm.with_base(*base_without_root(body, arm, found.mean[0]))
         starts = columns_of(body, arm, refined.mean)
         body, refined = arm, refine_fits(cost.with_body(arm), starts, options.search)
     kept, search = best_distinct(refined, num), options.search
     if has_root(body):
         body, kept = hang_on_best(body, kept)
         parameters = search.parameters
-        loose = with_lengths(body, lengths, scale, free_root=True, free_proportions=parameters)
-        cost = cost.with_body(loose)
-        kept = with_unknown_lengths(cost, body, kept, search)
+        free = with_lengths(body, lengths, scale, free_root=True, free_proportions=parameters)
+        kept = with_unknown_lengths(cost.with_body(free), body, kept, search)
+        loose = undetermined(body, kept, joints=cost.with_body(body))
+        cost = cost.with_body(free)
     else:
         cost = cost.with_body(body)
-    return body, kept, uncapped_covariance(cost, body, kept.mean[0], search)
+    return body, kept, uncapped_covariance(cost, body, kept.mean[0], search), loose
 
 
 def _check_in_view(body: BodyModel, camera: Camera) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 import torch
 
@@ -36,23 +37,22 @@ _SIDED = {
 
 
 def keypoints_by_name(
-    places: Mapping[str, Sequence[float]], *, own: tuple[str, ...] = ()
+    places: Mapping[str, Sequence[float]], *, own: Mapping[str, str] = MappingProxyType({})
 ) -> Keypoints:
     """Keypoints of one image from pixels by joint name, `(u, v)` or `(u, v, confidence)`.
 
     Args:
         places: The pixels.
-        own: Names that the body has for joints, besides the catalogue's.
+        own: Joints by what the body's file calls them, see `BodyModel.joint_of_name`.
 
     Raises:
         KeypointError: If a joint is unknown, or a place has other numbers.
     """
-    names = tuple(name if name in own else canonical_joint_name(name) or "" for name in places)
+    names = tuple(own.get(name) or canonical_joint_name(name) or "" for name in places)
     if "" in names:
         unknown = list(places)[names.index("")]
-        raise KeypointError(
-            f"unknown joint {unknown!r}; the known ones are {', '.join(own or JOINT_NAMES)}"
-        )
+        known = ", ".join(dict.fromkeys(own.values()) or JOINT_NAMES)
+        raise KeypointError(f"unknown joint {unknown!r}; the known ones are {known}")
     rows = [[*(float(number) for number in place), 1.0][:3] for place in places.values()]
     if any(len(row) != 3 for row in rows):
         raise KeypointError("expected (u, v) or (u, v, confidence) for every joint")

@@ -34,7 +34,7 @@ from torch import Tensor
 from torchcss.body.catalog import PLACES, PROPORTIONS, Proportions, without_side
 from torchcss.body.flips import Segments
 from torchcss.body.model import BodyModel
-from torchcss.body.root import ROOT_NAMES, has_root
+from torchcss.body.root import ROOT_NAMES, has_root, unwound
 from torchcss.body.rotations import within_half_turn
 from torchcss.cost.anthropometric import proportion_columns
 from torchcss.cost.joints import JointTerm
@@ -194,7 +194,8 @@ def multi_start_fits(
 
 def optimise(cost: TrackingCost, x: Vectors, bounds: Bounds, steps: int) -> Modes:
     """Descend to a hundredth of a nat, which tells fits apart, in so many steps at the most."""
-    return TrustRegionNewton(max_steps=steps, tolerance=1e-2).minimise(cost, x, bounds)
+    fits = TrustRegionNewton(max_steps=steps, tolerance=1e-2).minimise(cost, x, bounds)
+    return fits._replace(mean=unwound(cost.body, fits.mean))
 
 
 def descend_widened(

@@ -25,6 +25,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchcss.body.root import unwound
 from torchcss.cost.joints import JointTargets, JointTerm, match_joints
 from torchcss.cost.total import TrackingCost
 from torchcss.inference.mixture import distinct_modes
@@ -157,7 +158,8 @@ def refine_fits(cost: TrackingCost, x: Vectors, search: StartSearch) -> Modes:
     """Descend from fits to other keypoints or lengths: wide at first, then to the end."""
     bounds = search.bounds(cost.body)
     x = descend_widened(cost, x, bounds, ((4.0, 8),))
-    return TrustRegionNewton(max_steps=60, tolerance=1e-3).minimise(cost, x, bounds)
+    fits = TrustRegionNewton(max_steps=60, tolerance=1e-3).minimise(cost, x, bounds)
+    return fits._replace(mean=unwound(cost.body, fits.mean))
 
 
 def best_distinct(fits: Modes, num: int | None = None) -> Modes:

@@ -275,8 +275,8 @@ def scale_report(stature: float | None, lengths: Mapping[str, float], *, num_vie
     return f"{source}; proportions within 10 % of the standard humanoid: {fitted}"
 
 
-def undetermined_line(body: BodyModel, modes: Modes, joints: TrackingCost) -> str | None:
-    """Which parameters of the best fit the image leaves at their prior."""
+def undetermined(body: BodyModel, modes: Modes, joints: TrackingCost) -> list[str]:
+    """Names of the parameters that the image leaves open in the best fit."""
     prior = torch.minimum(
         default_prior_variance(body.bounds).sqrt(), body.sticky_deviation
     ).nan_to_num(posinf=math.inf)
@@ -289,9 +289,6 @@ def undetermined_line(body: BodyModel, modes: Modes, joints: TrackingCost) -> st
     loose = free & (deviation > _UNDETERMINED * prior)
     # A parameter that moves no known joint has no curvature at all.
     loose = loose | (curvature.abs() * prior.square() < 1e-6)
-    names = [
+    return [
         name for name, is_loose in zip(body.state_names, loose.tolist(), strict=True) if is_loose
     ]
-    if not names:
-        return None
-    return f"not determined by the joints, kept at their prior: {', '.join(names)}"

@@ -28,6 +28,7 @@ from torchcss.body.load import load_body
 from torchcss.errors import ConfigurationError, KeypointError
 from torchcss.files import write_text
 from torchcss.show.track_plots import bones_of, draw_bones
+from torchcss.tracking.settings import Settings
 from torchcss.types import Keypoints
 
 CLICKED = (
@@ -43,8 +44,9 @@ class JointClicker:
 
     Args:
         image: The picture.
-        names: Joints to ask for, in order.
+        names: Joints to ask for, in order; by default `CLICKED`, or all of another body.
         figure: Where to draw; by default a new window of pyplot, or a widget in a notebook.
+        body: The body that has these joints, or its file.
 
     Attributes:
         figure: The figure.
@@ -58,15 +60,19 @@ class JointClicker:
     def __init__(
         self,
         image: UInt8[np.ndarray, "h w 3"],
-        names: tuple[str, ...] = CLICKED,
+        names: tuple[str, ...] | None = None,
         *,
         figure: Figure | None = None,
+        body: str = Settings.body,
     ) -> None:
-        body = load_body("body34")
-        unknown = [name for name in names if name not in body.joint_names]
+        shown = load_body(body, free_root=True)
+        there = shown.joint_names
+        if names is None:
+            names = CLICKED if set(CLICKED) <= set(there) else there
+        unknown = [name for name in names if name not in there]
         if not names or unknown or len(set(names)) < len(names):
             raise ConfigurationError(
-                f"joints to click: expected different ones of {', '.join(body.joint_names)}, "
+                f"joints to click: expected different ones of {', '.join(there)}, "
                 f"got {', '.join(unknown or names) or 'none'}"
             )
         if figure is None:
@@ -76,9 +82,10 @@ class JointClicker:
         self.names, self.figure = names, figure
         self.places: list[tuple[float, float] | None] = []
         self.finished = False
-        joints = body.pose(body.rest).joints.numpy()
-        # Facing the viewer: the person's left is on the right.
-        self._map = dict(zip(body.joint_names, joints[:, :2].tolist(), strict=True))
+        joints = shown.pose(shown.rest).joints.numpy()
+        # Facing the viewer: the person's left is on the right. What is longer than wide: its side.
+        joints = joints[:, [0 if np.ptp(joints[:, 0]) >= np.ptp(joints[:, 2]) else 2, 1]]
+        self._map = dict(zip(there, joints.tolist(), strict=True))
         left, right = figure.subplots(1, 2, width_ratios=(3, 1))
         figure.subplots_adjust(left=0.02, right=0.98, bottom=0.1, top=0.92, wspace=0.03)
         left.imshow(image)
@@ -87,7 +94,7 @@ class JointClicker:
         right.set_aspect("equal")
         right.margins(0.2)
         look = {"color": "0.6", "lw": 3, "zorder": 1}
-        draw_bones(right, joints[:, :2] * [1, -1], bones_of(body), look)
+        draw_bones(right, joints * [1, -1], bones_of(shown), look)
         self._image_axes, self._map_axes = left, right
         self._marks: list[Any] = []
         self._buttons = []
@@ -193,12 +200,18 @@ def spoken(joint: str) -> str:
     return f"{'left' if side == 'l' else 'right'} {words.get(place, place)} (the person's own)"
 
 
-def click_joints(image: UInt8[np.ndarray, "h w 3"], names: tuple[str, ...] = CLICKED) -> Keypoints:
+def click_joints(
+    image: UInt8[np.ndarray, "h w 3"],
+    names: tuple[str, ...] | None = None,
+    *,
+    body: str = Settings.body,
+) -> Keypoints:
     """Open a window, let the user click, and wait until it is closed.
 
     Args:
         image: The picture.
-        names: Joints to ask for, in order.
+        names: Joints to ask for, in order; by default those of `JointClicker`.
+        body: The body that has these joints, or its file.
 
     Raises:
         ConfigurationError: If no window can be opened here.
@@ -212,7 +225,7 @@ def click_joints(image: UInt8[np.ndarray, "h w 3"], names: tuple[str, ...] = CLI
             f"no window can be opened here (matplotlib's backend is {matplotlib.get_backend()}): "
             "run where there is a display, or give the joints as a file"
         )
-    clicker = JointClicker(image, names)
+    clicker = JointClicker(image, names, body=body)
     pyplot.show(block=True)
     return clicker.joints
 

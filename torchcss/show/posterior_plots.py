@@ -37,7 +37,6 @@ from torchcss.show.style import DEVIATIONS, OKABE_ITO, save_figure
 from torchcss.show.track_pictures import has_pictures, pictures_of, rows_with_modes
 from torchcss.show.track_plots import (
     effective_number,
-    is_length,
     label,
     mode_colour,
     modes_figure,
@@ -199,7 +198,7 @@ def angles_figure(track: Track) -> Figure:
     for axes in grid.flat[len(track.state_names) :]:
         axes.set_visible(False)
     for index, (axes, name) in enumerate(zip(grid.flat, track.state_names, strict=False)):
-        factor, unit = (1.0, "m") if is_length(name) else (180 / math.pi, "degrees")
+        factor, unit = (180 / math.pi, "degrees") if body.is_angle[index] else (1.0, "m")
         values = factor * track.state[rows, :, index]
         breaks = moved if name in ROOT_NAMES else moved[:0]
         _draw(axes, track, rows, values, factor * deviation[:, index], breaks=breaks)

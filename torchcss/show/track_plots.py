@@ -27,7 +27,6 @@ from PIL import Image
 
 from torchcss.body.bases import pose_track
 from torchcss.body.model import BodyModel
-from torchcss.body.root import ROOT_NAMES
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.io.run import body_of_track
@@ -459,11 +458,6 @@ def _draw_reference(
     look = {"color": "black", "lw": 1.3, "ls": "--", "zorder": 5}
     draw_bones(front, in_perspective(places, distance), rows, look, label="reference")
     draw_bones(side, places[:, [2, 1]], rows, look)
-
-
-def is_length(name: str) -> bool:
-    """Whether a parameter of a state is a length, metres; others are angles."""
-    return name in ROOT_NAMES[:3] or name.endswith("_length")
 
 
 def label(axes: Axes, title: str = "", x: str = "", y: str = "") -> None:

@@ -238,7 +238,7 @@ class _Problem(NamedTuple):
         cost = pose_targets(body, link, pose, columns=columns, held=held, sigma=search.sigma)
         bounds = Bounds(body.lower[columns], body.upper[columns])
         endless = ~(bounds.lower.isfinite() & bounds.upper.isfinite())
-        turns = (body.tie[~body.tree.is_revolute] == 0).all(0)[columns]
+        turns = body.is_angle[columns]
         if bool((endless & ~turns).any()):
             names = [body.state_names[int(i)] for i in columns[endless & ~turns]]
             raise ConfigurationError(f"{', '.join(names)}: a length without limits; fix it")

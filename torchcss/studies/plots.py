@@ -19,8 +19,9 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from torchcss.body.root import ROOT_NAMES
 from torchcss.show.style import OKABE_ITO
-from torchcss.show.track_plots import is_length, tidy
+from torchcss.show.track_plots import tidy
 from torchcss.studies.metrics import spread
 from torchcss.studies.slices import PROMINENCE, Slice, StateLine
 
@@ -64,7 +65,7 @@ def unit_of(line: StateLine, *, close: bool = False) -> Unit:
         if close:
             return Unit("standard deviations", 1 / line.deviation)
         return Unit("length of the step (radians and metres)")
-    if is_length(line.name):
+    if line.name in ROOT_NAMES[:3] or line.name.endswith("_length"):
         return Unit("metres")
     return Unit("degrees", 180 / math.pi)
 

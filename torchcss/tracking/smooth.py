@@ -228,8 +228,9 @@ def base_changes(
 
 
 def _periods(body: BodyModel) -> Vector:
-    """After how much each parameter comes round; infinite but for the angles of the root."""
-    period = torch.full((body.num_parameters,), math.inf, dtype=torch.float64)
+    """After how much each parameter comes round; infinite but for joints without limits."""
+    endless = body.comes_round & body.lower.isinf() & body.upper.isinf()
+    period = torch.where(endless, 2 * math.pi, math.inf).double()
     if has_root(body):
         period[[body.state_index(name) for name in ROOT_NAMES[3:]]] = 2 * math.pi
     return period

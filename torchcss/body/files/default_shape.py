@@ -165,6 +165,19 @@ def solid_shape(kind: str, size: Sequence[float]) -> tuple[float, ...]:
     return (*(float(a) for a in axes), e1, e2, 0.0, 0.0, 0.0, 0.0)
 
 
+def unopened_meshes(links: Sequence[str], where: str) -> str:
+    """What to say of links whose meshes are not opened.
+
+    Args:
+        links: Their names.
+        where: Where the file may give them a simple solid.
+    """
+    return (
+        f"meshes are not opened, {', '.join(links)}: their shape is a guess along the bones; "
+        f"boxes, cylinders or spheres as {where} are taken instead"
+    )
+
+
 def touching_parts(
     joints: Sequence[JointSpecification], parts: Sequence[PartSpecification]
 ) -> tuple[tuple[str, str], ...]:

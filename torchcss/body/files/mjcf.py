@@ -31,7 +31,7 @@ from jaxtyping import Float
 from torchcss.body.catalog import PartSpecification
 from torchcss.body.chain import JointSpecification
 from torchcss.body.files.bvh import BASE, HungTree
-from torchcss.body.files.default_shape import solid_shape, unused
+from torchcss.body.files.default_shape import solid_shape, unopened_meshes, unused
 from torchcss.body.files.xml import parse_xml
 from torchcss.body.rotations import as_rows, as_vector, from_quaternion
 from torchcss.errors import BodyError, optional_package
@@ -71,7 +71,7 @@ def read_mjcf(path: Path) -> tuple[HungTree, tuple[PartSpecification, ...]]:
             expands to very many bodies.
         MissingExtraError: If MuJoCo is not installed.
     """
-    model = _compiled(path)
+    model, meshed = _compiled(path)
     if not model.njnt and model.nbody < 2:
         raise BodyError(f"{path}: no <body> in the <worldbody>; expected an MJCF of a body")
     tops = [body for body in range(1, model.nbody) if model.body_parentid[body] == 0]
@@ -81,7 +81,12 @@ def read_mjcf(path: Path) -> tuple[HungTree, tuple[PartSpecification, ...]]:
     if len(tops) > 1:
         others = [model.body(body).name or "without name" for body in tops if body != chosen]
         notes.append(f"of several bodies the one with most joints; not {', '.join(others)}")
-    return _Reader(path, model).read(chosen, tuple(notes))
+    skeleton, parts = _Reader(path, model).read(chosen, tuple(notes))
+    bare = {*skeleton.places} - {part.link for part in parts}
+    if meshes := [link for link in meshed if link in bare]:
+        note = unopened_meshes(meshes, "<geom>")
+        skeleton = skeleton._replace(notes=(*skeleton.notes, note))
+    return skeleton, parts
 
 
 class _Screen:
@@ -164,8 +169,8 @@ def _product(words: str) -> float:
         return 1  # the compiler says what is wrong
 
 
-def _compiled(path: Path) -> Any:
-    """The file as MuJoCo compiles it, meshes left out."""
+def _compiled(path: Path) -> tuple[Any, list[str]]:
+    """The file as MuJoCo compiles it, meshes left out, and the bodies that have some."""
     mujoco = optional_package(
         "mujoco",
         f"{path}: an MJCF file is read by MuJoCo; install it: pip install 'torchcss[mjcf]'",
@@ -179,7 +184,10 @@ def _compiled(path: Path) -> Any:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about dynamics
             spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, "unicode"), include=others)
+            meshed: dict[str, None] = {}
             for geom in list(spec.geoms):
+                if geom.meshname:
+                    meshed[geom.parent.name] = None
                 if geom.meshname or geom.hfieldname or int(geom.type) not in (0, *_SOLIDS):
                     spec.delete(geom)
             for joint in spec.joints:
@@ -189,7 +197,7 @@ def _compiled(path: Path) -> Any:
                     )
             spec.compiler.fusestatic = spec.compiler.discardvisual = False
             spec.compiler.boundmass = spec.compiler.boundinertia = _LIGHT
-            return spec.compile()
+            return spec.compile(), list(meshed)
     except (ValueError, mujoco.FatalError) as error:
         reason = re.sub(r",? line \d+", "", one_line(error))  # of what was handed over
         raise BodyError(f"{path}: MuJoCo cannot read this MJCF: {reason}") from error

@@ -21,7 +21,7 @@ from itertools import count
 from torchcss.body.catalog import PartSpecification
 from torchcss.body.chain import JointSpecification, check_joints, link_order, urdf_joints
 from torchcss.body.files.bvh import HungTree
-from torchcss.body.files.default_shape import solid_shape
+from torchcss.body.files.default_shape import solid_shape, unopened_meshes
 from torchcss.body.rotations import Vector3, about_fixed_axes, as_rows
 from torchcss.errors import BodyError
 from torchcss.files import shortened
@@ -67,6 +67,14 @@ def read_urdf(robot: ElementTree.Element) -> tuple[HungTree, tuple[PartSpecifica
         for joint in _bare_joints(robot)
     ]
     solids = _solids(robot)
+    shaped = {part.link for part in solids}
+    meshes = [
+        name
+        for link in robot.findall("link")
+        if (name := link.get("name", "")) not in shaped and link.find("*/geometry/mesh") is not None
+    ]
+    if meshes:
+        notes.append(unopened_meshes(meshes, "<collision>"))
     check_joints(joints)
     places = tuple(link_order(joints))
     return HungTree(tuple(joints), {}, tuple(notes), places, floats), solids

@@ -55,8 +55,7 @@ def mot_text(selection: Selection, mode: int, body: BodyModel) -> str:
         body: The body, on the origin.
     """
     values = selection.state[:, mode].copy()
-    joints = (body.tie != 0).T  # which a parameter moves
-    turns = np.array([bool(body.tree.is_revolute[moved].all()) for moved in joints])
+    turns = body.is_angle.numpy()
     if has_root(body):
         index = [body.state_index(name) for name in ROOT_NAMES]
         root, base = values[:, index], selection.base[:, mode]

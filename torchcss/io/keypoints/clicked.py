@@ -13,20 +13,6 @@ from torchcss.errors import KeypointError
 from torchcss.files import real_numbers, shortened, unexpected
 from torchcss.io.keypoints.json_people import JOINTS, PEOPLE
 from torchcss.io.keypoints.people import Frames, People, Person, Size, united
-from torchcss.joint_names import JOINT_NAMES, canonical_joint_name
-
-
-def known_joint(where: str, name: str) -> str:
-    """The catalogue's name of a joint.
-
-    Raises:
-        KeypointError: If it has none.
-    """
-    if (known := canonical_joint_name(name)) is None:
-        raise KeypointError(
-            f"{where}: unknown joint {name!r}; the known ones are {', '.join(JOINT_NAMES)}"
-        )
-    return known
 
 
 def is_clicked(content: Mapping[str, Any]) -> bool:
@@ -61,7 +47,7 @@ def read_clicked(content: Mapping[str, Any], image_size_wh: Size) -> People:
         named = _clicked_joints(f"frame {key}", joints)
         clicked[int(key)] = [Person.by_name(named)] if named else []
     found, names = united(clicked)
-    return People(found, names, ["format: clicked joints"], first=0)
+    return People(found, names, ["format: clicked joints"], first=0, by_hand=True)
 
 
 def _clicked_joints(where: str, joints: object) -> dict[str, list[float]]:
@@ -77,6 +63,5 @@ def _clicked_joints(where: str, joints: object) -> dict[str, list[float]]:
             raise KeypointError(
                 f"{where}: {name}: expected [u, v] or [u, v, confidence], found {shortened(place)}"
             )
-        known_joint(where, name)
         found[name] = [*values.tolist(), 1.0][:3]
     return found

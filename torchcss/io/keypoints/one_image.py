@@ -14,16 +14,19 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
+from types import MappingProxyType
 
 import torch
 
 from torchcss.errors import KeypointError
 from torchcss.files import StrPath, load_json
-from torchcss.io.keypoints.clicked import known_joint
+from torchcss.io.keypoints.frames import Film
+from torchcss.io.keypoints.links import Links, joints_named
+from torchcss.io.keypoints.one_person import Whom
 from torchcss.io.keypoints.people import Size
-from torchcss.io.keypoints.read import Scale, read_keypoints
+from torchcss.io.keypoints.read import Scale, read_person
 from torchcss.io.keypoints.tables import Row, table_rows
-from torchcss.joint_names import canonical_joint_name
+from torchcss.joint_names import JOINT_NAMES, canonical_joint_name
 from torchcss.types import Keypoints
 
 
@@ -34,6 +37,7 @@ def read_joints(
     layout: str | None = None,
     normalised: bool | Scale = False,
     frame: int = 0,
+    links: Links = MappingProxyType({}),
 ) -> Keypoints:
     """Read the joints of one picture.
 
@@ -44,6 +48,7 @@ def read_joints(
         normalised: Whether coordinates are fractions of the image, and which, see
             `torchcss.io.keypoints.read.Scale` (MediaPipe's always are, rows of joints never).
         frame: Which frame of a file that has several; a file of one picture is of that picture.
+        links: What the body's file calls its joints.
 
     Raises:
         KeypointError: If the file is missing, damaged or of unknown format.
@@ -51,17 +56,19 @@ def read_joints(
     path = Path(path)
     if path.suffix.lower() == ".csv":
         rows = table_rows(path)
-        if _are_joints(rows):
+        if _are_joints(rows, links):
             if normalised not in (False, "pixels"):
                 raise KeypointError(
                     f"{path}: rows joint, u, v[, confidence] are in pixels; leave normalised out"
                 )
-            return _read_csv(path, rows)
+            return _read_csv(path, rows, links)
     if path.suffix.lower() == ".json":
         frame = _frame_of_single_image(load_json(path, KeypointError), frame)
-    return read_keypoints(
-        path, image_size_wh=image_size_wh, layout=layout, normalised=normalised, first_frame=frame
-    ).at(frame)
+    whom = Whom(frame, "prominent", image_size_wh)
+    return read_person(
+        path, film=Film(None, None, None), whom=whom, layout=layout, normalised=normalised,
+        links=links,
+    ).at(frame)  # fmt: skip
 
 
 def _frame_of_single_image(content: object, otherwise: int) -> int:
@@ -77,9 +84,13 @@ def _frame_of_single_image(content: object, otherwise: int) -> int:
     return int(digits[-1]) if digits else otherwise
 
 
-def _is_heading(cells: list[str]) -> bool:
+def _joint(name: str, links: Links) -> str | None:
+    return joints_named((name,), links)[0] or canonical_joint_name(name)
+
+
+def _is_heading(cells: list[str], links: Links) -> bool:
     """Whether a first row names the columns: it is of no joint, and holds words."""
-    return canonical_joint_name(cells[0]) is None and _values(cells) is None
+    return _joint(cells[0], links) is None and _values(cells) is None
 
 
 def _values(cells: list[str]) -> list[float] | None:
@@ -90,24 +101,27 @@ def _values(cells: list[str]) -> list[float] | None:
         return None
 
 
-def _are_joints(rows: list[Row]) -> bool:
+def _are_joints(rows: list[Row], links: Links) -> bool:
     """Whether these are rows `joint, u, v[, confidence]` and not another table with a heading."""
     heading = rows[0][1]
-    if len(rows) < 2 or not _is_heading(heading):
+    if len(rows) < 2 or not _is_heading(heading, links):
         return True
     # MediaPipe's landmarks are a row each too, with a depth or under their own word.
     names = [cell.lower() for cell in heading]
     if "z" in names or "landmark" in names[0]:
         return False
-    return any(canonical_joint_name(cells[0]) for _, cells in rows[1:])
+    return any(_joint(cells[0], links) for _, cells in rows[1:])
 
 
-def _read_csv(path: Path, rows: list[Row]) -> Keypoints:
+def _read_csv(path: Path, rows: list[Row], links: Links) -> Keypoints:
     table: dict[str, list[float]] = {}
-    for number, cells in rows[_is_heading(rows[0][1]) :]:
+    for number, cells in rows[_is_heading(rows[0][1], links) :]:
         where = f"{path}: row {number}"
         values = _values(cells)
-        name = "" if values is None else known_joint(where, cells[0])
+        name = "" if values is None else _joint(cells[0], links)
+        if name is None:
+            known = ", ".join(dict.fromkeys(links.values()) or JOINT_NAMES)
+            raise KeypointError(f"{where}: unknown joint {cells[0]!r}; the known ones are {known}")
         if values == []:
             continue  # a joint without a place is missing
         if not values or len(values) == 1 or not all(map(math.isfinite, values)):

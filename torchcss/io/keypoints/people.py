@@ -64,6 +64,7 @@ class People(NamedTuple):
         size_wh: Size of the images in which the file's pixels count, if it says so.
         relative_noise: Standard deviation of a place of confidence 1, in multiples of what
             detectors have.
+        by_hand: Somebody typed the names, so that one that is not known is an error.
     """
 
     frames: list[list[Person]] | Frames
@@ -75,6 +76,7 @@ class People(NamedTuple):
     whole: bool = False
     size_wh: tuple[float, float] | None = None
     relative_noise: float = 1.0
+    by_hand: bool = False
 
 
 def united(frames: Frames) -> tuple[Frames, Names | None]:

@@ -21,8 +21,10 @@ order must have as many entries as the video has frames.
 
 Files that name their joints are read by name; the others by layout, which their number of joints
 tells (25 is BODY_25 or BODY_25B: the places of the points decide). Out come the catalogue's names
-(`torchcss.joint_names`); a joint that has none keeps its own. A missing joint has confidence 0 and
-stands at (0, 0). Of several people, one is followed, by the file's own tracks where it has them.
+(`torchcss.joint_names`); a joint that has none keeps its own. For a body from a file, such as a
+robot, the names of its links count too (`torchcss.io.keypoints.links`). A missing joint has
+confidence 0 and stands at (0, 0). Of several people, one is followed, by the file's own tracks
+where it has them.
 Left and right that change places for some frames are put back (`torchcss.io.keypoints.sides`).
 Every such choice, and whatever looks odd, is a line of `Keypoints.report`.
 
@@ -31,13 +33,16 @@ By default: `read_keypoints(path, image_size_wh=(w, h), num_frames=t)`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
 import torch
 
+from torchcss.body.model import BodyModel
 from torchcss.errors import KeypointError
 from torchcss.files import StrPath, load_array, load_arrays, naming, read_text, shortened
 from torchcss.io.keypoints.arrays import read_arrays
@@ -48,6 +53,7 @@ from torchcss.io.keypoints.h36m import is_h36m, read_h36m
 from torchcss.io.keypoints.hdf5 import read_hdf5
 from torchcss.io.keypoints.json_files import read_folder, read_json
 from torchcss.io.keypoints.labels import read_labels
+from torchcss.io.keypoints.links import Links, joints_named, names_links
 from torchcss.io.keypoints.one_person import Whom, follow_person, size_of
 from torchcss.io.keypoints.people import Names, People, Person, Size, is_there
 from torchcss.io.keypoints.sides import with_sides_put_back
@@ -87,7 +93,7 @@ def read_keypoints(
     *,
     image_size_wh: Size,
     num_frames: int | None = None,
-    layout: str | None = None,
+    layout: str | BodyModel | None = None,
     normalised: bool | Scale = False,
     first_frame: int = 0,
     frame_names: Sequence[str] | None = None,
@@ -102,8 +108,8 @@ def read_keypoints(
         num_frames: Number of frames of the video, which the file must match (a clicked file need
             not). None: as many as the file has.
         layout: A key of `torchcss.joint_names.ALIASES`, for files that do not name their joints;
-            "own": the names of the file as they are, which are those of the body, such as a robot.
-            None: recognise it.
+            "own": the names of the file as they are. A body from a file, such as a robot: its links
+            may be named as well as a person's joints. None: recognise it.
         normalised: True, `"zero-one"` or `"plus-minus-one"` for coordinates that are fractions of
             the image, which are then converted: the range ends at the centres of the border pixels.
         first_frame: The frame in which tracking starts; there somebody must be seen.
@@ -121,7 +127,11 @@ def read_keypoints(
     """
     film = Film(num_frames, frame_names, frame_rate)
     whom = Whom(first_frame, "prominent", image_size_wh)
-    return read_person(path, film=film, whom=whom, layout=layout, normalised=normalised)
+    links = layout.joint_of_name if isinstance(layout, BodyModel) else {}
+    layout = None if isinstance(layout, BodyModel) else layout
+    return read_person(
+        path, film=film, whom=whom, layout=layout, normalised=normalised, links=links
+    )
 
 
 def read_person(
@@ -131,6 +141,7 @@ def read_person(
     whom: Whom,
     layout: str | None = None,
     normalised: bool | Scale = False,
+    links: Links = MappingProxyType({}),
 ) -> Keypoints:
     """The same, for a film of which more is known, and a person of choice.
 
@@ -140,6 +151,7 @@ def read_person(
         whom: Who is followed, and the size of the images.
         layout: As for `read_keypoints`.
         normalised: The same.
+        links: What the body's file calls its joints.
 
     Raises:
         KeypointError: The same, or that person is not in the file.
@@ -151,11 +163,16 @@ def read_person(
                 f"unknown layout {layout!r}; the known ones are {', '.join((*ALIASES, OWN_NAMES))}"
             )
         people = _read(path, whom.image_size_wh, film.num_frames)
-        return _person(people, film, whom, layout or people.layout, normalised)
+        names = partial(_joint_names, people, layout=layout or people.layout, links=links)
+        return _person(people, film, whom, normalised, names)
 
 
 def _person(
-    people: People, film: Film, whom: Whom, layout: str | None, normalised: bool | Scale
+    people: People,
+    film: Film,
+    whom: Whom,
+    normalised: bool | Scale,
+    names_of: Callable[[np.ndarray, list[str]], Names],
 ) -> Keypoints:
     """Who is followed, checked and in pixels."""
     first_frame, _, image_size_wh = whom
@@ -179,7 +196,7 @@ def _person(
         frame[..., :2] = scale * frame[..., :2] + shift
     tracks = [[person.track for person in frame] for frame in everyone]
     chosen = follow_person(frames, tracks, whom, report)
-    names = _joint_names(people, chosen, layout, report)
+    names = names_of(chosen, report)
     chosen = with_sides_put_back(chosen, names, report)
     report += findings(chosen, names, image_size_wh, first_frame)
     positions = np.where(chosen[..., 2:] > 0.0, chosen[..., :2], 0.0)
@@ -414,14 +431,42 @@ def _check_places(points: np.ndarray, image_size_wh: Size) -> None:
 
 
 def _joint_names(
-    people: People, chosen: np.ndarray, layout: str | None, report: list[str]
+    people: People, chosen: np.ndarray, report: list[str], *, layout: str | None, links: Links
 ) -> Names:
-    num_joints, own = chosen.shape[1], people.names or ()
-    if layout == OWN_NAMES:
+    """Names of the joints: the body's own where the file has them, else those of people."""
+    own = people.names or ()
+    if layout == OWN_NAMES or (layout is None and names_links(own, links)):
         if not own:
             raise KeypointError(f"layout {OWN_NAMES}: the file does not name its joints")
-        report.append(f"layout: {num_joints} names as they are")
-        return tuple(own)
+        report.append(f"layout: {len(own)} names as they are")
+        known = zip(own, joints_named(own, links), strict=True)
+        names = tuple(joint or name for name, joint in known)
+    else:
+        names = _names_of_people(people, chosen, report, layout, any_names=bool(links))
+    there = tuple(dict.fromkeys(links.values()))
+    if layout == OWN_NAMES and not there:
+        return names
+    unused = [name for name in names if name not in (there or JOINT_NAMES)]
+    if people.by_hand and unused:
+        raise KeypointError(
+            f"unknown joint {unused[0]!r}; the known ones are {', '.join(there or JOINT_NAMES)}"
+        )
+    if there and len(unused) == len(names):
+        raise KeypointError(
+            f"no joint of the body among {shortened(list(own or names))}; it has {', '.join(there)}"
+        )
+    if own and unused:
+        report.append(
+            f"joints that {'the body has not' if there else 'no body has'}: {', '.join(unused)}"
+        )
+    return names
+
+
+def _names_of_people(
+    people: People, chosen: np.ndarray, report: list[str], layout: str | None, *, any_names: bool
+) -> Names:
+    """A person's joints, by their names or by their number."""
+    num_joints, own = chosen.shape[1], people.names or ()
     if layout is not None and len(ALIASES[layout]) != num_joints:
         fitting = ", ".join(_LAYOUTS_BY_COUNT.get(num_joints, ())) or "none of the known"
         raise KeypointError(
@@ -431,7 +476,7 @@ def _joint_names(
     if layout is not None:
         known = ALIASES[layout]
         why = f"{layout}, as {'the file says' if people.layout == layout else 'asked for'}"
-    elif own and any(layout_of_names(own)):
+    elif own and (any_names or people.by_hand or any(layout_of_names(own))):
         known, why = layout_of_names(own), f"by {num_joints} names"
     elif people.names is None and num_joints in _LAYOUTS_BY_COUNT:
         layout, reason = _recognise(chosen)
@@ -441,15 +486,16 @@ def _joint_names(
         raise KeypointError(
             f"unknown layout: found {num_joints} {found}; the known layouts are "
             + ", ".join(f"{name} ({len(joints)})" for name, joints in ALIASES.items())
-            + (f"; names that are a robot's own take layout {OWN_NAMES}" if own else "")
+            + (
+                "; to name a robot's or an animal's joints, give its file as the body"
+                if own
+                else ""
+            )
         )
     report.append(f"layout: {why}")
-    names = tuple(
+    return tuple(
         name or (own[index] if own else f"{layout}[{index}]") for index, name in enumerate(known)
     )
-    if own and (unused := [name for name in names if name not in JOINT_NAMES]):
-        report.append(f"joints that no body has: {', '.join(unused)}")
-    return names
 
 
 def _recognise(chosen: np.ndarray) -> tuple[str, str]:

@@ -188,7 +188,7 @@ def _headed(heading: Sequence[str]) -> _Columns:
 
 def _split(cell: str, kinds: Mapping[str, int] = _PARTS) -> tuple[str, int] | None:
     """Joint and kind of number of a column, whichever comes first in its name."""
-    parted = [word for word in re.split(r"[^a-z0-9]+", re.sub(CASE, " ", cell).lower()) if word]
+    parted = [word for word in re.split(r"[\W_]+", re.sub(CASE, " ", cell).lower()) if word]
     parted = [word for word in parted if word not in _UNITS]
     if match := re.fullmatch(r"([a-z]+)_?([0-9]+)", "_".join(parted)):  # x1, v33
         return (match[2], kinds[match[1]]) if match[1] in kinds else None
