@@ -1,4 +1,4 @@
-"""One tracker step as the processor sees it: eager and compiled, by body and number of samples.
+"""One tracker step as the processor sees it: eager, compiled and fused, by body and samples.
 
     python scripts/profile_step.py --out profile/profile.json --folder profile
 
@@ -7,13 +7,15 @@ cost of all (pose, projection, robust joint residuals, priors; value, gradient a
 accepts or refuses, and plans the next damped Cholesky step inside the box: `fixed_step`, all that
 is of fixed shape in the search. Samples are worked off in pools of one size, the last one filled
 up, so that one graph serves any number. Compiled it is one graph (`fullgraph=True`), and is not
-compiled again for a second frame; a graph that broke or a second compilation would raise.
+compiled again for a second frame; a graph that broke or a second compilation would raise. Fused is
+what the search does on a CPU: the cost by compiled kernels, the step of `TrustRegionNewton` as
+well.
 
-Printed are seconds per sample and iteration (one evaluation and one step), the ratio of eager to
-compiled within a repeat, the memory that an iteration takes on top of its inputs (its results
-included), and what compiling took, with nothing from a cache. On a CPU the clock is the process's
-own, since others may use the machine; on a GPU it is the wall's. With `--folder` come the figure,
-and by body and way a table and a trace of `torch.profiler`.
+Printed are seconds per sample and iteration (one evaluation and one step), the ratios of eager to
+compiled and to fused within a repeat, the memory that an iteration takes on top of its inputs (its
+results included), and what compiling took, with nothing from a cache. On a CPU the clock is the
+process's own, since others may use the machine; on a GPU it is the wall's. With `--folder` come the
+figure, and by body and way a table and a trace of `torch.profiler`.
 
 What it says on a CPU (float32, one thread): compiled is slower nowhere, 4 times as fast as eager
 for the arm in pools of 100, where eager is mostly the overhead of over a thousand calls, 2.3 times
@@ -23,10 +25,11 @@ is slower when compiled, the product of the lift: inductor lays its factors out 
 innermost, though the code asks for contiguous ones, and `bmm` then copies them item by item, 7
 instead of 1 microsecond for 34 parameters. Checking that a graph still fits takes 0.4 ms a call.
 A compilation takes a minute of processor time, which a body earns back after 4 million
-sample-iterations, thousands of frames with the usual 60 samples: eager stays the default.
+sample-iterations, thousands of frames with the usual 60 samples. The search on a CPU takes neither,
+but the fused engine.
 
-What is evaluated agrees to 2e-5 in float32; planned steps to 1e-3, in the metric of the damped
-Hessian, since a matrix that is only just definite passes its rounding on (1e-9 in float64).
+What is compiled agrees with eager to 2e-5 in float32; planned steps to 1e-3, in the metric of the
+damped Hessian, since a matrix that is only just definite passes its rounding on (1e-9 in float64).
 """
 
 from __future__ import annotations
@@ -43,7 +46,15 @@ import numpy as np
 import torch
 from common import Table, quartiles, start, write_report
 from matplotlib.figure import Figure
-from peers.tracker_step import Step, Work, compile_step, make_frames, profiled, tracker_step
+from peers.tracker_step import (
+    Step,
+    Work,
+    compile_step,
+    fused_step,
+    make_frames,
+    profiled,
+    tracker_step,
+)
 
 from torchcss.errors import ConfigurationError
 from torchcss.io.tracks import prepare_output_folder
@@ -108,6 +119,9 @@ def measure(config: Config, body: str) -> Iterator[dict[str, Any]]:
     """The rows of one body."""
     like = torch.empty(0, dtype=getattr(torch, config.dtype), device=config.device)
     pool, found, ways = 0, {}, {"eager": tracker_step}
+    on_cpu = not config.device.startswith("cuda")
+    if on_cpu and (fused := fused_step(config.dtype)) is not None:
+        ways["fused"] = fused
     scale = math.sqrt(config.covariance_scale)
     for samples in sorted(config.samples):
         size = math.ceil(samples / math.ceil(samples / config.pool))
@@ -135,18 +149,24 @@ def measure(config: Config, body: str) -> Iterator[dict[str, Any]]:
         ]
         for name in ways:
             row[name]["seconds"] = quartiles([times[name] for times in rounds])
-        row["speed_up"] = quartiles([times["eager"] / times["compiled"] for times in rounds])
+        row["times_as_fast"] = {
+            name: quartiles([times["eager"] / times[name] for times in rounds])
+            for name in ways
+            if name != "eager"
+        }
         yield row
 
 
 def picture(rows: list[dict[str, Any]]) -> Figure:
-    """Time and memory over samples, eager solid and compiled dashed."""
+    """Time and memory over samples, eager solid, compiled dashed and fused dotted."""
     figure = Figure(figsize=(10, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2)
     for colour, body in zip(COLOURS, dict.fromkeys(row["body"] for row in rows), strict=False):
         own = [row for row in rows if row["body"] == body]
         samples = [row["samples"] for row in own]
-        for name, style in (("eager", "-"), ("compiled", "--")):
+        for name, style in (("eager", "-"), ("compiled", "--"), ("fused", ":")):
+            if name not in own[0]:
+                continue
             times = 1e6 * np.array([list(row[name]["seconds"].values()) for row in own])
             look: dict[str, Any] = {"color": colour, "ls": style, "marker": "o", "ms": 4}
             left.plot(samples, times[:, 1], label=f"{body} {name}", **look)
@@ -160,40 +180,46 @@ def picture(rows: list[dict[str, Any]]) -> Figure:
     return figure
 
 
+def _ways(row: dict[str, Any]) -> list[str]:
+    """The ways that a row has, eager first."""
+    return ["eager", *row["times_as_fast"]]
+
+
 def main(config: Config) -> dict[str, Any]:
     """Measure, print, write; return what is written."""
     torch.set_num_threads(config.threads)
     if config.folder is not None:
         prepare_output_folder(config.folder)
     print(f"{config.dtype} on {config.device}; microseconds per sample and iteration, median")
-    print(f"{'':8}{'samples':>8}{'eager':>8}{'compiled':>9}{'speed-up':>22}{'MiB eager':>10}"
-          f"{'compiled':>9}{'library':>8}{'compiling':>10}{'apart':>9}")  # fmt: skip
+    print(f"{'':8}{'samples':>8}{'way':>10}{'us':>8}{'times as fast':>22}{'MiB':>8}{'library':>9}")
     rows = []
     for row in (row for body in config.bodies for row in measure(config, body)):
         rows.append(row)
-        eager, compiled, (low, middle, high) = (
-            row["eager"], row["compiled"], row["speed_up"].values(),
-        )  # fmt: skip
-        print(f"{row['body']:8}{row['samples']:8d}{1e6 * eager['seconds']['median']:8.1f}"
-              f"{1e6 * compiled['seconds']['median']:9.1f}"
-              f"{middle:8.2f} ({low:.2f} to {high:.2f}){eager['memory_mib']:10.1f}"
-              f"{compiled['memory_mib']:9.1f}{compiled['library_share']:8.0%}"
-              f"{row['compile']['wall_s']:8.0f} s"
-              f"{max(row['relative_difference'].values()):9.1e}", flush=True)  # fmt: skip
+        for name in _ways(row):
+            way, ratio = row[name], ""
+            if name != "eager":
+                low, middle, high = row["times_as_fast"][name].values()
+                ratio = f"{middle:.2f} ({low:.2f} to {high:.2f})"
+            print(f"{row['body']:8}{row['samples']:8d}{name:>10}"
+                  f"{1e6 * way['seconds']['median']:8.1f}{ratio:>22}"
+                  f"{way['memory_mib']:8.1f}{way['library_share']:9.0%}")  # fmt: skip
+        print(f"{'':16}compiled in {row['compile']['wall_s']:.0f} s, apart from eager by "
+              f"{max(row['relative_difference'].values()):.1e}", flush=True)  # fmt: skip
     report = {"rows": rows, "config": config, "torch": torch.__version__}
     if config.folder is not None:
         picture(rows).savefig(config.folder / "profile.png", dpi=100)
     cells = [
         [
-            f"{row['body']}, {row['samples']} samples",
-            *(1e6 * row[name]["seconds"]["median"] for name in ("eager", "compiled")),
-            row["speed_up"]["median"],
-            *(row[name]["memory_mib"] for name in ("eager", "compiled")),
+            f"{row['body']}, {row['samples']} samples, {name}",
+            1e6 * row[name]["seconds"]["median"],
+            row["times_as_fast"].get(name, {"median": 1.0})["median"],
+            row[name]["memory_mib"],
         ]
         for row in rows
+        for name in _ways(row)
     ]
-    columns = ("body", "eager", "compiled", "speed-up", "MiB eager", "MiB compiled")
-    title = "A step eager and compiled, microseconds per sample and iteration"
+    columns = ("body", "microseconds", "times as fast", "MiB")
+    title = "A step eager, compiled and fused, microseconds per sample and iteration"
     write_report(config.out, report, Table(title, columns, cells))
     return report
 

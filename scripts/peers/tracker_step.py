@@ -7,8 +7,9 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -20,17 +21,20 @@ from torch.profiler import ProfilerActivity, profile
 
 from torchcss.cost.choice import CostChoice
 from torchcss.cost.context import FrameContext
+from torchcss.cost.fused.engine import fused_engine
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.total import TrackingCost
 from torchcss.inference.mixture import GaussianMixture, Prior
+from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.studies.reprojection import reprojection_problem
-from torchcss.types import Keypoints
+from torchcss.types import Keypoints, Status
 
 FRAME_INTERVAL = 1 / 25
 NUM_MODES = 3
 LIBRARY = ("linalg_cholesky_ex", "linalg_solve_triangular", "aten::bmm", "aten::mm", "aten::addmm")
 """Calls of a linear algebra library, which compiling does not change."""
-Step = Callable[..., tuple[FixedStepState, Tensor]]
+Step = Callable[..., tuple[Any, Tensor]]
+"""From a frame, a state of a kind, fresh places and a scale to state and what was accepted."""
 
 
 class FrameData(NamedTuple):
@@ -55,6 +59,27 @@ def tracker_step(
     """Draw where a place is fresh; then evaluate, accept or refuse, and plan for all."""
     drawn = scaled_draw(frame.mean, frame.factor, frame.noise, deviation_scale)
     return fixed_step(frame.cost, refill(state, fresh, drawn), frame.cost.body.bounds)
+
+
+def fused_step(dtype: Literal["float32", "float64"]) -> Step | None:
+    """The same as the search does it on a CPU: compiled kernels, and the trust region's step.
+
+    No item ends, so that every iteration is one evaluation and one plan of all. None: there are no
+    kernels here.
+    """
+    engine = fused_engine(dtype)
+    newton = TrustRegionNewton()
+
+    def step(frame: FrameData, state: Any, fresh: Tensor, scale: float) -> tuple[Any, Tensor]:
+        cost = replace(frame.cost, engine=engine)
+        drawn = scaled_draw(frame.mean, frame.factor, frame.noise, scale)
+        if isinstance(state, FixedStepState):
+            state = newton.start(drawn)
+        state, info = newton.step(cost, state, cost.body.bounds)
+        running = torch.full_like(state.status, int(Status.RUNNING))
+        return state._replace(status=running), info.accepted
+
+    return None if engine is None else step
 
 
 def make_frames(body_name: str, pool: int, like: Tensor, seed: int) -> Iterator[FrameData]:
@@ -113,7 +138,9 @@ class Work:
     def __init__(self, frame: FrameData, samples: int, scale: float) -> None:
         self.frame, self.scale = frame, scale
         self.fresh = torch.ones_like(frame.mean[:, 0], dtype=torch.bool)
-        self.states = [start(frame.mean) for _ in range(math.ceil(samples / len(frame.mean)))]
+        self.states: list[Any] = [
+            start(frame.mean) for _ in range(math.ceil(samples / len(frame.mean)))
+        ]
 
     def iterate(self, step: Step) -> None:
         """One iteration of every sample; the first draws them."""

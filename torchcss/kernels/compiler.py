@@ -12,7 +12,8 @@ of its arguments, for the processor at hand (`torchcss.kernels.pipeline`):
   making, whatever the pool: an item's result depends on that item alone.
 
 With `TORCHCSS_CHECK_KERNELS=1` kernels are not compiled. They run as plain Python on arrays that
-refuse any index out of range (`torchcss.kernels.checked`): slow, for tests.
+refuse any index out of range (`torchcss.kernels.checked`): slow, for tests. With numba's own
+`NUMBA_DISABLE_JIT=1` they are plain Python as well.
 
 Where numba is not installed `AVAILABLE` is False, and nobody calls a kernel.
 """
