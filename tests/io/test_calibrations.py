@@ -235,6 +235,11 @@ def test_unit_of_anipose(
     if scale is not None:
         np.testing.assert_allclose(found.camera.t_camera_world, scale * np.array(t))
     assert (found.units_note is None) if words is None else words in str(found.units_note)
+    for units, factor in (('"mm"', 0.001), ("0.015", 0.015)):
+        path.write_text(f"{text}units = {units}\n")
+        said = load_camera(path, "1")
+        assert said.metric
+        np.testing.assert_allclose(said.camera.t_camera_world, factor * np.array(t))
 
 
 def test_caliscope_leaves_out_what_is_not_calibrated(tmp_path: Path) -> None:

@@ -98,10 +98,22 @@ def test_metres(tmp_path: Path, units: str) -> None:
 
 
 @pytest.mark.parametrize(
+    ("units", "factor"), [("mm, pixel", 0.001), ("Centimetres", 0.01), (0.015, 0.015), (2, 2.0)]
+)
+def test_other_units_that_are_said(tmp_path: Path, units: Any, factor: float) -> None:
+    metres = load_camera(write(tmp_path / "a.json", {"one": entry()})).camera
+    found = load_camera(write(tmp_path / "b.json", {"one": entry()}, units))
+    assert (found.metric, found.units_note) == (True, None)
+    torch.testing.assert_close(found.camera.t_camera_world, factor * metres.t_camera_world)
+    torch.testing.assert_close(found.camera.R_camera_world, metres.R_camera_world)
+
+
+@pytest.mark.parametrize(
     ("units", "more", "words"),
     [
         ("board square, pixel", {}, "'board square'"),
-        ("mm", {}, "'mm'"),
+        ("inch", {}, "'inch'"),
+        (-1.0, {}, "unknown unit"),
         (None, {}, "unknown unit"),
         ("metre", {"R": None}, "no extrinsics"),
         ("metre", {"t": None}, "no extrinsics"),

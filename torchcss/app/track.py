@@ -300,8 +300,8 @@ def _all_views(
     for opened in views:
         if len(views) > 1 and not opened.camera.metric:
             raise CameraError(
-                f"{own.video}: several cameras need their places in one world, in metres; "
-                f"that of {opened.files.video} is not known so: give R and t"
+                f"{opened.files.video}: several cameras need their places in one world, in "
+                f"metres: {opened.camera.units_note or 'give R and t'}"
             )
     return views
 

@@ -301,6 +301,10 @@ def _read_toml(path: Path) -> dict[str, Entry]:
         if not isinstance(name, str) or name in entries:
             raise unexpected(CameraError, f"{path}: table {table!r}", "a name of its own", name)
         entries[name] = _entry(values)
+    metadata = content.get("metadata", {})
+    if isinstance(metadata, dict) and "units" in metadata:
+        units = metadata["units"]
+        return {name: entry._replace(units=units) for name, entry in entries.items()}
     return _in_metres(entries, "metadata" in content)
 
 

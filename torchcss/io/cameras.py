@@ -31,7 +31,12 @@ from torchcss.io.calibrations import Entry, read_entries
 from torchcss.io.video import VideoReader
 from torchcss.vision.camera import Camera
 
-_METRES = frozenset({"m", "metre", "metres", "meter", "meters"})
+_METRES = {
+    **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0),
+    **dict.fromkeys(("cm", "centimetre", "centimetres", "centimeter", "centimeters"), 0.01),
+    **dict.fromkeys(("mm", "millimetre", "millimetres", "millimeter", "millimeters"), 0.001),
+}
+"""Metres per unit of a file's world."""
 _NUMBERS = ("K", "image size", "distortion", "rotation", "translation")
 """What messages call the first fields of an `Entry`."""
 
@@ -102,9 +107,11 @@ def load_camera(
         info = VideoReader(video).info
         entry = entry._replace(image_size_wh=[info.width, info.height])
     camera = _make_camera(entry, name, path)
-    note = _own_frame_note(name, entry)
+    note, unit = _own_frame_note(name, entry), _metres(entry.units)
     if note is not None:
         camera = camera.in_own_frame()
+    elif unit is not None and unit != 1.0:
+        camera = camera.in_world_times(unit)
     return LoadedCamera(camera, note is None, note or entry.note)
 
 
@@ -256,17 +263,24 @@ def camera_findings(camera: Camera) -> list[str]:
     return [f"camera {camera.name!r} looks odd: {line}" for line in lines]
 
 
+def _metres(units: Any) -> float | None:
+    """Metres per unit of the world that a file names, by word or number; None: not known."""
+    if isinstance(units, str):
+        return _METRES.get(units.split(",")[0].strip().lower())
+    is_number = isinstance(units, (int, float)) and not isinstance(units, bool)
+    return float(units) if is_number and 0 < units < math.inf else None
+
+
 def _own_frame_note(name: str, entry: Entry) -> str | None:
     """Say why the file's world frame cannot be used, or None if it can."""
     if entry.rotation is None or entry.translation is None:
         why = "has no extrinsics"
+    elif _metres(entry.units) is not None:
+        return None
     elif not isinstance(entry.units, str):
-        why = "has extrinsics of unknown unit"
+        why = 'has extrinsics of unknown unit (the file may say units: "mm", or metres per unit)'
     else:
-        unit = entry.units.split(",")[0].strip()
-        if unit.lower() in _METRES:
-            return None
-        why = f"has its extrinsics in the unit {unit!r}"
+        why = f"has its extrinsics in the unit {entry.units.split(',')[0].strip()!r}"
     return f"camera {name!r} {why}: tracking in the camera's own frame (x right, y down, z forward)"
 
 
@@ -291,7 +305,8 @@ def _choose(path: Path, entries: Mapping[str, Entry], name: str | None, video: P
         if len(found) == 1:
             return found[0]
     raise CameraError(
-        f"{path}: no single camera of {video.name}; say which of {names} it is (--camera-name)"
+        f"{path}: no single camera of {video.name}; say which of {names} it is (--camera-name, "
+        "or --other-cameras for a further video)"
     )
 
 

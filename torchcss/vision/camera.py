@@ -537,6 +537,11 @@ class Camera(nn.Module):
         rotation = torch.eye(3, dtype=self.K.dtype, device=self.K.device)
         return self._like(self.K, self.image_size_wh, rotation, self.K.new_zeros(3))
 
+    def in_world_times(self, factor: float) -> Camera:
+        """Return the camera in a world whose lengths are so many times as large."""
+        place = factor * self.t_camera_world
+        return self._like(self.K, self.image_size_wh, self.R_camera_world, place)
+
     def _like(
         self, K: Tensor, image_size_wh: tuple[int, int], rotation: Tensor, translation: Tensor
     ) -> Camera:
