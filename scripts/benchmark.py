@@ -174,8 +174,10 @@ def main(config: Config) -> dict[str, Any]:
     units = ("s per call", "1", "MiB", "1", "s per call", "s per frame")
     report = {"metrics": metrics, "unit": dict(zip(metrics, units, strict=True)), "config": config}
     report |= {"threads": torch.get_num_threads(), "torch": torch.__version__}
-    print_table(report)
-    write_report(config.out, report, table_of(report))
+    table = table_of(report)
+    table.print()
+    tell(report)
+    write_report(config.out, report, table)
     return report
 
 
@@ -191,15 +193,9 @@ def table_of(report: dict[str, Any]) -> Table:
     return Table(f"{title}, {report['threads']} threads", columns, rows)
 
 
-def print_table(report: dict[str, Any]) -> None:
-    """The report for people."""
-    config, metrics = report["config"], report["metrics"]
-    print(f"{config.samples} samples, {config.dtype}, {report['threads']} threads")
-    print(f"{'ms':>16} {'quartile':>9} {'median':>9} {'quartile':>9} {'peak MiB':>9} {'added':>6}")
-    for name, row in metrics["seconds"].items():
-        times = "".join(f" {1e3 * value:9.1f}" for value in row.values())
-        peak, added = metrics["memory"][name].values()
-        print(f"{name:>16}{times} {peak:9.0f} {added:6.0f}")
+def tell(report: dict[str, Any]) -> None:
+    """How evaluations compare, and where their time goes."""
+    metrics = report["metrics"]
     for name, ratio in metrics["ratio"].items():
         low, median, high = ratio.values()
         apart = metrics["relative_difference"].get(name)

@@ -101,8 +101,8 @@ def main(config: Config) -> dict[str, Any]:
         measure(scene, config, curves)
     rows = [row_of(key, curves) for key in sorted(curves, key=lambda key: key[:2])]
     report = {"settings": config, "least_prominences": LEAST, "rows": rows}
-    print_table(rows)
     table = table_of(rows)
+    table.print()
     if config.out is not None:
         draw_counts(rows, config.out)
         write_report(config.out / "cost_minima.json", report, table)
@@ -181,30 +181,20 @@ def row_of(key: tuple[str, str, str, float], curves: CountsByCase) -> dict[str, 
 
 
 def table_of(rows: list[dict[str, Any]]) -> Table:
-    """The rows for the page of results."""
+    """Counts by least prominence."""
     cells = [
         [
             f"{row['body']}, {row['terms']}, {row['potential']}, k = {row['k']:g}",
             *(row["spurious"][LEAST.index(least)] for least in STATED),
             row["fewer"],
+            row["standard_error"],
             100 * row["misleading"],
         ]
         for row in rows
     ]
     counts = (f"minima of {100 * least:g} %" for least in STATED)
-    columns = ("cost", *counts, "fewer than first", "misleading %")
+    columns = ("cost", *counts, "fewer than first", "standard error", "misleading %")
     return Table("Spurious minima of the contour term", columns, cells)
-
-
-def print_table(rows: list[dict[str, Any]]) -> None:
-    for index, row in enumerate(rows):
-        if index % (len(POTENTIALS) * len(EMPHASES)) == 0:
-            print(f"\n{row['body']}, {row['terms']}: spurious minima by least prominence in %")
-            header = "".join(f"{100 * least:>8g}" for least in STATED)
-            print(f"{'potential':14}{'k':>5} |{header} | fewer at 2 % | misleading")
-        counts = "".join(f"{row['spurious'][LEAST.index(least)]:8.2f}" for least in STATED)
-        print(f"{row['potential']:14}{row['k']:5.1f} |{counts} |{row['fewer']:5.2f}", end="")
-        print(f" +- {row['standard_error']:.2f} |{100 * row['misleading']:9.0f} %")
 
 
 def draw_counts(rows: list[dict[str, Any]], out: Path) -> None:

@@ -98,7 +98,7 @@ def main(config: Config) -> dict[str, Any]:
     for scene in scenes(config):
         rows = look(scene, config)
         table = summarise(rows)
-        print_table(scene.name, table, rows)
+        terms_table(scene.name, table, len(rows)).print()
         report["frames"][scene.name] = {"table": table, "slices": rows}
         report["frames"][scene.name]["displaced_minimum"] = displaced_minimum(scene, config)
     table = table_of(report["frames"])
@@ -185,16 +185,21 @@ def _counts(by_scale: dict[str, Any]) -> list[float]:
     return [*minima, 100 * max(row["discontinuity"] for row in (close, far))]
 
 
-def print_table(name: str, table: list[dict[str, Any]], rows: list[dict[str, Any]]) -> None:
-    print(f"\n{name}: {len(rows) // 2} lines, close and far; jumps in % of the slice's range")
-    print(f"{'':24}|{'minima per slice':^18}|{'largest jump on any slice':^34}")
-    print(f"{'term':16}{'scale':>8}|{'all':>8}{'counted':>10}|", end="")
-    print(f"{'sampled':>8}{'2 x density':>12}{'bisected':>10}  bisected on")
-    for entry in table:
-        print(f"{entry['term']:16}{entry['scale']:>8}|{entry['num_minima_raw']:8.1f}", end="")
-        print(f"{entry['num_minima']:10.1f}|{100 * entry['largest_jump']:8.2f}", end="")
-        print(f"{100 * entry['largest_jump_twice_density']:12.2f}", end="")
-        print(f"{100 * entry['discontinuity']:10.3f}  {entry['discontinuity_on']}")
+def terms_table(name: str, entries: list[dict[str, Any]], num_slices: int) -> Table:
+    """Minima per slice, and the largest jump on any slice in % of its range, term by term."""
+    keys = ("largest_jump", "largest_jump_twice_density", "discontinuity")
+    rows = [
+        [
+            f"{entry['term']}, {entry['scale']}",
+            entry["num_minima_raw"],
+            entry["num_minima"],
+            *(100 * entry[key] for key in keys),
+            entry["discontinuity_on"],
+        ]
+        for entry in entries
+    ]
+    columns = ("term", "all minima", "counted", "jump %", "2 x density", "bisected", "on")
+    return Table(f"\n{name}: {num_slices // 2} lines, close and far", columns, rows)
 
 
 def displaced_minimum(scene: Scene, config: Config) -> dict[str, Any] | None:

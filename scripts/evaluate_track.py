@@ -66,7 +66,6 @@ def main(config: Config) -> dict[str, Any]:
     run = Run.open(config.track)
     found = evaluation(run, config)
     report = report_of(found, config)
-    print_table(report)
     columns = [key + suffix for suffix in ("", "_best_of_modes") for key in KINDS]
     cells = [*(report[f"{column}_mm"] for column in columns), report["num_frames_lost"]]
     rows = [[str(config.track), *cells]]
@@ -76,9 +75,12 @@ def main(config: Config) -> dict[str, Any]:
             f"{key}_mm": getattr(errors, KINDS[key]).mean_mm for key in tuple(KINDS)[1:]
         }
         aligned, procrustes = errors.root_aligned.mean_mm, errors.procrustes.mean_mm
-        print(f"{'its detector':>16} | {'':8} {aligned:8.1f} {procrustes:8.1f}")
         rows.append(["its detector", "", aligned, procrustes, "", "", "", ""])
-    write_report(config.out, report, Table("A track", ("track", *columns, "lost"), rows))
+    table = Table("A track", ("track", *columns, "lost"), rows)
+    joints_table(report, columns).print()
+    table.print()
+    tell(report)
+    write_report(config.out, report, table)
     return report
 
 
@@ -150,17 +152,16 @@ def report_of(found: Evaluation, config: Config) -> dict[str, Any]:
     return report
 
 
-def print_table(report: dict[str, Any]) -> None:
-    """The report for people: one line per joint, then the means."""
-    columns = [key + suffix for suffix in ("", "_best_of_modes") for key in KINDS]
-    titles = ("MPJPE", "root-al.", "PA") * 2
-    print(f"{'millimetres':>16} | {'best mode':^26} | best of {report['num_modes']} modes")
-    print(f"{'joint':>16} |" + "".join(f" {title:>8}" for title in titles))
-    for joint in report["joint_names"]:
-        cells = [report["per_joint_mm"][column][joint] for column in columns]
-        print(f"{joint:>16} |" + "".join(f" {cell:8.1f}" for cell in cells))
-    means = [report[f"{column}_mm"] for column in columns]
-    print(f"{'mean':>16} |" + "".join(f" {mean:8.1f}" for mean in means))
+def joints_table(report: dict[str, Any], columns: list[str]) -> Table:
+    """Errors joint by joint."""
+    joints = {key: report["per_joint_mm"][key] for key in columns}
+    rows = [[name, *(joints[key][name] for key in columns)] for name in report["joint_names"]]
+    title = f"Millimetres, of the best mode and of the best of {report['num_modes']}"
+    return Table(title, ("joint", *columns), rows)
+
+
+def tell(report: dict[str, Any]) -> None:
+    """What was compared, and how often the truth was inside the stated regions."""
     lost = f"{report['num_frames_lost']} of {report['num_frames_measured']} measured frames lost"
     print(f"{report['num_frames']} frames tracked, {lost} (root-aligned > {LOST_MM:g} mm)")
     if report["inside"]:

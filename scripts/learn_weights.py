@@ -40,6 +40,7 @@ from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.initialise.result import Initialisation
 from torchcss.initialise.view import CameraView
 from torchcss.io.video import VideoReader
+from torchcss.studies.metrics import mpjpe_mm
 from torchcss.studies.render.sequences import arm_sequence
 from torchcss.studies.sequences import read_sequence
 from torchcss.tracking.presets import PRESETS
@@ -148,14 +149,17 @@ def main(config: Config) -> dict[str, Any]:
     if config.track:
         for when, factors in (("before", before), ("after", weights.factors())):
             report[f"track_{when}_mm"] = tracked_error(test, settings, factors)
-    print_report(report)
     rows = [
         [when, *report[f"weights_{when}"].values(), report[f"test_{when}_mm"],
-         report.get(f"track_{when}_mm")]
+         *report.get(f"track_{when}_mm", {}).values()]
         for when in ("before", "after")
     ]  # fmt: skip
-    columns = ("weights", *config.learnt, "minimum mm", "track mm")
-    write_report(config.out, report, Table("Weights learnt from true states", columns, rows))
+    tracked = ("track mm", "best of modes mm") if config.track else ()
+    columns = ("weights", *config.learnt, "minimum mm", *tracked)
+    table = Table("Weights learnt from true states", columns, rows)
+    table.print()
+    tell(report)
+    write_report(config.out, report, table)
     return report
 
 
@@ -299,17 +303,14 @@ def tracked_error(
     frames = (Frame(i, i * truth.interval, image) for i, image in enumerate(truth.images))
     for frame in session.track(tqdm(frames, total=len(truth.images), unit="frame")):
         joints = truth.body.pose(truth.states[frame.frame.index]).joints
-        error = (frame.joints_world - joints).norm(dim=-1).mean(-1)
-        best.append(1000 * float(error[0]))
-        of_modes.append(1000 * float(error.min()))
+        error = mpjpe_mm(frame.joints_world, joints)
+        best.append(error[0])
+        of_modes.append(error.min())
     return {"best_mode": float(np.mean(best)), "best_of_modes": float(np.mean(of_modes))}
 
 
-def print_report(report: dict[str, Any]) -> None:
-    """The weights, and what they do."""
-    print(f"{'term':>18}{'before':>10}{'after':>10}")
-    for name, before in report["weights_before"].items():
-        print(f"{name:>18}{before:10.3f}{report['weights_after'][name]:10.3f}")
+def tell(report: dict[str, Any]) -> None:
+    """What the learnt weights do."""
     history = report["train_mm"]
     print(
         f"one mode, train: {history[0]:.1f} mm in the first epoch, {min(history):.1f} in the best"

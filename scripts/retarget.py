@@ -90,13 +90,21 @@ def main(config: Config) -> dict[str, Any]:
     )
     seconds = time.perf_counter() - began
     report = report_of(config, whole, result, seconds)
-    print_table(report)
     write_retargeted(config.out, config, result)
     if config.reference is not None:
         write_reference(config.reference, config, result)
     cells = [[name, *row.values()] for name, row in report["error_mm"].items()]
     title = f"Retargeting {config.file.name} onto {config.body}, millimetres"
-    write_report(config.report, report, Table(title, ("joint", "mean", "95 %", "worst"), cells))
+    table = Table(title, ("joint", "mean", "95 %", "worst"), cells)
+    table.print()
+    for note in report["notes"]:
+        print(note)
+    print(
+        f"{report['num_frames']} frames of {report['body']}, {report['frames_per_second']:.0f} "
+        f"fitted per second; {100 * report['share_of_angles_at_limit']:.1f} % of all angles at a "
+        "limit"
+    )
+    write_report(config.report, report, table)
     if config.picture is not None:
         with replace_file(config.picture) as partial:
             picture(motion, result).savefig(partial, dpi=80)
@@ -135,20 +143,6 @@ def report_of(
         "deepest_collision_mm": 1000 * float(result.depth.max()),
         "notes": [*whole.report, *result.report],
     }
-
-
-def print_table(report: dict[str, Any]) -> None:
-    """The report for people."""
-    print(f"{'millimetres':>12} | {'mean':>6} {'95 %':>6} {'worst':>6}")
-    for name, row in report["error_mm"].items():
-        print(f"{name:>12} | {row['mean']:6.1f} {row['p95']:6.1f} {row['worst']:6.1f}")
-    for note in report["notes"]:
-        print(note)
-    print(
-        f"{report['num_frames']} frames of {report['body']}, {report['frames_per_second']:.0f} "
-        f"fitted per second; {100 * report['share_of_angles_at_limit']:.1f} % of all angles at a "
-        "limit"
-    )
 
 
 def write_retargeted(path: Path, config: Config, result: Retargeted) -> None:

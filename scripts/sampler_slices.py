@@ -147,7 +147,6 @@ def main(config: Config) -> dict[str, Any]:
     }
     runs: dict[str, Any] = {}
     print(f"noise {noise:.2f} rad; deviations of the mode {own.diagonal().sqrt().tolist()}")
-    print(f"{'':14}{'median cost':>14}{'within 100 nats':>18}{'end elsewhere':>16}{'minima':>8}")
     for name, proposal in proposals.items():
         generator = torch.Generator().manual_seed(config.seed)
         raw = proposal.sample(mode, config.samples, limits, generator=generator).x
@@ -165,8 +164,6 @@ def main(config: Config) -> dict[str, Any]:
             "minima_cost": modes.cost[kept].tolist(),
         }
         runs[name] = (row, raw, modes, kept)
-        print(f"{name:14}{row['median_cost']:14.4g}{row['share_low']:18.2f}"
-              f"{row['share_elsewhere']:16.2f}{len(kept):8d}")  # fmt: skip
     report = {"config": config, "noise": noise, "methods": {k: run[0] for k, run in runs.items()}}
     cells = [
         [name, row["median_cost"], 100 * row["share_low"], 100 * row["share_elsewhere"], len(kept)]
@@ -174,6 +171,7 @@ def main(config: Config) -> dict[str, Any]:
     ]
     columns = ("sampler", "median cost", "within 100 nats %", "end elsewhere %", "minima")
     table = Table("Samplers on a slice through a cost", columns, cells)
+    table.print()
     if config.out is not None:
         folder = prepare_output_folder(config.out)
         picture(config, plane, own, noise, runs).savefig(folder / "fig8d.png", dpi=90)

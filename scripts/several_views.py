@@ -137,9 +137,9 @@ def main(config: Config) -> dict[str, Any]:
     for name, study in ((BEAM, person), (BOARD, board)):
         if name in config.what:
             report[name] = study(config, config.data / name)
-    for name, rows in report.items():
-        print_table(name, rows)
-    write_report(config.out, report, table_of(report))
+    table = table_of(report)
+    table.print()
+    write_report(config.out, report, table)
     return report
 
 
@@ -302,17 +302,6 @@ def table_of(report: dict[str, Any]) -> Table:
     columns = list(dict.fromkeys(column for row in named.values() for column in row))
     rows = [[name, *map(row.get, columns)] for name, row in named.items()]
     return Table("Several cameras", ("cameras", *columns), rows)
-
-
-def print_table(name: str, rows: dict[str, Any]) -> None:
-    """One line per set of cameras."""
-    columns = [column for column in next(iter(rows.values())) if column != "per_frame"]
-    print(f"\n{name}; millimetres")
-    width = max(map(len, columns))
-    print(" " * width + "".join(f"{views:>16}" for views in rows))
-    for column in columns:
-        cells = "".join(f"{row[column]:16.2f}" for row in rows.values())
-        print(f"{column:{width}}{cells}")
 
 
 if __name__ == "__main__":

@@ -164,22 +164,13 @@ def main(config: Config) -> dict[str, Any]:
     table = Table("Robot arms", columns, cells)
     write_report(config.out / "summary.json", report, table)
     write_report(config.report, report, table)
-    print_table(rows)
+    table.print()
+    tell(rows)
     return report
 
 
-def print_table(rows: list[dict[str, Any]]) -> None:
-    """The errors for people."""
-    print(f"{'seed':>6} {'mode':>8} {'links mm':>9} {'tip mm':>8} {'tip deg':>8} {'joints deg':>11}"
-          "  by joint")  # fmt: skip
-    for row in rows:
-        for mode in ("best", "nearest"):
-            part = row[mode]
-            print(
-                f"{row['seed']:>6} {mode:>8} {part['links_mm']:9.1f} {part['end_effector_mm']:8.1f}"
-                f" {part['end_effector_degrees']:8.1f} {part['joint_degrees']:11.1f}  "
-                + " ".join(f"{value:.1f}" for value in part["joints_degrees"].values())
-            )
+def tell(rows: list[dict[str, Any]]) -> None:
+    """The best mode over all seeds."""
     for name in ("links_mm", "end_effector_mm", "end_effector_degrees", "joint_degrees"):
         values = [row["best"][name] for row in rows]
         print(f"{name}: median {np.median(values):.1f}, {min(values):.1f} to {max(values):.1f}")

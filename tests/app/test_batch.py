@@ -15,7 +15,7 @@ from urllib.parse import unquote
 
 import pytest
 
-from torchcss.app.batch import Batch, Job, _go_on_from, _track, read_manifest
+from torchcss.app.batch import Batch, Job, go_on_from, read_manifest, track_claimed
 from torchcss.app.claims import Claims
 from torchcss.errors import ConfigurationError
 from torchcss.io.checkpoint import Checkpoint, write_checkpoint
@@ -98,11 +98,11 @@ def test_what_is_half_written_is_not_gone_on_from(tmp_path: Path) -> None:
         (tmp_path / name / ".lock").mkdir(parents=True)
         for file in files:
             (tmp_path / name / file).write_text(name)
-    _go_on_from(place)
+    go_on_from(place)
     assert [(file.name, file.read_text()) for file in place.iterdir()] == [("track.npz", "2")]
     (place / "summary.json").mkdir()
     with pytest.raises(OSError, match="directory"):
-        _go_on_from(tmp_path / "5")
+        go_on_from(tmp_path / "5")
     assert not (tmp_path / "5").exists()
 
 
@@ -114,7 +114,7 @@ def test_who_was_taken_over_says_nothing_of_the_clip(tmp_path: Path) -> None:
     assert job.claims.take("a") is None
     claim.release()
     assert job.claims.take("a") is not None
-    _track(job, clip, claim)
+    track_claimed(job, clip, claim)
     assert job.failure(clip) is None
 
 
@@ -146,7 +146,7 @@ def test_a_clip_whose_owners_die_at_one_place_is_failed(
     for fails in (dead, False):
         claim = job.claims.take("a", gone=True)
         assert claim is not None
-        _track(job, job.clips[0], claim)
+        track_claimed(job, job.clips[0], claim)
         line = (job.failure(job.clips[0]) or {})["line"]
         assert ("died 3 times" in line) == fails, line
         job = Job.begin(
@@ -161,7 +161,7 @@ from torchcss.app import batch
 add = batch._Watch.add
 
 def add_or_die(watch, frame, picture):
-    if watch._claim.name == "deadly" and frame.frame.index:
+    if watch.claim.name == "deadly" and frame.frame.index:
         os.kill(os.getpid(), signal.SIGKILL)
     add(watch, frame, picture)
 

@@ -28,7 +28,7 @@ from torchcss.show.overlay import PALETTE
 from torchcss.show.style import DEVIATIONS
 from torchcss.show.track_plots import bones_of, count_apart, effective_number
 from torchcss.show.viewer import shown_frames, view_track
-from torchcss.show.viewer_layout import _eye, layout, world_axes
+from torchcss.show.viewer_layout import layout, viewpoint, world_axes
 from torchcss.studies.render.scene import look_at
 from torchcss.vision.camera import Camera
 
@@ -238,7 +238,7 @@ def test_what_is_up_stays_up(up: str, track: Track, body: BodyModel, camera: Cam
     package = pytest.importorskip("rerun")
 
     for seen_by in (camera, None):
-        position, target, vertical = _eye(track.joints_world[0, 0], seen_by, up)
+        position, target, vertical = viewpoint(track.joints_world[0, 0], seen_by, up)
         assert (position - target) @ vertical > 0  # looked at from above
         assert np.isfinite(position).all()
         layout(track.joints_world[0, 0], seen_by, up, events=seen_by is None)

@@ -18,7 +18,7 @@ from made_sessions import seen_by, session_at, start_at
 from torch import Tensor
 
 import torchcss
-from torchcss.app.track import TrackOptions, _first_pose_from_file, track_video
+from torchcss.app.track import TrackOptions, first_pose_from_file, track_video
 from torchcss.body.load import load_body
 from torchcss.cost.interpenetration import Interpenetration
 from torchcss.cost.joints import JointTerm
@@ -321,10 +321,10 @@ def test_a_body_from_a_file_is_the_same_by_any_path(
     write_fitted_body(tmp_path / "body.npz", found, eye)
     monkeypatch.chdir(tmp_path / "robots")
     for name in (str(robot), "robot.urdf", "../robots/robot.urdf"):
-        first = _first_pose_from_file(tmp_path, eye, Settings(body=name))
+        first = first_pose_from_file(tmp_path, eye, Settings(body=name))
         assert first.body.state_names == body.state_names
     with pytest.raises(ConfigurationError, match=r"give the body .*robot\.urdf"):
-        _first_pose_from_file(tmp_path, eye, Settings(body="other.urdf"))
+        first_pose_from_file(tmp_path, eye, Settings(body="other.urdf"))
 
 
 def test_the_papers_start_from_one_fit_whose_covariance_nothing_caps():

@@ -414,7 +414,7 @@ def work(job: Job) -> None:
         for clip in left:
             # The pass may take long; others go on meanwhile.
             if job.is_left(clip) and (claim := job.claims.take(clip.name)) is not None:
-                _track(job, clip, claim)
+                track_claimed(job, clip, claim)
         time.sleep(_POLL_S)  # others have what is left; one of them may die
 
 
@@ -430,7 +430,7 @@ class _Watch:
     """A sink that tells how far a clip is, and ends the tracking when somebody took over."""
 
     def __init__(self, claim: WorkClaim) -> None:
-        self._claim, self.first, self.done = claim, 0, 0
+        self.claim, self.first, self.done = claim, 0, 0
         self.total: int | None = None
 
     def progress(self) -> str:
@@ -440,22 +440,28 @@ class _Watch:
     def add(self, frame: Posterior, picture: Picture) -> None:
         """Before this frame is in a checkpoint, see that the claim holds."""
         self.done = frame.frame.index + 1 - self.first
-        if not self._claim.holds:
+        if not self.claim.holds:
             raise TakenOver
 
     def close(self) -> None:
         """Nothing is open."""
 
 
-def _track(job: Job, clip: Clip, claim: WorkClaim) -> None:
-    """Track a claimed clip and publish it, or say why it failed."""
+def track_claimed(job: Job, clip: Clip, claim: WorkClaim) -> None:
+    """Track a claimed clip and publish it, or say why it failed.
+
+    Args:
+        job: The batch.
+        clip: A clip of it.
+        claim: The claim to it, which is let go at the end.
+    """
     place = job.out / ".batch" / "work" / clip.name / str(claim.generation)
     watch = _Watch(claim)
     try:
         if not job.is_left(clip):  # done just before it was claimed
             return
         with claim.alive(watch.progress):
-            _go_on_from(place)
+            go_on_from(place)
             _refuse_deadly(place, job.claims, claim)
             with (
                 (place / "log.txt").open("a", encoding="utf-8") as log,
@@ -500,8 +506,12 @@ def _track_into(place: Path, job: Job, clip: Clip, watch: _Watch) -> None:
     )
 
 
-def _go_on_from(place: Path) -> None:
-    """Copy what the last claim has left; its owner may still write into its own folder."""
+def go_on_from(place: Path) -> None:
+    """Copy what the last claim has left; its owner may still write into its own folder.
+
+    Args:
+        place: Folder of this claim, which is made; the others lie beside it.
+    """
     draft = place.with_name(f".{place.name}")
     shutil.rmtree(draft, ignore_errors=True)
     draft.mkdir(parents=True)

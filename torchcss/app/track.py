@@ -427,7 +427,7 @@ def _first_pose(
     if options.first is not None:
         return options.first
     if options.init is not None:
-        return _first_pose_from_file(options.init, eye, settings)
+        return first_pose_from_file(options.init, eye, settings)
     view, *beside = views
     if view.keypoints is None:
         raise ConfigurationError(
@@ -446,8 +446,17 @@ def _first_pose(
     )
 
 
-def _first_pose_from_file(path: Path, camera: Camera, settings: Settings) -> Initialisation:
-    """A fitted body, hung before the video's camera as it was before the picture's."""
+def first_pose_from_file(path: Path, camera: Camera, settings: Settings) -> Initialisation:
+    """A fitted body, hung before the video's camera as it was before the picture's.
+
+    Args:
+        path: Its file, or the folder that holds it.
+        camera: The video's camera.
+        settings: How it is to be tracked.
+
+    Raises:
+        ConfigurationError: If the settings are of another body.
+    """
     fitted = read_fitted_body(
         path, camera=camera, dtype=settings.torch_dtype, device=settings.device
     )

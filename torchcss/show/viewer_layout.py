@@ -57,7 +57,7 @@ def layout(
         events: Whether there is room for losses.
     """
     blueprint = rerun().blueprint
-    position, target, vertical = _eye(joints, camera, up)
+    position, target, vertical = viewpoint(joints, camera, up)
     space = blueprint.Spatial3DView(
         origin="world",
         contents=["$origin/**", *([] if camera is not None else ["- /world/camera/**"])],
@@ -95,10 +95,16 @@ def layout(
     )
 
 
-def _eye(
+def viewpoint(
     joints: Float[np.ndarray, "j 3"], camera: Camera | None, up: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where to look from, at what, and what is up there: aside of the camera, where depth shows."""
+    """Where to look from, at what, and what is up there: aside of the camera, where depth shows.
+
+    Args:
+        joints: Joint positions of the first pose, metres.
+        camera: The camera that it is seen by; None: none is known.
+        up: The axis of the world that is up, such as "y" or "-z".
+    """
     middle = joints.mean(0)
     radius = float(np.linalg.norm(joints - middle, axis=-1).max())
     vertical = np.zeros(3)

@@ -33,6 +33,7 @@ from torchcss.io.fitted_body import write_fitted_body
 from torchcss.io.keypoints.read import OWN_NAMES
 from torchcss.io.tracks import load_track, prepare_output_folder, write_summary
 from torchcss.io.video import VideoWriter
+from torchcss.studies.metrics import mpjpe_mm
 from torchcss.studies.render.sequences import SyntheticSequence
 from torchcss.studies.sequence_writer import write_arrays, write_camera
 from torchcss.studies.sequences import read_reference
@@ -171,9 +172,9 @@ def _track_clip(
     )  # fmt: skip
     summary, truth = dict(run.summary), read_reference(clip / "reference3d.npz")[0]
     track = load_track(out)
-    error = np.linalg.norm(track.joints_world - truth[track.frames][:, None], axis=-1).mean(-1)
+    error = mpjpe_mm(track.joints_world, truth[track.frames][:, None])
     error = np.where(np.isfinite(track.log_weight), error, np.inf)
-    summary["mpjpe_mm"] = 1000 * float(error[:, 0].mean())
-    summary["mpjpe_best_of_modes_mm"] = 1000 * float(error.min(axis=1).mean())
+    summary["mpjpe_mm"] = float(error[:, 0].mean())
+    summary["mpjpe_best_of_modes_mm"] = float(error.min(axis=1).mean())
     write_summary(out, summary)
     return summary

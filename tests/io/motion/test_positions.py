@@ -376,9 +376,9 @@ def a_motion(names: tuple[str, ...]) -> MotionCapture:
 def test_names_of_limbs(names: tuple[str, ...]) -> None:
     motion = a_motion(names)
     found, index, positions = limb_positions(motion)
-    assert found == ("l_hip", "r_hip", "l_shoulder", "r_shoulder")
-    assert index == (0, 1, 4, 5)
-    np.testing.assert_array_equal(positions, motion.joints[:, [0, 1, 4, 5]])
+    assert found == ("l_shoulder", "r_shoulder", "l_hip", "r_hip")
+    assert index == (4, 5, 0, 1)
+    np.testing.assert_array_equal(positions, motion.joints[:, [4, 5, 0, 1]])
 
 
 def test_without_hips_there_is_nothing_to_follow() -> None:
