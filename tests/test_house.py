@@ -81,6 +81,16 @@ def test_no_concrete_class_is_subclassed(path: Path) -> None:
                 assert not ours or meant or issubclass(base, BaseException), (one, base)
 
 
+@of_package(MODULES)
+def test_a_record_is_found_by_its_name(path: Path) -> None:
+    """A compiled kernel that is kept on disk knows its records by name, else it is of others."""
+    name = ".".join(["torchcss", *path.relative_to(PACKAGE).with_suffix("").parts])
+    module = importlib.import_module(name.removesuffix(".__init__"))
+    for one in vars(module).values():
+        if inspect.isclass(one) and issubclass(one, tuple) and one.__module__ == name:
+            assert vars(module).get(one.__name__) is one, one
+
+
 def test_a_name_means_one_thing() -> None:
     """No function, class or constant is public in two modules.
 

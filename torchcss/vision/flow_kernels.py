@@ -13,7 +13,7 @@ import numpy as np
 
 from torchcss.kernels.compiler import entry, floor, inlined, kernel, sqrt
 
-FlowMemory = namedtuple("Memory", "degree inverse x image residual conditioned")
+FlowMemory = namedtuple("FlowMemory", "degree inverse x image residual conditioned")
 """Memory for `solve_flow`.
 
 Attributes:
