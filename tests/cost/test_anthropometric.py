@@ -15,7 +15,7 @@ from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel, differentiate_twice
 from torchcss.cost.anthropometric import INDIVIDUAL, Anthropometric, proportion_columns
 from torchcss.errors import ConfigurationError
-from torchcss.initialise.multi_start import PAPER_PROPORTIONS, Search
+from torchcss.initialise.multi_start import PAPER_PROPORTIONS, StartSearch
 from torchcss.types import LocalModel
 
 PRIOR = Anthropometric()
@@ -97,7 +97,7 @@ def test_sides_that_are_not_tied_share_their_stature_alone() -> None:
     assert float(covariance[left, right]) == pytest.approx((PRIOR.stature * length) ** 2)
     own = float(covariance[left, left] - covariance[left, right])
     assert own == pytest.approx((INDIVIDUAL["thigh"] * length) ** 2)
-    held = Search(proportions=("trunk",)).bounds(body)
+    held = StartSearch(proportions=("trunk",)).bounds(body)
     columns = [body.state_index(f"{side}_thigh_length") for side in "lr"]
     assert bool((held.upper[columns] == 0).all())
 
