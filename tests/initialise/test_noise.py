@@ -87,3 +87,21 @@ def test_marks_that_fit_no_pose_are_told() -> None:
         options=InitialiseOptions(sigma=2.0, learn_noise=True, search=few),
     )
     assert any("they fit no pose before this camera well" in line for line in found.report)
+
+
+@pytest.mark.parametrize(("noise_px", "told"), [(2.0, False), (3.0, False), (60.0, True)])
+def test_marks_that_miss_every_pose_by_more_than_their_stated_noise(
+    noise_px: float, told: bool
+) -> None:
+    person, keypoints = seen(noise_px, 1)
+    few = StartSearch(num_starts=4, num_flips=0, num_samples=0)
+    found = initialise(
+        None,
+        keypoints,
+        person.camera,
+        generator=torch.Generator().manual_seed(0),
+        options=InitialiseOptions(sigma=2.0, search=few),
+    )
+    lines = [line for line in found.report if "misses them by more than 3 times" in line]
+    assert bool(lines) == told
+    assert found.noise == 1.0

@@ -63,7 +63,7 @@ from torchcss.initialise.result import (
 )
 from torchcss.initialise.shape import ShapeFit, fit_shape
 from torchcss.initialise.view import CameraView
-from torchcss.types import Keypoints
+from torchcss.types import Keypoints, Vector
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor
 
@@ -82,6 +82,11 @@ alone; beside colours by 0.72 at full weight, 0.77 at a quarter, and 0.78 withou
 
 _POOR_FIT = 3.0
 """How many times as noisy as expected keypoints are where the user is told."""
+
+_NO_POSE = (
+    "they fit no pose before this camera well; look at the first frame's keypoints, or start at "
+    "another frame"
+)
 
 _RIVALS = 3.0
 """By how much more than the best a pose may cost the joints, nats, and be given a shape of its
@@ -140,20 +145,34 @@ def initialise(
             options = replace(options, sigma=noise * sigma)
             line = f"keypoints: noise of a wrist {noise * sigma:.1f} px, from the best fit"
             if noise > _POOR_FIT:
-                line += (
-                    f", {noise:.1f} times what detectors have: they fit no pose before this camera "
-                    "well; look at the first frame's keypoints, or start at another frame"
-                )
+                line += f", {noise:.1f} times what detectors have: {_NO_POSE}"
             notes.append(line)
         first, options = _fit_of_size(body, view, generator, options, others)
         first = first._replace(noise=noise)
         given = keypoints.only(first.body.joint_names).to(first.body.tie)
         alone = options.joint_cost(first.body, [view._replace(keypoints=given)])
+        if not learns and (line := _misses(alone, first.mixture.mean[0])):
+            notes.append(line)
         notes += swapped_sides(alone, first.mixture.mean[0], generator)
         first = first._replace(report=(*notes, *first.report))
         if image is None or not options.contours or isinstance(body, BodyModel):
             return first
         return _to_the_picture(first, image, view._replace(keypoints=given), others, options)
+
+
+def _misses(alone: TrackingCost, x: Vector) -> str | None:
+    """A line where keypoints cost as much as if all of them erred `_POOR_FIT` times their noise."""
+    joints, given = alone.choice.find(JointTerm), alone.keypoints
+    assert joints is not None
+    assert given is not None
+    error = 2 * x.new_tensor(_POOR_FIT * joints.sigma).square()
+    most = alone.choice.weight(joints.name) * joints.weight * 0.5 * joints.potential(error).rho
+    if alone.terms(x[None])[joints.name] <= most * (given.confidence > 0).sum():
+        return None
+    return (
+        f"keypoints: the best fit misses them by more than {_POOR_FIT:g} times the noise of "
+        f"{joints.sigma:.1f} px that is given: {_NO_POSE}"
+    )
 
 
 def _own_joints(body: str | BodyModel) -> dict[str, str]:
