@@ -100,7 +100,8 @@ def detector_alone(run: Run) -> Run | None:
     """The run with the joints in space that its detector believes in; None: it says none."""
     if not run.cameras or (files := run.cameras[0].files) is None or not files.video.exists():
         return None
-    keypoints = open_view(files, run.camera, None, run.body.joint_of_name).keypoints
+    links = {} if run.track.body is None else run.body.joint_of_name
+    keypoints = open_view(files, run.camera, None, links).keypoints
     if keypoints is None or keypoints.points is None:
         return None
     track = run.track

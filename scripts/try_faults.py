@@ -198,7 +198,7 @@ def crash(batch: Round) -> None:
     """SIGKILL in the midst of a clip, whoever tracks it; those that died start again."""
     frames = batch.moment.randrange(batch.config.frames)
     deadly = "import os; from torchcss.app.batch import _Watch as W; add = W.add; "
-    deadly += "W.add = lambda w, f, p: os.kill(os.getpid(), 9) if w._claim.name == 'clip0' "
+    deadly += "W.add = lambda w, f, p: os.kill(os.getpid(), 9) if w.claim.name == 'clip0' "
     deadly += f"and f.frame.index >= {frames} else add(w, f, p); "
     for _ in range(MOST_DEATHS + 1):
         processes = [batch.begin(deadly) for _ in range(batch.config.processes)]

@@ -169,6 +169,10 @@ def test_nothing_but_the_session_steps_a_tracker() -> None:
             continue
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
-                # `Tracker.step` takes state, cost and bounds; a session's takes an observation.
+                # `Tracker.step` takes state, problem and bounds, as an optimiser's step does; a
+                # session's takes an observation.
                 steps = node.func.attr == "step" and len(node.args) + len(node.keywords) >= 3
-                assert not steps or ast.unparse(node.func.value) == "number", (path, node.lineno)
+                assert not steps or ast.unparse(node.func.value) in ("number", "newton"), (
+                    path,
+                    node.lineno,
+                )

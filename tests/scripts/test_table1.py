@@ -80,6 +80,6 @@ def test_figures_of_runs_with_and_without_minima(script: ModuleType) -> None:
         script.minima_and_costs_figure({"SS": nothing}),
     ):
         made.canvas.draw()
-    spectra = script.spectra_figure({"arm8": spectrum(problem.start.covariance).tolist()})
+    spectra = script.eigenvector_figure({"arm8": spectrum(problem.start.covariance).tolist()})
     shown = spectra.axes[0].lines[0].get_ydata()[0]
     assert math.isclose(shown, float(spectrum(problem.start.covariance)[0]))

@@ -194,7 +194,7 @@ def test_bad_views_are_refused(folder: Path, tmp_path: Path):
             ),
         )  # fmt: skip
 
-    with pytest.raises(CameraError, match=r"one world, in metres.*front\.mp4"):
+    with pytest.raises(CameraError, match=r"front\.mp4: several cameras .* one world, in metres"):
         attempt("apart.json")
     with pytest.raises(VideoError, match="starts 3 frames after"):
         attempt("cameras.json", offset=-3)

@@ -38,7 +38,7 @@ for size in ((1, 1), (3, 4), (9, 1)):
 place, distance = 40 * rng.random((30, 2)) - 10, rng.random(30) + 0.5
 near, seen = np.full((1, 17, 19), -1, single), np.full((1, 17, 19), -1)
 faces = np.arange(30).reshape(-1, 3)
-run(rasterise_kernels.draw, place, distance, faces, np.arange(10), 10, near, seen)
+run(rasterise_kernels.draw_triangles, place, distance, faces, np.arange(10), 10, near, seen)
 print("checked")
 """
 

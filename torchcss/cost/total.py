@@ -224,6 +224,7 @@ class TrackingCost:
         Where x requires it, autograd and the transforms of `torch.func` get the derivatives of
         `local_model`, first and second.
         """
+        self.body.check_state(x)
         at = x.detach()
         if (x.requires_grad and torch.is_grad_enabled()) or unpack_dual(x).tangent is not None:
             return LocalModel(*_Opaque.apply(self.local_model, at)).at(x - at)
