@@ -104,7 +104,7 @@ def test_weights_of_css_and_of_figure_6():
     assert (arm.surprise, body.surprise) == (math.inf, 3.4)
     assert isinstance(arm, Tracker)
     assert isinstance(body, Tracker)
-    assert (arm.likelihood_power, body.likelihood_power) == (0.035, 0.1)
+    assert (arm.likelihood_power, body.likelihood_power) == (0.05, 0.1)
     assert arm.soft_matching
     assert body.soft_matching
     for name in ("arm8", "body34"):

@@ -649,7 +649,7 @@ def test_awkward_frames_leave_no_nan_and_lose_nothing():
         ({}, 0.1),
         ({"keypoints_use": "first"}, 0.1),
         ({"terms": ("contour", "temporal")}, 0.1),
-        ({"body": "arm8"}, 0.035),
+        ({"body": "arm8"}, 0.05),
         ({"likelihood_power": 0.7}, 0.7),
         ({"keypoints_use": "first", "likelihood_power": 0.7}, 0.7),
         ({"preset": "ijrr_css_heavy_tailed"}, 1.0),
