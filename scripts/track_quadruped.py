@@ -40,9 +40,6 @@ MARKED = ("THIGH", "SHANK", "FOOT")
 RATE = 25.0
 """Frames a second."""
 
-GIRTH = 0.05
-"""Radius of the links, metres."""
-
 EYES = ((1.6, 0.7, 3.2), (-3.0, 0.8, 1.8), (0.9, 1.2, -2.8))
 LOOKED_AT = (0.1, -0.2, 0.5)
 """Where the cameras are, and what they look at, metres."""

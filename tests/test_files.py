@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from common.flow_files import write_flow
 from made_tracks import export_as, make_track
 from matplotlib.figure import Figure
 
@@ -64,10 +63,6 @@ def film(path: Path) -> None:
             writer.write(np.full((48, 64, 3), value, np.uint8))
 
 
-def flow(path: Path) -> None:
-    write_flow(path, torch.zeros(2, 30, 40))
-
-
 def clicked(path: Path) -> None:
     places = torch.tensor([[3.0, 4.0]], dtype=torch.float64)
     write_clicked(path, Keypoints(places, torch.ones(1), ("l_wrist",)), (64, 48))
@@ -90,7 +85,6 @@ WRITERS = {
     "summary.json": summary,
     "body.npz": fitted_body,
     "film.mp4": film,
-    "flow.flo": flow,
     "clicked.json": clicked,
     "figure.png": figure,
     **{f"a.{kind}": exported(kind) for kind in ("bvh", "trc", "mot", "csv", "npz")},

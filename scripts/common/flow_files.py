@@ -4,7 +4,7 @@ Little endian throughout: float32 202021.25 (its four bytes spell PIEH), int32 w
 then row by row the float32 pairs (u to the right, v down) in pixels. A component beyond 1e9 in
 size marks a pixel whose flow is not known.
 
-By default: `read_flow(path)` and `write_flow(path, flow)`; `flow_discontinuities` of what was read.
+By default: `read_flow(path)`, then `flow_discontinuities` of what was read.
 """
 
 from __future__ import annotations
@@ -20,15 +20,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from torchcss.errors import FlowFileError, ShapeError, check_shape
-from torchcss.files import read_bytes, replace_file
+from torchcss.errors import FlowFileError, check_shape
+from torchcss.files import read_bytes
 from torchcss.robust import Leclerc, Lorentzian, Quadratic
 from torchcss.vision.flow import FlowConfiguration
 
 _MAGIC = b"PIEH"
 _HEADER_BYTES = 12
 _UNKNOWN_BEYOND = 1.0e9
-_UNKNOWN_WRITTEN = 1.666666752e9
 
 
 class FlowFile(NamedTuple):
@@ -67,44 +66,6 @@ def read_flow(path: str | os.PathLike[str]) -> FlowFile:
     flow = torch.from_numpy(values.astype(np.float32)).movedim(-1, 0).contiguous()
     known = (flow.abs() <= _UNKNOWN_BEYOND).all(dim=0)  # false for NaN
     return FlowFile(torch.where(known, flow, 0.0), known)
-
-
-def write_flow(
-    path: str | os.PathLike[str],
-    flow: Float[Tensor, "2 h w"],
-    known: Bool[Tensor, "h w"] | None = None,
-) -> None:
-    """Write a `.flo` file; it stores float32.
-
-    Args:
-        path: The file, overwritten if it exists.
-        flow: Displacement in pixels (u to the right, v down).
-        known: Where the flow is known; None takes it to be known everywhere. A pixel whose flow is
-            not finite is written as unknown in either case.
-
-    Raises:
-        ShapeError: If the flow is not `[2, h, w]` with at least one pixel or `known` not `[h, w]`.
-        OutputError: If the file cannot be written; an older one of this name is left as it is.
-    """
-    check_shape("flow", flow, 2, None, None)
-    if flow.ndim != 3 or flow.numel() == 0:
-        raise ShapeError(
-            f"flow: expected [2, h, w] with at least one pixel, got {list(flow.shape)}; "
-            "write each item of a batch to a file of its own"
-        )
-    height, width = flow.shape[-2:]
-    values = flow.detach().to("cpu", torch.float32)
-    usable = (values.abs() <= _UNKNOWN_BEYOND).all(dim=0)
-    if known is not None:
-        if known.shape != (height, width):
-            raise ShapeError(
-                f"known: expected the flow's size [{height}, {width}], got {list(known.shape)}"
-            )
-        usable &= known.cpu()
-    values = torch.where(usable, values, _UNKNOWN_WRITTEN).movedim(0, -1).contiguous().numpy()
-    header = _MAGIC + np.array([width, height], "<i4").tobytes()
-    with replace_file(Path(path)) as partial:
-        partial.write_bytes(header + values.astype("<f4").tobytes())
 
 
 def flow_discontinuities(

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchcss.errors import ConfigurationError
-from torchcss.inference.dynamics import ConstantVelocity, Diffusion, Learned
+from torchcss.inference.dynamics import ConstantVelocity, Diffusion
 from torchcss.inference.importance import fair_samples
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.proposals import (
@@ -451,22 +451,3 @@ def test_dynamics():
     torch.testing.assert_close(moved.mean, TWO.mean + 0.5 * velocity)
     assert torch.equal(moved.covariance, TWO.covariance)
     assert math.isclose(float(moved.weight.sum()), 1)
-
-
-def test_learned_dynamics_carry_covariances_along():
-    turn = torch.tensor([[0.8, -0.6], [0.6, 0.8]]).double()
-    linear = Learned(transition=lambda x, v: turn @ x + 0.5 * v, deviation=0.1)
-    velocity = torch.tensor([[1.0, 2.0], [0.0, 0.0]]).double()
-    got = linear.predict(TWO, velocity)
-    torch.testing.assert_close(got.mean, TWO.mean @ turn.T + 0.5 * velocity)
-    expected = turn @ TWO.covariance @ turn.T + 0.01 * torch.eye(2).double()
-    torch.testing.assert_close(got.covariance, expected)
-    network = torch.nn.Sequential(torch.nn.Linear(4, 8), torch.nn.Tanh(), torch.nn.Linear(8, 2))
-    network.double()
-    learned = Learned(transition=lambda x, v: x + network(torch.cat([x, v])))
-    got = learned.predict(TWO, velocity)
-    assert not got.mean.requires_grad
-    step = network(torch.cat([TWO.mean, velocity], -1)).detach()
-    torch.testing.assert_close(got.mean, TWO.mean + step)
-    points = TWO._replace(covariance=torch.zeros_like(TWO.covariance))
-    assert not bool(learned.predict(points, velocity).covariance.any())

@@ -11,8 +11,8 @@ drawn, before it was projected onto the bounds: the weighted samples then repres
 projected in the same way, exactly.
 
 How far such weights can be trusted is what footnote 12 [IJRR] is about: `survival` gives the
-effective sample size (the "survival diagnostic"), its share of the samples (the "survival rate")
-and how many samples a resampling would keep. In many dimensions, inflation in all of them leaves no
+effective sample size (the "survival diagnostic") and its share of the samples (the "survival
+rate"). In many dimensions, inflation in all of them leaves no
 survivors: for s = 8 and n Gaussian directions the survival rate is about (15 / 64)^(n / 2), that is
 3e-3 for n = 8 and 2e-11 for n = 34. That is why the tracker descends from its samples instead.
 
@@ -39,13 +39,10 @@ class Survival(NamedTuple):
     Attributes:
         effective_sample_size: `1 / sum w^2`, from 1 (one sample has all) to the number of samples.
         survival_rate: The same as a share of the samples.
-        expected_survivors: Expected number of different samples among as many drawn again with
-            replacement.
     """
 
     effective_sample_size: Float[Tensor, ""]
     survival_rate: Float[Tensor, ""]
-    expected_survivors: Float[Tensor, ""]
 
 
 def normalised_log_weight(log_weight: Numbers) -> Numbers:
@@ -69,8 +66,7 @@ def survival(log_weight: Numbers) -> Survival:
     weight = normalised_log_weight(log_weight).exp()
     some = (log_weight > -torch.inf).any()
     effective = torch.where(some, 1 / weight.square().sum(), 0.0)
-    survivors = torch.where(some, -torch.expm1(num * torch.log1p(-weight)).sum(), 0.0)
-    return Survival(effective, effective / num, survivors)
+    return Survival(effective, effective / num)
 
 
 def posterior_log_weight(samples: Samples, cost: CostFunction) -> Numbers:

@@ -351,18 +351,15 @@ def _same_state(name: str, first: GaussianMixture, second: GaussianMixture) -> i
     return n
 
 
-def bhattacharyya(
-    first: GaussianMixture, second: GaussianMixture, *, standard: bool = False
-) -> Float[Tensor, "k m"]:
-    """Bhattacharyya distance between the components of two mixtures.
+def bhattacharyya(first: GaussianMixture, second: GaussianMixture) -> Float[Tensor, "k m"]:
+    """Bhattacharyya distance between the components of two mixtures, as printed in Fig. 6 [IJRR].
+
+    That is `d^T S^-1 d + log(|A + B| / sqrt(|A| |B|)) / 2` with `S = (A + B) / 2`, without the
+    literature's factor 1/8 (decision "mode weights").
 
     Args:
         first: Rows of the result.
         second: Columns of the result.
-        standard: False for the distance as it is printed in Fig. 6 [IJRR],
-            `d^T S^-1 d + log(|A + B| / sqrt(|A| |B|)) / 2` with `S = (A + B) / 2`; True for that of
-            the literature, `d^T S^-1 d / 8 + log(|S| / sqrt(|A| |B|)) / 2` (decision "mode
-            weights").
     """
     n = _same_state("bhattacharyya", first, second)
     one, other = with_least_width(first.covariance), with_least_width(second.covariance)
@@ -371,14 +368,10 @@ def bhattacharyya(
     squared = multiply(whitener(between), apart).square().sum(-1)
     own = log_determinant(one)[:, None] + log_determinant(other)[None, :]
     overlap = 0.5 * (log_determinant(between) - 0.5 * own)
-    if standard:
-        return squared / 8 + overlap
     return squared + overlap + 0.5 * n * math.log(2)
 
 
-def match_to_prior(
-    posterior: GaussianMixture, prior: GaussianMixture, *, standard: bool = False
-) -> Past:
+def match_to_prior(posterior: GaussianMixture, prior: GaussianMixture) -> Past:
     """The weight of the closest prior component for each mode, Fig. 6 step 5.
 
     The modes choose in their order, and a prior component is used once. A mode for which no
@@ -389,12 +382,11 @@ def match_to_prior(
     Args:
         posterior: The modes of this frame, in the order in which they choose.
         prior: The modes of the frame before, one frame ahead.
-        standard: See `bhattacharyya`.
     """
     prior = prior.normalise()
     present = torch.nonzero(prior.log_weight > -torch.inf)[:, 0]
     prior = prior.take(present)
-    distance = bhattacharyya(posterior, prior, standard=standard)
+    distance = bhattacharyya(posterior, prior)
     parent = torch.full_like(posterior.log_weight, -1, dtype=torch.long)
     factor = prior.log_weight.min().repeat(len(parent))
     unused = torch.ones_like(present, dtype=torch.bool)

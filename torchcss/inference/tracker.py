@@ -283,8 +283,6 @@ class Tracker(SequenceTracker):
             end, since a sample that starts far up seldom overtakes. Of those within half the
             `separation` of each other the best goes first. Zero: all descend to the end, as in
             Fig. 6.
-        standard_bhattacharyya: Match modes by the distance of the literature instead of the one
-            printed (decision "mode weights").
         soft_matching: In step 5, multiply in the prior's weight at the place of each mode, see
             `prior_at`, instead of that of the closest prior mode, which Fig. 6 gives to one mode
             only: a mode far from all of the prior may then be handed the best past there is, and
@@ -312,7 +310,6 @@ class Tracker(SequenceTracker):
     coarse_every: int = 3
     oversampling: int = 1
     survivors: int = 0
-    standard_bhattacharyya: bool = False
     soft_matching: bool = False
     surprise: float = math.inf
     separation: float = 0.0
@@ -509,7 +506,7 @@ class Tracker(SequenceTracker):
         kept = self._explanations(problem, unpruned, volume - cost, past)
         pruned = unpruned.take(kept).normalise()
         if past is None:
-            past = match_to_prior(pruned, tempered, standard=self.standard_bhattacharyya)
+            past = match_to_prior(pruned, tempered)
         else:
             past = Past(*(part[kept] for part in past))
         mixture = pruned._replace(log_weight=pruned.log_weight + past.log_weight).normalise()
