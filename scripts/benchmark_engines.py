@@ -20,7 +20,7 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
-from common import start, write_report
+from common import Table, start, write_report
 from jaxtyping import Float
 from torch import Tensor
 
@@ -141,10 +141,11 @@ def main(config: Config) -> dict[str, Any]:
             row = {"engine": name, "pool": sizes[name], "beside": pool}
             row |= {"microseconds": float(np.median(taken)), "of_fused": float(np.median(ratio))}
             rows.append(row)
-            print(f"{name:>15} in pools of {sizes[name]:4d}: {row['microseconds']:9.0f} us each, "
-                  f"{row['of_fused']:6.1f} times the fused engine", flush=True)  # fmt: skip
+    columns = ("engine", "pool", "beside", "microseconds", "times the fused engine")
+    table = Table("Evaluations of the whole cost", columns, [list(row.values()) for row in rows])
+    table.print()
     report = {"rows": rows, "config": config, "torch": torch.__version__}
-    write_report(config.out, report)
+    write_report(config.out, report, table)
     return report
 
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from common import start
+from common import Table, start
 
 from torchcss.io.tracks import prepare_output_folder, write_summary
 
@@ -164,10 +164,9 @@ def arrows(package: Path) -> dict[tuple[str, str], set[str]]:
 
 def print_figures(figures: dict[str, Any]) -> None:
     """A line a folder, and the lists."""
-    print(f"{'folder':>12}{'lines':>8}{'tokens':>9}")
-    for folder, (lines, tokens) in figures["folders"].items():
-        print(f"{folder:>12}{lines:8}{tokens:9}")
-    print(f"{'all':>12}{figures['lines']:8}{figures['tokens']:9}")
+    rows = [[folder, *numbers] for folder, numbers in figures["folders"].items()]
+    total = ["all", figures["lines"], figures["tokens"]]
+    Table("Code by folder", ("folder", "lines", "tokens"), [*rows, total]).print()
     for name, rows in (
         (f"functions of more than {MOST_LINES} lines", figures["long_functions"]),
         (f"functions of more than {MOST_PARAMETERS} parameters", figures["many_parameters"]),

@@ -42,24 +42,24 @@ from torchcss.tracking.presets import PRESETS, preset_name
 from torchcss.tracking.settings import Settings
 
 COLUMNS = {
-    # title: entry, factor, decimals
-    "limb at s": ("limb_lost_s", 1, 1),
-    "of K at s": ("limb_lost_of_modes_s", 1, 1),
-    "best mm": ("root_aligned_mm", 1, 0),
-    "of K mm": ("root_aligned_best_of_modes_mm", 1, 0),
-    "PA mm": ("pa_mpjpe_mm", 1, 0),
-    "overlap": ("overlap", 1, 2),
-    "kept %": ("true_mode_kept", 100, 0),
-    "in 90 %": ("inside_90_best", 100, 0),
-    "nearest": ("inside_90_nearest", 100, 0),
-    "limits %": ("outside_share", 100, 0),
-    "deep %": ("deep_share", 100, 0),
-    "of K %": ("deep_modes_share", 100, 0),
-    "m/s^2": ("acceleration_error", 1, 1),
-    "evals": ("evaluations_per_frame", 1, 0),
-    "s/frame": ("search_s_per_frame", 1, 2),
+    # title: entry, factor
+    "limb at s": ("limb_lost_s", 1),
+    "of K at s": ("limb_lost_of_modes_s", 1),
+    "best mm": ("root_aligned_mm", 1),
+    "of K mm": ("root_aligned_best_of_modes_mm", 1),
+    "PA mm": ("pa_mpjpe_mm", 1),
+    "overlap": ("overlap", 1),
+    "kept %": ("true_mode_kept", 100),
+    "in 90 %": ("inside_90_best", 100),
+    "nearest": ("inside_90_nearest", 100),
+    "limits %": ("outside_share", 100),
+    "deep %": ("deep_share", 100),
+    "of K %": ("deep_modes_share", 100),
+    "m/s^2": ("acceleration_error", 1),
+    "evals": ("evaluations_per_frame", 1),
+    "s/frame": ("search_s_per_frame", 1),
 }
-"""What is printed: until the loss, the last two over all frames."""
+"""What the table has: until the loss, the last two over all frames."""
 TRACKING = Settings(keypoints_use="first", overlay=False)
 """How this script tracks, where nothing else is said."""
 STEP_S = 0.5
@@ -122,7 +122,7 @@ def main(config: Config) -> dict[str, Any]:
         for run in follow(config, sequence, together, thresholds):
             runs.append(entry_of(run, thresholds, 1 / sequence.frame_rate))
             report = write(config, study, runs)
-    print_table(report["by_tracker"], sequence.name)
+    trackers_table(report["by_tracker"], sequence.name).print()
     weights_table(report["apart_weight"]).print()
     if config.plot is not None and report["by_tracker"]:
         told = {row.preset: row.times_s for row in report["published"]}
@@ -197,17 +197,23 @@ def write(config: Config, study: dict[str, Any], runs: list[dict[str, Any]]) -> 
         "study": study, "published": published, "runs": runs, "by_tracker": table,
         "apart_weight": weights,
     }  # fmt: skip
-    cells = []
-    for name, row in table.items():
-        lost = f"{row['lost']} of {row['seeds']}", row["lost_s"][0]
-        shown = (
-            factor * row[key][0] if key in row else None for key, factor, _ in COLUMNS.values()
-        )
-        cells.append([name, *lost, *shown])
-    title = f"Trackers on {study['sequence']}, medians over seeds"
-    columns = ("tracker", "lost", "lost at s", *COLUMNS)
-    write_report(config.out, report, Table(title, columns, cells))
+    write_report(config.out, report, trackers_table(table, study["sequence"]))
     return report
+
+
+def trackers_table(by_tracker: dict[str, dict[str, Any]], sequence: str) -> Table:
+    """The medians, and the paper's words on the time of failure."""
+    told = {row.preset: row.told for row in PUBLISHED if row.sequence == sequence}
+    cells = []
+    for name, row in by_tracker.items():
+        middle, least, most = (f"{t:.1f}" if math.isfinite(t) else "-" for t in row["lost_s"])
+        when = f"{middle} ({least}..{most})" if row["lost"] else "never"
+        values = (factor * row.get(key, [math.nan])[0] for key, factor in COLUMNS.values())
+        shown = ("never" if math.isinf(value) else value for value in values)
+        lost = f"{row['lost']} of {row['seeds']}"
+        cells.append([name, lost, row["errors"], when, told.get(name), *shown])
+    columns = ("tracker", "lost", "errors", "lost at s", "paper", *COLUMNS)
+    return Table(f"Trackers on {sequence}, medians over seeds", columns, cells)
 
 
 def weight_over_time(frames: list[dict[str, Any]]) -> dict[str, list[tuple[float, float, float]]]:
@@ -270,24 +276,6 @@ def entry_of(run: TrackerRun, thresholds: Thresholds, interval_s: float) -> dict
     """A run as it is written."""
     entry = {"preset": run.settings.preset, "seed": run.settings.seed, "ended": run.ended}
     return entry | summarise(run.measures, thresholds, interval_s) if run.measures else entry
-
-
-def print_table(table: dict[str, dict[str, Any]], sequence: str) -> None:
-    """The medians, and the paper's words on the time of failure."""
-    told = {row.preset: row.told for row in PUBLISHED if row.sequence == sequence}
-    titles = "".join(f"{title:>10}" for title in COLUMNS)
-    print(f"{'median over seeds':22}{'lost':>6}{'at s (range)':>18}{'paper':>16}{titles}")
-    for name, row in table.items():
-        middle, least, most = (f"{t:.1f}" if math.isfinite(t) else "-" for t in row["lost_s"])
-        when = f"{middle} ({least}..{most})" if row["lost"] else "never"
-        cells = ""
-        for entry, factor, digits in COLUMNS.values():
-            value = factor * row[entry][0] if entry in row else math.nan
-            text = "never" if math.isinf(value) else f"{value:.{digits}f}"
-            cells += f"{'' if math.isnan(value) else text:>10}"
-        ended = f"  {row['errors']} ended by an error" if row["errors"] else ""
-        lost = f"{row['lost']}/{row['seeds']}"
-        print(f"{name:22}{lost:>6}{when:>18}{told.get(name, ''):>16}{cells}{ended}")
 
 
 if __name__ == "__main__":

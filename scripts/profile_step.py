@@ -185,42 +185,35 @@ def _ways(row: dict[str, Any]) -> list[str]:
     return ["eager", *row["times_as_fast"]]
 
 
+def cells_of(row: dict[str, Any], name: str) -> list[str | float]:
+    """A way's line of the table: microseconds per sample and iteration, medians."""
+    way, ratio = row[name], "1"
+    if name != "eager":
+        low, middle, high = row["times_as_fast"][name].values()
+        ratio = f"{middle:.2f} ({low:.2f} to {high:.2f})"
+    label = f"{row['body']}, {row['samples']} samples, {name}"
+    return [label, 1e6 * way["seconds"]["median"], ratio, way["memory_mib"], way["library_share"]]
+
+
 def main(config: Config) -> dict[str, Any]:
     """Measure, print, write; return what is written."""
     torch.set_num_threads(config.threads)
     if config.folder is not None:
         prepare_output_folder(config.folder)
-    print(f"{config.dtype} on {config.device}; microseconds per sample and iteration, median")
-    print(f"{'':8}{'samples':>8}{'way':>10}{'us':>8}{'times as fast':>22}{'MiB':>8}{'library':>9}")
     rows = []
     for row in (row for body in config.bodies for row in measure(config, body)):
         rows.append(row)
-        for name in _ways(row):
-            way, ratio = row[name], ""
-            if name != "eager":
-                low, middle, high = row["times_as_fast"][name].values()
-                ratio = f"{middle:.2f} ({low:.2f} to {high:.2f})"
-            print(f"{row['body']:8}{row['samples']:8d}{name:>10}"
-                  f"{1e6 * way['seconds']['median']:8.1f}{ratio:>22}"
-                  f"{way['memory_mib']:8.1f}{way['library_share']:9.0%}")  # fmt: skip
-        print(f"{'':16}compiled in {row['compile']['wall_s']:.0f} s, apart from eager by "
+        print(f"{row['body']}, {row['samples']} samples: compiled in "
+              f"{row['compile']['wall_s']:.0f} s, apart from eager by "
               f"{max(row['relative_difference'].values()):.1e}", flush=True)  # fmt: skip
     report = {"rows": rows, "config": config, "torch": torch.__version__}
     if config.folder is not None:
         picture(rows).savefig(config.folder / "profile.png", dpi=100)
-    cells = [
-        [
-            f"{row['body']}, {row['samples']} samples, {name}",
-            1e6 * row[name]["seconds"]["median"],
-            row["times_as_fast"].get(name, {"median": 1.0})["median"],
-            row[name]["memory_mib"],
-        ]
-        for row in rows
-        for name in _ways(row)
-    ]
-    columns = ("body", "microseconds", "times as fast", "MiB")
-    title = "A step eager, compiled and fused, microseconds per sample and iteration"
-    write_report(config.out, report, Table(title, columns, cells))
+    title = f"A step eager, compiled and fused, {config.dtype} on {config.device}"
+    columns = ("body", "microseconds", "times as fast", "MiB", "library's share")
+    table = Table(title, columns, [cells_of(row, name) for row in rows for name in _ways(row)])
+    table.print()
+    write_report(config.out, report, table)
     return report
 
 

@@ -47,16 +47,21 @@ from torchcss.studies.sampling_study import (
     study_problem,
 )
 
-COLUMNS = ("minima", "distance_raw", "distance", "deviations_raw", "deviations", "cost_raw", "cost")
+COLUMNS = {
+    "minima": "minima",
+    "distance_raw": "distance raw", "distance": "minima's",
+    "deviations_raw": "deviations raw", "deviations": "minima's",
+    "cost_raw": "cost raw", "cost": "minima's",
+}  # fmt: skip
 CHECKS = {
-    "minima_half": "distance / 2", "minima_double": "distance x 2", "valleys": "valleys",
-    "back": "back", "cheap": "cheap", "below_start": "below start",
+    "shared": "shared", "minima_half": "distance / 2", "minima_double": "distance x 2",
+    "valleys": "valleys", "back": "back", "cheap": "cheap", "below_start": "below start",
     "converged": "converged", "inside": "inside", "upward": "upward", "steps": "steps",
     "seconds": "seconds",
 }  # fmt: skip
-"""Minima when the duplicate distance is halved and doubled, those not joined by low paths, share of
-the samples that descend back to the start; minima at most `cheap` nats above it, those below it;
-shares of the samples that pass each test."""
+"""Minima of SS that CSS found too, minima when the duplicate distance is halved and doubled, those
+not joined by low paths, share of the samples that descend back to the start; minima at most `cheap`
+nats above it, those below it; shares of the samples that pass each test."""
 
 TABLE1 = {
     ("CSS", 1.0): (8, 1.148, 2.552, 10.94, 47.60, 117.0, 8.497),
@@ -162,24 +167,22 @@ def row_of(config: Config, run: SamplerRun) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def print_table(rows: list[dict[str, Any]]) -> None:
+def tables(rows: list[dict[str, Any]], poses: str) -> tuple[Table, Table]:
     """The paper's columns, ours above the paper's, and what the count is worth."""
-    titles = ("minima", "distance raw", "opt", "deviations raw", "opt", "cost raw", "opt")
-    print(f"{'':15}" + "".join(f"{title:>15}" for title in titles))
+    cells, checks = [], []
     for row in rows:
-        name = f"{row['method']:>4} {row['scale']:4g}"
-        print(f"{name} ours " + "".join(f"{row[column]:15.4g}" for column in COLUMNS))
-        if (row["method"], row["scale"]) in TABLE1:
-            values = TABLE1[row["method"], row["scale"]]
-            print(f"{'paper':>14} " + "".join(f"{value:15.4g}" for value in values))
-    print(f"{'':10}" + "".join(f"{title:>14}" for title in CHECKS.values()))
-    for row in rows:
-        name = f"{row['method']:>4} {row['scale']:4g}"
-        print(f"{name} " + "".join(f"{row[column]:14.4g}" for column in CHECKS))
-        if "shared" in row:
-            print(f"{'':12}found by CSS too: {row['shared']:g} of {row['minima']:g}")
-        if row.get("flips"):
-            print(f"{'':12}flipped: " + ", ".join(f"{k} {n}" for k, n in row["flips"].items()))
+        key = row["method"], row["scale"]
+        name = f"{key[0]} {key[1]:g}"
+        cells.append([name, *(row[column] for column in COLUMNS)])
+        if key in TABLE1:
+            cells.append([f"{name}, paper", *TABLE1[key]])
+        flips = ", ".join(f"{k} {n}" for k, n in row.get("flips", {}).items())
+        checks.append([name, *(row.get(column) for column in CHECKS), flips])
+    method = "method, scale"
+    return (
+        Table(f"Table 1 of [IJRR], {poses}", (method, *COLUMNS.values()), cells),
+        Table("What the counts are worth", (method, *CHECKS.values(), "flipped"), checks),
+    )
 
 
 def run_seed(config: Config, seed: int) -> dict[str, Any]:
@@ -239,18 +242,19 @@ def main(config: Config) -> dict[str, Any]:
         print(f"seed {seed}: spectrum ratio {ratio}; start at {run['start_cost']:.2f} nats; "
               f"{run['seconds']:.1f} s")  # fmt: skip
         if config.num_seeds > 1:
-            print_table(run["rows"])
-    table = medians(runs) if len(runs) > 1 else runs[0]["rows"]
-    print(f"{len(runs)} seeds, medians:" if len(runs) > 1 else "")
-    print_table(table)
-    counts = {(row["method"], row["scale"]): row["minima"] for row in table}
+            for table in tables(run["rows"], f"seed {seed}"):
+                table.print()
+    several = len(runs) > 1
+    rows = medians(runs) if several else runs[0]["rows"]
+    shown = tables(rows, f"medians over {len(runs)} poses" if several else "one pose")
+    for table in shown:
+        table.print()
+    counts = {(row["method"], row["scale"]): row["minima"] for row in rows}
     times = {f"{scale:g}": counts["CSS", scale] / (counts["SS", scale] or math.nan)
              for scale in config.scales}  # fmt: skip
     print("minima of CSS over those of SS by scale:", times)
-    report = {"config": config, "runs": runs, "median": table, "css_over_ss": times}
-    cells = [[f"{row['method']} {row['scale']:g}", *(row[c] for c in COLUMNS)] for row in table]
-    shown = Table("Table 1 of [IJRR], medians over poses", ("method, scale", *COLUMNS), cells)
-    write_report(config.out, report, shown)
+    report = {"config": config, "runs": runs, "median": rows, "css_over_ss": times}
+    write_report(config.out, report, shown[0])
     return report
 
 

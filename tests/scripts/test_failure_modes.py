@@ -84,7 +84,7 @@ def test_small_mode_and_resume(
     text = capsys.readouterr().out
     assert "Weight of other explanations" in text
     assert "2.6 s" in text  # the paper's robust tracker
-    assert "0/2" in text
+    assert "0 of 2" in text
     assert "never" in text
 
     for changed in ({"terms": ("default", "background")}, {"prediction": "surface"}, None):
@@ -153,7 +153,7 @@ def test_a_lost_track_in_the_table(
     measured["apart_weight"] = [0.0, 0.0, 0.0]
     measured["root_aligned_best_of_modes_mm"] = [10.0, 200.0, 200.0]
     base = {"preset": "ijrr_single_limits", "ended": "lost", "num_frames": 3, "per_frame": measured}
-    entries = {key: 1.0 for key, _, _ in script.COLUMNS.values()}
+    entries = {key: 1.0 for key, _ in script.COLUMNS.values()}
     runs = [
         {**base, **entries, "seed": 0, "lost": True, "lost_s": 0.04},
         {**base, **entries, "seed": 1, "lost": False, "lost_s": None, "ended": "complete"},
@@ -161,11 +161,11 @@ def test_a_lost_track_in_the_table(
     ]
     config = script.Config(sequence=arm, presets=("ijrr_single_limits",))
     report = script.write(config, {"sequence": "arm"}, runs)
-    script.print_table(report["by_tracker"], "arm")
+    script.trackers_table(report["by_tracker"], "arm").print()
     text = capsys.readouterr().out
-    assert "1/2" in text
+    assert "1 of 2" in text
     assert "- (0.0..-)" in text
-    assert "1 ended by an error" in text
+    assert report["by_tracker"]["ijrr_single_limits"]["errors"] == 1
     shown, (curve,) = error_curves(runs, {"ijrr_single_limits": (2.6,)})
     assert shown.tolist() == times
     np.testing.assert_equal(curve.best_mm, [[10, 300, np.nan]] * 2)
