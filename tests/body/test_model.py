@@ -159,22 +159,22 @@ def test_leading_shapes_and_types(
 
 
 def test_surface_is_the_posed_mesh(generator: torch.Generator) -> None:
-    body = BodyModel(specification("arm8"), rings=4, meridians=6)
+    body = BodyModel(specification("arm8"))
     pose = body.pose(random_states(body, generator=generator))
     surface, mesh = body.surface(pose), body.mesh()
-    assert mesh.points.shape == (4, 4, 6, 3)
+    assert mesh.points.shape == (4, 8, 12, 3)
     link_turn, link_origin = pose.tree.rotation, pose.tree.translation
     for part in range(4):
         link = int(body.part_link[part])
         local = mesh.points[part] @ body.part_rotation[part].T + body.part_translation[part]
         world = local @ link_turn[link].T + link_origin[link]
-        got = surface.points.unflatten(0, (4, 24))[part]
-        torch.testing.assert_close(got, world.reshape(24, 3))
+        got = surface.points.unflatten(0, (4, 96))[part]
+        torch.testing.assert_close(got, world.reshape(96, 3))
         normal = mesh.normals[part] @ body.part_rotation[part].T @ link_turn[link].T
-        got = surface.normals.unflatten(0, (4, 24))[part]
-        torch.testing.assert_close(got, normal.reshape(24, 3))
-    torch.testing.assert_close(surface.normals.norm(dim=-1), torch.ones(96, dtype=torch.float64))
-    assert body.mesh(3).points.shape == (4, 3, 6, 3)
+        got = surface.normals.unflatten(0, (4, 96))[part]
+        torch.testing.assert_close(got, normal.reshape(96, 3))
+    torch.testing.assert_close(surface.normals.norm(dim=-1), torch.ones(384, dtype=torch.float64))
+    assert body.mesh(3).points.shape == (4, 3, 12, 3)
     assert body.mesh(3, 5).points.shape == (4, 3, 5, 3)
 
 

@@ -124,7 +124,7 @@ def test_derivatives_per_point_are_those_of_autograd(
 ) -> None:
     camera = make_camera(distortion)
     term = EdgeEnergyTerm(potential_kind=kind, nu=1.3)
-    field = edge_energy_field(random_edges(generator), smoothing=0.8)
+    field = edge_energy_field(random_edges(generator))
     nodes = random_nodes(*batch, generator=generator)
     got = term.point_cost(nodes, camera, field)
     leaf = nodes.points.clone().requires_grad_()

@@ -147,7 +147,7 @@ def test_masks_of_a_posed_body_are_inside_and_around_its_parts() -> None:
     left, right = (body.part_names.index(f"{side}_forearm") for side in "lr")
     assert layer_of[left] == layer_of[right]
     parts = part_map(body, body.rest, camera)
-    inside, around = region_masks(body, body.rest, camera, reach=12)
+    inside, around = region_masks(body, body.rest, camera)
     assert inside.shape == around.shape == (len(names), 200, 160)
     assert not (inside & around).any()
     layer_map = torch.tensor((*layer_of, -1))[parts]
@@ -206,10 +206,10 @@ def test_masks_are_those_of_the_whole_picture(
     state = body.rest.clone()
     for name, metres in zip(("root_x", "root_y"), shift, strict=True):
         state[body.state_index(name)] += metres
-    found = region_masks(body, state, camera, reach=22)
+    found = region_masks(body, state, camera)
     assert found[0].any() == found[1].any() == (shift[0] < 5)
     monkeypatch.setattr(region, "_window", lambda *_: (..., slice(None), slice(None)))
-    for one, other in zip(found, region_masks(body, state, camera, reach=22), strict=True):
+    for one, other in zip(found, region_masks(body, state, camera), strict=True):
         assert torch.equal(one, other)
 
 

@@ -129,7 +129,7 @@ def test_flesh_goes_to_the_pose_that_the_picture_is_of(by: str):
     true = start[None, :n]
 
     def fit(states: torch.Tensor):
-        return fit_shape(cost.base, states, parameters, cost.outlines, max_steps=10)
+        return fit_shape(cost.base, states, parameters, cost.outlines)
 
     alone = fit(true)
     for states, start_of_best in ((torch.cat([true, other]), 0), (torch.cat([other, true]), 1)):

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchcss.body.load import load_body
 from torchcss.body.model import differentiate_twice
-from torchcss.cost.targets import PointTargets, pose_targets
+from torchcss.cost.targets import ARM, PointTargets, pose_targets
 from torchcss.errors import BodyError, ShapeError
 from torchcss.solve.inverse_kinematics import link_pose
 
@@ -90,10 +90,8 @@ def test_any_batch_shape(shape: tuple[int, ...], generator: torch.Generator) -> 
 
 def test_what_a_displacement_and_a_turn_cost() -> None:
     body = load_body("body30")
-    x, arm, sigma = body.rest.clone(), 0.25, 0.1
-    cost = pose_targets(
-        body, "root_roll_link", link_pose(body, "root_roll_link", x), arm=arm, sigma=sigma
-    )
+    x, sigma = body.rest.clone(), 0.1
+    cost = pose_targets(body, "root_roll_link", link_pose(body, "root_roll_link", x), sigma=sigma)
     assert float(cost.value(x)) == 0
     moved = x.clone()
     moved[body.state_index("root_x")] += 0.03
@@ -101,7 +99,7 @@ def test_what_a_displacement_and_a_turn_cost() -> None:
     for name in ("root_yaw", "root_pitch", "root_roll"):
         turned = x.clone()
         turned[body.state_index(name)] += 0.4
-        want = 0.5 * 4 / 3 * arm**2 * (1 - math.cos(0.4)) / sigma**2
+        want = 0.5 * 4 / 3 * ARM**2 * (1 - math.cos(0.4)) / sigma**2
         assert float(cost.value(turned)) == pytest.approx(want)
 
 

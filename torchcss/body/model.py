@@ -45,8 +45,6 @@ class BodyModel(nn.Module):
 
     Args:
         body: Rows of the catalogue, or a specification made from a file.
-        rings: Latitudes of the mesh of every part.
-        meridians: Longitudes of the mesh of every part.
 
     Attributes:
         name: Name of the body, for a body from a file its path: `load_body(name)` makes it again.
@@ -70,15 +68,13 @@ class BodyModel(nn.Module):
     part_rotation: Tensor
     part_translation: Tensor
     part_shape: Tensor
-    eta: Tensor
-    omega: Tensor
     sticky_mean: Tensor
     sticky_deviation: Tensor
     motion_rate: Tensor
     base_rotation: Tensor
     base_translation: Tensor
 
-    def __init__(self, body: BodySpecification, *, rings: int = 8, meridians: int = 12) -> None:
+    def __init__(self, body: BodySpecification) -> None:
         super().__init__()
         self.name = body.name
         self.specification = body
@@ -99,13 +95,10 @@ class BodyModel(nn.Module):
         self._register("part_rotation", [part.rotation for part in body.parts], 3, 3)
         self._register("part_translation", [part.translation for part in body.parts], 3)
         self._register("part_shape", [part.shape for part in body.parts], 9)
-        eta, omega = angular_grid(rings, meridians, dtype=torch.float64)
-        self.register_buffer("eta", eta)
-        self.register_buffer("omega", omega)
         self.register_buffer("base_rotation", torch.eye(3, dtype=torch.float64))
         self.register_buffer("base_translation", torch.zeros(3, dtype=torch.float64))
         # By their sizes, with the shape that they are of: copies on other bases share them.
-        self._meshes: dict[tuple[int | None, int | None], tuple[Tensor, SurfaceSample]] = {}
+        self._meshes: dict[tuple[int, int], tuple[Tensor, SurfaceSample]] = {}
 
     def _register(self, name: str, rows: Sequence[Any], *shape: int) -> None:
         """Keep rows of numbers, of which there may be none, as a tensor."""
@@ -325,25 +318,18 @@ class BodyModel(nn.Module):
         centre = (rotation * self.part_translation[:, None, :]).sum(-1)
         return rotation @ self.part_rotation, centre + pose.tree.translation[..., self.part_link, :]
 
-    def mesh(self, rings: int | None = None, meridians: int | None = None) -> SurfaceSample:
+    def mesh(self, rings: int = 8, meridians: int = 12) -> SurfaceSample:
         """Nodes and normals of all parts in their own frames, `[parts rings meridians 3]`.
 
         Args:
-            rings: Latitudes; the model's own by default.
-            meridians: Longitudes; the model's own by default.
+            rings: Latitudes.
+            meridians: Longitudes.
         """
         size, shape = (rings, meridians), self.part_shape
         known = self._meshes.get(size)
         if known is not None and known[0] is shape:
             return known[1]
-        eta, omega = self.eta, self.omega
-        if rings is not None or meridians is not None:
-            eta, omega = angular_grid(
-                rings or eta.shape[0],
-                meridians or eta.shape[1],
-                dtype=self.dtype,
-                device=eta.device,
-            )
+        eta, omega = angular_grid(rings, meridians, dtype=self.dtype, device=shape.device)
         full = (self.num_parts, *eta.shape)
         mesh = surface_points(shape[:, None, None, :], eta.expand(full), omega.expand(full))
         if not shape.requires_grad:

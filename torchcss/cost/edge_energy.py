@@ -40,17 +40,19 @@ from torchcss.robust import Lorentzian, RobustPotential
 from torchcss.vision.sampling import gaussian_blur
 from torchcss.vision.spline import SplineField, spline_field
 
+_SMOOTHING = 2.0
+"""Standard deviation of the blur, pixels: the reach of an edge."""
+
 _RIDGE = 1.2
 """Standard deviation of the ridge that the edge detector makes of a clean step, pixels."""
 
 
-def edge_energy_field(edge_field: Float[Tensor, "2 h w"], *, smoothing: float = 2.0) -> SplineField:
+def edge_energy_field(edge_field: Float[Tensor, "2 h w"]) -> SplineField:
     """Make the smooth edge energy of a frame.
 
     Args:
         edge_field: Edge energy times direction, weighted or not, of length at most one; see
             `FrameFeatures.edge_field`.
-        smoothing: Standard deviation of the blur, pixels: the reach of an edge.
 
     Raises:
         ShapeError: If the field is not a floating-point `[2, h, w]` with at least one pixel.
@@ -65,9 +67,9 @@ def edge_energy_field(edge_field: Float[Tensor, "2 h w"], *, smoothing: float = 
             "edge_field: expected a floating-point field [2, h, w] with at least one pixel, "
             f"got {edge_field.dtype} {list(edge_field.shape)}"
         )
-    energy = gaussian_blur(edge_field.norm(dim=0), smoothing)
+    energy = gaussian_blur(edge_field.norm(dim=0), _SMOOTHING)
     # The spline's own kernel has a variance of 1/3.
-    height = math.sqrt(1.0 + (smoothing**2 + 1.0 / 3.0) / _RIDGE**2)
+    height = math.sqrt(1.0 + (_SMOOTHING**2 + 1.0 / 3.0) / _RIDGE**2)
     coefficients = (height * energy).clamp(0.0, 1.0)
     return spline_field(coefficients[None])
 

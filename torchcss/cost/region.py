@@ -45,6 +45,12 @@ from torchcss.vision.features import Window
 from torchcss.vision.sampling import gaussian_blur
 from torchcss.vision.spline import SplineField, spline_field
 
+_SMOOTHING = 3.0
+"""Standard deviation of the blur of foreground ratios, pixels. With more, thin limbs fade."""
+
+_REACH = 30
+"""How far the surroundings go, pixels."""
+
 _COARSE = 4
 """Surroundings are found on a grid of so many pixels: their outer border may be rough."""
 
@@ -85,7 +91,7 @@ def layer_of_part(body: BodyModel) -> Int[Tensor, " parts"]:
 
 
 def region_field(
-    ratio: Float[Tensor, "layers h w"], *, window: Window | None = None, smoothing: float = 3.0
+    ratio: Float[Tensor, "layers h w"], *, window: Window | None = None
 ) -> SplineField:
     """Make the foreground ratios of a frame, or of a window of it, smooth functions.
 
@@ -93,12 +99,10 @@ def region_field(
         ratio: How much each pixel looks like each layer, in -1..1.
         window: The part of the frame that the functions are of, outside of which they are zero;
             None: all of it.
-        smoothing: Standard deviation of the blur, pixels. With more than the default, thin limbs
-            fade.
     """
     # Single precision is far finer than the colours, and twice as fast.
     seen = (ratio if window is None else ratio[window.pixels]).float()
-    return spline_field(gaussian_blur(seen, smoothing))
+    return spline_field(gaussian_blur(seen, _SMOOTHING))
 
 
 def region_masks(
@@ -106,7 +110,6 @@ def region_masks(
     state: Float[Tensor, " n"],
     camera: Camera,
     *,
-    reach: int = 30,
     fitted: bool = True,
 ) -> tuple[Bool[Tensor, "layers h w"], Bool[Tensor, "layers h w"]]:
     """Pixels that are each layer's own for all that a pose may be off, and those around it.
@@ -115,7 +118,6 @@ def region_masks(
         body: The body.
         state: Its pose.
         camera: Camera of the image.
-        reach: How far the surroundings go, pixels.
         fitted: The girths are the person's; else only the core of a part counts as its own.
 
     Returns:
@@ -131,7 +133,7 @@ def region_masks(
     whole, layers = seen(1.0), torch.arange(len(names), device=body.tie.device)[:, None, None]
     core = torch.zeros(len(names), *whole.shape, dtype=torch.bool, device=whole.device)
     around = core.clone()
-    window = _window(whole >= 0, reach + _COARSE)
+    window = _window(whole >= 0, _REACH + _COARSE)
     if window is None:
         return core, around
     own = whole[window] == layers
@@ -141,7 +143,7 @@ def region_masks(
     small = inner.flatten(1).sum(1) < _CORE_PIXELS
     core[window] = torch.where(small[:, None, None], ~grow(~own, 1), inner)
     blocks = functional.max_pool2d(own.float(), _COARSE, ceil_mode=True) > 0
-    blocks = grow(blocks, reach // _COARSE)
+    blocks = grow(blocks, _REACH // _COARSE)
     far = blocks.repeat_interleave(_COARSE, -1).repeat_interleave(_COARSE, -2)
     near = far[:, : own.shape[1], : own.shape[2]] & ~grow(own, _GAP)
     for first, second in body.neighbours:

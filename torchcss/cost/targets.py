@@ -34,6 +34,10 @@ _CORNERS = ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 
 """A regular tetrahedron: seen from its middle, errors of orientation about all axes count alike."""
 
 
+ARM = 0.25
+"""Distance of a pose's points from the link's origin, metres: a radian counts as much as this."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class PointTargets(BlendedCost):
     """Squared distances of points from where they should be; a `CostFunction`.
@@ -189,14 +193,13 @@ def pose_targets(
     *,
     columns: Int[Tensor, " m"] | None = None,
     held: Float[Tensor, " n"] | None = None,
-    arm: float = 0.25,
     sigma: float = 0.1,
 ) -> PointTargets:
     """The cost of a link that should have a given pose.
 
     Four points at the corners of a regular tetrahedron about the link's origin, in the mean:
 
-        f(x) = 1/2 (|t - t'|^2 + 2/3 arm^2 (1 - cos angle) 2) / sigma^2
+        f(x) = 1/2 (|t - t'|^2 + 2/3 ARM^2 (1 - cos angle) 2) / sigma^2
 
     with t the origin, and the angle that of the rotation between the orientations.
 
@@ -206,7 +209,6 @@ def pose_targets(
         pose: Its frame in the world, or the place of its origin alone, metres.
         columns: The parameters to search; all of them by default.
         held: Values of the others; the rest pose by default.
-        arm: Distance of the points from the origin, metres: a radian counts as much as this.
         sigma: Scale of the errors, metres.
 
     Raises:
@@ -215,7 +217,7 @@ def pose_targets(
     """
     if pose.shape not in ((4, 4), (3,)):
         raise ShapeError(f"pose: expected a frame [4, 4] or a place [3], got {list(pose.shape)}")
-    corners = arm / 3**0.5 * body.tie.new_tensor(_CORNERS if pose.dim() == 2 else [[0.0] * 3])
+    corners = ARM / 3**0.5 * body.tie.new_tensor(_CORNERS if pose.dim() == 2 else [[0.0] * 3])
     pose = pose.to(body.tie)
     target = corners @ pose[:3, :3].T + pose[:3, 3] if pose.dim() == 2 else pose[None]
     num = len(corners)

@@ -48,7 +48,6 @@ def fit_shape(
     outlines: tuple[Outline, ...],
     *,
     bounds: Bounds | None = None,
-    max_steps: int = 25,
 ) -> tuple[ShapeFit, ShapeFit]:
     """Run the second stage from all poses, and the third from the cheapest.
 
@@ -58,13 +57,12 @@ def fit_shape(
         parameters: Which shape numbers are free.
         outlines: What of the working image the outline is compared with.
         bounds: Limits of the state; by default the body's.
-        max_steps: Iterations of each stage.
 
     Returns:
         The fits after the second and after the third stage.
     """
     cost = ShapedCost(base=base, parameters=parameters, outlines=outlines)
-    optimiser = TrustRegionNewton(max_steps=max_steps, tolerance=1e-2)
+    optimiser = TrustRegionNewton(max_steps=25, tolerance=1e-2)
     n = states.shape[-1]
     y = torch.cat([states, states.new_zeros(len(states), len(parameters.names))], dim=-1)
     volume = [name.endswith(CROSS_SECTIONS) for name in parameters.names]

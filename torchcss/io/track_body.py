@@ -24,30 +24,31 @@ PARAMETER_NUMBERS = ("lower", "upper", "sticky_mean", "sticky_deviation", "motio
 
 
 def body_to_plain(body: BodyModel) -> dict[str, Any]:
-    """What JSON holds of a body: its specification, what has changed since, and its mesh."""
+    """What JSON holds of a body: its specification, and what has changed since."""
     shapes = body.part_shape.double().tolist()
     parts = tuple(
         replace(part, shape=tuple(shape))
         for part, shape in zip(body.specification.parts, shapes, strict=True)
     )
-    rings, meridians = body.eta.shape
     built_of = replace(body.specification, parts=parts, neighbours=body.neighbours)
     numbers = {name: getattr(body, name).double().tolist() for name in PARAMETER_NUMBERS}
-    return {**asdict(built_of), "parameters": numbers, "rings": rings, "meridians": meridians}
+    return {**asdict(built_of), "parameters": numbers}
 
 
 def body_from_plain(plain: Mapping[str, Any]) -> BodyModel:
     """The body again, on the world's origin.
 
     Args:
-        plain: From `body_to_plain`; files of earlier versions have no `parameters`.
+        plain: From `body_to_plain`; files of earlier versions have no `parameters`,
+            and the size of a mesh.
 
     Raises:
         KeyError, TypeError, ValueError: If it is not such a body.
     """
     entries = dict(plain)
     numbers = entries.pop("parameters", {})
-    mesh = {name: int(entries.pop(name)) for name in ("rings", "meridians")}
+    for name in ("rings", "meridians"):
+        entries.pop(name, None)
     kinds = {"joints": JointSpecification, "parts": PartSpecification,
              "markers": MarkerSpecification}  # fmt: skip
     rows = {
@@ -55,7 +56,7 @@ def body_from_plain(plain: Mapping[str, Any]) -> BodyModel:
         for name, kind in kinds.items()
     }
     described: dict[str, Any] = {**_with_tuples(entries), **rows}
-    body = BodyModel(BodySpecification(**described), **mesh)
+    body = BodyModel(BodySpecification(**described))
     set_numbers(body, {key: torch.tensor(row, dtype=torch.float64) for key, row in numbers.items()})
     return body
 

@@ -107,6 +107,9 @@ class _NearPlane:
 _NEIGHBOURS = 3
 """How many lower minima each is tried against."""
 
+_STEPS = 200
+"""Steps of a descent from a sample, which nearly all converge in."""
+
 _CHECKS = 5
 """Interior points at which the cost along a straight segment is evaluated."""
 
@@ -183,8 +186,6 @@ def joined_minima(
     covariance: Float[Tensor, "m n n"],
     value: Float[Tensor, " m"],
     bounds: Bounds,
-    *,
-    rise: float = 0.1,
 ) -> Items:
     """Find out which minima are one valley: joined by paths along which the cost hardly rises.
 
@@ -196,7 +197,6 @@ def joined_minima(
         covariance: Their covariances.
         value: Their costs, nats.
         bounds: Box limits.
-        rise: Nats above the higher of two minima that a path between them may reach.
 
     Returns:
         For each minimum, the index of the lowest minimum of its valley; as many valleys as there
@@ -212,7 +212,7 @@ def joined_minima(
     near, lower = distance.topk(min(_NEIGHBOURS, num - 1), largest=False)
     higher = torch.arange(num, device=mean.device)[:, None].expand_as(lower)
     pairs = near.isfinite()
-    low = low_path(cost, mean[higher[pairs]], mean[lower[pairs]], bounds, rise=rise)
+    low = low_path(cost, mean[higher[pairs]], mean[lower[pairs]], bounds)
     for child, parent in zip(higher[pairs][low].tolist(), lower[pairs][low].tolist(), strict=True):
         one, other = int(label[child]), int(label[parent])
         best, worse = (one, other) if rank[one] <= rank[other] else (other, one)
@@ -263,7 +263,6 @@ def find_minima(
     proposal: Proposal,
     num_samples: int,
     generator: torch.Generator,
-    optimiser: TrustRegionNewton | None = None,
     distance: float = 1.0,
 ) -> FoundMinima:
     """Sample around a mode, descend from every sample, and count: a run of Table 1 [IJRR].
@@ -275,13 +274,12 @@ def find_minima(
         proposal: Where samples go.
         num_samples: How many.
         generator: Source of the samples.
-        optimiser: How they descend; by default with 200 steps, which nearly all converge in.
         distance: See `other_minima`.
     """
     mixture = GaussianMixture(
         start.mean[None], start.covariance[None], torch.zeros_like(start.cost)[None]
     )
     raw = proposal.sample(mixture, num_samples, bounds, generator=generator).x
-    modes = (optimiser or TrustRegionNewton(max_steps=200)).minimise(cost, raw, bounds)
+    modes = TrustRegionNewton(max_steps=_STEPS).minimise(cost, raw, bounds)
     tests = is_minimum(modes, cost, bounds)
     return FoundMinima(raw, modes, tests, other_minima(modes, tests, start, distance=distance))

@@ -7,9 +7,11 @@ import math
 import pytest
 import torch
 
-from torchcss.errors import ConfigurationError, ShapeError
+from torchcss.errors import ShapeError
 from torchcss.studies.render.clutter import clutter_background
 from torchcss.studies.render.renderer import (
+    READ,
+    SHOT,
     Lighting,
     Mesh,
     add_sensor_noise,
@@ -423,8 +425,6 @@ def test_texture_has_the_contrast_that_was_asked_for(generator):
     assert factor.shape == (20000, 1)
     assert abs(factor.mean() - 1) < 0.02
     assert abs(factor.std() - 0.1) < 0.01
-    with pytest.raises(ConfigurationError, match="wavelengths"):
-        random_texture(generator=generator, shortest=0.2, longest=0.1)
 
 
 @pytest.mark.parametrize(("height", "width"), [(60, 80), (61, 33), (8, 8)])
@@ -454,13 +454,9 @@ def test_value_noise_is_smooth_and_of_unit_size(generator):
 
 def test_sensor_noise_has_the_stated_variance(generator):
     grey = torch.full((200, 200, 3), 100, dtype=torch.uint8)
-    noisy = add_sensor_noise(grey, generator=generator, read=2.0, shot=0.05)
+    noisy = add_sensor_noise(grey, generator=generator)
     error = noisy.double() - 100
-    variance = 4 + 0.05 * 100 + 1 / 12  # rounding adds a twelfth
+    variance = READ**2 + SHOT * 100 + 1 / 12  # rounding adds a twelfth
     count = error.numel()
     assert error.mean().abs() < 4 * math.sqrt(variance / count)
     assert abs(error.var() - variance) < 4 * variance * math.sqrt(2 / count)
-    same = add_sensor_noise(grey, generator=generator, read=0.0, shot=0.0)
-    assert torch.equal(same, grey)
-    with pytest.raises(ConfigurationError, match="read"):
-        add_sensor_noise(grey, generator=generator, read=-1.0)

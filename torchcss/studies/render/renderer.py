@@ -26,9 +26,12 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from torchcss.errors import ConfigurationError, check_shape
+from torchcss.errors import check_shape
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import interpolate, join_faces, rasterise
+
+READ, SHOT = 1.5, 0.02
+"""Noise of the sensor: deviation in the dark, grey levels, and variance per level of signal."""
 
 _GAMMA = 2.2
 """Exponent between display values and light."""
@@ -193,15 +196,7 @@ def random_texture(
         contrast: Standard deviation of the factor on the colour, which is about 1.
         shortest: Shortest wavelength, metres.
         longest: Longest wavelength, metres.
-
-    Raises:
-        ConfigurationError: If the wavelengths are not positive and ordered.
     """
-    if not 0 < shortest <= longest:
-        raise ConfigurationError(
-            f"random_texture: expected 0 < shortest <= longest, got {shortest} and {longest}; "
-            "wavelengths are in metres"
-        )
     waves = random_waves(7, shortest, longest, generator=generator)
     # A sine of amplitude a has the variance a^2 / 2.
     amplitudes = torch.full_like(waves.phases, contrast * (2 / len(waves.phases)) ** 0.5)
@@ -329,24 +324,13 @@ def to_bytes(image: Float[Tensor, "h w 3"]) -> Picture:
     return image.round().clamp(0, 255).to(torch.uint8)
 
 
-def add_sensor_noise(
-    image: Picture, *, generator: torch.Generator, read: float = 1.5, shot: float = 0.02
-) -> Picture:
-    """Add the noise of a sensor: Gaussian, with the variance `read^2 + shot * grey level`.
+def add_sensor_noise(image: Picture, *, generator: torch.Generator) -> Picture:
+    """Add the noise of a sensor: Gaussian, with the variance `READ^2 + SHOT * grey level`.
 
     Args:
         image: The clean picture.
         generator: Source of randomness.
-        read: Standard deviation in the dark, grey levels.
-        shot: Variance per grey level of signal.
-
-    Raises:
-        ConfigurationError: If a strength is negative.
     """
-    if read < 0 or shot < 0:
-        raise ConfigurationError(
-            f"sensor noise: expected read >= 0 and shot >= 0, got {read} and {shot}"
-        )
     clean = image.float()
     noise = torch.randn(clean.shape, generator=generator)
-    return to_bytes(clean + noise * (read**2 + shot * clean).sqrt())
+    return to_bytes(clean + noise * (READ**2 + SHOT * clean).sqrt())
