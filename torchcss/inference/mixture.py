@@ -258,8 +258,8 @@ def distinct_modes(
     while len(order) and len(kept) != most:
         best, order = order[0], order[1:]
         kept.append(best)
-        whitened = (mean[order] - mean[best]) @ whitener(with_least_width(covariance[best])).mT
-        order = order[whitened.square().sum(-1) > distance**2]
+        apart = squared_mahalanobis(mean[order] - mean[best], with_least_width(covariance[best]))
+        order = order[apart > distance**2]
     return torch.stack(kept) if kept else order[:0]
 
 
