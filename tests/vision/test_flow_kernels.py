@@ -56,9 +56,8 @@ def test_conjugate_gradients(size, monkeypatch, generator):
         0.1 * random(2, *size) - 0.05, 0.04 * random(1, *size) - 0.02, torch.ones(2, 1, *size)
     )
     right, down = 30 * random(1, height, width - 1), 30 * random(1, height - 1, width)
-    got, expected = both(
-        monkeypatch, lambda: flow._solve(start, constancy, weight, right, down, 20)
-    )
+    energy = flow._Quadratic.of(constancy, weight, right, down)
+    got, expected = both(monkeypatch, lambda: flow._solve(start, energy, 20))
     torch.testing.assert_close(got, expected, rtol=0, atol=1e-5)
 
 
@@ -66,7 +65,8 @@ def test_nothing_to_go_by_is_no_motion(generator):
     """No links, no gradient: the flow stays where it is."""
     start, zero = torch.rand(1, 2, 4, 5, generator=generator), torch.zeros(1, 1, 4, 5)
     constancy = flow._Constancy(torch.zeros(1, 2, 4, 5), zero, zero)
-    got = flow._solve(start, constancy, zero, zero[..., 1:], zero[..., 1:, :], 20)
+    energy = flow._Quadratic.of(constancy, zero, zero[..., 1:], zero[..., 1:, :])
+    got = flow._solve(start, energy, 20)
     assert torch.equal(got, start)
 
 
@@ -83,3 +83,16 @@ def test_linearised_brightness(size, monkeypatch, generator):
     torch.testing.assert_close(got.gradient, expected.gradient, rtol=0, atol=2e-5)
     expected_residual = flow._residual(expected, moves)
     torch.testing.assert_close(flow._residual(got, moves), expected_residual, rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_weights(size, monkeypatch, generator):
+    """Also where neighbours have nothing in common, and where a pixel is seen once only."""
+    moves = 10 * torch.randn(2, 2, *size, generator=generator)
+    gradient = 0.1 * torch.randn(2, 2, *size, generator=generator)
+    offset, seen = torch.rand(2, 2, 1, *size, generator=generator)
+    constancy = flow._Constancy(gradient, offset, (seen > 0.3).float())
+    choice = flow.TRACKING_FLOW.data, flow.TRACKING_FLOW.smoothness
+    got, expected = both(monkeypatch, lambda: flow._weighed(moves, constancy, *choice))
+    for own, other in zip(got, expected, strict=True):
+        torch.testing.assert_close(own, other, rtol=1e-4, atol=1e-5)

@@ -305,15 +305,9 @@ def _refine(flow: Field, frames: Field, guide: Plane, configuration: FlowConfigu
         factor = factors[warp * len(factors) // configuration.num_warps]
         data = _of_scale(configuration.data, factor * configuration.data.sigma)
         smoothness = _of_scale(configuration.smoothness, factor * configuration.smoothness.sigma)
-        weakest = _WEAKEST_LINK * smoothness.nu / smoothness.sigma**2
         constancy = _linearise(flow, first, second)
         for _ in range(configuration.num_reweightings):
-            weight = data(_residual(constancy, flow).square()).first * constancy.visible
-            right, down = (
-                smoothness(squared).first.clamp(min=weakest)
-                for squared in _squared_differences(flow)
-            )
-            flow = _solve(flow, constancy, weight, right, down, _NUM_ITERATIONS)
+            flow = _solve(flow, _weighed(flow, constancy, data, smoothness), _NUM_ITERATIONS)
         unfiltered = flow
         flow = _median(flow, _MEDIAN_RADIUS)
         if configuration.weighted_median_radius and warp + 1 == configuration.num_warps:
@@ -410,29 +404,77 @@ def _largest_of_neighbours(right: Right, down: Down) -> Plane:
     return torch.maximum(horizontal, torch.maximum(vertical[..., 1:, :], vertical[..., :-1, :]))
 
 
-def _solve(
-    flow: Field, constancy: _Constancy, weight: Plane, right: Right, down: Down, num_iterations: int
-) -> Field:
-    """Improve the flow on the quadratic energy that fixed weights leave.
+class _Quadratic(NamedTuple):
+    """The quadratic energy that fixed weights leave: its normal equations (q q^T + L) f = target.
 
-    The normal equations are (q q^T + L) f = -q sqrt(weight) offset with q = sqrt(weight) gradient
-    and L the Laplacian of the weighted grid. Each pixel's block is degree I + q q^T, whose
-    determinant is degree (degree + |q|^2); it is never formed as a difference, so float32 will do.
+    Attributes:
+        q: Gradient of the brightness times the root of its weight.
+        target: -q times offset and root.
+        right: Weights on the links between columns, of which L is the Laplacian; zero at both ends.
+        down: The same between rows.
     """
-    root = weight.sqrt()
-    q = root * constancy.gradient
+
+    q: Field
+    target: Field
+    right: Float[Tensor, "b 1 h w+1"]
+    down: Float[Tensor, "b 1 h+1 w"]
+
+    @staticmethod
+    def of(constancy: _Constancy, weight: Plane, right: Right, down: Down) -> _Quadratic:
+        """The energy of some weights of pixels and links."""
+        root = weight.sqrt()
+        q = root * constancy.gradient
+        links = functional.pad(right, (1, 1)), functional.pad(down, (0, 0, 1, 1))
+        return _Quadratic(q, -q * (root * constancy.offset), *links)
+
+
+def _weighed(
+    flow: Field, constancy: _Constancy, data: FlowPotential, smoothness: FlowPotential
+) -> _Quadratic:
+    """The energy with the robust weights that pixels and links have under a flow."""
+    weakest = _WEAKEST_LINK * smoothness.nu / smoothness.sigma**2
+    known = isinstance(data, Lorentzian) and isinstance(smoothness, Lorentzian)
+    if known and has_flow_kernels(flow):
+        from torchcss.vision import flow_kernels
+
+        batch, _, height, width = flow.shape
+        found = _Quadratic(
+            torch.empty_like(constancy.gradient),
+            torch.empty_like(constancy.gradient),
+            flow.new_empty(batch, 1, height, width + 1),
+            flow.new_empty(batch, 1, height + 1, width),
+        )
+        choice = [(p.nu, p.sigma**2, least) for p, least in ((data, 0.0), (smoothness, weakest))]
+        for x, to, (rest,), (seen,), q, target, (right,), (down,) in zip(
+            flow, *constancy, *found, strict=True
+        ):
+            run(flow_kernels.weigh, x, to, rest, seen, *choice, q, target, right, down)
+        return found
+    weight = data(_residual(constancy, flow).square()).first * constancy.visible
+    right, down = (
+        smoothness(squared).first.clamp(min=weakest) for squared in _squared_differences(flow)
+    )
+    return _Quadratic.of(constancy, weight, right, down)
+
+
+def _solve(flow: Field, energy: _Quadratic, num_iterations: int) -> Field:
+    """Improve the flow on a quadratic energy.
+
+    Each pixel's block is degree I + q q^T, whose determinant is degree (degree + |q|^2); it is
+    never formed as a difference, so float32 will do.
+    """
     if has_flow_kernels(flow):
         from torchcss.vision import flow_kernels
 
-        flow, target = flow.clone(), -q * (root * constancy.offset)
-        links = functional.pad(right, (1, 1)), functional.pad(down, (0, 0, 1, 1))
+        flow = flow.clone()
         memory = flow_kernels.make_flow_memory(*flow.shape[-2:])
-        for x, a, b, (across,), (along,) in zip(flow, q, target, *links, strict=True):
-            run(flow_kernels.solve_flow, x, a, b, across, along, num_iterations, memory)
+        for x, q, target, (right,), (down,) in zip(flow, *energy, strict=True):
+            run(flow_kernels.solve_flow, x, q, target, right, down, num_iterations, memory)
         return flow
-    system = _NormalEquations.of(q, _degree(weight, right, down), right, down)
+    q, right, down = energy.q, energy.right[..., 1:-1], energy.down[..., 1:-1, :]
+    system = _NormalEquations.of(q, _degree(energy), right, down)
     flow = flow.clone()
-    residual = -q * (root * constancy.offset) - system.apply(flow)
+    residual = energy.target - system.apply(flow)
     direction = system.precondition(residual)
     reduction = _dot(residual, direction)
     for _ in range(num_iterations):
@@ -503,14 +545,10 @@ def _ratio(numerator: Tensor, denominator: Tensor) -> Tensor:
     return torch.where(positive, numerator / denominator.where(positive, 1.0), 0.0)
 
 
-def _degree(like: Plane, right: Right, down: Down) -> Plane:
+def _degree(energy: _Quadratic) -> Plane:
     """Sum of the weights on the four links of each pixel."""
-    degree = torch.zeros_like(like)
-    degree[..., :-1] += right
-    degree[..., 1:] += right
-    degree[..., :-1, :] += down
-    degree[..., 1:, :] += down
-    return degree
+    right, down = energy.right, energy.down
+    return right[..., :-1] + right[..., 1:] + down[..., :-1, :] + down[..., 1:, :]
 
 
 def _median(images: Images, radius: int) -> Images:

@@ -96,6 +96,53 @@ def linearise(flow, first, second, least, gradient, offset, visible):  # type: i
             offset[row, c] = level - first[0, row, c] - along
 
 
+@entry
+def weigh(flow, gradient, offset, visible, data, smoothness, q, target, right, down):  # type: ignore[no-untyped-def]
+    """The quadratic energy about a flow under Lorentzian potentials; see `torchcss.vision.flow`.
+
+    Args:
+        flow: `[2 h w]`, single precision.
+        gradient: Of the linearised brightness, `[2 h w]`.
+        offset: Of the same, `[h w]`.
+        visible: 1 where the pixel is in both frames, else 0, `[h w]`.
+        data: nu and the square of sigma of the data term, and the least weight, zero.
+        smoothness: The same of links.
+        q: Becomes the gradient times the root of its weight, `[2 h w]`.
+        target: Becomes the right-hand side, `[2 h w]`.
+        right: Becomes the weights of the links between columns, `[h w+1]`, zero at both ends.
+        down: The same between rows, `[h+1 w]`.
+    """
+    height, width = offset.shape
+    for row in range(height):
+        u, v, seen, rest = flow[0, row], flow[1, row], visible[row], offset[row]
+        to_u, to_v, q_u, q_v = gradient[0, row], gradient[1, row], q[0, row], q[1, row]
+        target_u, target_v = target[0, row], target[1, row]
+        for c in range(width):
+            residual = rest[c] + (to_u[c] * u[c] + to_v[c] * v[c])
+            root = sqrt(_weight(residual * residual, data) * seen[c])
+            q_u[c], q_v[c] = root * to_u[c], root * to_v[c]
+            target_u[c], target_v[c] = -q_u[c] * (root * rest[c]), -q_v[c] * (root * rest[c])
+        right[row, 0] = right[row, width] = 0.0
+        _weigh_links(u[1:], v[1:], u[: width - 1], v[: width - 1], smoothness, right[row, 1:width])
+        if row > 0:
+            _weigh_links(u, v, flow[0, row - 1], flow[1, row - 1], smoothness, down[row])
+    down[0, :] = down[height, :] = 0.0
+
+
+@inlined
+def _weight(squared, potential):  # type: ignore[no-untyped-def]
+    """Derivative of a Lorentzian potential, no less than the least weight."""
+    nu, variance, least = potential
+    return max(nu * (1.0 / (squared + variance)), least)
+
+
+@inlined
+def _weigh_links(u, v, other_u, other_v, potential, weight):  # type: ignore[no-untyped-def]
+    for c in range(len(weight)):
+        d_u, d_v = u[c] - other_u[c], v[c] - other_v[c]
+        weight[c] = _weight(d_u * d_u + d_v * d_v, potential)
+
+
 @kernel
 def _apply(x, q, degree, right, down, product):  # type: ignore[no-untyped-def]
     """Matrix times vector, inside a border of zeros; returns their inner product."""
