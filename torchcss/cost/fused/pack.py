@@ -378,21 +378,26 @@ def pack_limbs(body: BodyModel, density: BodyDensity, scale: float, camera: Came
     """The prior on poses, its directions in the camera's frame."""
     which = density.which
     row, place = carried_markers(body, which.joint)
-    above = array(body.tree.ancestors[:, body.marker_link[which.joint]])
+    above = array(body.tree.ancestors[:, body.marker_link[which.joint]], bool)
     parts = [density.densities[group.name] for group in which.groups]
     number, size = (max(part.mean.shape[axis] for part in parts) for axis in (0, 1))
-    mean, height = (np.zeros((len(parts), number, *more)) for more in ((size,), ()))
-    precision = np.zeros((len(parts), number, size, size))
+    mean, precision = (np.zeros((len(parts), *shape, number)) for shape in ((size,), (size, size)))
+    height = np.zeros((len(parts), number))
     for g, part in enumerate(parts):
         k, d = part.mean.shape
-        mean[g, :k, :d], height[g, :k] = array(part.mean), array(part.height)
-        precision[g, :k, :d, :d] = array(part.precision)
+        mean[g, :d, :k], height[g, :k] = array(part.mean.T), array(part.height)
+        precision[g, :d, :d, :k] = array(part.precision.movedim(0, -1))
+    difference = array(which.difference)
+    # Those that it is made from come first, in their order.
+    end = np.argsort(difference == 0, axis=1, kind="stable")[:, : (difference != 0).sum(1).max()]
     return Limbs(
         scale=scale,
         row=row,
         place=place,
         above=above,
-        difference=array(which.difference),
+        end=end,
+        difference=np.take_along_axis(difference, end, 1),
+        moves=above @ (difference != 0).T,
         fixed=array(which.fixed) @ array(camera.R_camera_world).T,
         first=np.array([group.row.start for group in which.groups]),
         segments=np.array([len(group.known) for group in which.groups]),
@@ -417,14 +422,14 @@ def _bends(group: Group, which: Directions, above: Array) -> Array:
 
 def make_limb_scratch(tree: Tree, limbs: Limbs, num_parameters: int) -> LimbScratch:
     """Memory for the prior on poses of one state."""
-    joints, (segments, points) = len(tree.parent), limbs.difference.shape
-    number, size = limbs.mean.shape[1:]
+    joints, segments, points = len(tree.parent), len(limbs.end), len(limbs.row)
+    size, number = limbs.mean.shape[1:]
     shapes = dict(
         frames=(1 + joints, 3, 4), reference=(3,), twists=(joints, 6), point=(points, 3),
         velocity=(points, 3), unit=(segments, 3), length=(segments,), moved=(joints, segments, 3),
         axes=(2, 3, 3), normal=(2,), spin=(joints, 2, 3), turned=(3,), direction=(size,),
-        slope=(num_parameters, size), share=(number,), pulls=(number, size), pull=(size,),
-        bend=(size, size), bent=(size,),
+        slope=(size, num_parameters), share=(number,), offset=(size, number),
+        pulls=(size, number), pull=(size,), bend=(size, size), bent=(size, num_parameters),
     )  # fmt: skip
     return LimbScratch(
         **{name: np.zeros(shape) for name, shape in shapes.items()},

@@ -6,7 +6,7 @@ import math
 
 from torchcss.cost.fused.kinematics import find_twists, pose_tree
 from torchcss.cost.fused.records import Array, Limbs, LimbScratch, Result, Tree
-from torchcss.kernels.compiler import entry, kernel
+from torchcss.kernels.compiler import entry, inlined, kernel
 
 _SHORT = 1e-9
 _TRUNK = 2
@@ -55,12 +55,12 @@ def _find_units(limbs: Limbs, scratch: LimbScratch) -> None:
             scratch.point[p, i] = frame[i, 3]
             for k in range(3):
                 scratch.point[p, i] += frame[i, k] * place[k]
-    for m in range(len(limbs.difference)):
+    for m in range(len(limbs.end)):
         square = 0.0
         for i in range(3):
             apart = limbs.fixed[m, i]
-            for p in range(len(limbs.row)):
-                apart += limbs.difference[m, p] * scratch.point[p, i]
+            for e in range(limbs.end.shape[1]):
+                apart += limbs.difference[m, e] * scratch.point[limbs.end[m, e], i]
             scratch.unit[m, i] = apart
             square += apart * apart
         scratch.length[m] = max(math.sqrt(square), _SHORT)
@@ -94,19 +94,25 @@ def _move_units(joint: int, limbs: Limbs, scratch: LimbScratch) -> None:
     """How the directions of all segments move with a joint."""
     twist, moved = scratch.twists[joint], scratch.moved[joint]
     for p in range(len(limbs.row)):
-        _cross(twist[:3], scratch.point[p], scratch.velocity[p])
-        for i in range(3):
-            scratch.velocity[p, i] += twist[3 + i]
-            scratch.velocity[p, i] *= limbs.above[joint, p]
-    for m in range(len(limbs.difference)):
-        along = 0.0
-        for i in range(3):
-            moved[m, i] = 0.0
-            for p in range(len(limbs.row)):
-                moved[m, i] += limbs.difference[m, p] * scratch.velocity[p, i]
-            along += moved[m, i] * scratch.unit[m, i]
-        for i in range(3):
-            moved[m, i] = (moved[m, i] - along * scratch.unit[m, i]) / scratch.length[m]
+        point, velocity = scratch.point[p], scratch.velocity[p]
+        x, y, z = (point[0], point[1], point[2])
+        share = 1.0 if limbs.above[joint, p] else 0.0
+        velocity[0] = share * (twist[1] * z - twist[2] * y + twist[3])
+        velocity[1] = share * (twist[2] * x - twist[0] * z + twist[4])
+        velocity[2] = share * (twist[0] * y - twist[1] * x + twist[5])
+    for m in range(len(limbs.end)):
+        x = y = z = 0.0
+        if limbs.moves[joint, m]:
+            for e in range(limbs.end.shape[1]):
+                share, velocity = limbs.difference[m, e], scratch.velocity[limbs.end[m, e]]
+                x += share * velocity[0]
+                y += share * velocity[1]
+                z += share * velocity[2]
+            unit, shorter = scratch.unit[m], 1.0 / scratch.length[m]
+            along = x * unit[0] + y * unit[1] + z * unit[2]
+            x, y = (x - along * unit[0]) * shorter, (y - along * unit[1]) * shorter
+            z = (z - along * unit[2]) * shorter
+        moved[m, 0], moved[m, 1], moved[m, 2] = x, y, z
 
 
 @kernel
@@ -139,23 +145,32 @@ def _find_directions(group: int, limbs: Limbs, scratch: LimbScratch) -> None:
 @kernel
 def _density(group: int, limbs: Limbs, scratch: LimbScratch) -> float:
     """`-log p` of a group's directions, the shares of its Gaussians, and their pulls."""
-    size, most = 3 * limbs.segments[group], limbs.uniform[group]
-    for k in range(limbs.number[group]):
-        exponent, precision = limbs.height[group, k], limbs.precision[group, k]
-        for i in range(size):
-            pull = 0.0
-            for j in range(size):
-                pull += precision[i, j] * (scratch.direction[j] - limbs.mean[group, k, j])
-            scratch.pulls[k, i] = pull
-            exponent -= 0.5 * pull * (scratch.direction[i] - limbs.mean[group, k, i])
-        scratch.share[k] = exponent
-        most = max(most, exponent)
+    size, number, most = 3 * limbs.segments[group], limbs.number[group], limbs.uniform[group]
+    share = scratch.share
+    for k in range(number):
+        share[k] = limbs.height[group, k]
+    for i in range(size):
+        mean, offset = limbs.mean[group, i], scratch.offset[i]
+        for k in range(number):
+            offset[k] = scratch.direction[i] - mean[k]
+    for i in range(size):
+        pull, own = scratch.pulls[i], scratch.offset[i]
+        for k in range(number):
+            pull[k] = 0.0
+        for j in range(size):
+            precision, offset = limbs.precision[group, i, j], scratch.offset[j]
+            for k in range(number):
+                pull[k] += precision[k] * offset[k]
+        for k in range(number):
+            share[k] -= 0.5 * pull[k] * own[k]
+    for k in range(number):
+        most = max(most, share[k])
     total = math.exp(limbs.uniform[group] - most)
-    for k in range(limbs.number[group]):
-        scratch.share[k] = math.exp(scratch.share[k] - most)
-        total += scratch.share[k]
-    for k in range(limbs.number[group]):
-        scratch.share[k] /= total
+    for k in range(number):
+        share[k] = math.exp(share[k] - most)
+        total += share[k]
+    for k in range(number):
+        share[k] /= total
     return -(most + math.log(total))
 
 
@@ -178,32 +193,45 @@ def _find_slopes(group: int, tree: Tree, limbs: Limbs, scratch: LimbScratch) -> 
                 moved = 0.0
                 for i in range(3):
                     moved += (scratch.moved[joint, row, i] - scratch.turned[i]) * axes[k, i]
-                slope[column, 3 * s + k] += factor * limbs.side[group, k] * moved
+                slope[3 * s + k, column] += factor * limbs.side[group, k] * moved
 
 
 @kernel
 def _lift(group: int, limbs: Limbs, scratch: LimbScratch, gradient: Array, hessian: Array) -> None:
     """Add the derivatives of a group's density in the state."""
-    size, slope, bend = 3 * limbs.segments[group], scratch.slope, scratch.bend
+    size, number, slope = 3 * limbs.segments[group], limbs.number[group], scratch.slope
     for i in range(size):
-        scratch.pull[i] = 0.0
-        for j in range(size):
-            bend[i, j] = 0.0
-    for k in range(limbs.number[group]):
-        share = limbs.scale * scratch.share[k]
-        for i in range(size):
-            scratch.pull[i] += share * scratch.pulls[k, i]
-            for j in range(size):
-                bend[i, j] += share * limbs.precision[group, k, i, j]
-    for a in range(len(gradient)):
-        if not scratch.touched[a]:
-            continue
-        for i in range(size):
-            gradient[a] += slope[a, i] * scratch.pull[i]
-            scratch.bent[i] = 0.0
-            for j in range(size):
-                scratch.bent[i] += bend[i, j] * slope[a, j]
-        for c in range(len(gradient)):
-            if scratch.touched[c]:
-                for i in range(size):
-                    hessian[a, c] += scratch.bent[i] * slope[c, i]
+        scratch.pull[i] = limbs.scale * _dot(scratch.pulls[i], scratch.share, number)
+        for j in range(i + 1):
+            bend = limbs.scale * _dot(limbs.precision[group, i, j], scratch.share, number)
+            scratch.bend[i, j] = scratch.bend[j, i] = bend
+        for a in range(len(gradient)):
+            scratch.bent[i, a] = 0.0
+    for i in range(size):
+        bend, bent = scratch.bend[i], scratch.bent[i]
+        for j in range(0, size, 3):
+            _add(bend[j : j + 3], slope[j], slope[j + 1], slope[j + 2], bent)
+    for i in range(0, size, 3):
+        _add(scratch.pull[i : i + 3], slope[i], slope[i + 1], slope[i + 2], gradient)
+        one, two, three = scratch.bent[i], scratch.bent[i + 1], scratch.bent[i + 2]
+        for a in range(len(gradient)):
+            if scratch.touched[a]:
+                turn = scratch.turned
+                turn[0], turn[1], turn[2] = one[a], two[a], three[a]
+                _add(turn, slope[i], slope[i + 1], slope[i + 2], hessian[a])
+
+
+@inlined
+def _dot(a: Array, b: Array, size: int) -> float:
+    total = 0.0
+    for k in range(size):
+        total += a[k] * b[k]
+    return total
+
+
+@inlined
+def _add(share: Array, one: Array, two: Array, three: Array, total: Array) -> None:
+    """Add three rows, those of one segment, in their shares."""
+    first, second, third = share[0], share[1], share[2]
+    for a in range(len(total)):
+        total[a] += first * one[a] + second * two[a] + third * three[a]

@@ -213,8 +213,8 @@ Attributes:
 
 Limbs = namedtuple(
     "Limbs",
-    "scale row place above difference fixed first segments line side bends number mean "
-    "precision height uniform",
+    "scale row place above end difference moves fixed first segments line side bends number "
+    "mean precision height uniform",
 )
 """Directions of limbs and their density, by groups; see `torchcss.cost.pose_prior`.
 
@@ -222,8 +222,10 @@ Attributes:
     scale: Factor on the prior.
     row: Row of the frame that carries each end of a segment.
     place: Its place in that frame.
-    above: Which joints move it, `[joint point]`, zero or one.
-    difference: What takes the ends to segments.
+    above: Which joints move it, `[joint point]`.
+    end: The ends that each segment is made from, and
+    difference: their shares in it.
+    moves: Which joints move one of these, `[joint segment]`.
     fixed: Segments that no joint moves; zero for the others.
     first: First segment of each group.
     segments: Number of its segments.
@@ -231,8 +233,8 @@ Attributes:
     side: Factors on its axes: a right arm is mirrored.
     bends: Which joints move its directions, `[group joint]`.
     number: Number of its Gaussians.
-    mean: Their means, `[group k d]`.
-    precision: Their inverse covariances.
+    mean: Their means, `[group d k]`.
+    precision: Their inverse covariances, `[group d d k]`.
     height: Logarithms of their densities at their means.
     uniform: Logarithm of the uniform part of each group.
 """
@@ -241,7 +243,7 @@ Attributes:
 LimbScratch = namedtuple(
     "LimbScratch",
     "frames reference twists point velocity unit length moved axes normal spin turned "
-    "direction slope touched share pulls pull bend bent",
+    "direction slope touched share offset pulls pull bend bent",
 )
 """What is found of one state on the way to `Limbs`' density.
 
@@ -259,13 +261,14 @@ Attributes:
     spin: How they turn with each joint.
     turned: What a frame's turning adds.
     direction: Directions of one group in its frame.
-    slope: How they move with each parameter.
+    slope: How they move with each parameter, `[d n]`.
     touched: Whether they do.
     share: Shares of the Gaussians.
+    offset: Distances from their means, `[d k]`.
     pulls: Their pulls.
     pull: All of them together.
     bend: Mean precision.
-    bent: Its product with one slope.
+    bent: Its product with the slopes.
 """
 
 
