@@ -445,10 +445,9 @@ def _weighed(
             flow.new_empty(batch, 1, height + 1, width),
         )
         choice = [(p.nu, p.sigma**2, least) for p, least in ((data, 0.0), (smoothness, weakest))]
-        for x, to, (rest,), (seen,), q, target, (right,), (down,) in zip(
-            flow, *constancy, *found, strict=True
-        ):
-            run(flow_kernels.weigh, x, to, rest, seen, *choice, q, target, right, down)
+        for x, *parts in zip(flow, *constancy, *found, strict=True):
+            arrays = tuple(part.squeeze(0).numpy() for part in parts)
+            run(flow_kernels.weigh, x, arrays[:3], *choice, arrays[3:])
         return found
     weight = data(_residual(constancy, flow).square()).first * constancy.visible
     right, down = (

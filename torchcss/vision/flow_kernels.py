@@ -97,21 +97,18 @@ def linearise(flow, first, second, least, gradient, offset, visible):  # type: i
 
 
 @entry
-def weigh(flow, gradient, offset, visible, data, smoothness, q, target, right, down):  # type: ignore[no-untyped-def]
+def weigh(flow, constancy, data, smoothness, energy):  # type: ignore[no-untyped-def]
     """The quadratic energy about a flow under Lorentzian potentials; see `torchcss.vision.flow`.
 
     Args:
         flow: `[2 h w]`, single precision.
-        gradient: Of the linearised brightness, `[2 h w]`.
-        offset: Of the same, `[h w]`.
-        visible: 1 where the pixel is in both frames, else 0, `[h w]`.
+        constancy: What `linearise` has found.
         data: nu and the square of sigma of the data term, and the least weight, zero.
         smoothness: The same of links.
-        q: Becomes the gradient times the root of its weight, `[2 h w]`.
-        target: Becomes the right-hand side, `[2 h w]`.
-        right: Becomes the weights of the links between columns, `[h w+1]`, zero at both ends.
-        down: The same between rows, `[h+1 w]`.
+        energy: Becomes the `q`, `target`, `right` and `down` of `solve_flow`.
     """
+    gradient, offset, visible = constancy
+    q, target, right, down = energy
     height, width = offset.shape
     for row in range(height):
         u, v, seen, rest = flow[0, row], flow[1, row], visible[row], offset[row]
