@@ -123,7 +123,8 @@ def weigh(flow, constancy, data, smoothness, energy):  # type: ignore[no-untyped
         _weigh_links(u[1:], v[1:], u[: width - 1], v[: width - 1], smoothness, right[row, 1:width])
         if row > 0:
             _weigh_links(u, v, flow[0, row - 1], flow[1, row - 1], smoothness, down[row])
-    down[0, :] = down[height, :] = 0.0
+    for c in range(width):
+        down[0, c] = down[height, c] = 0.0
 
 
 @inlined
