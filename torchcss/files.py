@@ -340,7 +340,8 @@ def load_json(path: Path, error_class: type[TorchcssError]) -> Any:
         error_class: If the file is missing, empty, unreadable or not JSON.
     """
     data = read_bytes(path, error_class)
-    with refusing(error_class, f"{path}: not a JSON file"):
+    other = " nor of another format that is read" if path.suffix.lower() != ".json" else ""
+    with refusing(error_class, f"{path}: not a JSON file{other}"):
         return json.loads(data)
 
 

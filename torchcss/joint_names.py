@@ -191,7 +191,11 @@ def layout_of_names(names: tuple[str, ...]) -> tuple[str | None, ...]:
     """
     found: list[str | None] = []
     for name in names:
-        canonical = canonical_joint_name(name) or _numbered_side(name, names)
+        canonical = (
+            canonical_joint_name(name)
+            or _numbered_side(name, names)
+            or canonical_joint_name(re.sub(r"(?i)(.)[\W_]*(joint|jnt|keypoint|kpt)$", r"\1", name))
+        )
         found.append(None if canonical in found else canonical)
     if "l_knee" in found and not any(name and name.endswith("ankle") for name in found):
         # MMPose's names of Human3.6M end the leg in its foot, which is the ankle.

@@ -120,7 +120,7 @@ def test_the_advice_about_fractions_can_be_followed(
     points = np.load(files / "keypoints.npz")["keypoints"]
     spoil_keypoints(files, keypoints=points / (63, 47))
     assert track(files) == 2
-    assert "set normalised to zero-one or plus-minus-one" in capsys.readouterr().err
+    assert "say --normalised zero-one" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may write everywhere")

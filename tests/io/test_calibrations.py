@@ -107,6 +107,22 @@ def test_one_camera(tmp_path: Path, kind: str) -> None:
     check(tmp_path / name)
 
 
+def test_pixels_of_the_board_beside_the_camera(tmp_path: Path) -> None:
+    """OpenCV's program can write the board's corners, pairs in the cells of a matrix."""
+    corners = yaml_matrix("image_points", [1.0] * 12, 2).replace("cols: 6", "cols: 3")
+    text = FILES["OpenCV, a column"][1] + corners.replace("dt: d", 'dt: "2f"')
+    (tmp_path / "a.yml").write_text(text)
+    assert load_camera(tmp_path / "a.yml").camera.K[0, 0] == FX
+
+
+@pytest.mark.parametrize("turn", [[10, 5, 3], [90, 0, 45]])
+def test_degrees_are_refused(tmp_path: Path, turn: list[float]) -> None:
+    entry = {"K": K, "image_size_wh": SIZE, "rotation": turn, "t": [0, 0, 3]}
+    (tmp_path / "a.json").write_text(json.dumps({"units": "m", "cameras": {"a": entry}}))
+    with pytest.raises(CameraError, match="expected axis times angle in radians"):
+        load_camera(tmp_path / "a.json")
+
+
 @pytest.mark.parametrize("shape", [(5,), (1, 5), (5, 1)])
 def test_arrays_take_the_size_of_the_video(tmp_path: Path, shape: tuple[int, ...]) -> None:
     path = tmp_path / "calibration.npz"

@@ -173,7 +173,7 @@ def test_pose2sim(tmp_path: Path) -> None:
 
 
 @settings(max_examples=50, deadline=None)
-@given(st.lists(st.floats(-10, 10), min_size=3, max_size=3))
+@given(st.lists(st.floats(-3.6, 3.6), min_size=3, max_size=3))
 def test_rotation_vector_against_scipy(vector: list[float]) -> None:
     expected = Rotation.from_rotvec(vector).as_matrix()
     np.testing.assert_allclose(rotation_matrix(np.array(vector)), expected, atol=1e-12)

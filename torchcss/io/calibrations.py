@@ -561,8 +561,9 @@ class _Loader(yaml.SafeLoader):
 def _matrix(loader: yaml.SafeLoader, node: yaml.Node) -> list[Any]:
     """A matrix as nested lists."""
     values = loader.construct_mapping(node, deep=True) if isinstance(node, yaml.MappingNode) else {}
-    matrix = _plain(values)
-    if matrix is values:
+    channels = re.sub("[^0-9]", "", str(values.get("dt"))) or "1"  # 2f: pairs, as of pixels
+    matrix = _plain({**values, "cols": int(channels) * values.get("cols", 0)})
+    if not isinstance(matrix, list):
         raise yaml.YAMLError(
             f"line {node.start_mark.line + 1}: an opencv-matrix of {values.get('rows')} rows and "
             f"{values.get('cols')} columns needs as many numbers as data"

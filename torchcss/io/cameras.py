@@ -327,9 +327,9 @@ def rotation_matrix(vector: np.ndarray, where: str = "rotation") -> np.ndarray:
     """
     if vector.shape != (3,) or not np.isfinite(vector).all():
         raise unexpected(CameraError, where, "a rotation vector of 3 numbers", vector.tolist())
-    if np.abs(vector).max() > 4 * np.pi:
+    if np.hypot.reduce(vector) > 2 * np.pi:
         raise CameraError(
-            f"{where}: a rotation vector of {shortened(vector.tolist())} turns more than twice "
-            "around; expected radians"
+            f"{where}: a rotation vector of {shortened(vector.tolist())} turns more than once "
+            "around; expected axis times angle in radians"
         )
     return from_axis_angle(vector)

@@ -857,3 +857,89 @@ def test_words_that_mean_something_else(tmp_path: Path) -> None:
     rows = [["clip.mp4", 1, 5, 5, 9, 9, *person(t).flat] for t in T]
     heads = ["file", "id", "x", "y", "w", "h", *ends("_x", "_y", "_c")]
     check(read(write(tmp_path / "a.csv", wide(heads, rows))))
+
+
+@pytest.mark.parametrize("label", ["{}.0", "{}.000e+00"])
+def test_frame_numbers_as_decimals(tmp_path: Path, label: str) -> None:
+    rows = [[label.format(t), *person(t).flat] for t in SEEN]
+    check(read(write(tmp_path / "a.csv", wide(["frame", *ends("_x", "_y", "_c")], rows))), (3,))
+
+
+def test_a_heading_behind_a_sign_and_columns_set_apart_by_spaces(tmp_path: Path) -> None:
+    """NumPy's savetxt."""
+    rows = np.array([[t, *person(t).flat] for t in T])
+    heads = ["frame", *ends("_x", "_y", "_c")]
+    for delimiter in (",", " "):
+        path = tmp_path / "a.txt"
+        np.savetxt(path, rows, delimiter=delimiter, header="by me\n" + delimiter.join(heads))
+        check(read(path))
+
+
+@pytest.mark.parametrize("merged", [False, True])
+def test_joints_above_x_and_y(tmp_path: Path, merged: bool) -> None:
+    """Two rows of headings, as pandas and spreadsheets write them."""
+    above = [cell for name in TFJS for cell in (name, *([""] * 2 if merged else [name] * 2))]
+    rows = [["", *["x", "y", "score"] * 17], *([] if merged else [["frame"]])]
+    rows += [[t, *person(t).flat] for t in SEEN]
+    check(read(write(tmp_path / "a.csv", wide(["frame" if merged else "", *above], rows))), (3,))
+
+
+def test_joints_by_number_of_which_some_are_left_out(tmp_path: Path) -> None:
+    order = np.random.default_rng(0).permutation([i for i in range(17) if i not in (1, 4)])
+    rows = [{"frame": t, "keypoints": [{"id": int(i), "x": x, "y": y, "score": c} for i in order
+             for x, y, c in [person(t)[i]]]} for t in T]  # fmt: skip
+    check(read(write(tmp_path / "a.json", rows)))
+    heads = [f"{kind}{i}" for i in order for kind in "xyc"]
+    table = wide(["frame", *heads], [[t, *person(t)[order].flat] for t in T])
+    check(read(write(tmp_path / "a.csv", table)))
+    few = ["frame", *(f"{kind}{i}" for i in range(3, 20) for kind in "xyc")]
+    table = wide(few, [[t, *person(t).flat] for t in T])
+    with pytest.raises(KeypointError, match="17 joints numbered from 3 to 19: which they are"):
+        read(write(tmp_path / "a.csv", table))
+
+
+def test_people_with_boxes_and_how_long_it_took(tmp_path: Path) -> None:
+    """Roboflow's: names are classes, and `time` is no frame's."""
+    frames = [
+        {"predictions": [{"x": 3, "y": 4, "width": 9, "height": 9, "class": "person", "keypoints": [
+            {"x": x, "y": y, "confidence": c, "class_id": i, "class": TFJS[i]}
+            for i, (x, y, c) in enumerate(person(t)) if i != 3]}],
+         "image": {"width": 640, "height": 480}, "time": 0.03 - 0.01 * (t % 2) + 1e-4 * t}
+        for t in T
+    ]  # fmt: skip
+    check(read(write(tmp_path / "a.json", frames)))
+
+
+@pytest.mark.parametrize("key", ["keypoints", "pred_keypoints", "poseLandmarks"])
+def test_words_in_any_case(tmp_path: Path, key: str) -> None:
+    rows = [
+        {"frame": t, "poseWorldLandmarks": [[0, 0, 0]] * 17, key: person(t).tolist()} for t in T
+    ]
+    check(read(write(tmp_path / "a.json", rows)))
+
+
+def test_movenet_of_one_picture_after_the_other(tmp_path: Path) -> None:
+    values = [(person(t) / (*SIZE, 1))[None, :, [1, 0, 2]] for t in T]
+    np.save(tmp_path / "a.npy", values)
+    check(read(tmp_path / "a.npy"))
+
+
+def test_names_that_end_in_joint(tmp_path: Path) -> None:
+    rows = [[t, *person(t).flat] for t in T]
+    heads = ["frame", *(f"{name}_joint{end}" for name in TFJS for end in ("_x", "_y", "_c"))]
+    check(read(write(tmp_path / "a.csv", wide(heads, rows))))
+
+
+def test_y_that_counts_upwards_is_told(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", [person(t) * (1, -1, 1) + (0, 480, 0) for t in T])
+    assert any("y counts upwards" in line for line in read(tmp_path / "a.npy").report)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("a.mp4", "torchcss detect"), ("a.png", "init PICTURE --click"), ("a.trc", "in space"),
+     ("a.xlsx", "save it as CSV"), ("a.json.gz", "unpack"), ("a.yaml", "of another format")],
+)  # fmt: skip
+def test_files_of_other_kinds(tmp_path: Path, name: str, words: str) -> None:
+    with pytest.raises(KeypointError, match=words):
+        read(write(tmp_path / name, "a: 1"))

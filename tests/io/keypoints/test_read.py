@@ -305,7 +305,7 @@ def test_normalised_coordinates(tmp_path: Path, kind: str) -> None:
     if kind == "plus-minus-one":
         fractions = [fraction * (2, 2, 1) - (1, 1, 0) for fraction in fractions]
     path = write_npz(tmp_path / "a.npz", fractions)
-    with pytest.raises(KeypointError, match=r"expected pixels.*set normalised"):
+    with pytest.raises(KeypointError, match=r"expected pixels.*--normalised"):
         read(path)
     check(read(path, normalised=kind), frames, "COCO-17")
     if kind == "zero-one":

@@ -4,8 +4,8 @@ Ours is `keypoints [T J 2]`, `confidence [T J]`, `joint_names [J]`; of several p
 `[T P J]` and `person_ids [P]`; and `image_size_wh [2]` and `relative_noise []` (`People`), and
 `points [T P J 3]` (`read_points`). Read as well, as NPY or as the only array of an NPZ: pairs or
 triples `[T J 2]`, `[T J 3]` (x, y, confidence), in a row `[T 3 J]`, of several people `[T P J 3]`,
-of one picture `[J 3]`, and MoveNet's `[T 1 1 J 3]` (y, x, confidence, fractions). Confidences may
-be called `scores` and the like.
+of one picture `[J 3]`, and MoveNet's `[T 1 1 17 3]` or, in fractions, `[T 1 17 3]` (y, x,
+confidence). Confidences may be called `scores` and the like.
 """
 
 from __future__ import annotations
@@ -60,6 +60,9 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
     report = [f"format: {path.suffix[1:].upper()}"]
     values = _people(name, arrays[name])
     is_movenet = arrays[name].ndim == 5 or arrays[name].shape[-1] == 56
+    if arrays[name].shape[1:] == (1, 17, 3):  # of one picture after the other
+        with np.errstate(invalid="ignore"):
+            is_movenet = bool(((values >= 0) & (values <= 1)).all())
     if len(values) == 1 and values.shape[1] > _MOST_PEOPLE:
         values = values.swapaxes(0, 1)
         report.append(f"{name}: one person in {len(values)} frames, which are the second axis")

@@ -97,12 +97,18 @@ def _sides(joints: np.ndarray, names: Sequence[str]) -> list[str]:
 
 
 def _lying(joints: np.ndarray, names: Sequence[str]) -> list[str]:
-    """Whether shoulders and hips stand side by side, as where y comes before x."""
+    """Whether shoulders and hips stand side by side or upside down, as with other axes."""
     columns = _columns(names, "shoulder") + _columns(names, "hip")
     if len(columns) < 4:
         return []
     seen = joints[(joints[:, columns, 2] > _CONFIDENT).all(1)][:, columns, :2]
-    along = np.abs(seen[:, :2].mean(1) - seen[:, 2:].mean(1))
+    down = seen[:, 2:].mean(1) - seen[:, :2].mean(1)
+    along = np.abs(down)
+    if len(along) and ((along[:, 1] > along[:, 0]) & (down[:, 1] < 0)).mean() > 0.9:
+        return [
+            "the hips are above the shoulders: somebody stands on the hands, or y counts upwards "
+            "in the file, or it is of a turned video"
+        ]
     if not len(along) or (along[:, 0] > along[:, 1]).mean() < 0.9:
         return []
     return [

@@ -29,6 +29,7 @@ from torchcss.io.keypoints.json_people import (
     PEOPLE,
     heads,
     is_joints,
+    key_of,
     listed,
     people_of,
     said_size,
@@ -42,6 +43,7 @@ from torchcss.io.keypoints.people import (
     Person,
     Size,
     is_there,
+    joint_counts,
     number_array,
     united,
 )
@@ -127,7 +129,7 @@ def _people(name: str, frames: Frames, names: Names | None, *, in_order: bool = 
             people[:] = [p._replace(track=p.track or f"{n}") for n, p in enumerate(people)]
     frames, names = reordered(frames, names or ())
     found = list(frames.values()) if in_order else frames
-    if names is None and everyone and len(everyone[0].joints) == NUM_LANDMARKS:
+    if names is None and NUM_LANDMARKS in joint_counts(frames):
         return People(found, None, ["format: MediaPipe landmarks"], LAYOUT, corner_fractions=True)
     return People(found, names, [f"format: {name}"])
 
@@ -177,7 +179,7 @@ def _format_of(content: object) -> str:
 
 def _said_names(content: object, frames: Frames) -> Names | None:
     """As many names as joints that stand in the head, as a list or by number (MMPose's)."""
-    counts = {len(person.joints) for people in frames.values() for person in people}
+    counts = joint_counts(frames)
     for head in heads(content):
         names = first_of(head, ORDER_NAMES)
         if isinstance(names, dict) and all(str(i) in names for i in range(len(names))):
@@ -198,7 +200,7 @@ def _frames(path: Path, content: Any, num_frames: int | None) -> list[list[Perso
         )
         if inner is not None:
             return _frames(path, inner, num_frames)
-        inner = next((content[k] for k in (*PEOPLE, *JOINTS) if k in content), None)
+        inner = content.get(key_of(content, (*PEOPLE, *JOINTS)) or "")
         if isinstance(inner, list) and 1 < len(inner) == num_frames and not is_joints(inner):
             return _frames(path, inner, num_frames)
         if inner is not None or "shapes" in content:
@@ -215,6 +217,8 @@ def _frames(path: Path, content: Any, num_frames: int | None) -> list[list[Perso
     keys = [_key_of(f"{path}: detection {i}", entry) for i, entry in enumerate(content)]
     if len(set(keys)) == 1 < len(keys) == num_frames:  # such as the name of the video
         keys = [None] * len(keys)
+    if len(set(keys)) == len(keys) and _are_durations(keys):
+        keys = [None] * len(keys)
     if all(key is None for key in keys):
         one = num_frames == 1 or is_joints(content)
         if one or not content:
@@ -230,6 +234,12 @@ def _frames(path: Path, content: Any, num_frames: int | None) -> list[list[Perso
         found.setdefault(key, []).extend(people_of(f"{path}: {key!r}", entry, alone=True))
     time = time_word(content[0]) if all(isinstance(key, float) for key in found) else None
     return found if time is None else in_seconds(time, found)
+
+
+def _are_durations(keys: list[Key | None]) -> bool:
+    """Whether times are how long something took: those of frames rise from entry to entry."""
+    times = [key for key in keys if isinstance(key, float)]
+    return len(times) == len(keys) and times != sorted(times)
 
 
 def _key_of(where: str, entry: object) -> Key | None:

@@ -10,22 +10,38 @@ Call `people_of`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from torchcss.errors import KeypointError
 from torchcss.files import unexpected
-from torchcss.io.keypoints.people import LAYOUT_SIZES, Person, number_array, screened, track_of
-from torchcss.io.keypoints.words import CONFIDENCES, SCORES, SIDES, SIZES, first_of
+from torchcss.io.keypoints.people import (
+    LAYOUT_SIZES,
+    MOST_JOINTS,
+    Person,
+    number_array,
+    screened,
+    track_of,
+)
+from torchcss.io.keypoints.words import (
+    CONFIDENCES,
+    JOINT_WORDS,
+    SCORES,
+    SIDES,
+    SIZES,
+    first_of,
+    plain_word,
+)
 from torchcss.joint_names import names_in
 
 PEOPLE = names_in(
-    "people bodies instances instance_info predictions annots poses persons detections"
+    "people bodies instances instanceinfo predictions annots poses persons detections"
 )
 JOINTS = names_in(
-    "pose_keypoints_2d pose_keypoints keypoints pose_landmarks landmarks landmark joints pose kps"
+    "posekeypoints2d posekeypoints predkeypoints keypoints poselandmarks landmarks landmark joints "
+    "pose kps"
 )
 _HEADS = names_in("meta_info metadata meta info header video video_info image")
 
@@ -43,16 +59,13 @@ def people_of(where: str, value: Any, *, alone: bool = False) -> list[Person]:
     if isinstance(value, dict):
         if "shapes" in value:
             return _labelme(where, value["shapes"])
-        for key in PEOPLE:
-            if key in value:
-                if not isinstance(value[key], (list, dict, type(None))):
-                    raise KeypointError(f"{where}: expected a list {key!r}")
-                return people_of(f"{where}: {key}", value[key])
-        for key in JOINTS:
-            if key not in value:
-                continue
+        if (key := key_of(value, PEOPLE)) is not None:
+            if not isinstance(value[key], (list, dict, type(None))):
+                raise KeypointError(f"{where}: expected a list {key!r}")
+            return people_of(f"{where}: {key}", value[key])
+        if (key := key_of(value, JOINTS)) is not None:
             inner = value[key]
-            if isinstance(inner, dict) and inner.keys() & {*JOINTS}:
+            if isinstance(inner, dict) and key_of(inner, JOINTS) is not None:
                 return people_of(where, inner)
             if isinstance(inner, list) and inner and not is_joints(inner) and not _flat(inner):
                 return people_of(f"{where}: {key}", inner)
@@ -80,6 +93,12 @@ def people_of(where: str, value: Any, *, alone: bool = False) -> list[Person]:
     raise unexpected(KeypointError, where, "people with keypoints", value)
 
 
+def key_of(entry: Mapping[str, Any], words: Sequence[str]) -> str | None:
+    """The key that is the first of some words, such as `PEOPLE`, whatever stands under it."""
+    found = {plain_word(key): key for key in entry}
+    return next((found[word] for word in words if word in found), None)
+
+
 def _flat(value: list[Any]) -> bool:
     return isinstance(value[0], (int, float, str))
 
@@ -88,6 +107,9 @@ def is_joints(value: list[Any]) -> bool:
     """Whether a list is one person's joints: short rows of numbers, or objects with x and y."""
     first = next((each for each in value if each is not None), None)
     if isinstance(first, dict):
+        key = key_of(first, JOINTS)  # of a person, who may have a box with x and y
+        if key is not None and isinstance(first[key], (list, dict)):
+            return False
         return {"x", "y"} <= first.keys() or "position" in first
     return (
         isinstance(first, list) and 2 <= len(first) <= 4 and not isinstance(first[0], (list, dict))
@@ -118,11 +140,24 @@ def one_person(where: str, value: Any, around: Mapping[str, Any] | None = None) 
     else:
         rows = [_row(f"{where}: joint {index}", row) for index, row in enumerate(value)]
         joints = screened(np.array(rows)[:, :2], np.array(rows)[:, 2])
-        if names is None and isinstance(value[0], dict):
-            said = [row.get("name", row.get("part")) for row in value]
-            names = said if all(isinstance(name, str) for name in said) else None
+        if names is None:
+            names = _said_by_rows(value)
         joints = _with_scores(where, joints, scores)
     return [Person(joints, track_of(around), None if names is None else tuple(map(str, names)))]
+
+
+def _said_by_rows(rows: list[Any]) -> list[str] | None:
+    """The joints' names, or else their numbers, where every row has its own."""
+    if not all(isinstance(row, dict) for row in rows):
+        return None
+    texts, numbers = (
+        [first_of({k: v for k, v in row.items() if type(v) is kind}, JOINT_WORDS) for row in rows]
+        for kind in (str, int)
+    )
+    if None not in texts:
+        return texts
+    usual = None not in numbers and len({*numbers}) == len(rows) and max(numbers) < MOST_JOINTS
+    return [str(number) for number in numbers] if usual else None
 
 
 def listed(value: object) -> list[Any]:

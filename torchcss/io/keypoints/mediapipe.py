@@ -13,7 +13,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from torchcss.io.keypoints.people import Frames, Names, People, Person, screened
+from torchcss.errors import KeypointError
+from torchcss.io.keypoints.people import (
+    LAYOUT_SIZES,
+    Frames,
+    Names,
+    People,
+    Person,
+    screened,
+)
 from torchcss.joint_names import ALIASES, names_in
 
 LAYOUT = "MediaPipe-33"
@@ -37,9 +45,9 @@ def reordered(frames: Frames, names: Sequence[str]) -> tuple[Frames, Names | Non
         names: Names of their joints, or none; what comes in an order has none any more.
     """
     plain = [re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_") for name in names]
-    if plain and all(map(str.isdigit, plain)):
-        order = sorted(range(len(plain)), key=lambda index: int(plain[index]))
-    elif set(plain) == set(MEDIAPIPE_NAMES):
+    if plain and all(map(str.isdecimal, plain)):
+        return _by_number(frames, [int(number) for number in plain]), None
+    if set(plain) == set(MEDIAPIPE_NAMES):
         order = [plain.index(name) for name in MEDIAPIPE_NAMES]
     else:
         return frames, tuple(names) or None
@@ -47,6 +55,33 @@ def reordered(frames: Frames, names: Sequence[str]) -> tuple[Frames, Names | Non
         key: [person._replace(joints=person.joints[order]) for person in people]
         for key, people in frames.items()
     }, None
+
+
+def _by_number(frames: Frames, numbers: Sequence[int]) -> Frames:
+    """People whose joints are in the order of their numbers; joints that are left out are zero.
+
+    Raises:
+        KeypointError: If it is not clear whether 0 or 1 is the first, or one has no number.
+    """
+    low, high = min(numbers), max(numbers)
+    first = low
+    if (high - low + 1, low > 1) != (len(numbers), False):  # some are left out
+        firsts = [f for f in (0, 1) if f <= low and high - f + 1 in LAYOUT_SIZES]
+        if len(firsts) != 1:
+            raise KeypointError(
+                f"{len(numbers)} joints numbered from {low} to {high}: which they are is not "
+                "known; number all of them, or name them"
+            )
+        first = firsts[0]
+    place = [number - first for number in numbers]
+    found: Frames = {}
+    for key, people in frames.items():
+        found[key] = []
+        for person in people:
+            joints = np.zeros((high - first + 1, 3))
+            joints[place] = person.joints
+            found[key].append(person._replace(joints=joints))
+    return found
 
 
 def read_landmark_array(name: str, array: np.ndarray) -> People:

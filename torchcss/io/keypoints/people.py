@@ -22,6 +22,9 @@ Names = tuple[str, ...]
 LAYOUT_SIZES = frozenset(map(len, ALIASES.values()))
 """How many joints people have."""
 
+MOST_JOINTS = 150
+"""No layout has so many joints: a larger number is not a joint's."""
+
 Size = tuple[int, int]
 """Width and height of an image in pixels."""
 
@@ -101,6 +104,11 @@ def united(frames: Frames) -> tuple[Frames, Names | None]:
             joints[[place[name] for name in person.names]] = person.joints
             found[key].append(Person(joints, person.track))
     return found, names
+
+
+def joint_counts(frames: Frames) -> set[int]:
+    """How many joints people have."""
+    return {len(person.joints) for people in frames.values() for person in people}
 
 
 def number_array(value: object, where: str) -> np.ndarray:

@@ -64,7 +64,20 @@ from torchcss.types import Keypoints
 Scale = Literal["pixels", "zero-one", "plus-minus-one"]
 """What the coordinates of a file count: pixels, or fractions of the image from 0 or -1 to 1."""
 
-_PICKLES = (".pkl", ".pickle", ".pt", ".pth", ".joblib")
+_AS_CSV = "save it as CSV"
+_OTHERS = {
+    ".pkl .pickle .pt .pth .joblib": "a pickle, from which code may run: not read; save the arrays "
+    "with numpy.savez(FILE, keypoints=..., confidence=..., joint_names=...)",
+    ".mp4 .mov .avi .mkv .webm .m4v .mpg .mpeg .wmv .mts": "a video; torchcss detect VIDEO --out "
+    "keypoints.npz finds the keypoints in it",
+    ".jpg .jpeg .png .bmp .tif .tiff .webp": "a picture; torchcss init PICTURE --click marks its "
+    "joints",
+    ".trc .c3d .bvh .amc .mot .fbx .glb": "a motion in space; expected the pixels of joints",
+    ".xlsx .xls .ods .numbers": f"a spreadsheet; {_AS_CSV}",
+    ".parquet .feather .arrow .mat .tsv.gz": f"a table that is not read; {_AS_CSV}",
+    ".zip .gz .bz2 .xz .7z .tar .tgz .rar": "packed; unpack it",
+}
+"""Files of other kinds by their suffixes, and what to do."""
 
 OWN_NAMES = "own"
 """The layout of files whose names are those of the body."""
@@ -249,11 +262,9 @@ def _read(path: Path, image_size_wh: Size, num_frames: int | None) -> People:
         return read_hdf5(path)
     if suffix == ".xml":
         return read_cvat(path)
-    if suffix in _PICKLES:
-        raise KeypointError(
-            "a pickle, from which code may run: not read; save the arrays with "
-            "numpy.savez(FILE, keypoints=..., confidence=..., joint_names=...)"
-        )
+    for suffixes, what in _OTHERS.items():
+        if suffix in suffixes.split() and path.is_file():
+            raise KeypointError(what)
     return read_json(path, image_size_wh, num_frames)
 
 
@@ -393,8 +404,9 @@ def _from_border_pixels(
         if fractions:
             raise KeypointError(
                 f"expected pixels, but all coordinates lie between {points.min():.3g} and "
-                f"{points.max():.3g}: they seem to be fractions of the image; if so, "
-                "set normalised to zero-one or plus-minus-one"
+                f"{points.max():.3g}: they seem to be fractions of the image; if so, say "
+                "--normalised zero-one (or plus-minus-one); MoveNet's, which have y before x, are "
+                "arrays [frames 1 1 17 3]"
             )
         return 1.0, 0.0, []
     if not fractions:

@@ -21,6 +21,7 @@ import io
 import itertools
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,7 +32,7 @@ from torchcss.files import read_text, refusing, shortened, unexpected
 from torchcss.io.keypoints import words
 from torchcss.io.keypoints.frames import in_seconds
 from torchcss.io.keypoints.mediapipe import LAYOUT, NUM_LANDMARKS, reordered
-from torchcss.io.keypoints.people import Frames, Key, People, Person, screened
+from torchcss.io.keypoints.people import Frames, Key, People, Person, joint_counts, screened
 from torchcss.joint_names import CASE, names_in
 
 _PARTS = {
@@ -44,11 +45,7 @@ _PARTS = {
 
 _UNITS = frozenset(names_in("px pixel pixels pos position coord 2d"))
 _POINTS = r"((landmark|lm|joint|keypoint|kpt|kp|point|pose)(_|(?=[0-9])))+"
-_JOINTS = (
-    *(f"{of}{what}" for of in names_in("landmark joint keypoint kpt bodypart part node marker")
-      for what in ("", "id", "name", "index", "idx")),
-    *names_in("name label id index"),
-)  # fmt: skip
+_ABSENT = names_in("nan none null na n/a #n/a <na> -")
 
 _DECIMAL = re.compile(r"^(-?[0-9]*),([0-9]+(?:[eE][-+]?[0-9]+)?)$")
 
@@ -90,6 +87,7 @@ def read_table(path: Path) -> People:
         return People(frames, tuple(joints), report, first=0)
     if len(rows) == 1:
         raise KeypointError("row 1: a heading and nothing below it; get a complete copy")
+    rows = _with_one_heading(rows)
     heading = rows[0][1]
     columns = _headed(heading)
     said = [n for n in (columns.frame, columns.track) if n is not None]
@@ -112,7 +110,7 @@ def read_table(path: Path) -> People:
     frames, names = reordered(frames, joints)
     in_order = columns.frame is None and columns.joint is None
     people = list(frames.values()) if in_order else frames
-    if names is None and len(joints) == NUM_LANDMARKS:
+    if names is None and joint_counts(frames) == {NUM_LANDMARKS}:
         report.insert(0, "format: CSV of MediaPipe's landmarks")
         return People(people, None, report, LAYOUT, corner_fractions=True)
     report.insert(0, "format: CSV, a heading per column")
@@ -128,20 +126,56 @@ def table_rows(path: Path) -> list[Row]:
     """
     text = read_text(path, KeypointError)
     text = re.sub(r"^sep=.\r?\n", "", text)  # for Excel
-    comma = max(",;\t", key=re.sub(r"\A(\s*# .*\n)*", "", text).lstrip().partition("\n")[0].count)
+    line = (re.sub(r"\A(\s*#.*\n)*", "", text) or text).lstrip().partition("\n")[0]
+    comma = max(",;\t", key=line.count)
     with refusing(KeypointError, f"{path}: cannot be read as CSV"):
-        lines = list(csv.reader(io.StringIO(text, newline=""), delimiter=comma))
-    rows = [
-        (number, [cell.strip() for cell in row])
-        for number, row in enumerate(lines, start=1)
-        if any(row) and not row[0].startswith("# ")
-    ]
+        lines = (
+            list(csv.reader(io.StringIO(text, newline=""), delimiter=comma))
+            if comma in line
+            else [re.sub("^# *", "#", line).split() for line in text.splitlines()]  # by spaces
+        )
+    rows = _without_comments(
+        [(n, [c.strip() for c in row]) for n, row in enumerate(lines, start=1) if any(row)]
+    )
     if not rows:
         raise KeypointError(f"{path}: the file is empty")
     if comma == ",":
         return rows
     # Whoever separates cells by something else may write decimals with a comma.
     return [(n, [_DECIMAL.sub(r"\1.\2", cell) for cell in row]) for n, row in rows]
+
+
+def _without_comments(rows: list[Row]) -> list[Row]:
+    """Rows that no `#` begins, but for a heading: NumPy and others put one before theirs."""
+    first = next((index for index, (_, row) in enumerate(rows) if row[0][:1] != "#"), 0)
+    body = [each for each in rows[first:] if not each[1][0].startswith("# ")]
+    if first and body:
+        number, (cell, *rest) = rows[first - 1]
+        if len("".join(rest).split()) and len(_ended(rows[first - 1])) == len(_ended(body[0])):
+            body.insert(0, (number, [cell.removeprefix("#").strip() or cell, *rest]))
+    return body
+
+
+def _ended(row: Row) -> list[str]:
+    """The cells of a row without empty ones at its end."""
+    cells = row[1]
+    return cells[: max((n for n, cell in enumerate(cells, start=1) if cell), default=0)]
+
+
+def _with_one_heading(rows: list[Row]) -> list[Row]:
+    """The same where joints stand above x and y in a row of their own, maybe once for both."""
+    (number, above), (_, below) = rows[:2]
+    kinds = {_PARTS.get(cell.lower()) for cell in below}
+    if not {0, 1} <= kinds or {0, 1} <= {_PARTS.get(cell.lower()) for cell in above}:
+        return rows
+    heading, joint = [], ""
+    for cell, kind in itertools.zip_longest(above, below, fillvalue=""):
+        joint = cell or joint
+        heading.append(f"{joint} {kind}" if kind.lower() in _PARTS else cell or kind)
+    rest = rows[2:]
+    if rest and len(_ended(rest[0])) == 1 and not heading[0]:  # what pandas calls the index
+        heading[0], rest = rest[0][1][0], rest[1:]
+    return [(number, heading), *rest]
 
 
 def _counts(rows: Sequence[Row]) -> bool:
@@ -162,7 +196,7 @@ def _headed(heading: Sequence[str]) -> _Columns:
     if frame is None:
         time = words.time_word(heading)
         frame = words.first_of(places, words.PICTURES if time is None else (time,))
-    joint, track = words.first_of(places, _JOINTS), words.first_of(places, words.TRACKS)
+    joint, track = words.first_of(places, words.JOINT_WORDS), words.first_of(places, words.TRACKS)
     split = [_split(cell) for cell in heading]
     if not any(each is not None and each[1] == 1 for each in split):  # u and v
         split = [_split(cell, {**_PARTS, "v": 1}) for cell in heading]
@@ -277,17 +311,18 @@ def _place(where: str, columns: _Columns, cells: Sequence[str], index: int) -> K
     cell = cells[columns.frame]
     if columns.time is not None:
         return _number(where, cell)
-    if not re.fullmatch(r"[0-9.-]*", cell):
+    if not re.fullmatch(r"[0-9.-]*|[0-9.]+[eE][-+]?[0-9]+", cell):
         return cell  # of labelled frames the picture's name
-    match = re.fullmatch(r"(?:.*\.)?([0-9]{1,9})(?:\.0*)?", cell)
-    if match is None:
-        raise unexpected(KeypointError, where, "a frame number", cell)
-    return int(match[1])
+    with suppress(ValueError):
+        number = float(cell)
+        if 0 <= number < 1e9 and number.is_integer():
+            return int(number)
+    raise unexpected(KeypointError, where, "a frame number", cell)
 
 
 def _number(where: str, cell: str) -> float:
     """A number; what is not there is NaN."""
-    if not cell or cell.lower() in ("nan", "none", "null", "na"):
+    if not cell or cell.lower() in _ABSENT:
         return np.nan
     try:
         if "_" not in cell:

@@ -43,9 +43,16 @@ TRACKS = names_in(
 
 CONFIDENCES = names_in(
     "confidence conf confidencescore c score keypointscore kptscore likelihood p prob probability "
-    "certainty visibility visible vis v presence"
+    "certainty visibility visible vis v presence inframelikelihood"
 )
 """The confidence of a joint, the best first where there are several."""
+
+JOINT_WORDS = (
+    *(f"{of}{what}" for of in names_in("landmark joint keypoint kpt bodypart part node marker")
+      for what in ("", "name", "id", "index", "idx", "type")),
+    *names_in("name label class classname id index idx classid type"),
+)  # fmt: skip
+"""The name of a joint, or else its number."""
 
 SCORES = (
     *names_in("keypointscores keypointsscores scores confidences keypointsconf keypointconfidences "
