@@ -331,6 +331,9 @@ THREE = LINKS + "<link name='c'/>" + joint("<limit lower='-1' upper='2'/>")
         ),
         pytest.param(robot(LINKS + joint(kind="planar")), "'planar'; supported", id="planar"),
         pytest.param(robot(THREE + joint(child="c")), "same name", id="duplicate joint"),
+        pytest.param(
+            robot(LINKS + joint().replace("name=", "nam=", 1)), "or one has none", id="no name"
+        ),
         pytest.param(robot(LINKS + LINKS + joint()), "a link occurs twice", id="duplicate link"),
         pytest.param(robot(LINKS), r"one root link, found \['a', 'b'\]", id="two roots"),
         pytest.param(

@@ -314,7 +314,7 @@ def _in_metres(entries: dict[str, Entry], is_anipose: bool) -> dict[str, Entry]:
     for name, entry in entries.items():
         with suppress(CameraError):  # said to whoever wants that camera
             places[name] = real_numbers(entry.translation, name, CameraError).ravel()
-    farthest = max((float(np.linalg.norm(place)) for place in places.values()), default=0.0)
+    farthest = max((float(np.hypot.reduce(place)) for place in places.values()), default=0.0)
     if farthest >= 1000:
         note = (
             f"its world is taken to be in millimetres: in metres a camera would stand "

@@ -683,7 +683,8 @@ def _monotonic_radius(distortion: Float[Tensor, " 5"]) -> Float[Tensor, ""]:
     terms, small in any real lens, are left out.
     """
     k1, k2, _, _, k3 = distortion.tolist()
-    roots = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])
+    terms = (7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0)
+    roots = np.roots([term if abs(term) > 1e-100 else 0.0 for term in terms])  # 1 / term is finite
     real = roots.real[np.abs(roots.imag) <= 1.0e-9 * np.abs(roots)]
     positive = real[real > 0.0]
     return distortion.new_tensor(math.sqrt(positive.min()) if positive.size else math.inf)

@@ -53,6 +53,10 @@ class Segment(NamedTuple):
 # Numbers and places.
 
 
+_HUGE = 1e12
+"""No length or angle of a body is so large, in any unit."""
+
+
 def bad(path: Path, line: int, expected: str, found: object) -> MotionCaptureError:
     """The error for a line that is not as it should be."""
     return MotionCaptureError(
@@ -66,7 +70,7 @@ def finite_numbers(path: Path, line: int, words: Sequence[str], expected: str) -
         values = [math.nan if "_" in word else float(word) for word in words]
     except ValueError:
         values = [math.nan]
-    if not all(math.isfinite(value) for value in values):
+    if not all(abs(value) < _HUGE for value in values):
         raise bad(path, line, expected, " ".join(words))
     return values
 

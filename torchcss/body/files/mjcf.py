@@ -271,7 +271,13 @@ class _Reader:
         self, joint: JointSpecification, link: str, parent: str, place: _Place, shift: np.ndarray
     ) -> str:
         """Add a joint and the link below it."""
-        at = as_vector(place.translation + place.rotation @ shift)
+        where = place.translation + place.rotation @ shift
+        if not (np.abs(where) < _FAR).all():
+            raise BodyError(
+                f"{self.path}: body {link!r}: expected places below {_FAR:g} metres, found "
+                f"{where.tolist()}"
+            )
+        at = as_vector(where)
         self.joints.append(
             replace(
                 joint, link=link, parent=parent, translation=at, rotation=as_rows(place.rotation)

@@ -118,7 +118,7 @@ def _take_off_the_world(robot: ElementTree.Element, notes: list[str]) -> bool:
 
 def _check_tree(robot: ElementTree.Element, joints: Mapping[str, ElementTree.Element]) -> None:
     """Names, types, and that the links form one tree."""
-    if len(joints) != len(robot.findall("joint")):
+    if len(joints) != len(robot.findall("joint")) or "" in joints:
         raise BodyError("two joints have the same name, or one has none")
     for name, element in joints.items():
         if element.get("type") not in _TYPES:
