@@ -898,6 +898,17 @@ def test_joints_by_number_of_which_some_are_left_out(tmp_path: Path) -> None:
         read(write(tmp_path / "a.csv", table))
 
 
+def test_a_joint_without_a_place_has_no_confidence(tmp_path: Path) -> None:
+    """Whatever stands beside it."""
+    frames = [{"frame_id": t, "instances": [mmpose(t, person(t))]} for t in T]
+    frames[0]["instances"][0]["keypoints"][9] = [None, 255.0]
+    found = read(write(tmp_path / "a.json", frames))
+    assert found.confidence[:2, found.names.index("l_wrist")].tolist() == [0.0, 0.78]
+    frames[0]["instances"][0]["keypoints"][9] = [255.0]
+    with pytest.raises(KeypointError, match="as many numbers for every joint, found 1 and 2"):
+        read(write(tmp_path / "a.json", frames))
+
+
 def test_people_with_boxes_and_how_long_it_took(tmp_path: Path) -> None:
     """Roboflow's: names are classes, and `time` is no frame's."""
     frames = [

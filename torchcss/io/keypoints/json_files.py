@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -236,7 +236,7 @@ def _frames(path: Path, content: Any, num_frames: int | None) -> list[list[Perso
     return found if time is None else in_seconds(time, found)
 
 
-def _are_durations(keys: list[Key | None]) -> bool:
+def _are_durations(keys: Sequence[Key | None]) -> bool:
     """Whether times are how long something took: those of frames rise from entry to entry."""
     times = [key for key in keys if isinstance(key, float)]
     return len(times) == len(keys) and times != sorted(times)

@@ -136,13 +136,17 @@ def one_person(where: str, value: Any, around: Mapping[str, Any] | None = None) 
     while isinstance(scores, list) and scores and isinstance(scores[0], list):
         scores = [each[0] if isinstance(each, list) and each else each for each in scores]
     if _flat(value) or value[0] is None:
+        if names is not None:
+            raise unexpected(KeypointError, where, "x and y of every joint", around or value)
         joints = _in_a_row(where, number_array(value, where), scores)
     else:
-        rows = [_row(f"{where}: joint {index}", row) for index, row in enumerate(value)]
-        joints = screened(np.array(rows)[:, :2], np.array(rows)[:, 2])
+        if len(sizes := {len(row) for row in value if isinstance(row, list)}) > 1:
+            found = " and ".join(map(str, sorted(sizes)))
+            raise KeypointError(f"{where}: expected as many numbers for every joint, found {found}")
+        rows = np.array([_row(f"{where}: joint {n}", row) for n, row in enumerate(value)])
+        joints = _joints(where, rows[:, :2], rows[:, 2], scores)
         if names is None:
             names = _said_by_rows(value)
-        joints = _with_scores(where, joints, scores)
     return [Person(joints, track_of(around), None if names is None else tuple(map(str, names)))]
 
 
@@ -150,14 +154,19 @@ def _said_by_rows(rows: list[Any]) -> list[str] | None:
     """The joints' names, or else their numbers, where every row has its own."""
     if not all(isinstance(row, dict) for row in rows):
         return None
-    texts, numbers = (
-        [first_of({k: v for k, v in row.items() if type(v) is kind}, JOINT_WORDS) for row in rows]
-        for kind in (str, int)
-    )
-    if None not in texts:
-        return texts
-    usual = None not in numbers and len({*numbers}) == len(rows) and max(numbers) < MOST_JOINTS
-    return [str(number) for number in numbers] if usual else None
+    for kind in (str, int):
+        said = [
+            first_of({k: v for k, v in row.items() if type(v) is kind}, JOINT_WORDS) for row in rows
+        ]
+        found = [str(each) for each in said if each is not None]
+        if len(found) == len(rows) and (kind is str or _are_numbers(found)):
+            return found
+    return None
+
+
+def _are_numbers(found: list[str]) -> bool:
+    """Whether these are the numbers of joints, and not of people or of entries."""
+    return len({*found}) == len(found) and all(0 <= int(each) < MOST_JOINTS for each in found)
 
 
 def listed(value: object) -> list[Any]:
@@ -176,19 +185,21 @@ def _in_a_row(where: str, values: np.ndarray, scores: object) -> np.ndarray:
             f"{values.size} numbers"
         )
     if pairs:
-        return _with_scores(where, screened(values.reshape(-1, 2)), scores)
+        return _joints(where, values.reshape(-1, 2), None, scores)
     return values.reshape(-1, 3)
 
 
-def _with_scores(where: str, joints: np.ndarray, scores: object) -> np.ndarray:
-    if scores is None or np.isnan(joints).any():
-        return joints
-    confidence = number_array(scores, f"{where}: scores")
-    if confidence.shape != joints.shape[:1]:
-        raise KeypointError(
-            f"{where}: {confidence.size} confidences for {len(joints)} joints; expected as many"
-        )
-    return screened(joints[:, :2], confidence)
+def _joints(
+    where: str, places: np.ndarray, confidence: np.ndarray | None, scores: object
+) -> np.ndarray:
+    """Joints with their confidences, those beside them if there are some."""
+    if scores is not None:
+        confidence = number_array(scores, f"{where}: scores")
+        if confidence.shape != places.shape[:1]:
+            raise KeypointError(
+                f"{where}: {confidence.size} confidences for {len(places)} joints; expected as many"
+            )
+    return screened(places, confidence)
 
 
 def _row(where: str, row: Any) -> list[float]:
