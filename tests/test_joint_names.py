@@ -109,6 +109,10 @@ def test_names_of_the_real_file(shared_data) -> None:
         (("panda_link1", "panda_hand"), (None, None)),
         (("hips_JNT", "l_upleg_JNT", "l_leg_JNT", "l_shoulder_JNT", "l_arm_JNT", "l_forearm_JNT"),
          (None, "l_hip", "l_knee", None, "l_shoulder", "l_elbow")),
+        (("l_shoulder", "l_up_arm", "l_low_arm", "l_up_leg", "l_low_leg"),
+         (None, "l_shoulder", "l_elbow", "l_hip", "l_knee")),
+        (("LeftArmUpper", "LeftArmLower", "LeftHandWrist", "LeftLegLower", "LeftFootAnkle"),
+         ("l_shoulder", "l_elbow", "l_wrist", "l_knee", "l_ankle")),
     ],
 )  # fmt: skip
 def test_skeletons_name_joints_by_what_they_move(

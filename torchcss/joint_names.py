@@ -227,16 +227,17 @@ def _of_limbs(*words: str) -> dict[str, tuple[str, ...]]:
 
 
 LIMB_WORDS: Final = _of_limbs(
-    "upleg upperleg thigh thighbend hip",
-    "knee lowerleg leg calf shin shank",
-    "ankle foot",
-    "upperarm uarm arm shldr shldrbend shoulder",
-    "elbow forearm lowerarm farm larm forearmbend",
-    "wrist hand",
+    "upleg upperleg legupper thigh thighbend hip",
+    "knee lowerleg lowleg leglower leg calf shin shank",
+    "ankle footankle foot",
+    "upperarm uparm armupper uarm arm shldr shldrbend shoulder",
+    "elbow forearm lowerarm lowarm armlower farm larm forearmbend",
+    "wrist handwrist hand",
 )
 """What skeletons call the joint in which a limb's segment starts, without side and prefix; of
 several that are there the first: MotionBuilder, Mixamo, Rokoko; Unity, VRM and Xsens; Unreal,
-Biped and Character Creator; Rigify; Poser and DAZ Studio; OptiTrack; Kinect, SMPL and robots."""
+Biped and Character Creator; Rigify; Poser and DAZ Studio; OptiTrack; mocopi; Meta; Kinect, SMPL
+and robots."""
 
 _SEGMENTS: Final = frozenset(
     word for place, words in LIMB_WORDS.items() for word in words if word not in (place, "foot")

@@ -59,10 +59,7 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
         )
     report = [f"format: {path.suffix[1:].upper()}"]
     values = _people(name, arrays[name])
-    is_movenet = arrays[name].ndim == 5 or arrays[name].shape[-1] == 56
-    if arrays[name].shape[1:] == (1, 17, 3):  # of one picture after the other
-        with np.errstate(invalid="ignore"):
-            is_movenet = bool(((values >= 0) & (values <= 1)).all())
+    is_movenet = _is_movenet(arrays[name])
     if len(values) == 1 and values.shape[1] > _MOST_PEOPLE:
         values = values.swapaxes(0, 1)
         report.append(f"{name}: one person in {len(values)} frames, which are the second axis")
@@ -117,6 +114,12 @@ def read_points(path: Path, keypoints: Keypoints) -> Keypoints:
     gap = torch.where(keypoints.confidence[:, None] > 0, gap, 0.0).nan_to_num(torch.inf).sum(-1)
     points = torch.as_tensor(arrays["points"]).to(places)[:, :, column]
     return keypoints._replace(points=points[torch.arange(len(gap)), gap.argmin(1)])
+
+
+def _is_movenet(array: np.ndarray) -> bool:
+    """Whether these are MoveNet's arrays, of many people, or of pictures one after the other."""
+    fractions = array.shape[1:] == (1, 17, 3) and bool(((array >= 0) & (array <= 1)).all())
+    return array.ndim == 5 or array.shape[-1] == 56 or fractions
 
 
 def _counted(people: list[list[Person]], numbers: np.ndarray | None) -> list[list[Person]] | Frames:
