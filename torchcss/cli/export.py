@@ -21,7 +21,8 @@ class Export:
     """The run's folder, or a track's file in it."""
     to: Format
     """bvh: skeleton and turns; trc, c3d: joints as markers, metres; mot: joint angles, degrees;
-    csv, npz: joints with covariances; npz-smpl: SMPL's pose parameters. c3d needs ezc3d."""
+    angles: the same as CSV, with standard deviations; csv, npz: joints with covariances; npz-smpl:
+    SMPL's pose parameters. c3d needs ezc3d."""
     out: Path | None = None
     """File, or folder for files of the usual names; by default the run's folder."""
     options: Annotated[ExportOptions, tyro.conf.OmitArgPrefixes] = field(

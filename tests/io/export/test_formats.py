@@ -72,6 +72,24 @@ def test_trc(tmp_path: Path):
     np.testing.assert_allclose(found, track.joints_world[:, 0] @ UP_OF_FILE.T, atol=1e-12)
 
 
+def test_angles(tmp_path: Path):
+    body = body_named("body30")
+    track = make_track(body)
+    path = export_as(track, to="angles", out=tmp_path).paths[0]
+    assert path.name == "track_angles.csv"
+    rows = list(csv.DictReader(path.read_text().splitlines()))
+    assert len(rows[0]) == 2 + 2 * (len(body.state_names) - 6)
+    knee = body.state_index("l_knee_flexion")
+    for t, row in enumerate(rows):
+        assert int(row["frame"]) == track.frames[t]
+        expected = track.state[t, 0, knee], math.sqrt(track.covariance[t, 0, knee, knee])
+        found = float(row["l_knee_flexion_deg"]), float(row["l_knee_flexion_deg_sd"])
+        np.testing.assert_allclose(found, np.degrees(expected), atol=1e-6)
+    path = export_as(track, to="angles", out=tmp_path / "a.csv", mode=2).paths[0]
+    cells = [line.split(",")[2] for line in path.read_text().splitlines()[1:]]
+    assert cells.count("") == 2
+
+
 def test_missing_modes_are_empty_cells(tmp_path: Path):
     track = make_track(body_named("body30"))
     done = export_as(track, to="trc", out=tmp_path, mode=2, frame="world")

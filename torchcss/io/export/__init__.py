@@ -6,6 +6,7 @@
 | `trc` | `track.trc` | joints as markers, metres | a file each |
 | `c3d` | `track.c3d` | joints as points, metres (needs ezc3d) | a file each |
 | `mot` | `track.mot` | joint angles, degrees | a file each |
+| `angles` | `track_angles.csv` | joint angles and their standard deviations | a file each |
 | `csv` | `track_joints.csv` | joints and their covariances | one file |
 | `npz` | `track_joints.npz` | the same as arrays | one file |
 | `npz-smpl` | `track_smpl.npz` | SMPL's pose parameters, joints and covariances | one file |
@@ -30,15 +31,16 @@ from torchcss.io.export.c3d import write_c3d
 from torchcss.io.export.mot import mot_text
 from torchcss.io.export.selection import FrameOfFile, Selection, SelectionChoice, select
 from torchcss.io.export.smpl import smpl_arrays
-from torchcss.io.export.tables import csv_text, joint_covariances, npz_arrays
+from torchcss.io.export.tables import angles_text, csv_text, joint_covariances, npz_arrays
 from torchcss.io.export.trc import trc_text
 from torchcss.io.run import Run, as_run, body_of_track
 from torchcss.io.tracks import Track
 
-Format = Literal["bvh", "trc", "c3d", "mot", "csv", "npz", "npz-smpl"]
+Format = Literal["bvh", "trc", "c3d", "mot", "angles", "csv", "npz", "npz-smpl"]
 FORMATS: tuple[str, ...] = get_args(Format)
 
-_ENDINGS = {"csv": "_joints.csv", "npz": "_joints.npz", "npz-smpl": "_smpl.npz"}
+_TABLES = {"csv": "_joints.csv", "npz": "_joints.npz", "npz-smpl": "_smpl.npz"}
+_ENDINGS = {**_TABLES, "angles": "_angles.csv"}
 _UP: dict[str, FrameOfFile] = {**dict.fromkeys(("bvh", "trc", "mot"), "y-up"), "c3d": "z-up"}
 """What the readers of a format take for up."""
 
@@ -113,7 +115,7 @@ def export(
         track, source = run.track, run.path
     frame = options.frame or _UP.get(to, "world")
     selection = select(track, options.selection, frame=frame)
-    one_file = to in _ENDINGS
+    one_file = to in _TABLES
     labels = [""] if one_file and options.selection.mode == "all" else selection.labels
     paths = _paths(source, to, labels, path)
     report = list(selection.report)
@@ -145,6 +147,8 @@ def _write_modes(
             write_text(path, trc_text(selection, index, path.name))
         elif to == "mot":
             write_text(path, mot_text(selection, index, body_of_track(track)))
+        elif to == "angles":
+            write_text(path, angles_text(selection, index, body_of_track(track)))
         else:
             text, notes = bvh_text(selection, index, body_of_track(track), style)
             report += [note for note in notes if note not in report]

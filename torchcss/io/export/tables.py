@@ -1,4 +1,4 @@
-"""The joints of all chosen modes in one table, with their covariances: CSV and NPZ.
+"""The joints of all chosen modes in one table, with their covariances: CSV and NPZ; and angles.
 
 The CSV is tidy, a row per frame, mode and joint:
 
@@ -15,7 +15,11 @@ The NPZ has the same as arrays (t frames, m modes, j joints; NaN where a frame l
 `frames`, `times` [t]; `mode`, `parent`, `log_weight`, `cost` [t m]; `joint_names` [j]; `joints`
 [t m j 3]; `joint_covariance` [t m j 3 3]; `frame_from_world` [3 3]; `frame_rate`.
 
-Call `joint_covariances`, then `csv_text` or `npz_arrays`.
+The angles of one mode are a CSV with a row per frame: `frame`, `time`, then of every parameter but
+the root's six its value (`NAME_deg`, or `NAME_m` of what slides) and its standard deviation
+(`NAME_deg_sd`), both empty where the frame lacks the mode.
+
+Call `joint_covariances`, then `csv_text` or `npz_arrays`; or `angles_text`.
 """
 
 from __future__ import annotations
@@ -29,6 +33,7 @@ from jaxtyping import Float
 
 from torchcss.body.bases import pose_track
 from torchcss.body.model import BodyModel
+from torchcss.body.root import ROOT_NAMES
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.io.export.selection import Selection
 from torchcss.joint_names import names_in
@@ -79,6 +84,28 @@ def csv_text(selection: Selection, covariance: Float[np.ndarray, "t m j 3 3"]) -
         for name, row in zip(selection.joint_names, numbers[t, m].tolist(), strict=True):
             writer.writerow([*head, name, *row])
     return out.getvalue()
+
+
+def angles_text(selection: Selection, mode: int, body: BodyModel) -> str:
+    """The joint angles of one mode as text.
+
+    Args:
+        selection: The frames.
+        mode: Which of its modes.
+        body: The body, on the origin.
+    """
+    turns = body.is_angle.numpy()
+    columns = [n for n, name in enumerate(body.state_names) if name not in ROOT_NAMES]
+    variance = np.diagonal(selection.covariance[:, mode], axis1=1, axis2=2)
+    both = np.stack([selection.state[:, mode], np.sqrt(variance)], axis=-1)
+    both[:, turns] = np.degrees(both[:, turns])
+    numbers = both[:, columns].reshape(len(both), -1)
+    names = [f"{body.state_names[n]}_{'deg' if turns[n] else 'm'}" for n in columns]
+    rows = [["frame", "time", *(column for name in names for column in (name, f"{name}_sd"))]]
+    for t, there in enumerate(selection.present[:, mode]):
+        cells = [f"{value:.6f}" if there else "" for value in numbers[t]]
+        rows.append([str(selection.frames[t]), f"{selection.times[t]:.6f}", *cells])
+    return "".join(",".join(row) + "\n" for row in rows)
 
 
 def npz_arrays(
