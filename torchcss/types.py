@@ -75,6 +75,10 @@ class LocalModel(NamedTuple):
         curved = (self.hessian @ step[..., None])[..., 0]
         return self.value + (step * (self.gradient + 0.5 * curved)).sum(-1)
 
+    def plus(self, other: LocalModel, weight: float = 1.0) -> LocalModel:
+        """The sum with another cost, so many times."""
+        return LocalModel(*(a + weight * b for a, b in zip(self, other, strict=True)))
+
 
 class PointCost(NamedTuple):
     """A cost per 3D point with its derivatives with respect to that point, world frame.

@@ -129,11 +129,10 @@ def test_lift_to_joints_is_the_plain_loop(
     points = body.points_on_links(pose, problem.link, problem.offset)
     few = slice(0, 8)
     cost = PointCost(*(part[few] for part in problem.cost_at(points)))
-    arguments = (
-        pose, body.tree.ancestors, body.tree.joint_ancestors, points[few], problem.link[few], cost,
-    )  # fmt: skip
-    got = lift_to_joints(*arguments, second_order_kinematics=second_order)
-    expected = reference.lift(*arguments, second_order_kinematics=second_order)
+    tree, given = body.tree, (points[few], problem.link[few], cost)
+    got = lift_to_joints(tree, pose, *given, second_order_kinematics=second_order)
+    above = tree.ancestors, tree.joint_ancestors
+    expected = reference.lift(pose, *above, *given, second_order_kinematics=second_order)
     for ours, plain in zip(got, expected, strict=True):
         assert_relative(ours, plain)
 

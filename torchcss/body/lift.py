@@ -27,17 +27,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchcss.body.kinematics import TreePose
+from torchcss.body.kinematics import KinematicTree, TreePose
 from torchcss.types import LocalModel, PointCost
 
 
 def lift_to_joints(
+    tree: KinematicTree,
     pose: TreePose,
-    ancestors: Bool[Tensor, "q l"],
-    joint_ancestors: Bool[Tensor, "q q"],
     points: Float[Tensor, "*batch p 3"],
     point_link: Int[Tensor, " p"],
     cost: PointCost,
@@ -47,9 +46,8 @@ def lift_to_joints(
     """Sum a cost over points and differentiate it with respect to the joint values.
 
     Args:
-        pose: Poses and twists of the tree at the state where the cost was evaluated.
-        ancestors: True where a joint moves a link.
-        joint_ancestors: True at (i, j) where joint i moves joint j or i is j.
+        tree: The tree.
+        pose: Its poses and twists at the state where the cost was evaluated.
         points: World positions of the points, metres.
         point_link: The link that carries each point.
         cost: Value, gradient and Hessian of each point's cost in its world position.
@@ -70,7 +68,7 @@ def lift_to_joints(
         _components(cost.hessian.flatten(-2)),
     )
     features = torch.stack(moments, dim=1).flatten(1)
-    below = ancestors.to(features)
+    below = tree.ancestors.to(features)
     if num_points > num_joints:  # fewer products by way of the links
         by_link = features.new_zeros(below.shape[1], features.shape[1])
         features = by_link.index_add_(0, point_link, features)
@@ -85,7 +83,7 @@ def lift_to_joints(
     left = torch.stack(twist).permute(2, 1, 0).contiguous()
     right = torch.stack(reaction).permute(2, 0, 1).contiguous()
     # Every pair of joints on a branch once, the diagonal twice by half.
-    half_diagonal = joint_ancestors.to(left)
+    half_diagonal = tree.joint_ancestors.to(left)
     half_diagonal.diagonal().fill_(0.5)
     upper = (left @ right).mul_(half_diagonal)
     hessian = upper + upper.mT

@@ -388,9 +388,8 @@ class BodyModel(nn.Module):
             Value, gradient and Hessian in x.
         """
         joints = lift_to_joints(
+            self.tree,
             pose.tree,
-            self.tree.ancestors,
-            self.tree.joint_ancestors,
             points,
             point_link,
             cost,

@@ -83,11 +83,11 @@ class ShapedCost:
         hessian = x.new_zeros(*x.shape, x.shape[-1])
         hessian[:, :n, :n] = plain.hessian
         hessian[:, n:, n:] = self.parameters.precision
+        model = LocalModel(plain.value + prior, gradient, hessian)
         if not outlines:
-            return LocalModel(plain.value + prior, gradient, hessian)
-        seen = LocalModel(*(torch.stack(field) for field in zip(*outlines, strict=True)))
-        return LocalModel(
-            plain.value + prior + seen.value, gradient + seen.gradient, hessian + seen.hessian
+            return model
+        return model.plus(
+            LocalModel(*(torch.stack(field) for field in zip(*outlines, strict=True)))
         )
 
     def _outlines(self, x: Float[Tensor, " n"], z: Float[Tensor, " z"]) -> LocalModel:

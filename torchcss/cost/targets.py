@@ -110,22 +110,13 @@ class PointTargets(BlendedCost):
 
     def _local_model(self, x: States, share: Float[Tensor, "*batch"] | None) -> LocalModel:
         tree, points = self._pose(x)
-        error = points - self.target[:, :, None]
-        strength = (self.weight / self.sigma**2)[:, None, None]
-        gradient = strength * error
-        hessian = strength * torch.eye(3, dtype=x.dtype, device=x.device)
-        cost = PointCost(
-            0.5 * (gradient * error).sum(1).T,
-            gradient.movedim(-1, 0),
-            hessian.expand(points.shape[-1], -1, -1, -1),
-        )
+        points = points.movedim(-1, 0)
         value, slope, curvature = lift_to_joints(
+            self.body.tree,
             tree,
-            self.body.tree.ancestors,
-            self.body.tree.joint_ancestors,
-            points.movedim(-1, 0),
+            points,
             self.link,
-            cost,
+            squared_errors(points - self.target, self.weight / self.sigma**2),
             second_order_kinematics=True if share is None else share.reshape(-1),
         )
         tie, batch, m = self.body.tie[:, self.columns], x.shape[:-1], x.shape[-1]
@@ -172,18 +163,29 @@ class PointDistances:
         """Cost, gradient and exact Hessian."""
         body, pose = self.body, self.body.pose(x)
         points = body.points_on_links(pose.tree, self.link, self.offset)
-        weight = self.sigma.pow(-2)
-        error = points - self.target
-        slope = weight[:, None] * error
-        hessian = (weight[:, None, None] * torch.eye(3).to(x)).expand(*error.shape, 3)
-        cost = PointCost(0.5 * weight * error.square().sum(-1), slope, hessian)
+        cost = squared_errors(points - self.target, self.sigma.pow(-2))
         total = body.lift(pose, points, self.link, cost)
         priors = [self.stabiliser.local_model(x, body.sticky_mean, body.sticky_deviation)]
         if self.repulsion is not None and self.pairs is not None:
             priors.append(self.repulsion.local_model(body, pose, self.pairs))
         for prior in priors:
-            total = LocalModel(*(a + b for a, b in zip(total, prior, strict=True)))
+            total = total.plus(prior)
         return total
+
+
+def squared_errors(error: Float[Tensor, "*batch p 3"], weight: Float[Tensor, " p"]) -> PointCost:
+    """`1/2 w |e|^2` of points that miss their places by e, with its derivatives.
+
+    Args:
+        error: By how much they miss them, metres.
+        weight: w of each point, one over square metres.
+    """
+    hessian = weight[:, None, None] * torch.eye(3).to(error)
+    return PointCost(
+        0.5 * weight * error.square().sum(-1),
+        weight[:, None] * error,
+        hessian.expand(*error.shape, 3),
+    )
 
 
 def pose_targets(

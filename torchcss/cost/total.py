@@ -429,7 +429,7 @@ class _Part:
         for name, weight, prior, posed in self._bound("prior", pose):
             with cost.timed(name):
                 model = prior.local_model(posed, curvature)
-                total = LocalModel(*(a + weight * b for a, b in zip(total, model, strict=True)))
+                total = total.plus(model, weight)
         return total
 
     def _by_autograd(self) -> LocalModel:

@@ -36,10 +36,10 @@ from torchcss.io.tracks import TRACK_NAME, Track
 from torchcss.show.style import DEVIATIONS, OKABE_ITO, save_figure
 from torchcss.show.track_pictures import has_pictures, pictures_of, rows_with_modes
 from torchcss.show.track_plots import (
-    effective_number,
     label,
     mode_colour,
     modes_figure,
+    most_open_frame,
     sheet_of,
     shrunk,
     side_view_figure,
@@ -93,7 +93,7 @@ def plot_track(
     out = prepare_output_folder(run.folder / usual if out is None else out)
     camera = run.cameras[0].camera if run.cameras else None
     if frame is None:
-        frame = int(track.frames[rows[effective_number(track)[rows].argmax()]])
+        frame = most_open_frame(track)
     figures = {
         "modes": modes_figure(track, run.summary),
         "joints": joints_figure(track, camera=camera),

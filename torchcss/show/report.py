@@ -27,7 +27,7 @@ from torchcss.io.tracks import TRACK_NAME
 from torchcss.io.video import VideoWriter
 from torchcss.show.posterior_plots import angles_figure
 from torchcss.show.track_pictures import has_pictures, pictures_of, rows_with_modes
-from torchcss.show.track_plots import effective_number, modes_figure, side_view_figure
+from torchcss.show.track_plots import modes_figure, most_open_frame, side_view_figure
 from torchcss.tracking.presets import OLD_NAMES, PRESETS, Preset
 
 REPORT_NAME = "report.html"
@@ -82,14 +82,16 @@ def write_report_page(run: Run, *, anew: bool = False) -> Path:
     """
     track, rows = run.track._replace(body=run.body), rows_with_modes(run)
     camera = run.cameras[0].camera if run.cameras else None
-    frame = int(track.frames[rows[effective_number(track)[rows].argmax()]])
     sections = (
         ("Film", _film(run, rows, anew=anew)),
         (
             "The modes from the side",
             "<p>The frame whose weight is spread over most modes. Where the lines part, one camera "
             "cannot tell which pose it was.</p>"
-            + _image(side_view_figure(track, frame, camera=camera), "the modes from the side"),
+            + _image(
+                side_view_figure(track, most_open_frame(track), camera=camera),
+                "the modes from the side",
+            ),
         ),
         ("Weights over time", _image(modes_figure(track, run.summary), "weights over time")),
         ("Joint angles", _image(angles_figure(track), "joint angles with bands")),

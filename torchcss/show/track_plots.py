@@ -209,6 +209,12 @@ def effective_number(track: Track) -> Float[np.ndarray, " t"]:
     return 1 / np.square(weight).sum(axis=1)
 
 
+def most_open_frame(track: Track) -> int:
+    """Number of the frame whose belief is spread over most modes."""
+    shown = np.where(track.num_modes > 0, effective_number(track), 0.0)
+    return int(track.frames[shown.argmax()])
+
+
 def modes_figure(track: Track, summary: Mapping[str, Any] | None = None) -> Figure:
     """Weights of the modes, number of explanations and cost of the best mode over time.
 

@@ -206,9 +206,8 @@ class ReprojectionCost(BlendedCost):
         hessian = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz]).unflatten(0, (3, 3))
         body = self.body
         model = lift_to_joints(
+            body.tree,
             tree,
-            body.tree.ancestors,
-            body.tree.joint_ancestors,
             points.permute(2, 1, 0),
             body.marker_link[self.index],
             PointCost(0.5 * rho.T, gradient.permute(2, 1, 0), hessian.permute(3, 2, 0, 1)),
