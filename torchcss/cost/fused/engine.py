@@ -26,13 +26,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.cost.anthropometric import Anthropometric
-from torchcss.cost.context import FrameContext
+from torchcss.cost.context import BodyTables, FrameContext
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.flow import FlowTerm
 from torchcss.cost.fused import pack
 from torchcss.cost.fused.pose_prior import add_pose_prior
 from torchcss.cost.fused.priors import add_priors
-from torchcss.cost.fused.records import Array, Result, View
+from torchcss.cost.fused.records import Array, Curves, Limbs, Parts, Result, Tree, View
 from torchcss.cost.fused.repulsion import add_repulsion
 from torchcss.cost.fused.view import add_view
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
@@ -60,20 +60,21 @@ _IMAGES: dict[type[Any], tuple[str, Callable[..., Any]]] = {
 
 _PRIORS = (Stabiliser, Anthropometric, TemporalPrior, MixturePrior)
 _KEPT = 8
-"""Packed costs that are kept of a frame, as long as that lives: with other terms and weights."""
+"""Packed costs that are kept of a frame, as long as that lives: with other terms and weights; and
+so many packed tables of a body."""
 
 
 class _Packs:
-    """What has been packed of frames that are still there, the latest few of each."""
+    """What has been packed of frames or bodies that are still there, the latest few of each."""
 
     def __init__(self) -> None:
-        self._of: WeakKeyDictionary[FrameContext, OrderedDict[Any, tuple[Any, Any]]] = (
-            WeakKeyDictionary()
-        )
+        self._of: WeakKeyDictionary[Any, OrderedDict[Any, tuple[Any, Any]]] = WeakKeyDictionary()
 
-    def of(self, context: FrameContext, what: tuple[object, ...], make: Callable[[], Any]) -> Any:
-        """What is packed of a frame and of some other objects, packed now if it is not known."""
-        known = self._of.setdefault(context, OrderedDict())
+    def of(
+        self, owner: FrameContext | BodyTables, what: tuple[object, ...], make: Callable[[], Any]
+    ) -> Any:
+        """What is packed of a frame or body and other objects, packed now if it is not known."""
+        known = self._of.setdefault(owner, OrderedDict())
         # The objects are kept, so that no other one gets their numbers.
         key = tuple(map(id, what))
         if key not in known:
@@ -154,7 +155,8 @@ class FusedEngine:
 
     def __init__(self, dtype: Literal["float32", "float64"] = "float32", threads: int = 1) -> None:
         self.real: Any = np.float32 if dtype == "float32" else np.float64
-        self._views, self._priors = _Packs(), _Packs()
+        self._views, self._priors, self._bodies = _Packs(), _Packs(), _Packs()
+        self._workspaces: dict[tuple[int, ...], Workspaces] = {}
         self._threads = threads
         self._helpers: dict[int, ThreadPoolExecutor] = {}  # by process: a fork has no threads
 
@@ -277,22 +279,47 @@ class FusedEngine:
         density = past.tables.of(density_where(past.camera.up))
         if density is None:
             return []
-        tree = pack.pack_tree(past.body, past.camera)
-        limbs = pack.pack_limbs(past.body, density, weight, past.camera)
-        make = partial(pack.make_limb_scratch, tree, limbs, past.body.num_parameters)
-        return [_Packed(add_pose_prior, 0, (tree, limbs), Workspaces(make))]
+        body, camera, tree = past.body, past.camera, pack.pack_tree(past.body, past.camera)
+
+        def make() -> tuple[Limbs, Workspaces]:
+            limbs = pack.pack_limbs(body, density)
+            scratch = partial(pack.make_limb_scratch, tree, limbs, body.num_parameters)
+            return limbs, Workspaces(scratch)
+
+        limbs, workspaces = self._bodies.of(past.tables, (pack.pack_limbs, density), make)
+        turned = limbs.fixed @ pack.array(camera.R_camera_world).T
+        limbs = limbs._replace(scale=weight, fixed=turned)
+        return [_Packed(add_pose_prior, 0, (tree, limbs), workspaces)]
 
     def _pack_repulsion(
         self, cost: TrackingCost, term: Interpenetration, weight: float, past: FrameContext
     ) -> _Packed:
-        tree, real = pack.pack_tree(past.body, past.camera), self.real
-        parts = pack.pack_parts(past.body, real)
-        repulsion = pack.pack_repulsion(term, past.tables.of(InterpenetrationPairs), weight, real)
-        curves = pack.pack_curves(None, len(parts.row), real)
+        tree, parts, real = pack.pack_tree(past.body, past.camera), self._parts(past), self.real
+        pairs = past.tables.of(InterpenetrationPairs)
+        repulsion = self._bodies.of(
+            past.tables, (term, pairs), lambda: pack.pack_repulsion(term, pairs, real)
+        )
         interior, chain = repulsion.nodes.shape[2], repulsion.chain.shape[1]
-        make = partial(pack.make_workspace, tree, curves, interior, chain, (5, real))
+        repulsion = repulsion._replace(scale=real(weight * term.weight / interior))
+        curves = pack.pack_curves(None, len(parts.row), real)
         records = tree, parts, repulsion, _is_exact(cost)
-        return _Packed(add_repulsion, 0, records, Workspaces(make))
+        memory = self._memory(tree, curves, interior, chain, 5)
+        return _Packed(add_repulsion, 0, records, memory)
+
+    def _parts(self, past: FrameContext) -> Parts:
+        """The parts of a body, packed once: their shape does not change."""
+        make = partial(pack.pack_parts, past.body, self.real)
+        return self._bodies.of(past.tables, (pack.pack_parts,), make)
+
+    def _memory(
+        self, tree: Tree, curves: Curves, interior: int, chain: int, steps: int
+    ) -> Workspaces:
+        """Memory that all bodies of these sizes share, one after the other."""
+        sizes = (len(tree.parent), *curves.table.shape, *curves[1:], interior, chain, steps)
+        if sizes not in self._workspaces:
+            make = partial(pack.make_workspace, tree, curves, interior, chain, (steps, self.real))
+            self._workspaces[sizes] = Workspaces(make)
+        return self._workspaces[sizes]
 
     def _view(self, cost: TrackingCost, past: FrameContext, context: FrameContext) -> _Found:
         return self._views.of(
@@ -319,7 +346,7 @@ class FusedEngine:
         predictor = None
         if "edges" in made or "colours" in made:
             predictor = context.tables.of(ContourPredictor)
-        tree, parts = pack.pack_tree(body, camera), pack.pack_parts(body, real)
+        tree, parts = pack.pack_tree(body, camera), self._parts(past)
         num, lens = len(parts.row), pack.pack_lens(camera)
         records = {
             field: pack.in_precision(record, np.float64 if field == "keypoints" else real)
@@ -331,16 +358,18 @@ class FusedEngine:
         view = View(
             lens=pack.in_precision(lens, real),
             precise=lens,
-            curves=pack.pack_curves(predictor, num, real),
+            curves=self._bodies.of(
+                past.tables,
+                (pack.pack_curves, predictor),
+                lambda: pack.pack_curves(predictor, num, real),
+            ),
             nothing=float(nothing) * (0 if predictor is None else predictor.num_nodes),
             exact=_is_exact(cost),
             **records,
         )
         interior = view.flow.nodes.shape[2]
-        make = partial(
-            pack.make_workspace, tree, view.curves, interior, 1, (len(edges.steps), real)
-        )
-        packed = _Packed(add_view, len(view.flow.target), (tree, parts, view), Workspaces(make))
+        memory = self._memory(tree, view.curves, interior, 1, len(edges.steps))
+        packed = _Packed(add_view, len(view.flow.target), (tree, parts, view), memory)
         return [packed], frozenset(others)
 
 

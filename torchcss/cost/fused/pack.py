@@ -295,17 +295,15 @@ def pack_keypoints(
     )
 
 
-def pack_repulsion(
-    term: Interpenetration, pairs: InterpenetrationPairs, weight: float, real: Real
-) -> Repulsion:
-    """The repulsion between the parts of a body."""
+def pack_repulsion(term: Interpenetration, pairs: InterpenetrationPairs, real: Real) -> Repulsion:
+    """The repulsion between the parts of a body; the caller sets its scale."""
     num = len(pairs.nodes)
     pair = np.full((num, num), -1)
     pair[pairs.first.cpu().numpy(), pairs.second.cpu().numpy()] = np.arange(pairs.num_pairs)
     inner = array(pairs.nodes.abs().amax(dim=1), real)
     outer = array(term.reach * pairs.extent, real)
     repulsion = Repulsion(
-        scale=weight * term.weight / pairs.nodes.shape[1],
+        scale=1.0,
         p=term.p,
         sharpness=term.sharpness,
         end=END ** (1 / term.p),
@@ -374,8 +372,8 @@ def make_workspace(
     )
 
 
-def pack_limbs(body: BodyModel, density: BodyDensity, scale: float, camera: Camera) -> Limbs:
-    """The prior on poses, its directions in the camera's frame."""
+def pack_limbs(body: BodyModel, density: BodyDensity) -> Limbs:
+    """The prior on poses, with its fixed directions in the world's frame."""
     which = density.which
     row, place = carried_markers(body, which.joint)
     above = array(body.tree.ancestors[:, body.marker_link[which.joint]], bool)
@@ -391,14 +389,14 @@ def pack_limbs(body: BodyModel, density: BodyDensity, scale: float, camera: Came
     # Those that it is made from come first, in their order.
     end = np.argsort(difference == 0, axis=1, kind="stable")[:, : (difference != 0).sum(1).max()]
     return Limbs(
-        scale=scale,
+        scale=1.0,
         row=row,
         place=place,
         above=above,
         end=end,
         difference=np.take_along_axis(difference, end, 1),
         moves=above @ (difference != 0).T,
-        fixed=array(which.fixed) @ array(camera.R_camera_world).T,
+        fixed=array(which.fixed),
         first=np.array([group.row.start for group in which.groups]),
         segments=np.array([len(group.known) for group in which.groups]),
         line=np.array([group.line for group in which.groups]),
