@@ -34,6 +34,16 @@ def make_camera(distortion: list[float] | None = None) -> Camera:
     return camera.to(torch.float64)
 
 
+def masks_of(body, state, camera, **choice) -> tuple[torch.Tensor, torch.Tensor]:
+    """`region_masks` of the whole image."""
+    found = region_masks(body, state, camera, **choice)
+    width, height = camera.image_size_wh
+    inside = torch.zeros(len(found.inside), height, width, dtype=torch.bool)
+    outside = inside.clone()
+    inside[found.pixels], outside[found.pixels] = found.inside, found.outside
+    return inside, outside
+
+
 def some_nodes(*batch: int, count: int = 30, generator: torch.Generator) -> SeenNodes:
     """Nodes in the image, outside it, behind the camera, hidden, and absent."""
     points = torch.randn(*batch, count, 3, generator=generator, dtype=torch.float64)
@@ -147,7 +157,7 @@ def test_masks_of_a_posed_body_are_inside_and_around_its_parts() -> None:
     left, right = (body.part_names.index(f"{side}_forearm") for side in "lr")
     assert layer_of[left] == layer_of[right]
     parts = part_map(body, body.rest, camera)
-    inside, around = region_masks(body, body.rest, camera)
+    inside, around = masks_of(body, body.rest, camera)
     assert inside.shape == around.shape == (len(names), 200, 160)
     assert not (inside & around).any()
     layer_map = torch.tensor((*layer_of, -1))[parts]
@@ -165,7 +175,7 @@ def test_colours_are_taken_from_the_core_of_a_part_and_not_beside_it() -> None:
     """A limb that is drawn some pixels off its place still learns its own colour."""
     body, camera = someone_at_three_metres(450.0)
     names, layer_of = part_layers(body)
-    inside, around = region_masks(body, body.rest, camera)
+    inside, around = masks_of(body, body.rest, camera)
     moved = body.rest.clone()
     # Two pixels to the side.
     moved[body.state_index("root_x")] += 2 * 3.0 / 450.0
@@ -183,7 +193,7 @@ def test_of_a_part_too_small_for_a_core_all_but_the_outline_is_learned() -> None
     body, camera = someone_at_three_metres(150.0)
     names, layer_of = part_layers(body)
     layers = torch.tensor((*layer_of, -1))
-    inside, _ = region_masks(body, body.rest, camera)
+    inside, _ = masks_of(body, body.rest, camera)
     thin, whole = (layers[part_map(body, body.rest, camera, girth=girth)] for girth in (_CORE, 1.0))
     core = {name: (thin == i) & (whole == i) for i, name in enumerate(names)}
     small = [name for name in names if 0 < int(core[name].sum()) < _CORE_PIXELS]
@@ -206,10 +216,10 @@ def test_masks_are_those_of_the_whole_picture(
     state = body.rest.clone()
     for name, metres in zip(("root_x", "root_y"), shift, strict=True):
         state[body.state_index(name)] += metres
-    found = region_masks(body, state, camera)
+    found = masks_of(body, state, camera)
     assert found[0].any() == found[1].any() == (shift[0] < 5)
     monkeypatch.setattr(region, "_window", lambda *_: (..., slice(None), slice(None)))
-    for one, other in zip(found, region_masks(body, state, camera), strict=True):
+    for one, other in zip(found, masks_of(body, state, camera), strict=True):
         assert torch.equal(one, other)
 
 
@@ -225,9 +235,9 @@ def test_what_is_off_the_outline_is_own(name: str, margin: int) -> None:
     else:
         body, camera = someone_at_three_metres(900.0)
     names, layer_of = part_layers(body)
-    inside, _ = region_masks(body, body.rest, camera.to(torch.float64))
+    inside, _ = masks_of(body, body.rest, camera.to(torch.float64))
     own = torch.tensor((*layer_of, -1))[part_map(body, body.rest, camera.to(torch.float64))]
-    core, _ = region_masks(body, body.rest, camera.to(torch.float64), fitted=False)
+    core, _ = masks_of(body, body.rest, camera.to(torch.float64), fitted=False)
     assert not (core & ~inside).any()
     wide = 0
     for layer, part in enumerate(names):

@@ -134,8 +134,8 @@ class FrameCosts:
             return appearance
         if appearance is None:
             appearance = Appearance.unknown(self.num_layers, like=features.colour)
-        inside, outside = region_masks(body, state, self.camera, fitted=fitted)
-        return appearance.learn(features.colour, inside, outside)
+        masks = region_masks(body, state, self.camera, fitted=fitted)
+        return appearance.learn(features.colour[masks.pixels], masks.inside, masks.outside)
 
     def learn_background(
         self,

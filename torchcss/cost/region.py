@@ -105,13 +105,27 @@ def region_field(
     return spline_field(gaussian_blur(seen, _SMOOTHING))
 
 
+class RegionMasks(NamedTuple):
+    """Where colours are taken from.
+
+    Attributes:
+        inside: What is sure of each layer.
+        outside: Its surroundings; neither holds what lies between the two.
+        pixels: The index, in an image `[... h w]`, of the part of it that these masks are of.
+    """
+
+    inside: Bool[Tensor, "layers y x"]
+    outside: Bool[Tensor, "layers y x"]
+    pixels: tuple[EllipsisType, slice, slice]
+
+
 def region_masks(
     body: BodyModel,
     state: Float[Tensor, " n"],
     camera: Camera,
     *,
     fitted: bool = True,
-) -> tuple[Bool[Tensor, "layers h w"], Bool[Tensor, "layers h w"]]:
+) -> RegionMasks:
     """Pixels that are each layer's own for all that a pose may be off, and those around it.
 
     Args:
@@ -119,29 +133,23 @@ def region_masks(
         state: Its pose.
         camera: Camera of the image.
         fitted: The girths are the person's; else only the core of a part counts as its own.
-
-    Returns:
-        What is sure of each layer, and its surroundings; neither holds what lies between them.
     """
     names, layer_of = part_layers(body)
     # A last entry for pixels that see no part, whose index is -1.
     layer_of_part = torch.tensor((*layer_of, -1), device=body.tie.device)
 
-    def seen(girth: float) -> Int[Tensor, "h w"]:
-        return layer_of_part[part_map(body, state, camera, girth=girth)]
-
-    whole, layers = seen(1.0), torch.arange(len(names), device=body.tie.device)[:, None, None]
-    core = torch.zeros(len(names), *whole.shape, dtype=torch.bool, device=whole.device)
-    around = core.clone()
-    window = _window(whole >= 0, _REACH + _COARSE)
-    if window is None:
-        return core, around
-    own = whole[window] == layers
-    inner = own & (seen(_CORE)[window] == layers)
+    parts = part_map(body, state, camera)
+    window = _window(parts >= 0, _REACH + _COARSE)
+    layers = torch.arange(len(names), device=parts.device)[:, None, None]
+    own = layer_of_part[parts[window]] == layers
+    if not own.numel():
+        return RegionMasks(own, own, window)
+    thin = part_map(body, state, camera, girth=_CORE)[window]
+    inner = own & (layer_of_part[thin] == layers)
     if fitted:
         inner |= ~grow(~own, _BODY_MARGIN if has_root(body) else _ARM_MARGIN)
     small = inner.flatten(1).sum(1) < _CORE_PIXELS
-    core[window] = torch.where(small[:, None, None], ~grow(~own, 1), inner)
+    core = torch.where(small[:, None, None], ~grow(~own, 1), inner)
     blocks = functional.max_pool2d(own.float(), _COARSE, ceil_mode=True) > 0
     blocks = grow(blocks, _REACH // _COARSE)
     far = blocks.repeat_interleave(_COARSE, -1).repeat_interleave(_COARSE, -2)
@@ -151,12 +159,11 @@ def region_masks(
         if i != j:
             near[i] &= ~own[j]
             near[j] &= ~own[i]
-    around[window] = near
-    return core, around
+    return RegionMasks(core, near, window)
 
 
-def _window(mask: Bool[Tensor, "h w"], margin: int) -> tuple[EllipsisType, slice, slice] | None:
-    """Rows and columns of what is within a margin of a mask, in whole blocks; None: it is empty.
+def _window(mask: Bool[Tensor, "h w"], margin: int) -> tuple[EllipsisType, slice, slice]:
+    """Rows and columns of what is within a margin of a mask, in whole blocks.
 
     A person fills a quarter of most pictures, and growing masks takes time by their pixels.
     """
@@ -164,7 +171,7 @@ def _window(mask: Bool[Tensor, "h w"], margin: int) -> tuple[EllipsisType, slice
     for axis in (1, 0):
         found = torch.nonzero(mask.any(axis))
         if not len(found):
-            return None
+            return (..., slice(0), slice(0))
         start = max(int(found[0]) - margin, 0) // _COARSE * _COARSE
         stop = -(-(int(found[-1]) + margin + 1) // _COARSE) * _COARSE
         spans.append(slice(start, stop))

@@ -124,7 +124,7 @@ def colour_bins(colour: Float[Tensor, "3 h w"]) -> Int[Tensor, "h w"]:
     Args:
         colour: Red, green, blue in 0..1.
     """
-    red, green, blue = (colour * BINS).long().clamp(0, BINS - 1)
+    red, green, blue = (colour * BINS).int().clamp_(0, BINS - 1)
     return (red * BINS + green) * BINS + blue
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -309,6 +310,7 @@ def _chunks(length: Int[Tensor, " r"]) -> list[slice]:
     return [slice(a, b) for a, b in pairwise(cuts)]
 
 
+@cache
 def grid_faces(rings: int, meridians: int) -> Faces:
     """Triangles of a mesh of rings closed around the part, poles capped by fans.
 
