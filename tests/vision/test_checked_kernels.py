@@ -33,7 +33,7 @@ for height, width, y, x in ((7, 5, 3, 2), (9, 9, 8, 8), (50, 3, 7, 1), (33, 64, 
 
 for size in ((1, 1), (3, 4), (9, 1)):
     image, blurred = rng.random((2, *size))
-    run(blur_kernels.blur, image, np.array([0.4, 0.2, 0.1]), np.zeros(size[1] + 4), blurred)
+    run(blur_kernels.blur, image, np.array([0.4, 0.2, 0.1, 0.0]), np.zeros(size[1] + 6), blurred)
 
 place, distance = 40 * rng.random((30, 2)) - 10, rng.random(30) + 0.5
 near, seen = np.full((1, 17, 19), -1, single), np.full((1, 17, 19), -1)

@@ -237,7 +237,9 @@ class FeatureExtractor(nn.Module):
                 )
         planes = self._planes("frame", frame)
         grey = self._luma(planes)
-        edges = edge_features(grey if window is None else grey[window.pixels], self.edges)
+        # Single precision is far finer than the edges, and twice as fast.
+        seen = (grey if window is None else grey[window.pixels]).float()
+        edges = edge_features(seen, self.edges)
         features = FrameFeatures(
             grey=grey,
             edge_energy=_within(window, grey, edges.energy, 0.0),

@@ -37,9 +37,11 @@ def gaussian_blur(image: Float[Tensor, "*batch h w"], sigma: float) -> Float[Ten
     weight = (weight / (2 * weight.sum() - weight[0])).to(image)
     images = image.reshape(-1, *image.shape[-2:])
     if has_kernels(image):
-        from torchcss.vision.blur_kernels import blur
+        from torchcss.vision.blur_kernels import AT_ONCE, blur
 
-        line, blurred = image.new_empty(image.shape[-1] + 2 * radius), torch.empty_like(images)
+        weight = functional.pad(weight, (0, -radius % AT_ONCE))
+        line = image.new_empty(image.shape[-1] + 2 * (len(weight) - 1))
+        blurred = torch.empty_like(images)
         for one, into in zip(images.detach(), blurred, strict=True):
             run(blur, one, weight, line, into)
         return blurred.reshape(image.shape)
