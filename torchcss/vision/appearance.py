@@ -24,7 +24,6 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn import functional
 
 from torchcss.vision.background import Background
 
@@ -103,7 +102,8 @@ class Appearance(NamedTuple):
         inside, outside = ((_smooth(part) + _FLOOR).log() for part in (self.inside, self.outside))
         if background is None:
             ratio = (0.5 * torch.where(known[:, None], inside - outside, 0.0)).tanh()
-            return ratio.to(colour)[:, bins]
+            # Several times faster than by two-dimensional indices.
+            return ratio.to(colour).index_select(1, bins.flatten()).unflatten(1, bins.shape)
         # Densities over the unit cube of colours, as the background's.
         inside, outside = (
             torch.where(known[:, None], part + math.log(BINS**3), 0.0)[:, bins]
@@ -142,12 +142,10 @@ def _mix(old: Tensor, bins: Tensor, masks: Tensor, rate: float) -> Tensor:
 
 def _smooth(histograms: Histograms) -> Histograms:
     """Spread each bin over its neighbours, by 1/4, 1/2, 1/4 along each channel."""
-    cube = histograms.reshape(-1, 1, BINS, BINS, BINS)
-    kernel = histograms.new_tensor([0.25, 0.5, 0.25])
-    for axis in range(3):
-        shape = [1, 1, 1, 1, 1]
-        shape[2 + axis] = 3
-        padding = [0, 0, 0]
-        padding[axis] = 1
-        cube = functional.conv3d(cube, kernel.reshape(shape), padding=tuple(padding))
+    cube = histograms.reshape(-1, BINS, BINS, BINS)
+    for axis in (1, 2, 3):
+        smooth, inner = 0.5 * cube, BINS - 1
+        smooth.narrow(axis, 0, inner).add_(cube.narrow(axis, 1, inner), alpha=0.25)
+        smooth.narrow(axis, 1, inner).add_(cube.narrow(axis, 0, inner), alpha=0.25)
+        cube = smooth
     return cube.reshape(histograms.shape)

@@ -90,8 +90,6 @@ def edge_features(grey: Image, configuration: EdgeConfiguration | None = None) -
         ShapeError: If the image is not `[h, w]` with at least one pixel or not of a real floating
             point type.
     """
-    from kornia.filters import spatial_gradient
-
     _check_image("grey", grey)
     choice = configuration or EdgeConfiguration()
     height, width = grey.shape
@@ -102,7 +100,7 @@ def edge_features(grey: Image, configuration: EdgeConfiguration | None = None) -
         detail = smooth - gaussian_blur(smooth, choice.window)
         deviation = math.sqrt(0.5 * math.pi) * gaussian_blur(detail.abs(), choice.window)
         normalised = detail / torch.sqrt(deviation.square() + choice.floor**2)
-    gradient = spatial_gradient(normalised)[0, 0]
+    gradient = _sobel(normalised)
     # The border is replicated, which halves the slope across it.
     if width > 1:
         gradient[0, :, 0] *= 2.0
@@ -119,6 +117,17 @@ def edge_features(grey: Image, configuration: EdgeConfiguration | None = None) -
     energy = squared / (squared + choice.half_energy_step**2)
     direction = gradient / torch.where(present, squared, 1.0).sqrt()
     return EdgeFeatures(energy, direction, gradient)
+
+
+def _sobel(image: Float[Tensor, "1 1 h w"]) -> Float[Tensor, "2 h w"]:
+    """Derivatives along u and v over three by three pixels, the border replicated.
+
+    In slices: the size is another one in every frame, and a convolution is made for its size.
+    """
+    padded = functional.pad(image, (1, 1, 1, 1), mode="replicate")[0, 0]
+    rows = padded[:-2] + 2 * padded[1:-1] + padded[2:]
+    columns = padded[:, :-2] + 2 * padded[:, 1:-1] + padded[:, 2:]
+    return torch.stack([rows[:, 2:] - rows[:, :-2], columns[2:] - columns[:-2]]) / 8
 
 
 def _check_image(name: str, image: Tensor) -> None:
