@@ -666,6 +666,9 @@ def test_pictures_of_several_sizes_are_told_at_once(
     reader = VideoReader(tmp_path, stop=3)
     monkeypatch.setattr(video, "read_image", None)
     reader.check_sizes()
+    # Nor is one opened again that is as it was: films are detected first and tracked then.
+    monkeypatch.setattr(video, "Image", None)
+    reader.check_sizes()
 
 
 # Writing.

@@ -155,10 +155,8 @@ def initialise_image(
     write_fitted_body(out / FITTED_BODY_NAME, found, camera)
     _draw(out, found, picture, camera, keypoints)
     rows = proportion_table(found.lengths, found.scale)
-    with replace_file(out / "proportions.csv") as partial, partial.open("w", newline="") as file:
-        table = csv.DictWriter(file, names_in("name fitted_m standard_m difference_percent"))
-        table.writeheader()
-        table.writerows(rows)
+    if rows:  # bodies from files keep their lengths
+        _write_proportions(out / "proportions.csv", rows)
     summary: dict[str, Any] = {
         "image": image,
         "frame": files.frame,
@@ -179,6 +177,13 @@ def initialise_image(
         summary["stature_known"] = options.stature is not None
     write_summary(out / "summary.json", summary)
     return found, summary
+
+
+def _write_proportions(path: Path, rows: Sequence[dict[str, object]]) -> None:
+    with replace_file(path) as partial, partial.open("w", newline="") as file:
+        table = csv.DictWriter(file, names_in("name fitted_m standard_m difference_percent"))
+        table.writeheader()
+        table.writerows(rows)
 
 
 def initialise_video(

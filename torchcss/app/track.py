@@ -73,7 +73,8 @@ class TrackOptions:
         frame_rate: Frames per second of a folder of images; None: 30.
         person: Who of several people is followed: prominent, largest, leftmost or centre in the
             first frame, or the keypoint file's number of a person.
-        sigma: Noise of a wrist's keypoint, pixels; None: learnt from the first frame's.
+        sigma: Noise of a wrist's keypoint, or of a robot's joint, pixels; None: learnt from the
+            first frame's.
         focal: Focal length in pixels, of a camera that nobody calibrated.
         fov: The same as angle between the left and the right border of the image, degrees.
         detect: What finds the keypoints where no file of them is given.

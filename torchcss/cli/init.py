@@ -54,7 +54,7 @@ class Init:
     colours: bool = InitialiseOptions.colours
     """Let these fits see the colours on either side of the outline too."""
     sigma: float | None = InitialiseOptions.sigma
-    """Noise of a marked wrist, pixels; by default 0.6 % of the person's size."""
+    """Noise of a marked wrist or a robot's joint, pixels; by default 0.6 % of the body's size."""
     seed: int = Settings.seed
     """Seed of all random numbers."""
     device: str = Settings.device
@@ -105,7 +105,8 @@ class Init:
             options=options,
         )
         print("\n".join(found.report))
-        print(f"{'length':16}{'fitted, m':>12}{'standard, m':>14}{'difference':>12}")
+        if summary["proportions"]:
+            print(f"{'length':16}{'fitted, m':>12}{'standard, m':>14}{'difference':>12}")
         for row in summary["proportions"]:
             print(
                 f"{row['name']:16}{row['fitted_m']:12.3f}{row['standard_m']:14.3f}"

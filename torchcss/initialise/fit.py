@@ -143,7 +143,8 @@ def initialise(
             rough = fit_joints(body, view, generator=generator, options=brief, others=others)
             noise = _noise(rough, view, others, options)
             options = replace(options, sigma=noise * sigma)
-            line = f"keypoints: noise of a wrist {noise * sigma:.1f} px, from the best fit"
+            what = "a wrist" if {"l_wrist", "r_wrist"} & {*rough.body.joint_names} else "a joint"
+            line = f"keypoints: noise of {what} {noise * sigma:.1f} px, from the best fit"
             if noise > _POOR_FIT:
                 line += f", {noise:.1f} times what detectors have: {_NO_POSE}"
             notes.append(line)

@@ -22,6 +22,7 @@ from collections import Counter
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import suppress
 from fractions import Fraction
+from functools import lru_cache
 from itertools import pairwise, takewhile
 from pathlib import Path
 from types import TracebackType
@@ -535,7 +536,17 @@ def read_image(path: StrPath) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def _size_at_beginning(path: Path) -> tuple[int, int] | None:
-    """Columns and rows of an image, turned upright; None: nothing that can be read says it.
+    """Columns and rows of an image, turned upright; None: nothing that can be read says it."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return _size_of_file(path, status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(2**16)
+def _size_of_file(path: Path, _changed: int, _length: int) -> tuple[int, int] | None:
+    """The same; a file that is as it was is not opened again, as by who detects and then tracks.
 
     What a PNG says of its turn behind the pixels is not looked for.
     """

@@ -152,16 +152,11 @@ def side_view_figure(
             side.add_patch(ellipse)
     if reference is not None:
         _draw_reference(front, side, body, bones, camera, reference, distance)
-    _label_side_view(figure, front, side)
-    figure.suptitle(
-        f"frame {frame}, {track.times[row]:.2f} s; ellipses: one standard deviation, of the modes "
-        f"of {100 * _LEAST_WEIGHT:.0f} % or more",
-        fontsize=10,
-    )
+    _label_side_view(figure, front, side, f"frame {frame}, {track.times[row]:.2f} s")
     return figure
 
 
-def _label_side_view(figure: Figure, front: Axes, side: Axes) -> None:
+def _label_side_view(figure: Figure, front: Axes, side: Axes, when: str) -> None:
     """Titles, axes of one scale, and the legend."""
     label(front, "as the camera sees it", "metres to the right", "metres up")
     label(side, "from the side; the camera is far to the left", "metres from the camera")
@@ -171,6 +166,13 @@ def _label_side_view(figure: Figure, front: Axes, side: Axes) -> None:
         handles[::-1], labels[::-1], title="weight of the modes", loc="outside right upper",
         fontsize=8, title_fontsize=9, frameon=False,
     )  # fmt: skip
+    figure.suptitle(
+        f"{when}; ellipses: one standard deviation, of the modes of {100 * _LEAST_WEIGHT:.0f} % "
+        "or more",
+        fontsize=10,
+        x=0.01,
+        ha="left",  # away from the legend
+    )
 
 
 def num_explanations(track: Track, *, apart: float = EXPLANATION_M) -> np.ndarray:
