@@ -569,6 +569,33 @@ def test_bad_requests(tmp_path: Path) -> None:
     assert load_body(path).num_parameters == 11  # XML says its encoding itself
 
 
+@pytest.mark.parametrize("binary", [False, True])
+def test_a_link_is_as_large_as_the_box_around_its_mesh(tmp_path: Path, binary: bool) -> None:
+    corners = np.array([[[-50, -30, 0], [50, 30, 0], [0, 0, 400]]], "<f4")
+    if binary:
+        record = np.concatenate([np.zeros((1, 1, 3), "<f4"), corners], 1).tobytes() + bytes(2)
+        content = b"solid in millimetres".ljust(80) + (1).to_bytes(4, "little") + record
+    else:
+        rows = "".join(f"vertex {x} {y:e} {z}\n" for x, y, z in corners[0])
+        content = f"solid a\nfacet normal 0 0 1\nouter loop\n{rows}endloop\nendfacet\n".encode()
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "a.stl").write_bytes(content)
+    path = planar_arm(tmp_path / "arm.urdf", 0.5, 0.4)
+    mesh = (
+        '<visual><origin xyz="0.2 0 0" rpy="0 1.5707963267948966 0"/><geometry>'
+        '<mesh filename="package://arm/meshes/a.stl" scale="0.001 0.001 0.001"/>'
+        "</geometry></visual>"
+    )
+    text = path.read_text().replace('<link name="link2"/>', f'<link name="link2">{mesh}</link>')
+    path.write_text(text)
+    body = load_body(path)
+    assert "arm.urdf: as large as the boxes around their meshes: 'link2'" in body.notes
+    part = body.part_names.index("link2")
+    np.testing.assert_allclose(body.part_shape[part, :3], [0.03, 0.05, 0.2], atol=1e-12)
+    np.testing.assert_allclose(body.part_translation[part], [0.4, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(body.part_rotation[part].abs()[:, 2], [1, 0, 0], atol=1e-12)
+
+
 def test_meshes_that_stand_for_a_link_are_told(tmp_path: Path) -> None:
     path = planar_arm(tmp_path / "arm.urdf", 0.5, 0.4)
     mesh = '<visual><geometry><mesh filename="package://arm/meshes/{}.stl"/></geometry></visual>'

@@ -240,3 +240,27 @@ def test_meshes_and_includes_stay_in_the_folder(tmp_path: Path) -> None:
         "</geometry></visual></link></robot>"
     )
     assert load_body(folder / "a.urdf").part_names == ()
+    (tmp_path / "a.stl").write_text("solid a\nvertex 0 0 0\nvertex 1 1 1\n")
+    (folder / "b.stl").symlink_to(tmp_path / "a.stl")
+    for name in ("../a.stl", "package://../a.stl", "package://robot/../a.stl", "b.stl",
+                 f"file://{tmp_path}/a.stl", "a\0.stl".replace("\0", "&#9;")):  # fmt: skip
+        text = f"<mesh filename='{name}'/></geometry></visual></link></robot>"
+        head = "<robot name='a'><link name='b'><visual><geometry>"
+        (folder / "a.urdf").write_text(head + text)
+        assert load_body(folder / "a.urdf").part_names == (), name
+
+
+def test_meshes_are_of_a_links_size(tmp_path: Path) -> None:
+    (tmp_path / "a.urdf").write_text(
+        "<robot name='a'><link name='b'><visual><geometry><mesh filename='a.stl'/>"
+        "</geometry></visual></link></robot>"
+    )
+    mesh = tmp_path / "a.stl"
+    with mesh.open("wb") as file:
+        file.truncate(2**26 + 1)
+    assert "not a link's mesh" in "".join(load_body(tmp_path / "a.urdf").notes)
+    for content in (b"x", b"solid a\nvertex 0 0 x\n", b"solid a\nvertex 0 0 nan\n", bytes(84)):
+        mesh.write_bytes(content)
+        body = load_body(tmp_path / "a.urdf")
+        assert not body.part_names
+        assert "not an STL" in "".join(body.notes)

@@ -215,7 +215,7 @@ def _read(
     if path.suffix.lower() != ".urdf" and root.tag in ("mujoco", "mujocoinclude"):
         return *read_mjcf(path), _Y_UP
     try:
-        return *read_urdf(root), _Y_UP
+        return *read_urdf(root, path.parent), _Y_UP
     except BodyError as error:
         raise BodyError(f"{path}: {error}") from error
 

@@ -1,11 +1,12 @@
-"""A body from a URDF file: its tree, limits and simple solids; meshes and inertias are ignored.
+"""A body from a URDF file: its tree, limits, simple solids and boxes of meshes.
 
 pytorch-kinematics reads the tree (`torchcss.body.chain.urdf_joints`). Limits and mimic joints,
 which it leaves out, and origins and axes, of which it keeps seven digits, are read here, and the
 file is screened before it sees it. A floating joint of
 the root link is a free root, and what hangs on that link beside it is left out. Solids are boxes,
 cylinders, spheres and capsules: the visual ones of a link, or where it has none those for
-collisions.
+collisions. A link that has only meshes is as large as the box around them, in its own frame, if
+they are STL files in the folder of the URDF or below it; others are not opened.
 
 Call `read_urdf`; `torchcss.load_body("x.urdf")` does.
 """
@@ -15,14 +16,20 @@ from __future__ import annotations
 import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from itertools import count
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
 
 from torchcss.body.catalog import PartSpecification
 from torchcss.body.chain import JointSpecification, check_joints, link_order, urdf_joints
 from torchcss.body.files.bvh import HungTree
 from torchcss.body.files.default_shape import solid_shape, unopened_meshes
-from torchcss.body.rotations import Vector3, about_fixed_axes, as_rows
+from torchcss.body.files.stl import stl_points
+from torchcss.body.rotations import Vector3, about_fixed_axes, as_rows, as_vector
 from torchcss.errors import BodyError
 from torchcss.files import shortened
 
@@ -35,11 +42,22 @@ _SIZES = {
 }
 
 
-def read_urdf(robot: ElementTree.Element) -> tuple[HungTree, tuple[PartSpecification, ...]]:
+_THINNEST = 0.001
+"""Half the thickness of the thinnest part, metres."""
+
+_ROUNDED = (0.5, 1.0, 0.0, 0.0, 0.0, 0.0)
+"""What a part in a box has beside its half sides: a section that is round, ends that are nearly
+flat."""
+
+
+def read_urdf(
+    robot: ElementTree.Element, folder: Path
+) -> tuple[HungTree, tuple[PartSpecification, ...]]:
     """Tree and solids of a URDF.
 
     Args:
         robot: Its root element.
+        folder: Where meshes are looked for.
 
     Returns:
         The tree, and the parts of the links that have solids.
@@ -67,14 +85,7 @@ def read_urdf(robot: ElementTree.Element) -> tuple[HungTree, tuple[PartSpecifica
         for joint in _bare_joints(robot)
     ]
     solids = _solids(robot)
-    shaped = {part.link for part in solids}
-    meshes = [
-        name
-        for link in robot.findall("link")
-        if (name := link.get("name", "")) not in shaped and link.find("*/geometry/mesh") is not None
-    ]
-    if meshes:
-        notes.append(unopened_meshes(meshes, "<collision>"))
+    solids += _boxes_of_meshes(robot, folder.resolve(), {part.link for part in solids}, notes)
     check_joints(joints)
     places = tuple(link_order(joints))
     return HungTree(tuple(joints), {}, tuple(notes), places, floats), solids
@@ -230,6 +241,77 @@ def _solids(robot: ElementTree.Element) -> tuple[PartSpecification, ...]:
                 )
             )
     return tuple(parts)
+
+
+def _boxes_of_meshes(
+    robot: ElementTree.Element, folder: Path, shaped: set[str], notes: list[str]
+) -> tuple[PartSpecification, ...]:
+    """A part for every link that has no solids but meshes."""
+    parts: list[PartSpecification] = []
+    unopened: list[str] = []
+    for link in robot.findall("link"):
+        name = link.get("name", "")
+        if name in shaped or link.find("*/geometry/mesh") is None:
+            continue
+        corners = _mesh_points(link, "visual", folder, notes)
+        if corners is None:
+            corners = _mesh_points(link, "collision", folder, notes)
+        if corners is None:
+            unopened.append(name)
+            continue
+        low, high = corners.min(0), corners.max(0)
+        half = np.maximum(0.5 * (high - low), _THINNEST)
+        order = np.argsort(half)  # a superquadric's own axis is its longest
+        turn = np.eye(3)[:, order]
+        turn[:, 0] *= np.linalg.det(turn)
+        parts.append(
+            PartSpecification(
+                name=name,
+                link=name,
+                translation=as_vector(0.5 * (low + high)),
+                rotation=as_rows(turn),
+                shape=(*half[order].tolist(), *_ROUNDED),
+            )
+        )
+    if parts:
+        names = shortened(", ".join(part.name for part in parts))
+        notes.append(f"as large as the boxes around their meshes: {names}")
+    if unopened:
+        notes.append(unopened_meshes(unopened, "<collision>, or STL files in this folder,"))
+    return tuple(parts)
+
+
+def _mesh_points(
+    link: ElementTree.Element, tag: str, folder: Path, notes: list[str]
+) -> Float[np.ndarray, "p 3"] | None:
+    """Corners of all meshes of a link in its frame; None: there are none, or one is not at hand."""
+    found: list[np.ndarray] = []
+    for element in link.findall(tag):
+        for mesh in element.findall("geometry/mesh"):
+            path = _inside(folder, mesh.get("filename", ""))
+            if path is None:
+                return None
+            where = f"link {link.get('name', '')!r}: <mesh>"
+            scale = _numbers(where, "scale", mesh.get("scale", "1 1 1"), 3)
+            place, turn = _origin(where, element)
+            try:
+                corners = stl_points(path)
+            except BodyError as error:  # such as a pointer to where the file lies
+                notes.append(str(error))
+                return None
+            found.append(corners * scale @ np.array(turn).T + place)
+    return np.concatenate(found) if found else None
+
+
+def _inside(folder: Path, name: str) -> Path | None:
+    """The STL of that name in a folder or below it; a package is the folder, or is in it."""
+    package, _, rest = name.removeprefix("file://").removeprefix("package://").partition("/")
+    for each in (f"{package}/{rest}", rest if name.startswith("package://") else ""):
+        with suppress(OSError, ValueError):
+            path = (folder / each).resolve()
+            if path.suffix.lower() == ".stl" and path.is_relative_to(folder) and path.is_file():
+                return path
+    return None
 
 
 def _simple_solids(

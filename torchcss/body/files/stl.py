@@ -1,0 +1,53 @@
+"""The box around the triangles of an STL file, binary or text.
+
+Only the corners of triangles are read, and only of files of a size that a robot's link has.
+
+Call `stl_points`.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from torchcss.errors import BodyError
+from torchcss.files import read_bytes
+
+_MOST_BYTES = 2**26
+_FAR = 1e9
+_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+_HEAD = 84
+"""Bytes before the triangles of a binary file; the last four say how many there are."""
+
+_VERTEX = re.compile(rb"^\s*vertex\s+(\S+)\s+(\S+)\s+(\S+)\s*$", re.MULTILINE)
+
+
+def stl_points(path: Path) -> Float[np.ndarray, "8 3"]:
+    """The corners of the box around a mesh, in its own frame and unit.
+
+    Args:
+        path: The file.
+
+    Raises:
+        BodyError: If it cannot be read, is larger than 64 MiB, or no STL.
+    """
+    if path.is_file() and path.stat().st_size > _MOST_BYTES:
+        raise BodyError(f"{path}: more than {_MOST_BYTES:,} bytes; not a link's mesh")
+    data = read_bytes(path, BodyError)
+    count = int.from_bytes(data[_HEAD - 4 : _HEAD], "little")
+    points = np.zeros((0, 3))
+    if len(data) == _HEAD + count * _TRIANGLE.itemsize:
+        triangles = np.frombuffer(data, _TRIANGLE, offset=_HEAD)
+        points = triangles["corners"].reshape(-1, 3).astype(np.float64)
+    elif data.lstrip().startswith(b"solid"):
+        try:
+            points = np.array(_VERTEX.findall(data)).astype(np.float64).reshape(-1, 3)
+        except ValueError:  # a corner that is no number
+            points = points[:0]
+    if not len(points) or not (np.abs(points) < _FAR).all():
+        raise BodyError(f"{path}: not an STL, or without triangles; get a complete copy")
+    ends = np.stack([points.min(0), points.max(0)])
+    return ends[np.indices((2, 2, 2)).reshape(3, -1).T, np.arange(3)]
