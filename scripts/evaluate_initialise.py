@@ -180,7 +180,7 @@ def fit(case: Case, variant: str, config: Config, seed: int) -> dict[str, float]
     )
     seconds = time.process_time() - began
     body, states = found.body, found.hypotheses(50, generator=generator)
-    places = body.pose(states).joints[:, [body.joint_index(name) for name in LIMB_JOINTS]].numpy()
+    places = body.pose(states).joints[:, body.joint_columns(LIMB_JOINTS)].numpy()
     procrustes = pa_mpjpe_mm(places, case.joints)
     aligned = root_aligned_mpjpe_mm(places, case.joints, LIMB_JOINTS)
     modes = found.mixture.mean

@@ -110,7 +110,7 @@ def joint_errors(found: Initialisation, sequence: RecordedSequence, index: int) 
     """Root-aligned errors of the fits, over the joints whose truth is known."""
     true = dict(zip(sequence.joint_names, sequence.joints_world[index], strict=True))
     names = [n for n in found.body.joint_names if n in true and np.isfinite(true[n]).all()]
-    columns = [found.body.joint_index(name) for name in names]
+    columns = found.body.joint_columns(names)
     joints = found.body.pose(found.mixture.mean).joints[:, columns].numpy()
     root = None if "l_hip" in names else names[0]
     reference = np.stack([true[name] for name in names])

@@ -93,7 +93,7 @@ def begin(config: Config, body: BodyModel, truth: Tensor) -> tuple[TrackingSessi
     ]
     films = film_robot(body, truth, generator=generator, cameras=cameras, frame_rate=RATE)
     names = tuple(n for n in body.joint_names if n.rsplit("_", 1)[-1] in MARKED)
-    marked = body.pose(truth).joints[:, [body.joint_index(name) for name in names]]
+    marked = body.pose(truth).joints[:, body.joint_columns(names)]
     seen = []
     for camera in cameras:
         exact = camera.project(marked).uv

@@ -38,7 +38,7 @@ def made_up_costs(
     noise = torch.randn(samples, body.num_parameters, generator=generator, dtype=dtype)
     x = body.bounds.project(body.rest + 0.2 * noise)
     names = tuple(name for name in ALIASES["BODY_25B"] if name in body.joint_names)
-    joints = body.pose(body.rest).joints[[body.joint_index(name) for name in names]]
+    joints = body.pose(body.rest).joints[body.joint_columns(names)]
     uv = camera.project(joints).uv
     uv = uv + 3.0 * torch.randn(uv.shape, generator=generator, dtype=dtype)
     observation = Keypoints(uv, torch.ones_like(uv[:, 0]), names)

@@ -243,7 +243,7 @@ def states_of(body: BodyModel, path: Path, frames: list[int]) -> Tensor:
                 turn = turn @ torch.linalg.matrix_exp(math.radians(value) * angle)
             elif f"{name}_{letter}" in body.state_names:
                 x[row, body.state_index(f"{name}_{letter}")] = math.radians(value)
-        x[row, [body.state_index(n) for n in ROOT_NAMES[3:]]] = root_angles(turn)
+        x[row, body.state_columns(ROOT_NAMES[3:])] = root_angles(turn)
     return x
 
 

@@ -97,7 +97,7 @@ def test_left_and_right_bend_as_mirror_images():
         torch.zeros(1, dtype=torch.float64),
     )
     tips = (turns @ tips[..., None])[..., 0] + centres
-    hips = [body.joint_index(name) for name in ("l_hip", "r_hip")]
+    hips = body.joint_columns(("l_hip", "r_hip"))
     across = pose.joints[hips[0]] - pose.joints[hips[1]]
     across = across / across.norm()
     middle = pose.joints[hips].mean(0)

@@ -71,7 +71,7 @@ def test_what_is_held_moves_the_joints_by_their_sensitivity(generator: torch.Gen
     depth = ((joints.mean(0) - eye) @ axis) * axis
     drawn = eye + (1 + 0.03 * size) * (joints - eye) + 0.1 * focal * depth
     torch.testing.assert_close(found[5], torch.cov(drawn[:, 5].T), rtol=0.05, atol=2e-4)
-    hips = [body.joint_index(name) for name in ("l_hip", "r_hip")]
+    hips = body.joint_columns(("l_hip", "r_hip"))
     about = joint_covariance(body, pose, none, about=hips, held=held)
     drawn = drawn - drawn[:, hips].mean(1, keepdim=True)
     torch.testing.assert_close(about[5], torch.cov(drawn[:, 5].T), rtol=0.05, atol=1e-6)

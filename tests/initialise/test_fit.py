@@ -83,7 +83,7 @@ def find(someone: RandomPerson, search: Search = SMALL, **options) -> Initialisa
 
 
 def error_mm(found: Initialisation, someone: RandomPerson) -> np.ndarray:
-    index = [found.body.joint_index(name) for name in LIMB_JOINTS]
+    index = found.body.joint_columns(LIMB_JOINTS)
     joints = found.body.pose(found.mixture.mean).joints[:, index].numpy()
     return pa_mpjpe_mm(joints, someone.joints_world(LIMB_JOINTS).numpy()[None])
 
@@ -310,7 +310,7 @@ def test_unseen_legs_stand_as_people_do():
     generator, knees = torch.Generator().manual_seed(0), ["l_knee_flexion", "r_knee_flexion"]
     options = InitialiseOptions(search=SMALL, num_modes=2)
     found = initialise(None, above, someone.camera, generator=generator, options=options)
-    column = [found.body.state_index(name) for name in knees]
+    column = found.body.state_columns(knees)
     spread = found.mixture.covariance[0].diagonal().sqrt()[column]
     assert bool((spread < 0.8 * found.body.sticky_deviation[column]).all())
 
@@ -345,7 +345,7 @@ def test_odd_marks_are_named_and_gross_ones_move_little():
     assert "r_ankle" in found.left_out
     projected = someone.camera.project(found.body.pose(found.mixture.mean[0]).joints).uv
     others = [name for name in LIMB_JOINTS if name not in ("l_wrist", "r_ankle")]
-    fitted = projected[[found.body.joint_index(name) for name in others]]
+    fitted = projected[found.body.joint_columns(others)]
     given = fitted.new_tensor([spoilt[name] for name in others])
     assert float((fitted - given).norm(dim=-1).max()) < 20
 
@@ -593,7 +593,7 @@ def test_a_detectors_points_are_a_start() -> None:
             None, keypoints, someone.camera, generator=torch.Generator().manual_seed(0),
             options=options,
         )  # fmt: skip
-        index = [found.body.joint_index(name) for name in LIMB_JOINTS]
+        index = found.body.joint_columns(LIMB_JOINTS)
         joints = found.body.pose(found.mixture.mean[:1]).joints[:, index].numpy()
         truth = someone.joints_world(LIMB_JOINTS).numpy()
         return float(found.cost[0]), float(pa_mpjpe_mm(joints, truth)[0])

@@ -82,7 +82,7 @@ def test_files_and_table(
 
     positions, names = read_reference(reference, "joints")
     assert set(names) == {*LIMB_JOINTS, "HumanoidRoot", "vt1"}
-    index = [body.joint_index(name) for name in names]
+    index = body.joint_columns(names)
     assert 1000 * np.linalg.norm(positions - joints[:, index].numpy(), axis=-1).mean() < 10
     with np.load(reference) as arrays:
         assert float(arrays["frame_rate"]) == 40

@@ -50,7 +50,7 @@ def capture_of(
 ) -> MotionCapture:
     """A motion of a body as motion capture would have it, zero pose and all."""
     names = [name for name in PARENTS if name not in leave_out]
-    index = [body.joint_index(name) for name in names]
+    index = body.joint_columns(names)
     above = [PARENTS[name] for name in names]
     upright = body.with_base(torch.eye(3), torch.zeros(3))
     rest = upright.pose(torch.zeros_like(body.lower)).joints[index]
@@ -219,7 +219,7 @@ def test_no_numbers_that_make_no_sense() -> None:
 
 
 def test_lengths_stay_in_range(subject: BodyModel) -> None:
-    joints = subject.pose(moving(subject)).joints[:, [subject.joint_index(n) for n in LIMB_JOINTS]]
+    joints = subject.pose(moving(subject)).joints[:, subject.joint_columns(LIMB_JOINTS)]
     lengths, (line,) = fit_lengths(LIMB_JOINTS, joints)
     assert "all within" in line
     assert lengths["thigh"] == pytest.approx(subject.lengths["thigh"])
@@ -234,7 +234,7 @@ def test_joints_take_lengths_and_keep_directions(
     subject: BodyModel, generator: torch.Generator
 ) -> None:
     joints = subject.pose(moving(subject, count=6)).joints
-    joints = joints[:, [subject.joint_index(name) for name in LIMB_JOINTS]]
+    joints = joints[:, subject.joint_columns(LIMB_JOINTS)]
     narrow = joints.clone()
     for side, sign in (("l", 1), ("r", -1)):  # the shoulders 6 cm nearer to each other
         across = (
@@ -256,7 +256,7 @@ def test_derivatives_against_autograd(subject: BodyModel, generator: torch.Gener
     target = torch.randn(3, count, 3, generator=generator, dtype=torch.float64)
     cost = PointDistances(
         body=subject,
-        link=subject.marker_link[[subject.joint_index(name) for name in LIMB_JOINTS]],
+        link=subject.marker_link[subject.joint_columns(LIMB_JOINTS)],
         offset=0.1 * torch.randn(count, 3, generator=generator, dtype=torch.float64),
         target=target,
         sigma=torch.linspace(0.1, 0.2, count, dtype=torch.float64),

@@ -208,7 +208,7 @@ def test_a_body_is_measured_alike_on_any_base() -> None:
     states = body.bounds.project(0.15 * noise)
     # The reference is seen from other names and lacks most joints.
     names = [*LIMB_JOINTS, "skull_tip"]
-    index = [body.joint_index(name) for name in names]
+    index = body.joint_columns(names)
     sequence = recorded(
         body, states, joint_names=tuple(names),
         joints_world=body.pose(states).joints[:, index].numpy(),

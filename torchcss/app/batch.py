@@ -38,7 +38,7 @@ from contextlib import (
     redirect_stdout,
     suppress,
 )
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, field
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -66,6 +66,7 @@ from torchcss.io.video import VideoReader
 from torchcss.joint_names import names_in
 from torchcss.tracking.session import Posterior
 from torchcss.tracking.settings import Settings, settings_from_plain
+from torchcss.types import frozen
 
 FILE_COLUMNS = names_in("video camera keypoints masks init")
 """Columns that are paths, from the manifest's folder on."""
@@ -90,7 +91,7 @@ MOST_DEATHS = 3
 _POLL_S = 0.5
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Batch:
     """Track many clips; the same command goes on with what was interrupted."""
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -22,9 +21,10 @@ from torchcss.io.detect import Detected, Detector, DetectorName, open_detector
 from torchcss.io.keypoints.one_person import identified
 from torchcss.io.video import VideoReader, VideoWriter
 from torchcss.joint_names import ALIASES
+from torchcss.types import frozen
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class DetectOptions:
     """What finds the keypoints.
 

@@ -17,7 +17,6 @@ from __future__ import annotations
 import csv
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -41,14 +40,14 @@ from torchcss.io.video import read_frame
 from torchcss.joint_names import names_in
 from torchcss.show.overlay import draw_poses
 from torchcss.tracking.settings import Settings, check_seed
-from torchcss.types import Keypoints
+from torchcss.types import Keypoints, frozen
 from torchcss.vision.camera import Camera
 
 NUM_DRAWN = 7
 """Hypotheses drawn at most."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class PictureFiles:
     """What belongs to a picture: its joints and its camera.
 

@@ -8,7 +8,6 @@ is fitted to the keypoints (`torchcss.initialise.focal`) and held while tracking
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -21,6 +20,7 @@ from torchcss.initialise.options import InitialiseOptions
 from torchcss.io.cameras import LoadedCamera
 from torchcss.io.video import VideoReader, focal_length_35mm
 from torchcss.tracking.settings import Settings
+from torchcss.types import frozen
 from torchcss.vision.camera import Camera
 
 PERSONS = ("body30", "body32", "body34")
@@ -32,7 +32,7 @@ _OF_FILE = 0.05
 """Deviation of what a file says of its lens (ours): a film is often cropped, to steady it."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class KnownLens:
     """What is known of a lens.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, field, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -44,10 +44,11 @@ from torchcss.show.track_pictures import write_overlays
 from torchcss.tracking.checkpoint import state_from_tensors
 from torchcss.tracking.session import TrackingSession
 from torchcss.tracking.settings import Settings, settings_from_plain
+from torchcss.types import frozen
 from torchcss.vision.camera import Camera
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class TrackOptions:
     """What else there is to say about the files of a run, beside its settings.
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterator, Sequence
 from contextlib import nullcontext
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
@@ -26,7 +26,7 @@ from torchcss.io.keypoints.one_person import Whom
 from torchcss.io.keypoints.read import read_person
 from torchcss.io.video import VideoReader, missing_numbers, several_kinds
 from torchcss.io.view_files import RecordedCamera, ViewFiles
-from torchcss.types import Frame, Keypoints
+from torchcss.types import Frame, Keypoints, frozen
 from torchcss.vision.camera import Camera
 
 
@@ -131,7 +131,7 @@ def moments(
         yield (frame, *(next(other, None) for other in others))
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class FrameSelection:
     """Which frames of the first camera's video.
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchcss.body.kinematics import TreePose
 from torchcss.body.model import BodyModel, BodyPose
+from torchcss.linalg import multiply
 
 
 def on_origin(body: BodyModel) -> BodyModel:
@@ -33,13 +34,13 @@ def pose_track(
     """
     pose = body.pose(state)
     turn, shift = base[..., None, :3, :3], base[..., None, :3, 3]
-    omega = (turn @ pose.tree.omega[..., None])[..., 0]
-    velocity = (turn @ pose.tree.velocity[..., None])[..., 0]
+    omega = multiply(turn, pose.tree.omega)
+    velocity = multiply(turn, pose.tree.velocity)
     tree = TreePose(
         turn @ pose.tree.rotation,
-        (turn @ pose.tree.translation[..., None])[..., 0] + shift,
+        multiply(turn, pose.tree.translation) + shift,
         omega,
         # The twist is taken at the origin, which moved away from the base by -shift.
         velocity + torch.linalg.cross(shift.expand_as(omega), omega),
     )
-    return BodyPose(state, tree, (turn @ pose.joints[..., None])[..., 0] + shift)
+    return BodyPose(state, tree, multiply(turn, pose.joints) + shift)

@@ -22,7 +22,7 @@ import math
 import re
 import tomllib
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,6 +31,7 @@ import numpy as np
 from torchcss.body.chain import JointSpecification
 from torchcss.body.rotations import Vector3, as_rows, as_vector
 from torchcss.errors import BodyError
+from torchcss.types import frozen
 
 _TABLE = tomllib.loads(Path(__file__).with_name("humanoid.toml").read_text(encoding="utf-8"))
 
@@ -74,7 +75,7 @@ def without_side(name: str) -> str:
     return name.removeprefix("l_").removeprefix("r_")
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class PartSpecification:
     """One superquadric part: where it sits and its nine shape numbers (see `body.surface`).
 
@@ -93,7 +94,7 @@ class PartSpecification:
     shape: tuple[float, ...]
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class MarkerSpecification:
     """A named joint centre or landmark, fixed in a link.
 
@@ -108,7 +109,7 @@ class MarkerSpecification:
     translation: Vector3 = (0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class BodySpecification:
     """Everything that `BodyModel` needs: joints, parts, landmarks, ties and weak parameters.
 

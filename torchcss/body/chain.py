@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,6 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.errors import BodyError
+from torchcss.types import frozen
 
 if TYPE_CHECKING:
     from pytorch_kinematics import Chain
@@ -27,7 +27,7 @@ _FAR = 1e6
 """Metres beyond which nothing is a body's, and squares would overflow."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class JointSpecification:
     """One joint and the link below it.
 

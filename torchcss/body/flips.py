@@ -90,7 +90,7 @@ class Segments:
         children = list(rows)
         names = [n for n in dict.fromkeys(p for p, _ in rows.values()) if n not in rows] + children
         self.joint: Int[Tensor, " m"] = torch.tensor(
-            [body.joint_index(name) for name in names], dtype=torch.long, device=body.tie.device
+            body.joint_columns(names), dtype=torch.long, device=body.tie.device
         )
         self.groups = tuple(dict.fromkeys(group for _, group in rows.values()))
         # Parent and group of every joint; roots have none.

@@ -18,7 +18,7 @@ Call `load_body`; `has_free_root` tells bodies that move about from arms.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -48,6 +48,7 @@ from torchcss.body.rotations import as_vector
 from torchcss.errors import BodyError, ConfigurationError, MotionCaptureError, check_device
 from torchcss.files import one_line
 from torchcss.joint_names import skeleton_joint_names
+from torchcss.types import frozen
 
 BODY_SUFFIXES = (".urdf", ".xml", ".mjcf", ".bvh")
 
@@ -58,7 +59,7 @@ _Y_UP = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
 """Robots are Z up and face +X: to Y up, facing +Z."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class FileOptions:
     """What is made of a body's file beyond its tree.
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -220,6 +220,14 @@ class BodyModel(nn.Module):
             BodyError: If the body has no such parameter.
         """
         return self._place("parameter", name, self.state_names)
+
+    def joint_columns(self, names: Iterable[str]) -> list[int]:
+        """Positions of joint centres, see `joint_index`."""
+        return [self.joint_index(name) for name in names]
+
+    def state_columns(self, names: Iterable[str]) -> list[int]:
+        """Positions of state parameters, see `state_index`."""
+        return [self.state_index(name) for name in names]
 
     def _place(self, kind: str, name: str, names: tuple[str, ...]) -> int:
         if name not in names:

@@ -46,7 +46,7 @@ def free_turns(body: BodyModel) -> Bounds:
     """The body's limits, but none on a root's yaw and roll, which wind up over a long motion."""
     lower, upper = body.lower.clone(), body.upper.clone()
     if has_root(body):
-        turns = [body.state_index(name) for name in ("root_yaw", "root_roll")]
+        turns = body.state_columns(("root_yaw", "root_roll"))
         lower[turns], upper[turns] = -math.inf, math.inf
     return Bounds(lower, upper)
 
@@ -55,7 +55,7 @@ def root_pose(
     body: BodyModel, x: Float[Tensor, "*batch n"]
 ) -> tuple[Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch 3"]]:
     """World pose of the root link."""
-    index = [body.state_index(name) for name in ROOT_NAMES]
+    index = body.state_columns(ROOT_NAMES)
     root = x[..., index]
     rotation = body.base_rotation @ root_rotation(root[..., 3:])
     return rotation, root[..., :3] @ body.base_rotation.T + body.base_translation
@@ -102,7 +102,7 @@ def move_base(
     Returns:
         The body on the new base, and the states and covariances in its parameters.
     """
-    index = [body.state_index(name) for name in ROOT_NAMES]
+    index = body.state_columns(ROOT_NAMES)
     turn = rotation.T @ body.base_rotation
     shift = (body.base_translation - translation) @ rotation
 

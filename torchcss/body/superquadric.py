@@ -33,6 +33,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchcss.linalg import multiply
+
 Triple = tuple[Tensor, Tensor, Tensor]
 
 _LEAST_SQUARE = {torch.float32: 1e-12, torch.float64: 1e-24}
@@ -285,14 +287,14 @@ def _bent(
     stretch = turn.stretch[..., None]
     beside = torch.stack([zero, one, zero], dim=-1)
     jacobian = torch.stack([n, beside, m / stretch], dim=-2)
-    slope = (plane @ gradient[..., None])[..., 0]
+    slope = multiply(plane, gradient)
     bowl = jacobian.mT @ (plane @ hessian @ plane.mT) @ jacobian
     curvature = (shape.bend / turn.stretch)[..., None, None]
     mixed = n[..., :, None] * m[..., None, :]
     bowl = bowl - slope[..., :1, None] * curvature * (m[..., :, None] * m[..., None, :])
     bowl = bowl + slope[..., 2:, None] * curvature / stretch[..., None] * (mixed + mixed.mT)
-    slope = (jacobian.mT @ slope[..., None])[..., 0]
-    return (plane.mT @ slope[..., None])[..., 0], plane.mT @ bowl @ plane
+    slope = multiply(jacobian.mT, slope)
+    return multiply(plane.mT, slope), plane.mT @ bowl @ plane
 
 
 def _power(base: Tensor, exponent: Tensor) -> Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated
 
@@ -11,9 +11,10 @@ import tyro
 from torchcss.app.detect import DetectOptions, detect_video
 from torchcss.errors import VideoError
 from torchcss.io.detector_model import download_model
+from torchcss.types import frozen
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Detect:
     """Find the keypoints of everybody in a video; --download-model fetches the detector's model."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated
 
@@ -11,9 +11,10 @@ import tyro
 from torchcss.cli.options import GivenOptions, PathArgument
 from torchcss.io.export import ExportOptions, Format, export
 from torchcss.io.run import Given, Run
+from torchcss.types import frozen
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Export:
     """Write a track as BVH, TRC, C3D, MOT, SMPL parameters, or a table with uncertainties."""
 

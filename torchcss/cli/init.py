@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,9 +19,10 @@ from torchcss.initialise.multi_start import PAPER_LENGTHS, StartSearch
 from torchcss.initialise.options import InitialiseOptions
 from torchcss.io.video import read_frame
 from torchcss.tracking.settings import Settings
+from torchcss.types import frozen
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Init:
     """Fit pose, proportions and shape to one picture with marked joints."""
 

@@ -20,7 +20,7 @@ SIGTERM with 143. What was tracked until then is on disk; `torchcss track ... --
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 
 import tyro
@@ -36,9 +36,10 @@ from torchcss.cli.track import Track
 from torchcss.cli.view import Plot, Report, View
 from torchcss.errors import OutputError, TorchcssError
 from torchcss.studies.demo import DEMO_SETTINGS, run_demo
+from torchcss.types import frozen
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Demo:
     """Track an arm that moves in depth before clutter, and compare with the truth."""
 

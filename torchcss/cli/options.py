@@ -1,6 +1,6 @@
 """Options that several verbs have: all of `Settings`, and what is written to the terminal.
 
-    @dataclass(frozen=True, kw_only=True)
+    @frozen
     class Config:
         settings: SettingsOptions = Settings(body="arm8")
 
@@ -14,7 +14,6 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -23,6 +22,7 @@ import tyro
 from torchcss.io.run import Given
 from torchcss.io.tracks import read_summary
 from torchcss.tracking.settings import Settings
+from torchcss.types import frozen
 
 PathArgument = Annotated[Path, tyro.conf.Positional]
 """What a verb works on."""
@@ -34,7 +34,7 @@ SettingsOptions = Annotated[Settings, tyro.conf.arg(name="")]
 """How to track; each field is an option of its own name."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Terminal:
     """What is written to the terminal."""
 

@@ -5,7 +5,7 @@ With the track alone it takes seconds. With the images it takes about as long as
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, field, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -17,9 +17,10 @@ from torchcss.errors import ConfigurationError
 from torchcss.io.run import Given, GivenKeypoints, Run
 from torchcss.tracking.smooth import Smoothing
 from torchcss.tracking.smooth_images import IMAGES
+from torchcss.types import frozen
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Smooth:
     """Choose among the modes of a track with all frames in view, and smooth what was chosen."""
 

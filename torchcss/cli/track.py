@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing, nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -15,9 +15,10 @@ from torchcss.cli.options import PathArgument, SettingsOptions, Terminal, Termin
 from torchcss.errors import ConfigurationError
 from torchcss.io.view_files import ViewFiles
 from torchcss.tracking.settings import Settings
+from torchcss.types import frozen
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Track:
     """Track a body through a video, and write its track, summary, overlay and report.html."""
 

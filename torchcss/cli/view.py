@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 
 from torchcss.cli.options import GivenOptions, PathArgument
 from torchcss.io.run import Given, Run
 from torchcss.show.track_pictures import has_pictures
+from torchcss.types import frozen
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class View:
     """Look at a track in the rerun viewer, or save a recording of it that needs no video."""
 
@@ -34,7 +35,7 @@ class View:
             print(f"wrote {self.save}; open it with: rerun {self.save}")
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Plot:
     """Draw a track's modes, trajectories with uncertainties, and frames, as PNG files."""
 
@@ -56,7 +57,7 @@ class Plot:
             print(f"wrote {path}")
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Report:
     """Write report.html: film, figures, what was assumed and how to go on, on one page."""
 

@@ -35,7 +35,6 @@ otherwise count twice: `proportion_columns(body)` says which parameters those ar
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -46,7 +45,7 @@ from torchcss.body.model import BodyModel
 from torchcss.cost.context import FrameContext
 from torchcss.cost.term import OnStates, Term
 from torchcss.errors import ConfigurationError
-from torchcss.types import LocalModel
+from torchcss.types import LocalModel, frozen
 
 INDIVIDUAL: dict[str, float] = {
     "hip_width": 0.050,
@@ -80,7 +79,7 @@ def proportion_columns(body: BodyModel) -> dict[str, int]:
     }
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Anthropometric(Term):
     """The Gaussian prior on internal proportions.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import TypeVar
 
 from torchcss.cost.anthropometric import Anthropometric
@@ -19,7 +19,7 @@ from torchcss.cost.silhouette import SilhouetteTerm
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.temporal import MixturePrior, TemporalPrior
 from torchcss.cost.term import Need, Term
-from torchcss.types import Curvature
+from torchcss.types import Curvature, frozen
 
 _Term = TypeVar("_Term", bound=Term)
 
@@ -41,7 +41,7 @@ TERM_TABLE: dict[str, type[Term]] = {
 """All terms by name, in the order in which costs are summed."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class CostChoice:
     """Which terms and priors make up the cost, and how they weigh.
 

@@ -33,7 +33,6 @@ of a fitted model, and hidden nodes cost slightly more.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, NamedTuple
 
@@ -47,6 +46,7 @@ from torchcss.cost.outline import Derivatives, ImageNodes, OutlineTerm
 from torchcss.cost.term import Need, OnPoints, Values
 from torchcss.cost.visibility import places
 from torchcss.robust import Lorentzian, RobustPotential, RobustValue
+from torchcss.types import frozen
 from torchcss.vision.sampling import inside_image, interpolate_bilinear
 
 Pixels = Float[Tensor, "*batch p 2"]
@@ -92,7 +92,7 @@ _FADE = 0.25
 """Share of the window over which an assignment that enters it comes to count in the sum of 1."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class ContourTerm(OutlineTerm):
     """The robust edge-matching cost of occluding contours.
 

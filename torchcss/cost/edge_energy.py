@@ -26,7 +26,6 @@ By default: `edge_energy_field(features.edge_field())` once per frame, then
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -37,6 +36,7 @@ from torchcss.cost.outline import Derivatives, ImageNodes, OutlineTerm
 from torchcss.cost.term import OnPoints, Values
 from torchcss.errors import ShapeError
 from torchcss.robust import Lorentzian, RobustPotential
+from torchcss.types import frozen
 from torchcss.vision.sampling import gaussian_blur
 from torchcss.vision.spline import SplineField, spline_field
 
@@ -74,7 +74,7 @@ def edge_energy_field(edge_field: Float[Tensor, "2 h w"]) -> SplineField:
     return spline_field(coefficients[None])
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class EdgeEnergyTerm(OutlineTerm):
     """The robust potential of the edge energy at occluding contours.
 

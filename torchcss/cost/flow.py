@@ -30,7 +30,6 @@ the frame before, and `FlowTerm().point_cost(...)`.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -43,7 +42,7 @@ from torchcss.cost.term import Need, OnPoints, Points, Posed, Term, Values
 from torchcss.cost.visibility import SeenNodes
 from torchcss.errors import ShapeError, check_shape
 from torchcss.robust import Lorentzian, RobustPotential, residual_cost
-from torchcss.types import PointCost
+from torchcss.types import PointCost, frozen
 from torchcss.vision.camera import Camera
 from torchcss.vision.sampling import sample_bilinear
 
@@ -104,7 +103,7 @@ def flow_targets(
     return FlowTargets(projection.uv + moved, weight)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class FlowTerm(Term):
     """The robust cost of the interior nodes' displacement from the previous frame.
 

@@ -42,7 +42,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -56,7 +55,7 @@ from torchcss.body.surface import surface_points
 from torchcss.cost.context import FrameContext
 from torchcss.cost.term import OnStates, Term
 from torchcss.errors import ConfigurationError
-from torchcss.types import Curvature, LocalModel, PointCost
+from torchcss.types import Curvature, LocalModel, PointCost, frozen
 
 END = 6.0
 """The `c` above: the potential ends where that of the paper has fallen to `exp(-c)`."""
@@ -295,7 +294,7 @@ def _extent(body: BodyModel) -> Float[Tensor, "parts 3"]:
     return torch.where((rows.bend != 0)[:, None], anywhere[:, None], straight)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Interpenetration(Term):
     """The repulsive potential between parts.
 

@@ -10,7 +10,7 @@ one that lies farther off, since the Lorentzian grows without end.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
@@ -21,7 +21,7 @@ from torch import Tensor
 from torchcss.cost.context import FrameContext
 from torchcss.cost.term import OnPoints, Posed, Term
 from torchcss.robust import Lorentzian, RobustPotential, residual_cost
-from torchcss.types import Keypoints, PointCost
+from torchcss.types import Keypoints, PointCost, frozen
 from torchcss.vision.camera import Camera
 
 SPREAD = {
@@ -102,7 +102,7 @@ def _spread(name: str) -> float:
     return SPREAD.get(name, SPREAD.get(name.split("_", 1)[-1], 1.0))
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class JointTerm(Term):
     """The robust joint-correspondence cost.
 

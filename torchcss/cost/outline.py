@@ -12,7 +12,6 @@ To add such a term derive from `OutlineTerm`: give `match`, `derivatives`, and `
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from jaxtyping import Float, Int
@@ -21,7 +20,7 @@ from torch import Tensor
 from torchcss.cost.context import FrameContext
 from torchcss.cost.term import OnPoints, Points, Term, Values
 from torchcss.cost.visibility import ContourPredictor, SeenNodes, contour_nodes, places
-from torchcss.types import PointCost
+from torchcss.types import PointCost, frozen
 from torchcss.vision.camera import Camera, ProjectionModel
 
 Each = Float[Tensor, " k"]
@@ -48,7 +47,7 @@ class ImageNodes(NamedTuple):
     weight: Each
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class OutlineTerm(Term):
     """A term of the contour nodes.
 

@@ -28,7 +28,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import NamedTuple
@@ -43,7 +42,7 @@ from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.uncertainty import point_jacobian
 from torchcss.cost.context import FrameContext
 from torchcss.cost.term import OnStates, Term
-from torchcss.types import LocalModel
+from torchcss.types import LocalModel, frozen
 from torchcss.vision.camera import Upright
 
 Each = Float[Tensor, " k"]
@@ -424,7 +423,7 @@ def density_where(up: Upright | None) -> Callable[[BodyModel], BodyDensity | Non
     return partial(body_density, up=up)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class PosePrior(Term):
     """The prior on poses that is learnt from motion capture; see the module."""
 

@@ -23,7 +23,6 @@ By default: `region_field(ratio)` once per frame, `RegionImages(field, layer)`, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from types import EllipsisType
 from typing import NamedTuple
 
@@ -40,6 +39,7 @@ from torchcss.cost.outline import Derivatives, ImageNodes, OutlineTerm
 from torchcss.cost.part_map import grow, part_map
 from torchcss.cost.term import Need, OnPoints, Values
 from torchcss.cost.visibility import ContourPredictor
+from torchcss.types import frozen
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import Window
 from torchcss.vision.sampling import gaussian_blur
@@ -192,7 +192,7 @@ class RegionImages(NamedTuple):
     origin: tuple[int, int] = (0, 0)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class RegionTerm(OutlineTerm):
     """The cost of what the image looks like on either side of the contour.
 

@@ -21,7 +21,6 @@ What to call: `SegmentationTerm.images` once a frame, then `value` at any number
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from jaxtyping import Float, Int
@@ -33,6 +32,7 @@ from torchcss.cost.context import FrameContext
 from torchcss.cost.part_map import part_map
 from torchcss.cost.region import layer_of_part
 from torchcss.cost.term import BoundWeight, Need, Term
+from torchcss.types import frozen
 from torchcss.vision.camera import Camera
 
 _FEWEST_PIXELS = 20
@@ -56,7 +56,7 @@ class SegmentationImages(NamedTuple):
     area: float
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class SegmentationTerm(Term):
     """The foreground log-likelihood ratio of all covered pixels, against the area of the body.
 

@@ -14,7 +14,6 @@ and give it to the optimiser; hold variables by bounds of no width.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
@@ -25,7 +24,7 @@ from torchcss.body.shape import ShapeParameters, lift_with_shape, surface_angles
 from torchcss.cost.outline import OutlineTerm
 from torchcss.cost.total import TrackingCost
 from torchcss.cost.visibility import ContourPredictor
-from torchcss.types import Bounds, LocalModel, PointCost
+from torchcss.types import Bounds, LocalModel, PointCost, frozen
 
 
 class Outline(NamedTuple):
@@ -42,7 +41,7 @@ class Outline(NamedTuple):
     weight: float
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class ShapedCost:
     """Cost of pose and shape; a `CostFunction` on states followed by shape parameters.
 

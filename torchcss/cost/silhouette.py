@@ -28,7 +28,6 @@ does it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -40,7 +39,7 @@ from torchcss.cost.context import FrameContext
 from torchcss.cost.interior import InteriorNodes, interior_nodes
 from torchcss.cost.part_map import grow, part_map
 from torchcss.cost.term import Need, OnPoints, Points, Term, Values
-from torchcss.types import PointCost
+from torchcss.types import PointCost, frozen
 from torchcss.vision.camera import Camera
 from torchcss.vision.spline import SplineField, spline_field
 
@@ -69,7 +68,7 @@ class SilhouetteImages(NamedTuple):
     sigma: float
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class SilhouetteTerm(Term):
     """The disagreement of the body with the silhouette. Lengths are for a person.
 

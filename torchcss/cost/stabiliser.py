@@ -9,7 +9,6 @@ a strong observation can unstick the parameter and turn the prior off.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -20,7 +19,7 @@ from torchcss.cost.anthropometric import proportion_columns
 from torchcss.cost.context import FrameContext
 from torchcss.cost.term import OnStates, Term
 from torchcss.robust import Lorentzian
-from torchcss.types import LocalModel
+from torchcss.types import LocalModel, frozen
 
 _SEEN = (
     *("shoulder_swing", "shoulder_raising", "elbow_flexion"),
@@ -51,7 +50,7 @@ def long_tailed(
     return LocalModel(0.5 * rho.sum(-1), first * z / deviation, torch.diag_embed(curvature))
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Stabiliser(Term):
     """The sticky prior of a body's hard-to-see parameters.
 

@@ -23,7 +23,6 @@ By default: `surface_targets(...)` for the modes of the frame before, then
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from jaxtyping import Float, Int
@@ -32,7 +31,7 @@ from torch import Tensor
 from torchcss.cost.term import Values
 from torchcss.cost.visibility import SeenNodes
 from torchcss.robust import Leclerc, RobustPotential
-from torchcss.types import PointCost
+from torchcss.types import PointCost, frozen
 from torchcss.vision.camera import Camera
 from torchcss.vision.spline import SplineField
 
@@ -68,7 +67,7 @@ def surface_targets(nodes: SeenNodes, camera: Camera, contrast: SplineField) -> 
     return SurfaceTargets(contrast.value(projection.uv), nodes.exists * nodes.visible * seen)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class SurfaceTerm:
     """The robust cost of the nodes' change of look.
 

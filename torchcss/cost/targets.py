@@ -13,7 +13,7 @@ that differ from item to item, with the priors of a body.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -26,7 +26,7 @@ from torchcss.body.uncertainty import point_jacobian
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.errors import ShapeError, check_shape
-from torchcss.types import BlendedCost, LocalModel, PointCost
+from torchcss.types import BlendedCost, LocalModel, PointCost, frozen
 
 States = Float[Tensor, "*batch m"]
 
@@ -38,7 +38,7 @@ ARM = 0.25
 """Distance of a pose's points from the link's origin, metres: a radian counts as much as this."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class PointTargets(BlendedCost):
     """Squared distances of points from where they should be; a `CostFunction`.
 
@@ -127,7 +127,7 @@ class PointTargets(BlendedCost):
         )
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class PointDistances:
     """Squared distances from places of their own in every item, and priors; a `CostFunction`.
 

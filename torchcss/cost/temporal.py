@@ -10,7 +10,6 @@ not impossible.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -21,12 +20,12 @@ from torchcss.cost.context import FrameContext
 from torchcss.cost.stabiliser import long_tailed
 from torchcss.cost.term import OnStates, Term
 from torchcss.inference.mixture import GaussianMixture
-from torchcss.types import LocalModel
+from torchcss.types import LocalModel, frozen
 
 _LEAST_VARIANCE = 1e-12
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class TemporalPrior(Term):
     """Long-tailed prior about the parent mode.
 
@@ -79,7 +78,7 @@ class MixtureDensity(NamedTuple):
     log_amplitude: Float[Tensor, " k"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class MixturePrior(Term):
     """The whole of `p(x_t | R_{t-1})`: the modes of the previous frame, widened by the motion.
 

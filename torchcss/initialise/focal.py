@@ -113,7 +113,7 @@ def _costs(
     bounds = options.search.bounds(body)
     frame = torch.arange(num).repeat_interleave(_NUM_STARTS)
     x = starts_about(body, _NUM_STARTS, generator).repeat(num, 1)
-    x[:, [body.state_index(name) for name in ROOT_NAMES[:3]]] += places[frame]
+    x[:, body.state_columns(ROOT_NAMES[:3])] += places[frame]
     first = _before(cost, cameras[middle], frame)
     x = descend_widened(first, x, bounds, _SCHEDULE)
     best = first.value(x).nan_to_num(math.inf).view(num, _NUM_STARTS).argsort(1)[:, :2]

@@ -50,7 +50,7 @@ def start_from_points(
     known = (keypoints.confidence > 0) & points.isfinite().all(-1)
     if int(known.sum()) < _LEAST_JOINTS:
         return starts[:0]
-    joint = torch.tensor([body.joint_index(name) for name in names], device=known.device)
+    joint = torch.tensor(body.joint_columns(names), device=known.device)
     points = points * _scale(body, names, points, known)
     points = points[known] + _place(camera, keypoints.positions[known].to(points), points[known])
     joint = joint[known]

@@ -230,7 +230,7 @@ def starts_about(body: BodyModel, num: int, generator: torch.Generator) -> Vecto
     spread = torch.where(body.sticky_deviation.isfinite(), body.sticky_deviation, 0.3)
     x = body.sticky_mean + 0.6 * spread * noise
     if has_root(body):
-        columns = [body.state_index(name) for name in ROOT_NAMES]
+        columns = body.state_columns(ROOT_NAMES)
         x[:, columns] = 0.1 * noise[:, columns]
         x[:, body.state_index("root_yaw")] = _all_round(x)
     return body.bounds.project(x)

@@ -124,7 +124,7 @@ def hang_on_best(body: BodyModel, fits: Modes) -> tuple[BodyModel, Modes]:
     Fits that lie across it by a right angle, where the root's angles lock, are left out.
     """
     body, mean, _ = move_base(body, *root_pose(body, fits.mean[0]), fits.mean)
-    root = [body.state_index(name) for name in ROOT_NAMES]
+    root = body.state_columns(ROOT_NAMES)
     inside = (mean >= body.lower) & (mean <= body.upper)
     keep = torch.nonzero(inside[:, root].all(-1))[:, 0]
     return body, fits._replace(mean=mean).take(keep)
@@ -132,13 +132,13 @@ def hang_on_best(body: BodyModel, fits: Modes) -> tuple[BodyModel, Modes]:
 
 def columns_of(source: BodyModel, target: BodyModel, x: Vectors) -> Float[Tensor, "b m"]:
     """The parameters of one body out of the states of another that has them too."""
-    return x[:, [source.state_index(name) for name in target.state_names]]
+    return x[:, source.state_columns(target.state_names)]
 
 
 def spread_to(source: BodyModel, target: BodyModel, x: Vectors) -> Float[Tensor, "b m"]:
     """States of a body as those of one with more parameters, which stay at zero."""
     full = x.new_zeros(len(x), target.num_parameters)
-    full[:, [target.state_index(name) for name in source.state_names]] = x
+    full[:, target.state_columns(source.state_names)] = x
     return full
 
 
@@ -210,7 +210,7 @@ def _with_lengths(
 ) -> tuple[LocalModel, Bool[Tensor, "k m"], list[int]]:
     """The cost about fits, its free parameters, of which lengths are some, and the body's own."""
     loose = cost.body
-    columns = [loose.state_index(name) for name in body.state_names]
+    columns = loose.state_columns(body.state_names)
     full = spread_to(body, loose, x)
     model, bounds = cost.local_model(full), search.bounds(loose)
     lengths = bounds.upper > bounds.lower

@@ -19,7 +19,6 @@ as everywhere: centres at integers, u counts columns.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +30,7 @@ from torch.nn import functional
 from torchcss.body.model import BodyModel
 from torchcss.errors import ConfigurationError, ShapeError, check_shape
 from torchcss.show.style import OKABE_ITO
+from torchcss.types import frozen
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import (
     Fragments,
@@ -95,7 +95,7 @@ class ProjectedBody(NamedTuple):
         return torch.where(face >= 0, self.part[face.clamp_min(0)], -1)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class OverlayStyle:
     """How the overlay looks.
 

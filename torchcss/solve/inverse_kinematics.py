@@ -30,7 +30,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -46,7 +45,7 @@ from torchcss.inference.proposals import CovarianceScaled
 from torchcss.inference.trust_region import TrustRegionNewton, default_prior_variance
 from torchcss.linalg import inverse_on_free
 from torchcss.solve.self_motion import Curve, SolutionSet, States, distance_from
-from torchcss.types import Bounds, Numbers, Vectors
+from torchcss.types import Bounds, Numbers, Vectors, frozen
 
 _NEAR = 0.02
 """Metres by which a descent may miss the pose to be worth polishing."""
@@ -93,7 +92,7 @@ class Solutions(NamedTuple):
         return len(self.closed)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Search:
     """How widely solutions are looked for.
 

@@ -30,7 +30,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -51,7 +51,7 @@ from torchcss.errors import ConfigurationError, check_positive
 from torchcss.inference.smoothing import Refinement, Transition, best_path, refine
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.io.motion.positions import MotionCapture, limb_positions
-from torchcss.types import Trajectory
+from torchcss.types import Trajectory, frozen
 
 _STERNOCLAVICULAR = 0.03
 """Metres from the midline to where the body's shoulder width begins."""
@@ -84,7 +84,7 @@ LimbPlaces = Float[Tensor, "t limbs 3"]
 """Joint centres of the limbs, frame by frame, metres."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Retargeting:
     """How a body is fitted to joint centres.
 
@@ -192,7 +192,7 @@ def retarget(
         model = model.with_base(model.base_rotation, drop)
         source, limbs = source + drop, limbs + drop
     joints = model.pose(states).joints
-    columns = [model.joint_index(name) for name in names]
+    columns = model.joint_columns(names)
     at_limit = (states <= model.lower + _SLACK) | (states >= model.upper - _SLACK)
     inside = PenetrationDepth(model)(model, states)
     report += _findings(model, states, at_limit, inside)
@@ -335,7 +335,7 @@ def levelled(
 
 def _face_middle(body: BodyModel, states: Trajectory) -> tuple[BodyModel, Trajectory]:
     """The same motion on a base that faces the middle of all turns: most room to both limits."""
-    place = [body.state_index(name) for name in ROOT_NAMES[:3]]
+    place = body.state_columns(ROOT_NAMES[:3])
     yaw = body.state_index("root_yaw")
     heading = 0.5 * (states[:, yaw].max() + states[:, yaw].min())
     facing = root_rotation(torch.stack([heading, 0 * heading, 0 * heading]))
@@ -449,7 +449,7 @@ def _cost(
     choice: Retargeting,
 ) -> PointDistances:
     """Limbs and other joints where they shall be, frame by frame."""
-    columns = [body.joint_index(name) for name in names]
+    columns = body.joint_columns(names)
     sigma = [choice.sigma] * len(names) + [choice.sigma_others] * len(others)
     return PointDistances(
         body=body,
@@ -474,7 +474,7 @@ def _fit(
     noise[0] = 0.0
     spread = torch.where(body.sticky_deviation.isfinite(), body.sticky_deviation, 0.0)
     starts = (body.sticky_mean + 0.7 * spread * noise).expand(frames, *noise.shape).clone()
-    starts[..., [body.state_index(name) for name in ROOT_NAMES]] = root[:, None]
+    starts[..., body.state_columns(ROOT_NAMES)] = root[:, None]
     every = torch.arange(frames).repeat_interleave(k)
     optimiser = TrustRegionNewton(max_steps=choice.max_steps, tolerance=1e-3)
     found = optimiser.minimise(cost.take(every), starts.flatten(0, 1), bounds)
@@ -516,7 +516,7 @@ def _findings(
             "choose a shorter part"
         )
     share = at_limit.double().mean(0)
-    share[[body.state_index(name) for name in ROOT_NAMES]] = 0.0
+    share[body.state_columns(ROOT_NAMES)] = 0.0
     worst = share.argsort(descending=True)[:6].tolist()
     held = [f"{body.state_names[i]} {100 * share[i]:.0f} %" for i in worst if share[i] > 0.005]
     lines.append(f"angles at a limit, share of frames: {', '.join(held) or 'none'}")

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchcss.cost.targets import PointTargets
+from torchcss.linalg import multiply
 from torchcss.types import Bounds
 
 _POLISHING = 12
@@ -178,7 +179,7 @@ class SolutionSet(NamedTuple):
             off = ((target - ahead) * along).sum(-1)
             rows = torch.cat([jacobian.flatten(1, 2), along[:, None]], 1)
             right = torch.cat([error.flatten(1), off[:, None]], 1)
-            target = target - (torch.linalg.pinv(rows) @ right[..., None])[..., 0]
+            target = target - multiply(torch.linalg.pinv(rows), right)
         error = self.cost.errors(target)[0].norm(dim=-1).amax(-1)
         aside = (target - ahead).norm(dim=-1)
         return target, (error <= _ON_THE_CURVE) & (aside <= 0.5 * step)

@@ -33,7 +33,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -75,7 +74,7 @@ from torchcss.studies.metrics import (
 )
 from torchcss.studies.sequences import RecordedSequence, common_name, read_reference
 from torchcss.tracking.session import Posterior
-from torchcss.types import Frame, Vector
+from torchcss.types import Frame, Vector, frozen
 from torchcss.vision.camera import Camera
 
 ARM_LOST_MM = 150.0
@@ -97,7 +96,7 @@ _PLACE = ROOT_NAMES[:3]
 """Where a body stands."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Thresholds:
     """The figures that make the words precise; see the module's page.
 
@@ -304,7 +303,7 @@ class Evaluator:
                 f"{sequence.name}: cannot align the roots: the reference has no "
                 f"{' and '.join(missing)}"
             )
-        self._column = [body.joint_index(name) for name in self._common]
+        self._column = body.joint_columns(self._common)
         index = [sequence.joint_names.index(name) for name in self._common]
         self._reference = sequence.joints_world[:, index]
         self._penetration = PenetrationDepth(body)

@@ -60,7 +60,7 @@ class RandomPerson(NamedTuple):
     def joints_world(self, names: tuple[str, ...]) -> Float[Tensor, "j 3"]:
         """True positions of joints, metres."""
         joints = self.body.pose(self.state).joints
-        return joints[[self.body.joint_index(name) for name in names]]
+        return joints[self.body.joint_columns(names)]
 
 
 def random_person(
@@ -92,7 +92,7 @@ def random_person(
     turn = torch.rand((), generator=generator, dtype=torch.float64)
     state[body.state_index("root_yaw")] = math.pi * (2 * turn - 1)
     camera = study_camera("random")
-    index = [body.joint_index(name) for name in joint_names]
+    index = body.joint_columns(joint_names)
     uv = camera.project(body.pose(state).joints[index]).uv
     noise = torch.randn(uv.shape, generator=generator, dtype=uv.dtype)
     chance = torch.rand(2, len(index), generator=generator, dtype=uv.dtype)
@@ -149,7 +149,7 @@ def person_coverage(
     """
     _, state, _ = move_base(person.body, body.base_rotation, body.base_translation, person.state)
     truth = torch.zeros_like(mixture.mean[0])
-    truth[[body.state_index(name) for name in person.body.state_names]] = state
+    truth[body.state_columns(person.body.state_names)] = state
     for name, column in proportion_columns(body).items():
         truth[column] = person.body.lengths[name] - body.lengths[name]
     apart = truth - mixture.mean
@@ -157,7 +157,7 @@ def person_coverage(
     apart[:, yaw] = within_half_turn(apart[:, yaw])
     z = apart.abs() / mixture.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     nearest = int(z.square().mean(-1).argmin())
-    index = [body.joint_index(name) for name in LIMB_JOINTS]
+    index = body.joint_columns(LIMB_JOINTS)
     pose = body.pose(mixture.mean[nearest])
     spread = joint_covariance(body, pose, mixture.covariance[nearest])[index]
     squared = squared_mahalanobis(person.joints_world(LIMB_JOINTS) - pose.joints[index], spread)

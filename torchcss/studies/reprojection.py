@@ -21,7 +21,7 @@ spread about as far as in Fig. 5 [IJRR] (`scripts/spectra.py` measures it). Thre
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import NamedTuple
 
 import torch
@@ -45,6 +45,7 @@ from torchcss.types import (
     PointCost,
     Vector,
     Vectors,
+    frozen,
 )
 from torchcss.vision.camera import Camera
 
@@ -68,7 +69,7 @@ _VECTOR = 32
 """A batch is filled up to a multiple of this, so that an item's bits do not depend on its place."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class ReprojectionCost(BlendedCost):
     """Reprojection error of joint centres and sticky priors; a `CostFunction`.
 
@@ -284,7 +285,7 @@ def reprojection_problem(
     camera = study_camera("reprojection")
     truth = plausible_pose(body, generator=generator)
     names = joint_names or tuple(n for n in body.joint_names if n not in (*_FACE, *_FOOT))
-    index = torch.tensor([body.joint_index(name) for name in names])
+    index = torch.tensor(body.joint_columns(names))
     exact = camera.project(body.pose(truth).joints[index]).uv
     noise = torch.randn(exact.shape, generator=generator, dtype=exact.dtype)
     observed = exact + pixel_noise * noise

@@ -26,7 +26,17 @@ from torchcss.linalg import squared_mahalanobis
 from torchcss.robust import Lorentzian, Quadratic
 from torchcss.studies.minima import FoundMinima, find_minima, joined_minima, other_minima
 from torchcss.studies.reprojection import ReprojectionProblem, reprojection_problem
-from torchcss.types import Bounds, CostFunction, Items, LocalModel, Modes, Numbers, Vector, Vectors
+from torchcss.types import (
+    Bounds,
+    CostFunction,
+    Items,
+    LocalModel,
+    Modes,
+    Numbers,
+    Vector,
+    Vectors,
+    frozen,
+)
 
 CLICKED_JOINTS = (
     "HumanoidRoot", "vt1", "skull_tip", "l_shoulder", "l_elbow", "l_wrist", "r_shoulder", "r_elbow",
@@ -123,7 +133,7 @@ class SamplerRun(NamedTuple):
     seconds: float
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class StudyChoice:
     """What the problem of a study is like.
 
@@ -181,7 +191,7 @@ def study_problem(
     if pose is not None:
         noise = problem.observed - _project(problem, truth)
         truth = torch.zeros_like(truth)
-        truth[[cost.body.state_index(name) for name in pose]] = truth.new_tensor([*pose.values()])
+        truth[cost.body.state_columns(pose)] = truth.new_tensor([*pose.values()])
         truth = cost.body.bounds.project(truth)
         cost = replace(cost, target=_project(problem, truth) + noise)
     if not choice.limits:

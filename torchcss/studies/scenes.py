@@ -227,7 +227,7 @@ def _nearest(body: BodyModel, fits: Float[Tensor, "k n"], reference: Path, frame
     """The state whose limbs are nearest the reference once the roots are on each other."""
     positions, names = read_reference(reference)
     common = [name for name in LIMB_JOINTS if name in names and name in body.joint_names]
-    fitted = body.pose(fits).joints[:, [body.joint_index(name) for name in common]]
+    fitted = body.pose(fits).joints[:, body.joint_columns(common)]
     true = positions[frame, [names.index(name) for name in common]]
     return fits[int(np.argmin(root_aligned_mpjpe_mm(fitted.cpu(), true, common)))]
 

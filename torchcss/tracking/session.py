@@ -527,7 +527,7 @@ def follow_with_base(body: BodyModel, state: TrackerState) -> tuple[BodyModel, T
     if not has_root(body):
         return body, state
     best = state.mixture.mean[0]
-    angles = best[[body.state_index(name) for name in ROOT_NAMES[3:]]]
+    angles = best[body.state_columns(ROOT_NAMES[3:])]
     if float(angles[1].abs()) < _PITCH_LIMIT and float(angles.abs().max()) < math.radians(270):
         return body, state
     mixture, base = state.mixture, root_pose(body, best)
@@ -535,7 +535,7 @@ def follow_with_base(body: BodyModel, state: TrackerState) -> tuple[BodyModel, T
     body, mean, covariance = move_base(body, *base, mixture.mean, mixture.covariance)
     assert covariance is not None
     velocity = mean - last
-    turned = [body.state_index(name) for name in ROOT_NAMES[3:]]
+    turned = body.state_columns(ROOT_NAMES[3:])
     velocity[:, turned] = within_half_turn(velocity[:, turned])
     # Particles belong to the old base; a filter draws new ones from the mixture.
     return body, state._replace(

@@ -232,7 +232,7 @@ def _periods(body: BodyModel) -> Vector:
     endless = body.comes_round & body.lower.isinf() & body.upper.isinf()
     period = torch.where(endless, 2 * math.pi, math.inf).double()
     if has_root(body):
-        period[[body.state_index(name) for name in ROOT_NAMES[3:]]] = 2 * math.pi
+        period[body.state_columns(ROOT_NAMES[3:])] = 2 * math.pi
     return period
 
 

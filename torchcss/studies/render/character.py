@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -31,8 +30,9 @@ from torchcss.body.catalog import without_side
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.rotations import quaternions
 from torchcss.body.surface import straighten
+from torchcss.linalg import multiply
 from torchcss.studies.render.renderer import Colour, Mesh, random_waves
-from torchcss.types import Vector
+from torchcss.types import Vector, frozen
 from torchcss.vision.rasterise import vertex_normals
 
 _BLEND = 0.008
@@ -86,7 +86,7 @@ Vertices = Float[Tensor, "v 3"]
 """Three numbers of every vertex: place (metres) or colour."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Clothing:
     """What a character wears and how much it differs from its body.
 
@@ -238,7 +238,7 @@ class Character:
         rotation, centre = self.body.part_poses(self.body.pose(state))
         # Motion of every part since the skin was made: turn about the origin, then shift.
         turn = rotation @ self._bind_rotation.mT
-        shift = centre - (turn @ self._bind_centre[..., None])[..., 0]
+        shift = centre - multiply(turn, self._bind_centre)
         real = torch.from_numpy(quaternions(turn.numpy()))
         dual = 0.5 * _times(torch.cat([torch.zeros_like(shift[:, :1]), shift], -1), real)
         first, second = real[self._owner[:, 0]], real[self._owner[:, 1]]

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,12 +25,12 @@ from torch import Tensor
 
 from torchcss.body.model import BodyModel
 from torchcss.errors import ConfigurationError
-from torchcss.types import Curvature, PointCost, Trajectory
+from torchcss.types import Curvature, PointCost, Trajectory, frozen
 
 _METRES = ("root_x", "root_y", "root_z")
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class KeyPoses:
     """A motion as a table.
 
@@ -138,7 +138,7 @@ def plant_feet(body: BodyModel, states: Trajectory) -> Trajectory:
         states: The motion; hip, knee and ankle angles are taken from its first state only.
     """
     names = [f"{side}_{place}" for side in "lr" for place in ("heel", "midtarsal", "toe")]
-    soles = torch.tensor([body.joint_index(name) for name in names])
+    soles = torch.tensor(body.joint_columns(names))
     columns = torch.tensor([
         body.state_index(f"{side}_{angle}")
         for side in "lr"

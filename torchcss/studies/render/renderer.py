@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -27,6 +26,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchcss.errors import check_shape
+from torchcss.types import frozen
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import interpolate, join_faces, rasterise
 
@@ -83,7 +83,7 @@ Shade = Callable[[Triples, Triples, Triples, Tensor], Triples]
 """What lights surfaces: `Lighting.shade`, or that of the lamps of a scene with their shadows."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Lighting:
     """A lamp with a soft cone, and ambient light that comes mostly from above.
 

@@ -33,6 +33,7 @@ from torchcss.studies.render.renderer import (
     to_display,
     to_light,
 )
+from torchcss.types import frozen
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import join_faces, rasterise
 
@@ -72,7 +73,7 @@ def lamp(place: Point, target: Point = (0.0, 0.0, 0.0), strength: float = 0.9) -
     )
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Style:
     """How a sequence looks.
 

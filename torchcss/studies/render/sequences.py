@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import NamedTuple
 
 import numpy as np
@@ -48,7 +48,7 @@ from torchcss.studies.render.renderer import (
     render_meshes,
 )
 from torchcss.studies.render.scene import SceneRenderer, Standpoint, Style, lamp, look_at
-from torchcss.types import Trajectory, Vector
+from torchcss.types import Trajectory, Vector, frozen
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import grid_faces, join_faces
 
@@ -59,7 +59,7 @@ _MARGIN = 0.06
 """Share of a picture's width and height that `camera_in_front` leaves free on every side."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class SyntheticSequence:
     """A rendered sequence and its truth.
 
@@ -218,7 +218,7 @@ class SequenceFrame(NamedTuple):
     occluded: Bool[Tensor, "h w"] | None
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Shot:
     """All that a sequence is rendered from.
 
