@@ -13,7 +13,6 @@ later cell.
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,7 @@ from matplotlib.widgets import Button
 
 from torchcss.body.load import load_body
 from torchcss.errors import ConfigurationError, KeypointError
-from torchcss.files import write_text
+from torchcss.files import StrPath, write_text
 from torchcss.show.track_plots import bones_of, draw_bones
 from torchcss.tracking.settings import Settings
 from torchcss.types import Keypoints
@@ -231,7 +230,7 @@ def click_joints(
 
 
 def write_clicked(
-    path: str | os.PathLike[str],
+    path: StrPath,
     joints: Keypoints,
     image_size_wh: tuple[int, int],
     *,

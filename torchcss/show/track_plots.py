@@ -13,7 +13,6 @@ colour-blind viewers can tell apart. Every function returns a figure that belong
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -29,6 +28,7 @@ from torchcss.body.bases import pose_track
 from torchcss.body.model import BodyModel
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.errors import ConfigurationError, ShapeError
+from torchcss.files import StrPath
 from torchcss.io.run import body_of_track
 from torchcss.io.tracks import Track
 from torchcss.io.video import VideoReader
@@ -295,7 +295,7 @@ def _draw_events(panels: Sequence[Axes], events: Sequence[Mapping[str, Any]]) ->
 
 
 def contact_sheet(
-    video: str | os.PathLike[str],
+    video: StrPath,
     frames: Sequence[int],
     *,
     track: Track | None = None,

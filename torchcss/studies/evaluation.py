@@ -31,7 +31,6 @@ several runs one of medians. What the words mean (the figures are those of `Thre
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -48,7 +47,7 @@ from torchcss.body.uncertainty import joint_covariance
 from torchcss.cost.part_map import part_map
 from torchcss.cost.penetration import PenetrationDepth
 from torchcss.errors import ConfigurationError, TrackFileError
-from torchcss.files import load_arrays
+from torchcss.files import StrPath, load_arrays
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.tracker import TrackerInfo
 from torchcss.io.run import Run, as_run
@@ -640,8 +639,8 @@ class Evaluation(NamedTuple):
 
 
 def evaluate(
-    run: Run | str | os.PathLike[str],
-    reference: str | os.PathLike[str],
+    run: Run | StrPath,
+    reference: StrPath,
     *,
     joints: Sequence[str] = LIMB_JOINTS,
     root: str | None = None,
@@ -738,7 +737,7 @@ def _check_names(
         )
 
 
-def reference_deviation(path: str | os.PathLike[str]) -> float:
+def reference_deviation(path: StrPath) -> float:
     """What a reference file says of its own error, metres per coordinate; 20 mm if nothing."""
     arrays = load_arrays(Path(path), TrackFileError)
     stated = arrays.get("deviation_m", np.array(Thresholds.reference_m))

@@ -18,7 +18,6 @@
 from __future__ import annotations
 
 import json
-import os
 import zipfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -29,7 +28,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from torchcss.files import prepare_output_folder, replace_file, write_text
+from torchcss.files import StrPath, prepare_output_folder, replace_file, write_text
 from torchcss.io.cameras import camera_entry
 from torchcss.io.video import VideoWriter
 from torchcss.studies.render.motions import Motion
@@ -41,7 +40,7 @@ _HIDDEN_CONFIDENCE = 0.3
 
 
 def write_sequence(
-    folder: str | os.PathLike[str], shot: Shot, *, noise_px: float = 2.0, progress: bool = False
+    folder: StrPath, shot: Shot, *, noise_px: float = 2.0, progress: bool = False
 ) -> Path:
     """Render a shot into a folder.
 

@@ -23,7 +23,6 @@ By default: `read_sequence(folder)`, or `read_sequence(folder, view="cam01")`; `
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -34,7 +33,7 @@ from jaxtyping import Bool, Float
 
 from torchcss.body.load import load_body
 from torchcss.errors import CameraError, KeypointError, TrackFileError, VideoError
-from torchcss.files import load_arrays, one_line
+from torchcss.files import StrPath, load_arrays, one_line
 from torchcss.io.cameras import check_image_size, load_camera
 from torchcss.io.keypoints.read import read_keypoints
 from torchcss.io.video import VideoReader
@@ -75,7 +74,7 @@ class RecordedSequence(NamedTuple):
     truth: Motion | None
 
 
-def read_sequence(folder: str | os.PathLike[str], *, view: str | None = None) -> RecordedSequence:
+def read_sequence(folder: StrPath, *, view: str | None = None) -> RecordedSequence:
     """Read a folder as described above.
 
     Args:
@@ -163,7 +162,7 @@ def _read_keypoints(
 
 
 def read_reference(
-    path: str | os.PathLike[str], array: str = "joints", *, num_frames: int | None = None
+    path: StrPath, array: str = "joints", *, num_frames: int | None = None
 ) -> tuple[Float[np.ndarray, "t j 3"], list[str]]:
     """Read joints in space.
 

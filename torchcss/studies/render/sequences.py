@@ -294,9 +294,7 @@ class Shot:
             Character(self.body, self.clothing, generator=generator, spacing=self.spacing)
         ]
         if self.bystander:
-            characters.append(
-                _rest_of_person(self.body, self.clothing, generator, 1.5 * self.spacing)
-            )
+            characters.append(_rest_of_person(self.body, self.clothing, generator))
         return characters, generator
 
 
@@ -311,9 +309,7 @@ def _place(joints: Float[Tensor, "t j 3"], camera: Camera, floor: float) -> Stan
     return Standpoint(middle, floor, behind + 0.15)
 
 
-def _rest_of_person(
-    arm: BodyModel, clothing: Clothing, generator: torch.Generator, spacing: float
-) -> Character:
+def _rest_of_person(arm: BodyModel, clothing: Clothing, generator: torch.Generator) -> Character:
     """Somebody standing still whose right arm is the given one."""
     body = load_body("body34", lengths=arm.lengths)
     start = body.tree.link_index("r_sternoclavicular_link")
