@@ -340,9 +340,16 @@ def load_json(path: Path, error_class: type[TorchcssError]) -> Any:
         error_class: If the file is missing, empty, unreadable or not JSON.
     """
     data = read_bytes(path, error_class)
-    other = " nor of another format that is read" if path.suffix.lower() != ".json" else ""
-    with refusing(error_class, f"{path}: not a JSON file{other}"):
-        return json.loads(data)
+    with refusing(error_class, f"{path}: not a JSON file"):
+        try:
+            return json.loads(data)
+        except ValueError:
+            if path.suffix.lower() == ".json":
+                raise
+            raise error_class(
+                f"{path}: not a JSON file, nor of another format that is read; docs/guide.md lists "
+                "them"
+            ) from None
 
 
 def load_arrays(path: Path, error_class: type[TorchcssError]) -> Mapping[str, np.ndarray]:

@@ -2,7 +2,7 @@
 
 | verb | does |
 |---|---|
-| `torchcss demo` | renders a sequence, tracks it and prints the error against the truth |
+| `torchcss demo` | tracks a film of the package and prints the error against the truth |
 | `torchcss init IMAGE` | fits a body to one picture with marked joints |
 | `torchcss detect VIDEO` | finds the keypoints of a video |
 | `torchcss track VIDEO` | tracks a body through a video |
@@ -65,6 +65,12 @@ class Demo:
 
 Verb = Demo | Init | Detect | Track | Batch | Smooth | Export | View | Plot | Report
 
+_DESCRIPTION = """Tracks a body with joints through a video, and keeps every pose that explains it.
+
+`torchcss track VIDEO` needs nothing but a video; `torchcss track --help` tells what else it takes.
+Bad input ends with one line on standard error and exit status 2. What was tracked before an
+interruption is on disk: `torchcss track ... --resume` goes on."""
+
 _OLD_NAMES = {
     "--evidence": "--likelihood-power",
     "--agility": "--acceleration-ratio",
@@ -87,7 +93,7 @@ def main(arguments: list[str] | None = None) -> int:
     words = ["".join((_OLD_NAMES.get(name, name), *value)) for name, *value in options]
     try:
         # Settings check themselves, so that reading them may fail as well.
-        verb = tyro.cli(Verb, prog="torchcss", args=words, description=__doc__)  # type: ignore[arg-type]
+        verb = tyro.cli(Verb, prog="torchcss", args=words, description=_DESCRIPTION)  # type: ignore[arg-type]
         verb.run()
     except TorchcssError as error:
         print(f"torchcss: {error}", file=sys.stderr)

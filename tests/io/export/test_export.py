@@ -73,8 +73,10 @@ def test_following_the_parents(track: Track):
     orphan = track._replace(parent=np.full_like(track.parent, -1))
     alone = select(orphan, SelectionChoice(mode=1, follow=True)).rank[:, 0].tolist()
     assert alone == [-1, -1, -1, 1]
-    with pytest.raises(ConfigurationError, match="no chosen frame has it"):
+    with pytest.raises(ConfigurationError, match="the last chosen frame lacks it"):
         select(track, SelectionChoice(mode=2, follow=True, stop=7))
+    few = select(track, SelectionChoice(mode="all", follow=True, stop=7))
+    assert few.rank.shape[1] == track.num_modes[track.frames < 7][-1]
 
 
 def test_an_arm_stands_as_the_pictures_do(tmp_path: Path):

@@ -208,7 +208,8 @@ def _ranks(
     """The wanted ranks `[m]`, and which of the modes that is in every kept frame `[t m]`."""
     kept = inside[:: choice.stride]
     if choice.mode == "all":
-        wanted = np.arange(track.num_modes[inside].max(initial=0))
+        ends = inside[-1:] if choice.follow else inside  # modes of the last frame are followed
+        wanted = np.arange(track.num_modes[ends].max(initial=0))
     else:
         wanted = np.array([0 if choice.mode == "best" else int(choice.mode)])
     if choice.follow:
@@ -216,9 +217,10 @@ def _ranks(
     else:
         ranks = np.where(wanted < track.num_modes[kept, None], wanted, -1)
     seen = (ranks >= 0).any(axis=0)
-    if not seen.all():
+    if not seen.all() or not seen.size:
+        where = "the last chosen frame lacks it" if choice.follow else "no chosen frame has it"
         raise ConfigurationError(
-            f"mode {wanted[np.argmin(seen)]}: no chosen frame has it; the track has up to "
+            f"mode {wanted[np.argmin(seen)] if seen.size else 0}: {where}; the track has up to "
             f"{track.num_modes[kept].max(initial=0)} modes, counted from 0"
         )
     return wanted, ranks

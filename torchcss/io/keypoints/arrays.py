@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from torchcss.errors import KeypointError
-from torchcss.files import load_arrays
+from torchcss.files import load_arrays, shortened
 from torchcss.io.keypoints.mediapipe import is_landmark_array, read_landmark_array
 from torchcss.io.keypoints.people import (
     LAYOUT_SIZES,
@@ -55,7 +55,7 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
     if name is None:
         raise KeypointError(
             f"expected the arrays keypoints, confidence and joint_names, "
-            f"found {', '.join(arrays) or 'none'}"
+            f"found {shortened(', '.join(arrays) or 'none')}"
         )
     report = [f"format: {path.suffix[1:].upper()}"]
     values = _people(name, arrays[name])

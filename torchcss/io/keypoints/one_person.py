@@ -47,7 +47,7 @@ class Whom(NamedTuple):
             return int(np.argmin(ranks[self.person]))
         if self.person in tracks:
             return tracks.index(self.person)
-        known = ", ".join(str(track) for track in tracks if track is not None) or "no numbers"
+        known = ", ".join(repr(track) for track in tracks if track is not None) or "no numbers"
         raise KeypointError(
             f"person {self.person!r} is not in frame {self.frame}, where tracking starts; there "
             f"are {known}; or say largest, leftmost or centre"
