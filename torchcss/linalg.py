@@ -223,8 +223,19 @@ def _resolved_eigen(covariance: Matrices) -> tuple[Vectors, Vectors, Matrices]:
     return deviation, values.clamp(min=resolution), vectors
 
 
+def _factored(covariance: Matrices) -> tuple[Vectors, Matrices, bool]:
+    """Deviations, lower factors of the resolved correlations, and whether all of these exist."""
+    deviation, correlation = _standardised(covariance)
+    resolution = deviation.new_tensor(covariance.shape[-1] * torch.finfo(covariance.dtype).eps)
+    factor, found = damped_cholesky(correlation, resolution)
+    return deviation, factor, bool(found.all())
+
+
 def log_determinant(covariance: Matrices) -> Numbers:
     """Log-determinant of a covariance; finite where it is singular, as the module page says."""
+    deviation, factor, found = _factored(covariance)
+    if found:
+        return 2 * (deviation * torch.linalg.diagonal(factor)).log().sum(-1)
     deviation, values, _ = _resolved_eigen(covariance)
     return 2 * deviation.log().sum(-1) + values.log().sum(-1)
 
@@ -237,12 +248,23 @@ def squared_mahalanobis(difference: Vectors, covariance: Matrices) -> Numbers:
         covariance: Positive semi-definite. Along a direction of no variance the distance is very
             large, as it ought to be, but finite as long as the dtype can hold it.
     """
-    deviation, correlation = _standardised(covariance)
-    resolution = deviation.new_tensor(covariance.shape[-1] * torch.finfo(covariance.dtype).eps)
-    factor, found = damped_cholesky(correlation, resolution)
-    if bool(found.all()):
-        return solve_lower(factor, difference / deviation).square().sum(-1)
-    return multiply(whitener(covariance), difference).square().sum(-1)
+    return squared_lengths(difference[..., None, :], covariance)[..., 0]
+
+
+def squared_lengths(
+    differences: Float[Tensor, "*#batch s n"], covariance: Matrices
+) -> Float[Tensor, "*batch s"]:
+    """Squared Mahalanobis distances of several vectors under each covariance.
+
+    Args:
+        differences: Vectors; leading dimensions broadcast with those of the covariance.
+        covariance: See `squared_mahalanobis`.
+    """
+    deviation, factor, found = _factored(covariance)
+    if not found:
+        return (differences @ whitener(covariance).mT).square().sum(-1)
+    standard = (differences / deviation[..., None, :]).mT
+    return torch.linalg.solve_triangular(factor, standard, upper=False).square().sum(-2)
 
 
 def whitener(covariance: Matrices) -> Matrices:

@@ -27,6 +27,7 @@ from torchcss.linalg import (
     log_determinant,
     multiply,
     prior_units,
+    squared_lengths,
     squared_mahalanobis,
     symmetric_part,
     whitener,
@@ -79,11 +80,11 @@ class GaussianMixture(NamedTuple):
     def squared_distance(self, x: Vectors) -> Float[Tensor, "*batch k"]:
         """Squared Mahalanobis distance from every component, in that component's own metric."""
         shape, n = x.shape[:-1], x.shape[-1]
-        white, parts = whitener(self.covariance), []
         # Component by component for many states at once, a few at a time to bound the memory.
-        for part in x.reshape(-1, n).split(_STATES_AT_ONCE):
-            apart = part - self.mean[:, None]
-            parts.append((apart @ white.mT).square().sum(-1).mT)
+        parts = [
+            squared_lengths(part - self.mean[:, None], self.covariance).mT
+            for part in x.reshape(-1, n).split(_STATES_AT_ONCE)
+        ]
         return torch.cat(parts).reshape(*shape, len(self.mean))
 
     def component_log_density(self, x: Vectors) -> Float[Tensor, "*batch k"]:
@@ -258,7 +259,7 @@ def distinct_modes(
     while len(order) and len(kept) != most:
         best, order = order[0], order[1:]
         kept.append(best)
-        apart = squared_mahalanobis(mean[order] - mean[best], with_least_width(covariance[best]))
+        apart = squared_lengths(mean[order] - mean[best], with_least_width(covariance[best]))
         order = order[apart > distance**2]
     return torch.stack(kept) if kept else order[:0]
 
