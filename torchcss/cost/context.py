@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -84,6 +84,17 @@ class FrameContext:
     def __post_init__(self) -> None:
         if self.tables is None:
             object.__setattr__(self, "tables", BodyTables(self.body))
+
+    def expecting(self, prior: GaussianMixture) -> FrameContext:
+        """The same view with the modes one frame ahead; of the same mixture the same object."""
+        if not self._expecting or self._expecting[0].prior is not prior:
+            self._expecting[:] = [replace(self, prior=prior)]
+        return self._expecting[0]
+
+    @cached_property
+    def _expecting(self) -> list[FrameContext]:
+        """What `expecting` has made last; what is packed of it is kept with it."""
+        return []
 
     @property
     def is_out(self) -> bool:

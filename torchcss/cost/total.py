@@ -163,7 +163,7 @@ class TrackingCost:
         seen = {view.sequence: view for view in reversed(self.views)}
         past, parent = [], torch.zeros_like(component)
         for number, own in zip(sorted(seen), prior, strict=True):
-            past.append(replace(seen[number], prior=own.mixture))
+            past.append(seen[number].expecting(own.mixture))
             some = slice(None) if self.sequence is None else self.sequence == number
             parent[some] = own.parent[component[some]]
         return replace(self, parent=parent, component=component, past=tuple(past))
