@@ -36,6 +36,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from copy import copy
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
@@ -180,7 +181,10 @@ class TrackingCost:
             None if index is None else index[items]
             for index in (self.parent, self.component, self.sequence)
         )
-        return replace(self, parent=parent, component=component, sequence=sequence)
+        # A copy: terms are bound already, and finding that out anew takes longer.
+        taken = copy(self)
+        vars(taken).update(parent=parent, component=component, sequence=sequence)
+        return taken
 
     def problem(self) -> SearchProblem:
         """What a tracker searches: the cost, its coarse and its cheap relative, and the rest."""

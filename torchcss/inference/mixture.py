@@ -35,6 +35,9 @@ from torchcss.linalg import (
 )
 from torchcss.types import Items, Matrices, Numbers, Vector, Vectors
 
+_MODES_AT_ONCE = 32
+"""Modes whose distances from all that cost more are found together; most of them are kept."""
+
 _STATES_AT_ONCE = 1024
 """States whose differences from all components are held in memory together."""
 
@@ -257,10 +260,14 @@ def distinct_modes(
     """
     order, kept = cheapest_first(cost), []
     while len(order) and len(kept) != most:
-        best, order = order[0], order[1:]
-        kept.append(best)
-        apart = squared_lengths(mean[order] - mean[best], with_least_width(covariance[best]))
-        order = order[apart > distance**2]
+        block, left = order[:_MODES_AT_ONCE], torch.ones_like(order, dtype=torch.bool)
+        apart = mean[order] - mean[block, None]
+        far = squared_lengths(apart, with_least_width(covariance[block])) > distance**2
+        for place, others in enumerate(far):
+            if len(kept) != most and bool(left[place]):
+                kept.append(block[place])
+                left &= others
+        order = order[len(block) :][left[len(block) :]]
     return torch.stack(kept) if kept else order[:0]
 
 
