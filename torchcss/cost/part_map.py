@@ -7,7 +7,7 @@ samples visibility is found node by node (`torchcss.cost.visibility`).
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 from torch.nn import functional
 
@@ -60,21 +60,21 @@ def part_map(
     batch = vertices.shape[:-3]
     vertices = vertices.flatten(-3, -2).reshape(-1, vertices.shape[-3] * vertices.shape[-2], 3)
     seen = every.new_empty(len(vertices), height, width)
-    # A last entry for pixels that see no face, whose index is -1.
-    part_of_face = torch.arange(-1, body.num_parts, device=faces.device).roll(-1)
-    part_of_face = part_of_face.repeat_interleave(len(faces))
+    # The last entry of -1 is for pixels that see no face, whose index is -1.
+    part_of_face = torch.arange(-1, body.num_parts, device=faces.device)
+    part_of_face = part_of_face.repeat_interleave(len(faces))[len(faces) - 1 :]
     for first in range(0, len(vertices), _POSES_AT_ONCE):
         uv, depth, valid = camera.project(some := vertices[first : first + _POSES_AT_ONCE])
         face = nearest_faces(uv, depth, every, height, width, valid=valid)
-        seen[first : first + len(some)] = part_of_face[face]
+        seen[first : first + len(some)] = part_of_face.take(face + 1)
     return seen.reshape(*batch, height, width)
 
 
-def grow(masks: Bool[Tensor, "layers h w"], radius: int) -> Bool[Tensor, "layers h w"]:
+def grow(masks: Shaped[Tensor, "layers h w"], radius: int) -> Shaped[Tensor, "layers h w"]:
     """Masks and all that is within a square of so many pixels about them.
 
     Args:
-        masks: The masks.
+        masks: The masks; of images, the greatest number in the square.
         radius: Half the side of the square, pixels.
     """
     for axis in (-1, -2):
@@ -83,8 +83,9 @@ def grow(masks: Bool[Tensor, "layers h w"], radius: int) -> Bool[Tensor, "layers
             # What has been grown by `done` may be shifted so far: no gap, even at the border.
             step = min(done + 1, radius - done)
             kept, wider = max(masks.shape[axis] - step, 0), masks.clone()
-            wider.narrow(axis, -kept, kept).logical_or_(masks.narrow(axis, 0, kept))
-            wider.narrow(axis, 0, kept).logical_or_(masks.narrow(axis, -kept, kept))
+            for to, by in ((-kept, 0), (0, -kept)):
+                part = wider.narrow(axis, to, kept)
+                torch.maximum(part, masks.narrow(axis, by, kept), out=part)
             masks, done = wider, done + step
     return masks
 

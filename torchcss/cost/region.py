@@ -136,20 +136,22 @@ def region_masks(
     """
     names, layer_of = part_layers(body)
     # A last entry for pixels that see no part, whose index is -1.
-    layer_of_part = torch.tensor((*layer_of, -1), device=body.tie.device)
+    layer_of_part = torch.tensor((*layer_of, -1), device=body.tie.device, dtype=torch.int16)
 
     parts = part_map(body, state, camera)
     window = _window(parts >= 0, _REACH + _COARSE)
-    layers = torch.arange(len(names), device=parts.device)[:, None, None]
-    own = layer_of_part[parts[window]] == layers
+    layer = layer_of_part[parts[window]]
+    layers = torch.arange(len(names), device=parts.device, dtype=layer.dtype)[:, None, None]
+    own = layer == layers
     if not own.numel():
         return RegionMasks(own, own, window)
-    thin = part_map(body, state, camera, girth=_CORE)[window]
-    inner = own & (layer_of_part[thin] == layers)
+    sure = layer_of_part[part_map(body, state, camera, girth=_CORE)[window]] == layer
     if fitted:
-        inner |= ~grow(~own, _BODY_MARGIN if has_root(body) else _ARM_MARGIN)
-    small = inner.flatten(1).sum(1) < _CORE_PIXELS
-    core = torch.where(small[:, None, None], ~grow(~own, 1), inner)
+        sure |= _is_alike(layer, _BODY_MARGIN if has_root(body) else _ARM_MARGIN)
+    small = (own & sure).flatten(1).sum(1) < _CORE_PIXELS
+    # The last entry again for pixels that see no part; they belong to no layer anyway.
+    small = functional.pad(small, (0, 1))[layer.long()]
+    core = own & torch.where(small, _is_alike(layer, 1), sure)
     blocks = functional.max_pool2d(own.float(), _COARSE, ceil_mode=True) > 0
     blocks = grow(blocks, _REACH // _COARSE)
     far = blocks.repeat_interleave(_COARSE, -1).repeat_interleave(_COARSE, -2)
@@ -160,6 +162,12 @@ def region_masks(
             near[i] &= ~own[j]
             near[j] &= ~own[i]
     return RegionMasks(core, near, window)
+
+
+def _is_alike(layer: Int[Tensor, "h w"], radius: int) -> Bool[Tensor, "h w"]:
+    """Where all pixels within a square see the same layer."""
+    most, least = grow(torch.stack([layer, -layer]), radius)
+    return most == -least
 
 
 def _window(mask: Bool[Tensor, "h w"], margin: int) -> tuple[EllipsisType, slice, slice]:
