@@ -90,7 +90,7 @@ class GridTracker(SequenceTracker):
         descents = self.optimiser.descend(own.cost, waiting, bounds)
         ends, floored = as_printed(self.optimiser.modes(descents, bounds), descents, bounds)
 
-        cost = finite_cost(ends, converged_only=True)
+        cost = finite_cost(ends.status, ends.cost, converged_only=True)
         if own.weight_only is not None:
             cost = cost + own.weight_only(ends.mean)
         order = cheapest_first(cost)

@@ -449,25 +449,26 @@ class Tracker(SequenceTracker):
                 short = replace(optimiser, max_steps=min(max_steps, optimiser.max_steps))
                 descents = short.descend(search.problem.cost, search.descents, bounds)
                 search = search._replace(descents=descents)
-                modes = optimiser.modes(descents, bounds)
+                ends = descents
             else:
-                modes = optimiser.promised(search.descents, bounds)
-            search = search.take(self._promising(search, modes, size))
+                ends = optimiser.promised(search.descents, bounds)
+            search = search.take(self._promising(search, ends, bounds, size))
         return search
 
-    def _promising(self, search: _Search, modes: Modes, size: int) -> Items:
+    def _promising(
+        self, search: _Search, ends: TrustRegionState, bounds: Bounds, size: int
+    ) -> Items:
         """Which samples go on, in their order; the modes of the last frame are never given up."""
-        energy, is_mode = finite_cost(modes), search.is_mode
+        energy, is_mode = finite_cost(ends.status, ends.model.value), search.is_mode
         lowest = energy.nan_to_num(posinf=0.0).amin()
         energy = torch.where(is_mode, lowest - 1, energy)
         order = cheapest_first(energy)
         if self.separation and search.problem.landmarks is not None:
-            points = search.problem.landmarks(modes.mean[order])
+            points = search.problem.landmarks(ends.x[order])
             order = order[separated(points, _CROWDED * self.separation, size)]
         # Samples in one minimum count as one, or the best would take all places.
-        distinct = distinct_modes(
-            modes.mean[order], modes.covariance[order], energy[order], most=size
-        )
+        modes = self.optimiser.modes(ends.take(order), bounds)
+        distinct = distinct_modes(modes.mean, modes.covariance, energy[order], most=size)
         own, best = is_mode.nonzero()[:, 0], order[distinct]
         best = torch.cat([own, best[~is_mode[best]]])
         return best[: max(size, len(own))].sort().values
@@ -479,7 +480,7 @@ class Tracker(SequenceTracker):
         floored = modes.status.new_zeros(())
         if not self.capped:
             modes, floored = as_printed(modes, descents, bounds)
-        energy = finite_cost(modes, converged_only=self.converged_only)
+        energy = finite_cost(modes.status, modes.cost, converged_only=self.converged_only)
         distinct = distinct_modes(modes.mean, modes.covariance, energy)
         return modes, distinct, floored
 
@@ -563,17 +564,20 @@ def _start(modes: GaussianMixture, prior: Prior) -> Vectors:
     return torch.where(prior.mixture.mean == expected, modes.mean[prior.parent], prior.mixture.mean)
 
 
-def finite_cost(modes: Modes, *, converged_only: bool = False) -> Numbers:
+def finite_cost(
+    status: Int[Tensor, " k"], cost: Numbers, *, converged_only: bool = False
+) -> Numbers:
     """Costs by which ends of descents are told apart.
 
     Args:
-        modes: The ends; those that are not finite cost infinitely much.
+        status: How the descents ended; those that are not finite cost infinitely much.
+        cost: The cost there.
         converged_only: Whether those that stopped at the step limit do so too.
     """
-    out = modes.status == Status.NON_FINITE
+    out = status == Status.NON_FINITE
     if converged_only:
-        out = out | (modes.status == Status.STEP_LIMIT)
-    return torch.where(out, torch.inf, modes.cost)
+        out = out | (status == Status.STEP_LIMIT)
+    return torch.where(out, torch.inf, cost)
 
 
 def as_printed(

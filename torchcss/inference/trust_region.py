@@ -421,7 +421,7 @@ class TrustRegionNewton:
         covariance = inverse_on_free(hessian, ~active, prior_variance, model.gradient)
         return Modes(state.x, covariance, model.value, active, state.status, state.num_steps)
 
-    def promised(self, state: TrustRegionState, bounds: Bounds) -> Modes:
+    def promised(self, state: TrustRegionState, bounds: Bounds) -> TrustRegionState:
         """Where the next step from every item would lead, by the quadratic model.
 
         After the first `step` it says well enough which of many starts are worth a descent.
@@ -432,12 +432,12 @@ class TrustRegionNewton:
 
         Returns:
             The ends of the steps, with the costs that the model promises there (infinite for starts
-            with `Status.NON_FINITE`) and the model's covariances; nothing was evaluated there.
+            with `Status.NON_FINITE`); nothing was evaluated there.
         """
         bounds = bounds.to(state.x)
         model = state.model._replace(value=state.model.value - state.predicted)
         ends = bounds.project(state.x + state.step)
-        return self.modes(state._replace(x=ends, model=model), bounds)
+        return state._replace(x=ends, model=model)
 
     def _plan(
         self,
