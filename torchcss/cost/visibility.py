@@ -32,6 +32,7 @@ nodes.
 
 from __future__ import annotations
 
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -420,7 +421,7 @@ def tabulate_parts(shape: Float[Tensor, "parts 9"]) -> _Parts:
     narrowest = torch.cat([axes[:, :2] * (1 - taper.abs()), axes[:, 2:]], dim=-1).amin(-1)
     within = (1 / smaller - RAMP / narrowest).clamp(min=0).square()
     some = torch.stack([plain.any(), (~plain).any(), is_bent.any()]).tolist()  # one transfer
-    kinds = tuple(kind for kind, there in zip((True, False), some, strict=False) if there)
+    kinds = tuple(compress((True, False), some))
     return _Parts(torch.stack(rows), radius, 1 / around.mT, within, plain, kinds, some[2])
 
 

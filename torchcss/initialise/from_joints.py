@@ -16,6 +16,8 @@ or the view of another camera, else the anthropometric prior does.
 
 from __future__ import annotations
 
+from itertools import compress
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -111,9 +113,7 @@ def _with_lengths_fitted(
     free, keypoints = cost.body, cost.keypoints
     assert keypoints is not None
     fits, outliers = fits_and_outliers(cost, search=options.search, generator=generator)
-    left_out = tuple(
-        name for name, out in zip(keypoints.names, outliers.tolist(), strict=True) if out
-    )
+    left_out = tuple(compress(keypoints.names, outliers.tolist()))
     if left_out:
         notes = (*notes, f"keypoints that fit no pose, left out: {', '.join(left_out)}")
         cost = without(cost, outliers)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import compress
 from typing import NamedTuple
 
 import torch
@@ -289,6 +290,4 @@ def undetermined(body: BodyModel, modes: Modes, joints: TrackingCost) -> list[st
     loose = free & (deviation > _UNDETERMINED * prior)
     # A parameter that moves no known joint has no curvature at all.
     loose = loose | (curvature.abs() * prior.square() < 1e-6)
-    return [
-        name for name, is_loose in zip(body.state_names, loose.tolist(), strict=True) if is_loose
-    ]
+    return list(compress(body.state_names, loose.tolist()))

@@ -31,6 +31,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import field, replace
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -532,7 +533,7 @@ def _colliding(body: BodyModel, collisions: Penetration) -> str:
         return f"no part more than {1000 * _DEEP:.0f} mm inside another"
     parts = collisions.parts.sort(-1).values.tolist()
     pairs = [" and ".join(body.part_names[part] for part in pair) for pair in parts]
-    named = [pair for pair, is_deep in zip(pairs, deep.tolist(), strict=True) if is_deep]
+    named = list(compress(pairs, deep.tolist()))
     common = max(set(named), key=named.count)
     return (
         f"parts more than {1000 * _DEEP:.0f} mm inside others in "

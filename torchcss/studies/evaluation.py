@@ -32,6 +32,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import compress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -275,7 +276,7 @@ def _moved_joints(body: BodyModel) -> tuple[str, ...]:
     variance = torch.eye(body.num_parameters).to(body.rest)
     variance = joint_covariance(body, pose, variance).diagonal(dim1=-2, dim2=-1).sum(-1)
     moves = variance > 1e-6  # square metres per radian: more than rounding
-    return tuple(name for name, moved in zip(body.joint_names, moves, strict=True) if moved)
+    return tuple(compress(body.joint_names, moves.tolist()))
 
 
 class Evaluator:
