@@ -352,8 +352,15 @@ def load_json(path: Path, error_class: type[TorchcssError]) -> Any:
             ) from None
 
 
-def load_arrays(path: Path, error_class: type[TorchcssError]) -> Mapping[str, np.ndarray]:
+def load_arrays(
+    path: Path, error_class: type[TorchcssError], most: int | None = None
+) -> Mapping[str, np.ndarray]:
     """Return all arrays of an NPZ file, in memory.
+
+    Args:
+        path: The file.
+        error_class: What to raise.
+        most: Bytes that they may have together; None: `MOST_ARRAYS`.
 
     Raises:
         error_class: If the file is missing, damaged, no NPZ file, or holds pickled objects.
@@ -362,7 +369,7 @@ def load_arrays(path: Path, error_class: type[TorchcssError]) -> Mapping[str, np
         raise error_class(f"{path}: not an NPZ file; expected what numpy.savez writes")
     try:
         # The stream is ours: NumPy does not close its own where the archive turns out damaged.
-        _check_sizes(path)
+        _check_sizes(path, MOST_ARRAYS if most is None else most)
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     except Exception as error:  # zipfile, zlib and NumPy raise a dozen kinds for damaged archives
@@ -374,7 +381,7 @@ def load_arrays(path: Path, error_class: type[TorchcssError]) -> Mapping[str, np
         raise error_class(f"{path}: cannot be read as an NPZ file: {reason}") from error
 
 
-def _check_sizes(path: Path) -> None:
+def _check_sizes(path: Path, most: int) -> None:
     """Refuse arrays that would take more memory than the file can fill, before any is taken.
 
     Raises:
@@ -382,8 +389,8 @@ def _check_sizes(path: Path) -> None:
     """
     with zipfile.ZipFile(path) as archive:
         members = archive.infolist()
-        if (total := sum(member.file_size for member in members)) > MOST_ARRAYS:
-            raise ValueError(f"{total:,} bytes of arrays; expected {MOST_ARRAYS:,} at most")
+        if (total := sum(member.file_size for member in members)) > most:
+            raise ValueError(f"{total:,} bytes of arrays; expected {most:,} at most")
         for member in members:
             with archive.open(member) as stream:
                 _check_header(stream, member.file_size)

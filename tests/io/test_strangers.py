@@ -76,12 +76,39 @@ def test_archives_that_unpack_to_more_than_there_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("torchcss.files.MOST_ARRAYS", 10**6)
+    monkeypatch.setattr("torchcss.io.keypoints.read.MOST_BYTES", 10**6)
     path = tmp_path / "a.npz"
     np.savez_compressed(path, keypoints=np.zeros((10**5, 17, 2)))
-    assert "27,200," in refused(keypoints, path)
+    for read in (keypoints, load_track):
+        assert "27,200," in refused(read, path)
     monkeypatch.setattr("torchcss.files.MOST_TEXT", 1000)
     (tmp_path / "a.json").write_text(" " * 1001)
     assert "1,001 bytes" in refused(keypoints, tmp_path / "a.json")
+
+
+class Room:
+    """What asks NumPy for an array of any size, before a number is read."""
+
+    def __init__(self, function: Any, arguments: tuple[Any, ...]) -> None:
+        self.asks = function, arguments
+
+    def __reduce__(self) -> Any:
+        return self.asks
+
+
+@pytest.mark.parametrize("kind", ["ndarray", "_reconstruct"])
+def test_pickles_that_ask_for_room(tmp_path: Path, kind: str) -> None:
+    shape = (2**26, 17, 2)
+    reconstruct, arguments, _ = np.zeros(1).__reduce__()
+    asks = {"ndarray": Room(np.ndarray, (shape, "f8")),
+            "_reconstruct": Room(reconstruct, (arguments[0], shape, "f8"))}  # fmt: skip
+    head = io.BytesIO()
+    plain = {"descr": "|O", "fortran_order": False, "shape": ()}
+    np.lib.format.write_array_header_1_0(head, plain)
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        value = {"S1": {"Walking": [asks[kind]]}}
+        archive.writestr("positions_2d.npy", head.getvalue() + pickle.dumps(value, protocol=2))
+    assert "cannot be read" in refused(keypoints, tmp_path / "a.npz")
 
 
 @pytest.mark.parametrize("read", [keypoints, load_track, load_camera])

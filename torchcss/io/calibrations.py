@@ -111,8 +111,8 @@ _MODELS = names_in(
 )
 _FISHEYE = re.compile("equidist|fish_?eye|kannala|omni|eucm|fov|^ds$|^ds-|-ds$", re.IGNORECASE)
 
-_MOST_MATLAB = 2**26
-"""Bytes of the largest calibration of MATLAB's, unpacked; they hold the pictures' corners too."""
+_MOST_BYTES = 2**26
+"""Bytes of the largest calibration, unpacked; MATLAB's hold the pictures' corners too."""
 
 _DEEPEST = 50
 """Brackets in brackets of a calibration in YAML."""
@@ -476,10 +476,10 @@ def _check_matlab_size(path: Path) -> None:
         packed, at = data[at + 8 : at + 8 + size], at + 8 + size
         if kind == 15:
             with refusing(CameraError, f"{path}: damaged", advice="get a complete copy"):
-                packed = zlib.decompressobj().decompress(packed, _MOST_MATLAB)
+                packed = zlib.decompressobj().decompress(packed, _MOST_BYTES)
         total += len(packed)
-        if total >= _MOST_MATLAB:
-            raise CameraError(f"{path}: more than {_MOST_MATLAB:,} bytes; not a calibration")
+        if total >= _MOST_BYTES:
+            raise CameraError(f"{path}: more than {_MOST_BYTES:,} bytes; not a calibration")
 
 
 def _is_matlabs(values: Mapping[str, Any]) -> bool:
@@ -535,7 +535,7 @@ def _read_arrays(path: Path) -> dict[str, Entry]:
     """Arrays by the usual words, or K alone."""
     if path.suffix.lower() == ".npy":
         return _alone(path, {"K": load_array(path, CameraError).tolist()})
-    arrays = load_arrays(path, CameraError)
+    arrays = load_arrays(path, CameraError, _MOST_BYTES)
     return _alone(path, {name: array.tolist() for name, array in arrays.items()})
 
 

@@ -19,6 +19,7 @@ import torch
 
 from torchcss.errors import KeypointError
 from torchcss.files import load_arrays, shortened
+from torchcss.io.keypoints.frames import MOST_FRAMES
 from torchcss.io.keypoints.mediapipe import is_landmark_array, read_landmark_array
 from torchcss.io.keypoints.people import (
     LAYOUT_SIZES,
@@ -34,6 +35,9 @@ from torchcss.joint_names import names_in
 from torchcss.types import Keypoints
 
 _PLACES = names_in("keypoints keypoints2d joints2d kps poses positions pose joints")
+MOST_BYTES = 2**29
+"""Bytes of the largest set of arrays of keypoints: ten hours of a person's 133."""
+
 _MOST_PEOPLE = 30
 """More people than this in a single frame are one person in so many frames: networks that lift
 joints to space take and give `[1 T J 3]`."""
@@ -105,7 +109,7 @@ def read_points(path: Path, keypoints: Keypoints) -> Keypoints:
     """
     if path.suffix.lower() != ".npz" or not path.is_file():
         return keypoints
-    arrays = load_arrays(path, KeypointError)
+    arrays = load_arrays(path, KeypointError, MOST_BYTES)
     if "points" not in arrays:
         return keypoints
     places = torch.as_tensor(arrays["keypoints"]).to(keypoints.positions)
@@ -158,6 +162,8 @@ def _positive(name: str, array: np.ndarray | None, count: int) -> list[float] | 
 def _people(name: str, array: np.ndarray) -> np.ndarray:
     """`[t p j 2]` or `[t p j 3]`, from any of the shapes."""
     shape: Sequence[int] = array.shape
+    if shape[:1] > (MOST_FRAMES,):
+        raise _unfit(name, array, f"{MOST_FRAMES:,} frames at most")
     if array.dtype.kind in "iuf" and 0 not in shape:
         values = array.astype(np.float64)
         if shape[-1] == 56 and len(shape) > 2:  # MoveNet's of several people

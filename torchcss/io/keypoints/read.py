@@ -45,7 +45,7 @@ import torch
 from torchcss.body.model import BodyModel
 from torchcss.errors import KeypointError
 from torchcss.files import StrPath, load_array, load_arrays, naming, read_text, shortened
-from torchcss.io.keypoints.arrays import read_arrays
+from torchcss.io.keypoints.arrays import MOST_BYTES, read_arrays
 from torchcss.io.keypoints.cvat import read_cvat
 from torchcss.io.keypoints.findings import findings
 from torchcss.io.keypoints.frames import Film, files_of, in_order, wrong_count
@@ -251,7 +251,7 @@ def _read(path: Path, image_size_wh: Size, num_frames: int | None) -> People:
             "several recordings to choose from"
         )
     if suffix == ".npz":
-        return read_arrays(path, load_arrays(path, KeypointError))
+        return read_arrays(path, load_arrays(path, KeypointError, MOST_BYTES))
     if suffix == ".npy":
         return read_arrays(path, {path.name: load_array(path, KeypointError)})
     if suffix in (".csv", ".tsv") or (
