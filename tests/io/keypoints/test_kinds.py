@@ -892,6 +892,8 @@ def test_joints_by_number_of_which_some_are_left_out(tmp_path: Path) -> None:
     heads = [f"{kind}{i}" for i in order for kind in "xyc"]
     table = wide(["frame", *heads], [[t, *person(t)[order].flat] for t in T])
     check(read(write(tmp_path / "a.csv", table)))
+    with pytest.raises(KeypointError, match="row 1: joint 0 has x or y, not both"):
+        read(write(tmp_path / "a.csv", table.replace("y0,", "a0,")))
     few = ["frame", *(f"{kind}{i}" for i in range(3, 20) for kind in "xyc")]
     table = wide(few, [[t, *person(t).flat] for t in T])
     with pytest.raises(KeypointError, match="17 joints numbered from 3 to 19: which they are"):

@@ -19,7 +19,7 @@ import torch
 
 from torchcss.errors import KeypointError
 from torchcss.files import load_arrays, shortened
-from torchcss.io.keypoints.frames import MOST_FRAMES
+from torchcss.io.keypoints.frames import FRAMES_AT_MOST
 from torchcss.io.keypoints.mediapipe import is_landmark_array, read_landmark_array
 from torchcss.io.keypoints.people import (
     LAYOUT_SIZES,
@@ -162,8 +162,8 @@ def _positive(name: str, array: np.ndarray | None, count: int) -> list[float] | 
 def _people(name: str, array: np.ndarray) -> np.ndarray:
     """`[t p j 2]` or `[t p j 3]`, from any of the shapes."""
     shape: Sequence[int] = array.shape
-    if shape[:1] > (MOST_FRAMES,):
-        raise _unfit(name, array, f"{MOST_FRAMES:,} frames at most")
+    if shape[:1] > (FRAMES_AT_MOST,):
+        raise _unfit(name, array, f"{FRAMES_AT_MOST:,} frames at most")
     if array.dtype.kind in "iuf" and 0 not in shape:
         values = array.astype(np.float64)
         if shape[-1] == 56 and len(shape) > 2:  # MoveNet's of several people

@@ -20,7 +20,7 @@ from torchcss.files import shortened
 from torchcss.io.keypoints.people import Frames, Key, People, Person
 from torchcss.io.keypoints.words import TIMES
 
-MOST_FRAMES = 1_000_000
+FRAMES_AT_MOST = 1_000_000
 
 
 class Film(NamedTuple):
@@ -71,7 +71,7 @@ def in_order(people: People, film: Film, report: list[str]) -> list[list[Person]
     total = max(max(found, default=-1) + 1, film.num_frames or 0)
     if film.num_frames is not None and total > film.num_frames:
         raise wrong_count(film.num_frames, total)
-    if total > MOST_FRAMES:
+    if total > FRAMES_AT_MOST:
         raise KeypointError(f"{total - 1} is not a frame number; number the frames from 0")
     if len(found) < total:
         report.append(f"{len(found)} of {total} frames are in the file, the others have nobody")
@@ -210,7 +210,7 @@ def _by_time(times: Sequence[float], film: Film, report: list[str]) -> list[int]
             nearest = np.searchsorted(0.5 * (true[1:] + true[:-1]), since)
             if np.abs(true[nearest] - since).max() < np.abs(found * interval - since).max():
                 found, grid = nearest, "as the video shows them"
-    if not ((found >= 0) & (found < MOST_FRAMES)).all():
+    if not ((found >= 0) & (found < FRAMES_AT_MOST)).all():
         raise KeypointError(
             f"times from {sorted_times[0]:.4g} to {sorted_times[-1]:.4g} s, one every "
             f"{interval:.3g} s, are no video's; number the frames"

@@ -207,6 +207,9 @@ def _headed(heading: Sequence[str]) -> _Columns:
             if each[1] in own and each[1] != 3 and each[0]:
                 raise KeypointError(f"row 1: column {heading[index]!r} is there twice")
             own.setdefault(each[1], index)
+    half = [joint for (_, joint), parts in columns.items() if len({0, 1} & set(parts)) == 1]
+    if numbers := [joint for joint in half if joint.isdecimal()]:
+        raise KeypointError(f"row 1: joint {numbers[0]} has x or y, not both")
     columns = {joint: parts for joint, parts in columns.items() if {0, 1} <= set(parts)}
     if joint is not None and set(columns) == {("", "")}:
         track = None if track == joint else track
