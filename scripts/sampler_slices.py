@@ -34,7 +34,7 @@ from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.io.tracks import prepare_output_folder
 from torchcss.linalg import squared_mahalanobis
 from torchcss.studies.sampling_study import StudyChoice, study_problem
-from torchcss.types import Bounds, CostFunction, LocalModel, Modes, Status
+from torchcss.types import Bounds, CostFunction, LocalModel, Status
 
 CHOICE = StudyChoice(pixel_noise=2.0, prior_scale=3.0)
 """Priors that reach as far as the flip, and noise that leaves the valley there narrow."""
@@ -136,7 +136,6 @@ def main(config: Config) -> dict[str, Any]:
     own = torch.diag(values[list(config.directions)])
     free = torch.full((2,), torch.inf, dtype=torch.float64)
     limits = Bounds(-free, free)
-    optimiser = TrustRegionNewton(max_steps=200)
     zero = torch.zeros(1, 2, dtype=torch.float64)
     mode = GaussianMixture(zero, own[None], zero[:, 0])
     noise = config.noise or config.deviation_scale * float(own[0, 0].sqrt())
@@ -150,7 +149,7 @@ def main(config: Config) -> dict[str, Any]:
     for name, proposal in proposals.items():
         generator = torch.Generator().manual_seed(config.seed)
         raw = proposal.sample(mode, config.samples, limits, generator=generator).x
-        modes: Modes = optimiser.minimise(plane, raw, limits)
+        modes = TrustRegionNewton(max_steps=200).minimise(plane, raw, limits)
         value = plane.value(raw)
         seen = (modes.status == Status.CONVERGED) & (modes.mean.abs() < config.reach).all(-1)
         done = torch.where(seen, modes.cost, torch.inf)

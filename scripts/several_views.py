@@ -217,7 +217,7 @@ def board(config: Config, folder: Path) -> dict[str, Any]:
             frame_interval=interval,
             generator=generator,
         )
-        sums, errors, frames = Sums(), [], 0
+        sums, errors = Sums(), []
         for tracked in session.track(zip_longest(*readers)):
             joints = tracked.joints_world[0]
             away = joints - truth[tracked.frame.index]
@@ -225,11 +225,10 @@ def board(config: Config, folder: Path) -> dict[str, Any]:
             spread = joint_covariance(tracked.body, pose, tracked.covariance[:1])[0]
             sums.add(away, spread, cameras[0])
             errors.append(float(away.norm(dim=-1).nanmean()))
-            frames += 1
         rows[" + ".join(views)] = {
             "absolute_mm": 1000 * float(np.nanmean(errors)),
             "worst_frame_mm": 1000 * float(np.nanmax(errors)),
-            "frames": frames,
+            "frames": len(errors),
             **sums.report(REFERENCE_M[BOARD]),
         }
     return rows
