@@ -174,7 +174,7 @@ def _kinematics_only(robot: ElementTree.Element) -> ElementTree.Element:
         wanted = ("parent", "child", "origin", "axis")[: 3 if joint.get("type") == "fixed" else 4]
         plain = {key: joint.get(key, "") for key in ("name", "type")}
         ElementTree.SubElement(bare, "joint", plain).extend(
-            part for part in joint if part.tag in wanted
+            part for tag in wanted if (part := joint.find(tag)) is not None
         )
     return bare
 

@@ -155,7 +155,9 @@ def _positive(name: str, array: np.ndarray | None, count: int) -> list[float] | 
     if array is None:
         return None
     if array.size != count or array.dtype.kind not in "iuf" or not (array > 0).all():
-        raise KeypointError(f"{name}: expected {count} positive numbers, got {array}")
+        raise KeypointError(
+            f"{name}: expected {count} positive numbers, got {shortened(array.tolist())}"
+        )
     return array.ravel().astype(float).tolist()
 
 
@@ -164,6 +166,8 @@ def _people(name: str, array: np.ndarray) -> np.ndarray:
     shape: Sequence[int] = array.shape
     if shape[:1] > (FRAMES_AT_MOST,):
         raise _unfit(name, array, f"{FRAMES_AT_MOST:,} frames at most")
+    if array.dtype.kind in "iu" and array.dtype.itemsize == 1:
+        raise _unfit(name, array, "pixels, which are more than eight bits count")
     if array.dtype.kind in "iuf" and 0 not in shape:
         values = array.astype(np.float64)
         if shape[-1] == 56 and len(shape) > 2:  # MoveNet's of several people
