@@ -201,6 +201,7 @@ def test_image_size() -> None:
         ({"K": [[90000.0, 0, 320], [0, 90000, 240], [0, 0, 1]]}, "degrees"),
         ({"K": [[800.0, 0, -320], [0, 800, 240], [0, 0, 1]]}, "outside the image"),
         ({"distortion": [-3.5, 0, 0, 0, 0]}, "distortion reaches"),
+        ({"distortion": [0.02, -0.03, 0.05, -0.01]}, "tangential distortion"),
         ({"t": [100.0, 200.0, 3000.0]}, "stands 3008 m"),
     ],
 )

@@ -46,6 +46,9 @@ _NARROWEST, _WIDEST = 2.0, 140.0
 _REACHED = 0.9
 """Share of the image that the distortion of a usable calibration can be undone in."""
 
+_TANGENTIAL = 0.02
+"""Tangential coefficients of lenses are smaller; k3 and those of fisheye lenses are larger."""
+
 _FAR = 1000.0
 """No camera sees a person from so many metres away."""
 
@@ -257,6 +260,12 @@ def camera_findings(camera: Camera) -> list[str]:
         lines.append(
             f"its distortion reaches {int(100 * reached.double().mean())} % of the image; nothing "
             "is seen elsewhere: calibrate with views up to the borders"
+        )
+    tangential = float(camera.distortion[2:4].abs().max())
+    if tangential > _TANGENTIAL:
+        lines.append(
+            f"its tangential distortion (p1, p2) is {tangential:.2g}, more than lenses have: are "
+            "its coefficients a fisheye lens's, or in another order?"
         )
     if (away := float(camera.centre_world.norm())) > _FAR:
         lines.append(f"it stands {away:.0f} m from the world's origin: is t in metres?")

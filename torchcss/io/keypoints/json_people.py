@@ -75,7 +75,8 @@ def people_of(where: str, value: Any, *, alone: bool = False) -> list[Person]:
         if named and not any(isinstance(each, (list, dict)) for each in rest):
             return one_person(where, named, value)
         if alone or not all(isinstance(each, (list, dict)) for each in value.values()):
-            raise unexpected(KeypointError, where, "keypoints", list(value))
+            what = "keypoints (docs/guide.md lists the formats; most programs export COCO's)"
+            raise unexpected(KeypointError, where, what, list(value))
         # By the people's own numbers.
         return [
             person._replace(track=person.track or key)
