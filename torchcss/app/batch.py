@@ -38,7 +38,7 @@ from contextlib import (
     redirect_stdout,
     suppress,
 )
-from dataclasses import asdict, field
+from dataclasses import asdict
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -107,7 +107,7 @@ class Batch:
     files have changed, are tried again in any case."""
     patience: float = 60.0
     """Seconds for which a process has to show no sign of life until its clip is taken over."""
-    settings: Annotated[Settings, tyro.conf.arg(name="")] = field(default_factory=Settings)
+    settings: Annotated[Settings, tyro.conf.arg(name="")] = Settings()
 
     def __post_init__(self) -> None:
         if self.workers < 1 or not self.patience > 0:

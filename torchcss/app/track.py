@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, field, replace
+from dataclasses import asdict, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -97,7 +97,7 @@ class TrackOptions:
     sigma: float | None = None
     focal: float | None = None
     fov: float | None = None
-    detect: DetectOptions = field(default_factory=DetectOptions)
+    detect: DetectOptions = DetectOptions()
 
     def __post_init__(self) -> None:
         if self.sigma is not None and not self.sigma > 0:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import field
 from pathlib import Path
 from typing import Annotated
 
@@ -30,9 +29,7 @@ class Detect:
     """Frame before which to end."""
     frame_rate: float | None = None
     """Frames per second of a folder of images; by default 30."""
-    options: Annotated[DetectOptions, tyro.conf.OmitArgPrefixes] = field(
-        default_factory=DetectOptions
-    )
+    options: Annotated[DetectOptions, tyro.conf.OmitArgPrefixes] = DetectOptions()
 
     def run(self) -> None:
         """Run the verb."""

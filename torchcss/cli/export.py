@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import field
 from pathlib import Path
 from typing import Annotated
 
@@ -26,10 +25,8 @@ class Export:
     SMPL's pose parameters. c3d needs ezc3d."""
     out: Path | None = None
     """File, or folder for files of the usual names; by default the run's folder."""
-    options: Annotated[ExportOptions, tyro.conf.OmitArgPrefixes] = field(
-        default_factory=ExportOptions
-    )
-    given: GivenOptions = field(default_factory=Given)
+    options: Annotated[ExportOptions, tyro.conf.OmitArgPrefixes] = ExportOptions()
+    given: GivenOptions = Given()
 
     def run(self) -> None:
         """Run the verb."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -64,7 +63,7 @@ class Init:
     """Floating type."""
     engine: Literal["fused", "eager"] = InitialiseOptions.engine
     """What evaluates the costs: compiled kernels, on a CPU, or the terms as they are written."""
-    files: Annotated[PictureFiles, tyro.conf.OmitArgPrefixes] = field(default_factory=PictureFiles)
+    files: Annotated[PictureFiles, tyro.conf.OmitArgPrefixes] = PictureFiles()
 
     def run(self) -> None:
         """Run the verb."""

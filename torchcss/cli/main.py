@@ -20,7 +20,6 @@ SIGTERM with 143. What was tracked until then is on disk; `torchcss track ... --
 from __future__ import annotations
 
 import sys
-from dataclasses import field
 from pathlib import Path
 
 import tyro
@@ -48,7 +47,7 @@ class Demo:
     frames: int = 50
     """Frames to track, of 50, 25 per second."""
     settings: SettingsOptions = DEMO_SETTINGS
-    terminal: TerminalOptions = field(default_factory=Terminal)
+    terminal: TerminalOptions = Terminal()
 
     def run(self) -> None:
         """Run the verb."""

@@ -5,7 +5,7 @@ With the track alone it takes seconds. With the images it takes about as long as
 
 from __future__ import annotations
 
-from dataclasses import asdict, field, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -39,11 +39,9 @@ class Smooth:
     with images."""
     lag: int | None = None
     """Most frames after each one that may say something of it; all by default."""
-    given: GivenOptions = field(default_factory=Given)
-    keypoints: Annotated[GivenKeypoints, tyro.conf.OmitArgPrefixes] = field(
-        default_factory=GivenKeypoints
-    )
-    terminal: TerminalOptions = field(default_factory=Terminal)
+    given: GivenOptions = Given()
+    keypoints: Annotated[GivenKeypoints, tyro.conf.OmitArgPrefixes] = GivenKeypoints()
+    terminal: TerminalOptions = Terminal()
 
     def run(self) -> None:
         """Run the verb."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing, nullcontext
-from dataclasses import field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -58,9 +58,9 @@ class Track:
     """The same, and fit that trajectory to the images again: a second pass over the video."""
     options: Annotated[
         TrackOptions, tyro.conf.OmitArgPrefixes, tyro.conf.AvoidSubcommands, tyro.conf.SuppressFixed
-    ] = field(default_factory=TrackOptions)
-    settings: SettingsOptions = field(default_factory=Settings)
-    terminal: TerminalOptions = field(default_factory=Terminal)
+    ] = TrackOptions()
+    settings: SettingsOptions = Settings()
+    terminal: TerminalOptions = Terminal()
 
     def run(self) -> None:
         """Run the verb."""

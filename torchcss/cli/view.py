@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import field
 from pathlib import Path
 
 from torchcss.cli.options import GivenOptions, PathArgument
@@ -21,7 +20,7 @@ class View:
     """Write a recording, FILE.rrd, instead of opening a viewer; `rerun FILE.rrd` opens it."""
     connect: str | None = None
     """Address of a viewer that runs, instead of opening one."""
-    given: GivenOptions = field(default_factory=Given)
+    given: GivenOptions = Given()
 
     def run(self) -> None:
         """Run the verb."""
@@ -45,7 +44,7 @@ class Plot:
     """Folder for the figures; by default `plots` (`smooth_plots`) in the run's folder."""
     frame: int | None = None
     """Frame that is seen from the side; by default the one with the most explanations."""
-    given: GivenOptions = field(default_factory=Given)
+    given: GivenOptions = Given()
 
     def run(self) -> None:
         """Run the verb."""
@@ -63,7 +62,7 @@ class Report:
 
     track: PathArgument
     """The run's folder, or a track's file in it (track.npz, smooth.npz)."""
-    given: GivenOptions = field(default_factory=Given)
+    given: GivenOptions = Given()
 
     def run(self) -> None:
         """Run the verb."""

@@ -13,7 +13,7 @@ that differ from item to item, with the priors of a body.
 
 from __future__ import annotations
 
-from dataclasses import field, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
@@ -147,7 +147,7 @@ class PointDistances:
     offset: Float[Tensor, "p 3"]
     target: Float[Tensor, "b p 3"]
     sigma: Float[Tensor, " p"]
-    stabiliser: Stabiliser = field(default_factory=Stabiliser)
+    stabiliser: Stabiliser = Stabiliser()
     repulsion: Interpenetration | None = None
     pairs: InterpenetrationPairs | None = None
 

@@ -74,7 +74,7 @@ class InitialiseOptions:
     colours: bool = True
     bends: bool = False
     working_size: int = 640
-    search: StartSearch = field(default_factory=StartSearch)
+    search: StartSearch = StartSearch()
     potential_kind: type = Lorentzian
     weights: Mapping[str, float] = field(default_factory=dict)
     dtype: torch.dtype = torch.float64

@@ -92,8 +92,8 @@ class ReprojectionCost(BlendedCost):
     index: Int[Tensor, " j"]
     target: Float[Tensor, "j 2"]
     pixel_noise: float
-    potential: RobustPotential = field(default_factory=Quadratic)
-    stabiliser: Stabiliser | None = field(default_factory=Stabiliser)
+    potential: RobustPotential = Quadratic()
+    stabiliser: Stabiliser | None = Stabiliser()
     focal: tuple[float, float] = field(init=False)
 
     def __post_init__(self) -> None:

@@ -10,7 +10,7 @@ image. A track that was lost for that reason is found in one frame.
 
 from __future__ import annotations
 
-from dataclasses import field, replace
+from dataclasses import replace
 
 from torchcss.inference.loss_monitor import LossMonitor
 from torchcss.inference.particle import AnnealedParticleFilter, ParticleFilter
@@ -34,7 +34,7 @@ class Recovery:
             the picture has changed for good; the track stays marked as lost.
     """
 
-    monitor: LossMonitor = field(default_factory=LossMonitor)
+    monitor: LossMonitor = LossMonitor()
     samples: int = 3
     modes: int = 2
     scale: float = 2.0

@@ -21,7 +21,7 @@ tracker.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import field, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -243,7 +243,7 @@ class SurfaceCost:
     held: Vectors
     expected: Float[Tensor, "b m"]
     deviation: Float[Tensor, " m"]
-    term: SurfaceTerm = field(default_factory=SurfaceTerm)
+    term: SurfaceTerm = SurfaceTerm()
 
     def take(self, items: Items) -> SurfaceCost:
         """The cost restricted to some items."""

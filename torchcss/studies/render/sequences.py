@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import field
 from typing import NamedTuple
 
 import numpy as np
@@ -242,8 +241,8 @@ class Shot:
     states: Trajectory
     frame_rate: float
     camera: Camera
-    style: Style = field(default_factory=Style)
-    clothing: Clothing = field(default_factory=Clothing)
+    style: Style = Style()
+    clothing: Clothing = Clothing()
     floor: float = 0.0
     seed: int = 0
     description: str = ""
