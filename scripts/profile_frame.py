@@ -1,0 +1,151 @@
+"""Where the time of a frame goes, stage by stage: in compiled kernels, and around them.
+
+    python scripts/profile_frame.py --clip CLIP --frames 45
+
+CLIP is a folder with `video.mp4`, `cameras.json` and `keypoints2d.npz`. It is tracked on one thread
+with its keypoints in every frame. Of each stage the table has the milliseconds of the processor a
+frame, its own without those of other stages, the part of them in compiled kernels, and its share of
+the frame. What is not in kernels is torch's operations and Python. The first frames are left out;
+of the others the lower part of the times is taken, since others may use the machine.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from common import Table, start, write_report
+
+from torchcss.app.track import track_video
+from torchcss.cost.fused.engine import FusedEngine
+from torchcss.inference import tracker
+from torchcss.inference.trust_region import TrustRegionNewton
+from torchcss.kernels import checked
+from torchcss.tracking.session import TrackingSession
+from torchcss.tracking.settings import Settings
+from torchcss.tracking.view import Observer
+from torchcss.vision import features
+
+STAGES: dict[str, tuple[Any, str]] = {
+    "optical flow": (features, "robust_flow"),
+    "edges": (features, "edge_features"),
+    "other features": (TrackingSession, "observe"),
+    "preparing the terms": (TrackingSession, "_cost"),
+    "evaluations": (FusedEngine, "local_model"),
+    "planning steps": (TrustRegionNewton, "_advance_compiled"),
+    "covariances of modes": (TrustRegionNewton, "modes"),
+    "the rest of the search": (tracker.Tracker, "step"),
+    "the best mode's terms": (TrackingSession, "_terms_of_best"),
+    "learning colours": (Observer, "learn"),
+    "the rest": (TrackingSession, "step"),
+}
+"""Functions that are timed, by the name of their stage; the last one ends a frame."""
+
+FIRST = 3
+"""Frames that are left out: kernels are loaded in them."""
+QUANTILE = 0.6
+"""Greater times than this quantile's count as it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """What to track."""
+
+    clip: Path
+    """Folder of the clip."""
+    frames: int = 45
+    """Frames to track."""
+    out: Path | None = None
+    """JSON file to write."""
+
+
+@dataclass
+class Clock:
+    """Adds up the time of stages, each without those inside it; `frames` has one entry a frame."""
+
+    open: list[list[float]] = field(default_factory=list)
+    now: dict[str, np.ndarray] = field(default_factory=lambda: defaultdict(lambda: np.zeros(2)))
+    frames: list[dict[str, np.ndarray]] = field(default_factory=list)
+
+    def stage(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """The function, timed."""
+
+        def timed(*arguments: Any, **options: Any) -> Any:
+            began = time.process_time()
+            self.open.append([0.0, 0.0])
+            result = function(*arguments, **options)
+            inside, kernels = self.open.pop()
+            spent = time.process_time() - began
+            self.now[name] += (spent - inside, kernels)
+            if self.open:
+                self.open[-1][0] += spent
+            if name == list(STAGES)[-1]:
+                self.frames.append(dict(self.now))
+                self.now.clear()
+            return result
+
+        return timed
+
+    def kernel(self, run: Callable[..., None]) -> Callable[..., None]:
+        """What calls kernels, timed."""
+
+        def timed(*arguments: Any) -> None:
+            began = time.process_time()
+            run(*arguments)
+            if self.open:
+                self.open[-1][1] += time.process_time() - began
+
+        return timed
+
+
+def watch() -> Clock:
+    """Time all stages of this process from now on."""
+    clock, run = Clock(), checked.run
+    for name, (owner, attribute) in STAGES.items():
+        setattr(owner, attribute, clock.stage(name, vars(owner)[attribute]))
+    timed = clock.kernel(run)
+    for module in list(sys.modules.values()):
+        if module.__name__.startswith("torchcss.") and vars(module).get("run") is run:
+            vars(module)["run"] = timed
+    return clock
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Track, print, write; return what is written."""
+    clock, clip = watch(), config.clip
+    with tempfile.TemporaryDirectory() as folder:
+        track_video(
+            clip / "video.mp4",
+            camera=clip / "cameras.json",
+            keypoints=clip / "keypoints2d.npz",
+            out=folder,
+            settings=Settings(overlay=False, threads=1),
+            stop=config.frames,
+        )
+    nothing = np.zeros(2)
+    times = 1e3 * np.array(
+        [[frame.get(name, nothing) for name in STAGES] for frame in clock.frames[FIRST:]]
+    )
+    stages = np.minimum(times, np.quantile(times, QUANTILE, axis=0)).mean(0)
+    total = stages[:, 0].sum()
+    rows = [
+        [name, float(own), float(kernels), f"{own / total:.0%}"]
+        for name, (own, kernels) in zip(STAGES, stages, strict=True)
+    ]
+    rows.append(["all", float(total), float(stages[:, 1].sum()), ""])
+    table = Table("Time of a frame", ("stage", "ms", "ms in kernels", "of the frame"), rows)
+    table.print()
+    report = {"config": config, "rows": rows}
+    write_report(config.out, report, table)
+    return report
+
+
+if __name__ == "__main__":
+    start(main, Config, __doc__)
