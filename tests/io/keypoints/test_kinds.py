@@ -865,6 +865,14 @@ def test_frame_numbers_as_decimals(tmp_path: Path, label: str) -> None:
     check(read(write(tmp_path / "a.csv", wide(["frame", *ends("_x", "_y", "_c")], rows))), (3,))
 
 
+def test_a_file_that_may_count_from_one_is_told(tmp_path: Path) -> None:
+    for last, doubt in ((5, True), (6, False)):
+        rows = [[t, *person(t).flat] for t in range(1, last + 1)]
+        path = write(tmp_path / "a.csv", wide(["frame", *ends("_x", "_y", "_c")], rows))
+        report = read(path, first_frame=2).report
+        assert any("a frame late" in line for line in report) == doubt
+
+
 def test_a_heading_behind_a_sign_and_columns_set_apart_by_spaces(tmp_path: Path) -> None:
     """NumPy's savetxt."""
     rows = np.array([[t, *person(t).flat] for t in T])

@@ -424,6 +424,8 @@ def test_ambiguous_layouts_are_reported(tmp_path: Path) -> None:
         ('[{"image_id": -4, "keypoints": [1, 2, 3]}]', "frame number"),
         ('[{"image_id": "a", "keypoints": [1, 2, 3]}]', "frame number"),
         ('[{"image_id": 999999999, "keypoints": [1, 2, 3]}]', "frame number"),
+        (f'[{{"image_id": 1{400 * "0"}, "keypoints": {17 * [1, 2, 3]}}}, {{"image_id": 1, '
+         '"keypoints": []}]', "entry 0: expected a frame number"),
         ('{"annotations": 3}', "list of detections"),
         ('{"annotations": [], "images": 3}', "images"),
         ('{"annotations": [{"image_id": 1, "keypoints": [1,2,3]}], "images": []}', "image 1"),

@@ -156,7 +156,9 @@ def _by_number(people: People, keys: Sequence[Key], film: Film, report: list[str
     if min(places, default=0) < 0:
         raise KeypointError(f"{min(places)} is not a frame number; number them from 0")
     first = _first(people, places, film.num_frames)
-    report.append(f"frame {first} is the first frame")
+    doubt = ", of which the file has nothing: if it counts from 1, all are a frame late"
+    known = first != 0 or min(places, default=0) != 1
+    report.append(f"frame {first} is the first frame{'' if known else doubt}")
     return [place - first for place in places]
 
 

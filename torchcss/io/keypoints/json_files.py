@@ -58,6 +58,9 @@ _FORMATS = {
 }  # fmt: skip
 """Whose a file is, by a word in it."""
 
+_HUGE = 1e17
+"""No number of a frame is so large, nor a time, were it in microseconds since 1970."""
+
 _FRAMES = ("frames", "instance_info", "results", "data")
 
 
@@ -249,7 +252,9 @@ def _key_of(where: str, entry: object) -> Key | None:
     if not isinstance(entry.get("image_id", 0), (int, str)):
         raise unexpected(KeypointError, where, "an image_id", entry["image_id"])
     counts = {
-        k: v for k, v in entry.items() if isinstance(v, (int, float)) and not isinstance(v, bool)
+        k: v
+        for k, v in entry.items()
+        if isinstance(v, (int, float)) and not isinstance(v, bool) and abs(v) < _HUGE
     }
     texts = {k: v for k, v in entry.items() if isinstance(v, str)}
     frame = first_of(counts, FRAMES)
