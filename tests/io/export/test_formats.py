@@ -90,6 +90,17 @@ def test_angles(tmp_path: Path):
     assert cells.count("") == 2
 
 
+def test_angles_of_joints_whose_names_have_commas(tmp_path: Path):
+    (tmp_path / "a.urdf").write_text(
+        "<robot name='a'><link name='b'/><link name='c'/><joint name='turn, first' "
+        "type='continuous'><parent link='b'/><child link='c'/></joint></robot>"
+    )
+    track = make_track(load_body(tmp_path / "a.urdf"))
+    text = export_as(track, to="angles", out=tmp_path).paths[0].read_text()
+    heads = ["frame", "time", "turn, first_deg", "turn, first_deg_sd"]
+    assert next(csv.reader(text.splitlines())) == heads
+
+
 def test_missing_modes_are_empty_cells(tmp_path: Path):
     track = make_track(body_named("body30"))
     done = export_as(track, to="trc", out=tmp_path, mode=2, frame="world")

@@ -101,11 +101,13 @@ def angles_text(selection: Selection, mode: int, body: BodyModel) -> str:
     both[:, turns] = np.degrees(both[:, turns])
     numbers = both[:, columns].reshape(len(both), -1)
     names = [f"{body.state_names[n]}_{'deg' if turns[n] else 'm'}" for n in columns]
-    rows = [["frame", "time", *(column for name in names for column in (name, f"{name}_sd"))]]
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(["frame", "time", *(each for name in names for each in (name, f"{name}_sd"))])
     for t, there in enumerate(selection.present[:, mode]):
         cells = [f"{value:.6f}" if there else "" for value in numbers[t]]
-        rows.append([str(selection.frames[t]), f"{selection.times[t]:.6f}", *cells])
-    return "".join(",".join(row) + "\n" for row in rows)
+        writer.writerow([selection.frames[t], f"{selection.times[t]:.6f}", *cells])
+    return out.getvalue()
 
 
 def npz_arrays(
