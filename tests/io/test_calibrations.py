@@ -115,6 +115,15 @@ def test_pixels_of_the_board_beside_the_camera(tmp_path: Path) -> None:
     assert load_camera(tmp_path / "a.yml").camera.K[0, 0] == FX
 
 
+@pytest.mark.parametrize(("columns", "kind"), [("x", "9f"), ("[1]", "9" * 12), ("~", "d")])
+def test_columns_that_are_no_number(tmp_path: Path, columns: str, kind: str) -> None:
+    corners = yaml_matrix("image_points", [1.0] * 6, 2).replace("cols: 3", f"cols: {columns}")
+    text = FILES["OpenCV, a column"][1] + corners.replace("dt: d", f'dt: "{kind}"')
+    (tmp_path / "a.yml").write_text(text)
+    with pytest.raises(CameraError, match="needs as many numbers as data"):
+        load_camera(tmp_path / "a.yml")
+
+
 @pytest.mark.parametrize("turn", [[10, 5, 3], [90, 0, 45]])
 def test_degrees_are_refused(tmp_path: Path, turn: list[float]) -> None:
     entry = {"K": K, "image_size_wh": SIZE, "rotation": turn, "t": [0, 0, 3]}

@@ -561,8 +561,10 @@ class _Loader(yaml.SafeLoader):
 def _matrix(loader: yaml.SafeLoader, node: yaml.Node) -> list[Any]:
     """A matrix as nested lists."""
     values = loader.construct_mapping(node, deep=True) if isinstance(node, yaml.MappingNode) else {}
-    channels = re.sub("[^0-9]", "", str(values.get("dt"))) or "1"  # 2f: pairs, as of pixels
-    matrix = _plain({**values, "cols": int(channels) * values.get("cols", 0)})
+    channels, columns = re.match("[0-9]{0,3}", str(values.get("dt"))), values.get("cols")
+    if channels and channels[0] and isinstance(columns, int):  # 2f: pairs, as of pixels
+        columns *= int(channels[0])
+    matrix = _plain({**values, "cols": columns})
     if not isinstance(matrix, list):
         raise yaml.YAMLError(
             f"line {node.start_mark.line + 1}: an opencv-matrix of {values.get('rows')} rows and "
