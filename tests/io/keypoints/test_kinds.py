@@ -892,6 +892,19 @@ def test_joints_above_x_and_y(tmp_path: Path, merged: bool) -> None:
     check(read(write(tmp_path / "a.csv", wide(["frame" if merged else "", *above], rows))), (3,))
 
 
+def test_a_comment_with_as_many_commas_is_no_heading(tmp_path: Path) -> None:
+    heads = ["frame", *ends("_x", "_y", "_c")]
+    table = wide(heads, [[t, *person(t).flat] for t in T])
+    check(read(write(tmp_path / "a.csv", f"# {','.join(heads[::-1])}\n{table}")))
+
+
+def test_two_rows_of_headings_and_nothing_below(tmp_path: Path) -> None:
+    rows = [["", *["x", "y"] * 2]]
+    path = write(tmp_path / "a.csv", wide(["frame", "nose", "", "l_elbow", ""], rows))
+    with pytest.raises(KeypointError, match="a heading and nothing below it"):
+        read(path)
+
+
 def test_joints_by_number_of_which_some_are_left_out(tmp_path: Path) -> None:
     order = np.random.default_rng(0).permutation([i for i in range(17) if i not in (1, 4)])
     rows = [{"frame": t, "keypoints": [{"id": int(i), "x": x, "y": y, "score": c} for i in order

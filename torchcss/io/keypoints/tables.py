@@ -85,9 +85,9 @@ def read_table(path: Path) -> People:
         columns, body, report = _deeplabcut(rows)
         joints, frames = _read_rows(columns, body)
         return People(frames, tuple(joints), report, first=0)
+    rows = _with_one_heading(rows) if len(rows) > 1 else rows
     if len(rows) == 1:
         raise KeypointError("row 1: a heading and nothing below it; get a complete copy")
-    rows = _with_one_heading(rows)
     heading = rows[0][1]
     columns = _headed(heading)
     said = [n for n in (columns.frame, columns.track) if n is not None]
@@ -146,10 +146,10 @@ def table_rows(path: Path) -> list[Row]:
 
 
 def _without_comments(rows: list[Row]) -> list[Row]:
-    """Rows that no `#` begins, but for a heading: NumPy and others put one before theirs."""
+    """Rows that no `#` begins, but for the heading of numbers: NumPy and others put one before."""
     first = next((index for index, (_, row) in enumerate(rows) if row[0][:1] != "#"), 0)
     body = [each for each in rows[first:] if not each[1][0].startswith("# ")]
-    if first and body:
+    if first and body and any(re.fullmatch(r"[-+]?[0-9.]+(e[-+]?[0-9]+)?", c) for c in body[0][1]):
         number, (cell, *rest) = rows[first - 1]
         if len("".join(rest).split()) and len(_ended(rows[first - 1])) == len(_ended(body[0])):
             body.insert(0, (number, [cell.removeprefix("#").strip() or cell, *rest]))
