@@ -87,21 +87,24 @@ def test_archives_that_unpack_to_more_than_there_is(
 
 
 class Room:
-    """What asks NumPy for an array of any size, before a number is read."""
+    """What asks NumPy for an array of any size, whatever numbers or objects follow."""
 
-    def __init__(self, function: Any, arguments: tuple[Any, ...]) -> None:
-        self.asks = function, arguments
+    def __init__(self, *asks: Any) -> None:
+        self.asks = asks
 
     def __reduce__(self) -> Any:
         return self.asks
 
 
-@pytest.mark.parametrize("kind", ["ndarray", "_reconstruct"])
+@pytest.mark.parametrize("kind", ["ndarray", "_reconstruct", "objects", "objects of a buffer"])
 def test_pickles_that_ask_for_room(tmp_path: Path, kind: str) -> None:
     shape = (2**26, 17, 2)
     reconstruct, arguments, _ = np.zeros(1).__reduce__()
+    from_buffer, few = np.zeros(1).__reduce_ex__(5)[0], (1, (10**7,), np.dtype("O"), False, [1])
     asks = {"ndarray": Room(np.ndarray, (shape, "f8")),
-            "_reconstruct": Room(reconstruct, (arguments[0], shape, "f8"))}  # fmt: skip
+            "_reconstruct": Room(reconstruct, (arguments[0], shape, "f8")),
+            "objects": Room(reconstruct, arguments, few),
+            "objects of a buffer": Room(from_buffer, (bytes(8), "f8", (1,), "C"), few)}  # fmt: skip
     head = io.BytesIO()
     plain = {"descr": "|O", "fortran_order": False, "shape": ()}
     np.lib.format.write_array_header_1_0(head, plain)
@@ -286,7 +289,14 @@ def test_meshes_are_of_a_links_size(tmp_path: Path) -> None:
     with mesh.open("wb") as file:
         file.truncate(2**26 + 1)
     assert "not a link's mesh" in "".join(load_body(tmp_path / "a.urdf").notes)
-    for content in (b"x", b"solid a\nvertex 0 0 x\n", b"solid a\nvertex 0 0 nan\n", bytes(84)):
+    spaces = b"solid a" + b"\n \r\n" * 10**6  # which took hours
+    for content in (
+        b"x",
+        b"solid a\nvertex 0 0 x\n",
+        b"solid a\nvertex 0 0 nan\n",
+        bytes(84),
+        spaces,
+    ):
         mesh.write_bytes(content)
         body = load_body(tmp_path / "a.urdf")
         assert not body.part_names
