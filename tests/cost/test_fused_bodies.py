@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
-from made_costs import changed, make_full_cost, random_states
+from made_costs import JOINTS_ONLY, changed, make_cost, make_full_cost, random_states
 from made_engines import assert_close, awkward_states, colours_of
 
+from torchcss.body.load import FileOptions, load_body
 from torchcss.body.shape import with_shape
 from torchcss.cost.context import BodyTables
+from torchcss.cost.fused.engine import FusedEngine
 from torchcss.cost.total import TrackingCost, beside, numbered, together
 
 ROBOTS = [
@@ -41,6 +45,31 @@ def test_robots_from_files(name: str, shared_data: Path, generator: torch.Genera
                    awkward_states(cost, generator)])  # fmt: skip
     for dtype in ("float64", "float32"):
         assert_close(cost, x, dtype)
+
+
+def test_keypoints_of_many_joints_without_parts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, generator: torch.Generator
+) -> None:
+    """There is memory for all of them: parts and nodes alone do not say how much."""
+    links = "".join(f"<link name='l{n}'/>" for n in range(101))
+    joints = "".join(
+        f"<joint name='j{n}' type='continuous'><parent link='l{n}'/><child link='l{n + 1}'/>"
+        "<origin xyz='0 0.005 0'/></joint>"
+        for n in range(100)
+    )
+    (tmp_path / "a.urdf").write_text(f"<robot name='a'>{links}{joints}</robot>")
+    bare = partial(load_body, file=FileOptions(shape="none"))
+    monkeypatch.setattr("made_costs.load_body", bare)
+    cost = make_cost(str(tmp_path / "a.urdf"), JOINTS_ONLY)
+    assert len(cost.views[0].keypoints.names) > 99
+    assert not cost.body.num_parts
+    x = random_states(cost.body, 2, generator=generator)
+    assert_close(cost, x, "float64")
+    engine = FusedEngine("float64")
+    replace(cost, engine=engine).value(x)
+    for memory in engine._workspaces.values():
+        with memory.lent() as workspace:
+            assert len(workspace.points.x) > 99
 
 
 def test_views_and_sequences_of_robots(shared_data: Path, generator: torch.Generator) -> None:

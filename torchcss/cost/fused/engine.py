@@ -303,7 +303,7 @@ class FusedEngine:
         repulsion = repulsion._replace(scale=real(weight * term.weight / interior))
         curves = pack.pack_curves(None, len(parts.row), real)
         records = tree, parts, repulsion, _is_exact(cost)
-        memory = self._memory(tree, curves, interior, chain, 5)
+        memory = self._memory(tree, curves, interior, chain, 5, 0)
         return _Packed(add_repulsion, 0, records, memory)
 
     def _parts(self, past: FrameContext) -> Parts:
@@ -311,15 +311,13 @@ class FusedEngine:
         make = partial(pack.pack_parts, past.body, self.real)
         return self._bodies.of(past.tables, (pack.pack_parts,), make)
 
-    def _memory(
-        self, tree: Tree, curves: Curves, interior: int, chain: int, steps: int
-    ) -> Workspaces:
+    def _memory(self, tree: Tree, curves: Curves, *sizes: int) -> Workspaces:
         """Memory that all bodies of these sizes share, one after the other."""
-        sizes = (len(tree.parent), *curves.table.shape, *curves[1:], interior, chain, steps)
-        if sizes not in self._workspaces:
-            make = partial(pack.make_workspace, tree, curves, interior, chain, (steps, self.real))
-            self._workspaces[sizes] = Workspaces(make)
-        return self._workspaces[sizes]
+        key = (len(tree.parent), *curves.table.shape, *curves[1:], *sizes)
+        if key not in self._workspaces:
+            make = partial(pack.make_workspace, tree, curves, sizes, self.real)
+            self._workspaces[key] = Workspaces(make)
+        return self._workspaces[key]
 
     def _view(self, cost: TrackingCost, past: FrameContext, context: FrameContext) -> _Found:
         return self._views.of(
@@ -368,7 +366,8 @@ class FusedEngine:
             **records,
         )
         interior = view.flow.nodes.shape[2]
-        memory = self._memory(tree, view.curves, interior, 1, len(edges.steps))
+        keypoints = 64 * math.ceil(len(view.keypoints.row) / 64)  # for all of these one memory
+        memory = self._memory(tree, view.curves, interior, 1, len(edges.steps), keypoints)
         packed = _Packed(add_view, len(view.flow.target), (tree, parts, view), memory)
         return [packed], frozenset(others)
 

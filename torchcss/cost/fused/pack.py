@@ -322,19 +322,17 @@ def pack_repulsion(term: Interpenetration, pairs: InterpenetrationPairs, real: R
     return in_precision(repulsion, real)
 
 
-def make_workspace(
-    tree: Tree, curves: Curves, interior: int, chain: int, samples: tuple[int, Any]
-) -> Workspace:
+def make_workspace(tree: Tree, curves: Curves, sizes: tuple[int, ...], real: Real) -> Workspace:
     """Memory for one state.
 
     Args:
         tree: The body's tree.
         curves: The curves on its parts.
-        interior: Number of nodes all over the surface of a part.
-        chain: Longest chain of joints between two parts.
-        samples: Number of samples on a search line, and the precision.
+        sizes: Number of nodes all over the surface of a part, longest chain of joints between two
+            parts, number of samples on a search line, and of keypoints.
+        real: The precision.
     """
-    steps, real = samples
+    interior, chain, steps, keypoints = sizes
     num_parts, num_joints = len(curves.table), len(tree.parent)
     outline = 2 * num_parts * (curves.rings + curves.meridians)
     nodes = max(outline, num_parts * interior, 1)
@@ -364,7 +362,7 @@ def make_workspace(
         rays=fields(Rays, nodes),
         near=fields(Lines, nodes),
         lines=fields(Lines, pairs),
-        points=fields(Points, max(pairs, 64), first=num_parts + 1),
+        points=fields(Points, max(pairs, keypoints), first=num_parts + 1),
         seen=fields(Seen, nodes, first=nodes + 1),
         peaks=fields(Peaks, nodes * (steps // 2)),
         response=np.zeros(steps, real),
