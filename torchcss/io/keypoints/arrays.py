@@ -63,7 +63,7 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
         )
     report = [f"format: {path.suffix[1:].upper()}"]
     values = _people(name, arrays[name])
-    is_movenet = _is_movenet(arrays[name])
+    is_movenet = _is_movenet(arrays[name], alone=len(arrays) == 1)
     if len(values) == 1 and values.shape[1] > _MOST_PEOPLE:
         values = values.swapaxes(0, 1)
         report.append(f"{name}: one person in {len(values)} frames, which are the second axis")
@@ -120,10 +120,12 @@ def read_points(path: Path, keypoints: Keypoints) -> Keypoints:
     return keypoints._replace(points=points[torch.arange(len(gap)), gap.argmin(1)])
 
 
-def _is_movenet(array: np.ndarray) -> bool:
+def _is_movenet(array: np.ndarray, *, alone: bool) -> bool:
     """Whether these are MoveNet's arrays, of many people, or of pictures one after the other."""
-    fractions = array.shape[1:] == (1, 17, 3) and bool(((array >= 0) & (array <= 1)).all())
-    return array.ndim == 5 or array.shape[-1] == 56 or fractions
+    if array.ndim == 5 or array.shape[-1] == 56:
+        return True
+    one = alone and array.shape[1:] == (1, 17, 3)
+    return one and bool(((array >= 0) & (array <= 1)).all())
 
 
 def _counted(people: list[list[Person]], numbers: np.ndarray | None) -> list[list[Person]] | Frames:
