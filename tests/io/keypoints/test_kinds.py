@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from torchcss.errors import KeypointError
 from torchcss.io.keypoints.frames import Film
@@ -956,6 +957,10 @@ def test_movenet_of_one_picture_after_the_other(tmp_path: Path) -> None:
     values = [(person(t) / (*SIZE, 1))[None, :, [1, 0, 2]] for t in T]
     np.save(tmp_path / "a.npy", values)
     check(read(tmp_path / "a.npy"))
+    named = {"keypoints": np.array(values)[..., [1, 0, 2]], "joint_names": TFJS}
+    np.savez(tmp_path / "a.npz", **named)  # whose names say that it is none
+    found = [read(tmp_path / "a.npz", normalised="zero-one"), read(tmp_path / "a.npy")]
+    torch.testing.assert_close(*(each.positions for each in found), rtol=0, atol=1.0)
 
 
 def test_names_that_end_in_joint(tmp_path: Path) -> None:

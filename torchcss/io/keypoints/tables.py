@@ -47,6 +47,7 @@ _UNITS = frozenset(names_in("px pixel pixels pos position coord 2d"))
 _POINTS = r"((landmark|lm|joint|keypoint|kpt|kp|point|pose)(_|(?=[0-9])))+"
 _ABSENT = names_in("nan none null na n/a #n/a <na> -")
 
+_NUMBER = re.compile(r"([-+]?[0-9.,]+([eE][-+]?[0-9]+)?|nan)$")
 _DECIMAL = re.compile(r"^(-?[0-9]*),([0-9]+(?:[eE][-+]?[0-9]+)?)$")
 
 Row = tuple[int, list[str]]
@@ -149,7 +150,7 @@ def _without_comments(rows: list[Row]) -> list[Row]:
     """Rows that no `#` begins, but for the heading of numbers: NumPy and others put one before."""
     first = next((index for index, (_, row) in enumerate(rows) if row[0][:1] != "#"), 0)
     body = [each for each in rows[first:] if not each[1][0].startswith("# ")]
-    if first and body and any(re.fullmatch(r"[-+]?[0-9.]+(e[-+]?[0-9]+)?", c) for c in body[0][1]):
+    if first and body and any(map(_NUMBER.match, body[0][1])):
         number, (cell, *rest) = rows[first - 1]
         if len("".join(rest).split()) and len(_ended(rows[first - 1])) == len(_ended(body[0])):
             body.insert(0, (number, [cell.removeprefix("#").strip() or cell, *rest]))
