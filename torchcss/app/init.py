@@ -8,7 +8,7 @@
 | `stage1.png`, `stage2.png`, `stage3.png` | the best fit after every stage, over the picture |
 | `hypotheses.png` | the hypotheses over the picture |
 | `side.png` | the hypotheses from the front, obliquely and from the side |
-| `proportions.csv` | fitted lengths beside the standard humanoid's |
+| `proportions.csv` | fitted lengths beside the standard humanoid's; not for bodies from files |
 | `summary.json` | what was run, found and assumed |
 """
 
