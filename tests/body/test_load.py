@@ -569,12 +569,12 @@ def test_bad_requests(tmp_path: Path) -> None:
     assert load_body(path).num_parameters == 11  # XML says its encoding itself
 
 
-@pytest.mark.parametrize("binary", [False, True])
-def test_a_link_is_as_large_as_the_box_around_its_mesh(tmp_path: Path, binary: bool) -> None:
+@pytest.mark.parametrize("end", [None, b"", b"\n"])
+def test_a_link_is_as_large_as_the_box_around_its_mesh(tmp_path: Path, end: bytes | None) -> None:
     corners = np.array([[[-50, -30, 0], [50, 30, 0], [0, 0, 400]]], "<f4")
-    if binary:
+    if end is not None:  # binary
         record = np.concatenate([np.zeros((1, 1, 3), "<f4"), corners], 1).tobytes() + bytes(2)
-        content = b"solid in millimetres".ljust(80) + (1).to_bytes(4, "little") + record
+        content = b"solid in millimetres".ljust(80) + (1).to_bytes(4, "little") + record + end
     else:
         rows = "".join(f"vertex {x} {y:e} {z}\n" for x, y, z in corners[0])
         content = f"solid a\nfacet normal 0 0 1\nouter loop\n{rows}endloop\nendfacet\n".encode()

@@ -39,8 +39,8 @@ def stl_points(path: Path) -> Float[np.ndarray, "8 3"]:
     data = read_bytes(path, BodyError)
     count = int.from_bytes(data[_HEAD - 4 : _HEAD], "little")
     points = np.zeros((0, 3))
-    if len(data) == _HEAD + count * _TRIANGLE.itemsize:
-        triangles = np.frombuffer(data, _TRIANGLE, offset=_HEAD)
+    if 0 < count <= (len(data) - _HEAD) // _TRIANGLE.itemsize:  # some programs add bytes
+        triangles = np.frombuffer(data, _TRIANGLE, count, _HEAD)
         points = triangles["corners"].reshape(-1, 3).astype(np.float64)
     elif data.lstrip().startswith(b"solid"):
         try:
