@@ -177,8 +177,7 @@ class FusedEngine:
         )
         if others is None:
             return model
-        rest = others.local_model(x)
-        return LocalModel(*(a + b for a, b in zip(model, rest, strict=True)))
+        return model.plus(others.local_model(x))
 
     def _evaluate(
         self, cost: TrackingCost, x: Tensor, *, slopes: bool

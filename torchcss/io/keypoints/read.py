@@ -74,7 +74,7 @@ _OTHERS = {
     "joints",
     ".trc .c3d .bvh .amc .mot .fbx .glb": "a motion in space; expected the pixels of joints",
     ".xlsx .xls .ods .numbers": f"a spreadsheet; {_AS_CSV}",
-    ".parquet .feather .arrow .mat .tsv.gz": f"a table that is not read; {_AS_CSV}",
+    ".parquet .feather .arrow .mat": f"a table that is not read; {_AS_CSV}",
     ".zip .gz .bz2 .xz .7z .tar .tgz .rar": "packed; unpack it",
 }
 """Files of other kinds by their suffixes, and what to do."""
