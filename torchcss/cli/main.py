@@ -64,9 +64,10 @@ class Demo:
 
 Verb = Demo | Init | Detect | Track | Batch | Smooth | Export | View | Plot | Report
 
-_DESCRIPTION = """Tracks a body with joints through a video, and keeps every pose that explains it.
+_DESCRIPTION = """Tracks a body with joints through a video, and keeps the poses that explain it.
 
-`torchcss track VIDEO` needs nothing but a video; `torchcss track --help` tells what else it takes.
+`torchcss track VIDEO` needs nothing but a video once `torchcss detect --download-model` has fetched
+a detector of people; `torchcss track --help` tells what else it takes.
 Bad input ends with one line on standard error and exit status 2. What was tracked before an
 interruption is on disk: `torchcss track ... --resume` goes on."""
 
