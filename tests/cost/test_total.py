@@ -470,6 +470,9 @@ def test_what_the_cost_says_of_the_past(engine: str, generator: torch.Generator)
     x = random_states(cost.body, 4, generator=generator)
     past, terms = cost.problem().past, cost.terms(x)
     assert past is not None
-    torch.testing.assert_close(past(x), terms["temporal"] + terms["temporal_mixture"])
-    choice = cost.choice.without("temporal", "temporal_mixture")
-    assert replace(cost, choice=choice).problem().past is None
+    torch.testing.assert_close(past.value(x), terms["temporal"] + terms["temporal_mixture"])
+    motion = cost.problem().motion
+    assert motion is not None
+    torch.testing.assert_close(motion.value(x), terms["flow"])
+    choice = cost.choice.without("temporal", "temporal_mixture", "flow")
+    assert replace(cost, choice=choice).problem()[4:6] == (None, None)

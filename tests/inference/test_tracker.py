@@ -459,25 +459,22 @@ class AfterModes(problems.Alike):
 
     seen: problems.DoubleWell
     prior: Prior
-
-    def past(self, x):
-        return self._past(x).value
-
-    def _past(self, x):
-        return MixturePrior().local_model(x, MixturePrior().density(self.prior.mixture))
+    alone: bool = False
 
     def value(self, x):
         return self.local_model(x).value
 
     def local_model(self, x):
-        pairs = zip(self.seen.local_model(x), self._past(x), strict=True)
-        return LocalModel(*(seen + past for seen, past in pairs))
+        past = MixturePrior().local_model(x, MixturePrior().density(self.prior.mixture))
+        if self.alone:
+            return past
+        return LocalModel(*(a + b for a, b in zip(self.seen.local_model(x), past, strict=True)))
 
     @staticmethod
     def problem(well):
         def children(_, prior):
             cost = AfterModes(well, prior)
-            return SearchProblem(cost, past=cost.past)
+            return SearchProblem(cost, past=replace(cost, alone=True))
 
         return SearchProblem(well, of_children=children)
 

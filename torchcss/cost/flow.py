@@ -125,6 +125,7 @@ class FlowTerm(Term):
     name = "flow"
     kind = "image"
     watched = True
+    of_motion = True
 
     weight: float = 20.0
     sigma: float = 0.5

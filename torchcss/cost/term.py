@@ -55,6 +55,7 @@ class Term(Protocol):
         screens: Whether it counts where samples are screened ([RR] section 4.2: edges alone).
         of_past: Whether it says what the modes before make likely: it guides descents, and is left
             out where the weights of those modes are multiplied in.
+        of_motion: Whether it says how a pose differs from the mode before that it came from.
     """
 
     name: ClassVar[str]
@@ -62,6 +63,7 @@ class Term(Protocol):
     watched: ClassVar[bool] = False
     screens: ClassVar[bool] = False
     of_past: ClassVar[bool] = False
+    of_motion: ClassVar[bool] = False
 
     @property
     def needs(self) -> frozenset[Need]:

@@ -193,7 +193,8 @@ class TrackingCost:
             coarse=self.coarse(),
             screening=self.screening(),
             weight_only=self.weight_only,
-            past=self.of_past if any(term.of_past for term in self.choice.terms) else None,
+            past=self._of_those([term.name for term in self.choice.terms if term.of_past]),
+            motion=self._of_those([term.name for term in self.choice.terms if term.of_motion]),
             landmarks=self.landmarks,
             restrict=lambda items: self.take(items).problem(),
             of_children=lambda *given: self.of_children(*given).problem(),
@@ -213,10 +214,9 @@ class TrackingCost:
         edges = self.choice.only([term.name for term in self.choice.terms if term.screens])
         return replace(self, choice=edges)
 
-    def of_past(self, x: States) -> Costs:
-        """The part of the cost that is no news of the frame, nats: see `Term.of_past`."""
-        names = [term.name for term in self.choice.terms if term.of_past]
-        return replace(self, choice=self.choice.only(names)).value(x)
+    def _of_those(self, names: list[str]) -> TrackingCost | None:
+        """The part of the cost that some terms make; None: there are none."""
+        return replace(self, choice=self.choice.only(names)) if names else None
 
     def landmarks(self, x: States) -> Float[Tensor, "*batch j 3"]:
         """Joint centres, metres: by how far they are apart two states are unlike each other."""

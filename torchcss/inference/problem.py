@@ -9,7 +9,8 @@ inside them:
 | `coarse` | a smoother cost, on which some samples descend first |
 | `screening` | a cheaper cost, by which more samples than descend are sorted out |
 | `weight_only` | what has no derivatives and counts among modes, nats |
-| `past` | what the cost says of the past: it guides descents, and is no news of the frame, nats |
+| `past` | the part of the cost that says what the modes before make likely |
+| `motion` | the part of the cost that compares a state with the mode before that it came from |
 | `landmarks` | points by whose distance two states are told apart |
 | `restrict` | the problem of some of the samples |
 | `of_children` | the problem of samples of a prior, where they are compared with it |
@@ -35,8 +36,11 @@ class SearchProblem(NamedTuple):
         coarse: A smoother one; None: there is none.
         screening: A cheaper one; None: the cost itself.
         weight_only: Cost in nats of what counts in the weights of modes alone.
-        past: The part of the cost that says what the modes before make likely. Weights that inherit
-            from these modes leave it out.
+        past: The part of the cost that says what the modes before make likely: it guides descents,
+            and is no news of the frame. Weights that inherit from these modes leave it out.
+        motion: The part of the cost that says how a state moved since the mode before that it came
+            from, and not where it is: flow. What is not known of that mode is not known of the
+            state either (`torchcss.inference.marginal`).
         landmarks: Points of each state.
         restrict: Makes the problem of some samples, by index; None: by the costs' `take`.
         of_children: Makes the problem of samples from the component of the prior that each came
@@ -47,7 +51,8 @@ class SearchProblem(NamedTuple):
     coarse: CostFunction | None = None
     screening: CostFunction | None = None
     weight_only: Callable[[Vectors], Numbers] | None = None
-    past: Callable[[Vectors], Numbers] | None = None
+    past: CostFunction | None = None
+    motion: CostFunction | None = None
     landmarks: Callable[[Vectors], Float[Tensor, "b m d"]] | None = None
     restrict: Callable[[Items], SearchProblem] | None = None
     of_children: Callable[[Int[Tensor, " s"], Prior], SearchProblem] | None = None

@@ -34,6 +34,7 @@ from torch import Tensor
 from torchcss.errors import ConfigurationError, check_positive, check_shape
 from torchcss.inference.dynamics import Diffusion, Dynamics
 from torchcss.inference.importance import Survival, survival
+from torchcss.inference.marginal import information_of_past
 from torchcss.inference.mixture import (
     GaussianMixture,
     Past,
@@ -53,8 +54,18 @@ from torchcss.inference.trust_region import (
     check_bounds,
     default_prior_variance,
 )
-from torchcss.linalg import constrained_inverse, log_determinant
-from torchcss.types import Bounds, Items, Modes, Numbers, Status, Vectors, frozen
+from torchcss.linalg import constrained_inverse, inverse_on_free, log_determinant
+from torchcss.types import (
+    Bounds,
+    Items,
+    LocalModel,
+    Matrices,
+    Modes,
+    Numbers,
+    Status,
+    Vectors,
+    frozen,
+)
 
 _ROUNDS = ((0, 6.0), (1, 2.0), (5, 1.0))
 """Rounds of successive halving: steps of descent, and how many samples are left then, in multiples
@@ -240,6 +251,27 @@ class _Search(NamedTuple):
         )
 
 
+class _Minima(NamedTuple):
+    """Ends of descents.
+
+    Attributes:
+        problem: The problem of these samples.
+        modes: The ends.
+        model: Cost and derivatives there.
+        origin: Component of the prior that each came from.
+    """
+
+    problem: SearchProblem
+    modes: Modes
+    model: LocalModel
+    origin: Items
+
+    def take(self, items: Items) -> _Minima:
+        """Some of them."""
+        model = LocalModel(*(part[items] for part in self.model))
+        return _Minima(self.problem.take(items), self.modes.take(items), model, self.origin[items])
+
+
 class _Kept(NamedTuple):
     """The posterior of a frame, the best mode first; see `TrackerInfo`."""
 
@@ -368,11 +400,10 @@ class Tracker(SequenceTracker):
             samples.parent[:0],
         )
         search = self._halve(search, bounds)
-        modes, distinct, floored = self._minima(search, bounds)
-        if len(distinct):
+        modes, found, floored = self._minima(search, bounds)
+        if len(found.origin):
             # 3: weights by the likelihood at the modes. 4 to 6: the best K, with their pasts.
-            found = search.problem.take(distinct), modes.take(distinct)
-            kept = self._posterior(state, prior, *found, search.samples.parent[distinct])
+            kept = self._posterior(state, prior, found, bounds)
         else:
             kept = self._carry_over(state, ahead, bounds)
 
@@ -383,7 +414,7 @@ class Tracker(SequenceTracker):
             status_counts=torch.bincount(modes.status, minlength=len(Status)),
             num_steps=torch.cat([modes.num_steps, search.given_up]),
             num_samples=torch.tensor(started, device="cpu"),
-            num_distinct=torch.tensor(len(distinct), device="cpu"),
+            num_distinct=torch.tensor(len(found.origin), device="cpu"),
             effective_sample_size=kept.effective_sample_size,
             num_floored=floored,
             survival=spread,
@@ -473,8 +504,8 @@ class Tracker(SequenceTracker):
         best = torch.cat([own, best[~is_mode[best]]])
         return best[: max(size, len(own))].sort().values
 
-    def _minima(self, search: _Search, bounds: Bounds) -> tuple[Modes, Items, Int[Tensor, ""]]:
-        """Descend to the end: all ends, which are distinct by ascending cost, `num_floored`."""
+    def _minima(self, search: _Search, bounds: Bounds) -> tuple[Modes, _Minima, Int[Tensor, ""]]:
+        """Descend to the end: all ends, the distinct ones by ascending cost, and `num_floored`."""
         descents = self.optimiser.descend(search.problem.cost, search.descents, bounds)
         modes = self.optimiser.modes(descents, bounds)
         floored = modes.status.new_zeros(())
@@ -482,16 +513,17 @@ class Tracker(SequenceTracker):
             modes, floored = as_printed(modes, descents, bounds)
         energy = finite_cost(modes.status, modes.cost, converged_only=self.converged_only)
         distinct = distinct_modes(modes.mean, modes.covariance, energy)
-        return modes, distinct, floored
+        every = _Minima(search.problem, modes, descents.model, search.samples.parent)
+        return modes, every.take(distinct), floored
 
     def _posterior(
-        self, state: TrackerState, prior: Prior, problem: SearchProblem, modes: Modes, origin: Items
+        self, state: TrackerState, prior: Prior, found: _Minima, bounds: Bounds
     ) -> _Kept:
         """Steps 3 to 6: weigh the distinct modes, keep the best, and multiply in their pasts."""
-        cost = modes.cost
+        problem, modes, cost = found.problem, found.modes, found.modes.cost
         if problem.weight_only is not None:
             cost = cost + problem.weight_only(modes.mean)
-        told = torch.zeros_like(cost) if problem.past is None else problem.past(modes.mean)
+        told = torch.zeros_like(cost) if problem.past is None else problem.past.value(modes.mean)
         volume = torch.zeros_like(cost)
         if self.laplace_evidence:
             volume = 0.5 * log_determinant(modes.covariance)
@@ -510,6 +542,8 @@ class Tracker(SequenceTracker):
             past = match_to_prior(pruned, tempered)
         else:
             past = Past(*(part[kept] for part in past))
+        wide = self._marginal(state.mixture, prior, found, kept, past.parent, bounds)
+        pruned = pruned._replace(covariance=wide)
         mixture = pruned._replace(log_weight=pruned.log_weight + past.log_weight).normalise()
         best_first = mixture.best_first
         mixture, match, kept = mixture.take(best_first), past.parent[best_first], kept[best_first]
@@ -517,7 +551,35 @@ class Tracker(SequenceTracker):
         velocity = torch.where((match >= 0)[:, None], moved, 0.0)
         parent = torch.where(match >= 0, prior.parent[match.clamp(min=0)], -1)
         effective = (-(2 * unpruned.log_weight).logsumexp(0)).exp()
-        return _Kept(mixture, velocity, (cost - told)[kept], parent, origin[kept], effective)
+        return _Kept(mixture, velocity, (cost - told)[kept], parent, found.origin[kept], effective)
+
+    def _marginal(
+        self,
+        before: GaussianMixture,
+        prior: Prior,
+        found: _Minima,
+        kept: Items,
+        parent: Items,
+        bounds: Bounds,
+    ) -> Matrices:
+        """Covariances of modes with what was not known a frame ago (`torchcss.inference.marginal`).
+
+        Those without a parent stay as they are: they say nothing of the modes before.
+        """
+        modes, model, problem = found.modes.take(kept), found.model, found.problem
+        if problem.past is None or problem.motion is None:
+            return modes.covariance
+        motion, past = (
+            part.take(kept).local_model(modes.mean).hessian
+            for part in (problem.motion, problem.past)
+        )
+        own = parent.clamp(min=0)
+        known, ahead = before.covariance[prior.parent[own]], prior.mixture.covariance[own]
+        variance = default_prior_variance(bounds)
+        told = information_of_past(motion, known, ahead - known, variance)
+        hessian = model.hessian[kept] - motion - past + told
+        wide = inverse_on_free(hessian, modes.active == 0, variance, model.gradient[kept])
+        return torch.where((parent >= 0)[:, None, None], wide, modes.covariance)
 
     def _explanations(
         self,
