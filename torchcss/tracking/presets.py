@@ -97,8 +97,8 @@ class Preset:
             explanations, see `Tracker`. The papers have none; their modes are distinct minima. By
             the mean distance of all joints an arm that is flipped would hardly count.
         soft_matching: See `Tracker`.
-        surprise_body: `Tracker.surprise` for a body: a tenth of its n = 34 nats, as a frame's
-            likelihood counts a tenth. An arm keeps n: nothing tells it from its mirror image but
+        surprise_body: `Tracker.surprise` for a body: 0.15 of its n = 34 nats, as of a frame's
+            likelihood. An arm keeps n: nothing tells it from its mirror image but
             where it was.
         jumps_every: Every how many frames the flips of the best mode join the search, see
             `torchcss.tracking.flip_moves`; 0, as in the papers: never.
@@ -188,14 +188,14 @@ _CSS = Preset(
     proposal=CovarianceScaled(covariance_scale=8.0, max_deviation=1.0),
     samples_arm=160,
     samples_body=60,
-    likelihood_power=0.1,
+    likelihood_power=0.15,
     power_arm=0.05,
     survivors_arm=20,
     survivors_body=15,
     persistence=0.8,
     separation=0.12,
     soft_matching=True,
-    surprise_body=3.4,
+    surprise_body=5.1,
     jumps_every=3,
 )
 
