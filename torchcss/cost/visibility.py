@@ -519,8 +519,9 @@ def _least_gap(parts: _Parts, lines: _Stretches, count: int, *, plain: bool) -> 
     least = lines.end.new_full((count,), torch.inf)
     if plain:
         s, curvature, square = _ellipsoid_minimum(parts.shapes(lines.part), lines)
-        hidden = places(square < parts.within.index_select(0, lines.part))
-        least.index_fill_(0, lines.ray.index_select(0, hidden), -torch.inf)
+        hidden = square < parts.within.index_select(0, lines.part)
+        met = torch.where(hidden, least.new_full((), -torch.inf), torch.inf)
+        least = least.scatter_reduce(0, lines.ray, met, "amin")
         open_ = places(least.index_select(0, lines.ray) > 0)
         lines, s, curvature = lines.take(open_), s[open_], curvature[open_]
         gap = _gap(parts, lines, s, curvature, steps=_STEPS)
