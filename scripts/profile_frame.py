@@ -15,15 +15,18 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from common import Table, start, write_report
 
 from torchcss.app.track import track_video
+from torchcss.cli.options import SettingsOptions
 from torchcss.cost.fused.engine import FusedEngine
 from torchcss.inference import tracker
 from torchcss.inference.trust_region import TrustRegionNewton
@@ -48,6 +51,8 @@ STAGES: dict[str, tuple[Any, str]] = {
 }
 """Functions that are timed, by the name of their stage; the last one ends a frame."""
 
+TRACKING = Settings(overlay=False)
+
 FIRST = 3
 """Frames that are left out: kernels are loaded in them."""
 QUANTILE = 0.6
@@ -64,6 +69,7 @@ class Config:
     """Frames to track."""
     out: Path | None = None
     """JSON file to write."""
+    tracking: SettingsOptions = TRACKING
 
 
 @dataclass
@@ -105,28 +111,30 @@ class Clock:
         return timed
 
 
-def watch() -> Clock:
-    """Time all stages of this process from now on."""
+@contextmanager
+def watched() -> Iterator[Clock]:
+    """Time all stages of this process."""
     clock, run = Clock(), checked.run
-    for name, (owner, attribute) in STAGES.items():
-        setattr(owner, attribute, clock.stage(name, vars(owner)[attribute]))
-    timed = clock.kernel(run)
-    for module in list(sys.modules.values()):
-        if module.__name__.startswith("torchcss.") and vars(module).get("run") is run:
-            vars(module)["run"] = timed
-    return clock
+    with ExitStack() as stack:
+        for name, (owner, attribute) in STAGES.items():
+            timed = clock.stage(name, vars(owner)[attribute])
+            stack.enter_context(patch.object(owner, attribute, timed))
+        for module in list(sys.modules.values()):
+            if module.__name__.startswith("torchcss.") and vars(module).get("run") is run:
+                stack.enter_context(patch.object(module, "run", clock.kernel(run)))
+        yield clock
 
 
 def main(config: Config) -> dict[str, Any]:
     """Track, print, write; return what is written."""
-    clock, clip = watch(), config.clip
-    with tempfile.TemporaryDirectory() as folder:
+    clip = config.clip
+    with watched() as clock, tempfile.TemporaryDirectory() as folder:
         track_video(
             clip / "video.mp4",
             camera=clip / "cameras.json",
             keypoints=clip / "keypoints2d.npz",
             out=folder,
-            settings=Settings(overlay=False, threads=1),
+            settings=config.tracking,
             stop=config.frames,
         )
     nothing = np.zeros(2)
@@ -142,7 +150,7 @@ def main(config: Config) -> dict[str, Any]:
     rows.append(["all", float(total), float(stages[:, 1].sum()), ""])
     table = Table("Time of a frame", ("stage", "ms", "ms in kernels", "of the frame"), rows)
     table.print()
-    report = {"config": config, "rows": rows}
+    report = {"settings": asdict(config.tracking), "rows": rows}
     write_report(config.out, report, table)
     return report
 

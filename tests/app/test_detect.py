@@ -105,7 +105,7 @@ def test_points_are_those_of_the_person_and_masks_lie_beside(files: Path, crowd:
 
 def test_who_is_not_there_is_told(files: Path, crowd: Crowd) -> None:
     path = detect_video(files / "video.mp4", files / "found.npz", detector=crowd)
-    with pytest.raises(KeypointError, match=r"person '2' is not in frame 1.*there are 0, 1"):
+    with pytest.raises(KeypointError, match=r"person '2' is not in frame 1.*there are '0', '1'"):
         read(path, "2", frame=1)
     with pytest.raises(KeypointError, match="largest, leftmost or centre"):
         read(path, "7")

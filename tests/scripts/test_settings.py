@@ -43,6 +43,7 @@ VARIED = {
     "long_run": {"body"},
     "model_variations": {"body", "preset"},
     "printed_and_ours": {"body", "preset"},
+    "profile_frame": set(),
     "several_views": set(),
     "spectra": {"body"},
     "track_quadruped": {"body"},
@@ -81,6 +82,7 @@ def arguments(folder: Path, script: str) -> list[str]:
         "long_run": ["--frames", "2", "--opened", "2"],
         "learn_weights": ["--frames", "2", "--epochs", "1", "--starts", "1",
                           "--learnt", "contour", "region"],
+        "profile_frame": ["--clip", str(folder)],
         "several_views": ["--data", str(folder), "--what", "balance_beam_4cam"],
     }[script]  # fmt: skip
 
@@ -120,7 +122,12 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Settings]:
         patch.setattr(TrackingSession, "__init__", catch)
         for name in VARIED:
             script = importlib.import_module(name)
-            if name in ("ablation", "several_views", "evaluate_posterior"):  # whose films are none
+            if name in (
+                "ablation",
+                "several_views",
+                "evaluate_posterior",
+                "profile_frame",
+            ):  # whose films are none
                 tracks = script.posterior if name == "ablation" else script
                 patch.setattr(tracks, "track_video", catch_video)
             if name == "hypothesis_scores":  # which refuses this preset, later

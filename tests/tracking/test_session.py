@@ -646,9 +646,9 @@ def test_awkward_frames_leave_no_nan_and_lose_nothing():
 @pytest.mark.parametrize(
     ("asked", "power"),
     [
-        ({}, 0.1),
-        ({"keypoints_use": "first"}, 0.1),
-        ({"terms": ("contour", "temporal")}, 0.1),
+        ({}, 0.15),
+        ({"keypoints_use": "first"}, 0.15),
+        ({"terms": ("contour", "temporal")}, 0.15),
         ({"body": "arm8"}, 0.05),
         ({"likelihood_power": 0.7}, 0.7),
         ({"keypoints_use": "first", "likelihood_power": 0.7}, 0.7),
