@@ -94,6 +94,17 @@ def test_singular_covariances_stay_finite(dtype):
     assert not bool(linalg.squared_mahalanobis(torch.ones(3, dtype=dtype), covariance).isnan())
 
 
+def test_an_item_without_a_factor_changes_no_other(generator):
+    regular = random_covariance(3, generator=generator)
+    negative = torch.diag(torch.tensor([1.0, 1.0, 1.0])).double()
+    negative[0, 1] = negative[1, 0] = 1.1
+    both, d = torch.stack([regular, negative]), torch.ones(3).double()
+    assert torch.equal(linalg.log_determinant(both)[0], linalg.log_determinant(regular[None])[0])
+    found = linalg.squared_mahalanobis(d, both)
+    assert torch.equal(found[0], linalg.squared_mahalanobis(d, regular[None])[0])
+    assert bool(found.isfinite().all())
+
+
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**31), spread=st.floats(0, 6))
 def test_whitening_ignores_units(seed, spread):

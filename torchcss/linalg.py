@@ -223,21 +223,22 @@ def _resolved_eigen(covariance: Matrices) -> tuple[Vectors, Vectors, Matrices]:
     return deviation, values.clamp(min=resolution), vectors
 
 
-def _factored(covariance: Matrices) -> tuple[Vectors, Matrices, bool]:
-    """Deviations, lower factors of the resolved correlations, and whether all of these exist."""
+def _factored(covariance: Matrices) -> tuple[Vectors, Matrices, Bool[Tensor, "*batch"]]:
+    """Deviations, lower factors of the resolved correlations, and which of these exist."""
     deviation, correlation = _standardised(covariance)
     resolution = deviation.new_tensor(covariance.shape[-1] * torch.finfo(covariance.dtype).eps)
     factor, found = damped_cholesky(correlation, resolution)
-    return deviation, factor, bool(found.all())
+    return deviation, factor, found
 
 
 def log_determinant(covariance: Matrices) -> Numbers:
     """Log-determinant of a covariance; finite where it is singular, as the module page says."""
     deviation, factor, found = _factored(covariance)
-    if found:
-        return 2 * (deviation * torch.linalg.diagonal(factor)).log().sum(-1)
+    result = 2 * (deviation * torch.linalg.diagonal(factor)).log().sum(-1)
+    if bool(found.all()):
+        return result
     deviation, values, _ = _resolved_eigen(covariance)
-    return 2 * deviation.log().sum(-1) + values.log().sum(-1)
+    return torch.where(found, result, 2 * deviation.log().sum(-1) + values.log().sum(-1))
 
 
 def squared_mahalanobis(difference: Vectors, covariance: Matrices) -> Numbers:
@@ -261,10 +262,12 @@ def squared_lengths(
         covariance: See `squared_mahalanobis`.
     """
     deviation, factor, found = _factored(covariance)
-    if not found:
-        return (differences @ whitener(covariance).mT).square().sum(-1)
     standard = (differences / deviation[..., None, :]).mT
-    return torch.linalg.solve_triangular(factor, standard, upper=False).square().sum(-2)
+    result = torch.linalg.solve_triangular(factor, standard, upper=False).square().sum(-2)
+    if bool(found.all()):
+        return result
+    others = (differences @ whitener(covariance).mT).square().sum(-1)
+    return torch.where(found[..., None], result, others)
 
 
 def whitener(covariance: Matrices) -> Matrices:

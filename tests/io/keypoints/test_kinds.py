@@ -945,6 +945,13 @@ def test_people_with_boxes_and_how_long_it_took(tmp_path: Path) -> None:
     check(read(write(tmp_path / "a.json", frames)))
 
 
+def test_times_of_frames_in_any_order(tmp_path: Path) -> None:
+    frames = [{"time": t / 25, "instances": [mmpose(t, person(t))]} for t in T]
+    rising = read(write(tmp_path / "a.json", frames))
+    falling = read(write(tmp_path / "b.json", frames[::-1]))
+    assert torch.equal(rising.positions, falling.positions)
+
+
 @pytest.mark.parametrize("key", ["keypoints", "pred_keypoints", "poseLandmarks"])
 def test_words_in_any_case(tmp_path: Path, key: str) -> None:
     rows = [

@@ -239,10 +239,21 @@ def _frames(path: Path, content: Any, num_frames: int | None) -> list[list[Perso
     return found if time is None else in_seconds(time, found)
 
 
+_UNEVEN = 0.1
+"""Of a step between frames: by how much times of frames may miss it."""
+
+
 def _are_durations(keys: Sequence[Key | None]) -> bool:
-    """Whether times are how long something took: those of frames rise from entry to entry."""
+    """Whether times are how long something took.
+
+    Those of frames rise from entry to entry, or are whole steps apart in their order.
+    """
     times = [key for key in keys if isinstance(key, float)]
-    return len(times) == len(keys) and times != sorted(times)
+    if len(times) < len(keys) or times == sorted(times):
+        return False
+    gaps = np.diff(np.sort(times))
+    steps = gaps / np.median(gaps)
+    return len(gaps) < 2 or bool((abs(steps - steps.round()) > _UNEVEN).any())
 
 
 def _key_of(where: str, entry: object) -> Key | None:
