@@ -45,6 +45,7 @@ def information_of_past(
     one = torch.eye(len(units), dtype=units.dtype, device=units.device)
     added = noise.double() / units
     # (Q^-1 + F)^-1 = (1 + Q F)^-1 Q has no inverse of Q.
-    step = symmetric_part(torch.linalg.solve(one + added @ flow, added))
+    step = symmetric_part(torch.linalg.solve_ex(one + added @ flow, added)[0])
     known = symmetric_part(before.double() / units) + step
-    return (symmetric_part(torch.linalg.inv(known + _LEAST_VARIANCE * one)) / units).to(motion)
+    information = torch.linalg.inv_ex(known + _LEAST_VARIANCE * one)[0]
+    return (symmetric_part(information) / units).to(motion)
