@@ -14,9 +14,14 @@ from torchcss.studies.render.sequences import SyntheticSequence
 OBSERVED = 12
 """Waits of the host while the features of a frame are made."""
 
-STEPPED = {"arm": 23, "person": 27}
-"""Waits of the host in the step of a frame, for every evaluation of the cost; there are 26 to 39 of
-a few samples each, by seed."""
+STEPPED = {"arm": 620, "person": 800}
+"""Waits of the host in the step of a frame, in the mean over seeds, which differ by a third: 26 to
+39 evaluations of a few samples each."""
+
+EVALUATED = {"arm": 20, "person": 24}
+"""The same for every evaluation of the cost, which hardly differs."""
+
+_SEEDS = range(4)
 
 
 @pytest.mark.parametrize("name", STEPPED)
@@ -33,9 +38,12 @@ def test_a_frame(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
             return of(self, *args)
 
         monkeypatch.setattr(TrackingCost, method, counted)
-    for seed in range(2):
+    total = 0
+    for seed in _SEEDS:
         stepping = _waits(sequence, seed, calls)
-        assert stepping.waits.total() <= STEPPED[name] * calls.total(), _worst(stepping)
+        total += stepping.waits.total()
+        assert stepping.waits.total() <= EVALUATED[name] * calls.total(), _worst(stepping)
+    assert total / len(_SEEDS) <= STEPPED[name]
 
 
 def _waits(sequence: SyntheticSequence, seed: int, calls: Counter[str]) -> Transfers:

@@ -520,11 +520,8 @@ def _least_gap(parts: _Parts, lines: _Stretches, count: int, *, plain: bool) -> 
     if plain:
         s, curvature, square = _ellipsoid_minimum(parts.shapes(lines.part), lines)
         hidden = square < parts.within.index_select(0, lines.part)
-        met = torch.where(hidden, least.new_full((), -torch.inf), torch.inf)
-        least = least.scatter_reduce(0, lines.ray, met, "amin")
-        open_ = places(least.index_select(0, lines.ray) > 0)
-        lines, s, curvature = lines.take(open_), s[open_], curvature[open_]
         gap = _gap(parts, lines, s, curvature, steps=_STEPS)
+        gap = torch.where(hidden, gap.new_full((), -torch.inf), gap)
     else:
         lines, s, curvature = _sampled_minima(parts, lines)
         gap = _gap(parts, lines, s, curvature, steps=_SAMPLED_STEPS, bent=parts.bent).amin(0)
