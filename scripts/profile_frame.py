@@ -83,7 +83,7 @@ REASONS = {
         "Draws, flips of limbs, distances of modes: operations of torch on arrays of a few "
         "kilobytes, 3 to 5 µs each, nearly none of it arithmetic."
     ),
-    "the best mode's terms": "One state by the eager terms: small operations of torch again.",
+    "the best mode's terms": "One state, term by term: packing and calls; colours by pixels.",
     "learning colours": "Masks of eleven layers, and two drawings of the body.",
 }
 """Why a stage is not faster: what was counted and tried, on a core with AVX-512."""

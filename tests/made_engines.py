@@ -43,6 +43,8 @@ def assert_close(cost: TrackingCost, x: Tensor, dtype: str) -> None:
     tolerance = NATS[dtype]
     torch.testing.assert_close(ours.value, theirs.value, rtol=RELATIVE[dtype], atol=tolerance)
     torch.testing.assert_close(fused.value(x), ours.value, rtol=1e-6, atol=1e-4)
+    terms = fused.terms(x), eager.terms(x)
+    torch.testing.assert_close(*terms, rtol=RELATIVE[dtype], atol=tolerance)
     for got, expected in zip(ours[1:], theirs[1:], strict=True):
         n = x.shape[-1]
         scale = 1 + expected.reshape(-1, n).abs().amax() if expected.numel() else 1.0

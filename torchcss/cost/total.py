@@ -244,7 +244,14 @@ class TrackingCost:
 
     def terms(self, x: States) -> dict[str, Costs]:
         """Cost of every term and prior by name, nats."""
-        return self._evaluated(_Part.values, x) if x.numel() else {}
+        if self.engine is None or not x.numel():
+            return self._evaluated(_Part.values, x) if x.numel() else {}
+        kinds: tuple[tuple[Kind, tuple[FrameContext, ...]], ...]
+        kinds = ("prior", self.past), ("image", self.views)
+        bound = (self._bound(kind, view) for kind, views in kinds for view in views)
+        names = dict.fromkeys(name for terms in bound for name, _ in terms)
+        at, only = x.detach(), self.choice.only
+        return {name: replace(self, choice=only([name])).value(at) for name in names}
 
     def gradients(self, x: States) -> dict[str, States]:
         """Gradient of every term and prior by name, visibility and assignments held fixed."""

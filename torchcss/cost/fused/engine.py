@@ -25,6 +25,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchcss.body.model import BodyModel
 from torchcss.cost.anthropometric import Anthropometric
 from torchcss.cost.context import BodyTables, FrameContext
 from torchcss.cost.contour import ContourTerm
@@ -59,9 +60,9 @@ _IMAGES: dict[type[Any], tuple[str, Callable[..., Any]]] = {
 """Image terms that have a compiled twin: their field in `View`, and what packs them."""
 
 _PRIORS = (Stabiliser, Anthropometric, TemporalPrior, MixturePrior)
-_KEPT = 8
-"""Packed costs that are kept of a frame, as long as that lives: with other terms and weights; and
-so many packed tables of a body."""
+_KEPT = 24
+"""Packed terms and costs that are kept of a frame, as long as that lives: with other terms and
+weights; and so many packed tables of a body."""
 
 
 class _Packs:
@@ -278,7 +279,7 @@ class FusedEngine:
         density = past.tables.of(density_where(past.camera.up))
         if density is None:
             return []
-        body, camera, tree = past.body, past.camera, pack.pack_tree(past.body, past.camera)
+        body, camera, tree = past.body, past.camera, self._tree(past.body, past)
 
         def make() -> tuple[Limbs, Workspaces]:
             limbs = pack.pack_limbs(body, density)
@@ -293,7 +294,7 @@ class FusedEngine:
     def _pack_repulsion(
         self, cost: TrackingCost, term: Interpenetration, weight: float, past: FrameContext
     ) -> _Packed:
-        tree, parts, real = pack.pack_tree(past.body, past.camera), self._parts(past), self.real
+        tree, parts, real = self._tree(past.body, past), self._parts(past), self.real
         pairs = past.tables.of(InterpenetrationPairs)
         repulsion = self._bodies.of(
             past.tables, (term, pairs), lambda: pack.pack_repulsion(term, pairs, real)
@@ -304,6 +305,11 @@ class FusedEngine:
         records = tree, parts, repulsion, _is_exact(cost)
         memory = self._memory(tree, curves, interior, chain, 5, 0)
         return _Packed(add_repulsion, 0, records, memory)
+
+    def _tree(self, body: BodyModel, context: FrameContext) -> Tree:
+        """A body before the camera of a frame, packed once."""
+        make = partial(pack.pack_tree, body, context.camera)
+        return self._bodies.of(context.tables, (pack.pack_tree, body, context.camera), make)
 
     def _parts(self, past: FrameContext) -> Parts:
         """The parts of a body, packed once: their shape does not change."""
@@ -332,22 +338,24 @@ class FusedEngine:
                 continue
             record, kind = None, type(term)
             if kind in _IMAGES and isinstance(bound, OnPoints) and bound.camera is None:
-                weight = cost.choice.weight(term.name)
-                record = _IMAGES[kind][1](term, bound, weight, context)
+                make = partial(self._pack_image, term, bound, context)
+                record = self._views.of(context, (term, bound.image), make)
             if record is None:
                 others.add(term.name)
             else:
-                made[_IMAGES[kind][0]] = record
+                scale = cost.choice.weight(term.name) * bound.scale
+                field = _IMAGES[kind][0]
+                made[field] = record._replace(scale=self._precision(field)(scale))
         if not made:
             return [], frozenset(others)
         predictor = None
         if "edges" in made or "colours" in made:
             predictor = context.tables.of(ContourPredictor)
-        tree, parts = pack.pack_tree(body, camera), self._parts(past)
+        tree, parts = self._tree(body, context), self._parts(past)
         num, lens = len(parts.row), pack.pack_lens(camera)
         records = {
-            field: pack.in_precision(record, np.float64 if field == "keypoints" else real)
-            for field, record in {**pack.absent(num), **made}.items()
+            **self._bodies.of(past.tables, (pack.absent,), lambda: self._absent(num)),
+            **made,
         }
         _repeat_for_all_modes(records, "flow", "keypoints")
         edges, colours = records["edges"], records["colours"]
@@ -369,6 +377,19 @@ class FusedEngine:
         memory = self._memory(tree, view.curves, interior, 1, len(edges.steps), keypoints)
         packed = _Packed(add_view, len(view.flow.target), (tree, parts, view), memory)
         return [packed], frozenset(others)
+
+    def _pack_image(self, term: Any, bound: OnPoints, context: FrameContext) -> Any:
+        """The record of an image term, without its weight; None: its twin does not know it."""
+        field, make = _IMAGES[type(term)]
+        record = make(term, bound, context)
+        return None if record is None else pack.in_precision(record, self._precision(field))
+
+    def _absent(self, num_parts: int) -> dict[str, Any]:
+        records = pack.absent(num_parts).items()
+        return {name: pack.in_precision(record, self._precision(name)) for name, record in records}
+
+    def _precision(self, field: str) -> Any:
+        return np.float64 if field == "keypoints" else self.real
 
 
 def _is_exact(cost: TrackingCost) -> bool:

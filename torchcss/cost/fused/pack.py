@@ -206,9 +206,7 @@ def _zero(record: Any) -> Any:
     return record._make([0.0] * len(record._fields))
 
 
-def pack_edges(
-    term: ContourTerm, bound: OnPoints, weight: float, context: FrameContext
-) -> Edges | None:
+def pack_edges(term: ContourTerm, bound: OnPoints, context: FrameContext) -> Edges | None:
     """The contour term of a frame."""
     field, potential = bound.image, pack_potential(term.potential)
     height, width = field.shape[1:]
@@ -217,7 +215,7 @@ def pack_edges(
     reach = math.ceil(term.window / term.step) + 2
     back_facing = term.fitted_level * term.nu
     return Edges(
-        scale=weight * bound.scale,
+        scale=bound.scale,
         field=field.movedim(0, -1),
         corner=torch.tensor([width - 1.0, height - 1.0]),
         steps=term.step * torch.arange(-reach, reach + 1).double(),
@@ -233,16 +231,14 @@ def pack_edges(
     )
 
 
-def pack_colours(
-    term: RegionTerm, bound: OnPoints, weight: float, context: FrameContext
-) -> Colours:
+def pack_colours(term: RegionTerm, bound: OnPoints, context: FrameContext) -> Colours:
     """The region term of a frame."""
     images, back_facing = bound.image, term.fitted_level * term.nu
     coefficients = images.field.coefficients
     height, width = coefficients.shape[1:]
     layer = images.layer[:: max(1, len(images.layer) // max(1, context.body.num_parts))]
     return Colours(
-        scale=weight * bound.scale,
+        scale=bound.scale,
         field=coefficients,
         origin=torch.tensor(images.origin).to(coefficients),
         corner=torch.tensor([width - 6.5, height - 6.5]),
@@ -254,7 +250,7 @@ def pack_colours(
     )
 
 
-def pack_flow(term: FlowTerm, bound: OnPoints, weight: float, context: FrameContext) -> Flow | None:
+def pack_flow(term: FlowTerm, bound: OnPoints, context: FrameContext) -> Flow | None:
     """The flow term of a frame."""
     nodes, targets = context.tables.of(InteriorNodes), bound.image
     potential = pack_potential(term.potential)
@@ -264,7 +260,7 @@ def pack_flow(term: FlowTerm, bound: OnPoints, weight: float, context: FrameCont
     rows = torch.cat([targets.uv, targets.weight[..., None]], dim=-1).mT
     back_facing = term.fitted_level * term.nu
     return Flow(
-        scale=weight * bound.scale,
+        scale=bound.scale,
         nodes=table,
         target=rows.reshape(len(rows), 3, *table.shape[::2]),
         back_facing=back_facing,
@@ -276,7 +272,7 @@ def pack_flow(term: FlowTerm, bound: OnPoints, weight: float, context: FrameCont
 
 
 def pack_keypoints(
-    term: JointTerm, bound: OnPoints, weight: float, context: FrameContext
+    term: JointTerm, bound: OnPoints, context: FrameContext
 ) -> PackedKeypoints | None:
     """The keypoints of a frame."""
     joint, position, precision = bound.image
@@ -286,7 +282,7 @@ def pack_keypoints(
     row, place = carried_markers(context.body, joint)
     target = torch.cat([position, precision[..., None]], dim=-1).mT
     return PackedKeypoints(
-        scale=weight * bound.scale,
+        scale=bound.scale,
         row=row,
         place=place,
         target=target.reshape(-1, *target.shape[-2:]),
