@@ -65,18 +65,6 @@ def test_errors_and_their_jacobian(generator: torch.Generator) -> None:
         torch.testing.assert_close(jacobian[item], want, rtol=1e-10, atol=1e-12)
 
 
-def test_blending_goes_from_gauss_newton_to_exact(generator: torch.Generator) -> None:
-    cost = cost_of("arm8", "r_wrist_link")
-    x = states(cost, generator)["anywhere"]
-    exact, zero = cost.local_model(x), x.new_zeros(len(x))
-    bare = cost.blended_model(x, zero).hessian
-    _, jacobian = cost.errors(x)
-    scaled = cost.weight[:, None, None].sqrt() / cost.sigma * jacobian
-    scaled = scaled.flatten(1, 2)
-    torch.testing.assert_close(bare, scaled.mT @ scaled, rtol=1e-9, atol=1e-9)
-    torch.testing.assert_close(cost.blended_model(x, zero + 1).hessian, exact.hessian)
-
-
 @pytest.mark.parametrize("shape", [(), (5,), (2, 3)])
 def test_any_batch_shape(shape: tuple[int, ...], generator: torch.Generator) -> None:
     cost = cost_of("arm7", "r_wrist_link")

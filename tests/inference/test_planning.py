@@ -17,7 +17,7 @@ from torch import Tensor
 from torchcss.inference import trust_region
 from torchcss.inference.trust_region import TrustRegionNewton, TrustRegionState
 from torchcss.kernels import compiler
-from torchcss.studies.reprojection import reprojection_problem
+from torchcss.studies.reprojection import study_problem
 from torchcss.types import Bounds, CostFunction, LocalModel, Status
 
 pytestmark = pytest.mark.skipif(not compiler.COMPILED, reason="numba is not installed")
@@ -59,7 +59,7 @@ def made(name: str, generator: torch.Generator) -> tuple[CostFunction, Tensor, B
     """A cost, starts, some of them awkward, and bounds."""
     a, inf = randn(7, 7, generator=generator), torch.inf
     if name == "body34":
-        problem = reprojection_problem("body34", generator=generator)
+        problem = study_problem("body34", generator=generator)
         x0 = problem.truth + 0.6 * randn(40, 34, generator=generator)
         return problem.cost, problem.bounds.project(x0), problem.bounds
     cost, n, width = {
@@ -96,11 +96,11 @@ def check_twins(monkeypatch: pytest.MonkeyPatch, tolerance: float) -> list[Tenso
     """
     compiled, seen = TrustRegionNewton._advance_compiled, []
 
-    def both(self, state, trial, bounds, weight):
+    def both(self, state, *given):
         before = [part.clone() for part in fields(state)]
-        got = compiled(self, state, trial, bounds, weight)
+        got = compiled(self, state, *given)
         assert alike(before, fields(state), 0.0).all()
-        expected = self._advance(state, trial, bounds, weight)
+        expected = self._advance(state, *given)
         seen.append(alike(fields(got[0]), fields(expected[0]), tolerance))
         assert torch.equal(got[1].accepted, expected[1].accepted)
         assert bool(alike(got[1][1:], expected[1][1:], tolerance).all())
@@ -182,13 +182,12 @@ def test_an_item_depends_on_no_other(generator):
     (state, _), weight = NEWTON.step(cost, NEWTON.start(x0), bounds), torch.ones(34).double()
     for _ in range(6):
         x = bounds.project(state.x + state.step)
-        model, share = cost.local_model(x), torch.ones(len(x)).double()
-        trial = trust_region._Trial(x, model, share, torch.inf)
-        whole, _ = NEWTON._advance_compiled(state, trial, bounds, weight)
+        model = cost.local_model(x)
+        whole, _ = NEWTON._advance_compiled(state, x, model, bounds, weight)
         for items in (torch.arange(40).flip(0), torch.tensor([17]), torch.arange(5, 29, 3)):
             model_of = LocalModel(*(part[items] for part in model))
-            part = trust_region._Trial(x[items], model_of, share[items], torch.inf)
-            some, _ = NEWTON._advance_compiled(state.take(items), part, bounds, weight)
+            part = state.take(items)
+            some, _ = NEWTON._advance_compiled(part, x[items], model_of, bounds, weight)
             assert all(map(torch.equal, fields(some), fields(whole.take(items))))
         state = whole
 

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.autograd.forward_ad import unpack_dual
 
@@ -218,14 +218,14 @@ class KinematicTree(nn.Module):
         check_shape("q", q, self.num_joints)
         batch = q.shape[:-1]
         flat = q.reshape(batch.numel(), self.num_joints)
+        self._check_type(q)
         base = _base(q, base_rotation, base_translation)
         if _plain(base) is not None and (values := _plain(flat)) is not None:
-            self._check_type(q)
             posed = self._pose_links(values, base)
             return TreePose(*(torch.from_numpy(p.reshape(*batch, *p.shape[1:])) for p in posed))
-        frames = self.frames(flat, base_rotation, base_translation)
+        frames = self._frames(flat, base)
         links = _followed_by(frames[self.link_place], self.link_constant)
-        parts = (links[:, :, :3], links[:, :, 3], *self.twists(frames))
+        parts = (links[:, :, :3], links[:, :, 3], *self._twists(frames))
         return TreePose(
             *(p.movedim(-1, 0).unflatten(0, batch) if batch else p[..., 0] for p in parts)
         )
@@ -251,19 +251,10 @@ class KinematicTree(nn.Module):
         run(pose_links, q, arrays, np.empty((1 + n, 3, 4), q.dtype), *parts)
         return parts
 
-    def frames(
-        self,
-        q: Float[Tensor, "b q"],
-        base_rotation: Float[Tensor, "3 3"] | None = None,
-        base_translation: Float[Tensor, "3"] | None = None,
+    def _frames(
+        self, q: Float[Tensor, "b q"], base: Float[Tensor, "3 4"]
     ) -> Float[Tensor, "frames 3 4 b"]:
-        """Axes and origin (the columns) of the base and of all moving joints, by depth.
-
-        With `twists` and `points` this is what a cost of few points needs, without the poses of all
-        links; the batch is innermost. For the arguments see `forward`.
-        """
-        self._check_type(q)
-        base = _base(q, base_rotation, base_translation)
+        """Axes and origin (the columns) of the base and of all moving joints, by depth."""
         q = q.T[self.joint_order].contiguous()
         revolute = self.is_revolute[self.joint_order, None]
         angle, slide = torch.where(revolute, q, 0.0), torch.where(revolute, 0.0, q)[:, None, None]
@@ -284,13 +275,7 @@ class KinematicTree(nn.Module):
             levels.append(frames)
         return torch.cat(levels)
 
-    def at_base(self, frames: Float[Tensor, "frames 3 4 b"]) -> TreePose:
-        """The tree with the base in place of all links, from `frames`: enough for the lift."""
-        # The lift needs no more of the links than a place near the body.
-        parts = (frames[:1, :, :3], frames[:1, :, 3], *self.twists(frames))
-        return TreePose(*(part.movedim(-1, 0) for part in parts))
-
-    def twists(
+    def _twists(
         self, frames: Float[Tensor, "frames 3 4 b"]
     ) -> tuple[Float[Tensor, "q 3 b"], Float[Tensor, "q 3 b"]]:
         """Angular and linear parts of the joints' twists in the world, from `frames`."""
@@ -301,23 +286,6 @@ class KinematicTree(nn.Module):
         moment = torch.stack([b * z - c * y, c * x - a * z, a * y - b * x], dim=1)
         revolute = self.is_revolute[:, None, None]
         return torch.where(revolute, axis, 0.0), torch.where(revolute, moment, axis)
-
-    def points(
-        self,
-        frames: Float[Tensor, "frames 3 4 b"],
-        link: Int[Tensor, " p"],
-        offset: Float[Tensor, "p 3"],
-    ) -> Float[Tensor, "p 3 b"]:
-        """World positions of points that are fixed in links, from `frames`.
-
-        Args:
-            frames: From `frames`.
-            link: Link of each point.
-            offset: Position in that link's frame, metres.
-        """
-        constant = self.link_constant[link]
-        place = (constant[:, :, :3] * offset[:, None, :]).sum(-1) + constant[:, :, 3]
-        return _followed_by(frames[self.link_place[link]], place[:, :, None])[:, :, 0]
 
 
 def _plain(q: Tensor) -> np.ndarray | None:

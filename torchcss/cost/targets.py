@@ -19,14 +19,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchcss.body.kinematics import TreePose
-from torchcss.body.lift import lift_to_joints
-from torchcss.body.model import BodyModel
+from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.uncertainty import point_jacobian
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.errors import ShapeError, check_shape
-from torchcss.types import BlendedCost, LocalModel, PointCost, frozen
+from torchcss.types import LocalModel, PointCost, frozen
 
 States = Float[Tensor, "*batch m"]
 
@@ -39,7 +37,7 @@ ARM = 0.25
 
 
 @frozen
-class PointTargets(BlendedCost):
+class PointTargets:
     """Squared distances of points from where they should be; a `CostFunction`.
 
     Attributes:
@@ -75,56 +73,27 @@ class PointTargets(BlendedCost):
     def value(self, x: States) -> Float[Tensor, "*batch"]:
         """Cost in nats."""
         _, points = self._pose(x)
-        squared = (points - self.target[:, :, None]).square().sum(1)
-        return (0.5 / self.sigma**2 * (self.weight @ squared)).reshape(x.shape[:-1])
+        return 0.5 / self.sigma**2 * ((points - self.target).square().sum(-1) @ self.weight)
 
     def local_model(self, x: States) -> LocalModel:
         """Cost, gradient and exact Hessian."""
-        return self._local_model(x, None)
-
-    def blended_model(self, x: States, share: Float[Tensor, "*batch"]) -> LocalModel:
-        """The same with a Hessian between Gauss-Newton, never negative, and the exact one.
-
-        Args:
-            x: States.
-            share: Factor on the second derivatives of the kinematics; 1 is exact.
-        """
-        return self._local_model(x, share)
+        pose, points = self._pose(x)
+        cost = squared_errors(points - self.target, self.weight / self.sigma**2)
+        value, slope, curvature = self.body.lift(pose, points, self.link, cost)
+        columns = self.columns
+        return LocalModel(value, slope[..., columns], curvature[..., columns[:, None], columns])
 
     def errors(
         self, x: Float[Tensor, "b m"]
     ) -> tuple[Float[Tensor, "b p 3"], Float[Tensor, "b p 3 m"]]:
         """By how much the points miss their targets, metres, and the derivatives of that in x."""
-        tree, points = self._pose(x)
-        place = points.movedim(-1, 0)
-        moved = point_jacobian(self.body, tree, place, self.link)
-        return place - self.target, moved[..., self.columns]
+        pose, points = self._pose(x)
+        moved = point_jacobian(self.body, pose.tree, points, self.link)
+        return points - self.target, moved[..., self.columns]
 
-    def _pose(self, x: States) -> tuple[TreePose, Float[Tensor, "p 3 b"]]:
-        """The tree and the points, the batch flattened; of the links only the base is there."""
-        body = self.body
-        state = self.whole(x).reshape(x.shape[:-1].numel(), body.num_parameters)
-        q = state if body.is_untied else state @ body.tie.T + body.offset
-        frames = body.tree.frames(q, body.base_rotation, body.base_translation)
-        return body.tree.at_base(frames), body.tree.points(frames, self.link, self.offset)
-
-    def _local_model(self, x: States, share: Float[Tensor, "*batch"] | None) -> LocalModel:
-        tree, points = self._pose(x)
-        points = points.movedim(-1, 0)
-        value, slope, curvature = lift_to_joints(
-            self.body.tree,
-            tree,
-            points,
-            self.link,
-            squared_errors(points - self.target, self.weight / self.sigma**2),
-            second_order_kinematics=True if share is None else share.reshape(-1),
-        )
-        tie, batch, m = self.body.tie[:, self.columns], x.shape[:-1], x.shape[-1]
-        return LocalModel(
-            value.reshape(batch),
-            (slope @ tie).reshape(*batch, m),
-            (tie.T @ curvature @ tie).reshape(*batch, m, m),
-        )
+    def _pose(self, x: States) -> tuple[BodyPose, Float[Tensor, "*batch p 3"]]:
+        pose = self.body.pose(self.whole(x))
+        return pose, self.body.points_on_links(pose.tree, self.link, self.offset)
 
 
 @frozen
