@@ -35,10 +35,10 @@ for size in ((1, 1), (3, 4), (9, 1)):
     image, blurred = rng.random((2, *size))
     run(blur_kernels.blur, image, np.array([0.4, 0.2, 0.1, 0.0]), np.zeros(size[1] + 6), blurred)
 
-place, distance = 40 * rng.random((30, 2)) - 10, rng.random(30) + 0.5
-near, seen = np.full((1, 17, 19), -1, single), np.full((1, 17, 19), -1)
-faces = np.arange(30).reshape(-1, 3)
-run(rasterise_kernels.draw_triangles, place, distance, faces, np.arange(10), 10, near, seen)
+place, distance = 40 * rng.random((2, 30, 2)) - 10, rng.random((2, 30)) + 0.5
+near, seen = np.full((2, 17, 19), -1, single), np.full((2, 17, 19), -1)
+given = place, distance, distance > 0.6, np.arange(30).reshape(-1, 3), np.arange(10)
+run(rasterise_kernels.draw_triangles, *given, near, seen)
 print("checked")
 """
 

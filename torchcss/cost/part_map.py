@@ -35,7 +35,7 @@ def part_map(
     *,
     rings: int = 12,
     meridians: int = 16,
-    girth: float = 1.0,
+    girth: Float[Tensor, "*#batch"] | float = 1.0,
 ) -> Int[Tensor, "*batch h w"]:
     """The part that each pixel sees, -1 where it sees none.
 
@@ -45,7 +45,7 @@ def part_map(
         camera: Camera of the image.
         rings: Latitudes of the mesh of each part.
         meridians: Longitudes of the mesh of each part.
-        girth: Factor on the cross-sections of all parts.
+        girth: Factor on the cross-sections of all parts, one for all poses or one for each.
     """
     width, height = camera.image_size_wh
     if body.num_parts == 0:
@@ -53,21 +53,19 @@ def part_map(
     mesh = body.mesh(rings, meridians)
     faces = grid_faces(rings, meridians).to(mesh.points.device)
     rotation, centre = body.part_poses(body.pose(state))
-    points = mesh.points * mesh.points.new_tensor([girth, girth, 1.0])
-    vertices = points.flatten(1, 2) @ rotation.mT + centre[..., None, :]
-    offsets = vertices.shape[-2] * torch.arange(body.num_parts, device=faces.device)
-    every = (faces + offsets[:, None, None]).flatten(0, 1)
+    across = torch.as_tensor(girth, dtype=mesh.points.dtype, device=mesh.points.device)
+    scale = torch.stack([across, across, torch.ones_like(across)], dim=-1)[..., None, None, :]
+    vertices = (mesh.points.flatten(1, 2) * scale) @ rotation.mT + centre[..., None, :]
+    parts = torch.arange(body.num_parts, device=faces.device)
+    every = (faces + vertices.shape[-2] * parts[:, None, None]).flatten(0, 1)
+    label = parts.repeat_interleave(len(faces))
     batch = vertices.shape[:-3]
     vertices = vertices.flatten(-3, -2).reshape(-1, vertices.shape[-3] * vertices.shape[-2], 3)
-    seen = every.new_empty(len(vertices), height, width)
-    # The last entry of -1 is for pixels that see no face, whose index is -1.
-    part_of_face = torch.arange(-1, body.num_parts, device=faces.device)
-    part_of_face = part_of_face.repeat_interleave(len(faces))[len(faces) - 1 :]
-    for first in range(0, len(vertices), _POSES_AT_ONCE):
-        uv, depth, valid = camera.project(some := vertices[first : first + _POSES_AT_ONCE])
-        face = nearest_faces(uv, depth, every, height, width, valid=valid)
-        seen[first : first + len(some)] = part_of_face.take(face + 1)
-    return seen.reshape(*batch, height, width)
+    seen = []
+    for some in vertices.split(_POSES_AT_ONCE):
+        uv, depth, valid = camera.project(some)
+        seen.append(nearest_faces(uv, depth, every, height, width, valid=valid, label=label))
+    return (seen[0] if len(seen) == 1 else torch.cat(seen)).reshape(*batch, height, width)
 
 
 def grow(masks: Shaped[Tensor, "layers h w"], radius: int) -> Shaped[Tensor, "layers h w"]:

@@ -138,21 +138,25 @@ def region_masks(
     # A last entry for pixels that see no part, whose index is -1.
     layer_of_part = torch.tensor((*layer_of, -1), device=body.tie.device, dtype=torch.int16)
 
-    parts = part_map(body, state, camera)
+    girths = state.new_tensor([1.0, _CORE])
+    parts, cores = part_map(body, state.expand(2, -1), camera, girth=girths)
     window = _window(parts >= 0, _REACH + _COARSE)
     layer = layer_of_part[parts[window]]
     layers = torch.arange(len(names), device=parts.device, dtype=layer.dtype)[:, None, None]
     own = layer == layers
     if not own.numel():
         return RegionMasks(own, own, window)
-    sure = layer_of_part[part_map(body, state, camera, girth=_CORE)[window]] == layer
+    sure = layer_of_part[cores[window]] == layer
     if fitted:
         sure |= _is_alike(layer, _BODY_MARGIN if has_root(body) else _ARM_MARGIN)
     small = (own & sure).flatten(1).sum(1) < _CORE_PIXELS
     # The last entry again for pixels that see no part; they belong to no layer anyway.
     small = functional.pad(small, (0, 1))[layer.long()]
     core = own & torch.where(small, _is_alike(layer, 1), sure)
-    blocks = functional.max_pool2d(own.float(), _COARSE, ceil_mode=True) > 0
+    row, column = torch.nonzero(layer >= 0, as_tuple=True)
+    height, width = (-(-side // _COARSE) for side in layer.shape)
+    blocks = own.new_zeros(len(names), height, width)
+    blocks[layer[row, column].long(), row // _COARSE, column // _COARSE] = True
     blocks = grow(blocks, _REACH // _COARSE)
     far = blocks.repeat_interleave(_COARSE, -1).repeat_interleave(_COARSE, -2)
     near = far[:, : own.shape[1], : own.shape[2]] & ~grow(own, _GAP)

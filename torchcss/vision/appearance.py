@@ -128,16 +128,12 @@ def colour_bins(colour: Float[Tensor, "3 h w"]) -> Int[Tensor, "h w"]:
     return (red * BINS + green) * BINS + blue
 
 
-def _mix(old: Tensor, bins: Tensor, masks: Tensor, rate: float) -> Tensor:
-    rows = []
-    for histogram, mask in zip(old, masks, strict=True):
-        seen = bins[mask]
-        if len(seen) >= _FEWEST:
-            new = torch.bincount(seen, minlength=BINS**3).to(histogram) / len(seen)
-            share = rate if bool(histogram.sum() > 0) else 1.0
-            histogram = torch.lerp(histogram, new, share)
-        rows.append(histogram)
-    return torch.stack(rows)
+def _mix(old: Histograms, bins: Tensor, masks: Tensor, rate: float) -> Histograms:
+    counts = torch.stack([torch.bincount(bins[mask], minlength=BINS**3) for mask in masks])
+    number = counts.sum(-1, keepdim=True)
+    new = counts.to(old) / number
+    mixed = torch.where(old.sum(-1, keepdim=True) > 0, old.lerp(new, rate), new)
+    return torch.where(number >= _FEWEST, mixed, old)
 
 
 def _smooth(histograms: Histograms) -> Histograms:

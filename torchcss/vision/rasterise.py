@@ -27,7 +27,7 @@ _NEAREST_DEPTH = 1e-6
 _FARTHEST_PIXEL = 1e9
 """A projection further out than this is no longer exact in float64; its triangles are dropped."""
 
-_LEAST_AREA = 1e-12
+LEAST_AREA = 1e-12
 """Square pixels, doubled; a triangle seen edge-on has no pixels, and no plane to divide by."""
 
 _PIXELS_AT_ONCE = 4_000_000
@@ -98,12 +98,13 @@ def rasterise(
     uv, depth, faces = uv.detach(), depth.detach(), faces.long()
     # float64, so that neither large coordinates nor thin triangles open cracks.
     place, distance = uv.double(), depth.double()
-    triangles = _Triangles.of(place, distance, faces, valid)
-    nearest = _nearest_faces(triangles, height, width)
+    usable = _usable(place, distance)
+    usable = usable if valid is None else usable & valid
+    nearest = _nearest(place[None], distance[None], faces, usable[None], height, width).flatten()
     pixel = torch.nonzero(nearest >= 0)[:, 0]
     face = nearest[pixel]
 
-    table = torch.cat((place[faces].flatten(1), distance[faces], triangles.area[:, None]), -1)
+    table = torch.cat((place[faces].flatten(1), distance[faces], _areas(place, faces)[:, None]), -1)
     parts, weighted = _barycentric(table.index_select(0, face), pixel % width, pixel // width)
     total = weighted.sum(0)
     barycentric = uv.new_zeros(height * width, 3)
@@ -142,6 +143,7 @@ def nearest_faces(
     width: int,
     *,
     valid: Bool[Tensor, "b v"],
+    label: Int[Tensor, " f"] | None = None,
 ) -> Int[Tensor, "b h w"]:
     """Only the `face` of `rasterise`, of many pictures of one mesh at once.
 
@@ -152,6 +154,7 @@ def nearest_faces(
         height: Rows of a picture.
         width: Columns of a picture.
         valid: Vertices that may be used.
+        label: What stands for each triangle in the pictures; None: its index.
 
     Raises:
         ShapeError: If a shape is wrong.
@@ -159,77 +162,72 @@ def nearest_faces(
     check_shape("depth", depth, None, None)
     check_shape("uv", uv, *depth.shape, 2)
     check_shape("valid", valid, *depth.shape)
-    pictures, vertices = depth.shape
-    if not pictures or not len(faces):
-        return faces.new_full((pictures, height, width), -1)
-    place, distance = uv.detach().double().flatten(0, 1), depth.detach().double().flatten()
-    first = vertices * torch.arange(pictures, device=uv.device)
-    every = (faces.long() + first[:, None, None]).flatten(0, 1)
-    triangles = _Triangles.of(place, distance, every, valid.flatten())
-    nearest = _nearest_faces(triangles, height, width, pictures=pictures)
-    nearest = nearest.view(pictures, height, width)
-    return nearest if pictures == 1 else nearest.where(nearest < 0, nearest % len(faces))
+    if label is not None:
+        check_shape("label", label, len(faces))
+    place, distance, faces = uv.detach().double(), depth.detach().double(), faces.long()
+    usable = _usable(place, distance) & valid
+    return _nearest(place, distance, faces, usable, height, width, label)
 
 
-class _Triangles(NamedTuple):
-    """Projected triangles, in double precision.
-
-    Attributes:
-        place: Vertices, pixels.
-        distance: Their depths.
-        faces: Corner indices.
-        area: Signed areas, doubled.
-        drawn: Which triangles can be drawn.
-    """
-
-    place: Places
-    distance: Float[Tensor, " v"]
-    faces: Faces
-    area: Float[Tensor, " f"]
-    drawn: Int[Tensor, " d"]
-
-    @classmethod
-    def of(cls, place: Tensor, distance: Tensor, faces: Tensor, valid: Tensor | None) -> _Triangles:
-        usable = (
-            (place.abs() < _FARTHEST_PIXEL).all(-1)
-            & (distance > _NEAREST_DEPTH)
-            & torch.isfinite(distance)
-        )
-        if valid is not None:
-            usable = usable & valid
-        first, second, third = place[faces].unbind(1)
-        a, b = second - first, third - first
-        area = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-        drawn = torch.nonzero(usable[faces].all(-1) & (area.abs() > _LEAST_AREA))[:, 0]
-        return cls(place, distance, faces, area, drawn)
+def _usable(place: Float[Tensor, "*b 2"], distance: Float[Tensor, "*b"]) -> Bool[Tensor, "*b"]:
+    """Vertices that are before the camera, and not too far off."""
+    is_near = (place.abs() < _FARTHEST_PIXEL).all(-1)
+    return is_near & (distance > _NEAREST_DEPTH) & (distance < torch.inf)
 
 
-def _nearest_faces(
-    triangles: _Triangles, height: int, width: int, *, pictures: int = 1
-) -> Int[Tensor, " bhw"]:
-    """Index of the nearest of the drawn triangles for every pixel, -1 where there is none.
+def _areas(place: Places, faces: Faces) -> Float[Tensor, " f"]:
+    """Signed areas of triangles, doubled."""
+    first, second, third = place[faces].unbind(1)
+    a, b = second - first, third - first
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
-    Of several pictures each has as many of the triangles, one after the other.
-    """
-    on_cpu = triangles.place.device.type == "cpu"
-    if compiler.COMPILED and on_cpu and not torch.compiler.is_compiling():
-        from torchcss.vision.rasterise_kernels import (
-            draw_triangles,
-        )  # compiled: only where it is used
+
+def _nearest(
+    place: Float[Tensor, "b v 2"],
+    distance: Float[Tensor, "b v"],
+    faces: Faces,
+    usable: Bool[Tensor, "b v"],
+    height: int,
+    width: int,
+    label: Int[Tensor, " f"] | None = None,
+) -> Int[Tensor, "b h w"]:
+    """Label of the nearest triangle for every pixel, -1 where there is none."""
+    pictures, vertices = distance.shape
+    label = torch.arange(len(faces), device=faces.device) if label is None else label
+    if compiler.COMPILED and place.device.type == "cpu" and not torch.compiler.is_compiling():
+        # Compiled: only where it is used.
+        from torchcss.vision.rasterise_kernels import draw_triangles
 
         near = torch.full((pictures, height, width), -1, dtype=torch.float32)
         seen = torch.full_like(near, -1, dtype=torch.long)
-        place, distance, faces, _, drawn = (part.contiguous() for part in triangles)
-        run(draw_triangles, place, distance, faces, drawn, len(faces) // pictures, near, seen)
-        return seen.flatten()
-    return _by_spans(triangles, height, width, pictures=pictures)
+        given = (part.contiguous() for part in (place, distance, usable, faces, label))
+        run(draw_triangles, *given, near, seen)
+        return seen
+    if not pictures or not len(faces):
+        return faces.new_full((pictures, height, width), -1)
+    first = vertices * torch.arange(pictures, device=faces.device)
+    every = (faces + first[:, None, None]).flatten(0, 1)
+    place, distance = place.flatten(0, 1), distance.flatten()
+    drawn = usable.flatten()[every].all(-1) & (_areas(place, every).abs() > LEAST_AREA)
+    drawn = torch.nonzero(drawn)[:, 0]
+    nearest = _by_spans(place, distance, every, drawn, height, width, pictures)
+    nearest = nearest.where(nearest < 0, label.repeat(pictures)[nearest])
+    return nearest.view(pictures, height, width)
 
 
 def _by_spans(
-    triangles: _Triangles, height: int, width: int, *, pictures: int = 1
+    place: Places,
+    distance: Float[Tensor, " v"],
+    faces: Faces,
+    drawn: Int[Tensor, " d"],
+    height: int,
+    width: int,
+    pictures: int,
 ) -> Int[Tensor, " bhw"]:
-    """The same in torch: spans of all triangles, and the nearest of them on every pixel."""
-    place, distance, faces, _, drawn = triangles
+    """Spans of all triangles, and the nearest of these on every pixel, -1 where there is none.
+
+    Of several pictures each has as many of the triangles, one after the other.
+    """
     corner, inverse = place[faces[drawn]], 1 / distance[faces[drawn]]
     order = corner[..., 1].argsort(-1)
     inverse = inverse.gather(-1, order)
