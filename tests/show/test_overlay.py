@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from torchcss.errors import ConfigurationError, ShapeError
-from torchcss.show.overlay import PALETTE, OverlayStyle, ProjectedBody, draw_overlay
+from torchcss.show import overlay
+from torchcss.show.overlay import PALETTE, ProjectedBody, draw_overlay
 from torchcss.vision.rasterise import join_faces
 
 
@@ -57,12 +58,13 @@ def test_only_the_body_and_its_outline_change(dtype):
     assert (drawn[60, 97:104].float().mean(-1) > 180).any()
 
 
-def test_lines_have_the_same_width_in_every_direction():
+def test_lines_have_the_same_width_in_every_direction(monkeypatch):
+    monkeypatch.setattr(overlay, "_FILL", 0.0)
     for resolution in (10**6, 6000):  # at full size, and rasterised at about a third
-        image = grey(220, 220, 0)
-        style = OverlayStyle(line=3.0, fill=0.0, resolution=resolution)
-        bright = draw_overlay(image, [disc(110, 110, 80)], style=style).float().mean(-1)
-        y, x = torch.meshgrid(torch.arange(220), torch.arange(220), indexing="ij")
+        image = grey(960, 220, 0)  # lines of 3 pixels
+        monkeypatch.setattr(overlay, "_RESOLUTION", resolution)
+        bright = draw_overlay(image, [disc(110, 110, 80)]).float().mean(-1)
+        y, x = torch.meshgrid(torch.arange(960), torch.arange(220), indexing="ij")
         sector = (torch.atan2(y - 110.0, x - 110.0) / (2 * math.pi) * 24).floor().long() % 24
         ink = torch.zeros(24).index_add(0, sector.view(-1), bright.view(-1)) / bright.max()
         width = ink / (2 * math.pi * 80 / 24)
@@ -90,7 +92,7 @@ def test_other_modes_are_outlines_and_their_weight_shows():
     assert heavy.norm() > 1.5 * light.norm() > 10
 
 
-def test_hidden_parts_are_dashed():
+def test_hidden_parts_are_dashed(monkeypatch):
     image = grey()
     front, back = disc(70, 60, 40, depth=1.0, part=0), disc(70, 60, 20, depth=2.0, part=1)
     with_back = draw_overlay(image, [together(front, back)])
@@ -101,15 +103,15 @@ def test_hidden_parts_are_dashed():
     # The same with the parts' depths exchanged is a solid line.
     solid = draw_overlay(image, [together(front._replace(depth=3 * front.depth), back)])
     assert (solid[ring].float().mean(-1) > 180).all()
-    quiet = draw_overlay(image, [together(front, back)], style=OverlayStyle(hidden=0.0))
-    assert torch.equal(quiet, alone)
+    monkeypatch.setattr(overlay, "_HIDDEN", 0.0)
+    assert torch.equal(draw_overlay(image, [together(front, back)]), alone)
 
 
-def test_meshes_of_one_part_share_an_outline():
+def test_meshes_of_one_part_share_an_outline(monkeypatch):
     image = grey()
-    style = OverlayStyle(fill=0.0)
-    one = draw_overlay(image, [together(disc(60, 60, 20), disc(80, 60, 20))], style=style)
-    two = draw_overlay(image, [together(disc(60, 60, 20), disc(80, 60, 20, part=1))], style=style)
+    monkeypatch.setattr(overlay, "_FILL", 0.0)
+    one = draw_overlay(image, [together(disc(60, 60, 20), disc(80, 60, 20))])
+    two = draw_overlay(image, [together(disc(60, 60, 20), disc(80, 60, 20, part=1))])
     lens = rings(120, 160, 60, 60).maximum(rings(120, 160, 80, 60)) < 15
     assert not changed(image, one)[lens].any()
     assert changed(image, one).any()
@@ -160,9 +162,10 @@ def test_bodies_far_larger_than_the_frame_fill_it():
         assert changed(image, drawn).all()
 
 
-def test_a_body_cut_by_the_frame_has_no_line_along_the_cut():
+def test_a_body_cut_by_the_frame_has_no_line_along_the_cut(monkeypatch):
+    monkeypatch.setattr(overlay, "_FILL", 0.0)
     image = grey()
-    drawn = draw_overlay(image, [disc(0, 60, 30)], style=OverlayStyle(fill=0.0))
+    drawn = draw_overlay(image, [disc(0, 60, 30)])
     touched = changed(image, drawn)
     assert touched[60, 28:32].any()
     assert not touched[50:70, :10].any()
@@ -203,7 +206,3 @@ def test_bad_input_is_named():
         draw_overlay(grey(), [mode], weights=[-3.0])
     with pytest.raises(ShapeError, match="keypoints"):
         draw_overlay(grey(), [mode], keypoints=torch.zeros(3, 3))
-    with pytest.raises(ConfigurationError, match="opacities"):
-        OverlayStyle(fill=1.5)
-    with pytest.raises(ConfigurationError, match="line width"):
-        OverlayStyle(line=0.0)

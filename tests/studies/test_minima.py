@@ -46,12 +46,13 @@ def test_ripples_on_a_curved_floor_are_one_valley():
         assert int(label[0]) == 0, "the lowest stands for its valley"
 
 
-def test_a_straight_path_would_not_do():
+def test_a_straight_path_would_not_do(monkeypatch):
     cost = banana(0.0)
     u = torch.tensor([[-1.2, 1.44], [1.2, 1.44]]).double()
     assert float(cost.value(u.mean(0))) > 500
-    assert bool(low_path(cost, u[:1], u[1:], BOX, rise=0.2))
-    assert not bool(low_path(cost, u[:1], u[1:], BOX, rise=0.2, depth=1))
+    assert bool(low_path(cost, u[:1], u[1:], BOX))
+    monkeypatch.setattr(minima, "DEPTH", 1)
+    assert not bool(low_path(cost, u[:1], u[1:], BOX))
 
 
 @pytest.mark.parametrize("barrier", [0.05, 5.0])
@@ -67,7 +68,7 @@ def test_bounds_stop_paths():
     cost = banana(0.0)
     u = torch.tensor([[-1.2, 1.44], [1.2, 1.44]]).double()
     narrow = problems.box(2, 1.0, 3.0)._replace(lower=torch.tensor([-3.0, 1.0]).double())
-    assert not bool(low_path(cost, u[:1], u[1:], narrow, rise=0.2))
+    assert not bool(low_path(cost, u[:1], u[1:], narrow))
 
 
 def test_the_order_of_the_minima_is_irrelevant(generator):

@@ -30,7 +30,6 @@ from torch.nn import functional
 from torchcss.body.model import BodyModel
 from torchcss.errors import ConfigurationError, ShapeError, check_shape
 from torchcss.show.style import OKABE_ITO
-from torchcss.types import frozen
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import (
     Fragments,
@@ -53,6 +52,14 @@ PALETTE = tuple(tuple(bytes.fromhex(OKABE_ITO[name].removeprefix("#"))) for name
 
 _RINGS, _MERIDIANS = 16, 20
 """Latitudes and longitudes of the mesh of a part."""
+
+_FILL, _HIDDEN, _FAINTEST = 0.45, 0.6, 0.35
+"""Opacity of the best mode's surface, of the dashes of hidden outlines, and of the outline of a
+mode that weighs nothing; one that weighs as much as the best is opaque."""
+
+_RESOLUTION = 300_000
+"""Pixels of the best mode's bounding box that are rasterised at most; larger boxes are rasterised
+more coarsely. The others' thin lines need a third."""
 
 _STEPS = 0.25
 """Square coarse pixels: how far the cracks of a raster, enlarged, scatter about the true line:
@@ -93,38 +100,6 @@ class ProjectedBody(NamedTuple):
         if not len(self.part):
             return face
         return torch.where(face >= 0, self.part[face.clamp_min(0)], -1)
-
-
-@frozen
-class OverlayStyle:
-    """How the overlay looks.
-
-    Attributes:
-        fill: Opacity of the best mode's surface, 0 to 1.
-        line: Width of the best mode's outlines, pixels; other modes get two thirds of it. `None`
-            chooses by the size of the frame: 1.5 pixels at 480 rows, 3.4 at 1080.
-        hidden: Opacity of the dashes of hidden outlines, 0 to 1.
-        faintest: Opacity of the outline of a mode that weighs nothing; one that weighs as much as
-            the best is opaque.
-        resolution: Pixels of the best mode's bounding box that are rasterised at most; larger boxes
-            are rasterised more coarsely. The others' thin lines need a third.
-    """
-
-    fill: float = 0.45
-    line: float | None = None
-    hidden: float = 0.6
-    faintest: float = 0.35
-    resolution: int = 300_000
-
-    def __post_init__(self) -> None:
-        opacities = (self.fill, self.hidden, self.faintest)
-        if not all(0 <= opacity <= 1 for opacity in opacities):
-            raise ConfigurationError(f"opacities: expected from 0 to 1, got {opacities}")
-        if self.resolution < 1 or (self.line is not None and not self.line > 0):
-            raise ConfigurationError(
-                "overlay style: expected a positive line width and resolution, got "
-                f"{self.line} and {self.resolution}"
-            )
 
 
 class _Window(NamedTuple):
@@ -210,7 +185,6 @@ def draw_overlay(
     weights: Float[Tensor, " k"] | Sequence[float] | None = None,
     keypoints: Float[Tensor, "j 2"] | None = None,
     text: str | None = None,
-    style: OverlayStyle | None = None,
 ) -> Picture:
     """Draw the modes of a tracker over a frame.
 
@@ -221,7 +195,6 @@ def draw_overlay(
         weights: Weight of every mode, in any unit; equal when absent.
         keypoints: Measured image points, drawn as small rings; those not finite are missing.
         text: A line to write into the lower left corner.
-        style: Opacities and widths.
 
     Returns:
         A new frame.
@@ -246,17 +219,16 @@ def draw_overlay(
             f"weights: expected finite and not negative, got {strength.tolist()}; "
             "exponentiate logarithms first"
         )
-    style = style or OverlayStyle()
     drawn = image.clone()
-    line = style.line or max(1.5, image.shape[0] / 320)
+    line = max(1.5, image.shape[0] / 320)
     colours = drawn.new_tensor(PALETTE, dtype=torch.float32)
     if modes:
-        _draw_body(drawn, modes[0], colours[0], line, style)
+        _draw_body(drawn, modes[0], colours[0], line)
     for index in range(len(modes) - 1, 0, -1):  # the heavier on top
         share = float(strength[index] / strength[0]) if strength[0] > 0 else 0.0
-        opacity = style.faintest + (1 - style.faintest) * min(share, 1.0)
+        opacity = _FAINTEST + (1 - _FAINTEST) * min(share, 1.0)
         colour = colours[1 + (index - 1) % (len(PALETTE) - 1)]
-        _draw_outline(drawn, modes[index], colour, 2 * line / 3, opacity, style)
+        _draw_outline(drawn, modes[index], colour, 2 * line / 3, opacity)
     if keypoints is not None:
         check_shape("keypoints", keypoints, None, 2)
         _draw_keypoints(drawn, keypoints, 2.5 * line)
@@ -349,11 +321,10 @@ def _draw_outline(
     colour: Float[Tensor, "3"],
     line: float,
     opacity: float,
-    style: OverlayStyle,
 ) -> None:
     """Thin outlines of the visible parts."""
     height, width = target.shape[:2]
-    window = _window(mode.in_front, height, width, line + 1, style.resolution // 3)
+    window = _window(mode.in_front, height, width, line + 1, _RESOLUTION // 3)
     if window is None:
         return
     sigma = _line_spread(line, window.scale)
@@ -366,11 +337,10 @@ def _draw_body(
     mode: ProjectedBody,
     colour: Float[Tensor, "3"],
     line: float,
-    style: OverlayStyle,
 ) -> None:
     """Translucent shaded parts, their outlines, and dashes for what is hidden."""
     height, width = target.shape[:2]
-    window = _window(mode.in_front, height, width, 2 * line + 2, style.resolution)
+    window = _window(mode.in_front, height, width, 2 * line + 2, _RESOLUTION)
     if window is None:
         return
     place = window.place(mode.uv)
@@ -386,8 +356,8 @@ def _draw_body(
         for profile, width in ((hidden, 0.7 * line), (visible, 2 * line), (visible, line))
     )
     white = torch.full_like(colour, 255.0)
-    _blend(target, window, colour * light[..., None], style.fill * seen)
-    _blend(target, window, torch.lerp(colour, white, 0.5), style.hidden * faint)
+    _blend(target, window, colour * light[..., None], _FILL * seen)
+    _blend(target, window, torch.lerp(colour, white, 0.5), _HIDDEN * faint)
     # A dark line under a bright one stands out from any background.
     _blend(target, window, 0.15 * colour, 0.6 * broad)
     _blend(target, window, torch.lerp(colour, white, 0.7), thin)

@@ -16,7 +16,6 @@ The look and the helpers are those of `torchcss.show.track_plots`.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -29,17 +28,17 @@ from matplotlib.figure import Figure
 from torchcss.body.bases import pose_track
 from torchcss.body.root import ROOT_NAMES, has_root
 from torchcss.body.uncertainty import joint_covariance
-from torchcss.errors import ConfigurationError
 from torchcss.files import prepare_output_folder
 from torchcss.io.run import Run, body_of_track
 from torchcss.io.tracks import TRACK_NAME, Track
 from torchcss.show.style import DEVIATIONS, OKABE_ITO, save_figure
-from torchcss.show.track_pictures import has_pictures, pictures_of, rows_with_modes
+from torchcss.show.track_pictures import has_pictures, pictures_of
 from torchcss.show.track_plots import (
     label,
     mode_colour,
     modes_figure,
     most_open_frame,
+    rows_with_modes,
     sheet_of,
     shrunk,
     side_view_figure,
@@ -51,7 +50,7 @@ SHOWN_JOINTS = (
     "skull_tip", "l_shoulder", "l_elbow", "l_wrist", "r_shoulder", "r_elbow", "r_wrist",
     "r_hand_tip", "l_hip", "l_knee", "l_ankle", "r_hip", "r_knee", "r_ankle",
 )  # fmt: skip
-"""Joints that `joints_figure` shows of a body that has them, if it is not told others."""
+"""Joints that `joints_figure` shows of a body that has any of them."""
 
 _LINE = OKABE_ITO["blue"]
 _SHOWN_PARAMETERS = 14
@@ -88,7 +87,7 @@ def plot_track(
         TorchcssError: If the body is not known, the folder cannot be written, or a picture cannot
             be read.
     """
-    track, rows = run.track._replace(body=run.body), rows_with_modes(run)
+    track, rows = run.track._replace(body=run.body), rows_with_modes(run.track)
     usual = "plots" if run.path.name == TRACK_NAME else f"{run.path.stem}_plots"
     out = prepare_output_folder(run.folder / usual if out is None else out)
     camera = run.cameras[0].camera if run.cameras else None
@@ -111,31 +110,19 @@ def plot_track(
     return [save_figure(figure, out / f"{name}.png") for name, figure in figures.items()]
 
 
-def joints_figure(
-    track: Track, *, camera: Camera | None = None, joints: Sequence[str] | None = None
-) -> Figure:
-    """Places of joints over time, a row per joint, a column per direction.
+def joints_figure(track: Track, *, camera: Camera | None = None) -> Figure:
+    """Places of `SHOWN_JOINTS`, or else of all joints, over time: a row each, a column a direction.
 
     Args:
         track: The track.
         camera: Its camera: directions are then to the right, up and away as it sees them. None: the
             axes of the track's world.
-        joints: Which joints; by default those of `SHOWN_JOINTS` that it has, or all.
 
     Raises:
-        ConfigurationError: If the track has no frames, or no such joint.
-        TrackFileError: If the body cannot be told.
+        TrackFileError: If the track has no frames, or its body cannot be told.
     """
-    rows = _rows(track)
-    names = (
-        list(joints) if joints is not None else [n for n in SHOWN_JOINTS if n in track.joint_names]
-    )
-    names = names or list(track.joint_names)
-    if missing := set(names) - set(track.joint_names):
-        raise ConfigurationError(
-            f"the track has no joints {', '.join(sorted(missing))}; it has "
-            f"{', '.join(track.joint_names)}"
-        )
+    rows = rows_with_modes(track)
+    names = [n for n in SHOWN_JOINTS if n in track.joint_names] or list(track.joint_names)
     chosen = [track.joint_names.index(name) for name in names]
     body = body_of_track(track)
     pose = pose_track(
@@ -176,10 +163,9 @@ def angles_figure(track: Track) -> Figure:
         track: The track.
 
     Raises:
-        ConfigurationError: If the track has no frames.
-        TrackFileError: If the body cannot be told.
+        TrackFileError: If the track has no frames, or its body cannot be told.
     """
-    rows = _rows(track)
+    rows = rows_with_modes(track)
     body = body_of_track(track)
     lower, upper = body.lower.numpy(), body.upper.numpy()
     deviation = np.sqrt(np.diagonal(track.covariance[rows, 0], axis1=-2, axis2=-1).clip(min=0))
@@ -226,9 +212,9 @@ def spectra_figure(track: Track) -> Figure:
         track: The track.
 
     Raises:
-        ConfigurationError: If the track has no frames.
+        TrackFileError: If the track has no frames.
     """
-    rows = _rows(track)
+    rows = rows_with_modes(track)
     names = [name.replace("_", " ") for name in track.state_names]
     covariance, times = track.covariance[rows, 0], track.times[rows]
     values, vectors = np.linalg.eigh(covariance)
@@ -270,8 +256,8 @@ def _draw_widest(
     order = np.argsort(-share.mean(0))[:_SHOWN_PARAMETERS]
     # Frames need not be evenly spaced: the cells end halfway between them.
     image = axes.pcolormesh(
-        _edges(times), np.arange(len(order) + 1) - 0.5, share[:, order].T, cmap="cividis",
-        vmin=0, vmax=1,
+        times, range(len(order)), share[:, order].T, cmap="cividis", vmin=0, vmax=1,
+        shading="nearest",
     )  # fmt: skip
     axes.set_yticks(range(len(order)), [names[index] for index in order], fontsize=8)
     axes.set_ylim(len(order) - 0.5, -0.5)
@@ -342,18 +328,3 @@ def _caption(what: str) -> str:
         f"{what}: the best mode with {DEVIATIONS:g} standard deviations; "
         "dots: the other modes, fainter the less they weigh"
     )
-
-
-def _edges(times: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t+1"]:
-    """Borders of cells about the times."""
-    if len(times) == 1:
-        return np.array([times[0] - 0.5, times[0] + 0.5])
-    middle = (times[1:] + times[:-1]) / 2
-    return np.concatenate([[2 * times[0] - middle[0]], middle, [2 * times[-1] - middle[-1]]])
-
-
-def _rows(track: Track) -> np.ndarray:
-    rows = np.flatnonzero(track.num_modes > 0)
-    if not len(rows):
-        raise ConfigurationError("the track has no frames; there is nothing to draw")
-    return rows

@@ -26,8 +26,13 @@ from torchcss.io.run import Run
 from torchcss.io.tracks import TRACK_NAME
 from torchcss.io.video import VideoWriter
 from torchcss.show.posterior_plots import angles_figure
-from torchcss.show.track_pictures import has_pictures, pictures_of, rows_with_modes
-from torchcss.show.track_plots import modes_figure, most_open_frame, side_view_figure
+from torchcss.show.track_pictures import has_pictures, pictures_of
+from torchcss.show.track_plots import (
+    modes_figure,
+    most_open_frame,
+    rows_with_modes,
+    side_view_figure,
+)
 from torchcss.tracking.presets import OLD_NAMES, PRESETS, Preset
 
 REPORT_NAME = "report.html"
@@ -80,7 +85,7 @@ def write_report_page(run: Run, *, anew: bool = False) -> Path:
         TorchcssError: If the track has no frames, its body is not known, a picture cannot be read,
             or the file cannot be written.
     """
-    track, rows = run.track._replace(body=run.body), rows_with_modes(run)
+    track, rows = run.track._replace(body=run.body), rows_with_modes(run.track)
     camera = run.cameras[0].camera if run.cameras else None
     sections = (
         ("Film", _film(run, rows, anew=anew)),

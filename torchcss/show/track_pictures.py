@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from torchcss.errors import TrackFileError, VideoError
+from torchcss.errors import VideoError
 from torchcss.io.cameras import check_image_size
 from torchcss.io.run import Run
 from torchcss.io.tracks import TRACK_NAME
@@ -124,18 +124,6 @@ def pictures_of(
         raise VideoError(
             f"{shown}: {missing} frames of the track are missing; give the video that was tracked"
         )
-
-
-def rows_with_modes(run: Run) -> np.ndarray:
-    """Rows of the track that have modes.
-
-    Raises:
-        TrackFileError: If there are none.
-    """
-    rows = np.flatnonzero(run.track.num_modes > 0)
-    if not rows.size:
-        raise TrackFileError(f"{run.path}: the track has no frames; there is nothing to show")
-    return rows
 
 
 def _frames_of(

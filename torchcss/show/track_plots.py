@@ -6,7 +6,7 @@
 * `contact_sheet`: frames of a video, of an overlay for instance, with their times.
 
 Modes have the colours that they have in the overlay (`torchcss.show.overlay.PALETTE`), which
-colour-blind viewers can tell apart. Every function returns a figure that belongs to nobody, see
+colour-blind viewers can tell apart. Every function returns a figure that belongs to nobody;
 `torchcss.show.style.save_figure` writes it.
 """
 
@@ -27,7 +27,7 @@ from PIL import Image
 from torchcss.body.bases import pose_track
 from torchcss.body.model import BodyModel
 from torchcss.body.uncertainty import joint_covariance
-from torchcss.errors import ConfigurationError, ShapeError
+from torchcss.errors import ConfigurationError, ShapeError, TrackFileError
 from torchcss.files import StrPath
 from torchcss.io.run import body_of_track
 from torchcss.io.tracks import Track
@@ -51,6 +51,9 @@ _TRUNK = (
 
 _FAINTEST = 0.45
 """Opacity of a mode that weighs nothing."""
+
+_SHEET_PX = 360
+"""Width of the images of a contact sheet."""
 
 _SPACE = 0.08
 _NARROWEST = 0.6
@@ -175,29 +178,35 @@ def _label_side_view(figure: Figure, front: Axes, side: Axes, when: str) -> None
     )
 
 
-def num_explanations(track: Track, *, apart: float = EXPLANATION_M) -> np.ndarray:
-    """How many of each frame's modes differ from all better ones, `[T]`.
-
-    Args:
-        track: The track.
-        apart: Distance of some joint centre from which modes differ, metres.
-    """
+def num_explanations(track: Track) -> np.ndarray:
+    """How many of each frame's modes differ from all better ones, `[T]`."""
     frames = zip(track.joints_world, track.num_modes, strict=True)
-    return np.array([count_apart(joints[:num], apart=apart) for joints, num in frames], np.int64)
+    return np.array([count_apart(joints[:num]) for joints, num in frames], np.int64)
 
 
-def count_apart(joints: Float[np.ndarray, "k j 3"], *, apart: float = EXPLANATION_M) -> int:
-    """How many of the modes of one frame differ from all better ones.
+def count_apart(joints: Float[np.ndarray, "k j 3"]) -> int:
+    """How many of the modes of one frame differ from all better ones by `EXPLANATION_M`.
 
     Args:
         joints: Joint centres of the modes, the best first.
-        apart: Distance of some joint centre from which modes differ, metres.
     """
     kept: list[np.ndarray] = []
     for own in joints:
-        if all(np.linalg.norm(own - other, axis=-1).max() >= apart for other in kept):
+        if all(np.linalg.norm(own - other, axis=-1).max() >= EXPLANATION_M for other in kept):
             kept.append(own)
     return len(kept)
+
+
+def rows_with_modes(track: Track) -> np.ndarray:
+    """Rows of the track that have modes.
+
+    Raises:
+        TrackFileError: If there are none.
+    """
+    rows = np.flatnonzero(track.num_modes > 0)
+    if not rows.size:
+        raise TrackFileError("the track has no frames; there is nothing to show")
+    return rows
 
 
 def effective_number(track: Track) -> Float[np.ndarray, " t"]:
@@ -228,10 +237,9 @@ def modes_figure(track: Track, summary: Mapping[str, Any] | None = None) -> Figu
             cross to a circle the track was told lost.
 
     Raises:
-        ConfigurationError: If the track has no frames.
+        TrackFileError: If the track has no frames.
     """
-    if not len(track.frames):
-        raise ConfigurationError("the track has no frames; there is nothing to draw")
+    rows_with_modes(track)
     events = [] if summary is None else summary.get("events", [])
     times = track.times
     figure = Figure(figsize=(9.0, 5.6), layout="constrained")
@@ -300,7 +308,6 @@ def contact_sheet(
     *,
     track: Track | None = None,
     columns: int | None = None,
-    width_px: int = 360,
 ) -> Figure:
     """Frames of a video in a grid, with their times.
 
@@ -310,7 +317,6 @@ def contact_sheet(
         track: The track, if the video is its `overlay.mp4`. Frames and times are then those of the
             video that was tracked.
         columns: Images in a row; all in one by default, up to six.
-        width_px: Width to which wider images are reduced.
 
     Raises:
         ConfigurationError: If no frames are asked for, or some that the video does not have.
@@ -324,7 +330,7 @@ def contact_sheet(
     for frame in VideoReader(video, stop=max(*place.values(), 0) + 1):
         if frame.index in place.values():
             time = frame.time_s if track is None else float(track.times[frame.index])
-            images[frame.index] = time, shrunk(frame.image, width_px)
+            images[frame.index] = time, shrunk(frame.image)
     if missing := [frame for frame, row in place.items() if row not in images]:
         raise ConfigurationError(f"{video}: no frames {missing}; choose others")
 
@@ -360,17 +366,12 @@ def sheet_of(
     return figure
 
 
-def shrunk(image: UInt8[np.ndarray, "h w 3"], width_px: int = 360) -> UInt8[np.ndarray, "r s 3"]:
-    """An image reduced to a width, if it is wider.
-
-    Args:
-        image: The image.
-        width_px: The width.
-    """
+def shrunk(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "r s 3"]:
+    """An image reduced to a width of `_SHEET_PX`, if it is wider."""
     height, width = image.shape[:2]
-    if width <= width_px:
+    if width <= _SHEET_PX:
         return image
-    size = (width_px, max(round(height * width_px / width), 1))
+    size = (_SHEET_PX, max(round(height * _SHEET_PX / width), 1))
     return np.asarray(Image.fromarray(image).resize(size))
 
 

@@ -113,21 +113,21 @@ _STEPS = 200
 _CHECKS = 5
 """Interior points at which the cost along a straight segment is evaluated."""
 
+RISE, DEPTH = 0.1, 5
+"""Nats by which a path may rise above its higher end, and how often its segments are halved."""
+
 
 def low_path(
     cost: CostFunction,
     first: Float[Tensor, "p n"],
     second: Float[Tensor, "p n"],
     bounds: Bounds,
-    *,
-    rise: float = 0.1,
-    depth: int = 5,
 ) -> Bool[Tensor, " p"]:
-    """Whether a path is found between two states that stays below the higher one plus a rise.
+    """Whether a path is found between two states that stays below the higher one plus `RISE`.
 
     A straight segment along which the cost stays low is a path. One along which it does not is cut
     in two at the lowest point of the plane that halves it, near the valley's floor, and both halves
-    are tried, up to `2^depth` pieces. True is a proof, up to what lies between the points checked;
+    are tried, up to `2^DEPTH` pieces. True is a proof, up to what lies between the points checked;
     False only says that this search found no path.
 
     Args:
@@ -135,34 +135,30 @@ def low_path(
         first: One end of each path.
         second: The other.
         bounds: Box limits; a box is convex, so that segments stay inside.
-        rise: Nats.
-        depth: How often segments may be halved.
     """
     n = first.shape[-1]
-    if not len(first):
-        return torch.ones(0, dtype=torch.bool, device=first.device)
     ends = torch.stack([first, second], 1)
-    limit = cost.value(ends.reshape(-1, n)).reshape(-1, 2).amax(-1) + rise
+    limit = cost.value(ends.reshape(-1, n)).reshape(-1, 2).amax(-1) + RISE
     found = torch.ones_like(limit, dtype=torch.bool)
     # Segments that are still to be shown low, and the pair that each belongs to.
     pair = torch.arange(len(first), device=first.device)
     start, end = first, second
-    optimiser = TrustRegionNewton(max_steps=50, tolerance=1e-3 * rise)
+    optimiser = TrustRegionNewton(max_steps=50, tolerance=1e-3 * RISE)
     share = torch.arange(1, _CHECKS + 1, device=first.device).to(first)[:, None] / (_CHECKS + 1)
-    for level in range(depth + 1):
+    for _ in range(DEPTH + 1):
+        if not len(pair):
+            return found
         inner = start[:, None] + share * (end - start)[:, None]
         height = cost.value(inner.reshape(-1, n)).reshape(-1, _CHECKS).amax(-1)
         high = ~(height <= limit[pair])
         start, end, pair = start[high], end[high], pair[high]
-        if level == depth:
-            found[pair] = False
-        if level == depth or not len(pair):
-            break
+        if not len(pair):
+            return found
         along, middle = end - start, 0.5 * (start + end)
         length = along.norm(dim=-1, keepdim=True)
         normal = along / torch.where(length > 0, length, 1.0)
         # A tenth of the way to an end costs a hundred times the rise.
-        stiffness = 2 * 100 * rise / (0.1 * torch.where(length > 0, length, 1.0)[:, 0]).square()
+        stiffness = 2 * 100 * RISE / (0.1 * torch.where(length > 0, length, 1.0)[:, 0]).square()
         plane = _NearPlane(cost, middle, normal, stiffness)
         middle = optimiser.minimise(plane, middle, bounds).mean
         blocked = ~(cost.value(middle) <= limit[pair])
@@ -170,13 +166,9 @@ def low_path(
         # A pair with one blocked segment is lost; its other segments need no more work.
         going = found[pair]
         start, middle, end, pair = start[going], middle[going], end[going], pair[going]
-        if not len(pair):
-            break
-        start, end, pair = (
-            torch.cat([start, middle]),
-            torch.cat([middle, end]),
-            torch.cat([pair, pair]),
-        )
+        start, end = torch.cat([start, middle]), torch.cat([middle, end])
+        pair = torch.cat([pair, pair])
+    found[pair] = False
     return found
 
 

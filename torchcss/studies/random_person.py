@@ -32,6 +32,8 @@ from torchcss.studies.reprojection import DISTANCE, HEIGHT, WIDTH, plausible_pos
 from torchcss.types import Vector
 from torchcss.vision.camera import Camera
 
+_BODY = "body34"
+
 MARKED = (*LIMB_JOINTS, "vc7", "skull_tip")
 """The joints of the keypoints: those of the limbs, the base of the neck, the top of the head."""
 
@@ -66,7 +68,6 @@ class RandomPerson(NamedTuple):
 def random_person(
     *,
     generator: torch.Generator,
-    body_name: str = "body34",
     joint_names: tuple[str, ...] = MARKED,
     spread: float = 1.0,
     noise_px: float = 2.0,
@@ -77,7 +78,6 @@ def random_person(
 
     Args:
         generator: Source of everything.
-        body_name: A body with a root.
         joint_names: Which joints are marked.
         spread: Factor on how far all angles are from rest. Each by itself is one that people take
             at 1, all together are a contortion; with a half they stand about.
@@ -85,9 +85,9 @@ def random_person(
         missing: Probability that a joint is missing.
         outliers: Probability that its mark is anywhere in the image.
     """
-    lengths = random_lengths(generator=generator, body_name=body_name)
+    lengths = random_lengths(generator=generator)
     place = torch.tensor([0.0, 0.0, -DISTANCE], dtype=torch.float64)
-    body = load_body(body_name, lengths=lengths).with_base(torch.eye(3), place)
+    body = load_body(_BODY, lengths=lengths).with_base(torch.eye(3), place)
     state = torch.lerp(body.rest, plausible_pose(body, generator=generator), spread)
     turn = torch.rand((), generator=generator, dtype=torch.float64)
     state[body.state_index("root_yaw")] = math.pi * (2 * turn - 1)
@@ -104,14 +104,9 @@ def random_person(
     return RandomPerson(body, state, camera, joint_names, uv, confidence, is_outlier)
 
 
-def random_lengths(*, generator: torch.Generator, body_name: str = "body34") -> dict[str, float]:
-    """Lengths of a person drawn from the anthropometric prior, within its 10 %, metres.
-
-    Args:
-        generator: Source of randomness.
-        body_name: The body; lengths that it does not have are those of the standard humanoid.
-    """
-    free = load_body(body_name, free_proportions=True)
+def random_lengths(*, generator: torch.Generator) -> dict[str, float]:
+    """Lengths of a person drawn from the anthropometric prior, within its 10 %, metres."""
+    free = load_body(_BODY, free_proportions=True)
     factor = torch.linalg.cholesky(Anthropometric().covariance(free))
     drawn = factor @ torch.randn(len(factor), generator=generator, dtype=torch.float64)
     lengths = dict(LENGTHS)

@@ -12,11 +12,9 @@ from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.shape import with_shape
 from torchcss.cost.interpenetration import InterpenetrationPairs
-from torchcss.errors import ConfigurationError
 from torchcss.studies.random_person import random_lengths
 from torchcss.studies.render.motions import (
     MOTIONS,
-    KeyPoses,
     clamped_spline,
     plant_feet,
     sample_times,
@@ -128,10 +126,3 @@ def test_the_dark_sequence_needs_the_clavicles() -> None:
     for side in "lr":
         for angle in ("elevation", "protraction"):
             assert max(poses.degrees[f"{side}_clavicle_{angle}"]) > 20
-
-
-def test_tables_are_checked() -> None:
-    with pytest.raises(ConfigurationError, match="ascending times from 0"):
-        KeyPoses(body="arm7", times=(0.0, 2.0, 1.0))
-    with pytest.raises(ConfigurationError, match="r_elbow_flexion has 1 values for 2 times"):
-        KeyPoses(body="arm7", times=(0.0, 2.0), degrees={"r_elbow_flexion": (3,)})

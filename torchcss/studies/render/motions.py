@@ -18,13 +18,11 @@ from dataclasses import field
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.body.model import BodyModel
-from torchcss.errors import ConfigurationError
 from torchcss.types import Curvature, PointCost, Trajectory, frozen
 
 _METRES = ("root_x", "root_y", "root_z")
@@ -48,17 +46,6 @@ class KeyPoses:
     degrees: Mapping[str, Sequence[float]] = field(default_factory=dict)
     planted: bool = False
     description: str = ""
-
-    def __post_init__(self) -> None:
-        if len(self.times) < 2 or self.times[0] != 0 or (np.diff(self.times) <= 0).any():
-            raise ConfigurationError(
-                f"KeyPoses.times: expected at least two ascending times from 0, got {self.times}"
-            )
-        for name, row in self.degrees.items():
-            if len(row) != len(self.times):
-                raise ConfigurationError(
-                    f"KeyPoses: {name} has {len(row)} values for {len(self.times)} times"
-                )
 
     @property
     def duration(self) -> float:
@@ -85,7 +72,7 @@ class Motion(NamedTuple):
     Attributes:
         body: The body, on its base.
         states: Its states.
-        frame_rate: Trajectory per second.
+        frame_rate: States per second.
         description: One line about it.
     """
 
