@@ -21,13 +21,15 @@ from torchcss.studies.sequence_writer import write_camera
 
 KEY = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
 
+SIZE = (64, 48)
+
 
 def video(path: Path, **metadata: str) -> Path:
     """A short film whose container says more."""
     with av.open(path, "w", options={"movflags": "use_metadata_tags"}) as container:
         container.metadata.update(metadata)
         stream = container.add_stream("libx264", rate=25)
-        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        stream.width, stream.height, stream.pix_fmt = *SIZE, "yuv420p"
         picture = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), format="rgb24")
         container.mux(stream.encode(picture))
         container.mux(stream.encode(None))
@@ -35,19 +37,19 @@ def video(path: Path, **metadata: str) -> Path:
 
 
 def focal(lens: KnownLens, path: Path) -> float:
-    return float(lens.of(path).camera(path).camera.K[0, 0])
+    return float(lens.of(path).camera(*SIZE).camera.K[0, 0])
 
 
 def test_the_file_says_it(tmp_path: Path) -> None:
     path = video(tmp_path / "a.mov", **{KEY: "26"})
     assert focal_length_35mm(path) == 26
     assert focal(KnownLens(), path) == pytest.approx(26 * 80 / math.hypot(36, 24))
-    assert "26 mm" in (KnownLens().of(path).camera(path).units_note or "")
+    assert "26 mm" in (KnownLens().of(path).camera(*SIZE).units_note or "")
     assert focal(KnownLens(focal=99.0), path) == 99  # the user knows better
     doubts = [
-        lens.of(path).camera(path).focal_deviation for lens in (KnownLens(focal=99.0), KnownLens())
+        lens.of(path).camera(*SIZE).focal_deviation for lens in (KnownLens(focal=99.0), KnownLens())
     ]
-    assert doubts[0] == 0 < doubts[1] < KnownLens().camera(path).focal_deviation
+    assert doubts[0] == 0 < doubts[1] < KnownLens().camera(*SIZE).focal_deviation
 
 
 @pytest.mark.parametrize("said", ["", "none", "0", "nan", "1e9", "-26"])

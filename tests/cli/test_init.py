@@ -116,8 +116,8 @@ def test_track_starts_from_it(scene: Path, result: Path, tmp_path: Path, capsys)
     [
         (("--joints", "nowhere.json"), "nowhere.json"),
         (("--camera", "nowhere.json"), "nowhere.json"),
-        (("--focal-px", "500", "--field-of-view", "60"), "field_of_view"),
-        (("--field-of-view", "200"), "field_of_view"),
+        (("--focal-px", "500", "--field-of-view", "60"), "--focal or --fov"),
+        (("--field-of-view", "200"), "--fov: expected degrees"),
         (("--stature", "175"), "stature"),
         (("--hypotheses", "0"), "at least 1 hypothesis"),
         (("--hypotheses", "-2"), "at least 1 hypothesis"),

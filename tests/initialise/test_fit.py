@@ -418,7 +418,6 @@ def test_cameras(generator: torch.Generator):
     angle = 2 * np.degrees(np.arctan(500 / float(camera.K[0, 0])))
     assert angle == pytest.approx(DEFAULT_VIEW_DEGREES)
     assert "not given" in note
-    assert float(default_camera(400, 300, focal_px=123)[0].K[0, 0]) == pytest.approx(123)
     picture = np.zeros((300, 400, 3), np.uint8)
     with pytest.raises(CameraError, match="neither"):
         initialise(None, marks(person()), generator=generator)

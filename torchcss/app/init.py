@@ -22,10 +22,11 @@ from typing import Any
 
 import torch
 
+from torchcss.app.lens import KnownLens
 from torchcss.body.load import load_body
-from torchcss.errors import CameraError, KeypointError
+from torchcss.errors import KeypointError
 from torchcss.files import prepare_output_folder, replace_file
-from torchcss.initialise.fit import default_camera, initialise
+from torchcss.initialise.fit import initialise
 from torchcss.initialise.noise import Noise
 from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
 from torchcss.initialise.result import Initialisation, stature_of
@@ -57,11 +58,10 @@ class PictureFiles:
         layout: Layout of a joints file that does not name its joints, e.g. BODY_25.
         normalised: Whether joints are pixels, or fractions of the picture from 0 to 1 or from -1
             to 1.
-        camera: Calibration; without it a pinhole camera of --focal-px, --field-of-view or 54
-            degrees.
+        camera: Calibration; without it a pinhole camera of --focal, --fov or 54 degrees.
         camera_name: Camera in the file; by default the one whose picture this is.
-        focal_px: Focal length in pixels.
-        field_of_view: Angle between the left and the right border of the picture, degrees.
+        focal: Focal length in pixels.
+        fov: Angle between the left and the right border of the picture, degrees.
     """
 
     frame: int = 0
@@ -70,8 +70,8 @@ class PictureFiles:
     normalised: Scale = "pixels"
     camera: Path | None = None
     camera_name: str | None = None
-    focal_px: float | None = None
-    field_of_view: float | None = None
+    focal: float | None = None
+    fov: float | None = None
 
     def read_camera(self, image: Path, width: int, height: int) -> tuple[Camera, list[str]]:
         """The camera of a picture of this size, and what is to be said about it.
@@ -79,18 +79,14 @@ class PictureFiles:
         Raises:
             CameraError: If it cannot be read, is of another size, or is given twice.
         """
-        focal, angle = self.focal_px, self.field_of_view
+        lens = KnownLens(focal=self.focal, fov=self.fov)
         if self.camera is None:
-            camera, note = default_camera(
-                width, height, focal_px=focal, field_of_view_degrees=angle
-            )
-            return camera, [note]
-        if (focal, angle) != (None, None):
-            raise CameraError("give a camera file, a focal length or a field of view, not several")
-        loaded = load_camera(self.camera, self.camera_name, video=image)
-        check_image_size(loaded.camera, width, height)
-        notes = [f"camera: {loaded.camera.name}", loaded.units_note]
-        return loaded.camera, [note for note in notes if note]
+            loaded, name = lens.camera(width, height), None
+        else:
+            loaded = load_camera(lens.unless(self.camera), self.camera_name, video=image)
+            check_image_size(loaded.camera, width, height)
+            name = f"camera: {loaded.camera.name}"
+        return loaded.camera, [note for note in (name, loaded.units_note) if note]
 
     def read_joints(self, width: int, height: int, links: Links) -> Keypoints:
         """The joints in a picture of this size, and of a body with names of its own.

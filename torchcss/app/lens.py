@@ -87,19 +87,14 @@ class KnownLens:
         """Whether the focal length is told."""
         return self.focal is not None or self.fov is not None
 
-    def camera(self, video: Path) -> LoadedCamera:
-        """The camera of a video, in its own frame, and what was assumed.
-
-        Raises:
-            VideoError: If the video cannot be read.
-        """
-        info = VideoReader(video).info
-        camera, note = default_camera(
-            info.width, info.height, focal_px=self.focal, field_of_view_degrees=self.fov
-        )
-        note = note.replace("as given", self.source)
-        deviation = self.deviation if self.is_known else DEVIATION
-        return LoadedCamera(camera, False, note, deviation)
+    def camera(self, width: int, height: int) -> LoadedCamera:
+        """A camera of this image size, in its own frame, and what was assumed."""
+        if not self.is_known:
+            camera, note = default_camera(width, height)
+            return LoadedCamera(camera, False, note, DEVIATION)
+        camera = Camera.pinhole(width, height, focal_px=self.focal, field_of_view_degrees=self.fov)
+        note = f"camera: pinhole, focal length {float(camera.K[0, 0]):.0f} px, {self.source}"
+        return LoadedCamera(camera, False, note, self.deviation)
 
 
 def fitted(view: OpenView, settings: Settings) -> OpenView:

@@ -38,6 +38,7 @@ from torchcss.io.keypoints.links import Links
 from torchcss.io.keypoints.read import Scale
 from torchcss.io.run import Run, as_run
 from torchcss.io.tracks import TRACK_NAME, prepare_output_folder
+from torchcss.io.video import VideoReader
 from torchcss.io.view_files import ViewFiles
 from torchcss.joint_names import JOINT_NAMES
 from torchcss.show.track_pictures import write_overlays
@@ -286,8 +287,8 @@ def _camera_of(
     lens = KnownLens(focal=options.focal, fov=options.fov)
     if camera is not None:
         return lens.unless(Path(camera)), True
-    lens = lens.of(video)
-    return lens.camera(video), lens.is_known
+    lens, info = lens.of(video), VideoReader(video).info
+    return lens.camera(info.width, info.height), lens.is_known
 
 
 def _all_views(

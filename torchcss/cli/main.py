@@ -73,6 +73,8 @@ interruption is on disk: `torchcss track ... --resume` goes on."""
 
 _OLD_NAMES = {
     "--evidence": "--likelihood-power",
+    "--focal-px": "--focal",
+    "--field-of-view": "--fov",
     "--agility": "--acceleration-ratio",
     "--no-recovery": "--recovery=False",
 }

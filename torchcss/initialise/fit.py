@@ -349,26 +349,8 @@ def _outlines(cost: TrackingCost) -> tuple[Outline, ...]:
     )
 
 
-def default_camera(
-    width: int,
-    height: int,
-    *,
-    focal_px: float | None = None,
-    field_of_view_degrees: float | None = None,
-) -> tuple[Camera, str]:
-    """A pinhole camera for a picture without calibration, and a line that says which.
-
-    Args:
-        width: Width of the picture, pixels.
-        height: Its height.
-        focal_px: Focal length in pixels.
-        field_of_view_degrees: Angle between left and right border. Neither: the default.
-    """
-    if focal_px is not None or field_of_view_degrees is not None:
-        camera = Camera.pinhole(
-            width, height, focal_px=focal_px, field_of_view_degrees=field_of_view_degrees
-        )
-        return camera, f"camera: pinhole, focal length {float(camera.K[0, 0]):.0f} px, as given"
+def default_camera(width: int, height: int) -> tuple[Camera, str]:
+    """A pinhole camera for a picture without calibration, and a line that says which."""
     longer = max(width, height)
     focal = 0.5 * longer / math.tan(math.radians(0.5 * DEFAULT_VIEW_DEGREES))
     return Camera.pinhole(width, height, focal_px=focal, name="default"), (
