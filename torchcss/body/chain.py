@@ -2,8 +2,8 @@
 
 This is the only module that knows the library, which is imported where it is first used: it takes
 a second. `make_chain` builds its `Chain` from a list of `JointSpecification`; `link_poses` is
-forward kinematics for any leading shape; `urdf_joints` reads the joints of a URDF. The evaluation
-of costs has kinematics of its own, the faster twin of these: `torchcss.body.kinematics`.
+forward kinematics for any leading shape. The evaluation of costs has kinematics of its own, the
+faster twin of these: `torchcss.body.kinematics`.
 """
 
 from __future__ import annotations
@@ -61,6 +61,9 @@ def make_chain(joints: Sequence[JointSpecification]) -> Chain:
 
     Args:
         joints: Joints that `check_joints` accepts.
+
+    Raises:
+        BodyError: If the links hang on each other hundreds deep.
     """
     import pytorch_kinematics as pk
 
@@ -84,7 +87,10 @@ def make_chain(joints: Sequence[JointSpecification]) -> Chain:
             frames[None] = frame
         else:
             frames[joint.parent].add_child(frame)
-    return pk.Chain(frames[None], dtype=torch.float64)
+    try:
+        return pk.Chain(frames[None], dtype=torch.float64)
+    except RecursionError as error:
+        raise BodyError("links hundreds deep; expected a body or a robot") from error
 
 
 def link_order(joints: Sequence[JointSpecification]) -> list[str]:
@@ -128,36 +134,6 @@ def offset_matrix(joint: JointSpecification) -> Float[np.ndarray, "4 4"]:
     matrix[:3, :3] = left @ right
     matrix[:3, 3] = joint.translation
     return matrix
-
-
-def urdf_joints(data: bytes) -> list[JointSpecification]:
-    """Joints of a URDF of one tree, depth first: names and kinds, no numbers.
-
-    The library keeps seven digits of origins and axes, and no limits.
-
-    Args:
-        data: The file, of links and joints alone: what else it holds the library may stumble over.
-
-    Raises:
-        BodyError: If the library cannot read it.
-    """
-    import pytorch_kinematics as pk
-
-    try:
-        chain = pk.build_chain_from_urdf(data)
-    except Exception as error:  # it raises many kinds, all of them mean a bad file
-        reason = " ".join(str(error).split())
-        raise BodyError(f"pytorch-kinematics cannot read this URDF ({reason})") from error
-    joints: list[JointSpecification] = []
-
-    def visit(frame: pk.Frame, parent: str | None) -> None:
-        name, kind = frame.joint.name or "root", frame.joint.joint_type
-        joints.append(JointSpecification(name=name, link=frame.name, parent=parent, kind=kind))
-        for child in frame.children:
-            visit(child, frame.name)
-
-    visit(chain._root, None)
-    return joints
 
 
 def check_joints(joints: Sequence[JointSpecification]) -> None:

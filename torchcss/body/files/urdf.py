@@ -1,12 +1,11 @@
 """A body from a URDF file: its tree, limits, simple solids and boxes of meshes.
 
-pytorch-kinematics reads the tree (`torchcss.body.chain.urdf_joints`). Limits and mimic joints,
-which it leaves out, and origins and axes, of which it keeps seven digits, are read here, and the
-file is screened before it sees it. A floating joint of
-the root link is a free root, and what hangs on that link beside it is left out. Solids are boxes,
-cylinders, spheres and capsules: the visual ones of a link, or where it has none those for
-collisions. A link that has only meshes is as large as the box around them, in its own frame, if
-they are STL files in the folder of the URDF or below it; others are not opened.
+The parser of pytorch-kinematics leaves limits and mimic joints out, and keeps seven digits of
+origins and axes: the file is read here. A floating joint of the root link is a free root, and what
+hangs on that link beside it is left out. Solids are boxes, cylinders, spheres and capsules: the
+visual ones of a link, or where it has none those for collisions. A link that has only meshes is as
+large as the box around them, in its own frame, if they are STL files in the folder of the URDF or
+below it; others are not opened.
 
 Call `read_urdf`; `torchcss.load_body("x.urdf")` does.
 """
@@ -25,7 +24,7 @@ import numpy as np
 from jaxtyping import Float
 
 from torchcss.body.catalog import PartSpecification
-from torchcss.body.chain import JointSpecification, check_joints, link_order, urdf_joints
+from torchcss.body.chain import JointSpecification, check_joints, link_order
 from torchcss.body.files.bvh import HungTree
 from torchcss.body.files.default_shape import solid_shape, unopened_meshes
 from torchcss.body.files.stl import stl_points
@@ -71,7 +70,7 @@ def read_urdf(
     notes = ["limits, axes and solids: as the URDF says"]
     floats = _take_off_the_world(robot, notes)
     elements = {element.get("name", ""): element for element in robot.findall("joint")}
-    _check_tree(robot, elements)
+    root = _check_links(robot, elements)
     for name, element in elements.items():
         mimic = element.find("mimic")
         if mimic is not None and mimic.get("joint") not in elements:
@@ -80,23 +79,15 @@ def read_urdf(
                 f"joint {name!r} mimics {mimic.get('joint')!r}, which is no joint: it is taken as "
                 "free"
             )
-    joints = [
-        joint if joint.parent is None else _completed(joint, elements[joint.name])
-        for joint in _bare_joints(robot)
-    ]
+    joints = _tree(root, elements)
+    links = {link.get("name", "") for link in robot.findall("link")}
+    if beside := links - {joint.link for joint in joints}:
+        raise BodyError(f"the links {sorted(beside)} form a loop")
     solids = _solids(robot)
     solids += _boxes_of_meshes(robot, folder.resolve(), {part.link for part in solids}, notes)
     check_joints(joints)
     places = tuple(link_order(joints))
     return HungTree(tuple(joints), {}, tuple(notes), places, floats), solids
-
-
-def _bare_joints(robot: ElementTree.Element) -> list[JointSpecification]:
-    """Joints without numbers."""
-    if robot.find("joint") is None:
-        name = robot.findall("link")[0].get("name", "")
-        return [JointSpecification(name="root", link=name, parent=None)]
-    return urdf_joints(ElementTree.tostring(_kinematics_only(robot)))
 
 
 def _take_off_the_world(robot: ElementTree.Element, notes: list[str]) -> bool:
@@ -127,8 +118,8 @@ def _take_off_the_world(robot: ElementTree.Element, notes: list[str]) -> bool:
     return True
 
 
-def _check_tree(robot: ElementTree.Element, joints: Mapping[str, ElementTree.Element]) -> None:
-    """Names, types, and that the links form one tree."""
+def _check_links(robot: ElementTree.Element, joints: Mapping[str, ElementTree.Element]) -> str:
+    """Check names and types, and that every link but one hangs on one joint; returns that one."""
     if len(joints) != len(robot.findall("joint")) or "" in joints:
         raise BodyError("two joints have the same name, or one has none")
     for name, element in joints.items():
@@ -147,13 +138,10 @@ def _check_tree(robot: ElementTree.Element, joints: Mapping[str, ElementTree.Ele
         raise BodyError(f"joints name links that do not exist: {sorted(unknown)}")
     if len(set(children)) != len(children) or len(set(links)) != len(links):
         raise BodyError("a link occurs twice, or hangs on two joints")
-    reached = [link for link in links if link not in children]
-    if len(reached) != 1:
-        raise BodyError(f"expected exactly one root link, found {sorted(reached)}")
-    for link in reached:  # grows while it is walked: breadth first
-        reached += [below for below, above in zip(children, parents, strict=True) if above == link]
-    if len(reached) != len(links):
-        raise BodyError(f"the links {sorted(set(links) - set(reached))} form a loop")
+    roots = [link for link in links if link not in children]
+    if len(roots) != 1:
+        raise BodyError(f"expected exactly one root link, found {sorted(roots)}")
+    return roots[0]
 
 
 def _link(element: ElementTree.Element, tag: str) -> str:
@@ -164,37 +152,37 @@ def _link(element: ElementTree.Element, tag: str) -> str:
     return child.get("link", "")
 
 
-def _kinematics_only(robot: ElementTree.Element) -> ElementTree.Element:
-    """The robot without meshes, inertias and limits, which the parser would only stumble over."""
-    bare = ElementTree.Element("robot", name="robot")
-    for link in robot.findall("link"):
-        ElementTree.SubElement(bare, "link", name=link.get("name", ""))
-    for joint in robot.findall("joint"):
-        # Files often give fixed joints the axis 0 0 0.
-        wanted = ("parent", "child", "origin", "axis")[: 3 if joint.get("type") == "fixed" else 4]
-        plain = {key: joint.get(key, "") for key in ("name", "type")}
-        ElementTree.SubElement(bare, "joint", plain).extend(
-            part for tag in wanted if (part := joint.find(tag)) is not None
-        )
-    return bare
+def _tree(root: str, elements: Mapping[str, ElementTree.Element]) -> list[JointSpecification]:
+    """What hangs on a link, depth first."""
+    joints, ahead = [JointSpecification(name="root", link=root, parent=None)], []
+    while True:
+        here = joints[-1].link
+        ahead = [each for each in elements.values() if _link(each, "parent") == here] + ahead
+        if not ahead:
+            return joints
+        joints.append(_joint(ahead.pop(0)))
 
 
-def _completed(joint: JointSpecification, element: ElementTree.Element) -> JointSpecification:
+def _joint(element: ElementTree.Element) -> JointSpecification:
     """A joint with its numbers and with what it mimics."""
-    where, axis = f"joint {joint.name!r}", element.find("axis")
+    name, kind = element.get("name", ""), element.get("type", "")
+    where, axis = f"joint {name!r}", element.find("axis")
     translation, rotation = _origin(where, element)
-    joint = replace(joint, translation=translation, rotation=rotation)
-    if joint.kind != "fixed":
+    joint = JointSpecification(
+        name=name,
+        link=_link(element, "child"),
+        parent=_link(element, "parent"),
+        kind="revolute" if kind == "continuous" else kind,
+        translation=translation,
+        rotation=rotation,
+    )
+    if kind != "fixed":  # files often give fixed joints the axis 0 0 0
         text = "1 0 0" if axis is None else axis.get("xyz", "1 0 0")
         x, y, z = _numbers(where, "axis", text, 3)
         joint = replace(joint, axis=(x, y, z))
     limit, mimic = element.find("limit"), element.find("mimic")
     try:
-        if (
-            limit is not None
-            and element.get("type") != "continuous"
-            and {"lower", "upper"} & set(limit.keys())
-        ):
+        if limit is not None and kind != "continuous" and {"lower", "upper"} & set(limit.keys()):
             lower, upper = (float(limit.get(end, 0.0)) for end in ("lower", "upper"))
             joint = replace(joint, lower=lower, upper=upper)
         if mimic is None:
