@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import pytest
@@ -14,7 +13,6 @@ from torchcss.body.catalog import BODY_NAMES, LENGTHS, PLACES, PROPORTIONS, spec
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel, differentiate_twice
 from torchcss.cost.anthropometric import INDIVIDUAL, Anthropometric, proportion_columns
-from torchcss.errors import ConfigurationError
 from torchcss.initialise.multi_start import PAPER_PROPORTIONS, StartSearch
 from torchcss.types import LocalModel
 
@@ -186,11 +184,3 @@ def test_far_out_it_stays_finite(dtype: torch.dtype, far: float) -> None:
     x = torch.stack([body.rest + far, body.rest - far, far * body.rest.sin().sign()])
     for part in PRIOR.local_model(x, body):
         assert bool(part.isfinite().all())
-
-
-@pytest.mark.parametrize(
-    "bad", [{"stature": -0.1}, {"individual": 0.0}, {"stature": math.nan}, {"individual": math.inf}]
-)
-def test_choices_that_make_no_sense(bad: dict[str, float]) -> None:
-    with pytest.raises(ConfigurationError):
-        Anthropometric(**bad)

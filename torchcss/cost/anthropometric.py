@@ -34,8 +34,6 @@ otherwise count twice: `proportion_columns(body)` says which parameters those ar
 
 from __future__ import annotations
 
-import math
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -44,7 +42,6 @@ from torchcss.body.catalog import PLACES, PROPORTIONS, without_side
 from torchcss.body.model import BodyModel
 from torchcss.cost.context import FrameContext
 from torchcss.cost.term import OnStates, Term
-from torchcss.errors import ConfigurationError
 from torchcss.types import LocalModel, frozen
 
 INDIVIDUAL: dict[str, float] = {
@@ -85,21 +82,12 @@ class Anthropometric(Term):
 
     Attributes:
         stature: Relative standard deviation of the common scale.
-        individual: Factor on the relative deviations of the single lengths, `INDIVIDUAL`.
     """
 
     name = "anthropometric"
     kind = "prior"
 
     stature: float = 0.039
-    individual: float = 1.0
-
-    def __post_init__(self) -> None:
-        if not (0 <= self.stature < math.inf and 0 < self.individual < math.inf):
-            raise ConfigurationError(
-                "Anthropometric: expected a stature that is not negative and a positive individual "
-                f"factor, got {self.stature} and {self.individual}; leave them out for the defaults"
-            )
 
     def prepare(self, context: FrameContext) -> OnStates | None:
         """Bind the prior to a body; None if it has no free lengths."""
@@ -148,4 +136,4 @@ class Anthropometric(Term):
         places = torch.tensor([name in PLACES for name in names]).to(lengths.device, torch.bool)
         own = body.tie.new_tensor([INDIVIDUAL.get(name, _OF_PLACES) for name in names])
         extent = torch.where(places, lengths, standard)
-        return self.stature * standard, self.individual * own * extent
+        return self.stature * standard, own * extent
