@@ -68,6 +68,10 @@ _H36M_END = _columns("skull_tip l_shoulder l_elbow l_wrist r_shoulder r_elbow r_
 # AlphaPose's body with feet: COCO's order, then MPII's head top, upper neck and hips' middle, then
 # big toes, small toes and heels. Face and hands follow in the layout of 136.
 _HALPE = (*_COCO, *_columns("skull_tip vc7 HumanoidRoot l_toe r_toe - - l_heel r_heel"))
+_MHR = (
+    *(*_COCO[:9], *_COCO[11:], *_COCO_FEET),
+    *(*20 * (None,), "r_wrist", *20 * (None,), "l_wrist", *6 * (None,), "vt1"),
+)
 _FACE_AND_HANDS = (None,) * 110
 
 ALIASES: Final[dict[str, tuple[str | None, ...]]] = {
@@ -79,6 +83,9 @@ ALIASES: Final[dict[str, tuple[str | None, ...]]] = {
     "COCO-18": (*_OPENPOSE_ARMS, *_OPENPOSE_LEGS, *_OPENPOSE_HEAD),
     # MMPose, RTMPose and DWPose: COCO's order and the feet, then face and hands.
     "COCO-133": (*_COCO, *_COCO_FEET, *_FACE_AND_HANDS),
+    # SAM 3D Body, and Sapiens with a face: wrists stand behind their fingers.
+    "MHR-70": _MHR,
+    "Goliath-308": (*_MHR, *238 * (None,)),
     "MPII-16": _columns(
         "r_ankle r_knee r_hip l_hip l_knee l_ankle HumanoidRoot vt1 vc7 skull_tip "
         "r_wrist r_elbow r_shoulder l_shoulder l_elbow l_wrist"

@@ -208,6 +208,9 @@ READERS = (
     Reader("vitpose.json", keypoints),
     Reader("ultralytics.json", keypoints),
     Reader("annotations.json", keypoints),
+    Reader("pandas.json", keypoints),
+    Reader("via.json", keypoints),
+    Reader("labelstudio.json", keypoints),
     Reader("triples.npy", keypoints),
     Reader("sleap.csv", keypoints),
     Reader("sleap.analysis.h5", keypoints),
@@ -271,12 +274,24 @@ def write_keypoints(folder: Path, marks: np.ndarray) -> None:
     annotations = [{"image_id": t, "keypoints": f.ravel().tolist()} for t, f in enumerate(marks)]
     images = [{"id": t, "file_name": f"{t}.png", "width": 64, "height": 48} for t in range(T)]
     skeleton = {str(i): name for i, name in enumerate(names)}
+    named = [dict(zip(names, f[:3, :2].tolist(), strict=True)) for f in marks]
+    heading = [f"{name}_{end}" for name in names for end in ("x", "y", "score")]
     contents: dict[str, Any] = {
         "mmpose": [{"frame_id": t, "instances": [frame]} for t, frame in enumerate(frames)],
         "vitpose": {"keypoints": [{"0": f[:3, [1, 0, 2]].tolist()} for f in marks],
                     "skeleton": skeleton},
         "ultralytics": [[frame] for frame in x],
         "annotations": {"images": images, "annotations": annotations},
+        "pandas": {"columns": heading, "index": [*range(T)],
+                   "data": [f[:3].ravel().tolist() for f in marks]},
+        "via": {f"{t}.png": {"filename": f"{t}.png", "regions": [
+            {"shape_attributes": {"name": "point", "cx": u, "cy": v},
+             "region_attributes": {"joint": name}} for name, (u, v) in each.items()]}
+             for t, each in enumerate(named)},
+        "labelstudio": [{"data": {"image": f"{t}.png"}, "annotations": [{"result": [
+            {"type": "keypointlabels", "original_width": 64, "original_height": 48,
+             "value": {"x": u / 0.64, "y": v / 0.48, "keypointlabels": [name]}}
+             for name, (u, v) in each.items()]}]} for t, each in enumerate(named)],
     }  # fmt: skip
     for name, content in contents.items():
         (folder / f"{name}.json").write_text(json.dumps(content))

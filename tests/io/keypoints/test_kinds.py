@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -12,9 +14,10 @@ import pytest
 import torch
 
 from torchcss.errors import KeypointError
+from torchcss.io.keypoints.annotated import VIA_SHAPE
 from torchcss.io.keypoints.frames import Film
 from torchcss.io.keypoints.one_person import Whom
-from torchcss.io.keypoints.read import read_keypoints, read_person
+from torchcss.io.keypoints.read import Scale, read_keypoints, read_person
 from torchcss.joint_names import ALIASES
 from torchcss.types import Keypoints
 
@@ -192,6 +195,45 @@ JSON_FILES: dict[str, tuple[Any, tuple[int, ...]]] = {
         {f"frame_{t:03d}": dict(zip(TFJS, person(t).tolist(), strict=True)) for t in T},
         (),
     ),
+    "scores of several people beside their joints": (
+        [
+            {"frame": t, "keypoints": [p[:, :2].tolist() for p in (other(t), person(t))],
+             "scores": [p[:, 2].tolist() for p in (other(t), person(t))]}
+            for t in T
+        ],
+        (),
+    ),
+    "scores of all frames beside the joints": (
+        {"keypoints": [[person(t)[:, :2].tolist()] for t in T],
+         "scores": [[person(t)[:, 2].tolist()] for t in T]},
+        (),
+    ),
+    "joints numbered from 100": (
+        [
+            {"frame": t, "keypoints": [
+                {"id": 100 + i, "x": x, "y": y, "score": c} for i, (x, y, c) in enumerate(person(t))
+            ]}
+            for t in T
+        ],
+        (),
+    ),
+    "a skeleton's names": (
+        [
+            {"frame": t, "joints": {
+                f"{side}_{word}_joint": dict(
+                    zip(("x", "y", "confidence"), person(t)[COCO.index(f"{side[0]}_{place}")],
+                        strict=True)
+                )
+                for side in ("left", "right")
+                for place, word in (
+                    ("shoulder", "shoulder_1"), ("elbow", "forearm"), ("wrist", "hand"),
+                    ("hip", "upLeg"), ("knee", "leg"), ("ankle", "foot"),
+                )
+            } | {"nose": {"x": 320 + 3 * t, "y": 100 + t, "confidence": 0.6}}}
+            for t in T
+        ],
+        (),
+    ),
     "times in seconds": (
         [{"time": t / 25, "keypoints": person(t).tolist()} for t in SEEN],
         (3,),
@@ -202,7 +244,9 @@ JSON_FILES: dict[str, tuple[Any, tuple[int, ...]]] = {
 @pytest.mark.parametrize("kind", JSON_FILES)
 def test_json(tmp_path: Path, kind: str) -> None:
     content, empty = JSON_FILES[kind]
-    check(read(write(tmp_path / "a.json", content)), empty)
+    found = read(write(tmp_path / "a.json", content))
+    check(found, empty)
+    assert float(found.confidence[0, found.names.index("nose")]) == pytest.approx(0.6)
 
 
 FOLDERS: dict[str, Callable[[int], tuple[str, Any]]] = {
@@ -305,7 +349,136 @@ def test_yolo_labels(tmp_path: Path, more: str, size: int) -> None:
     check(read(tmp_path), (3,))
 
 
+# Points that somebody marked.
+
+
+def via_regions(p: np.ndarray, **more: str) -> list[dict[str, Any]]:
+    box = {"shape_attributes": {"name": "rect", "x": 1}, "region_attributes": {"what": "dog"}}
+    return [box] + [
+        {"shape_attributes": {"name": "point", "cx": round(x), "cy": round(y)},
+         "region_attributes": {"sort": "joint", "what": name, **more}}
+        for (x, y, _), name in zip(p, TFJS, strict=True)
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("form", ["1", "2", "project", "csv"])
+def test_via(tmp_path: Path, form: str) -> None:
+    """Versions, and two people told apart by an attribute."""
+    regions = {
+        f"f{t}.jpg": via_regions(other(t), person="1") + via_regions(person(t), person="2")
+        for t in SEEN
+    }
+    regions["f3.jpg"] = []
+    if form == "csv":
+        text = io.StringIO()
+        table = csv.writer(text)
+        table.writerow(f"#filename,file_size,{VIA_SHAPE},region_attributes".split(","))
+        for name, own in regions.items():
+            for each in own or [{"shape_attributes": {}, "region_attributes": {}}]:
+                table.writerow([name, 9, *map(json.dumps, each.values())])
+        found = read(write(tmp_path / "via.csv", text.getvalue()))
+    else:
+        content: dict[str, Any] = {
+            f"{name}9": {"filename": name, "size": 9, "file_attributes": {},
+                         "regions": dict(enumerate(own)) if form == "1" else own}
+            for name, own in regions.items()
+        }  # fmt: skip
+        if form == "project":
+            content = {"_via_settings": {}, "_via_img_metadata": content}
+        found = read(write(tmp_path / "via.json", content))
+    check(found, (3,))
+    assert any("joints by 'what'" in line for line in found.report)
+
+
+@pytest.mark.parametrize("form", ["long", "short", "boxes", "relations"])
+def test_label_studio(tmp_path: Path, form: str) -> None:
+    """Percent of a picture of twice the size; people hang on boxes."""
+
+    def marks(p: np.ndarray, who: str) -> list[dict[str, Any]]:
+        return [
+            {"original_width": 1280, "original_height": 960, "image_rotation": 0,
+             "value": {"x": x / 6.4, "y": y / 4.8, "width": 0.3, "keypointlabels": [name]},
+             "id": f"{who}{name}", "from_name": "kp", "type": "keypointlabels"}
+            for (x, y, _), name in zip(p, TFJS, strict=True)
+        ]  # fmt: skip
+
+    content: list[Any] = []
+    for t in T:
+        results = marks(person(t), "b") if t != 3 else []
+        image = f"/data/upload/7/0a1b2c3d-f{t}.jpg"
+        if form in ("boxes", "relations") and t != 3:
+            results += marks(other(t), "a")
+            for mark in results:
+                if form == "boxes":
+                    mark["parentID"] = mark["id"][0]
+            ends = [(mark["id"], mark["id"][0]) for mark in results]
+            results += [{"type": "rectanglelabels", "id": who, "value": {}} for who in "ab"]
+            if form == "relations":
+                results += [{"type": "relation", "from_id": a, "to_id": b} for a, b in ends]
+        done = [{"was_cancelled": True, "result": [{}]}, {"result": results}]
+        task: dict[str, Any] = {"annotations": done, "data": {"image": image}, "predictions": []}
+        if form == "short":
+            kp = [mark | mark.pop("value") for mark in results]
+            task = {"image": image, "id": t, "kp": kp, "annotator": 1}
+        content.append(task)
+    path = write(tmp_path / "a.json", content)
+    check(read(path), (3,))
+    check(read(path, frame_names=[f"f{t}.jpg" for t in T]), (3,))
+    if form == "long":
+        for spoilt in ({"data": 0, "annotations": []}, {**content[0], "annotations": [3]}):
+            with pytest.raises(KeypointError, match=r"task 1: (expected the|not Label)"):
+                read(write(path, [content[0], spoilt]))
+        content[0]["annotations"][1]["result"][0]["image_rotation"] = 90
+        with pytest.raises(KeypointError, match="task 0: annotated in a turned picture"):
+            read(write(path, content))
+
+
 # Arrays.
+
+
+@pytest.mark.parametrize("name", ["a.npy", "a.json"])
+@pytest.mark.parametrize("normalised", [False, "zero-one"])
+def test_movenet_without_its_axes_of_one(
+    tmp_path: Path, name: str, normalised: bool | Scale
+) -> None:
+    """Somebody who stands tells that y is before x; x before y is what the caller says."""
+    upright = np.stack([(person(t) / (*SIZE, 1))[:, [1, 0, 2]] for t in T])
+    other_way = np.stack([(person(t) / (639, 479, 1)) for t in T])
+    path = tmp_path / name
+    for array in (upright, other_way):
+        np.save(path, array) if name == "a.npy" else write(path, array.tolist())
+        if array is upright or normalised:
+            check(read(path, normalised=normalised))
+        else:
+            with pytest.raises(KeypointError, match=r"zero-one .*MoveNet's"):
+                read(path)
+
+
+def test_points_in_space_are_refused(tmp_path: Path) -> None:
+    points = [{"x": 0.1, "y": 0.2, "z": 0.3, "visibility": 0.9}] * 33
+    for key in ("poseWorldLandmarks", "keypoints3D"):
+        path = write(tmp_path / "a.json", [{key: points} for _ in T])
+        with pytest.raises(KeypointError, match=f"{key}' are points in space"):
+            read(path)
+
+
+def test_boxes_beside_plain_arrays_are_no_archive(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", boxes=np.zeros((6, 4)), kpts=np.stack([person(t) for t in T]))
+    check(read(tmp_path / "a.npz"))
+
+
+@pytest.mark.parametrize("layout", ["MHR-70", "Goliath-308"])
+def test_wrists_behind_their_fingers(tmp_path: Path, layout: str) -> None:
+    names = ALIASES[layout]
+    assert [names.index(f"{side}_wrist") for side in "lr"] == [62, 41]
+    np.save(tmp_path / "a.npy", np.stack([person(t, names) for t in T]))
+    check(read(tmp_path / "a.npy"))
+
+
+def test_a_column_that_counts_the_rows(tmp_path: Path) -> None:
+    rows = np.stack([[t, *person(t).flat] for t in T])  # 52 numbers: not 26 pairs
+    np.save(tmp_path / "a.npy", rows)
+    check(read(tmp_path / "a.npy"))
 
 
 @pytest.mark.parametrize("form", ["triples", "pairs", "row", "people", "scores", "movenet"])
@@ -348,6 +521,65 @@ def test_detections_of_videopose3d(tmp_path: Path) -> None:
 
 
 # Tables.
+
+
+@pytest.mark.parametrize("labels", ["columns", "DeepLabCut's", "DeepLabCut's as text"])
+@pytest.mark.parametrize("form", ["split", "index", "columns", "records", "table", "lines"])
+def test_pandas_json(tmp_path: Path, form: str, labels: str) -> None:
+    heads: list[Any] = [[name, kind] for name in TFJS for kind in ("x", "y", "likelihood")]
+    if labels == "columns":
+        heads = ["frame", *map("_".join, heads)]
+    elif form == "split":
+        heads = [["net", *each] for each in heads]
+    elif labels.endswith("text"):
+        heads = [f"{('net', *each)}" for each in heads]
+    else:
+        heads = list(map(" ".join, heads))
+    data = [([t] if labels == "columns" else []) + person(t).ravel().tolist() for t in T]
+    records = [dict(zip(map(str, heads), row, strict=True)) for row in data]
+    content: Any = {
+        "split": {"columns": heads, "index": [*T], "data": data},
+        "index": {str(t): each for t, each in enumerate(records)},
+        "columns": {head: {str(t): records[t][head] for t in T} for head in records[0]},
+        "records": records,
+        "table": {"schema": {"fields": []}, "data": [{"index": t, **records[t]} for t in T]},
+        "lines": "\n".join(map(json.dumps, records)),
+    }[form]  # fmt: skip
+    found = read(write(tmp_path / "a.json", content))
+    check(found)
+    assert float(found.confidence[0, found.names.index("nose")]) == 0.6
+
+
+def test_pandas_json_of_a_row_a_joint(tmp_path: Path) -> None:
+    rows = [
+        {"frame": t, "joint": name, "x": x, "y": y, "score": c}
+        for t in SEEN
+        for name, (x, y, c) in zip(TFJS, person(t), strict=True)
+    ]
+    check(read(write(tmp_path / "a.json", rows)), (3,))
+
+
+def test_pixels_beside_fractions(tmp_path: Path) -> None:
+    rows = [
+        [t, *np.column_stack([p[:, :2] / SIZE, p]).flat] for t, p in ((t, person(t)) for t in T)
+    ]
+    heading = ["frame", *ends("_x", "_y", "_x_px", "_y_px", "_s")]
+    check(read(write(tmp_path / "a.csv", wide(heading, rows))))
+
+
+def test_body_and_face_of_mediapipe(tmp_path: Path) -> None:
+    """Numbers of the body before those of the face, in a table or an array with the hands."""
+    layout, rows = ALIASES["MediaPipe-33"], np.full((FRAMES, 501, 4), 0.4)
+    for t in T:
+        p = person(t, layout)
+        rows[t, :33] = np.column_stack([(p[:, :2] + 0.5) / SIZE, p[:, 2:], p[:, 2:]])
+    heading = ["class", *(f"{kind}{i}" for i in range(1, 502) for kind in "xyzv")]
+    text = wide(heading, [["squat", *each.flat] for each in rows])
+    check(read(write(tmp_path / "a.csv", text)))
+    holistic = np.full((FRAMES, 1662), 0.4)
+    holistic[:, :132] = rows[:, :33].reshape(FRAMES, -1)
+    np.save(tmp_path / "a.npy", holistic)
+    check(read(tmp_path / "a.npy"))
 
 
 def table(names: tuple[str, ...], ends: tuple[str, str, str], rows: list[list[Any]]) -> str:

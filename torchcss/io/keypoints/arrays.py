@@ -34,7 +34,7 @@ from torchcss.io.keypoints.words import FRAMES, ORDER_NAMES, SCORES, SIZES, firs
 from torchcss.joint_names import names_in
 from torchcss.types import Keypoints
 
-_PLACES = names_in("keypoints keypoints2d joints2d kps poses positions pose joints")
+_PLACES = names_in("keypoints keypoints2d joints2d kps kpts poses positions pose joints")
 MOST_BYTES = 2**31
 """Bytes of the largest set of arrays of keypoints: as of 33 people with 133 in 20,000 frames."""
 
@@ -54,20 +54,21 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
     name = first_of({key: key for key in numbers}, _PLACES)
     if len(arrays) == 1:
         (name,) = arrays
-        if is_landmark_array(arrays[name]):
-            return read_landmark_array(name, arrays[name])
+    array, counts = _numbered(arrays.get(name or "", np.zeros(0)))
+    if len(arrays) == 1 and is_landmark_array(array):
+        return read_landmark_array(name or "", array)
     if name is None:
         raise KeypointError(
             f"expected the arrays keypoints, confidence and joint_names, "
             f"found {shortened(', '.join(arrays) or 'none')}"
         )
     report = [f"format: {path.suffix[1:].upper()}"]
-    values = _people(name, arrays[name])
-    is_movenet = _is_movenet(arrays[name], alone=len(arrays) == 1)
+    values = _people(name, array)
+    from_movenet = is_movenet(array, alone=len(arrays) == 1)
     if len(values) == 1 and values.shape[1] > _MOST_PEOPLE:
         values = values.swapaxes(0, 1)
         report.append(f"{name}: one person in {len(values)} frames, which are the second axis")
-    if is_movenet:
+    if from_movenet:
         values = values[..., [1, 0, 2]]
         report = ["format: MoveNet's arrays, y before x, fractions of the image"]
     if (given := first_of(arrays, SCORES)) is not None:
@@ -91,10 +92,10 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
     noise = _positive("relative_noise", arrays.get("relative_noise"), 1)
     texts = {key: each for key, each in texts.items() if each.shape == values.shape[2:3]}
     return People(
-        _counted(people, first_of(numbers, FRAMES)),
+        _counted(people, first_of({**numbers, "frame": counts}, FRAMES)),
         _names(arrays.get("joint_names", first_of(texts, ORDER_NAMES)), values.shape[2]),
         report,
-        corner_fractions=is_movenet,
+        corner_fractions=from_movenet,
         size_wh=None if size is None else (size[0], size[1]),
         relative_noise=noise[0] if noise else 1.0,
     )
@@ -120,12 +121,26 @@ def read_points(path: Path, keypoints: Keypoints) -> Keypoints:
     return keypoints._replace(points=points[torch.arange(len(gap)), gap.argmin(1)])
 
 
-def _is_movenet(array: np.ndarray, *, alone: bool) -> bool:
-    """Whether these are MoveNet's arrays, of many people, or of pictures one after the other."""
+def _numbered(array: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """A table without the column that counts its rows, and that column."""
+    is_table = array.ndim == 2 and array.dtype.kind in "iuf" and len(array) > 2 < array.shape[1]
+    if is_table and (np.diff(array[:, 0]) == 1).all():
+        return array[:, 1:], array[:, 0]
+    return array, None
+
+
+def is_movenet(array: np.ndarray, *, alone: bool = True) -> bool:
+    """Whether an array is MoveNet's: y, x, confidence, fractions of the image.
+
+    Of joints in a row of people or pictures that is told by the trunk, which is rather upright.
+    """
     if array.ndim == 5 or array.shape[-1] == 56:
         return True
-    one = alone and array.shape[1:] == (1, 17, 3)
-    return one and bool(((array >= 0) & (array <= 1)).all())
+    if not alone or array.shape[-2:] != (17, 3) or not bool(((array >= 0) & (array <= 1)).all()):
+        return False
+    trunk = np.abs(array[..., (5, 6), :2].mean(-2) - array[..., (11, 12), :2].mean(-2))
+    upright = (trunk[..., 0] > trunk[..., 1])[trunk.any(-1)]
+    return array.shape[1:-2] == (1,) or bool(len(upright) and upright.mean() > 0.5)
 
 
 def _counted(people: list[list[Person]], numbers: np.ndarray | None) -> list[list[Person]] | Frames:

@@ -12,7 +12,15 @@ from typing import Any
 from torchcss.errors import KeypointError
 from torchcss.files import unexpected
 from torchcss.io.keypoints.json_people import listed, one_person, said_size
-from torchcss.io.keypoints.people import Frames, Key, Names, People, Person, track_of
+from torchcss.io.keypoints.people import (
+    Frames,
+    Key,
+    Names,
+    People,
+    Person,
+    one_size,
+    track_of,
+)
 from torchcss.io.video import natural_order
 from torchcss.joint_names import canonical_joint_name
 
@@ -82,7 +90,4 @@ def _by_images(
     frames: Frames = {
         str(image.get("file_name", image["id"])): found.get(image["id"], []) for image in ordered
     }
-    sizes = {said_size(image) for image in images}
-    if len(sizes) > 1:
-        raise KeypointError("pictures of several sizes; expected those of one video")
-    return frames, next(iter(sizes), None)
+    return frames, one_size({said_size(image) for image in images})

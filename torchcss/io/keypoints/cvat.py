@@ -15,7 +15,7 @@ from torchcss.body.files.xml import parse_xml
 from torchcss.errors import KeypointError
 from torchcss.files import unexpected
 from torchcss.io.keypoints.frames import plain_name
-from torchcss.io.keypoints.people import Frames, Key, People, Person, united
+from torchcss.io.keypoints.people import Frames, Key, People, Person, one_size, united
 
 _HIDDEN = 0.5
 """Confidence of a joint that is marked as occluded: where it is was guessed."""
@@ -51,9 +51,7 @@ def read_cvat(path: Path) -> People:
         (each.findtext("width"), each.findtext("height")) for each in root.iter("original_size")
     ]
     sizes = {*said, *((each.get("width"), each.get("height")) for each in pictures)}
-    if len(sizes) > 1:
-        raise KeypointError("pictures of several sizes; expected those of one video")
-    width, height = (int(n) if n and n.isdecimal() else 0 for n in next(iter(sizes), ("", "")))
+    width, height = (int(n) if n and n.isdecimal() else 0 for n in one_size(sizes) or ("", ""))
     return People(
         people, names, ["format: CVAT's XML"], first=None if pictures else 0, whole=bool(pictures),
         size_wh=(width, height) if width and height else None,

@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,13 @@ import numpy as np
 
 from torchcss.errors import KeypointError
 from torchcss.files import load_json, read_text, shortened, unexpected
-from torchcss.io.keypoints.arrays import read_arrays
+from torchcss.io.keypoints.annotated import (
+    is_label_studio,
+    is_via,
+    read_label_studio,
+    read_via,
+)
+from torchcss.io.keypoints.arrays import is_movenet, read_arrays
 from torchcss.io.keypoints.clicked import is_clicked, read_clicked
 from torchcss.io.keypoints.coco import read_coco
 from torchcss.io.keypoints.frames import files_of, in_seconds, plain_name
@@ -33,6 +40,7 @@ from torchcss.io.keypoints.json_people import (
     listed,
     people_of,
     said_size,
+    scored,
 )
 from torchcss.io.keypoints.mediapipe import LAYOUT, NUM_LANDMARKS, reordered
 from torchcss.io.keypoints.people import (
@@ -45,8 +53,10 @@ from torchcss.io.keypoints.people import (
     is_there,
     joint_counts,
     number_array,
+    one_size,
     united,
 )
+from torchcss.io.keypoints.tables import people_of_rows, rows_of_json
 from torchcss.io.keypoints.words import FRAMES, ORDER_NAMES, PICTURES, TIMES, first_of, time_word
 from torchcss.io.video import natural_order
 
@@ -76,9 +86,15 @@ def read_json(path: Path, image_size_wh: Size, num_frames: int | None) -> People
         KeypointError: If it is none of the formats; the message says where.
     """
     content = _load(path)
-    if (array := _five_deep(content)) is not None:
+    if (array := _plain_array(content)) is not None and is_movenet(array):
         return read_arrays(path, {path.name: array})
+    if is_label_studio(content):
+        return read_label_studio(content)
+    if (rows := rows_of_json(content)) is not None:
+        return people_of_rows(rows)
     if isinstance(content, dict):
+        if is_via(content):
+            return read_via(content)
         if "annotations" in content:
             return read_coco(content)
         if "skeleton" in content and isinstance(content.get("keypoints"), list):
@@ -104,8 +120,7 @@ def read_folder(path: Path) -> People:
     contents = [_load(file) for file in files]
     name = _format_of(contents[0])
     sizes = {said_size(content) for content in contents}
-    if len(sizes - {None}) > 1:
-        raise KeypointError("pictures of several sizes; expected those of one video")
+    size = one_size(sizes - {None})
     # Who labels pictures may call the files otherwise than the pictures.
     said = [first_of(each, PICTURES) if isinstance(each, dict) else None for each in contents]
     keys = [plain_name(each) for each in said if isinstance(each, str)]
@@ -120,7 +135,7 @@ def read_folder(path: Path) -> People:
     names = names or _said_names(contents[0], frames)
     people = _people(f"{name}, {len(files)} files", frames, names)
     # A labelled picture has a file; of a video every frame has one.
-    return people._replace(whole=name != "labelme", size_wh=max(sizes, key=bool))
+    return people._replace(whole=name != "labelme", size_wh=size)
 
 
 def _people(name: str, frames: Frames, names: Names | None, *, in_order: bool = False) -> People:
@@ -137,12 +152,14 @@ def _people(name: str, frames: Frames, names: Names | None, *, in_order: bool = 
     return People(found, names, [f"format: {name}"])
 
 
-def _five_deep(content: object) -> np.ndarray | None:
-    """What MoveNet returns, `[T 1 1 17 3]`, if it is that."""
+def _plain_array(content: object) -> np.ndarray | None:
+    """Lists of lists of numbers alone, as what MoveNet returns."""
     inner, depth = content, 0
     while isinstance(inner, list) and inner and depth < 5:
         inner, depth = inner[0], depth + 1
-    return number_array(content, "MoveNet's") if depth == 5 and isinstance(inner, float) else None
+    with suppress(KeypointError):
+        return number_array(content, "") if depth > 2 and isinstance(inner, float) else None
+    return None
 
 
 def _load(path: Path) -> Any:
@@ -205,7 +222,7 @@ def _frames(path: Path, content: Any, num_frames: int | None) -> list[list[Perso
             return _frames(path, inner, num_frames)
         inner = content.get(key_of(content, (*PEOPLE, *JOINTS)) or "")
         if isinstance(inner, list) and 1 < len(inner) == num_frames and not is_joints(inner):
-            return _frames(path, inner, num_frames)
+            return _frames(path, scored(inner, content), num_frames)
         if inner is not None or "shapes" in content:
             return [people_of(str(path), content)]
         if content and all(isinstance(value, (dict, list)) for value in content.values()):

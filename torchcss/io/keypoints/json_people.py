@@ -10,6 +10,7 @@ Call `people_of`.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -17,6 +18,7 @@ import numpy as np
 
 from torchcss.errors import KeypointError
 from torchcss.files import unexpected
+from torchcss.io.keypoints.annotated import labelme_people
 from torchcss.io.keypoints.people import (
     LAYOUT_SIZES,
     MOST_JOINTS,
@@ -58,7 +60,7 @@ def people_of(where: str, value: Any, *, alone: bool = False) -> list[Person]:
         return []
     if isinstance(value, dict):
         if "shapes" in value:
-            return _labelme(where, value["shapes"])
+            return labelme_people(where, value["shapes"])
         if (key := key_of(value, PEOPLE)) is not None:
             if not isinstance(value[key], (list, dict, type(None))):
                 raise KeypointError(f"{where}: expected a list {key!r}")
@@ -68,7 +70,7 @@ def people_of(where: str, value: Any, *, alone: bool = False) -> list[Person]:
             if isinstance(inner, dict) and key_of(inner, JOINTS) is not None:
                 return people_of(where, inner)
             if isinstance(inner, list) and inner and not is_joints(inner) and not _flat(inner):
-                return people_of(f"{where}: {key}", inner)
+                return people_of(f"{where}: {key}", scored(inner, value))
             return one_person(f"{where}: {key}", inner, value)
         named = {key: each for key, each in value.items() if is_joints([each])}
         rest = [each for key, each in value.items() if key not in named]
@@ -77,6 +79,8 @@ def people_of(where: str, value: Any, *, alone: bool = False) -> list[Person]:
         if alone or not all(isinstance(each, (list, dict)) for each in value.values()):
             what = "keypoints (docs/guide.md lists the formats; most programs export COCO's)"
             raise unexpected(KeypointError, where, what, list(value))
+        if space := [key for key in value if re.search("world|3d", plain_word(key))]:
+            raise KeypointError(f"{where}: {space[0]!r} are points in space; expected pixels")
         # By the people's own numbers.
         return [
             person._replace(track=person.track or key)
@@ -92,6 +96,20 @@ def people_of(where: str, value: Any, *, alone: bool = False) -> list[Person]:
             for person in people_of(f"{where}[{index}]", each)
         ]
     raise unexpected(KeypointError, where, "people with keypoints", value)
+
+
+def scored(people: list[Any], around: Mapping[str, Any]) -> list[Any]:
+    """People, or frames of them, whose joints are pairs, with what stands beside all as scores."""
+    scores = first_of({k: each for k, each in around.items() if isinstance(each, list)}, SCORES)
+    first = people
+    while isinstance(first, list) and first and isinstance(first[0], list):
+        first = first[0]
+    if scores is None or len(first) != 2 or len(scores) != len(people) or not all(
+        isinstance(own, list) and isinstance(each, list) and len(own) == len(each)
+        for own, each in zip(scores, people, strict=True)
+    ):  # fmt: skip
+        return people
+    return [{"keypoints": k, "scores": s} for k, s in zip(people, scores, strict=True)]
 
 
 def key_of(entry: Mapping[str, Any], words: Sequence[str]) -> str | None:
@@ -219,26 +237,6 @@ def _row(where: str, row: Any) -> list[float]:
     if values.shape not in ((2,), (3,)):
         raise unexpected(KeypointError, where, "x, y[, confidence]", row)
     return [*values.tolist(), np.nan][:3]
-
-
-def _labelme(where: str, shapes: object) -> list[Person]:
-    """People whose joints are labelled as points, by the number of their group."""
-    people: dict[str, dict[str, list[float]]] = {}
-    for index, shape in enumerate(listed(shapes)):
-        if not isinstance(shape, dict) or shape.get("shape_type") != "point":
-            continue
-        place = f"{where}: shape {index}"
-        point = number_array(shape.get("points"), place)
-        if point.shape != (1, 2):
-            raise unexpected(KeypointError, place, "one point", point.tolist())
-        group = people.setdefault(str(shape.get("group_id")), {})
-        label = str(shape.get("label"))
-        if label in group:
-            raise KeypointError(f"{place}: {label!r} twice; give people a group_id of their own")
-        group[label] = [*point[0].tolist(), 1.0]
-    return [
-        Person.by_name(joints, None if key == "None" else key) for key, joints in people.items()
-    ]
 
 
 def heads(content: object) -> list[dict[str, Any]]:

@@ -20,12 +20,16 @@ from torchcss.io.keypoints.people import (
     Names,
     People,
     Person,
+    joint_counts,
     screened,
 )
 from torchcss.joint_names import ALIASES, names_in
 
 LAYOUT = "MediaPipe-33"
 NUM_LANDMARKS = len(ALIASES[LAYOUT])
+_FACE, _HAND = 468, 21
+_HOLISTIC = 4 * NUM_LANDMARKS + 3 * (_FACE + 2 * _HAND)
+"""Numbers of the landmarks of body, face and hands in a row, the body's first."""
 
 MEDIAPIPE_NAMES = names_in(
     "nose left_eye_inner left_eye left_eye_outer right_eye_inner right_eye right_eye_outer "
@@ -46,8 +50,11 @@ def reordered(frames: Frames, names: Sequence[str]) -> tuple[Frames, Names | Non
     """
     plain = [re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_") for name in names]
     if plain and all(map(str.isdecimal, plain)):
-        return _by_number(frames, [int(number) for number in plain]), None
-    if set(plain) == set(MEDIAPIPE_NAMES):
+        frames = _by_number(frames, [int(number) for number in plain])
+        order = [*range(NUM_LANDMARKS)]
+        if joint_counts(frames) != {NUM_LANDMARKS + _FACE}:  # body and face
+            return frames, None
+    elif set(plain) == set(MEDIAPIPE_NAMES):
         order = [plain.index(name) for name in MEDIAPIPE_NAMES]
     else:
         return frames, tuple(names) or None
@@ -65,7 +72,8 @@ def _by_number(frames: Frames, numbers: Sequence[int]) -> Frames:
     """
     low, high = min(numbers), max(numbers)
     first = low
-    if (high - low + 1, low > 1) != (len(numbers), False):  # some are left out
+    numbered_on = low % 100 == 0 and len(numbers) in LAYOUT_SIZES  # the second person's: 100, 101
+    if high - low + 1 != len(numbers) or (low > 1 and not numbered_on):  # some are left out
         firsts = [f for f in (0, 1) if f <= low and high - f + 1 in LAYOUT_SIZES]
         if len(firsts) != 1:
             raise KeypointError(
@@ -86,6 +94,8 @@ def _by_number(frames: Frames, numbers: Sequence[int]) -> Frames:
 
 def read_landmark_array(name: str, array: np.ndarray) -> People:
     """Read an array of landmarks, if it is one (see `is_landmark_array`)."""
+    if array.shape[1:] == (_HOLISTIC,):
+        array = array[:, : 4 * NUM_LANDMARKS]
     size = array.shape[-1] if array.ndim == 3 else array.shape[-1] // NUM_LANDMARKS
     values = array.astype(np.float64).reshape(len(array), NUM_LANDMARKS, size)
     seen = np.isfinite(values[..., :2]).all(-1) & (values[..., :2] != 0).any(-1)
@@ -103,4 +113,4 @@ def is_landmark_array(array: np.ndarray) -> bool:
     """Whether an array may be landmarks of every frame, by its shape."""
     n = NUM_LANDMARKS
     is_numbers = array.dtype.kind in "iuf" and array.ndim > 0 and len(array) > 0
-    return is_numbers and array.shape[1:] in ((n, 4), (n, 3), (4 * n,), (3 * n,))
+    return is_numbers and array.shape[1:] in ((n, 4), (n, 3), (4 * n,), (3 * n,), (_HOLISTIC,))

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -22,7 +22,7 @@ Names = tuple[str, ...]
 LAYOUT_SIZES = frozenset(map(len, ALIASES.values()))
 """How many joints people have."""
 
-MOST_JOINTS = 150
+MOST_JOINTS = max(LAYOUT_SIZES)
 """No layout has so many joints: a larger number is not a joint's."""
 
 Size = tuple[int, int]
@@ -104,6 +104,17 @@ def united(frames: Frames) -> tuple[Frames, Names | None]:
             joints[[place[name] for name in person.names]] = person.joints
             found[key].append(Person(joints, person.track))
     return found, names
+
+
+def one_size(sizes: Collection[Any]) -> Any:
+    """The size of all pictures, None if they say none.
+
+    Raises:
+        KeypointError: If there are several.
+    """
+    if len(sizes) > 1:
+        raise KeypointError("pictures of several sizes; expected those of one video")
+    return next(iter(sizes), None)
 
 
 def joint_counts(frames: Frames) -> set[int]:

@@ -4,6 +4,7 @@
 |---|---|
 | OpenPose, DWPose, Pose2Sim | a folder of JSON with `people`, a file per frame; or a list |
 | EasyMocap, labelme | a folder of JSON with `annots` or `shapes` |
+| VIA, Label Studio | see `torchcss.io.keypoints.annotated` |
 | YOLO | a folder of text labels; JSON of Ultralytics |
 | CVAT | its XML of pictures or a video, with skeletons or single points |
 | COCO, CVAT, AlphaPose | JSON: `annotations`, a list of `{image_id, keypoints}`, or by picture |
@@ -13,6 +14,7 @@
 | SLEAP | its analysis as CSV or HDF5 |
 | VideoPose3D, HumanEva | NPZ with `positions_2d`, `FILE.npz#SUBJECT/ACTION/CAMERA`; detections |
 | CSV | any with columns such as `l_hip_x`, `l_hip_y`, see `torchcss.io.keypoints.tables` |
+| pandas | JSON of such a table, in any of its forms |
 | NPZ, NPY | `keypoints [T J 2]`, `confidence [T J]`, `joint_names [J]`; pairs or triples |
 | clicked | JSON: `{"joints": {"l_wrist": [u, v]}}` for one frame, or `{"frames": {"0": {...}}}` |
 
@@ -58,7 +60,13 @@ from torchcss.io.keypoints.one_person import Whom, follow_person, size_of
 from torchcss.io.keypoints.people import Names, People, Person, Size, is_there
 from torchcss.io.keypoints.sides import with_sides_put_back
 from torchcss.io.keypoints.tables import read_table
-from torchcss.joint_names import ALIASES, JOINT_NAMES, layout_of_names
+from torchcss.joint_names import (
+    ALIASES,
+    JOINT_NAMES,
+    LIMB_JOINTS,
+    layout_of_names,
+    skeleton_joint_names,
+)
 from torchcss.types import Keypoints
 
 Scale = Literal["pixels", "zero-one", "plus-minus-one"]
@@ -405,8 +413,8 @@ def _from_border_pixels(
             raise KeypointError(
                 f"expected pixels, but all coordinates lie between {points.min():.3g} and "
                 f"{points.max():.3g}: they seem to be fractions of the image; if so, say "
-                "--normalised zero-one (or plus-minus-one); MoveNet's, which have y before x, are "
-                "arrays [frames 1 1 17 3]"
+                "--normalised zero-one (or plus-minus-one); MoveNet's, which have y before x, save "
+                "as an array [frames 1 1 17 3]"
             )
         return 1.0, 0.0, []
     if not fractions:
@@ -490,6 +498,9 @@ def _names_of_people(
         why = f"{layout}, as {'the file says' if people.layout == layout else 'asked for'}"
     elif own and (any_names or people.by_hand or any(layout_of_names(own))):
         known, why = layout_of_names(own), f"by {num_joints} names"
+        skeleton = skeleton_joint_names(own)
+        if len({*LIMB_JOINTS} & {*skeleton}) > len({*LIMB_JOINTS} & {*known}):
+            known, why = skeleton, f"{why} of a skeleton's joints"
     elif people.names is None and num_joints in _LAYOUTS_BY_COUNT:
         layout, reason = _recognise(chosen)
         known, why = ALIASES[layout], f"{layout}, {reason}"

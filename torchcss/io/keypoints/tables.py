@@ -20,16 +20,18 @@ import csv
 import io
 import itertools
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
+from types import NoneType
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from torchcss.errors import KeypointError
 from torchcss.files import read_text, refusing, shortened, unexpected
 from torchcss.io.keypoints import words
+from torchcss.io.keypoints.annotated import VIA_SHAPE, read_via_table
 from torchcss.io.keypoints.frames import in_seconds
 from torchcss.io.keypoints.mediapipe import LAYOUT, NUM_LANDMARKS, reordered
 from torchcss.io.keypoints.people import Frames, Key, People, Person, joint_counts, screened
@@ -49,6 +51,8 @@ _ABSENT = names_in("nan none null na n/a #n/a <na> -")
 
 _NUMBER = re.compile(r"([-+]?[0-9.,]+([eE][-+]?[0-9]+)?|nan)$")
 _DECIMAL = re.compile(r"^(-?[0-9]*),([0-9]+(?:[eE][-+]?[0-9]+)?)$")
+
+_WHEN = (*words.FRAMES, *words.TIMES, *words.PICTURES)
 
 Row = tuple[int, list[str]]
 """A row's number in the file, from 1, and its cells."""
@@ -80,7 +84,15 @@ def read_table(path: Path) -> People:
     Raises:
         KeypointError: If it is none of those above; the message names the row.
     """
-    rows = table_rows(path)
+    return people_of_rows(table_rows(path))
+
+
+def people_of_rows(rows: list[Row]) -> People:
+    """The people of a table's rows, the first of which is its heading.
+
+    Raises:
+        KeypointError: As `read_table`.
+    """
     firsts = [row[0].lower() for _, row in rows[:4]]
     if "bodyparts" in firsts and "coords" in firsts:
         columns, body, report = _deeplabcut(rows)
@@ -90,6 +102,8 @@ def read_table(path: Path) -> People:
     if len(rows) == 1:
         raise KeypointError("row 1: a heading and nothing below it; get a complete copy")
     heading = rows[0][1]
+    if VIA_SHAPE in heading:
+        return read_via_table(heading, rows[1:])
     columns = _headed(heading)
     said = [n for n in (columns.frame, columns.track) if n is not None]
     who = {tuple("".join(row[n : n + 1]) for n in said) for _, row in rows[1:]}
@@ -117,6 +131,48 @@ def read_table(path: Path) -> People:
     report.insert(0, "format: CSV, a heading per column")
     first = 0 if any(cell.lower() == "frame_idx" for cell in heading) else None  # SLEAP's
     return People(people, names, report, first=first)
+
+
+def rows_of_json(content: object) -> list[Row] | None:
+    """The rows of a table that pandas wrote as JSON, in any of its forms; None: it is none."""
+    heading: Any = None
+    if isinstance(content, dict):
+        heading, index = content.get("columns"), content.get("index")
+        if isinstance(index, list) and isinstance(content.get("data"), list):  # split
+            heading = ["", *heading] if isinstance(heading, list) else None
+            content = [[i, *row] for i, row in zip(index, content["data"], strict=False)]
+        elif "schema" in content:
+            content = content.get("data")
+        elif all(isinstance(each, dict) for each in content.values()):  # by index or by column
+            if _heads_a_table(content):
+                keys = next(iter(content.values()))
+                content = {k: {n: each.get(k) for n, each in content.items()} for k in keys}
+            content = [{"": key, **each} for key, each in content.items()]
+    if not isinstance(content, list) or not content:
+        return None
+    if heading is None and isinstance(content[0], dict) and _heads_a_table(content[0]):
+        heading = list(content[0])
+        content = [each.values() if isinstance(each, dict) else [each] for each in content]
+    if not heading or not all(isinstance(cell, (str, float, int, NoneType)) for cell in content[0]):
+        return None
+    rows = [["" if cell is None else f"{cell}" for cell in row] for row in content]
+    return [*enumerate([[_head(each) for each in heading], *rows], start=1)]
+
+
+def _head(head: object) -> str:
+    """A column's name; of pandas' names in several levels the last two."""
+    if isinstance(head, str) and head.startswith("("):
+        head = re.findall("'([^']*)'", head)
+    return " ".join(map(str, head[-2:])) if isinstance(head, list) else f"{head}"
+
+
+def _heads_a_table(names: Iterable[str]) -> bool:
+    """Whether these are columns: x and y of a named joint, or of one that a column names."""
+    split = [_split(_head(name)) for name in names]
+    said = dict.fromkeys(names, 1)
+    named = bool(words.first_of(said, words.JOINT_WORDS) and words.first_of(said, _WHEN))
+    own = [each for each in split if each is not None and (each[0] or named)]
+    return any((joint, 0) in own and (joint, 1) in own for joint, _ in own)
 
 
 def table_rows(path: Path) -> list[Row]:
@@ -202,10 +258,13 @@ def _headed(heading: Sequence[str]) -> _Columns:
     if not any(each is not None and each[1] == 1 for each in split):  # u and v
         split = [_split(cell, {**_PARTS, "v": 1}) for cell in heading]
     columns: dict[tuple[str, str], dict[int, int]] = {}
-    for index, each in enumerate(split):
+    # Pixels before fractions, where a table has both.
+    in_pixels = [bool(re.search("(?i)(^|_)(px|pixels?)(_|$)", cell)) for cell in heading]
+    for index, each in sorted(enumerate(split), key=lambda each: not in_pixels[each[0]]):
         if each is not None:
             own = columns.setdefault(("", each[0]), {})
-            if each[1] in own and each[1] != 3 and each[0]:
+            twice = each[1] in own and in_pixels[index] == in_pixels[own[each[1]]]
+            if twice and each[1] != 3 and each[0]:
                 raise KeypointError(f"row 1: column {heading[index]!r} is there twice")
             own.setdefault(each[1], index)
     half = [joint for (_, joint), parts in columns.items() if len({0, 1} & set(parts)) == 1]

@@ -36,14 +36,14 @@ PICTURES = names_in(
 
 TRACKS = names_in(
     "trackid track trackname tracking trackingid idx personid person personidx personname "
-    "individual individuals instanceid instance objectid subjectid subject playerid player pid tid "
-    "id"
+    "individual individuals instanceid instance objectid subjectid subject playerid player person "
+    "pid tid id"
 )
 """That by which a person is known again in another frame."""
 
 CONFIDENCES = names_in(
-    "confidence conf confidencescore c score keypointscore kptscore likelihood p prob probability "
-    "certainty visibility visible vis v presence inframelikelihood"
+    "confidence conf confidencescore c score s keypointscore kptscore likelihood p prob "
+    "probability certainty visibility visible vis v presence inframelikelihood"
 )
 """The confidence of a joint, the best first where there are several."""
 
